@@ -41,10 +41,12 @@ __all__ = [
 os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
 os.environ.setdefault("HF_HUB_OFFLINE", "1")
 os.environ.setdefault("WANDB_MODE", "offline")
-# Ray starts a worker for each CPU before it knows what for: a second of CPU for each of the Rays of a test run.
+# Ray starts a worker for each CPU before it knows what for: a second of CPU for each of the Rays of
+# a test run.
 os.environ.setdefault("RAY_prestart_worker_first_driver", "0")
 os.environ.setdefault("RAY_enable_worker_prestart", "0")
-# A shell that starts a job in the background has it, and all that it starts, ignore Ctrl-C; tests send it to servers.
+# A shell that starts a job in the background has it, and all that it starts, ignore Ctrl-C; tests
+# send it to servers.
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
 prepare_rendering()
@@ -52,8 +54,9 @@ if (simpler := assets("simpler")) is not None:
     os.environ.setdefault("MS_ASSET_DIR", str(simpler))  # ManiSkill reads it once a process
 _RAY_FOLDER = own_ray_folder()
 
-# What takes longest goes first, so that the processes that share the tests end at about the same time; files that share
-# a Ray follow those that start their own, so that each process starts the shared one once.
+# What takes longest goes first, so that the processes that share the tests end at about the same
+# time; files that share a Ray follow those that start their own, so that each process starts the
+# shared one once.
 _ORDER = ("hosts", "server", "ray", shared.FIXTURE, "vulkan", "sim", "torch")
 _SHARED = _ORDER.index(shared.FIXTURE)
 _shared_files: set[Path] = set()
@@ -61,14 +64,19 @@ _shared_files: set[Path] = set()
 
 def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption(
-        "--verified", action="store_true", help="note what became of tests marked `verifies` and `program`, in JSON"
+        "--verified",
+        action="store_true",
+        help="note what became of tests marked `verifies` and `program`, in JSON",
     )
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    # Under `nohup`, this process and each program that a test starts ignore hangups, which tests send. A program
-    # inherits SIG_IGN, but no handler. The processes of pytest-xdist inherit SIG_IGN, and set the handler themselves.
-    if signal.getsignal(signal.SIGHUP) is signal.SIG_IGN and not config.getoption("numprocesses", None):
+    # Under `nohup`, this process and each program that a test starts ignore hangups, which tests
+    # send. A program inherits SIG_IGN, but no handler. The processes of pytest-xdist inherit
+    # SIG_IGN, and set the handler themselves.
+    if signal.getsignal(signal.SIGHUP) is signal.SIG_IGN and not config.getoption(
+        "numprocesses", None
+    ):
         signal.signal(signal.SIGHUP, _ignore_hangup)
     if config.getoption("--verified"):
         config.pluginmanager.register(VerifyingTests())
@@ -92,11 +100,15 @@ def pytest_itemcollected(item: pytest.Item) -> None:
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Put the tests in order: those of a file stay together, unless they run alone, and share what it starts."""
+    """Put the tests in order: those of a file stay together, unless they run alone, and share
+    what it starts.
+    """
     places: dict[str, int] = {}
     for item in items:
         if " at 0x" in item.nodeid:  # processes that share the tests must collect the same
-            raise pytest.UsageError(f"{item.nodeid}: got an address in a test's name; name its parameters with ids=")
+            raise pytest.UsageError(
+                f"{item.nodeid}: got an address in a test's name; name its parameters with ids="
+            )
         marked = {marker.name for marker in item.iter_markers()}
         place = next((number for number, name in enumerate(_ORDER) if name in marked), len(_ORDER))
         if item.path in _shared_files:
@@ -113,12 +125,16 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
 
 
 def pytest_collection_finish() -> None:
-    """Keep what was imported and collected, which lives to the end, out of every garbage collection of a test."""
+    """Keep what was imported and collected, which lives to the end, out of every garbage
+    collection of a test.
+    """
     gc.freeze()
 
 
 def pytest_runtest_setup(item: pytest.Item) -> None:
-    """Skip what this machine cannot run; end the shared Ray before a file that does not share it."""
+    """Skip what this machine cannot run; end the shared Ray before a file that does not share
+    it.
+    """
     skip_what_is_missing(item)
     if item.path not in _shared_files:
         shared.stop()
@@ -126,14 +142,20 @@ def pytest_runtest_setup(item: pytest.Item) -> None:
 
 @pytest.fixture(scope="module")
 def shared_ray() -> None:
-    """Ray in this process, as other files use it too; `shared_ray.shared_server` serves policies on it."""
+    """Ray in this process, as other files use it too; `shared_ray.shared_server` serves policies
+    on it.
+    """
     shared.start()
 
 
 @pytest.fixture(autouse=True, scope="module")
 def levels_of_loggers() -> Iterator[None]:
-    """Let no file change what the next one logs: `ray.init` sets the level of Ray's logger for the whole process."""
-    loggers = [one for one in logging.root.manager.loggerDict.values() if isinstance(one, logging.Logger)]
+    """Let no file change what the next one logs: `ray.init` sets the level of Ray's logger for
+    the whole process.
+    """
+    loggers = [
+        one for one in logging.root.manager.loggerDict.values() if isinstance(one, logging.Logger)
+    ]
     levels = [one.level for one in loggers]
     yield
     for logger, level in zip(loggers, levels, strict=True):

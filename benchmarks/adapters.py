@@ -1,7 +1,9 @@
-"""Cost of sessions with many fine-tunes: LoRA adapters over one base in one batch, against a whole model for each.
+"""Cost of sessions with many fine-tunes: LoRA adapters over one base in one batch, against a whole
+model for each.
 
-Each variant runs in its own process. The adapters are random, for all linear layers, over a checkpoint of a family that
-supports them; the models are loaded from that checkpoint, which takes as much memory and time as merged ones.
+Each variant runs in its own process. The adapters are random, for all linear layers, over a
+checkpoint of a family that supports them; the models are loaded from that checkpoint, which takes
+as much memory and time as merged ones.
 """
 
 from __future__ import annotations
@@ -35,9 +37,15 @@ ADAPTERS, MODELS, BASE = "adapters", "models", "base alone"
 
 
 def measure_adapters(
-    policy: str, config: dict[str, Any], dims: Mapping[str, int], sessions: int, rank: int, rounds: int
+    policy: str,
+    config: dict[str, Any],
+    dims: Mapping[str, int],
+    sessions: int,
+    rank: int,
+    rounds: int,
 ) -> dict[str, Any]:
-    """Return the memory of the process, MiB, and the acts a second of CPU time, by variant and round.
+    """Return the memory of the process, MiB, and the acts a second of CPU time, by variant and
+    round.
 
     Args:
         policy: The name of the policy.
@@ -50,7 +58,9 @@ def measure_adapters(
     with tempfile.TemporaryDirectory() as folder:
         adapters = _alone(_random_adapters, policy, config, sessions, rank, Path(folder))
         return {
-            ADAPTERS: _alone(_measure, policy, config | {"adapters": adapters}, dims, 1, sessions, rounds),
+            ADAPTERS: _alone(
+                _measure, policy, config | {"adapters": adapters}, dims, 1, sessions, rounds
+            ),
             MODELS: _alone(_measure, policy, config, dims, sessions, sessions, rounds),
             BASE: _alone(_measure, policy, config, dims, 1, sessions, rounds),
         }
@@ -69,7 +79,9 @@ def _loaded(policy: str, config: dict[str, Any]) -> ModelPolicy:
     return loaded
 
 
-def _random_adapters(policy: str, config: dict[str, Any], count: int, rank: int, folder: Path) -> dict[str, str]:
+def _random_adapters(
+    policy: str, config: dict[str, Any], count: int, rank: int, folder: Path
+) -> dict[str, str]:
     """Write adapters of all linear layers, as PEFT does; returns their folders by name."""
     agent, rng = _loaded(policy, config), np.random.default_rng(0)
     modules = attrgetter(agent.network or "")(agent).named_modules()
@@ -81,21 +93,30 @@ def _random_adapters(policy: str, config: dict[str, Any], count: int, rank: int,
                 draw = rng.standard_normal(shape, dtype=np.float32)
                 values[f"base_model.model.{name}.lora_{part}.weight"] = 0.01 * draw
         (folder / str(number)).mkdir()
-        (folder / str(number) / "adapter_model.safetensors").write_bytes(header_of(values) + b"".join(parts_of(values)))
+        (folder / str(number) / "adapter_model.safetensors").write_bytes(
+            header_of(values) + b"".join(parts_of(values))
+        )
         said = json.dumps({"peft_type": "LORA", "r": rank, "lora_alpha": rank})
         (folder / str(number) / "adapter_config.json").write_text(said)
     return {str(number): str(folder / str(number)) for number in range(count)}
 
 
 def _measure(
-    policy: str, config: dict[str, Any], dims: Mapping[str, int], models: int, sessions: int, rounds: int
+    policy: str,
+    config: dict[str, Any],
+    dims: Mapping[str, int],
+    models: int,
+    sessions: int,
+    rounds: int,
 ) -> dict[str, Any]:
     agents = [_loaded(policy, config) for _ in range(models)]
     views = [random_observation(agents[0].contract, seed, dims=dims) for seed in range(sessions)]
     begun = []
     for number, obs in enumerate(views):
         session = AgentCopies(agents[number % len(agents)]).make()
-        session.reset(obs, "a task", seed=number, adapter=str(number) if "adapters" in config else None)
+        session.reset(
+            obs, "a task", seed=number, adapter=str(number) if "adapters" in config else None
+        )
         begun.append(session)
     size = sessions // len(agents)
     _run(agents, views, begun, size)
@@ -123,19 +144,28 @@ def _resident_mib() -> float:
 def main(
     checkpoint: Annotated[str, typer.Argument(help="The base: a folder or hub id.")],
     policy: Annotated[str, typer.Option(help="The policy's name.")] = "pi0",
-    sessions: Annotated[int, typer.Option(min=1, help="Sessions, each with a fine-tune of its own.")] = 10,
+    sessions: Annotated[
+        int, typer.Option(min=1, help="Sessions, each with a fine-tune of its own.")
+    ] = 10,
     rank: Annotated[int, typer.Option(min=1, help="Rank of the adapters.")] = 16,
-    state: Annotated[list[str] | None, typer.Option(help="NAME=LENGTH of a part of the state.")] = None,
+    state: Annotated[
+        list[str] | None, typer.Option(help="NAME=LENGTH of a part of the state.")
+    ] = None,
     rounds: Annotated[int, typer.Option(min=1, help="Batches of all sessions.")] = 7,
     out_file: Out = None,
 ) -> None:
-    """Measure the cost of sessions with many fine-tunes: adapters over one base, against a model for each."""
+    """Measure the cost of sessions with many fine-tunes: adapters over one base, against a model
+    for each.
+    """
     with errors():
         dims = parse_dims(state or [], "--state-dim")
         found = measure_adapters(policy, {"checkpoint": checkpoint}, dims, sessions, rank, rounds)
     for way, row in found.items():
         rate = statistics.median(row["acts_per_cpu_s"])
-        typer.echo(f"{way:12} {row['resident_mib']:7.0f} MiB of the process, {rate:6.1f} acts a second of CPU time")
+        typer.echo(
+            f"{way:12} {row['resident_mib']:7.0f} MiB of the process, {rate:6.1f} acts a second of "
+            "CPU time"
+        )
     save(found, out_file)
 
 

@@ -1,9 +1,9 @@
 """Autoscaling of replicas: a timeline of one run on this machine.
 
-An application with `min_replicas` of 0 serves, one after the other, a single robot, a burst of robots, rollout workers,
-and a single robot again, with pauses until the last replica has stopped. The running and the requested replicas and
-their sessions are sampled throughout; each act is timed at its client. The policy and the environment sleep, so that
-four replicas run on few cores.
+An application with `min_replicas` of 0 serves, one after the other, a single robot, a burst of
+robots, rollout workers, and a single robot again, with pauses until the last replica has stopped.
+The running and the requested replicas and their sessions are sampled throughout; each act is timed
+at its client. The policy and the environment sleep, so that four replicas run on few cores.
 """
 
 from __future__ import annotations
@@ -43,7 +43,13 @@ _EVERY_S = 0.5  # between two samples of the replicas
 _ANSWER_S = 0.3  # time limit for a replica to state its number of sessions
 _LATE_S = 180.0  # by which a burst may exceed its plan, as replicas start
 _QUIET_S = 180.0
-_FROM_NONE = {"min_replicas": 0, "max_replicas": 4, "look_back_s": 4, "upscale_delay_s": 2, "downscale_delay_s": 6}
+_FROM_NONE = {
+    "min_replicas": 0,
+    "max_replicas": 4,
+    "look_back_s": 4,
+    "upscale_delay_s": 2,
+    "downscale_delay_s": 6,
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,8 +89,12 @@ class LoadPhase(NamedTuple):
     failed: Sequence[str]
 
 
-def measure_autoscaling(plan: AutoscalingPlan, progress: Callable[[str], None] = lambda _: None) -> dict[str, Any]:
-    """Run all phases; returns plain JSON values, with times in s since the first robot connected."""
+def measure_autoscaling(
+    plan: AutoscalingPlan, progress: Callable[[str], None] = lambda _: None
+) -> dict[str, Any]:
+    """Run all phases; returns plain JSON values, with times in s since the first robot
+    connected.
+    """
     served = deployment(
         "noop",
         config={"action_dim": ACTION_DIM, "base_ms": plan.policy_ms},
@@ -107,11 +117,15 @@ def measure_autoscaling(plan: AutoscalingPlan, progress: Callable[[str], None] =
     return report(plan, watcher.samples, phases)
 
 
-def _bursts(plan: AutoscalingPlan, robots: LineProcess) -> dict[str, Callable[[str, Path], LoadPhase]]:
+def _bursts(
+    plan: AutoscalingPlan, robots: LineProcess
+) -> dict[str, Callable[[str, Path], LoadPhase]]:
     def of(number: int, seconds: float) -> Callable[[str, Path], LoadPhase]:
         def come(name: str, _: Path) -> LoadPhase:
             begun = time.time()
-            said = robots.request(json.dumps({"robots": number, "hz": plan.hz, "seconds": seconds}), seconds + _LATE_S)
+            said = robots.request(
+                json.dumps({"robots": number, "hz": plan.hz, "seconds": seconds}), seconds + _LATE_S
+            )
             return _met(name, begun, [RobotBurst(*one) for one in said])
 
         return come
@@ -155,9 +169,17 @@ def _rollouts(plan: AutoscalingPlan, name: str, out: Path) -> LoadPhase:
     )
     evaluate(config)
     [cell] = Results.load(out).cells
-    acts = [(one.finished, one.result.policy_ms) for one in cell.episodes if one.result.policy_ms is not None]
+    acts = [
+        (one.finished, one.result.policy_ms)
+        for one in cell.episodes
+        if one.result.policy_ms is not None
+    ]
     failed = [attempt.error for attempt in cell.attempts]
-    failed += [f"{one.result.key}: {one.result.error}" for one in cell.episodes if one.result.status != "done"]
+    failed += [
+        f"{one.result.key}: {one.result.error}"
+        for one in cell.episodes
+        if one.result.status != "done"
+    ]
     return LoadPhase(name, begun, time.time(), sorted(acts), None, 0, failed)
 
 
@@ -178,13 +200,19 @@ class ScaleWatcher:
         self._thread.join()
 
     def wait_for_quiet(self, replicas: int) -> None:
-        """Wait until no session and at most `replicas` are left. Raises `ProcessFailed` after minutes."""
+        """Wait until no session and at most `replicas` are left. Raises `ProcessFailed` after
+        minutes.
+        """
         deadline = time.monotonic() + _QUIET_S
         asked = time.time()
-        while not any(one.running <= replicas and one.sessions == 0 and one.at > asked for one in self.samples[-1:]):
+        while not any(
+            one.running <= replicas and one.sessions == 0 and one.at > asked
+            for one in self.samples[-1:]
+        ):
             if time.monotonic() > deadline:
                 raise ProcessFailed(
-                    f"replicas: {self.samples[-1:]} after {_QUIET_S:g} s without anybody, want {replicas}"
+                    f"replicas: {self.samples[-1:]} after {_QUIET_S:g} s without anybody, want "
+                    f"{replicas}"
                 )
             time.sleep(_EVERY_S)
 
@@ -212,14 +240,20 @@ def _sessions(replicas: Sequence[str]) -> Iterator[int]:
     asked = []
     for name in replicas:
         with contextlib.suppress(ValueError):  # it has ended
-            asked.append(call_replica(ray.get_actor(name, namespace="serve"), SiblingApi.peer, "Rebalancer.load"))
+            asked.append(
+                call_replica(
+                    ray.get_actor(name, namespace="serve"), SiblingApi.peer, "Rebalancer.load"
+                )
+            )
     ready, _ = ray.wait(asked, num_returns=len(asked), timeout=_ANSWER_S) if asked else ([], [])
     for reference in ready:
         with contextlib.suppress(ray.exceptions.RayError):
             yield ray.get(reference).sessions
 
 
-def report(plan: AutoscalingPlan, samples: Sequence[ScaleSample], phases: Sequence[LoadPhase]) -> dict[str, Any]:
+def report(
+    plan: AutoscalingPlan, samples: Sequence[ScaleSample], phases: Sequence[LoadPhase]
+) -> dict[str, Any]:
     """Return all figures as plain JSON values."""
     begun = phases[0].begun
     return {
@@ -228,8 +262,18 @@ def report(plan: AutoscalingPlan, samples: Sequence[ScaleSample], phases: Sequen
         "phases": [
             one._asdict()
             | {"begun": one.begun - begun, "ended": one.ended - begun, "failed": list(one.failed)}
-            | {"acts": len(one.acts), "most_replicas": _most(samples, one), "seconds": by_second(one.acts, begun)}
-            | dict(zip(("median_ms", "p95_ms", "longest_ms"), _quantiles([ms for _, ms in one.acts]), strict=True))
+            | {
+                "acts": len(one.acts),
+                "most_replicas": _most(samples, one),
+                "seconds": by_second(one.acts, begun),
+            }
+            | dict(
+                zip(
+                    ("median_ms", "p95_ms", "longest_ms"),
+                    _quantiles([ms for _, ms in one.acts]),
+                    strict=True,
+                )
+            )
             for one in phases
         ],
     }
@@ -241,11 +285,18 @@ def by_second(acts: Sequence[tuple[float, float]], begun: float) -> list[dict[st
     for at, ms in acts:
         found.setdefault(int((at - begun) // 1), []).append(ms)
     quantiles = {second: _quantiles(each) for second, each in sorted(found.items())}
-    return [{"at": second + 0.5, "median_ms": one[0], "p95_ms": one[1]} for second, one in quantiles.items()]
+    return [
+        {"at": second + 0.5, "median_ms": one[0], "p95_ms": one[1]}
+        for second, one in quantiles.items()
+    ]
 
 
 def _quantiles(values: Sequence[float]) -> list[float]:
-    return [float(one) for one in np.quantile(values, (0.5, 0.95, 1.0))] if values else [float("nan")] * 3
+    return (
+        [float(one) for one in np.quantile(values, (0.5, 0.95, 1.0))]
+        if values
+        else [float("nan")] * 3
+    )
 
 
 def _most(samples: Sequence[ScaleSample], phase: LoadPhase) -> int:
@@ -253,11 +304,15 @@ def _most(samples: Sequence[ScaleSample], phase: LoadPhase) -> int:
 
 
 def check_plot_file(file: Path | None) -> None:
-    """Raise `ConfigError` for a suffix that is not .png, .svg or .pdf, `MissingDependency` without matplotlib."""
+    """Raise `ConfigError` for a suffix that is not .png, .svg or .pdf, `MissingDependency`
+    without matplotlib.
+    """
     if file is None:
         return
     if file.suffix not in _SUFFIXES:
-        raise ConfigError(f"--plot: got {file.name!r}, want a name that ends in one of {list(_SUFFIXES)}")
+        raise ConfigError(
+            f"--plot: got {file.name!r}, want a name that ends in one of {list(_SUFFIXES)}"
+        )
     require("matplotlib")
 
 
@@ -272,20 +327,35 @@ def plot_autoscaling(found: Mapping[str, Any], file: Path) -> None:
     above.set_ylabel("replicas")
     sessions = above.twinx()
     sessions.fill_between(
-        times, [one["sessions"] for one in found["samples"]], step="post", color=_SESSIONS, alpha=0.25, lw=0
+        times,
+        [one["sessions"] for one in found["samples"]],
+        step="post",
+        color=_SESSIONS,
+        alpha=0.25,
+        lw=0,
     )
     sessions.set_ylabel("sessions (shaded)")
     above.legend(loc="upper left", fontsize=8, frameon=False)
     for phase in found["phases"]:
         at = [one["at"] for one in phase["seconds"]]
-        below.plot(at, [one["median_ms"] for one in phase["seconds"]], ".-", color=_BLUE, markersize=3)
+        below.plot(
+            at, [one["median_ms"] for one in phase["seconds"]], ".-", color=_BLUE, markersize=3
+        )
         below.plot(at, [one["p95_ms"] for one in phase["seconds"]], ".", color=_GREY, markersize=3)
-        waited = "" if phase["first_reset_s"] is None else f"\nfirst reset {phase['first_reset_s']:.1f} s"
+        waited = (
+            ""
+            if phase["first_reset_s"] is None
+            else f"\nfirst reset {phase['first_reset_s']:.1f} s"
+        )
         text = f"{phase['name']}\n{len(phase['failed'])} failed{waited}"
-        below.annotate(text, (phase["begun"], 1.0), xycoords=("data", "axes fraction"), va="top", fontsize=7)
+        below.annotate(
+            text, (phase["begun"], 1.0), xycoords=("data", "axes fraction"), va="top", fontsize=7
+        )
         for axes in (above, below):
             axes.axvspan(phase["begun"], phase["ended"], color="#000000", alpha=0.04, lw=0)
-    below.set_ylim(0, 1.6 * max(one["p95_ms"] for phase in found["phases"] for one in phase["seconds"]))
+    below.set_ylim(
+        0, 1.6 * max(one["p95_ms"] for phase in found["phases"] for one in phase["seconds"])
+    )
     below.set_ylabel("an act, ms (grey: 95 %)")
     below.set_xlabel("s since the first robot came")
     for axes in (above, below, sessions):
@@ -295,27 +365,52 @@ def plot_autoscaling(found: Mapping[str, Any], file: Path) -> None:
 
 def show_autoscaling(found: Mapping[str, Any]) -> None:
     """Print a row for each phase."""
-    rows = table("", "first reset s", "replicas", "acts", "failed", "begun again", "median ms", "p95 ms", "longest")
+    rows = table(
+        "",
+        "first reset s",
+        "replicas",
+        "acts",
+        "failed",
+        "begun again",
+        "median ms",
+        "p95 ms",
+        "longest",
+    )
     for one in found["phases"]:
         waited = "" if one["first_reset_s"] is None else f"{one['first_reset_s']:.1f}"
         rows.add_row(
-            one["name"], waited, str(one["most_replicas"]), str(one["acts"]), str(len(one["failed"])),
-            str(one["resumed"]), *(f"{one[key]:.1f}" for key in ("median_ms", "p95_ms", "longest_ms")),
-        )  # fmt: skip
+            one["name"],
+            waited,
+            str(one["most_replicas"]),
+            str(one["acts"]),
+            str(len(one["failed"])),
+            str(one["resumed"]),
+            *(f"{one[key]:.1f}" for key in ("median_ms", "p95_ms", "longest_ms")),
+        )
     out.print(rows)
 
 
 def main(
     robots: Annotated[int, typer.Option(min=1, help="That come at once.")] = 12,
-    workers: Annotated[int, typer.Option(min=1, help="Of the evaluation that comes after them.")] = 8,
-    seconds: Annotated[float, typer.Option(min=1, help="That each of the two stays, about.")] = 25.0,
+    workers: Annotated[
+        int, typer.Option(min=1, help="Of the evaluation that comes after them.")
+    ] = 8,
+    seconds: Annotated[
+        float, typer.Option(min=1, help="That each of the two stays, about.")
+    ] = 25.0,
     out_file: Out = None,
-    plot: Annotated[Path | None, typer.Option("--plot", help="Draw the figures here: .png, .svg or .pdf.")] = None,
+    plot: Annotated[
+        Path | None, typer.Option("--plot", help="Draw the figures here: .png, .svg or .pdf.")
+    ] = None,
 ) -> None:
-    """Measure replicas over time while robots and rollouts start and end, from no replica and back to none."""
+    """Measure replicas over time while robots and rollouts start and end, from no replica and
+    back to none.
+    """
     with errors():
         check_plot_file(plot)
-        found = measure_autoscaling(AutoscalingPlan(robots=robots, workers=workers, seconds=seconds), progress)
+        found = measure_autoscaling(
+            AutoscalingPlan(robots=robots, workers=workers, seconds=seconds), progress
+        )
         show_autoscaling(found)
         save(found, out_file)
         if plot is not None:

@@ -1,4 +1,6 @@
-"""A policy without a server, as a process of `throughput`: `python -m benchmarks.bare_policy JSON`."""
+"""A policy without a server, as a process of `throughput`: `python -m benchmarks.bare_policy
+JSON`.
+"""
 
 from __future__ import annotations
 
@@ -13,7 +15,9 @@ from vlagents_ray.serve.python_env.child_start import die_with_parent, own_stdou
 
 
 class BarePolicy:
-    """A policy without a server, `batch` observations at a time, as the reference for a served one."""
+    """A policy without a server, `batch` observations at a time, as the reference for a served
+    one.
+    """
 
     def __init__(self, policy: str, config: dict[str, Any], batch: int) -> None:
         self._agent = policy_class(policy).from_config(config)
@@ -39,7 +43,9 @@ class BarePolicy:
 
 
 def main() -> None:
-    """Run a bare policy as a process: the settings are JSON; it answers each line, a time in s, with the rate."""
+    """Run a bare policy as a process: the settings are JSON; it answers each line, a time in s,
+    with the rate.
+    """
     die_with_parent()
     out = own_stdout()
     bare = BarePolicy(**json.loads(sys.argv[1]))

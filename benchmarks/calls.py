@@ -1,7 +1,9 @@
-"""The calls of Python, the system calls and the context switches of one warm act, by transport, of client and server.
+"""The calls of Python, the system calls and the context switches of one warm act, by transport, of
+client and server.
 
-Unlike times, they hardly depend on the machine and its load. Waiting is left out: how often a thread polls depends on
-the time that the other side takes. System calls are counted by `strace`, if it is installed.
+Unlike times, they hardly depend on the machine and its load. Waiting is left out: how often a
+thread polls depends on the time that the other side takes. System calls are counted by `strace`, if
+it is installed.
 """
 
 from __future__ import annotations
@@ -37,8 +39,23 @@ from vlagents_ray.serve.launch.server import running_server
 
 POLICY = "benchmarks.calls:CountedNoop"
 WARM_UP = 50  # acts
-_WAITING = {"_wait_for_request", "_wait_for_event", "poll", "mark_idle", "mark_busy", "await_answer"}
-_WAITING_CALLS = {"clock_nanosleep", "epoll_pwait", "epoll_wait", "futex", "poll", "restart_syscall", "sched_yield"}
+_WAITING = {
+    "_wait_for_request",
+    "_wait_for_event",
+    "poll",
+    "mark_idle",
+    "mark_busy",
+    "await_answer",
+}
+_WAITING_CALLS = {
+    "clock_nanosleep",
+    "epoll_pwait",
+    "epoll_wait",
+    "futex",
+    "poll",
+    "restart_syscall",
+    "sched_yield",
+}
 _OFTEN = 0.5  # calls an act; rarer ones are of other threads
 Counts = dict[str, float]
 
@@ -51,7 +68,9 @@ class CallCounter:
         self._thread = 0
 
     def install(self) -> None:
-        """Count on this thread, on those that start later, and on those of the event loops of this process."""
+        """Count on this thread, on those that start later, and on those of the event loops of
+        this process.
+        """
         threading.setprofile(self.count)
         sys.setprofile(self.count)
         for one in gc.get_objects():
@@ -85,7 +104,9 @@ class CountedNoop(Noop):
 
 
 def counted(agent: RemoteAgent, obs: Obs, acts: int) -> dict[str, Counts]:
-    """Return the counts of one act, of the "client" and of the "server", whose policy is `CountedNoop`."""
+    """Return the counts of one act, of the "client" and of the "server", whose policy is
+    `CountedNoop`.
+    """
     counter = CallCounter()
     begun = agent.reset(obs)
     for _ in range(WARM_UP):
@@ -102,19 +123,27 @@ def counted(agent: RemoteAgent, obs: Obs, acts: int) -> dict[str, Counts]:
         snapshots.append(agent.reset(obs))
     first, second, third = snapshots
     server = {name: (third[name] - 2 * second[name] + first[name]) / acts for name in client}
-    for counts, target in ((client, ["-p", str(threading.get_native_id())]), (server, ["-f", "-p", str(begun["pid"])])):
+    for counts, target in (
+        (client, ["-p", str(threading.get_native_id())]),
+        (server, ["-f", "-p", str(begun["pid"])]),
+    ):
         if shutil.which("strace") is not None:
             with traced(target) as calls:
                 for _ in range(acts):
                     agent.act(obs)
             often = {name: count / acts for name, count in calls.items() if count / acts > _OFTEN}
-            counts |= {"system": sum(often.values()), **{f"system: {name}": count for name, count in often.items()}}
+            counts |= {
+                "system": sum(often.values()),
+                **{f"system: {name}": count for name, count in often.items()},
+            }
     return {"client": client, "server": server}
 
 
 @contextlib.contextmanager
 def traced(target: Sequence[str]) -> Iterator[Counter[str]]:
-    """Count the system calls of a process or thread within the context, without those that wait, in the result."""
+    """Count the system calls of a process or thread within the context, without those that wait,
+    in the result.
+    """
     calls: Counter[str] = Counter()
     with tempfile.NamedTemporaryFile("r") as summary:
         command = ["strace", "-c", "-U", "calls,name", "-o", summary.name, *target]
@@ -124,7 +153,11 @@ def traced(target: Sequence[str]) -> Iterator[Counter[str]]:
             yield calls
             strace.terminate()
         for words in map(str.split, Path(summary.name).read_text().splitlines()):
-            if len(words) == 2 and words[0].isdecimal() and words[1] not in {"total", *_WAITING_CALLS}:
+            if (
+                len(words) == 2
+                and words[0].isdecimal()
+                and words[1] not in {"total", *_WAITING_CALLS}
+            ):
                 calls[words[1]] += int(words[0])
 
 
@@ -136,7 +169,12 @@ def count_acts(own: Sequence[OwnClient], acts: int) -> list[dict[str, Any]]:
         for one in own:
             agent = connect(f"serve://{app}" if one.actor else url, one.transport, one.codec)
             with agent:
-                found.append({"way": one.name.removesuffix(", Ray actor"), **counted(agent, observation(), acts)})
+                found.append(
+                    {
+                        "way": one.name.removesuffix(", Ray actor"),
+                        **counted(agent, observation(), acts),
+                    }
+                )
     return found
 
 
@@ -145,16 +183,26 @@ def main(
     transports: Transports = "",
     out_file: Out = None,
 ) -> None:
-    """Count the calls of Python and C, the system calls and the context switches of one act, by transport."""
+    """Count the calls of Python and C, the system calls and the context switches of one act, by
+    transport.
+    """
     with errors():
         own, skipped = own_clients(parse_list(transports))
         own = [one for one in own if one.actor is (one.transport in ("plasma", "handle"))]
-        found = {**measured_on("python -m benchmarks.calls"), "ways": count_acts(own, acts), "skipped": skipped}
+        found = {
+            **measured_on("python -m benchmarks.calls"),
+            "ways": count_acts(own, acts),
+            "skipped": skipped,
+        }
         names = ("Python", "C", "system", "switches", "hand-overs")
         rows = table("way", "side", *names)
         for way in found["ways"]:
             for side in ("client", "server"):
-                rows.add_row(way["way"], side, *(f"{way[side].get(name, float('nan')):.1f}" for name in names))
+                rows.add_row(
+                    way["way"],
+                    side,
+                    *(f"{way[side].get(name, float('nan')):.1f}" for name in names),
+                )
         out.print(rows)
         show_skipped(found)
         save(found, out_file)

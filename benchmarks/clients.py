@@ -1,7 +1,9 @@
-"""Round trips of the clients in other languages beside those of the Python client, in turns at one server.
+"""Round trips of the clients in other languages beside those of the Python client, in turns at one
+server.
 
-Each client is a process, and all send the same raw pixels. Build the client in TypeScript first: `cd clients/typescript
-&& npm ci && npm run build`. The one in C++ is compiled here, with the packages in its README.md.
+Each client is a process, and all send the same raw pixels. Build the client in TypeScript first:
+`cd clients/typescript && npm ci && npm run build`. The one in C++ is compiled here, with the
+packages in its README.md.
 """
 
 from __future__ import annotations
@@ -34,7 +36,9 @@ CPP = "C++, websocket"
 NODE = {"Node.js, websocket": "websocket", "Node.js, http": "http"}
 
 
-def measure_clients(url: str, calls: int, progress: Callable[[str], None] = lambda _: None) -> RoundTripsOfAll:
+def measure_clients(
+    url: str, calls: int, progress: Callable[[str], None] = lambda _: None
+) -> RoundTripsOfAll:
     """Measure `calls` round trips of each client at the server of `url`.
 
     Raises:
@@ -42,17 +46,29 @@ def measure_clients(url: str, calls: int, progress: Callable[[str], None] = lamb
     """
     node = shutil.which("node")
     if node is None or not (TYPESCRIPT / "dist" / "index.js").exists():
-        raise ConfigError(f"clients: want Node.js 18, and `npm ci && npm run build` in {TYPESCRIPT}")
+        raise ConfigError(
+            f"clients: want Node.js 18, and `npm ci && npm run build` in {TYPESCRIPT}"
+        )
     with contextlib.ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
         _save(observation(), folder)
         drivers: dict[str, Driver] = {
-            f"Python, {one.transport}": stack.enter_context(connected(one, url, "")) for one in PYTHON
+            f"Python, {one.transport}": stack.enter_context(connected(one, url, ""))
+            for one in PYTHON
         }
-        drivers[CPP] = stack.enter_context(ClientProcess(CPP, [_compiled(folder), url, str(folder)]))
+        drivers[CPP] = stack.enter_context(
+            ClientProcess(CPP, [_compiled(folder), url, str(folder)])
+        )
         script = str(HERE / "node_client.mjs")
         for name, transport in NODE.items():
-            command = [node, script, str(TYPESCRIPT / "dist" / "index.js"), url, transport, str(folder)]
+            command = [
+                node,
+                script,
+                str(TYPESCRIPT / "dist" / "index.js"),
+                url,
+                transport,
+                str(folder),
+            ]
             drivers[name] = stack.enter_context(ClientProcess(name, command))
         for driver in drivers.values():
             driver.ready()
@@ -62,9 +78,20 @@ def measure_clients(url: str, calls: int, progress: Callable[[str], None] = lamb
 def _compiled(folder: Path) -> str:
     """Return the path of the C++ client, compiled as a release is."""
     program = str(folder / "cpp_client")
-    command = ["c++", "-std=c++17", "-O2", f"-I{CLIENTS / 'cpp' / 'include'}", str(HERE / "cpp_client.cpp")]
+    command = [
+        "c++",
+        "-std=c++17",
+        "-O2",
+        f"-I{CLIENTS / 'cpp' / 'include'}",
+        str(HERE / "cpp_client.cpp"),
+    ]
     try:
-        subprocess.run([*command, "-o", program, "-ljpeg", "-pthread"], check=True, capture_output=True, text=True)
+        subprocess.run(
+            [*command, "-o", program, "-ljpeg", "-pthread"],
+            check=True,
+            capture_output=True,
+            text=True,
+        )
     except (FileNotFoundError, subprocess.CalledProcessError) as error:
         said = getattr(error, "stderr", error)
         raise ConfigError(
@@ -74,16 +101,23 @@ def _compiled(folder: Path) -> str:
 
 
 def _save(obs: Obs, folder: Path) -> None:
-    """Write the observation for clients in any language: the pixels of each camera, and the rest as JSON."""
+    """Write the observation for clients in any language: the pixels of each camera, and the rest
+    as JSON.
+    """
     cameras = {}
     for name, image in obs.cameras.items():
         (folder / name).write_bytes(image.tobytes())
         cameras[name] = image.shape[:2]
     state = {name: part.tolist() for name, part in obs.state.items()}
-    (folder / "obs.json").write_text(json.dumps({"cameras": cameras, "gripper": obs.gripper, "state": state}))
+    (folder / "obs.json").write_text(
+        json.dumps({"cameras": cameras, "gripper": obs.gripper, "state": state})
+    )
 
 
-def main(calls: Annotated[int, typer.Option(min=1, help="Acts of each client.")] = 2000, out_file: Out = None) -> None:
+def main(
+    calls: Annotated[int, typer.Option(min=1, help="Acts of each client.")] = 2000,
+    out_file: Out = None,
+) -> None:
     """Measure round trips of the clients in other languages, beside the Python client's."""
     with errors():
         with running_server(deployment(POLICY), host="127.0.0.1") as server:

@@ -1,7 +1,7 @@
 """Load by clients that act again at each answer, a thread for each.
 
-It needs only the standard library: the scripts of other policy servers (`benchmarks/peers`) load this file with a
-Python without vlagents_ray.
+It needs only the standard library: the scripts of other policy servers (`benchmarks/peers`) load
+this file with a Python without vlagents_ray.
 """
 
 from __future__ import annotations
@@ -24,14 +24,18 @@ class ClosedLoop:
         self._pool = ThreadPoolExecutor(len(acts))
 
     def run(self, robots: int, simulations: int, begin: float, end: float) -> list[list[Call]]:
-        """Run some of the clients until `end`, s of `time.monotonic`; all processes begin at the same moment.
+        """Run some of the clients until `end`, s of `time.monotonic`; all processes begin at the
+        same moment.
 
         Returns:
             For each client, robots first, its calls that ended after `begin`.
         """
         chosen = [(act, _THINK_S) for act in self._robots[:robots]]
         chosen += [(act, 0.0) for act in self._simulations[:simulations]]
-        return [one.result() for one in [self._pool.submit(self._repeat, *each, begin, end) for each in chosen]]
+        return [
+            one.result()
+            for one in [self._pool.submit(self._repeat, *each, begin, end) for each in chosen]
+        ]
 
     def close(self) -> None:
         self._pool.shutdown()

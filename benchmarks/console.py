@@ -19,7 +19,8 @@ Seconds = Annotated[float, typer.Option(min=0.1, help="Of each measurement.")]
 Rounds = Annotated[int, typer.Option(min=1)]
 Out = Annotated[Path | None, typer.Option("--out", help="File of the figures, as JSON.")]
 Transports = Annotated[str, typer.Option(help="shm,websocket,http,handle,plasma; default: all.")]
-_WITH_INTERVALS = 5  # ratios in a row that fit on a screen with their intervals; the file of figures has all
+# Ratios in a row that fit on a screen with their intervals; the file of figures has all.
+_WITH_INTERVALS = 5
 
 
 def show_round_trips(found: Mapping[str, Any], title: str) -> None:
@@ -33,20 +34,33 @@ def show_round_trips(found: Mapping[str, Any], title: str) -> None:
         cells = []
         for name in theirs:
             one = ratios.get(name)
-            interval = f" ({one['ci95'][0]:.2f}-{one['ci95'][1]:.2f})" if one and len(theirs) <= _WITH_INTERVALS else ""
+            interval = (
+                f" ({one['ci95'][0]:.2f}-{one['ci95'][1]:.2f})"
+                if one and len(theirs) <= _WITH_INTERVALS
+                else ""
+            )
             cells.append(f"{one['ratio']:.2f}{interval}" if one else "")
         rows.add_row(
-            row["way"], f"{row['median_ms']:.3f}", f"{low:.3f} to {high:.3f}", f"{row['p99_ms']:.3f}", *cells,
+            row["way"],
+            f"{row['median_ms']:.3f}",
+            f"{low:.3f} to {high:.3f}",
+            f"{row['p99_ms']:.3f}",
+            *cells,
             style="dim" if row["way"] in theirs else None,
-        )  # fmt: skip
+        )
     out.print(rows)
     show_skipped(found)
 
 
 USE_COLUMNS = (
-    "client CPU ms", "server CPU ms", "acts/s of a server's core", "server's programs, CPU ms", "client waits",
-    "server waits", "preempted",
-)  # fmt: skip
+    "client CPU ms",
+    "server CPU ms",
+    "acts/s of a server's core",
+    "server's programs, CPU ms",
+    "client waits",
+    "server waits",
+    "preempted",
+)
 
 
 def use_cells(use: Mapping[str, Any]) -> list[str]:
@@ -57,7 +71,9 @@ def use_cells(use: Mapping[str, Any]) -> list[str]:
         f"{client['cpu_ms']:.3f}",
         f"{server['cpu_ms']:.3f}",
         f"{1e3 / server['cpu_ms']:.0f}" if server["cpu_ms"] > 0 else "",
-        ", ".join(f"{name} {cpu_ms:.3f}" for name, cpu_ms in programs if cpu_ms >= 0.01 * server["cpu_ms"]),
+        ", ".join(
+            f"{name} {cpu_ms:.3f}" for name, cpu_ms in programs if cpu_ms >= 0.01 * server["cpu_ms"]
+        ),
         f"{client['voluntary_switches']:.1f}",
         f"{server['voluntary_switches']:.1f}",
         f"{client['involuntary_switches'] + server['involuntary_switches']:.1f}",
@@ -65,10 +81,14 @@ def use_cells(use: Mapping[str, Any]) -> list[str]:
 
 
 def show_use(found: Mapping[str, Any]) -> None:
-    """Print a row for each client: what an act uses of its process and of its server's processes."""
+    """Print a row for each client: what an act uses of its process and of its server's
+    processes.
+    """
     rows = table("way", *USE_COLUMNS)
     rows.title = "CPU time and context switches of one act, beyond those of idle processes"
-    for name, use in sorted(found["use"].items(), key=lambda one: float(one[1]["server"]["cpu_ms"])):
+    for name, use in sorted(
+        found["use"].items(), key=lambda one: float(one[1]["server"]["cpu_ms"])
+    ):
         rows.add_row(name, *use_cells(use))
     out.print(rows)
 
@@ -84,7 +104,9 @@ def parse_counts(text: str, option: str) -> list[int]:
     try:
         counts = sorted({int(one) for one in parse_list(text)})
     except ValueError as error:
-        raise ConfigError(f"{option}: got {text!r}, want numbers with commas between them") from error
+        raise ConfigError(
+            f"{option}: got {text!r}, want numbers with commas between them"
+        ) from error
     if not counts or counts[0] < 1:
         raise ConfigError(f"{option}: got {text!r}, want numbers from 1 on")
     return counts

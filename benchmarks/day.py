@@ -1,18 +1,19 @@
-"""A day of control without a jump: `python -m benchmarks.day --seed 1`, 24 simulated hours at 50 Hz with faults.
+"""A day of control without a jump: `python -m benchmarks.day --seed 1`, 24 simulated hours at 50 Hz
+with faults.
 
-Control loop, chunk player, guard, watchdog and command inbox are those of a robot; the arm, the network, the server,
-the operator and all clocks are simulated, so that a day takes minutes, and a seed replays exactly. Checked at each
-command:
+Control loop, chunk player, guard, watchdog and command inbox are those of a robot; the arm, the
+network, the server, the operator and all clocks are simulated, so that a day takes minutes, and a
+seed replays exactly. Checked at each command:
 
-- no step above 3 times the largest one of a run without faults, and none above the limit of speed, also not from the
-  measured pose after a stop;
+- no step above 3 times the largest one of a run without faults, and none above the limit of speed,
+  also not from the measured pose after a stop;
 - no command after a stop or a pause until the operator at the robot has restarted it.
 
-`--relative` plays the day with relative actions, `--arms 2` with two arms. Exit status: 0 without a violation, else 1.
-`--hours` and the seed repeat a violation, whose time the report has.
+`--relative` plays the day with relative actions, `--arms 2` with two arms. Exit status: 0 without a
+violation, else 1. `--hours` and the seed repeat a violation, whose time the report has.
 
-`--ticks 20000` measures in place of a day what a tick costs: of the guard, and from `observe` until `apply` with and
-without it.
+`--ticks 20000` measures in place of a day what a tick costs: of the guard, and from `observe` until
+`apply` with and without it.
 """
 
 from __future__ import annotations
@@ -39,7 +40,13 @@ from vlagents_ray.chunking.player import ChunkPlayer, PlayerSettings
 from vlagents_ray.cli.console import errors, out
 from vlagents_ray.client.commands import COMMAND, CommandInbox
 from vlagents_ray.contract import ActionSpec, Contract
-from vlagents_ray.errors import ConnectionLost, DeadlineExceeded, PolicyFailed, PolicyUnavailable, VLAgentsError
+from vlagents_ray.errors import (
+    ConnectionLost,
+    DeadlineExceeded,
+    PolicyFailed,
+    PolicyUnavailable,
+    VLAgentsError,
+)
 from vlagents_ray.interface import CAPTURED, Act, Agent, Obs
 from vlagents_ray.robot import Guard, Limits, Watchdog, loop, run_loop, watchdog
 from vlagents_ray.robot.simulated import SimulatedRobot
@@ -85,7 +92,9 @@ _EVERY_S = 45.0  # mean time between two faults
 
 
 class DayClock:
-    """Stands for the module `time` in those that run; it goes on by ticks, and its wall time may be set."""
+    """Stands for the module `time` in those that run; it goes on by ticks, and its wall time may
+    be set.
+    """
 
     def __init__(self) -> None:
         self.now, self.offset = 0.0, 1.7e9
@@ -118,20 +127,27 @@ class DayReport:
     normal_step: float = 0.0  # rad
     largest_step: float = 0.0  # rad
     faults: dict[str, int] = field(default_factory=dict)
-    held: dict[str, int] = field(default_factory=dict)  # ticks without the policy, by cause, in whole runs
+    # Ticks without the policy, by cause, in whole runs.
+    held: dict[str, int] = field(default_factory=dict)
     violations: list[str] = field(default_factory=list)
     digest: str = ""  # of all commands
 
 
 class World:
-    """The simulated arm, its surroundings and its operator; `robot` methods are those of `vlagents_ray.robot.Robot`."""
+    """The simulated arm, its surroundings and its operator; `robot` methods are those of
+    `vlagents_ray.robot.Robot`.
+    """
 
-    def __init__(self, seed: int, hours: float, *, faults: bool, relative: bool = False, arms: int = 1) -> None:
+    def __init__(
+        self, seed: int, hours: float, *, faults: bool, relative: bool = False, arms: int = 1
+    ) -> None:
         self.clock = DayClock()
         self.report = DayReport(seed, hours, relative=relative, arms=arms)
         self.random = np.random.default_rng(seed)
         names = tuple(f"arm{number}" for number in range(arms)) if arms > 1 else None
-        self.action = ActionSpec(dim=len(REST) * arms, delta=relative, gripper_open=1.0, gripper_closed=0.0, arms=names)
+        self.action = ActionSpec(
+            dim=len(REST) * arms, delta=relative, gripper_open=1.0, gripper_closed=0.0, arms=names
+        )
         self.deltas = self.action.delta_columns(len(REST) * arms)
         self.grippers = self.action.gripper_columns(len(REST) * arms)
         self.joints = np.tile(np.array(REST, np.float32), arms)
@@ -158,7 +174,9 @@ class World:
         """Return the joints, or the observation of before while the camera hangs."""
         self.joints = self.joints + np.float32(_SMOOTHING) * (self.target - self.joints)
         if self._picture is None or not self.has("old picture"):
-            self._picture = Obs(state={"joints": self.joints.copy()}, info={CAPTURED: self.clock.time()})
+            self._picture = Obs(
+                state={"joints": self.joints.copy()}, info={CAPTURED: self.clock.time()}
+            )
         return self._picture
 
     def apply(self, action: np.ndarray) -> None:
@@ -245,11 +263,15 @@ class World:
             self.clock.offset += self.random.normal(0.0, 10.0)
         elif fault == "pushed":  # only an arm without commands can be moved by hand
             if self.forbidden is not None:
-                self.joints = self.joints + self.random.uniform(-0.2, 0.2, len(self.joints)).astype(np.float32)
+                self.joints = self.joints + self.random.uniform(-0.2, 0.2, len(self.joints)).astype(
+                    np.float32
+                )
                 self.stop()
         else:
             do = fault.partition(" ")[0]
-            self.commands.came(Act(self.joints, info={COMMAND: {"id": str(self.clock.now), "do": do}}))
+            self.commands.came(
+                Act(self.joints, info={COMMAND: {"id": str(self.clock.now), "do": do}})
+            )
             if do != "restart":
                 self._forbid(fault)
 
@@ -268,7 +290,9 @@ class DayWatchdog(Watchdog):
 
 
 class DayPolicy(Agent):
-    """A policy that leads the arm around a closed path from any pose, behind a network and a server with faults."""
+    """A policy that leads the arm around a closed path from any pose, behind a network and a
+    server with faults.
+    """
 
     contract: Contract | None = None
 
@@ -314,13 +338,21 @@ class DayPolicy(Agent):
         begin = math.atan2(float(joints[1]), float(joints[0])) + _TURN * _LAG
         angle = begin + _TURN * np.arange(CHUNK + 1)
         radius, zeros = _RADIUS + random.uniform(-_SWAY, _SWAY), np.zeros(CHUNK + 1)
-        columns = [radius * np.cos(angle), radius * np.sin(angle), 0.3 * np.cos(2 * angle), zeros, zeros, zeros]
+        columns = [
+            radius * np.cos(angle),
+            radius * np.sin(angle),
+            0.3 * np.cos(2 * angle),
+            zeros,
+            zeros,
+            zeros,
+        ]
         path = np.stack([*columns, (1 + np.cos(angle)) / 2], 1)
         path = np.tile(path, (1, world.report.arms))
         rows = path[1:].astype(np.float32)
         if world.deltas:
             behind = np.roll(path, 1, axis=0)[1:]
-            pull = np.clip((path[0] - joints) / CHUNK, -_PULL, _PULL)  # of the lag, too, which is the same all day
+            # Of the lag, too, which is the same all day.
+            pull = np.clip((path[0] - joints) / CHUNK, -_PULL, _PULL)
             rows[:, world.deltas] = (path[1:] - behind + pull)[:, world.deltas]
         place = int(random.integers(CHUNK))
         if world.has("NaN"):
@@ -400,14 +432,22 @@ def simulated_time(world: World) -> Iterator[None]:
         for module in (loop, player, buffer, watchdog):
             stack.enter_context(mock.patch.object(module, "time", world.clock))
         stack.enter_context(mock.patch.object(loop, "Pacer", Pacer))
-        stack.enter_context(mock.patch.object(loop, "undisturbed", return_value=contextlib.nullcontext([])))
+        stack.enter_context(
+            mock.patch.object(loop, "undisturbed", return_value=contextlib.nullcontext([]))
+        )
         stack.enter_context(mock.patch.object(loop, "_COLLECT_S", math.inf))
         stack.enter_context(mock.patch.object(player, "AsyncCaller", DayCaller))
         yield
 
 
 def play_day(
-    seed: int, hours: float, *, faults: bool = True, normal_step: float = 0.0, relative: bool = False, arms: int = 1
+    seed: int,
+    hours: float,
+    *,
+    faults: bool = True,
+    normal_step: float = 0.0,
+    relative: bool = False,
+    arms: int = 1,
 ) -> DayReport:
     """Play a day.
 
@@ -442,7 +482,14 @@ def play_day(
             world.report.runs += 1
             left_s = min(RUN_S, hours * 3600 - world.clock.now)
             try:
-                done = run_loop(world, driver, hz=HZ, seconds=left_s, watchdog=world.watchdog, commands=world.commands)
+                done = run_loop(
+                    world,
+                    driver,
+                    hz=HZ,
+                    seconds=left_s,
+                    watchdog=world.watchdog,
+                    commands=world.commands,
+                )
                 held.update({str(cause): ticks for cause, ticks in done.safe.items()})
                 held.update({"waiting": done.waiting, "paused": done.paused})
             except (VLAgentsError, ZeroDivisionError):  # the operator begins another run
@@ -474,24 +521,36 @@ class CirclePolicy(Agent):
 
 
 def limits_of(joints: int) -> Limits:
-    """Return limits of speed, acceleration, jerk and the workspace of an arm's tip behind its first seven joints."""
+    """Return limits of speed, acceleration, jerk and the workspace of an arm's tip behind its
+    first seven joints.
+    """
     links = "".join(
-        f'<joint name="{i}" type="revolute"><parent link="{i}"/><child link="{i + 1}"/><origin xyz="0 0 0.15" '
-        f'rpy="{(-1) ** i * 1.57} 0 0"/><axis xyz="0 0 1"/><limit lower="-3" upper="3" velocity="2"/></joint>'
+        f'<joint name="{i}" type="revolute"><parent link="{i}"/><child link="{i + 1}"/><origin '
+        'xyz="0 0 0.15" '
+        f'rpy="{(-1) ** i * 1.57} 0 0"/><axis xyz="0 0 1"/><limit lower="-3" upper="3" '
+        'velocity="2"/></joint>'
         for i in range(joints)
     )
     with tempfile.TemporaryDirectory() as folder:
         Path(folder, "arm.urdf").write_text(f"<robot name='arm'>{links}</robot>")
         workspace = {"workspace_low": [-2.0, -2.0, -2.0], "workspace_high": [2.0, 2.0, 2.0]}
-        Path(folder, "arm.json").write_text(json.dumps({"urdf": "arm.urdf", "tip": "7", **workspace}))
+        Path(folder, "arm.json").write_text(
+            json.dumps({"urdf": "arm.urdf", "tip": "7", **workspace})
+        )
         read = Limits.read(Path(folder, "arm.json"))
     return replace(read, acceleration=LIMITS.acceleration, jerk=LIMITS.jerk)
 
 
 def tick_us(joints: int, ticks: int, *, part: str) -> list[float]:
-    """Measure part of each tick, µs: "guard", or from `observe` until `apply`, "loop" or "loop without guard"."""
+    """Measure part of each tick, µs: "guard", or from `observe` until `apply`, "loop" or "loop
+    without guard".
+    """
     policy, took = CirclePolicy(joints), list[float]()
-    guard = None if part == "loop without guard" else Guard(policy.contract, limits=limits_of(joints), hz=HZ)
+    guard = (
+        None
+        if part == "loop without guard"
+        else Guard(policy.contract, limits=limits_of(joints), hz=HZ)
+    )
     if part == "guard" and guard is not None:
         last = guard(policy.row(0))
         for tick in range(1, ticks):
@@ -501,7 +560,9 @@ def tick_us(joints: int, ticks: int, *, part: str) -> list[float]:
             took.append(1e6 * (time.perf_counter() - begun))
         return took
     robot = SimulatedRobot(policy.contract)
-    with ChunkPlayer(policy, PlayerSettings(mode="open_loop", deadline_s=1.0), check=guard) as driver:
+    with ChunkPlayer(
+        policy, PlayerSettings(mode="open_loop", deadline_s=1.0), check=guard
+    ) as driver:
         driver.initialize()
         driver.reset(robot.observe())
         for _ in range(ticks):
@@ -518,7 +579,10 @@ def measure_ticks(ticks: int) -> dict[str, dict[str, float]]:
         for part in ("guard", "loop", "loop without guard"):
             tick_us(joints, ticks // 10, part=part)  # warm
             p50, p99 = np.quantile(tick_us(joints, ticks, part=part), [0.5, 0.99])
-            found[f"{part}, {joints} joints"] = {"p50_us": round(float(p50), 1), "p99_us": round(float(p99), 1)}
+            found[f"{part}, {joints} joints"] = {
+                "p50_us": round(float(p50), 1),
+                "p99_us": round(float(p99), 1),
+            }
     return found
 
 
@@ -527,7 +591,9 @@ def main(
     hours: Annotated[float, typer.Option(help="of simulated time")] = 24.0,
     relative: Annotated[bool, typer.Option(help="play it with relative actions")] = False,
     arms: Annotated[int, typer.Option(min=1, max=8)] = 1,
-    ticks: Annotated[int, typer.Option(help="measure the cost of so many ticks, and play no day")] = 0,
+    ticks: Annotated[
+        int, typer.Option(help="measure the cost of so many ticks, and play no day")
+    ] = 0,
     out_file: Out = None,
 ) -> None:
     """Play a day with faults, and compare its steps with those of ten minutes without."""

@@ -1,4 +1,6 @@
-"""Clients that are measured in turns: `Driver`, and a client in a process with the line protocol."""
+"""Clients that are measured in turns: `Driver`, and a client in a process with the line
+protocol.
+"""
 
 from __future__ import annotations
 
@@ -33,7 +35,9 @@ class ClientProcess(LineProcess):
     server_pid: int | None = None
 
     def ready(self) -> dict[str, Any]:
-        """Read the first line of a client, its description, which it writes when it is connected and warm."""
+        """Read the first line of a client, its description, which it writes when it is connected
+        and warm.
+        """
         said: dict[str, Any] = self.read(START_S)
         return said
 

@@ -1,6 +1,8 @@
-"""Environments of the measurements: any one that records its times, and one that takes time but no CPU.
+"""Environments of the measurements: any one that records its times, and one that takes time but no
+CPU.
 
-It imports only the standard library, numpy and this package's light part, since the peers' Python imports it as well.
+It imports only the standard library, numpy and this package's light part, since the peers' Python
+imports it as well.
 """
 
 from __future__ import annotations
@@ -39,7 +41,13 @@ class TimedEnv(EvalEnv):
     """
 
     def __init__(
-        self, *, notes: str, env: str = "tabletop", size: int = 224, max_steps: int = 80, step_ms: float = 0.0
+        self,
+        *,
+        notes: str,
+        env: str = "tabletop",
+        size: int = 224,
+        max_steps: int = 80,
+        step_ms: float = 0.0,
     ) -> None:
         """Make the environment.
 
@@ -59,7 +67,9 @@ class TimedEnv(EvalEnv):
 
     @classmethod
     def known_contract(cls, arguments: Mapping[str, Any]) -> Contract | None:
-        return known_contract(arguments["env"], dict.fromkeys(("width", "height"), arguments["size"]))
+        return known_contract(
+            arguments["env"], dict.fromkeys(("width", "height"), arguments["size"])
+        )
 
     @property
     def contract(self) -> Contract:
@@ -75,14 +85,17 @@ class TimedEnv(EvalEnv):
     def describe(self) -> dict[str, Any]:
         return self._env.describe()
 
-    def reset(self, *, seed: int, options: Mapping[str, Any] | None = None) -> tuple[Obs, dict[str, Any]]:
+    def reset(
+        self, *, seed: int, options: Mapping[str, Any] | None = None
+    ) -> tuple[Obs, dict[str, Any]]:
         self._begun, self._seed, self._steps = time.time(), seed, 0
         if options is None and self.init_states:
             options = {"init_state": seed % self.init_states}
         return self._env.reset(seed=seed, options=options)
 
     def step(self, act: Act) -> tuple[Obs, float, bool, bool, dict[str, Any]]:
-        until = time.thread_time() + self._step_s  # CPU time: wall time would pass while others have the core
+        # CPU time: wall time would pass while others have the core.
+        until = time.thread_time() + self._step_s
         self._env.looked_at = self.looked_at
         found = self._env.step(act)
         while self._step_s and time.thread_time() < until:
@@ -98,22 +111,34 @@ class TimedEnv(EvalEnv):
 
 
 def read_episode_times(folder: Path) -> dict[int, list[EpisodeTimes]]:
-    """Read the episodes of each process, by its id, in order. A line that is being written is left out."""
+    """Read the episodes of each process, by its id, in order. A line that is being written is
+    left out.
+    """
     found = {}
     for file in folder.glob("*.txt"):
-        lines = [line.split() for line in file.read_text().splitlines(keepends=True) if line.endswith("\n")]
-        found[int(file.stem)] = [EpisodeTimes(float(a), float(b), int(steps), int(seed)) for a, b, steps, seed in lines]
+        lines = [
+            line.split()
+            for line in file.read_text().splitlines(keepends=True)
+            if line.endswith("\n")
+        ]
+        found[int(file.stem)] = [
+            EpisodeTimes(float(a), float(b), int(steps), int(seed)) for a, b, steps, seed in lines
+        ]
     return found
 
 
 class SleepingEnv(EvalEnv):
-    """Each step sleeps `step_ms`, so that many of them run on few cores; an episode is `max_steps` of them."""
+    """Each step sleeps `step_ms`, so that many of them run on few cores; an episode is
+    `max_steps` of them.
+    """
 
     def __init__(self, *, step_ms: float = 20.0, max_steps: int = 50, size: int = 224) -> None:
         """Take `size`, the pixels a side of the one camera."""
         self.max_steps = max_steps
         self._step_s = step_ms / 1e3
-        self._contract = Contract(cameras={"front": CameraSpec(size, size)}, action=ActionSpec(dim=ACTION_DIM))
+        self._contract = Contract(
+            cameras={"front": CameraSpec(size, size)}, action=ActionSpec(dim=ACTION_DIM)
+        )
         self._obs = Obs(cameras={"front": np.zeros((size, size, 3), np.uint8)})
         self._steps = 0
 
@@ -125,7 +150,9 @@ class SleepingEnv(EvalEnv):
     def instruction(self) -> str:
         return "let time pass"
 
-    def reset(self, *, seed: int, options: Mapping[str, Any] | None = None) -> tuple[Obs, dict[str, Any]]:
+    def reset(
+        self, *, seed: int, options: Mapping[str, Any] | None = None
+    ) -> tuple[Obs, dict[str, Any]]:
         self._steps = 0
         return self._obs, {"success": False}
 

@@ -1,23 +1,29 @@
-"""Episodes a minute of whole evaluations, ours and the peers' own, in alternating rounds on one machine.
+"""Episodes a minute of whole evaluations, ours and the peers' own, in alternating rounds on one
+machine.
 
-Each system plays the same episodes of one environment (`environments.TimedEnv`: same code, image size, step limit,
-seeds and initial states) with a policy that does nothing behind its own server, by its own command, and keeps its
-results. A round runs each system once:
+Each system plays the same episodes of one environment (`environments.TimedEnv`: same code, image
+size, step limit, seeds and initial states) with a policy that does nothing behind its own server,
+by its own command, and keeps its results. A round runs each system once:
 
 - ours: `vlagents-ray eval`, which serves the policy for the length of the run;
-- vlagents: `run-eval`, over shared memory. It plays one configuration in one process, its first variant here; the
-  second splits the episodes into one configuration for each worker, each with its own process and server;
+- vlagents: `run-eval`, over shared memory. It plays one configuration in one process, its first
+  variant here; the second splits the episodes into one configuration for each worker, each with its
+  own process and server;
 - vla-eval: one model server, and as many shards as `vlagents-ray eval` has workers, without Docker;
-- lerobot: `lerobot-eval`, the policy in its process, with as many environments, which it steps one after another.
+- lerobot: `lerobot-eval`, the policy in its process, with as many environments, which it steps one
+  after another.
 
-`--env` names a simulator: it must be installed in this Python and, with the peers, in `--peers-python`
-(`peers/requirements-simulators.txt` has LIBERO and ManiSkill; vlagents, which needs numpy 1, cannot be there). With
-`--chunk 8` our policy returns as many rows, and images between two requests are not rendered; peers render each step.
+`--env` names a simulator: it must be installed in this Python and, with the peers, in
+`--peers-python` (`peers/requirements-simulators.txt` has LIBERO and ManiSkill; vlagents, which
+needs numpy 1, cannot be there). With `--chunk 8` our policy returns as many rows, and images
+between two requests are not rendered; peers render each step.
 
-For ours, summary.json also has the shares of the time in which the simulators and the policy were busy.
+For ours, summary.json also has the shares of the time in which the simulators and the policy were
+busy.
 
-The rate is that from the first reset to the last step, so that start-up and shutdown do not count: those of `run-eval`
-contain a fixed sleep of 30 s. The wall time of the whole command is the second figure.
+The rate is that from the first reset to the last step, so that start-up and shutdown do not count:
+those of `run-eval` contain a fixed sleep of 30 s. The wall time of the whole command is the second
+figure.
 """
 
 from __future__ import annotations
@@ -53,11 +59,21 @@ from vlagents_ray_cluster.tune.line_process import LineProcess, ProcessFailed, o
 
 OURS = "vlagents-ray"
 SPLIT = "vlagents, split"  # into a configuration for each worker
-PEERS = {"vlagents": "vlagents_peer.py", "vla-eval": "vla_eval_peer.py", "lerobot": "lerobot_eval_peer.py"}  # scripts
-_SIMULATORS = "vlagents-ray env make benchmarks/peers/requirements-simulators.txt --light --out .venv-peers-simulators"
+# scripts.
+PEERS = {
+    "vlagents": "vlagents_peer.py",
+    "vla-eval": "vla_eval_peer.py",
+    "lerobot": "lerobot_eval_peer.py",
+}
+_SIMULATORS = (
+    "vlagents-ray env make benchmarks/peers/requirements-simulators.txt --light --out "
+    ".venv-peers-simulators"
+)
 _CURES = {
     "vlagents": "`python -m benchmarks.peers` makes an environment",
-    "vla-eval": f"`python -m benchmarks.peers` makes an environment, with simulators `{_SIMULATORS}`",
+    "vla-eval": (
+        f"`python -m benchmarks.peers` makes an environment, with simulators `{_SIMULATORS}`"
+    ),
     "lerobot": f"`{_SIMULATORS}` makes an environment",
 }
 _MOST_S = 3600.0  # for one command
@@ -78,7 +94,9 @@ class EvaluationPlan:
 
     def __post_init__(self) -> None:
         if self.episodes % max(1, self.workers):
-            raise ConfigError(f"episodes: got {self.episodes}, want a multiple of the {self.workers} workers")
+            raise ConfigError(
+                f"episodes: got {self.episodes}, want a multiple of the {self.workers} workers"
+            )
 
     def env(self, notes: Path) -> dict[str, Any]:
         """Return the options of the environment."""
@@ -89,7 +107,8 @@ class EvaluationPlan:
     def action_dim(self) -> int:
         """The numbers of an action."""
         contract = known_contract(self.name, {})
-        return 7 if contract is None else contract.action.dim or 7  # LIBERO's, and ManiSkill's by default
+        # LIBERO's, and ManiSkill's by default.
+        return 7 if contract is None else contract.action.dim or 7
 
 
 class Played(NamedTuple):
@@ -112,13 +131,19 @@ def measure_evaluation(
     peers_python: Path,
     progress: Callable[[str], None] = lambda _: None,
 ) -> dict[str, Any]:
-    """Measure all systems; returns plain JSON values. Peers that cannot run here are in `skipped`, with the reason."""
+    """Measure all systems; returns plain JSON values. Peers that cannot run here are in
+    `skipped`, with the reason.
+    """
     wanted = list(PEERS) if "all" in peers else peers
     if unknown := set(wanted) - set(PEERS):
         raise ConfigError(f"peers: got {sorted(unknown)}, want some of {list(PEERS)}, or 'all'")
     versions = installed(peers_python, list(PEERS)) if wanted and peers_python.is_file() else {}
     scripts = {peer: SCRIPTS / PEERS[peer] for peer in wanted if peer in versions}
-    skipped = {peer: f"not installed for {peers_python}; {_CURES[peer]}" for peer in wanted if peer not in versions}
+    skipped = {
+        peer: f"not installed for {peers_python}; {_CURES[peer]}"
+        for peer in wanted
+        if peer not in versions
+    }
     rounds: dict[str, list[Played]] = {}
     with tempfile.TemporaryDirectory() as top:
         runs = {OURS: our_run(plan)} | their_runs(plan, scripts, peers_python, alone(Path(top)))
@@ -127,7 +152,8 @@ def measure_evaluation(
                 folder = Path(top) / f"{name} {number}"
                 rounds.setdefault(name, []).append(played := play(plan, run, folder))
                 progress(
-                    f"round {number + 1}/{plan.rounds}: {name} {played.episodes_per_minute:.0f} episodes/min, "
+                    f"round {number + 1}/{plan.rounds}: {name} {played.episodes_per_minute:.0f} "
+                    "episodes/min, "
                     f"whole command {played.wall_s:.1f} s"
                 )
     return {
@@ -137,12 +163,16 @@ def measure_evaluation(
         "skipped": skipped,
         "rounds": {name: [one._asdict() for one in each] for name, each in rounds.items()},
         "medians": {name: _median(each)._asdict() for name, each in rounds.items()},
-        "ratios": {name: ratios(rounds[OURS], each) for name, each in rounds.items() if name != OURS},
+        "ratios": {
+            name: ratios(rounds[OURS], each) for name, each in rounds.items() if name != OURS
+        },
     }
 
 
 def play(plan: EvaluationPlan, run: Run, folder: Path) -> Played:
-    """Run the plan with one system. Raises `ProcessFailed` if it did not play exactly those episodes."""
+    """Run the plan with one system. Raises `ProcessFailed` if it did not play exactly those
+    episodes.
+    """
     notes = folder / "notes"
     notes.mkdir(parents=True)
     begun = time.time()  # the clock of the notes
@@ -152,8 +182,10 @@ def play(plan: EvaluationPlan, run: Run, folder: Path) -> Played:
     seeds, steps = sorted(note.seed for note in episodes), {note.steps for note in episodes}
     if seeds != list(range(plan.episodes)) or steps != {plan.max_steps}:
         raise ProcessFailed(
-            f"{folder.name}: played {len(episodes)} episodes with {len(set(seeds))} seeds and {sorted(steps)} steps, "
-            f"want each of {plan.episodes} once with {plan.max_steps}; its results stand for something else"
+            f"{folder.name}: played {len(episodes)} episodes with {len(set(seeds))} seeds and "
+            f"{sorted(steps)} steps, "
+            f"want each of {plan.episodes} once with {plan.max_steps}; its results stand for "
+            "something else"
         )
     first = min(note.begun for note in episodes)
     playing_s = max(note.ended for note in episodes) - first
@@ -164,7 +196,9 @@ def play(plan: EvaluationPlan, run: Run, folder: Path) -> Played:
 
 
 def ratios(ours: Sequence[Played], theirs: Sequence[Played]) -> dict[str, Any]:
-    """Return our rate over theirs and their wall time over ours: both are above 1 if we are faster."""
+    """Return our rate over theirs and their wall time over ours: both are above 1 if we are
+    faster.
+    """
     pairs = list(zip(ours, theirs, strict=True))
     rates = [mine.episodes_per_minute / other.episodes_per_minute for mine, other in pairs]
     walls = [other.wall_s / mine.wall_s for mine, other in pairs]
@@ -177,7 +211,9 @@ def ratios(ours: Sequence[Played], theirs: Sequence[Played]) -> dict[str, Any]:
 
 
 def alone(folder: Path) -> dict[str, str]:
-    """Return variables that let another Python import our two packages, and no others of this Python."""
+    """Return variables that let another Python import our two packages, and no others of this
+    Python.
+    """
     place = folder / "path"
     place.mkdir()
     for package in (Path(vlagents_ray.__file__).parent, Path(__file__).parent):
@@ -186,20 +222,35 @@ def alone(folder: Path) -> dict[str, str]:
 
 
 def our_run(plan: EvaluationPlan) -> Run:
-    """Return the run of `vlagents-ray eval`, which serves the policy or, without workers, plays it itself."""
+    """Return the run of `vlagents-ray eval`, which serves the policy or, without workers, plays
+    it itself.
+    """
 
     def run(folder: Path, notes: Path) -> None:
         settings = [f"--env-set={name}={value}" for name, value in plan.env(notes).items()]
         command = [
-            sys.executable, "-c", "from vlagents_ray.cli import main; main()",
-            "eval", TIMED_ENV, "--policy=noop", f"--set=action_dim={plan.action_dim}", f"--set=chunk={plan.chunk}",
-            f"--episodes={plan.episodes}", f"--workers={plan.workers}", "--video=none", f"--out={folder / 'results'}",
+            sys.executable,
+            "-c",
+            "from vlagents_ray.cli import main; main()",
+            "eval",
+            TIMED_ENV,
+            "--policy=noop",
+            f"--set=action_dim={plan.action_dim}",
+            f"--set=chunk={plan.chunk}",
+            f"--episodes={plan.episodes}",
+            f"--workers={plan.workers}",
+            "--video=none",
+            f"--out={folder / 'results'}",
             *settings,
-        ]  # fmt: skip
+        ]
         environment = os.environ | our_environment()
-        done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False, timeout=_MOST_S)
+        done = subprocess.run(
+            command, env=environment, capture_output=True, text=True, check=False, timeout=_MOST_S
+        )
         if done.returncode:
-            raise ProcessFailed(f"{OURS}: ended with exit status {done.returncode}\n{done.stderr[-2000:]}")
+            raise ProcessFailed(
+                f"{OURS}: ended with exit status {done.returncode}\n{done.stderr[-2000:]}"
+            )
 
     return run
 
@@ -211,12 +262,19 @@ def their_runs(
 
     def way(name: str, peer: str, workers: int) -> Run:
         def run(folder: Path, notes: Path) -> None:
-            words = {"folder": str(folder), "episodes": plan.episodes, "workers": workers, "seed": 0}
+            words = {
+                "folder": str(folder),
+                "episodes": plan.episodes,
+                "workers": workers,
+                "seed": 0,
+            }
             words["action_dim"] = plan.action_dim
             given = json.dumps(words | {"env": plan.env(notes)})
             port = str(free_block(workers))
             with LineProcess(
-                name, [str(python), str(scripts[peer]), "evaluate", LOOPBACK, port, given], environment
+                name,
+                [str(python), str(scripts[peer]), "evaluate", LOOPBACK, port, given],
+                environment,
             ) as child:
                 child.read(_MOST_S)
 
@@ -238,17 +296,28 @@ def show_evaluation(found: Mapping[str, Any]) -> None:
     """Print a row for each system, and the targets."""
     plan = found["plan"]
     rows = table(
-        "", "episodes/min", "whole command s", "simulators busy", "policy busy", "ours / theirs", "wall: theirs / ours"
+        "",
+        "episodes/min",
+        "whole command s",
+        "simulators busy",
+        "policy busy",
+        "ours / theirs",
+        "wall: theirs / ours",
     )
     rows.title = (
-        f"{plan['episodes']} episodes of {plan['max_steps']} steps of {plan['name']}, {plan['size']}x{plan['size']}, "
+        f"{plan['episodes']} episodes of {plan['max_steps']} steps of {plan['name']}, "
+        f"{plan['size']}x{plan['size']}, "
         f"{plan['workers']} workers on {found['cores']} cores, medians of {plan['rounds']} rounds"
     )
     for name, row in found["medians"].items():
         ratio = found["ratios"].get(name)
         cells = [f"{ratio['median']:.2f}", f"{ratio['wall_median']:.2f}"] if ratio else ["", ""]
-        busy = ["" if row[side] is None else f"{row[side]:.0%}" for side in ("env_busy", "policy_busy")]
-        rows.add_row(name, f"{row['episodes_per_minute']:.0f}", f"{row['wall_s']:.1f}", *busy, *cells)
+        busy = [
+            "" if row[side] is None else f"{row[side]:.0%}" for side in ("env_busy", "policy_busy")
+        ]
+        rows.add_row(
+            name, f"{row['episodes_per_minute']:.0f}", f"{row['wall_s']:.1f}", *busy, *cells
+        )
     out.print(rows)
     show_outcomes(evaluation_outcomes(found))
     show_skipped(found)
@@ -257,25 +326,36 @@ def show_evaluation(found: Mapping[str, Any]) -> None:
 def main(
     episodes: Annotated[int, typer.Option(min=1, help="Of each system and round.")] = 200,
     workers: Annotated[int, typer.Option(min=1)] = 2,
-    peers: Annotated[str, typer.Option(help="vlagents, vla-eval, lerobot, with commas between them, or 'all'.")] = "",
+    peers: Annotated[
+        str, typer.Option(help="vlagents, vla-eval, lerobot, with commas between them, or 'all'.")
+    ] = "",
     rounds: Annotated[int, typer.Option(min=1)] = 3,
     size: Annotated[int, typer.Option(min=32, help="Pixels a side of the image.")] = 224,
     max_steps: Annotated[int, typer.Option(min=1, help="Steps of an episode.")] = 80,
-    env_ms: Annotated[float, typer.Option(min=0, help="CPU time that each env step takes more.")] = 0.0,
+    env_ms: Annotated[
+        float, typer.Option(min=0, help="CPU time that each env step takes more.")
+    ] = 0.0,
     env: Annotated[
         str, typer.Option(help="The environment: libero/libero_spatial/0, maniskill/PushCube-v1.")
     ] = "tabletop",
-    chunk: Annotated[int, typer.Option(min=1, help="Rows of each answer of ours, all of which are executed.")] = 1,
+    chunk: Annotated[
+        int, typer.Option(min=1, help="Rows of each answer of ours, all of which are executed.")
+    ] = 1,
     peers_python: PeersPython = PYTHON,
     out_file: Out = None,
     report: Annotated[
-        Path | None, typer.Option(help="Add the figures to this file of `python -m benchmarks.report --out`.")
+        Path | None,
+        typer.Option(help="Add the figures to this file of `python -m benchmarks.report --out`."),
     ] = None,
 ) -> None:
-    """Measure episodes a minute of whole evaluations: `vlagents-ray eval`, and the peers' own commands, in turns."""
+    """Measure episodes a minute of whole evaluations: `vlagents-ray eval`, and the peers' own
+    commands, in turns.
+    """
     with errors():
         plan = EvaluationPlan(episodes, workers, rounds, size, max_steps, env_ms, env, chunk)
-        found = measure_evaluation(plan, peers=parse_list(peers), peers_python=peers_python, progress=progress)
+        found = measure_evaluation(
+            plan, peers=parse_list(peers), peers_python=peers_python, progress=progress
+        )
     show_evaluation(found)
     save(found, out_file)
     if report is not None:

@@ -1,7 +1,8 @@
 """A robot whose policy is far away: `python -m benchmarks.far_away`.
 
-The server and the robot are on two hosts of this machine (`benchmarks.hosts`), connected by a link with delay, loss and
-cuts (`benchmarks.far_link`). Each mode of the chunk player drives the robot over each link. Needs Linux and root.
+The server and the robot are on two hosts of this machine (`benchmarks.hosts`), connected by a link
+with delay, loss and cuts (`benchmarks.far_link`). Each mode of the chunk player drives the robot
+over each link. Needs Linux and root.
 """
 
 from __future__ import annotations
@@ -153,13 +154,18 @@ def measure(
     congestion: str,
     say: Callable[[str], None] = lambda _: None,
 ) -> list[Row]:
-    """Run each mode over a clean link, a long one, a long one that loses packets, and the same with a cut."""
+    """Run each mode over a clean link, a long one, a long one that loses packets, and the same
+    with a cut.
+    """
     rate = f"{mbit:g} Mbit/s"
     links = {
         f"clean, {rate}": (Conditions(mbit=mbit), 0.0),
         f"{delay_ms:g} ms each way": (Conditions(delay_ms, 0.0, mbit), 0.0),
         f"{delay_ms:g} ms, {100 * loss:g} % lost": (Conditions(delay_ms, loss, mbit), 0.0),
-        f"{delay_ms:g} ms, {100 * loss:g} % lost, cut for {cut_s:g} s": (Conditions(delay_ms, loss, mbit), cut_s),
+        f"{delay_ms:g} ms, {100 * loss:g} % lost, cut for {cut_s:g} s": (
+            Conditions(delay_ms, loss, mbit),
+            cut_s,
+        ),
     }
     rows = []
     with (
@@ -177,12 +183,20 @@ def measure(
 
 def main(
     delay_ms: Annotated[float, typer.Option(min=0, help="Of the link, each way.")] = 80.0,
-    loss: Annotated[float, typer.Option(min=0, max=0.5, help="Share of the packets, each way.")] = 0.02,
-    mbit: Annotated[float, typer.Option(min=0.1, help="What the link carries each way, Mbit/s.")] = 20.0,
+    loss: Annotated[
+        float, typer.Option(min=0, max=0.5, help="Share of the packets, each way.")
+    ] = 0.02,
+    mbit: Annotated[
+        float, typer.Option(min=0.1, help="What the link carries each way, Mbit/s.")
+    ] = 20.0,
     cut_s: Annotated[float, typer.Option(min=0.1, help="How long the link is cut.")] = 10.0,
     seconds: Annotated[float, typer.Option(min=8, help="Of each run, beside the cut.")] = 10.0,
-    modes: Annotated[str, typer.Option(help="Which ones, with commas; default: all.")] = ",".join(MODES),
-    congestion: Annotated[str, typer.Option(help="TCP's congestion control: cubic, bbr.")] = "cubic",
+    modes: Annotated[str, typer.Option(help="Which ones, with commas; default: all.")] = ",".join(
+        MODES
+    ),
+    congestion: Annotated[
+        str, typer.Option(help="TCP's congestion control: cubic, bbr.")
+    ] = "cubic",
     out_file: Out = None,
 ) -> None:
     """Measure a robot whose policy is far away."""
@@ -192,9 +206,17 @@ def main(
             raise ConfigError(f"--modes: got {unknown}, want some of {list(MODES)}")
         rows = measure(delay_ms, loss, mbit, cut_s, seconds, chosen, congestion, progress)
     shown = table(
-        "link", "mode", "period error p50/p99", "acted", "longest without", "spells (median)", "age p50/p99",
-        "step p99", "stops", "recovered",
-    )  # fmt: skip
+        "link",
+        "mode",
+        "period error p50/p99",
+        "acted",
+        "longest without",
+        "spells (median)",
+        "age p50/p99",
+        "step p99",
+        "stops",
+        "recovered",
+    )
     for one in rows:
         shown.add_row(*_shown(one))
     out.print(shown)

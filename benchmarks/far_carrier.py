@@ -1,7 +1,9 @@
-"""The process that carries a link between two hosts: `python -m benchmarks.far_carrier DEVICE PID PID`.
+"""The process that carries a link between two hosts: `python -m benchmarks.far_carrier DEVICE PID
+PID`.
 
 It gets the device's name in the hosts, and the first process of each.
-It answers each line of `Conditions` with a line. It imports only the standard library, so that it starts at once.
+It answers each line of `Conditions` with a line. It imports only the standard library, so that it
+starts at once.
 """
 
 from __future__ import annotations
@@ -42,7 +44,8 @@ class _Carrier:
         for name, pid in zip(names, pids, strict=True):
             subprocess.run(["ip", "link", "set", name, "netns", pid, "name", device], check=True)  # noqa: S607
         self._conditions = Conditions()
-        self._way: list[tuple[float, int, int, bytes]] = []  # due time, number, device, and the packet
+        # Due time, number, device, and the packet.
+        self._way: list[tuple[float, int, int, bytes]] = []
         self._count = 0
         self._free_at = [0.0, 0.0]  # time at which the last packet to a device left its sender
         self._random = random.Random(0)
@@ -85,7 +88,9 @@ class _Carrier:
             return
         self._free_at[target] = begins + len(packet) * 8 / (known.mbit * 1e6)
         self._count += 1
-        heapq.heappush(self._way, (self._free_at[target] + known.delay_ms / 1e3, self._count, target, packet))
+        heapq.heappush(
+            self._way, (self._free_at[target] + known.delay_ms / 1e3, self._count, target, packet)
+        )
 
     def _write(self, device: int, packet: bytes) -> None:
         try:

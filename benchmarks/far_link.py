@@ -1,7 +1,9 @@
-"""A link between two hosts with delay, loss and cuts of IP packets, even if the kernel has no netem.
+"""A link between two hosts with delay, loss and cuts of IP packets, even if the kernel has no
+netem.
 
-Each host gets a TUN device, whose packets `benchmarks.far_carrier` carries to the other: real packets of the kernel's
-own TCP, with real retransmissions, congestion control and head-of-line blocking.
+Each host gets a TUN device, whose packets `benchmarks.far_carrier` carries to the other: real
+packets of the kernel's own TCP, with real retransmissions, congestion control and head-of-line
+blocking.
 
     with hosts(2) as [cloud, home], FarLink(cloud, home) as link:
         link.set(Conditions(delay_ms=80, loss=0.02))
@@ -20,7 +22,8 @@ from benchmarks.hosts import Host
 from vlagents_ray_cluster.tune.line_process import LineProcess, our_environment
 
 _MTU = 1500
-_ADDRESSES = ("198.19.0.1", "198.19.0.2")  # RFC 2544's, for tests of networks; hosts have the other half
+# RFC 2544's, for tests of networks; hosts have the other half.
+_ADDRESSES = ("198.19.0.1", "198.19.0.2")
 _START_S = 20.0
 _ANSWER_S = 10.0
 
@@ -28,7 +31,9 @@ _ANSWER_S = 10.0
 class FarLink:
     """A link between two hosts, and its process."""
 
-    def __init__(self, one: Host, other: Host, congestion: str = "cubic", device: str = "", own: bool = False) -> None:
+    def __init__(
+        self, one: Host, other: Host, congestion: str = "cubic", device: str = "", own: bool = False
+    ) -> None:
         """Prepare the link, which begins with `with`.
 
         Args:
@@ -36,23 +41,43 @@ class FarLink:
             other: That of `other_address`.
             congestion: TCP's congestion control, "cubic" or "bbr".
             device: The name of the device in either host, if a host has several.
-            own: Whether the link carries what is sent to the hosts' own addresses, in place of two further ones.
+            own: Whether the link carries what is sent to the hosts' own addresses, in place of two
+                further ones.
         """
         self._addresses = (one.address, other.address) if own else _ADDRESSES
         self.address, self.other_address = self._addresses
         self._ends, self._congestion, self._device = (one, other), congestion, device or DEVICE
 
     def __enter__(self) -> FarLink:
-        command = ["setpriv", "--pdeathsig=KILL", "nsenter", f"--target={self._ends[0].switch}", "--net"]
+        command = [
+            "setpriv",
+            "--pdeathsig=KILL",
+            "nsenter",
+            f"--target={self._ends[0].switch}",
+            "--net",
+        ]
         command += [sys.executable, "-m", "benchmarks.far_carrier", self._device]
         command += [str(host.pid) for host in self._ends]
         self._process = LineProcess("the link", command, our_environment())
         try:
             self._process.read(_START_S)
-            for host, near, far in zip(self._ends, self._addresses, reversed(self._addresses), strict=True):
+            for host, near, far in zip(
+                self._ends, self._addresses, reversed(self._addresses), strict=True
+            ):
                 host.run(["ip", "address", "add", near, "peer", far, "dev", self._device])
                 host.run(["ip", "link", "set", self._device, "mtu", str(_MTU), "up"])
-                host.run(["ip", "route", "replace", far, "dev", self._device, "congctl", self._congestion])
+                host.run(
+                    [
+                        "ip",
+                        "route",
+                        "replace",
+                        far,
+                        "dev",
+                        self._device,
+                        "congctl",
+                        self._congestion,
+                    ]
+                )
         except BaseException:
             self._process.close()
             raise

@@ -1,7 +1,8 @@
-"""A robot far from its policy, which records each tick: `python -m benchmarks.far_robot URL`; and its policy.
+"""A robot far from its policy, which records each tick: `python -m benchmarks.far_robot URL`; and
+its policy.
 
-Each line that the process reads is a run, {"mode": "async", "seconds": 20}. It answers with a line when the loop
-begins, and with its record when the loop ends.
+Each line that the process reads is a run, {"mode": "async", "seconds": 20}. It answers with a line
+when the loop begins, and with its record when the loop ends.
 """
 
 from __future__ import annotations
@@ -52,10 +53,12 @@ class FarConfig(BaseModel, extra="forbid"):
 
 
 class FarPolicy(Agent):
-    """Moves along a sine, with chunks that differ slightly from each other, like those of a real policy.
+    """Moves along a sine, with chunks that differ slightly from each other, like those of a real
+    policy.
 
-    A row has the position, the tick of its observation, and the number of observations that came twice. With real-time
-    chunking a chunk begins with the rows that will have been executed, and leaves them gradually.
+    A row has the position, the tick of its observation, and the number of observations that came
+    twice. With real-time chunking a chunk begins with the rows that will have been executed, and
+    leaves them gradually.
     """
 
     Config: ClassVar[type] = FarConfig
@@ -71,7 +74,9 @@ class FarPolicy(Agent):
     def contract(self) -> Contract:
         cameras = dict.fromkeys(("front", "wrist"), CameraSpec(_IMAGE, _IMAGE))
         state = {"ticks": StateSpec(2)}
-        return Contract(cameras=cameras, state=state, action=ActionSpec(dim=3, delta=False), chunk=CHUNK)
+        return Contract(
+            cameras=cameras, state=state, action=ActionSpec(dim=3, delta=False), chunk=CHUNK
+        )
 
     def reset(self, obs: Obs, instruction: str | None = None, **kwargs: Any) -> dict[str, Any]:
         """Begin an episode."""
@@ -85,11 +90,15 @@ class FarPolicy(Agent):
         self._twice += tick in self._seen
         self._seen.add(tick)
         path = np.sin(_TURN * (executed + np.arange(CHUNK))) + self._random.uniform(-_SWAY, _SWAY)
-        rows = np.stack([path, np.full(CHUNK, tick), np.full(CHUNK, self._twice)], -1).astype(np.float32)
+        rows = np.stack([path, np.full(CHUNK, tick), np.full(CHUNK, self._twice)], -1).astype(
+            np.float32
+        )
         before = obs.info.get(LEFTOVER)
         if before is not None:
             n, frozen = min(CHUNK, len(before)), int(obs.info[DELAY])
-            ours = np.clip((np.arange(n) - frozen + 1) / max(1, n - frozen), 0, 1).astype(np.float32)
+            ours = np.clip((np.arange(n) - frozen + 1) / max(1, n - frozen), 0, 1).astype(
+                np.float32
+            )
             rows[:n, 0] = ours * rows[:n, 0] + (1 - ours) * before[:n, 0]
             rows[:frozen] = before[:frozen]
         return Act(rows)
@@ -101,8 +110,10 @@ class Ticks:
 
     at_s: list[float] = field(default_factory=list)  # its begin, by `time.monotonic`
     acted: list[bool] = field(default_factory=list)  # whether the policy's action was executed
-    age_ticks: list[int] = field(default_factory=list)  # of the observation behind each executed action of the policy
-    step: list[float] = field(default_factory=list)  # distance of each such action from the one before
+    # Of the observation behind each executed action of the policy.
+    age_ticks: list[int] = field(default_factory=list)
+    # Distance of each such action from the one before.
+    step: list[float] = field(default_factory=list)
     twice: int = 0  # observations that the policy saw twice in one session
     resumed: list[int] = field(
         default_factory=list
@@ -157,7 +168,12 @@ class NotingPlayer(ChunkPlayer):
 
 
 def drive(
-    url: str, mode: str, seconds: float, *, recovers: bool = False, began: Callable[[], object] = lambda: None
+    url: str,
+    mode: str,
+    seconds: float,
+    *,
+    recovers: bool = False,
+    began: Callable[[], object] = lambda: None,
 ) -> dict[str, Any]:
     """Drive the robot by the policy for `seconds`, and return the record.
 
@@ -168,7 +184,9 @@ def drive(
         low, high = np.array([-1.1, 0, 0]), np.array([1.1, 1e6, 1e6])
         guard = Guard(agent.contract, low=low, high=high, max_step=np.array([MAX_STEP, 1e6, 1e6]))
         watchdog = Watchdog(lambda _: robot.stop(), {"server": SILENCE_S, "loop": 1.0})
-        settings = PlayerSettings(deadline_s=0, safe=robot.here, max_age_s=MAX_AGE_S, timeout_s=ACT_S, **MODES[mode])
+        settings = PlayerSettings(
+            deadline_s=0, safe=robot.here, max_age_s=MAX_AGE_S, timeout_s=ACT_S, **MODES[mode]
+        )
         player = NotingPlayer(agent, settings, check=guard)
         player.robot = robot
         ends = float("inf")
@@ -181,7 +199,15 @@ def drive(
             recovered = recovers and bool(watchdog.barks) and all(robot.ticks.acted[-round(HZ) :])
             return recovered or time.monotonic() >= ends
 
-        report = run_loop(robot, player, hz=HZ, instruction="go round", watchdog=watchdog, until=until, real_time=True)
+        report = run_loop(
+            robot,
+            player,
+            hz=HZ,
+            instruction="go round",
+            watchdog=watchdog,
+            until=until,
+            real_time=True,
+        )
         found = {
             "ticks": asdict(robot.ticks),
             "missed": report.jitter["missed"],

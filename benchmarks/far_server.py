@@ -1,7 +1,8 @@
-"""The policy of `benchmarks.far_robot` behind the endpoints of a replica, in one process without Ray.
+"""The policy of `benchmarks.far_robot` behind the endpoints of a replica, in one process without
+Ray.
 
-`python -m benchmarks.far_server PORT` writes a line when it serves, and answers each line with the numbers of held and
-of opened sessions. It ends with its standard input.
+`python -m benchmarks.far_server PORT` writes a line when it serves, and answers each line with the
+numbers of held and of opened sessions. It ends with its standard input.
 """
 
 from __future__ import annotations
@@ -42,9 +43,12 @@ def main() -> None:
         "contract": policy.contract.to_json(),
     }
     app = AccessMiddleware(build_http_app(engine, lambda: metadata, DEFAULT_LIMITS), None, "far")
-    server = uvicorn.Server(uvicorn.Config(app, host=EVERYWHERE, port=int(sys.argv[1]), log_level="warning"))
+    server = uvicorn.Server(
+        uvicorn.Config(app, host=EVERYWHERE, port=int(sys.argv[1]), log_level="warning")
+    )
     threading.Thread(target=server.run, daemon=True).start()
-    print(json.dumps("ready"), file=out, flush=True)  # clients that connect before uvicorn has started try again
+    # Clients that connect before uvicorn has started try again.
+    print(json.dumps("ready"), file=out, flush=True)
     for _ in sys.stdin:
         print(json.dumps([len(engine.sessions), engine.sessions.opened]), file=out, flush=True)
     os._exit(0)  # even if clients are still connected

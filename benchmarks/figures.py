@@ -53,7 +53,9 @@ class Ratio(NamedTuple):
 
 
 def median_interval(values: np.ndarray) -> tuple[float, float]:
-    """Return the 95 % confidence interval of the median, from order statistics: only independence is assumed."""
+    """Return the 95 % confidence interval of the median, from order statistics: only
+    independence is assumed.
+    """
     ordered = np.sort(values)
     n = len(ordered)
     half = 0.98 * np.sqrt(n)  # 1.96 standard deviations of a binomial with p = 1/2
@@ -66,7 +68,9 @@ _T = (12.706, 4.303, 3.182, 2.776, 2.571, 2.447, 2.365, 2.306, 2.262)
 
 
 def mean_interval(rounds: Sequence[float]) -> tuple[float, float] | None:
-    """Return the 95 % interval of the mean of 2 to 10 rounds, by Student's t; None for a single one."""
+    """Return the 95 % interval of the mean of 2 to 10 rounds, by Student's t; None for a single
+    one.
+    """
     n = len(rounds)
     if n < 2:
         return None
@@ -77,14 +81,19 @@ def mean_interval(rounds: Sequence[float]) -> tuple[float, float] | None:
 def median_ratio(ours: RoundTrips, theirs: RoundTrips, *, seed: int = 0) -> Ratio:
     """Return the ratio of the two medians.
 
-    The bootstrap draws whole rounds, the same of both, because calls of one round, and adjacent rounds, share the
-    machine's other load. Raises `ValueError` unless both have the same number of rounds.
+    The bootstrap draws whole rounds, the same of both, because calls of one round, and adjacent
+    rounds, share the machine's other load. Raises `ValueError` unless both have the same number of
+    rounds.
     """
     if len(ours.rounds) != len(theirs.rounds):
-        raise ValueError(f"rounds: got {len(ours.rounds)} and {len(theirs.rounds)}; measure both in one run")
+        raise ValueError(
+            f"rounds: got {len(ours.rounds)} and {len(theirs.rounds)}; measure both in one run"
+        )
     n = len(ours.rounds)
     drawn = np.random.default_rng(seed).integers(0, n, (RESAMPLES, n))
-    medians = [np.median(trips.rounds[drawn].reshape(RESAMPLES, -1), axis=1) for trips in (ours, theirs)]
+    medians = [
+        np.median(trips.rounds[drawn].reshape(RESAMPLES, -1), axis=1) for trips in (ours, theirs)
+    ]
     low, high = np.quantile(medians[0] / medians[1], [0.025, 0.975])
     return Ratio(ours.median / theirs.median, float(low), float(high))
 
@@ -93,12 +102,15 @@ def ratios(ours: Sequence[RoundTrips], theirs: Sequence[RoundTrips]) -> dict[str
     """Return the ratios of all of ours to all of theirs, as JSON: {ours: {theirs: ratio}}."""
     found = {a.name: {b.name: median_ratio(a, b) for b in theirs} for a in ours}
     return {
-        a: {b: {"ratio": one.ratio, "ci95": [one.low, one.high]} for b, one in row.items()} for a, row in found.items()
+        a: {b: {"ratio": one.ratio, "ci95": [one.low, one.high]} for b, one in row.items()}
+        for a, row in found.items()
     }
 
 
 def lost_db(images: Mapping[str, np.ndarray], sent: Mapping[str, np.ndarray]) -> float | None:
-    """Return the peak signal-to-noise ratio of all images against what was `sent`, dB; None if they are equal."""
+    """Return the peak signal-to-noise ratio of all images against what was `sent`, dB; None if
+    they are equal.
+    """
     squares = [(images[name].astype(np.float64) - sent[name]) ** 2 for name in sent]
     error = float(np.mean([np.mean(one) for one in squares]))
     return None if error == 0 else float(10 * np.log10(255**2 / error))
@@ -108,7 +120,9 @@ PACKAGES = ("vlagents-ray", "ray", "numpy", "torch", "jax", "transformers", "ler
 
 
 def measured_on(program: str = "vlagents-ray") -> dict[str, Any]:
-    """Return date, command, machine and versions as JSON values; call it before measuring, as it has the load."""
+    """Return date, command, machine and versions as JSON values; call it before measuring, as it
+    has the load.
+    """
     return {
         "date": datetime.datetime.now(datetime.timezone.utc).date().isoformat(),
         "command": " ".join([program, shlex.join(sys.argv[1:])]).rstrip(),

@@ -1,8 +1,10 @@
-"""Growth: a fleet of robots, and how the cost of an act changes with the number of sessions and of replicas.
+"""Growth: a fleet of robots, and how the cost of an act changes with the number of sessions and of
+replicas.
 
-The policy does nothing; each client sends two 224x224 RGB cameras as JPEG. The fleet acts at its rate. Along a curve,
-all sessions together act at one low rate, so that only their number, or that of the replicas, differs. The ticks of
-each session begin at a random moment. An act counts from its tick, and is on time if it ends before the next one.
+The policy does nothing; each client sends two 224x224 RGB cameras as JPEG. The fleet acts at its
+rate. Along a curve, all sessions together act at one low rate, so that only their number, or that
+of the replicas, differs. The ticks of each session begin at a random moment. An act counts from its
+tick, and is on time if it ends before the next one.
 """
 
 from __future__ import annotations
@@ -56,19 +58,26 @@ class GrowthPlan:
     transport: str = "websocket"
 
 
-def measure_growth(plan: GrowthPlan, progress: Callable[[str], None] = lambda _: None) -> dict[str, Any]:
+def measure_growth(
+    plan: GrowthPlan, progress: Callable[[str], None] = lambda _: None
+) -> dict[str, Any]:
     """Measure the fleet and both curves; returns plain JSON values.
 
     The curve of replicas has as many sessions as there are robots.
     """
     rate = plan.acts_per_s
-    limit = 2 * max(plan.robots, *plan.sessions)  # those of the measurement before may still be ending
+    # Those of the measurement before may still be ending.
+    limit = 2 * max(plan.robots, *plan.sessions)
     found: dict[str, Any] = {"plan": asdict(plan), "sessions": [], "replicas": []}
     for replicas in sorted({1, *plan.replicas}):
-        with running_server(deployment(POLICY, replicas=replicas, sessions={"limit": limit})) as server:
+        with running_server(
+            deployment(POLICY, replicas=replicas, sessions={"limit": limit})
+        ) as server:
             if replicas == 1:
                 found["fleet"] = _point(plan, server, plan.robots, plan.hz)
-                progress(f"{plan.robots} robots: {found['fleet']['on_time']:.1%} of the acts on time")
+                progress(
+                    f"{plan.robots} robots: {found['fleet']['on_time']:.1%} of the acts on time"
+                )
                 for n in plan.sessions:
                     found["sessions"].append(_point(plan, server, n, rate / n))
                     progress(f"{n} sessions: {found['sessions'][-1]['p50_ms']:.2f} ms")
@@ -87,9 +96,18 @@ def _point(plan: GrowthPlan, server: Server, sessions: int, hz: float) -> dict[s
     with contextlib.ExitStack() as stack:
         clients = []
         for share in shares:
-            command = [sys.executable, "-m", "benchmarks.robots", server.url, plan.transport, str(share)]
+            command = [
+                sys.executable,
+                "-m",
+                "benchmarks.robots",
+                server.url,
+                plan.transport,
+                str(share),
+            ]
             clients.append(stack.enter_context(LineProcess("robots", command, our_environment())))
-        replicas = Counter(pid for one in clients for pid in one.read(START_S + _CONNECT_S * sessions))
+        replicas = Counter(
+            pid for one in clients for pid in one.read(START_S + _CONNECT_S * sessions)
+        )
 
         def run(seconds: float) -> np.ndarray:
             begin = time.monotonic() + _AHEAD_S
@@ -117,7 +135,9 @@ def _point(plan: GrowthPlan, server: Server, sessions: int, hz: float) -> dict[s
 
 
 def figures(ms: np.ndarray, hz: float) -> dict[str, Any]:
-    """Return the share on time of all ticks, and quantiles of acts at the rate `hz` that end `ms` after their ticks."""
+    """Return the share on time of all ticks, and quantiles of acts at the rate `hz` that end
+    `ms` after their ticks.
+    """
     ticks = np.maximum(1, np.ceil(ms * hz / 1e3))  # each act's own, and those that passed during it
     return {
         "on_time": float(np.sum(ms * hz <= 1e3) / np.sum(ticks)),
@@ -129,19 +149,37 @@ def figures(ms: np.ndarray, hz: float) -> dict[str, Any]:
 def show_growth(found: Mapping[str, Any]) -> None:
     """Print a row for the fleet, and for each point of the curves."""
     rows = table(
-        "", "sessions", "replicas", "acts/s", "on time", "p50 ms", "p99 ms", "client CPU ms", "server CPU ms",
-        "server waits", "server, cores", "idle", "sessions by replica",
-    )  # fmt: skip
+        "",
+        "sessions",
+        "replicas",
+        "acts/s",
+        "on time",
+        "p50 ms",
+        "p99 ms",
+        "client CPU ms",
+        "server CPU ms",
+        "server waits",
+        "server, cores",
+        "idle",
+        "sessions by replica",
+    )
     for name, points in (("robots", [found["fleet"]]), *((name, found[name]) for name in CURVES)):
         for one in points:
             rows.add_row(
-                name, str(one["sessions"]), str(one.get("replicas", 1)), f"{one['acts_per_s']:.1f}",
-                f"{one['on_time']:.1%}", f"{one['p50_ms']:.2f}", f"{one['p99_ms']:.2f}",
-                f"{one['client']['cpu_ms']:.3f}", f"{one['server']['cpu_ms']:.3f}",
+                name,
+                str(one["sessions"]),
+                str(one.get("replicas", 1)),
+                f"{one['acts_per_s']:.1f}",
+                f"{one['on_time']:.1%}",
+                f"{one['p50_ms']:.2f}",
+                f"{one['p99_ms']:.2f}",
+                f"{one['client']['cpu_ms']:.3f}",
+                f"{one['server']['cpu_ms']:.3f}",
                 f"{one['server']['voluntary_switches']:.1f}",
-                f"{1e-3 * one['server']['cpu_ms'] * one['acts_per_s']:.3f}", f"{one['idle_server_cores']:.3f}",
+                f"{1e-3 * one['server']['cpu_ms'] * one['acts_per_s']:.3f}",
+                f"{one['idle_server_cores']:.3f}",
                 ", ".join(map(str, one["sessions_by_replica"])),
-            )  # fmt: skip
+            )
         rows.add_section()
     out.print(rows)
 
@@ -168,26 +206,41 @@ def plot_growth(found: Mapping[str, Any], file: Path) -> None:
 
 
 def main(
-    robots: Annotated[int, typer.Option(min=1, help="Of the fleet; also the sessions of the curve of replicas.")] = 64,
+    robots: Annotated[
+        int, typer.Option(min=1, help="Of the fleet; also the sessions of the curve of replicas.")
+    ] = 64,
     hz: Annotated[float, typer.Option(min=0.1, help="Of each robot of the fleet.")] = 10.0,
-    sessions: Annotated[str, typer.Option(help="Numbers of sessions with one replica.")] = "1,4,16,64,256,1000",
+    sessions: Annotated[
+        str, typer.Option(help="Numbers of sessions with one replica.")
+    ] = "1,4,16,64,256,1000",
     replicas: Annotated[str, typer.Option(help="Numbers of replicas.")] = "1,2,4,8",
-    rate: Annotated[float, typer.Option(min=10, help="Acts a second of all sessions of a curve together.")] = 50.0,
+    rate: Annotated[
+        float, typer.Option(min=10, help="Acts a second of all sessions of a curve together.")
+    ] = 50.0,
     seconds: Annotated[float, typer.Option(min=1, help="Of each measurement.")] = 20.0,
     transport: Annotated[str, typer.Option(help="websocket, http or shm.")] = "websocket",
     out_file: Out = None,
-    plot: Annotated[Path | None, typer.Option("--plot", help="Draw the curves here: .png, .svg or .pdf.")] = None,
+    plot: Annotated[
+        Path | None, typer.Option("--plot", help="Draw the curves here: .png, .svg or .pdf.")
+    ] = None,
 ) -> None:
-    """Measure a fleet of robots, and the cost of an act by the number of sessions and of replicas."""
+    """Measure a fleet of robots, and the cost of an act by the number of sessions and of
+    replicas.
+    """
     with errors():
         if transport not in TRANSPORTS:
             raise ConfigError(f"--transport: got {transport!r}, want one of {list(TRANSPORTS)}")
         check_plot_file(plot)
         origin = measured_on("python -m benchmarks.growth")
         plan = GrowthPlan(
-            robots=robots, hz=hz, sessions=parse_counts(sessions, "--sessions"),
-            replicas=parse_counts(replicas, "--replicas"), acts_per_s=rate, seconds=seconds, transport=transport,
-        )  # fmt: skip
+            robots=robots,
+            hz=hz,
+            sessions=parse_counts(sessions, "--sessions"),
+            replicas=parse_counts(replicas, "--replicas"),
+            acts_per_s=rate,
+            seconds=seconds,
+            transport=transport,
+        )
         found = measure_growth(plan, progress)
         show_growth(found)
         save({**origin, **found}, out_file)

@@ -1,4 +1,6 @@
-"""Cost of a child process behind the replica: `act` of a policy that does nothing, in either process, in turns."""
+"""Cost of a child process behind the replica: `act` of a policy that does nothing, in either
+process, in turns.
+"""
 
 from __future__ import annotations
 
@@ -69,10 +71,14 @@ class _Driver:
 
 def main(
     calls: Annotated[int, typer.Option(min=1, help="Acts by each way.")] = 2000,
-    python: Annotated[str, typer.Option(help="The child's interpreter; default: this one.")] = sys.executable,
+    python: Annotated[
+        str, typer.Option(help="The child's interpreter; default: this one.")
+    ] = sys.executable,
     out_file: Out = None,
 ) -> None:
-    """Measure the cost of a policy in a child process behind the replica, against one in the replica."""
+    """Measure the cost of a policy in a child process behind the replica, against one in the
+    replica.
+    """
     with errors():
         found = measure_hop(calls, python, progress).to_json()
     show_round_trips(found, "one act, as the batch queue sees it")

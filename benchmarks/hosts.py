@@ -1,9 +1,10 @@
 """Several simulated hosts on one machine for Ray, Slurm and networks, and a Ray cluster over them.
 
-Each host has its own address, host name, processes, shared memory and boot id; a switch connects them, apart from the
-machine's network. Links can be limited and cut, hosts can be killed. They share the machine's CPUs, memory, files
-(except /dev/shm, /tmp/ray and /etc/hosts) and GPUs. Processes in a host end with it, and hosts end with the process
-that made them, however that ends. Needs Linux and root.
+Each host has its own address, host name, processes, shared memory and boot id; a switch connects
+them, apart from the machine's network. Links can be limited and cut, hosts can be killed. They
+share the machine's CPUs, memory, files (except /dev/shm, /tmp/ray and /etc/hosts) and GPUs.
+Processes in a host end with it, and hosts end with the process that made them, however that ends.
+Needs Linux and root.
 
     with hosts(3) as [head, second, robot], ray_cluster([head, second]) as cluster:
         head.run(["ray", "status"])
@@ -52,7 +53,8 @@ class Host:
     folder: Path  # outside, for its private files
     pid: int  # of its first process, in the outer namespace
     switch: int  # of the switch's process
-    environment: dict[str, str] = field(default_factory=dict)  # of its processes, beside this process's
+    # Of its processes, beside this process's.
+    environment: dict[str, str] = field(default_factory=dict)
     _keeper: Any = None
 
     @property
@@ -68,7 +70,8 @@ class Host:
     def command(self, command: Sequence[str]) -> list[str]:
         """Return the words that run `command` in this host."""
         spaces = ("--net", "--pid", "--mount", "--uts", "--ipc")
-        here = ["--", "env", f"--chdir={os.getcwd()}", "-u", "RAY_TMPDIR"]  # each host has its own /tmp/ray
+        # Each host has its own /tmp/ray.
+        here = ["--", "env", f"--chdir={os.getcwd()}", "-u", "RAY_TMPDIR"]
         settings = [f"{key}={value}" for key, value in self.environment.items()]
         return ["nsenter", f"--target={self.pid}", *spaces, *here, *settings, *command]
 
@@ -77,7 +80,9 @@ class Host:
         return subprocess.Popen(self.command(command), text=True, **options)
 
     def run(self, command: Sequence[str], timeout_s: float = _RAY_S) -> str:
-        """Run a command; returns its standard output. Raises `HostFailed` if it fails or takes longer."""
+        """Run a command; returns its standard output. Raises `HostFailed` if it fails or takes
+        longer.
+        """
         return _output(self.command(command), timeout_s)
 
     def cut(self) -> None:
@@ -120,7 +125,9 @@ def hosts(number: int) -> Iterator[list[Host]]:
         for one in range(1, number + 1):
             folder = Path(top) / f"host{one}"
             folder.mkdir()
-            keeper, pid = _first_process(stack, ["--net", "--uts", "--mount", "--ipc", "--propagation=private"])
+            keeper, pid = _first_process(
+                stack, ["--net", "--uts", "--mount", "--ipc", "--propagation=private"]
+            )
             host = Host(one, folder, pid, switch[1], _keeper=keeper)
             _set_up(host, inside, number)
             made.append(host)
@@ -134,7 +141,9 @@ def hosts(number: int) -> Iterator[list[Host]]:
 def require() -> None:
     """Raise `ConfigError` unless this machine and user can have hosts."""
     if missing := [tool for tool in _TOOLS if shutil.which(tool) is None]:
-        raise ConfigError(f"hosts: {', '.join(missing)} not found; install iproute2, util-linux and mount")
+        raise ConfigError(
+            f"hosts: {', '.join(missing)} not found; install iproute2, util-linux and mount"
+        )
     tried = subprocess.run(
         ["unshare", "--net", "--mount", "--pid", "--fork", "--mount-proc", "true"],  # noqa: S607
         capture_output=True,
@@ -143,12 +152,25 @@ def require() -> None:
     )
     if os.geteuid() != 0 or tried.returncode != 0:
         reason = tried.stderr.strip() or "not root"
-        raise ConfigError(f"hosts: cannot make network and process namespaces ({reason}); run as root")
+        raise ConfigError(
+            f"hosts: cannot make network and process namespaces ({reason}); run as root"
+        )
 
 
-def _first_process(stack: contextlib.ExitStack, spaces: Sequence[str]) -> tuple[subprocess.Popen[bytes], int]:
+def _first_process(
+    stack: contextlib.ExitStack, spaces: Sequence[str]
+) -> tuple[subprocess.Popen[bytes], int]:
     """Start the first process of new namespaces; it ends with `stack` or this process."""
-    command = ["setpriv", "--pdeathsig=KILL", "unshare", *spaces, "--pid", "--fork", "--kill-child", "--mount-proc"]
+    command = [
+        "setpriv",
+        "--pdeathsig=KILL",
+        "unshare",
+        *spaces,
+        "--pid",
+        "--fork",
+        "--kill-child",
+        "--mount-proc",
+    ]
     keeper = subprocess.Popen([*command, "sh", "-c", _INIT])
     deadline = time.monotonic() + _BEGIN_S
     while (first := _child(keeper.pid)) is None or _runs(first) != "sh":
@@ -219,7 +241,12 @@ def _set_up(host: Host, switch: Sequence[str], number: int) -> None:
 def _output(command: Sequence[str], timeout_s: float) -> str:
     try:
         done = subprocess.run(
-            list(command), capture_output=True, text=True, check=False, timeout=timeout_s, stdin=subprocess.DEVNULL
+            list(command),
+            capture_output=True,
+            text=True,
+            check=False,
+            timeout=timeout_s,
+            stdin=subprocess.DEVNULL,
         )
     except subprocess.TimeoutExpired as error:
         raise HostFailed(f"`{' '.join(command)}`: not done within {timeout_s:g} s") from error
@@ -257,9 +284,13 @@ class RayCluster:
 
 @contextlib.contextmanager
 def ray_cluster(
-    hosts: Sequence[Host], cpus: float = 2, environment: Mapping[str, str] | None = None, **options: str
+    hosts: Sequence[Host],
+    cpus: float = 2,
+    environment: Mapping[str, str] | None = None,
+    **options: str,
 ) -> Iterator[RayCluster]:
-    """Start Ray with `cpus` logical CPUs on each host, and Ray's token; `options` are further ones of `ray start`.
+    """Start Ray with `cpus` logical CPUs on each host, and Ray's token; `options` are further ones
+    of `ray start`.
 
     `environment` is that of all processes started in the hosts from now on.
     """
@@ -272,7 +303,9 @@ def ray_cluster(
     }
     cluster = RayCluster(list(hosts))
     cluster.head.environment |= shared | {"RAY_ADDRESS": cluster.address}
-    _ray_start(cluster.head, ["--head", f"--port={_PORT}", "--include-dashboard=false"], cpus, options)
+    _ray_start(
+        cluster.head, ["--head", f"--port={_PORT}", "--include-dashboard=false"], cpus, options
+    )
     for host in hosts[1:]:
         cluster.join(host, cpus, **options)
     yield cluster

@@ -1,9 +1,10 @@
-"""The client's side of a benchmark's line protocol, for processes that `vlagents_ray_cluster.tune.line_process` starts.
+"""The client's side of a benchmark's line protocol, for processes that
+`vlagents_ray_cluster.tune.line_process` starts.
 
-A client writes one line of JSON when it is connected and warm. Then each line of its input is a number of calls to
-make, which it answers with a JSON list of their milliseconds. It ends with its standard input or with its parent. This
-file needs only the standard library, as the scripts of other policy servers (`benchmarks/peers`) load it with a Python
-without vlagents_ray.
+A client writes one line of JSON when it is connected and warm. Then each line of its input is a
+number of calls to make, which it answers with a JSON list of their milliseconds. It ends with its
+standard input or with its parent. This file needs only the standard library, as the scripts of
+other policy servers (`benchmarks/peers`) load it with a Python without vlagents_ray.
 """
 
 from __future__ import annotations
@@ -17,7 +18,9 @@ WARM_UP = 20  # calls
 
 
 def timed(prepare: Callable[[], Any], call: Callable[[Any], object], calls: int) -> list[float]:
-    """Make `calls` calls; return the milliseconds of each, excluding `prepare`, which makes the observation."""
+    """Make `calls` calls; return the milliseconds of each, excluding `prepare`, which makes the
+    observation.
+    """
     taken = []
     for _ in range(calls):
         obs = prepare()
@@ -27,8 +30,12 @@ def timed(prepare: Callable[[], Any], call: Callable[[Any], object], calls: int)
     return taken
 
 
-def obey(lines: Iterable[str], out: TextIO, measure: Callable[[int], list[float]], said: dict[str, Any]) -> None:
-    """Warm up, write `said` to report that the client is ready, and answer each line until the input ends."""
+def obey(
+    lines: Iterable[str], out: TextIO, measure: Callable[[int], list[float]], said: dict[str, Any]
+) -> None:
+    """Warm up, write `said` to report that the client is ready, and answer each line until the
+    input ends.
+    """
     measure(WARM_UP)
     print(json.dumps(said), file=out, flush=True)
     for line in lines:

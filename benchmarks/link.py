@@ -1,8 +1,9 @@
-"""Round trips over a real network link on one machine: two network namespaces, joined by a shaped veth pair.
+"""Round trips over a real network link on one machine: two network namespaces, joined by a shaped
+veth pair.
 
-The servers live in one namespace, the clients in the other. A namespace ends with its last process, and each
-process here ends with its parent or its standard input: nothing is left, however the benchmark ends. Without
-root it runs in a user namespace, where the kernel allows that.
+The servers live in one namespace, the clients in the other. A namespace ends with its last process,
+and each process here ends with its parent or its standard input: nothing is left, however the
+benchmark ends. Without root it runs in a user namespace, where the kernel allows that.
 """
 
 from __future__ import annotations
@@ -81,9 +82,12 @@ def measure_link(
         "rate": rate,
         "delay": delay,
         "peers": list(peers),
-        "peers_python": str(peers_python.absolute()),  # not resolved: a virtual environment's Python is a link
+        # Not resolved: a virtual environment's Python is a link.
+        "peers_python": str(peers_python.absolute()),
     }
-    with LineProcess("the link", [*command, json.dumps(settings)], _environment(), end_s=_END_S) as inside:
+    with LineProcess(
+        "the link", [*command, json.dumps(settings)], _environment(), end_s=_END_S
+    ) as inside:
         while True:
             line = inside.read(_RUN_S)
             if "progress" in line:
@@ -102,7 +106,9 @@ def _environment() -> dict[str, str]:
 
 
 def enter() -> list[str]:
-    """Return the prefix that runs a command in a new network namespace, as root or in a user namespace."""
+    """Return the prefix that runs a command in a new network namespace, as root or in a user
+    namespace.
+    """
     if missing := [tool for tool in _TOOLS if shutil.which(tool) is None]:
         raise ConfigError(f"link: {', '.join(missing)} not found; install iproute2 and util-linux")
     refusals = []
@@ -117,8 +123,10 @@ def enter() -> list[str]:
 def refused(reasons: Sequence[str]) -> str:
     """Return the error message for users without the right to make namespaces, with the cure."""
     return (
-        f"link: cannot make a network namespace, neither as this user nor in a user namespace ({'; '.join(reasons)}); "
-        "run it as root, or let users make them: sysctl kernel.unprivileged_userns_clone=1 (Debian), "
+        "link: cannot make a network namespace, neither as this user nor in a user namespace "
+        f"({'; '.join(reasons)}); "
+        "run it as root, or let users make them: sysctl kernel.unprivileged_userns_clone=1 "
+        "(Debian), "
         "kernel.apparmor_restrict_unprivileged_userns=0 (Ubuntu)"
     )
 
@@ -135,13 +143,16 @@ class EmulatedLink:
             _run(["ip", "link", "set", "lo", "up"])
             _run(["ip", "link", "add", "vlagents0", "type", "veth", "peer", "name", "vlagents1"])
             _run(["ip", "link", "set", "vlagents1", "netns", str(self._holder.pid)])
-            for prefix, name, address in (([], "vlagents0", _SERVER), (self.prefix, "vlagents1", _CLIENT)):
+            for prefix, name, address in (
+                ([], "vlagents0", _SERVER),
+                (self.prefix, "vlagents1", _CLIENT),
+            ):
                 _run([*prefix, "ip", "address", "add", f"{address}/24", "dev", name])
                 _run([*prefix, "ip", "link", "set", name, "up"])
                 for words in shaping(rate, delay):
                     _run([*prefix, "tc", "qdisc", "add", "dev", name, *words])
-            # Ray uses the address of the default route; without one it would choose an address that this namespace
-            # lacks.
+            # Ray uses the address of the default route; without one it would choose an address that
+            # this namespace lacks.
             _run(["ip", "route", "add", "default", "via", _CLIENT])
         except BaseException:
             self._holder.close()
@@ -155,7 +166,10 @@ class EmulatedLink:
 
     def megabits(self) -> float:
         """Measure the throughput of TCP from client to server, Mbit/s."""
-        code = f"import socket; s = socket.create_connection(({_SERVER!r}, {{}})); s.sendall(bytes({_BULK}))"
+        code = (
+            f"import socket; s = socket.create_connection(({_SERVER!r}, {{}})); "
+            f"s.sendall(bytes({_BULK}))"
+        )
         with socket.create_server((_SERVER, 0)) as server:
             server.settimeout(30)
             command = [*self.prefix, sys.executable, "-c", code.format(server.getsockname()[1])]
@@ -171,7 +185,9 @@ class EmulatedLink:
 
 
 def shaping(rate: str, delay: str | None) -> list[list[str]]:
-    """Return the words of `tc qdisc add dev DEV …` for a link of that rate, and that delay each way."""
+    """Return the words of `tc qdisc add dev DEV …` for a link of that rate, and that delay each
+    way.
+    """
     if delay is None:
         return [["root", "tbf", "rate", rate, "burst", "64kb", "latency", "50ms"]]
     return [
@@ -186,11 +202,16 @@ def _run(command: Sequence[str]) -> None:
         return
     reason = done.stderr.strip()
     if "netem" in command and "unknown" in reason:
-        raise ConfigError(f"--delay: this kernel has no netem ({reason}); leave it out, or load the module sch_netem")
+        raise ConfigError(
+            f"--delay: this kernel has no netem ({reason}); leave it out, or load the module "
+            "sch_netem"
+        )
     raise ConfigError(f"link: `{' '.join(command)}` failed: {reason}")
 
 
-def _inside(calls: int, rate: str, delay: str | None, peers: Sequence[str], peers_python: str, progress: Any) -> Any:
+def _inside(
+    calls: int, rate: str, delay: str | None, peers: Sequence[str], peers_python: str, progress: Any
+) -> Any:
     """Run the benchmark in the server's namespace."""
     python = Path(peers_python)
     clients, absent, versions = others.peer_clients(peers, python)
@@ -199,13 +220,23 @@ def _inside(calls: int, rate: str, delay: str | None, peers: Sequence[str], peer
         carried = link.megabits()
         progress(f"the link carries {carried:.0f} Mbit/s")
         starters = others.starters(clients, python, host=_SERVER, prefix=link.prefix)
-        found = measure(CLIENTS, calls, progress, others=starters, skipped=absent, host=_SERVER, prefix=link.prefix)
+        found = measure(
+            CLIENTS,
+            calls,
+            progress,
+            others=starters,
+            skipped=absent,
+            host=_SERVER,
+            prefix=link.prefix,
+        )
     made = {"rate": rate, "delay": delay, "measured_mbit_per_s": carried}
     return {**found.to_json(), "versions": versions, "link": made}
 
 
 def _interrupt_with_stdin() -> None:
-    """Interrupt this process, and so end the benchmark, when its standard input ends, as its parent has ended."""
+    """Interrupt this process, and so end the benchmark, when its standard input ends, as its
+    parent has ended.
+    """
 
     def wait() -> None:
         while os.read(0, 4096):
@@ -216,10 +247,13 @@ def _interrupt_with_stdin() -> None:
 
 
 def _run_inside(settings: str) -> None:
-    """Run the process inside; writes lines of JSON with "progress", then one with "result" or "error"."""
+    """Run the process inside; writes lines of JSON with "progress", then one with "result" or
+    "error".
+    """
     die_with_parent()
     out = own_stdout()
-    signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell may have started all this with it ignored
+    # A shell may have started all this with it ignored.
+    signal.signal(signal.SIGINT, signal.default_int_handler)
     _interrupt_with_stdin()
 
     def say(**line: Any) -> None:
@@ -236,18 +270,29 @@ def _run_inside(settings: str) -> None:
 def main(
     calls: Calls = 600,
     rate: Annotated[str, typer.Option(help="Of the link, as tc writes it.")] = RATE,
-    delay: Annotated[str | None, typer.Option(help="Each way, as tc writes it: 2ms. Needs the kernel's netem.")] = None,
+    delay: Annotated[
+        str | None, typer.Option(help="Each way, as tc writes it: 2ms. Needs the kernel's netem.")
+    ] = None,
     peers: others.Peers = "vlagents,openpi",
     peers_python: others.PeersPython = others.PYTHON,
     out_file: Out = None,
 ) -> None:
-    """Measure round trips over a link of 1 Gbit/s between two network namespaces on this machine."""
+    """Measure round trips over a link of 1 Gbit/s between two network namespaces on this
+    machine.
+    """
     with errors():
         origin = measured_on("python -m benchmarks.link")
         found = measure_link(
-            calls, rate=rate, delay=delay, peers=parse_list(peers), peers_python=peers_python, progress=progress
-        )  # fmt: skip
-        show_round_trips(found, f"round trip of one act over {found['link']['measured_mbit_per_s']:.0f} Mbit/s")
+            calls,
+            rate=rate,
+            delay=delay,
+            peers=parse_list(peers),
+            peers_python=peers_python,
+            progress=progress,
+        )
+        show_round_trips(
+            found, f"round trip of one act over {found['link']['measured_mbit_per_s']:.0f} Mbit/s"
+        )
         save({**origin, **found, "versions": origin["versions"] | found["versions"]}, out_file)
 
 

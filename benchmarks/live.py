@@ -1,10 +1,11 @@
 """Cost of the live page: acts of robots with no, one and four viewers, side by side in one run.
 
-One cluster serves three applications, each with one replica of a policy that takes 5 ms: one unchanged, one whose
-sender lacks the lines for the live page, and one that holds the last 30 s of each session. All serve the same robots:
-two of 50 Hz, and a saturated one that acts again at each answer. Robots and viewers have their own processes. The
-settings take turns within each round. A viewer shows the pictures of all sessions, and requests the next message at
-once, like the page. On a busy machine the CPU time of the replica is a better measure than acts a second.
+One cluster serves three applications, each with one replica of a policy that takes 5 ms: one
+unchanged, one whose sender lacks the lines for the live page, and one that holds the last 30 s of
+each session. All serve the same robots: two of 50 Hz, and a saturated one that acts again at each
+answer. Robots and viewers have their own processes. The settings take turns within each round. A
+viewer shows the pictures of all sessions, and requests the next message at once, like the page. On
+a busy machine the CPU time of the replica is a better measure than acts a second.
 """
 
 from __future__ import annotations
@@ -71,10 +72,15 @@ class Untapped(Measured):
 
 
 def _without(method: Callable[..., Any], lines: str, instead: str) -> None:
-    """Compile a method of the sender again with something else in place of the only lines that match."""
+    """Compile a method of the sender again with something else in place of the only lines that
+    match.
+    """
     source, found_lines = re.subn(lines, instead, textwrap.dedent(inspect.getsource(method)))
     if found_lines != 1:
-        raise ConfigError(f"{method.__name__}: got {found_lines} places with the lines for the tap, want 1; look there")
+        raise ConfigError(
+            f"{method.__name__}: got {found_lines} places with the lines for the tap, want 1; look "
+            "there"
+        )
     found: dict[str, Any] = {}
     exec(source, vars(sender), found)  # noqa: S102 - the package's own source
     setattr(sender.Sender, method.__name__, found[method.__name__])
@@ -92,17 +98,24 @@ class Turn(NamedTuple):
 
 
 class Robots:
-    """The robots of one application: a process of those with a rate, and one of the saturated one."""
+    """The robots of one application: a process of those with a rate, and one of the saturated
+    one.
+    """
 
     def __init__(self, stack: contextlib.ExitStack, name: str, url: str, transport: str) -> None:
         self._processes = [
-            stack.enter_context(_process(f"{kind} of {name}", {"url": url, "hz": hz, "transport": transport}))
+            stack.enter_context(
+                _process(f"{kind} of {name}", {"url": url, "hz": hz, "transport": transport})
+            )
             for kind, hz in (("robots", [HZ, HZ]), ("saturated robot", [SATURATED_HZ]))
         ]
-        [self.replica] = {process.read(START_S) for process in self._processes}  # the id of its process
+        # The id of its process.
+        [self.replica] = {process.read(START_S) for process in self._processes}
 
     def act(self, seconds: float) -> list[list[float]]:
-        """Run all robots; returns the durations of the acts, ms, of the paced robots and of the saturated one."""
+        """Run all robots; returns the durations of the acts, ms, of the paced robots and of the
+        saturated one.
+        """
         for process in self._processes:
             process.send(json.dumps(seconds))
         return [process.read(seconds + START_S) for process in self._processes]
@@ -122,13 +135,19 @@ def measure_live(
         made = {
             "tapped": deployment("benchmarks.live:Measured", config=_CONFIG),
             "untapped": deployment("benchmarks.live:Untapped", config=_CONFIG),
-            "holding": deployment("benchmarks.live:Measured", config=_CONFIG, parts={"live": {"folder": folder}}),
+            "holding": deployment(
+                "benchmarks.live:Measured", config=_CONFIG, parts={"live": {"folder": folder}}
+            ),
         }
         apps = [one.applications[0] for one in made.values()]
         for name, one in zip(made, apps, strict=True):
             one.name, one.route_prefix = name, f"/{name}"
-        server = stack.enter_context(running_server(made["tapped"].model_copy(update={"applications": apps})))
-        fleets = {app.name: Robots(stack, app.name, server.apps[app.name], transport) for app in apps}
+        server = stack.enter_context(
+            running_server(made["tapped"].model_copy(update={"applications": apps}))
+        )
+        fleets = {
+            app.name: Robots(stack, app.name, server.apps[app.name], transport) for app in apps
+        }
         watching = [
             stack.enter_context(_process(f"viewer {number}", {"watch": server.apps["tapped"]}))
             for number in range(max(viewers, default=0))
@@ -160,7 +179,9 @@ def _name(viewers: int) -> str:
 
 
 def _base(name: str) -> str:
-    """Return the reference of a setting: the build without live page, or the same without viewers."""
+    """Return the reference of a setting: the build without live page, or the same without
+    viewers.
+    """
     return ABSENT if name in (ABSENT, NOBODY) else NOBODY
 
 
@@ -188,7 +209,10 @@ def _figures(turns: list[Turn], base: list[Turn]) -> dict[str, Any]:
     }
     for name in ("paced_ms", "saturated_ms"):
         values = np.concatenate([getattr(turn, name) for turn in turns])
-        found |= {f"{name}_p50": float(np.quantile(values, 0.5)), f"{name}_p99": float(np.quantile(values, 0.99))}
+        found |= {
+            f"{name}_p50": float(np.quantile(values, 0.5)),
+            f"{name}_p99": float(np.quantile(values, 0.99)),
+        }
     return found
 
 
@@ -200,7 +224,9 @@ def _process(name: str, settings: dict[str, Any]) -> Iterator[LineProcess]:
 
 
 def child(settings: dict[str, Any]) -> None:
-    """Run a process of robots or of a viewer; each line on its standard input is the length of a turn, s."""
+    """Run a process of robots or of a viewer; each line on its standard input is the length of a
+    turn, s.
+    """
     die_with_parent()
     file = own_stdout()
     with contextlib.ExitStack() as stack:
@@ -228,7 +254,9 @@ def _robots(
         return taken
 
     def act(seconds: float) -> list[float]:
-        played = [pool.submit(play, agent, each, seconds) for agent, each in zip(agents, hz, strict=True)]
+        played = [
+            pool.submit(play, agent, each, seconds) for agent, each in zip(agents, hz, strict=True)
+        ]
         return [ms for one in played for ms in one.result()]
 
     return act, replica
@@ -238,7 +266,9 @@ def _viewer(_: contextlib.ExitStack, watch: str) -> tuple[Callable[[float], tupl
     """Connect as a browser does, which offers to compress messages."""
     address = f"{watch.replace('http', 'ws', 1)}/v1/live"
     with connect(address, proxy=None, max_size=None) as socket:
-        said = socket.response.headers.get("sec-websocket-extensions", "") if socket.response else ""
+        said = (
+            socket.response.headers.get("sec-websocket-extensions", "") if socket.response else ""
+        )
 
     def look(seconds: float) -> tuple[int, int]:
         messages = size = 0
@@ -250,7 +280,9 @@ def _viewer(_: contextlib.ExitStack, watch: str) -> tuple[Callable[[float], tupl
                 data = socket.recv()
                 messages, size = messages + 1, size + len(data)
                 document = json.loads(bytes(data[4 : 4 + int.from_bytes(data[:4], "little")]))  # type: ignore[arg-type]
-                shown = [one["id"] for replica in document["replicas"] for one in replica["sessions"]]
+                shown = [
+                    one["id"] for replica in document["replicas"] for one in replica["sessions"]
+                ]
         return messages, size
 
     return look, said
@@ -279,12 +311,23 @@ def main(
         ]
         for name, one in found["settings"].items()
     ]
-    columns = ("acts/s", "ratio", "CPU ms/act", "50 Hz p50/p99 ms", "saturated p50/p99 ms", "messages/s", "MB/s")
+    columns = (
+        "acts/s",
+        "ratio",
+        "CPU ms/act",
+        "50 Hz p50/p99 ms",
+        "saturated p50/p99 ms",
+        "messages/s",
+        "MB/s",
+    )
     shown = table("who looks", *columns)
     for row in rows:
         shown.add_row(*row)
     out.print(shown)
-    out.print(f"compression of the viewers' messages: {', '.join(found['websocket_extensions']) or 'none'}")
+    out.print(
+        "compression of the viewers' messages: "
+        f"{', '.join(found['websocket_extensions']) or 'none'}"
+    )
     save(found, out_file)
 
 

@@ -15,7 +15,8 @@ from vlagents_ray.registry import require
 Span = tuple[float, float, str]  # begin and end, µs, and the name of a kernel
 
 _SHOWN = 5  # gaps
-_WAIT = "called a synchronizing CUDA operation"  # in torch's warning; its debug mode warns of itself in other words
+# In torch's warning; its debug mode warns of itself in other words.
+_WAIT = "called a synchronizing CUDA operation"
 
 
 class NetworkTimer:
@@ -34,7 +35,11 @@ class NetworkTimer:
         mark = Compilation.core
 
         def core(
-            compilation: Compilation, name: str, function: Any, rows: int | None = None, parts: Sequence[Any] = ()
+            compilation: Compilation,
+            name: str,
+            function: Any,
+            rows: int | None = None,
+            parts: Sequence[Any] = (),
         ) -> Callable[..., Any]:
             cores = [getattr(part, "untimed", part) for part in parts]
             return self._timed(mark(compilation, name, function, rows, cores))
@@ -46,7 +51,9 @@ class NetworkTimer:
             Compilation.core = mark  # type: ignore[method-assign]
 
     def measure(self, act: Callable[[], object]) -> float | None:
-        """Run an act that waits for its result; return the time of its cores, ms, or None if the policy has none."""
+        """Run an act that waits for its result; return the time of its cores, ms, or None if the
+        policy has none.
+        """
         self._spans = []
         try:
             act()
@@ -81,19 +88,27 @@ def _now(on_gpu: bool) -> Any:
 
 
 def profile(act: Callable[[], object]) -> dict[str, Any]:
-    """Run an act under torch's profiler; on a machine without a GPU, operators of the CPU take the place of kernels.
+    """Run an act under torch's profiler; on a machine without a GPU, operators of the CPU take the
+    place of kernels.
 
     Returns:
-        "launches": calls that start a kernel or a graph; "kernels"; "busy_ms": the time in which at least one kernel
-        ran; "gaps": the longest times without one, "MS ms before KERNEL", which the profiler itself lengthens.
+        "launches": calls that start a kernel or a graph; "kernels"; "busy_ms": the time in which at
+        least one kernel ran; "gaps": the longest times without one, "MS ms before KERNEL", which
+        the profiler itself lengthens.
     """
     torch = require("torch")
     kinds, on_gpu = torch.profiler.ProfilerActivity, torch.cuda.is_available()
-    with torch.profiler.profile(activities=[kinds.CPU, *([kinds.CUDA] if on_gpu else [])]) as profiled:
+    with torch.profiler.profile(
+        activities=[kinds.CPU, *([kinds.CUDA] if on_gpu else [])]
+    ) as profiled:
         act()
     events = profiled.events()
     kind = torch.autograd.DeviceType.CUDA if on_gpu else torch.autograd.DeviceType.CPU
-    spans = sorted((one.time_range.start, one.time_range.end, one.name) for one in events if one.device_type == kind)
+    spans = sorted(
+        (one.time_range.start, one.time_range.end, one.name)
+        for one in events
+        if one.device_type == kind
+    )
     busy, gaps = busy_time(spans)
     return {
         "launches": sum("Launch" in one.name for one in events if one.device_type != kind),
@@ -104,7 +119,9 @@ def profile(act: Callable[[], object]) -> dict[str, Any]:
 
 
 def busy_time(spans: Sequence[Span]) -> tuple[float, list[tuple[float, str]]]:
-    """Return the time that ascending spans cover, µs, and the gaps between them, µs, the longest first."""
+    """Return the time that ascending spans cover, µs, and the gaps between them, µs, the longest
+    first.
+    """
     busy, gaps, end = 0.0, [], spans[0][0] if spans else 0.0
     for begin, stop, name in spans:
         if begin > end:
@@ -115,7 +132,9 @@ def busy_time(spans: Sequence[Span]) -> tuple[float, list[tuple[float, str]]]:
 
 
 def waits(act: Callable[[], object]) -> Counter[str]:
-    """Run an act, and count the places, FILE:LINE, at which the CPU waits for the GPU; none without a GPU."""
+    """Run an act, and count the places, FILE:LINE, at which the CPU waits for the GPU; none
+    without a GPU.
+    """
     torch = require("torch")
     with warnings.catch_warnings(record=True) as said:
         warnings.simplefilter("always")

@@ -1,10 +1,11 @@
 """Overhead of an evaluation over the bare environments: steps a second, in alternating rounds.
 
-A bare round steps the environments in as many processes as the evaluation has workers, with zeros as actions and no
-policy, server or Ray. An evaluated round plays the same episodes with a served `noop` policy. Both count the steps made
-while all workers were playing, with the gaps between episodes, but without the creation of environments and the wait
-for the first and the last worker. CPU time is that of the same span: of all bare processes, or of all processes of the
-evaluation (driver, workers, replica, HAProxy and Ray's daemons).
+A bare round steps the environments in as many processes as the evaluation has workers, with zeros
+as actions and no policy, server or Ray. An evaluated round plays the same episodes with a served
+`noop` policy. Both count the steps made while all workers were playing, with the gaps between
+episodes, but without the creation of environments and the wait for the first and the last worker.
+CPU time is that of the same span: of all bare processes, or of all processes of the evaluation
+(driver, workers, replica, HAProxy and Ray's daemons).
 """
 
 from __future__ import annotations
@@ -84,7 +85,9 @@ class Overhead:
     @property
     def ratios(self) -> tuple[float, ...]:
         """The ratios of evaluated to bare, by round."""
-        return tuple(e.steps_per_s / b.steps_per_s for e, b in zip(self.evaluated, self.bare, strict=True))
+        return tuple(
+            e.steps_per_s / b.steps_per_s for e, b in zip(self.evaluated, self.bare, strict=True)
+        )
 
     @property
     def ratio(self) -> float:
@@ -94,7 +97,10 @@ class Overhead:
     @property
     def added_cpu_ms(self) -> tuple[float, ...]:
         """The CPU time that the evaluation adds to a step, ms, by round."""
-        return tuple(e.cpu_ms_per_step - b.cpu_ms_per_step for e, b in zip(self.evaluated, self.bare, strict=True))
+        return tuple(
+            e.cpu_ms_per_step - b.cpu_ms_per_step
+            for e, b in zip(self.evaluated, self.bare, strict=True)
+        )
 
     def to_json(self) -> dict[str, Any]:
         """Return plain JSON values."""
@@ -142,15 +148,22 @@ def measure_overhead(
             with CpuSampler(lambda: marked(os.environ[MARK])) as cpu:  # the cluster's own mark
                 evaluate(config)
             playing = steady(recorded(config.out), workers)
-            evaluated.append(CallRate(playing.rate, cpu.between(playing.first, playing.last) * 1e3 / playing.steps))
-            progress(f"round {number + 1}/{rounds}: evaluated {evaluated[-1].steps_per_s:.1f} steps/s")
+            evaluated.append(
+                CallRate(
+                    playing.rate, cpu.between(playing.first, playing.last) * 1e3 / playing.steps
+                )
+            )
+            progress(
+                f"round {number + 1}/{rounds}: evaluated {evaluated[-1].steps_per_s:.1f} steps/s"
+            )
     return Overhead(env, workers, tuple(bare), tuple(evaluated))
 
 
 def steady(episodes: Sequence[Span], workers: int) -> Steady:
     """Find the span between the first and the last moment at which all `workers` play.
 
-    The steps of an episode are assumed to be spread evenly. Raises `EnvFailed` if the workers never all play.
+    The steps of an episode are assumed to be spread evenly. Raises `EnvFailed` if the workers never
+    all play.
     """
     edges = sorted([(e.begun, 1) for e in episodes] + [(e.ended, -1) for e in episodes])
     playing = 0
@@ -162,11 +175,16 @@ def steady(episodes: Sequence[Span], workers: int) -> Steady:
     if len(full) < 2:
         raise EnvFailed(f"{workers} workers were never all playing; measure more episodes")
     first, last = full[0], full[-1]
-    inside = sum(e.steps * max(0.0, min(e.ended, last) - max(e.begun, first)) / (e.ended - e.begun) for e in episodes)
+    inside = sum(
+        e.steps * max(0.0, min(e.ended, last) - max(e.begun, first)) / (e.ended - e.begun)
+        for e in episodes
+    )
     return Steady(first, last, inside)
 
 
-def bare_rate(env: str, options: Mapping[str, Any], action_dim: int, workers: int, episodes: int) -> CallRate:
+def bare_rate(
+    env: str, options: Mapping[str, Any], action_dim: int, workers: int, episodes: int
+) -> CallRate:
     """Play `episodes` episodes of zeros in each of `workers` processes."""
     context = multiprocessing.get_context("spawn")
     start = context.Barrier(workers)
@@ -176,7 +194,8 @@ def bare_rate(env: str, options: Mapping[str, Any], action_dim: int, workers: in
     try:
         processes = [
             context.Process(
-                target=_play, args=(env, dict(options), action_dim, worker * episodes, episodes, start, results)
+                target=_play,
+                args=(env, dict(options), action_dim, worker * episodes, episodes, start, results),
             )
             for worker in range(workers)
         ]
@@ -196,7 +215,13 @@ def bare_rate(env: str, options: Mapping[str, Any], action_dim: int, workers: in
 
 
 def _play(
-    name: str, options: dict[str, Any], action_dim: int, seed: int, episodes: int, start: Barrier, results: Any
+    name: str,
+    options: dict[str, Any],
+    action_dim: int,
+    seed: int,
+    episodes: int,
+    start: Barrier,
+    results: Any,
 ) -> None:
     spans: list[Span] = []
     act = Act(np.zeros(action_dim, np.float32))
@@ -267,9 +292,18 @@ class CpuSampler:
 
 def show_overhead(found: Overhead) -> None:
     """Print a row for each round."""
-    rows = table("round", "bare steps/s", "evaluated steps/s", "ratio", "bare CPU ms/step", "evaluated CPU ms/step")
+    rows = table(
+        "round",
+        "bare steps/s",
+        "evaluated steps/s",
+        "ratio",
+        "bare CPU ms/step",
+        "evaluated CPU ms/step",
+    )
     rows.title = f"{found.env}, {found.workers} workers"
-    for number, (bare, ours, ratio) in enumerate(zip(found.bare, found.evaluated, found.ratios, strict=True), 1):
+    for number, (bare, ours, ratio) in enumerate(
+        zip(found.bare, found.evaluated, found.ratios, strict=True), 1
+    ):
         rows.add_row(
             str(number), f"{bare.steps_per_s:.1f}", f"{ours.steps_per_s:.1f}", f"{ratio:.3f}",
             f"{bare.cpu_ms_per_step:.3f}", f"{ours.cpu_ms_per_step:.3f}",
@@ -285,15 +319,25 @@ def main(
     out_file: Out = None,
     env_set: Annotated[list[str], typer.Option("--env-set", metavar="KEY=VALUE")] = [],  # noqa: B006
 ) -> None:
-    """Measure steps a second, and CPU time a step, of an evaluation against the bare environments."""
+    """Measure steps a second, and CPU time a step, of an evaluation against the bare
+    environments.
+    """
     with errors():
         options = parse_settings(env_set, "--env-set")
         found = measure_overhead(
-            env, workers=workers, episodes=episodes, rounds=rounds, env_options=options, progress=progress
+            env,
+            workers=workers,
+            episodes=episodes,
+            rounds=rounds,
+            env_options=options,
+            progress=progress,
         )
     show_overhead(found)
     data = found.to_json()
-    out.print(f"median ratio {found.ratio:.3f}, CPU time added to a step {data['median_added_cpu_ms_per_step']:.3f} ms")
+    out.print(
+        f"median ratio {found.ratio:.3f}, CPU time added to a step "
+        f"{data['median_added_cpu_ms_per_step']:.3f} ms"
+    )
     save(data, out_file)
 
 

@@ -1,6 +1,7 @@
 """Our clients, each in a process or a Ray actor: `python -m benchmarks.own_clients JSON`.
 
-A process holds one client that makes calls in its turn (`BenchCaller`), or several that make load (`LoadGenerator`).
+A process holds one client that makes calls in its turn (`BenchCaller`), or several that make load
+(`LoadGenerator`).
 """
 
 from __future__ import annotations
@@ -35,18 +36,23 @@ ROBOT, SIMULATION = "robot", "simulation"
 
 @functools.cache
 def observation(size: int = 224, cameras: int = 2) -> Obs:
-    """Return the observation that every server in a benchmark gets, ours or a peer's, byte for byte.
+    """Return the observation that every server in a benchmark gets, ours or a peer's, byte for
+    byte.
 
-    It has camera images with smooth structure and some noise, like photographs, seven joints and a gripper. Each call
-    returns the same object, which must not be changed.
+    It has camera images with smooth structure and some noise, like photographs, seven joints and a
+    gripper. Each call returns the same object, which must not be changed.
     """
     rng = np.random.default_rng(0)
     y, x = np.mgrid[0:size, 0:size] / size
     images = {}
     for number in range(cameras):
-        waves = [np.sin(2 * np.pi * (a * x + b * y) + number) for a, b in rng.uniform(-4, 4, (6, 2))]
+        waves = [
+            np.sin(2 * np.pi * (a * x + b * y) + number) for a, b in rng.uniform(-4, 4, (6, 2))
+        ]
         base = np.stack([sum(waves[i : i + 2]) for i in (0, 2, 4)], axis=-1)
-        images[f"camera_{number}"] = np.clip(128 + 50 * base + rng.normal(0, 6, base.shape), 0, 255).astype(np.uint8)
+        images[f"camera_{number}"] = np.clip(
+            128 + 50 * base + rng.normal(0, 6, base.shape), 0, 255
+        ).astype(np.uint8)
     return Obs(images, 0.5, {"joints": np.zeros(7, np.float32)})
 
 
@@ -86,21 +92,27 @@ OWN_CLIENTS = (
 
 
 def own_clients(only: Sequence[str] = ()) -> tuple[list[OwnClient], dict[str, str]]:
-    """Return the clients of this version, or those with a transport in `only`, and the reasons for skipped ones."""
+    """Return the clients of this version, or those with a transport in `only`, and the reasons
+    for skipped ones.
+    """
     known = get_args(TransportName)
     wanted = [one for one in OWN_CLIENTS if not only or one.transport in only]
     if unknown := set(only) - {one.transport for one in OWN_CLIENTS}:
         known_here = sorted({one.transport for one in OWN_CLIENTS})
         raise ConfigError(f"transports: got {sorted(unknown)}, want some of {known_here}")
-    skipped = {w.name: f"no transport {w.transport!r} in this version" for w in wanted if w.transport not in known}
+    skipped = {
+        w.name: f"no transport {w.transport!r} in this version"
+        for w in wanted
+        if w.transport not in known
+    }
     return [one for one in wanted if one.transport in known], skipped
 
 
 def connect(url: str, transport: str, codec: str, rank: str | None = None) -> RemoteAgent:
     """Make an agent that has not connected yet.
 
-    `codec` is "auto", "raw", "jpeg", or "jpeg QUALITY SUBSAMPLING". `rank` is "robot" or "simulation", and has no
-    effect if `RemoteAgent` has no ranks.
+    `codec` is "auto", "raw", "jpeg", or "jpeg QUALITY SUBSAMPLING". `rank` is "robot" or
+    "simulation", and has no effect if `RemoteAgent` has no ranks.
     """
     name, *details = codec.split()
     chosen = ImageCodec(name, int(details[0]), details[1]) if details else codec
@@ -142,7 +154,9 @@ class LoadGenerator:
         self._agents = [connect(url, transport, codec, rank) for rank in ranks]
         with ThreadPoolExecutor(len(ranks)) as pool:
             list(pool.map(lambda agent: agent.reset(self._obs, "measure"), self._agents))
-        self._loop = ClosedLoop([functools.partial(self._act, agent) for agent in self._agents], robots)
+        self._loop = ClosedLoop(
+            [functools.partial(self._act, agent) for agent in self._agents], robots
+        )
 
     def ready(self) -> bool:
         """Answer an actor's caller once `__init__` is done."""
@@ -185,16 +199,21 @@ class ActorDriver:
 
 
 @contextlib.contextmanager
-def connected(client: OwnClient, url: str, app: str, prefix: Sequence[str] = ()) -> Iterator[ProcessDriver]:
+def connected(
+    client: OwnClient, url: str, app: str, prefix: Sequence[str] = ()
+) -> Iterator[ProcessDriver]:
     """Start a client of ours to the server at `url`; its command begins with `prefix`."""
     if client.actor:
         import ray
 
-        actor = ray.remote(num_cpus=0)(BenchCaller).remote(f"serve://{app}", client.transport, client.codec)
+        actor = ray.remote(num_cpus=0)(BenchCaller).remote(
+            f"serve://{app}", client.transport, client.codec
+        )
         try:
             yield ActorDriver(actor)
         finally:
-            with contextlib.suppress(ray.exceptions.RayError):  # `ready` has raised the reason if it never connected
+            # `ready` has raised the reason if it never connected.
+            with contextlib.suppress(ray.exceptions.RayError):
                 ray.get(actor.close.remote(), timeout=CALL_S)
             ray.kill(actor)
         return

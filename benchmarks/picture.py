@@ -1,4 +1,6 @@
-"""The picture of the league: round trips of all systems, and actions a second by number of clients."""
+"""The picture of the league: round trips of all systems, and actions a second by number of
+clients.
+"""
 
 from __future__ import annotations
 
@@ -8,17 +10,27 @@ from typing import Any
 
 from vlagents_ray.registry import require
 
-_OURS, _PEERS, _TEXT = "#3f6fd8", "#9a9a9a", "#808080"  # the text is readable on a light page and on a dark one
+# The text is readable on a light page and on a dark one.
+_OURS, _PEERS, _TEXT = "#3f6fd8", "#9a9a9a", "#808080"
 _DASHES = ("-", "--", ":", "-.")
 _SETTINGS = {
-    "svg.fonttype": "none", "svg.hashsalt": "league", "font.size": 9, "text.color": _TEXT, "axes.edgecolor": _TEXT,
-    "axes.labelcolor": _TEXT, "xtick.color": _TEXT, "ytick.color": _TEXT, "axes.spines.top": False,
+    "svg.fonttype": "none",
+    "svg.hashsalt": "league",
+    "font.size": 9,
+    "text.color": _TEXT,
+    "axes.edgecolor": _TEXT,
+    "axes.labelcolor": _TEXT,
+    "xtick.color": _TEXT,
+    "ytick.color": _TEXT,
+    "axes.spines.top": False,
     "axes.spines.right": False,
-}  # fmt: skip
+}
 
 
 def plot_league(results: Mapping[str, Any], file: Path) -> None:
-    """Draw the medians of `rtt`, and the curves of `throughput` and `without_gain`, as far as they were measured."""
+    """Draw the medians of `rtt`, and the curves of `throughput` and `without_gain`, as far as
+    they were measured.
+    """
     matplotlib = require("matplotlib")
     parts = [results[name] for name in ("throughput", "without_gain") if results.get(name)]
     with matplotlib.rc_context(_SETTINGS):
@@ -29,16 +41,27 @@ def plot_league(results: Mapping[str, Any], file: Path) -> None:
             _plot_throughput(axes[index + 1], part)
         if parts:
             handles, labels = axes[1].get_legend_handles_labels()
-            figure.legend(handles, labels, loc="outside right center", fontsize=8, frameon=False, labelcolor=_TEXT)
+            figure.legend(
+                handles,
+                labels,
+                loc="outside right center",
+                fontsize=8,
+                frameon=False,
+                labelcolor=_TEXT,
+            )
         figure.savefig(file, transparent=True, metadata={"Date": None})
 
 
 def _plot_round_trips(axes: Any, rtt: Mapping[str, Any]) -> None:
-    ways = sorted([*rtt["ways"], *rtt["peers"]], key=lambda one: float(one["median_ms"]), reverse=True)
+    ways = sorted(
+        [*rtt["ways"], *rtt["peers"]], key=lambda one: float(one["median_ms"]), reverse=True
+    )
     theirs = [peer["way"] for peer in rtt["peers"]]
     medians = [way["median_ms"] for way in ways]
     bars = axes.barh(
-        [way["way"] for way in ways], medians, color=[_PEERS if way["way"] in theirs else _OURS for way in ways]
+        [way["way"] for way in ways],
+        medians,
+        color=[_PEERS if way["way"] in theirs else _OURS for way in ways],
     )
     axes.bar_label(bars, [f"{ms:.3g}" for ms in medians], padding=3, color=_TEXT)
     axes.set_xscale("log")
@@ -47,15 +70,26 @@ def _plot_round_trips(axes: Any, rtt: Mapping[str, Any]) -> None:
 
 
 def _plot_throughput(axes: Any, part: Mapping[str, Any]) -> None:
-    for number, (name, row) in enumerate([*part["transports"].items(), *part.get("peers", {}).items()]):
+    for number, (name, row) in enumerate(
+        [*part["transports"].items(), *part.get("peers", {}).items()]
+    ):
         ours = name in part["transports"]
         points = row["curve"]
         rates = [point["actions_per_s"] for point in points]
-        spread = [0.0 if point.get("ci95") is None else point["actions_per_s"] - point["ci95"][0] for point in points]
+        spread = [
+            0.0 if point.get("ci95") is None else point["actions_per_s"] - point["ci95"][0]
+            for point in points
+        ]
         axes.errorbar(
-            [point["clients"] for point in points], rates, spread, label=name, capsize=2, lw=2 if ours else 1,
-            ls=_DASHES[number % len(_DASHES)], color=_OURS if ours else f"C{number % 10}",
-        )  # fmt: skip
+            [point["clients"] for point in points],
+            rates,
+            spread,
+            label=name,
+            capsize=2,
+            lw=2 if ours else 1,
+            ls=_DASHES[number % len(_DASHES)],
+            color=_OURS if ours else f"C{number % 10}",
+        )
     axes.axhline(part["ideal_actions_per_s"], color=_TEXT, lw=0.8)
     axes.set_xscale("log", base=2)
     counts = [point["clients"] for point in points]  # those of all

@@ -1,8 +1,10 @@
-"""The speed of a policy on this machine by batch size, without Ray: bare, and behind a replica's batch queue.
+"""The speed of a policy on this machine by batch size, without Ray: bare, and behind a replica's
+batch queue.
 
-Bare is `act_batch` on full batches, one after another. Behind the queue, as many sessions as the batch has rows act
-again at each answer. The network alone is the part of the bare time in the model's cores, and GPU busy is the part in
-which the GPU runs any kernel. The policy is loaded once for all.
+Bare is `act_batch` on full batches, one after another. Behind the queue, as many sessions as the
+batch has rows act again at each answer. The network alone is the part of the bare time in the
+model's cores, and GPU busy is the part in which the GPU runs any kernel. The policy is loaded once
+for all.
 """
 
 from __future__ import annotations
@@ -48,11 +50,14 @@ class PolicyPlan:
     seconds: float = 2.0  # of each measurement
     rounds: int = 3  # in which all measurements take turns
     side: int = 224  # px, of images if the policy takes any size
-    dims: Mapping[str, int] = field(default_factory=dict)  # of parts of the state that the policy leaves open
+    # Of parts of the state that the policy leaves open.
+    dims: Mapping[str, int] = field(default_factory=dict)
 
 
 class BareAndQueued(MeasuredPolicy):
-    """A policy that is also measured without the queue, and of which the network is measured alone."""
+    """A policy that is also measured without the queue, and of which the network is measured
+    alone.
+    """
 
     def __enter__(self) -> Self:
         self._network = NetworkTimer()
@@ -63,7 +68,8 @@ class BareAndQueued(MeasuredPolicy):
         """Measure `act_batch` on full batches of that size, one after another, without the queue.
 
         Returns:
-            "actions_per_s"; "batch_ms"; "network_ms": the time of the model's cores, 0 of a policy without any.
+            "actions_per_s"; "batch_ms"; "network_ms": the time of the model's cores, 0 of a policy
+            without any.
         """
         batch = self.batch(range(size))
         times: list[float] = []
@@ -80,19 +86,28 @@ class BareAndQueued(MeasuredPolicy):
         }
 
 
-def measure_policy(plan: PolicyPlan, progress: Callable[[str], None] = lambda _: None) -> dict[str, Any]:
+def measure_policy(
+    plan: PolicyPlan, progress: Callable[[str], None] = lambda _: None
+) -> dict[str, Any]:
     """Measure the plan; returns plain JSON values: actions a second, ms, MiB."""
     batch = plan.args.batch
     if batch.sizes is not None and max(plan.batches) > batch.sizes[-1]:
-        raise ConfigError(f"--batch: got {max(plan.batches)}, the file's largest of batch.sizes is {batch.sizes[-1]}")
+        raise ConfigError(
+            f"--batch: got {max(plan.batches)}, the file's largest of batch.sizes is "
+            f"{batch.sizes[-1]}"
+        )
     agent: Agent = build_agent(plan.args.policy, plan.args.config, plan.args.wrappers)
 
     def view(contract: Contract | None, seed: int) -> Obs:
         return random_observation(contract, seed, side=plan.side, dims=plan.dims)
 
     measured = BareAndQueued(
-        agent, view, max_size=max(plan.batches), patience=batch.patience, batch_sizes=batch.sizes or ()
-    )  # fmt: skip
+        agent,
+        view,
+        max_size=max(plan.batches),
+        patience=batch.patience,
+        batch_sizes=batch.sizes or (),
+    )
     with measured:
         progress(f"{plan.args.policy}: loaded in {measured.load_s:.1f} s")
         rows = {size: _SizedRow(size) for size in plan.batches}
@@ -102,7 +117,9 @@ def measure_policy(plan: PolicyPlan, progress: Callable[[str], None] = lambda _:
                 row.bare.append(measured.bare(row.size, plan.seconds))
                 row.queued.append(measured.queued(row.size, plan.seconds, "simulation"))
                 row.memory.append(peak_mib())
-            rates = ", ".join(f"{row.size}: {row.bare[-1]['actions_per_s']:.1f}/s" for row in rows.values())
+            rates = ", ".join(
+                f"{row.size}: {row.bare[-1]['actions_per_s']:.1f}/s" for row in rows.values()
+            )
             progress(f"round {number + 1} of {plan.rounds}: {rates}")
         for row in rows.values() if cuda() is not None else ():
             row.busy_ms = profile(measured.batch(range(row.size)))["busy_ms"]
@@ -127,13 +144,18 @@ class _SizedRow:
     busy_ms: float | None = None  # time of a batch in which the GPU ran a kernel
 
     def to_json(self) -> dict[str, Any]:
-        """Return the medians of the rounds, the 99th percentile of all their round trips, and the rounds.
+        """Return the medians of the rounds, the 99th percentile of all their round trips, and the
+        rounds.
 
-        `queued_share` is the median of the rounds' actions a second behind the queue, divided by those without it, and
-        `network_share` that of those of the network alone. `gpu_busy` is the share of the bare time.
+        `queued_share` is the median of the rounds' actions a second behind the queue, divided by
+        those without it, and `network_share` that of those of the network alone. `gpu_busy` is the
+        share of the bare time.
         """
         queued = [_figures(turn) for turn in self.queued]
-        shares = [ours["actions_per_s"] / bare["actions_per_s"] for ours, bare in zip(queued, self.bare, strict=True)]
+        shares = [
+            ours["actions_per_s"] / bare["actions_per_s"]
+            for ours, bare in zip(queued, self.bare, strict=True)
+        ]
         networks = [
             ours["actions_per_s"] * bare["network_ms"] / 1e3 / self.size
             for ours, bare in zip(queued, self.bare, strict=True)
@@ -171,17 +193,25 @@ def main(
     seconds: Seconds = 2.0,
     rounds: Rounds = 3,
     app: Annotated[str | None, typer.Option(help="Of the file, if it holds several.")] = None,
-    image: Annotated[int, typer.Option(min=1, help="Pixels a side, where the policy takes any image.")] = 224,
+    image: Annotated[
+        int, typer.Option(min=1, help="Pixels a side, where the policy takes any image.")
+    ] = 224,
     state: StateDims = [],  # noqa: B006
     settings: Set = [],  # noqa: B006
     out_file: Out = None,
 ) -> None:
-    """Measure actions a second of one policy by batch size, bare and behind its batch queue, without Ray."""
-    from vlagents_ray.serve.launch.deployment_file import policy_application  # imports Ray, for the file's schema
+    """Measure actions a second of one policy by batch size, bare and behind its batch queue,
+    without Ray.
+    """
+    # Imports Ray, for the file's schema.
+    from vlagents_ray.serve.launch.deployment_file import policy_application
 
     with errors():
         origin = measured_on("python -m benchmarks.policy")
-        args, batches = ServerArgs(**policy_application(file, app).args), parse_counts(batch, "--batch")
+        args, batches = (
+            ServerArgs(**policy_application(file, app).args),
+            parse_counts(batch, "--batch"),
+        )
         args = args.model_copy(update={"config": args.config | parse_settings(settings, "--set")})
         plan = PolicyPlan(args, batches, seconds, rounds, image, parse_dims(state, "--state-dim"))
         found = measure_policy(plan, progress)
@@ -192,20 +222,37 @@ def main(
 def show_policy(found: Mapping[str, Any]) -> None:
     """Print a row for each batch size."""
     rows = table(
-        "batch", "bare actions/s", "ms a batch", "network ms", "GPU busy", "queued actions/s", "of bare", "of network",
-        "round trip ms", "p99 ms", "mean batch", "peak MiB",
-    )  # fmt: skip
+        "batch",
+        "bare actions/s",
+        "ms a batch",
+        "network ms",
+        "GPU busy",
+        "queued actions/s",
+        "of bare",
+        "of network",
+        "round trip ms",
+        "p99 ms",
+        "mean batch",
+        "peak MiB",
+    )
     chunk = f", {found['chunk']} rows an action" if (found["chunk"] or 1) > 1 else ""
     rows.title = f"{found['policy']} on {found['device']}{chunk}"
     for row in found["batches"]:
         bare, queued = row["bare"], row["queued"]
         rows.add_row(
-            str(row["batch"]), f"{bare['actions_per_s']:.1f}", f"{bare['batch_ms']:.2f}",
-            f"{bare['network_ms']:.2f}" if row["network_share"] else "", _percent(row["gpu_busy"]),
-            f"{queued['actions_per_s']:.1f}", f"{row['queued_share']:.1%}", _percent(row["network_share"]),
+            str(row["batch"]),
+            f"{bare['actions_per_s']:.1f}",
+            f"{bare['batch_ms']:.2f}",
+            f"{bare['network_ms']:.2f}" if row["network_share"] else "",
+            _percent(row["gpu_busy"]),
+            f"{queued['actions_per_s']:.1f}",
+            f"{row['queued_share']:.1%}",
+            _percent(row["network_share"]),
             f"{queued['round_trip_ms']:.2f}",
-            f"{queued['p99_ms']:.2f}", f"{queued['mean_batch']:.2f}", f"{row['peak_mib']:.0f}",
-        )  # fmt: skip
+            f"{queued['p99_ms']:.2f}",
+            f"{queued['mean_batch']:.2f}",
+            f"{row['peak_mib']:.0f}",
+        )
     out.print(rows)
 
 

@@ -11,13 +11,15 @@ from typing import Any
 
 import numpy as np
 
-# Ray's processes that do nothing for an act: `program` of each, some before they have set their title.
+# Ray's processes that do nothing for an act: `program` of each, some before they have set their
+# title.
 DAEMONS = frozenset(
     {"gcs_server", "raylet", "ServeController", "DashboardAgent", "RuntimeEnvAgent", "IDLE"}
     | {"default_worker.py", "dashboard.py", "agent.py", "main.py", "monitor.py", "log_monitor.py"}
 )
 _IDLE_S = 3.0
-_POLLING_CORES = 0.25  # of an idle process; one that waits for events or a timer takes less than 0.02
+# Of an idle process; one that waits for events or a timer takes less than 0.02.
+_POLLING_CORES = 0.25
 _SWITCHES = re.compile(r"ctxt_switches:\t(\d+)")  # voluntary ones, then involuntary ones
 
 
@@ -28,14 +30,17 @@ def cpu_seconds(pid: int) -> float:
         ProcessLookupError: It has ended.
     """
     try:
-        # Its CPU clock (clock_getcpuclockid(3)) counts ns; /proc/PID/stat counts ticks of 10 ms, which is 100 acts.
+        # Its CPU clock (clock_getcpuclockid(3)) counts ns; /proc/PID/stat counts ticks of 10 ms,
+        # which is 100 acts.
         return time.clock_gettime((~pid << 3) | 2)
     except OSError as error:
         raise ProcessLookupError(f"/proc/{pid}: there is no such process") from error
 
 
 def program(pid: int) -> str:
-    """Return the name of a process: Ray's title for it, a script, or a program; empty if it has ended."""
+    """Return the name of a process: Ray's title for it, a script, or a program; empty if it has
+    ended.
+    """
     try:
         words = Path(f"/proc/{pid}/cmdline").read_bytes().decode(errors="replace").split("\0")
     except OSError:
@@ -50,7 +55,9 @@ def descendants(pid: int) -> set[int]:
     children: dict[int, list[int]] = {}
     for stat in Path("/proc").glob("[0-9]*/stat"):
         with contextlib.suppress(OSError):  # it has ended
-            children.setdefault(int(stat.read_text().rpartition(")")[2].split()[1]), []).append(int(stat.parent.name))
+            children.setdefault(int(stat.read_text().rpartition(")")[2].split()[1]), []).append(
+                int(stat.parent.name)
+            )
     found: set[int] = set()
     waiting = [pid]
     while waiting:
@@ -64,14 +71,17 @@ def server_processes(root: int, others: Collection[int] = ()) -> list[int]:
 
     Args:
         root: The process that started the server.
-        others: Further processes that `root` has started; neither these nor their descendants belong to the server.
+        others: Further processes that `root` has started; neither these nor their descendants
+            belong to the server.
     """
     strangers = {*others}.union(*(descendants(one) for one in others))
     return [pid for pid in sorted(descendants(root) - strangers) if program(pid) not in DAEMONS]
 
 
 class UsageMeter:
-    """Adds up the CPU time and the context switches of processes in spans of time, beyond their use while idle."""
+    """Adds up the CPU time and the context switches of processes in spans of time, beyond their
+    use while idle.
+    """
 
     def __init__(self, pids: Sequence[int]) -> None:
         self._pids = pids
@@ -95,7 +105,8 @@ class UsageMeter:
     def mark_idle(self) -> float:
         """Take what was counted so far as the use while idle; returns its CPU s in a second.
 
-        What a process that polls uses is all counted: polling takes a core that no act beside it could have.
+        What a process that polls uses is all counted: polling takes a core that no act beside it
+        could have.
         """
         idle = self._used / self._seconds
         self._seconds, self._used = 0.0, np.zeros_like(self._used)
@@ -103,7 +114,9 @@ class UsageMeter:
         return float(idle[:, 0].sum())
 
     def per_act(self, acts: int) -> dict[str, Any]:
-        """Return the use for each of `acts` acts as JSON values, and its CPU time by program, ms."""
+        """Return the use for each of `acts` acts as JSON values, and its CPU time by program,
+        ms.
+        """
         each = (self._used - self._seconds * self._idle) / acts * (1e3, 1, 1)
         programs = dict.fromkeys(self._programs, 0.0)
         for name, cpu_ms in zip(self._programs, each[:, 0], strict=True):
@@ -118,7 +131,9 @@ class UsageMeter:
 
 
 def count_idle(meters: Sequence[UsageMeter]) -> list[float]:
-    """Count for 3 s while all processes are idle, as their use while idle; returns the CPU s a second of each meter."""
+    """Count for 3 s while all processes are idle, as their use while idle; returns the CPU s a
+    second of each meter.
+    """
     with contextlib.ExitStack() as stack:
         for meter in meters:
             stack.enter_context(meter.counting())
@@ -127,12 +142,16 @@ def count_idle(meters: Sequence[UsageMeter]) -> list[float]:
 
 
 def _counters(pid: int) -> tuple[float, dict[str, tuple[int, ...]]] | None:
-    """Return CPU s, and the voluntary and involuntary context switches of each thread; None if it has ended."""
+    """Return CPU s, and the voluntary and involuntary context switches of each thread; None if
+    it has ended.
+    """
     switches: dict[str, tuple[int, ...]] = {}
     try:
         for thread in Path(f"/proc/{pid}/task").iterdir():
             with contextlib.suppress(OSError):  # it has ended
-                switches[thread.name] = tuple(map(int, _SWITCHES.findall((thread / "status").read_text())))
+                switches[thread.name] = tuple(
+                    map(int, _SWITCHES.findall((thread / "status").read_text()))
+                )
         return cpu_seconds(pid), switches
     except OSError:
         return None

@@ -57,7 +57,9 @@ class Trained(Agent):
 def layers(parameters: int, dtype: str, value: float) -> dict[str, np.ndarray]:
     """Return `parameters` numbers, all of one value, in layers of a million."""
     sizes = [_LAYER] * (parameters // _LAYER) + [parameters % _LAYER]
-    return {f"layer.{number}": np.full(size, value, dtype) for number, size in enumerate(sizes) if size}
+    return {
+        f"layer.{number}": np.full(size, value, dtype) for number, size in enumerate(sizes) if size
+    }
 
 
 class Sessions:
@@ -71,7 +73,9 @@ class Sessions:
             agent.reset(self._obs, "act", weights="follow")
 
     def act(self, seconds: float) -> dict[str, Any]:
-        """Act for `seconds`; return the count of acts, the longest, ms, failures, and whether versions only grew."""
+        """Act for `seconds`; return the count of acts, the longest, ms, failures, and whether
+        versions only grew.
+        """
         ends = time.perf_counter() + seconds
         with ThreadPoolExecutor(len(self._agents)) as threads:
             each = list(threads.map(lambda agent: self._act(agent, ends), self._agents))
@@ -99,11 +103,12 @@ class Sessions:
 def measure_push(
     parameters: int, dtype: str, sessions: int, base_ms: float, rounds: int, seconds: float
 ) -> list[dict[str, Any]]:
-    """Return for each round the sessions' figures without and with a push, its seconds, and the node's memory.
+    """Return for each round the sessions' figures without and with a push, its seconds, and the
+    node's memory.
 
-    In a round the sessions act for `seconds` without a push, then for `seconds` with a push after the first quarter.
-    The memory is the largest decrease of available memory during the push, as a multiple of the model's bytes, without
-    the learner's own copy of the weights.
+    In a round the sessions act for `seconds` without a push, then for `seconds` with a push after
+    the first quarter. The memory is the largest decrease of available memory during the push, as a
+    multiple of the model's bytes, without the learner's own copy of the weights.
     """
     config = {"parameters": parameters, "dtype": dtype, "base_ms": base_ms}
     document = deployment("benchmarks.push:Trained", config=config, batch={"max_size": sessions})
@@ -121,7 +126,12 @@ def measure_push(
                 learner.push(values, mode="keep")
                 push_s = time.perf_counter() - begun
             size = sum(value.nbytes for value in values.values())
-            row = {"alone": alone, "push": ray.get(during), "push_s": push_s, "memory": available.taken / size}
+            row = {
+                "alone": alone,
+                "push": ray.get(during),
+                "push_s": push_s,
+                "memory": available.taken / size,
+            }
             found.append(row)
     return found
 
@@ -151,17 +161,25 @@ class _LeastAvailable:
 
 
 def _available() -> int:
-    line = next(line for line in Path("/proc/meminfo").read_text().splitlines() if line.startswith("MemAvailable"))
+    line = next(
+        line
+        for line in Path("/proc/meminfo").read_text().splitlines()
+        if line.startswith("MemAvailable")
+    )
     return int(line.split()[1]) * 1024
 
 
 def main(
     parameters: Annotated[float, typer.Option(help="Parameters of the model.")] = 30e6,
-    dtype: Annotated[str, typer.Option(help="Of numpy; float16 has as many bytes as bfloat16.")] = "float32",
+    dtype: Annotated[
+        str, typer.Option(help="Of numpy; float16 has as many bytes as bfloat16.")
+    ] = "float32",
     sessions: Annotated[int, typer.Option(min=1)] = 16,
     base_ms: Annotated[float, typer.Option(help="Time of a batch.")] = 20.0,
     rounds: Annotated[int, typer.Option(min=1)] = 5,
-    seconds: Annotated[float, typer.Option(help="For which the sessions act, without a push and with one.")] = 4.0,
+    seconds: Annotated[
+        float, typer.Option(help="For which the sessions act, without a push and with one.")
+    ] = 4.0,
     out_file: Out = None,
 ) -> None:
     """Push weights under acting sessions."""
@@ -172,7 +190,8 @@ def main(
             f"push {row['push_s']:.2f} s, memory {row['memory']:.2f} x the model; longest act "
             f"{pushed['longest_ms']:.0f} ms, without a push {alone['longest_ms']:.0f} ms; "
             f"{pushed['failed']} of {pushed['acts']} acts failed; "
-            f"versions {'only grew' if pushed['monotone'] else 'went back'}, up to {pushed['newest']}"
+            f"versions {'only grew' if pushed['monotone'] else 'went back'}, up to "
+            f"{pushed['newest']}"
         )
     for name, value in (
         ("push, s", [row["push_s"] for row in found]),

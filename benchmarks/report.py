@@ -1,4 +1,5 @@
-"""The figures of docs/measured.md: measured in one run, compared with targets, and written as Markdown.
+"""The figures of docs/measured.md: measured in one run, compared with targets, and written as
+Markdown.
 
 Figures of `python -m benchmarks.evaluation --report FILE` in the same file are also compared.
 """
@@ -50,19 +51,31 @@ def collect(
     plan: ThroughputPlan | None = None,
     progress: Callable[[str], None] = lambda _: None,
 ) -> dict[str, Any]:
-    """Measure round trips with all peers, the link if this machine can make one, and throughput, as JSON values."""
+    """Measure round trips with all peers, the link if this machine can make one, and throughput,
+    as JSON values.
+    """
     results: dict[str, Any] = {
         **measured_on(),
         "command": COMMAND,
         "skipped": {},
     }
-    results["rtt"] = measure_with_peers(calls, peers=["all"], peers_python=peers_python, progress=progress)
+    results["rtt"] = measure_with_peers(
+        calls, peers=["all"], peers_python=peers_python, progress=progress
+    )
     results["versions"] |= results["rtt"]["versions"]
     plan = plan or ThroughputPlan(peers=["all"], peers_python=peers_python)
     parts = {
-        "link": partial(link.measure_link, link_calls, peers=link.PEERS, peers_python=peers_python, progress=progress),
+        "link": partial(
+            link.measure_link,
+            link_calls,
+            peers=link.PEERS,
+            peers_python=peers_python,
+            progress=progress,
+        ),
         "throughput": partial(measure_throughput, plan, progress),
-        "without_gain": partial(measure_throughput, replace(plan, config=WITHOUT_GAIN, batch=1), progress),
+        "without_gain": partial(
+            measure_throughput, replace(plan, config=WITHOUT_GAIN, batch=1), progress
+        ),
     }
     for name, part in parts.items():
         try:
@@ -74,7 +87,9 @@ def collect(
 
 
 def write(results: Mapping[str, Any], page: Path, file: Path | None) -> None:
-    """Write the section into the page, its picture beside it, and the figures into `file` for the next time."""
+    """Write the section into the page, its picture beside it, and the figures into `file` for
+    the next time.
+    """
     if file is not None:
         file.parent.mkdir(parents=True, exist_ok=True)
         file.write_text(json.dumps(results, indent=1) + "\n")
@@ -105,7 +120,9 @@ def outcomes(results: Results) -> list[Outcome]:
         _ratio(rtt, f"{node} ({actor.partition(',')[0]})", actor, "vlagents shm", 0.20),
         _ratio(rtt, f"{shm} (shm)", "shm", "vlagents shm", 0.10),
         _ratio(rtt, f"{shm} (shm)", "shm", "openpi", 0.12),
-        _ratio(rtt, "WebSocket, JPEG at vlagents' setting (q85 4:4:4)", JPEG, "vlagents JPEG", 0.62),
+        _ratio(
+            rtt, "WebSocket, JPEG at vlagents' setting (q85 4:4:4)", JPEG, "vlagents JPEG", 0.62
+        ),
         _ratio(rtt, "WebSocket, raw", "websocket, raw", "openpi", 0.80),
         _default(rtt),
         _ratio(rtt, "HTTP, JPEG", "http, jpeg", "vlagents JPEG", 0.45),
@@ -123,8 +140,14 @@ def evaluation_outcomes(found: Results) -> list[Outcome]:
     """Return the targets of `benchmarks.evaluation`."""
     workers = found["plan"]["workers"]
     cores = min(found["cores"], workers)
-    simulator = found["plan"].get("name", "tabletop") != "tabletop"  # its steps take most of the time
-    limits = {"vlagents": float(cores), "vlagents, split": 1.0, "vla-eval": LIMIT_VLA_EVAL, "lerobot": float(cores)}
+    # Its steps take most of the time.
+    simulator = found["plan"].get("name", "tabletop") != "tabletop"
+    limits = {
+        "vlagents": float(cores),
+        "vlagents, split": 1.0,
+        "vla-eval": LIMIT_VLA_EVAL,
+        "lerobot": float(cores),
+    }
     limits |= {"vla-eval": 1.0, "lerobot": 1.0} if simulator else {}
     names = {
         "vlagents": "vlagents run-eval, one process",
@@ -149,7 +172,9 @@ def _ratio(part: Results, what: str, ours: str, theirs: str, limit: float) -> Ou
     if found is None:
         return unmeasured(what, wanted)
     low, high = found["ci95"]
-    return Outcome(what, wanted, f"{found['ratio']:.3f} ({low:.3f} to {high:.3f})", found["ratio"] <= limit)
+    return Outcome(
+        what, wanted, f"{found['ratio']:.3f} ({low:.3f} to {high:.3f})", found["ratio"] <= limit
+    )
 
 
 def _default(rtt: Results) -> Outcome:
@@ -158,13 +183,18 @@ def _default(rtt: Results) -> Outcome:
     ours, theirs = _way(rtt, DEFAULT), _way(rtt, JPEG)
     if found.met is None or ours is None or theirs is None:
         return found
-    as_good = ours["psnr_db"] is None or (theirs["psnr_db"] is not None and ours["psnr_db"] >= theirs["psnr_db"])
+    as_good = ours["psnr_db"] is None or (
+        theirs["psnr_db"] is not None and ours["psnr_db"] >= theirs["psnr_db"]
+    )
     seen = f"{found.measured}; PSNR {_decibels(ours)}, theirs {_decibels(theirs)}"
     return Outcome(found.what, f"{found.wanted}, PSNR no worse", seen, found.met and as_good)
 
 
 def _tail(rtt: Results, name: str) -> Outcome:
-    what, wanted = f"p99 over median, {name}, calls without a break", f"≤ {LIMIT_P99:g}, idle machine"
+    what, wanted = (
+        f"p99 over median, {name}, calls without a break",
+        f"≤ {LIMIT_P99:g}, idle machine",
+    )
     way = next((way for way in rtt.get("steady", ()) if way["way"] == name), None)
     if way is None:
         return unmeasured(what, wanted)
@@ -206,16 +236,22 @@ def unmeasured(what: str, wanted: str) -> Outcome:
 
 
 def replaced(text: str, section: str) -> str:
-    """Put `section` between the two markers of `text`. Raises `ConfigError` unless it has both, once."""
+    """Put `section` between the two markers of `text`. Raises `ConfigError` unless it has both,
+    once.
+    """
     before, begin, rest = text.partition(BEGIN)
     _, end, after = rest.partition(END)
     if not begin or not end or BEGIN in after or END in before + after:
-        raise ConfigError(f"the page has no single pair {BEGIN} … {END}; put it where the figures belong")
+        raise ConfigError(
+            f"the page has no single pair {BEGIN} … {END}; put it where the figures belong"
+        )
     return f"{before}{BEGIN}\n{section.strip()}\n{END}{after}"
 
 
 def section(results: Mapping[str, Any]) -> str:
-    """Return the text between the markers: targets, round trips, the link, throughput, and their origin."""
+    """Return the text between the markers: targets, round trips, the link, throughput, and their
+    origin.
+    """
     parts = [_origin(results), _targets(outcomes(results))]
     if rtt := results.get("rtt"):
         parts.append(_league(results))
@@ -223,7 +259,8 @@ def section(results: Mapping[str, Any]) -> str:
             parts.append(_use(use))
     if link := results.get("link"):
         name = (
-            f"The same over a link of {link['link']['measured_mbit_per_s']:.0f} Mbit/s between two network namespaces"
+            f"The same over a link of {link['link']['measured_mbit_per_s']:.0f} Mbit/s between "
+            "two network namespaces"
         )
         parts.append(_round_trips(name, link))
     parts += [_throughput(results[name]) for name in THROUGHPUTS if results.get(name)]
@@ -236,21 +273,28 @@ def _origin(results: Mapping[str, Any]) -> str:
     machine = results["machine"]
     versions = ", ".join(f"{name} {version}" for name, version in results["versions"].items())
     return (
-        f"Measured {results['date']} by `{results['command']}` on {machine['cpu']}, {machine['cores']} cores, "
-        f"{machine['memory_gb']} GB, Linux {machine['kernel']}, load average {machine['load']:.1f} before it began. "
-        f"{versions}. Two 224x224 RGB cameras, a policy that does nothing, all ways in turns of 100 calls in one run; "
-        f"in brackets 95 % intervals. A turn begins cold, which is most of what the p99 column shows."
+        f"Measured {results['date']} by `{results['command']}` on {machine['cpu']}, "
+        f"{machine['cores']} cores, "
+        f"{machine['memory_gb']} GB, Linux {machine['kernel']}, load average {machine['load']:.1f} "
+        "before it began. "
+        f"{versions}. Two 224x224 RGB cameras, a policy that does nothing, all ways in turns of "
+        "100 calls in one run; "
+        "in brackets 95 % intervals. A turn begins cold, which is most of what the p99 column "
+        "shows."
     )
 
 
 def _targets(lines: Sequence[Outcome]) -> str:
     return _table(
-        ("", "target", "measured", "met"), [(one.what, one.wanted, one.measured, _MET[one.met]) for one in lines]
+        ("", "target", "measured", "met"),
+        [(one.what, one.wanted, one.measured, _MET[one.met]) for one in lines],
     )
 
 
 def _league(results: Results) -> str:
-    """Return the table of all systems: round trips, and the actions of the most clients by both policies."""
+    """Return the table of all systems: round trips, and the actions of the most clients by both
+    policies.
+    """
     rtt = results["rtt"]
     found = [{way["way"]: way for way in rows_of(results.get(name) or {})} for name in THROUGHPUTS]
     theirs = {peer["way"] for peer in rtt["peers"]}
@@ -271,15 +315,25 @@ def _league(results: Results) -> str:
     for name in THROUGHPUTS:
         part = results.get(name) or {}
         head += (
-            [f"actions/s of {part['clients']}, {policy_of(part)}", "a robot waits, p50 / p99 ms"] if part else ["", ""]
+            [f"actions/s of {part['clients']}, {policy_of(part)}", "a robot waits, p50 / p99 ms"]
+            if part
+            else ["", ""]
         )
     text = "Round trips of one `act` on one machine, and the actions a second of many clients"
-    return f"![{text}]({PICTURE})\n\n{text}; *other systems* run their own servers and clients:\n\n{_table(head, rows)}"
+    return (
+        f"![{text}]({PICTURE})\n\n{text}; *other systems* run their own servers and "
+        f"clients:\n\n{_table(head, rows)}"
+    )
 
 
 def rows_of(part: Results) -> list[Results]:
-    """Return the rows of a measurement of throughput, ours and the peers', each with the name of its way."""
-    return [{"way": name, **row} for name, row in {**part.get("transports", {}), **part.get("peers", {})}.items()]
+    """Return the rows of a measurement of throughput, ours and the peers', each with the name of
+    its way.
+    """
+    return [
+        {"way": name, **row}
+        for name, row in {**part.get("transports", {}), **part.get("peers", {})}.items()
+    ]
 
 
 def policy_of(part: Results) -> str:
@@ -290,7 +344,9 @@ def policy_of(part: Results) -> str:
 
 def _rate(point: Results) -> str:
     rate = f"{point['actions_per_s']:.0f}"
-    return rate if point.get("ci95") is None else "{} ({:.0f} to {:.0f})".format(rate, *point["ci95"])
+    return (
+        rate if point.get("ci95") is None else "{} ({:.0f} to {:.0f})".format(rate, *point["ci95"])
+    )
 
 
 def _waits(row: Results) -> str:
@@ -313,28 +369,39 @@ def _round_trips(title: str, part: Mapping[str, Any]) -> str:
                 *(f"{ratios[peer]['ratio']:.2f}" if peer in ratios else "" for peer in theirs),
             )
         )
-    return f"{title}:\n\n" + _table(("", "median ms", "p99 ms", *(f"/ {peer}" for peer in theirs)), rows)
+    return f"{title}:\n\n" + _table(
+        ("", "median ms", "p99 ms", *(f"/ {peer}" for peer in theirs)), rows
+    )
 
 
 def _use(use: Results) -> str:
-    rows = [(name, *use_cells(one)) for name, one in sorted(use.items(), key=lambda one: one[1]["server"]["cpu_ms"])]
+    rows = [
+        (name, *use_cells(one))
+        for name, one in sorted(use.items(), key=lambda one: one[1]["server"]["cpu_ms"])
+    ]
     text = (
-        "CPU time of the same acts, beyond that of the idle processes, and how often a thread of client or server "
+        "CPU time of the same acts, beyond that of the idle processes, and how often a thread of "
+        "client or server "
         "waited or was preempted:"
     )
     return f"{text}\n\n{_table(('', *USE_COLUMNS), rows)}"
 
 
 def _throughput(part: Results) -> str:
-    counts = list(dict.fromkeys(point["clients"] for row in rows_of(part) for point in row["curve"]))
+    counts = list(
+        dict.fromkeys(point["clients"] for row in rows_of(part) for point in row["curve"])
+    )
     head = ("", "of the ideal", *(f"K = {k}" for k in counts), "a robot waits, p50 / p99 ms")
     rows = []
     for row in rows_of(part):
         rates = {point["clients"]: _rate(point) for point in row["curve"]}
         name = f"*{row['way']}*" if row["way"] in part.get("peers", {}) else row["way"]
-        rows.append((name, f"{row['of_ideal']:.3f}", *(rates.get(k, "") for k in counts), _waits(row)))
+        rows.append(
+            (name, f"{row['of_ideal']:.3f}", *(rates.get(k, "") for k in counts), _waits(row))
+        )
     text = (
-        f"Actions a second of one replica by K clients ({policy_of(part)}; ideal {part['ideal_actions_per_s']:.0f}, "
+        f"Actions a second of one replica by K clients ({policy_of(part)}; ideal "
+        f"{part['ideal_actions_per_s']:.0f}, "
         f"{part['ideal_is']}), and how long a robot among {part['clients'] - 1} simulations waits:"
     )
     return f"{text}\n\n{_table(head, rows)}"
@@ -367,16 +434,24 @@ def show_outcomes(lines: Sequence[Outcome]) -> None:
 
 
 def main(
-    page: Annotated[Path, typer.Option(help="Its text between the bench markers is replaced.")] = Path(
-        "docs/measured.md"
+    page: Annotated[
+        Path, typer.Option(help="Its text between the bench markers is replaced.")
+    ] = Path("docs/measured.md"),
+    file: Annotated[Path, typer.Option("--out", help="Keep the figures here.")] = Path(
+        "benchmarks/latest.json"
     ),
-    file: Annotated[Path, typer.Option("--out", help="Keep the figures here.")] = Path("benchmarks/latest.json"),
     calls: Calls = 1000,
-    seconds: Annotated[float, typer.Option(min=0.1, help="Of each measurement of the throughput.")] = 2.0,
+    seconds: Annotated[
+        float, typer.Option(min=0.1, help="Of each measurement of the throughput.")
+    ] = 2.0,
     peers_python: PeersPython = PYTHON,
-    from_json: Annotated[bool, typer.Option("--from-json", help="Measure nothing: use the figures in --out.")] = False,
+    from_json: Annotated[
+        bool, typer.Option("--from-json", help="Measure nothing: use the figures in --out.")
+    ] = False,
 ) -> None:
-    """Measure round trips, the link and throughput, and write the figures of docs/measured.md again."""
+    """Measure round trips, the link and throughput, and write the figures of docs/measured.md
+    again.
+    """
     with errors():
         if not page.is_file():
             raise ConfigError(f"--page {page}: does not exist")

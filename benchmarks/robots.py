@@ -1,8 +1,9 @@
-"""Robots that act at their rate and do nothing else: `python -m benchmarks.robots URL [TRANSPORT ROBOTS]`.
+"""Robots that act at their rate and do nothing else: `python -m benchmarks.robots URL [TRANSPORT
+ROBOTS]`.
 
-Each line that the process reads is a burst, {"robots": 12, "hz": 10, "seconds": 20}. At its end it writes each robot's
-figures. With TRANSPORT and ROBOTS, the robots connect at once: the process writes the replica of each, and then each
-line has the arguments of `ConnectedRobots.run`.
+Each line that the process reads is a burst, {"robots": 12, "hz": 10, "seconds": 20}. At its end it
+writes each robot's figures. With TRANSPORT and ROBOTS, the robots connect at once: the process
+writes the replica of each, and then each line has the arguments of `ConnectedRobots.run`.
 """
 
 from __future__ import annotations
@@ -71,11 +72,14 @@ class ConnectedRobots:
     def __init__(self, url: str, transport: str, robots: int) -> None:
         self._agents = [connect(url, transport, "jpeg", "robot") for _ in range(robots)]
         # One after another, since a server accepts only so many handshakes at once.
-        self.replicas: list[int] = [agent.reset(observation(), "measure")["pid"] for agent in self._agents]
+        self.replicas: list[int] = [
+            agent.reset(observation(), "measure")["pid"] for agent in self._agents
+        ]
         self._threads = ThreadPoolExecutor(robots)
 
     def run(self, begin: float, end: float, hz: float) -> list[float]:
-        """Act at `hz` between two moments, s of `time.monotonic`; returns the time from tick to action of each act, ms.
+        """Act at `hz` between two moments, s of `time.monotonic`; returns the time from tick to
+        action of each act, ms.
 
         A tick that passes during an act is skipped.
         """
@@ -91,7 +95,11 @@ class ConnectedRobots:
 
         phase = random.Random(os.getpid())  # other moments in each process
         ticks = [begin + phase.uniform(0, 1 / hz) for _ in self._agents]
-        return [1e3 * taken for played in self._threads.map(play, self._agents, ticks) for taken in played]
+        return [
+            1e3 * taken
+            for played in self._threads.map(play, self._agents, ticks)
+            for taken in played
+        ]
 
     def close(self) -> None:
         """Close all connections."""
@@ -108,7 +116,9 @@ def main(url: str, transport: str | None = None, robots: str = "0") -> None:
         said: Any = "ready"
         run: Callable[..., Any] = partial(burst, url)
         if transport is not None:
-            connected = stack.enter_context(contextlib.closing(ConnectedRobots(url, transport, int(robots))))
+            connected = stack.enter_context(
+                contextlib.closing(ConnectedRobots(url, transport, int(robots)))
+            )
             said, run = connected.replicas, connected.run
         print(json.dumps(said), file=out, flush=True)
         for line in sys.stdin:

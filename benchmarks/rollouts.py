@@ -1,9 +1,10 @@
-"""Steps a second of `Rollouts` against a plain loop of the same environments and policy in one process, in turns.
+"""Steps a second of `Rollouts` against a plain loop of the same environments and policy in one
+process, in turns.
 
-The loop is a learner's first program: it steps environments one after another, calls the policy once for all, and
-collects arrays. `Rollouts` steps as many environments in workers, with a server whose batches may hold all of them. One
-environment is also stepped without workers, in this process. With `--torchrl`, TorchRL's collector with its inference
-server also takes its turns.
+The loop is a learner's first program: it steps environments one after another, calls the policy
+once for all, and collects arrays. `Rollouts` steps as many environments in workers, with a server
+whose batches may hold all of them. One environment is also stepped without workers, in this
+process. With `--torchrl`, TorchRL's collector with its inference server also takes its turns.
 """
 
 from __future__ import annotations
@@ -56,7 +57,10 @@ class Tiny(Agent):
 
     def initialize(self) -> None:
         rng = np.random.default_rng(0)
-        self.layers = [rng.normal(0, size[0] ** -0.5, size).astype(np.float32) for size in ((7, 64), (64, 64), (64, 4))]
+        self.layers = [
+            rng.normal(0, size[0] ** -0.5, size).astype(np.float32)
+            for size in ((7, 64), (64, 64), (64, 4))
+        ]
 
     def act_batch(self, obs: Sequence[Obs], sessions: Sequence[Agent]) -> list[Act | Exception]:
         rows = np.array([(*one.state["xyzrpy"], one.gripper) for one in obs], np.float32)
@@ -65,8 +69,12 @@ class Tiny(Agent):
         return [Act(row) for row in rows]
 
 
-def loop(agent: Agent, num_envs: int, episodes: int, options: dict[str, Any], *, images: bool) -> float:
-    """Return the steps a second of `episodes` episodes in this process, whose arrays are kept until all are played."""
+def loop(
+    agent: Agent, num_envs: int, episodes: int, options: dict[str, Any], *, images: bool
+) -> float:
+    """Return the steps a second of `episodes` episodes in this process, whose arrays are kept
+    until all are played.
+    """
     envs = [Tabletop(**options) for _ in range(num_envs)]
     seeds, steps, begun = itertools.count(), 0, time.perf_counter()
     collected: list[list[np.ndarray]] = []
@@ -94,7 +102,8 @@ class RolloutComparison:
     policies: tuple[str, ...] = tuple(_POLICIES)
     envs: tuple[int, ...] = (1, 16, 64)  # in all, of each way
     workers: int = 2  # at most, for all environments
-    episodes: int = 64  # of each way in each round, rounded up to whole turns of the environments; a quarter if slow
+    # Of each way in each round, rounded up to whole turns of the environments; a quarter if slow.
+    episodes: int = 64
     rounds: int = 3
     patience: float = 0.5  # `batch.patience` of the server
     size: int = 224  # pixels a side
@@ -105,7 +114,9 @@ class RolloutComparison:
         if unknown := set(self.policies) - set(_POLICIES):
             raise ConfigError(f"policies: got {sorted(unknown)}, want some of {list(_POLICIES)}")
         if odd := [envs for envs in self.envs if envs % min(envs, self.workers)]:
-            raise ConfigError(f"--envs: got {odd}, want multiples of the {self.workers} workers, or 1")
+            raise ConfigError(
+                f"--envs: got {odd}, want multiples of the {self.workers} workers, or 1"
+            )
         if self.torchrl not in ("", "grouped", "processes"):
             raise ConfigError(f"--torchrl: got {self.torchrl!r}, want 'grouped' or 'processes'")
 
@@ -120,13 +131,17 @@ class RolloutComparison:
         return envs * math.ceil(episodes / envs)
 
 
-def compare_rollouts(plan: RolloutComparison, progress: Callable[[str], None] = lambda _: None) -> dict[str, Any]:
+def compare_rollouts(
+    plan: RolloutComparison, progress: Callable[[str], None] = lambda _: None
+) -> dict[str, Any]:
     """Measure each policy with each number of environments; returns plain JSON values."""
     rows = [_row(plan, policy, envs, progress) for policy in plan.policies for envs in plan.envs]
     return {"plan": asdict(plan), "cores": os.cpu_count(), "rows": rows}
 
 
-def _row(plan: RolloutComparison, policy: str, envs: int, progress: Callable[[str], None]) -> dict[str, Any]:
+def _row(
+    plan: RolloutComparison, policy: str, envs: int, progress: Callable[[str], None]
+) -> dict[str, Any]:
     name, config = _POLICIES[policy]
     make = partial(_made, name, config)
     agent, episodes = make(), plan.turn(policy, envs)
@@ -138,7 +153,9 @@ def _row(plan: RolloutComparison, policy: str, envs: int, progress: Callable[[st
         LOOP: lambda number: loop(agent, envs, number, plan.options, images=plan.images)
     }
     if plan.torchrl:
-        ways["torchrl"] = partial(torchrl_rate, plan.torchrl, policy, options=plan.options, **settings)
+        ways["torchrl"] = partial(
+            torchrl_rate, plan.torchrl, policy, options=plan.options, **settings
+        )
     with contextlib.ExitStack() as stack:
         ways[OURS] = stack.enter_context(served(name, config, plan.patience, **kept, **settings))
         if envs == 1:
@@ -153,7 +170,11 @@ def _row(plan: RolloutComparison, policy: str, envs: int, progress: Callable[[st
         "envs": envs,
         "workers": workers,
         "steps_per_s": {way: statistics.median(one[way] for one in rounds) for way in ways},
-        "of_loop": {way: statistics.median(one[way] / one[LOOP] for one in rounds) for way in ways if way != LOOP},
+        "of_loop": {
+            way: statistics.median(one[way] / one[LOOP] for one in rounds)
+            for way in ways
+            if way != LOOP
+        },
         "rounds": rounds,
     }
 
@@ -164,7 +185,9 @@ def _made(name: str, config: Mapping[str, Any]) -> Agent:
 
 
 @contextlib.contextmanager
-def served(policy: str, config: dict[str, Any], patience: float, **settings: Any) -> Iterator[Callable[[int], float]]:
+def served(
+    policy: str, config: dict[str, Any], patience: float, **settings: Any
+) -> Iterator[Callable[[int], float]]:
     """Serve the policy, and yield `collecting` with its server."""
     rows = settings["workers"] * settings["num_envs"]
     document = deployment(policy, config=config, batch={"patience": patience, "max_size": rows})
@@ -176,8 +199,12 @@ def served(policy: str, config: dict[str, Any], patience: float, **settings: Any
 
 
 @contextlib.contextmanager
-def collecting(policy: str | Callable[[], Agent], **settings: Any) -> Iterator[Callable[[int], float]]:
-    """Yield a function that returns the steps a second of n episodes of `Rollouts` with these settings."""
+def collecting(
+    policy: str | Callable[[], Agent], **settings: Any
+) -> Iterator[Callable[[int], float]]:
+    """Yield a function that returns the steps a second of n episodes of `Rollouts` with these
+    settings.
+    """
     with Rollouts(RolloutPlan("tabletop", policy, **settings)) as rollouts:
         rollouts.collect(
             4 * max(1, settings["workers"]) * settings["num_envs"]
@@ -192,11 +219,15 @@ def collecting(policy: str | Callable[[], Agent], **settings: Any) -> Iterator[C
 
 
 def torchrl_rate(layout: str, policy: str, episodes: int, **settings: Any) -> float:
-    """Return the steps a second of TorchRL's collector, measured in a new process by `rate` there."""
+    """Return the steps a second of TorchRL's collector, measured in a new process by `rate`
+    there.
+    """
     try:
         from benchmarks.torchrl_collector import rate
     except ModuleNotFoundError as error:
-        raise typer.BadParameter(f"TorchRL is not installed ({error}): pip install torchrl") from error
+        raise typer.BadParameter(
+            f"TorchRL is not installed ({error}): pip install torchrl"
+        ) from error
     slow = policy == "slow"
     name, config = _POLICIES[policy]
     settings |= {"grouped": layout == "grouped", "whole_batches": slow, "images": slow}
@@ -215,7 +246,9 @@ def rollout_outcomes(found: Mapping[str, Any]) -> list[Outcome]:
         wanted, got = _TARGETS.get((row["policy"], row["envs"]), 1.0), row["of_loop"][way]
         who = "rollouts" if way == OURS else "rollouts without Ray"
         name = f"{who}, {row['envs']} environments, the {row['policy']} policy"
-        outcomes.append(Outcome(name, f"≥ {wanted:g} x a loop in one process", f"{got:.2f}", got >= wanted))
+        outcomes.append(
+            Outcome(name, f"≥ {wanted:g} x a loop in one process", f"{got:.2f}", got >= wanted)
+        )
     return outcomes
 
 
@@ -224,11 +257,20 @@ def show_rollouts(found: Mapping[str, Any]) -> None:
     plan = found["plan"]
     ways = list(dict.fromkeys(way for row in found["rows"] for way in row["steps_per_s"]))
     rows = table(
-        "policy", "envs", "workers", *(f"{way}, steps/s" for way in ways), *(f"{way} / loop" for way in ways[1:])
+        "policy",
+        "envs",
+        "workers",
+        *(f"{way}, steps/s" for way in ways),
+        *(f"{way} / loop" for way in ways[1:]),
     )
-    rows.title = f"{plan['size']}x{plan['size']}, medians of {plan['rounds']} rounds on {found['cores']} cores"
+    rows.title = (
+        f"{plan['size']}x{plan['size']}, medians of {plan['rounds']} rounds on "
+        f"{found['cores']} cores"
+    )
     for row in found["rows"]:
-        rates = (f"{row['steps_per_s'][way]:.0f}" if way in row["steps_per_s"] else "" for way in ways)
+        rates = (
+            f"{row['steps_per_s'][way]:.0f}" if way in row["steps_per_s"] else "" for way in ways
+        )
         shares = (f"{row['of_loop'][way]:.2f}" if way in row["of_loop"] else "" for way in ways[1:])
         rows.add_row(row["policy"], str(row["envs"]), str(row["workers"]), *rates, *shares)
     out.print(rows)
@@ -236,26 +278,40 @@ def show_rollouts(found: Mapping[str, Any]) -> None:
 
 
 def main(
-    policies: Annotated[str, typer.Option(help=f"Some of {', '.join(_POLICIES)}.")] = ",".join(_POLICIES),
+    policies: Annotated[str, typer.Option(help=f"Some of {', '.join(_POLICIES)}.")] = ",".join(
+        _POLICIES
+    ),
     envs: Annotated[str, typer.Option(help="Numbers of environments.")] = "1,16,64",
     workers: Annotated[int, typer.Option(min=1, help="Workers of the rollouts, at most.")] = 2,
-    episodes: Annotated[int, typer.Option(min=4, help="Of each way in each round; a quarter if slow.")] = 64,
+    episodes: Annotated[
+        int, typer.Option(min=4, help="Of each way in each round; a quarter if slow.")
+    ] = 64,
     rounds: Annotated[int, typer.Option(min=1)] = 3,
     patience: Annotated[float, typer.Option(help="`batch.patience` of the server.")] = 0.5,
     size: Annotated[int, typer.Option(help="Pixels a side.")] = 224,
     images: Annotated[bool, typer.Option(help="Whether images are kept.")] = True,
     torchrl: Annotated[
         str,
-        typer.Option(help="TorchRL's collector too: 'grouped' in as many workers, or 'processes', one for each env."),
+        typer.Option(
+            help="TorchRL's collector too: 'grouped' in as many workers, or 'processes', one for "
+            "each env."
+        ),
     ] = "",
     out_file: Out = None,
 ) -> None:
     """Measure steps a second of each way, and their shares of the loop's."""
     with errors():
         plan = RolloutComparison(
-            tuple(parse_list(policies)), tuple(parse_counts(envs, "--envs")), workers, episodes, rounds, patience, size,
-            images, torchrl,
-        )  # fmt: skip
+            tuple(parse_list(policies)),
+            tuple(parse_counts(envs, "--envs")),
+            workers,
+            episodes,
+            rounds,
+            patience,
+            size,
+            images,
+            torchrl,
+        )
         found = compare_rollouts(plan, progress)
     show_rollouts(found)
     save(found, out_file)

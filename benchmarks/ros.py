@@ -1,8 +1,10 @@
-"""The time that topics of ROS 2 add: from an image on its topic to the action computed from it on another.
+"""The time that topics of ROS 2 add: from an image on its topic to the action computed from it on
+another.
 
-A driver publishes images with a number in their first pixel, and times the actions, which repeat it. The policy is in
-this process and computes nothing, and no tick is awaited, so the time is that of both transports, decoding, and the
-chunk player with its guard. `--link ros2` and a real rosbridge (`--link ws://…`) need rclpy.
+A driver publishes images with a number in their first pixel, and times the actions, which repeat
+it. The policy is in this process and computes nothing, and no tick is awaited, so the time is that
+of both transports, decoding, and the chunk player with its guard. `--link ros2` and a real
+rosbridge (`--link ws://…`) need rclpy.
 """
 
 from __future__ import annotations
@@ -96,8 +98,17 @@ def measure(link: str, *, compressed: bool, images: int) -> list[float]:
         address, publish = stack.enter_context(driver(link, kind, watch))
         over = threading.Event()
         stack.callback(over.set)
-        action = {"topic": COMMANDS, "type": "std_msgs/msg/Float64MultiArray", "numbers": 1, "stop": "nothing"}
-        stated = {"link": address, "cameras": {"front": {"topic": IMAGE, "type": kind}}, "actions": [action]}
+        action = {
+            "topic": COMMANDS,
+            "type": "std_msgs/msg/Float64MultiArray",
+            "numbers": 1,
+            "stop": "nothing",
+        }
+        stated = {
+            "link": address,
+            "cameras": {"front": {"topic": IMAGE, "type": kind}},
+            "actions": [action],
+        }
         settings = settings_from({**stated, "max_age_s": 60.0, "silent_s": 60.0}, "benchmark")
         begin = threading.Thread(target=_publish_until, args=(publish, compressed, over))
         begin.start()
@@ -142,7 +153,9 @@ def _act_on_each(robot: RosRobot, player: ChunkPlayer, done: threading.Event) ->
 def main() -> None:
     """Measure each kind of image, and print a row for each."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--link", default="double", help="double, ros2, or the address of a rosbridge beside ROS 2")
+    parser.add_argument(
+        "--link", default="double", help="double, ros2, or the address of a rosbridge beside ROS 2"
+    )
     parser.add_argument("--images", type=int, default=300)
     options = parser.parse_args()
     print(f"{'link':<24}{'images':<12}{'n':>5}{'p10 ms':>9}{'p50 ms':>9}{'p99 ms':>9}{'lost':>6}")  # noqa: T201
@@ -152,7 +165,8 @@ def main() -> None:
         p10, p50, p99 = np.percentile(took, [10, 50, 99])
         lost = options.images - len(took)
         print(  # noqa: T201
-            f"{options.link:<24}{name:<12}{len(took):>5}{p10:>9.2f}{p50:>9.2f}{p99:>9.2f}{lost:>6}", flush=True
+            f"{options.link:<24}{name:<12}{len(took):>5}{p10:>9.2f}{p50:>9.2f}{p99:>9.2f}{lost:>6}",
+            flush=True,
         )
 
 

@@ -1,10 +1,11 @@
 """Round trips of one `act` by every transport, interleaved in one run.
 
-The observation is that of the paper's measurement: two 224x224 RGB cameras and seven joints. All clients take turns in
-short rounds, in a new random order each time, so that other load on the machine affects them alike. Every client is a
-process (those that need Ray, an actor); every server stays up, and idles between its turns. So each turn begins cold,
-which the 99th percentile shows; at the end the clients on the node also make calls without a break. CPU time and
-context switches of client and server are counted around each turn.
+The observation is that of the paper's measurement: two 224x224 RGB cameras and seven joints. All
+clients take turns in short rounds, in a new random order each time, so that other load on the
+machine affects them alike. Every client is a process (those that need Ray, an actor); every server
+stays up, and idles between its turns. So each turn begins cold, which the 99th percentile shows; at
+the end the clients on the node also make calls without a break. CPU time and context switches of
+client and server are counted around each turn.
 """
 
 from __future__ import annotations
@@ -37,13 +38,15 @@ ROUND = 100  # calls of one client in its turn
 UNBROKEN = 200  # rounds' worth of calls without a break: a second or two
 ON_NODE = ("shm", "plasma")
 
-StartClient = Callable[[Path], AbstractContextManager[ProcessDriver]]  # given the file of the observation
+# Given the file of the observation.
+StartClient = Callable[[Path], AbstractContextManager[ProcessDriver]]
 
 
 class MeasuredNoop(Noop):
     """The policy of the round trips: `reset` also returns the loss of the images' codec.
 
-    The loss is {"psnr_db"}: of the cameras, against the observation of the benchmark; None if they are equal.
+    The loss is {"psnr_db"}: of the cameras, against the observation of the benchmark; None if they
+    are equal.
     """
 
     def reset(self, obs: Obs, instruction: str | None, **kwargs: Any) -> dict[str, Any]:
@@ -58,12 +61,16 @@ class RoundTripsOfAll:
     theirs: tuple[RoundTrips, ...] = ()
     skipped: Mapping[str, str] = field(default_factory=dict)
     steady: tuple[RoundTrips, ...] = ()  # of clients on the node, each without a break
-    psnr_db: Mapping[str, float | None] = field(default_factory=dict)  # of the images, by client; None: lossless
-    use: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)  # of an act: `MeteredDriver.per_act`, by client
+    # Of the images, by client; None: lossless.
+    psnr_db: Mapping[str, float | None] = field(default_factory=dict)
+    # Of an act: `MeteredDriver.per_act`, by client.
+    use: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
 
     def to_json(self) -> dict[str, Any]:
         return {
-            "ways": [{**trips.to_json(), "psnr_db": self.psnr_db.get(trips.name)} for trips in self.ours],
+            "ways": [
+                {**trips.to_json(), "psnr_db": self.psnr_db.get(trips.name)} for trips in self.ours
+            ],
             "peers": [trips.to_json() for trips in self.theirs],
             "ratios": ratios(self.ours, self.theirs),
             "steady": [trips.to_json() for trips in self.steady],
@@ -97,12 +104,19 @@ class MeteredDriver:
 
     def per_act(self) -> dict[str, Any]:
         """Return the use of client and server for each act so far, as `UsageMeter.per_act` does."""
-        return {"client": self.client.per_act(self._acts), "server": self.server.per_act(self._acts)}
+        return {
+            "client": self.client.per_act(self._acts),
+            "server": self.server.per_act(self._acts),
+        }
 
 
 def metered(drivers: Mapping[str, ProcessDriver]) -> dict[str, MeteredDriver]:
-    """Count what the acts of ready drivers use beyond the use of the same processes while all are idle."""
-    others = [pid for one in drivers.values() for pid in (one.pid, one.server_pid) if pid is not None]
+    """Count what the acts of ready drivers use beyond the use of the same processes while all
+    are idle.
+    """
+    others = [
+        pid for one in drivers.values() for pid in (one.pid, one.server_pid) if pid is not None
+    ]
     ours = server_processes(os.getpid(), others)
     found = {}
     for name, one in drivers.items():
@@ -133,7 +147,9 @@ def measure(
         for name, start in others.items():  # before Ray, whose start takes longest
             drivers[name] = stack.enter_context(start(obs))
         # Without keys: a host other than loopback is one end of a link that only this run uses.
-        server = stack.enter_context(running_server(deployment(POLICY), host=host, insecure=host != LOOPBACK))
+        server = stack.enter_context(
+            running_server(deployment(POLICY), host=host, insecure=host != LOOPBACK)
+        )
         [(app, url)] = server.apps.items()
         for one in own:
             drivers[one.name] = stack.enter_context(connected(one, url, app, prefix))
@@ -144,7 +160,9 @@ def measure(
         found = in_turns(meters, calls, progress)
         use = {name: one.per_act() for name, one in meters.items()}
         steady = [
-            RoundTrips(one.name, np.array([drivers[one.name].measure(UNBROKEN * min(ROUND, calls))]))
+            RoundTrips(
+                one.name, np.array([drivers[one.name].measure(UNBROKEN * min(ROUND, calls))])
+            )
             for one in own
             if one.transport in ON_NODE
         ]
@@ -158,8 +176,12 @@ def measure(
     )
 
 
-def in_turns(drivers: Mapping[str, Driver], calls: int, progress: Callable[[str], None]) -> dict[str, RoundTrips]:
-    """Run turns of at most 100 calls until all clients have made `calls`, in a new random order each time."""
+def in_turns(
+    drivers: Mapping[str, Driver], calls: int, progress: Callable[[str], None]
+) -> dict[str, RoundTrips]:
+    """Run turns of at most 100 calls until all clients have made `calls`, in a new random order
+    each time.
+    """
     each = min(ROUND, calls)
     rounds = -(-calls // each)
     taken: dict[str, list[list[float]]] = {name: [] for name in drivers}

@@ -1,4 +1,6 @@
-"""Round trips and CPU time of one `act`: our transports, and other policy servers (`peers`), in turns in one run."""
+"""Round trips and CPU time of one `act`: our transports, and other policy servers (`peers`), in
+turns in one run.
+"""
 
 from __future__ import annotations
 
@@ -29,17 +31,21 @@ def measure_with_peers(
 
     Args:
         calls: Round trips of each client.
-        peers: Names of `peers.PEERS`, or "all"; one that is not installed is in "skipped", with the cure.
+        peers: Names of `peers.PEERS`, or "all"; one that is not installed is in "skipped", with the
+            cure.
         peers_python: The Python in which they are installed.
         transports: Of ours; by default all.
         progress: Is called with lines of progress.
 
     Returns:
-        The result of `benchmarks.round_trips.measure(...).to_json()`, and the "versions" of the peers' packages.
+        The result of `benchmarks.round_trips.measure(...).to_json()`, and the "versions" of the
+        peers' packages.
     """
     own, skipped = own_clients(transports)
     found, absent, versions = others.peer_clients(peers, peers_python)
-    trips = measure(own, calls, progress, others=others.starters(found, peers_python), skipped=skipped | absent)
+    trips = measure(
+        own, calls, progress, others=others.starters(found, peers_python), skipped=skipped | absent
+    )
     return trips.to_json() | {"versions": versions}
 
 
@@ -50,13 +56,18 @@ def main(
     peers_python: others.PeersPython = others.PYTHON,
     out_file: Out = None,
 ) -> None:
-    """Measure round trips and CPU time of acts on this machine: every transport, and other policy servers, in turns."""
+    """Measure round trips and CPU time of acts on this machine: every transport, and other
+    policy servers, in turns.
+    """
     with errors():
         origin = measured_on("python -m benchmarks.rtt")
         found = measure_with_peers(
-            calls, peers=parse_list(peers), peers_python=peers_python, transports=parse_list(transports),
+            calls,
+            peers=parse_list(peers),
+            peers_python=peers_python,
+            transports=parse_list(transports),
             progress=progress,
-        )  # fmt: skip
+        )
         show_round_trips(found, "round trip of one act on this machine")
         show_use(found)
         save({**origin, **found, "versions": origin["versions"] | found["versions"]}, out_file)

@@ -1,12 +1,14 @@
-"""A cluster of many workers on paper: which part saturates first, by the costs that `benchmarks.scaling` has measured.
+"""A cluster of many workers on paper: which part saturates first, by the costs that
+`benchmarks.scaling` has measured.
 
     python -m benchmarks.scaling --out scaling.json
     python -m benchmarks.saturation scaling.json --workers 1000
 
-Each part has a load that grows with the workers, and a capacity. Loads of Ray's daemons on the head and of the driver
-are the measured ones, extended as a line, but the driver queries no more than `QUERIES_PER_S` workers a second. Those
-of replicas and of learners' images follow from sizes and times. Nothing is simulated: where a load does not grow as a
-line, as in a full network, it is higher than stated.
+Each part has a load that grows with the workers, and a capacity. Loads of Ray's daemons on the head
+and of the driver are the measured ones, extended as a line, but the driver queries no more than
+`QUERIES_PER_S` workers a second. Those of replicas and of learners' images follow from sizes and
+times. Nothing is simulated: where a load does not grow as a line, as in a full network, it is
+higher than stated.
 """
 
 from __future__ import annotations
@@ -30,11 +32,15 @@ _BYTES_PER_MBIT = 1e6 / 8
 ANSWERS = {
     "driver": "several drivers share a plan, and `merge` combines their results",
     "database": "the same: each driver has its own",
-    "gcs_server": "episodes are handed out by calls from the driver to the actor, which do not pass it",
+    "gcs_server": (
+        "episodes are handed out by calls from the driver to the actor, which do not pass it"
+    ),
     "ServeController": "acts do not pass it: a worker talks to its replica; fewer, larger replicas",
     "replicas": "replicas grow with the workers; longer chunks, larger batches",
     "head's link": "observations stay on their node; only jobs and results pass",
-    "learner's link": "`images=False`; a learner of images takes fewer workers, each on a faster link",
+    "learner's link": (
+        "`images=False`; a learner of images takes fewer workers, each on a faster link"
+    ),
 }
 
 
@@ -68,7 +74,9 @@ class Part:
     each: float
 
     def row(self, workers: int) -> dict[str, Any]:
-        """Return the load with these workers, and the number that saturates the part; None: no number does."""
+        """Return the load with these workers, and the number that saturates the part; None: no
+        number does.
+        """
         saturates = (1 - self.base) / self.each if self.each > 0 else None
         load = self.base + self.each * workers
         return {**asdict(self), "load": load, "saturates": saturates, "answer": ANSWERS[self.name]}
@@ -87,7 +95,9 @@ def parts(scaling: Mapping[str, Any], load: Load) -> list[dict[str, Any]]:
     cluster = scaling["clusters"][-1]
     rows = [row for row in cluster["rows"] if row["app"] == OWN]
     if len(rows) < 2:
-        raise ConfigError("scaling: got one number of workers, want two on the last cluster: --workers 1,16")
+        raise ConfigError(
+            "scaling: got one number of workers, want two on the last cluster: --workers 1,16"
+        )
     costs, flooded = scaling["driver"]["costs_ms"], scaling["driver"]["flooded"]
     watched = min(load.workers, QUERIES_PER_S * WATCH_S)  # a second
     each_ms = (costs["episode"] + costs["step"] * load.steps) / load.episode_s
@@ -95,13 +105,29 @@ def parts(scaling: Mapping[str, Any], load: Load) -> list[dict[str, Any]]:
     batches = load.batch * load.replicas
     found = [
         Part("driver", "one core", base_ms / 1e3, each_ms / 1e3),
-        Part("database", "the driver's episodes/s, flooded", 0.0, 1 / load.episode_s / flooded["episodes_per_s"]),
-        Part("replicas", f"{load.replicas} replicas", 0.0, load.acts_per_s * load.act_ms / 1e3 / batches),
         Part(
-            "learner's link", f"{load.mbit:g} Mbit/s", 0.0,
-            load.cameras * IMAGE_BYTES * load.steps / load.episode_s / (load.mbit * _BYTES_PER_MBIT),
+            "database",
+            "the driver's episodes/s, flooded",
+            0.0,
+            1 / load.episode_s / flooded["episodes_per_s"],
         ),
-    ]  # fmt: skip
+        Part(
+            "replicas",
+            f"{load.replicas} replicas",
+            0.0,
+            load.acts_per_s * load.act_ms / 1e3 / batches,
+        ),
+        Part(
+            "learner's link",
+            f"{load.mbit:g} Mbit/s",
+            0.0,
+            load.cameras
+            * IMAGE_BYTES
+            * load.steps
+            / load.episode_s
+            / (load.mbit * _BYTES_PER_MBIT),
+        ),
+    ]
     workers = [row["workers"] for row in rows]
     for daemon in ("gcs_server", "ServeController"):
         each, base = np.polyfit(workers, [row["daemon_shares"][daemon] for row in rows], 1)
@@ -115,9 +141,16 @@ def parts(scaling: Mapping[str, Any], load: Load) -> list[dict[str, Any]]:
 
 def show_parts(rows: list[dict[str, Any]], load: Load) -> None:
     """Print a row for each part."""
-    grid = table("part", "capacity", f"load at {load.workers}", "saturated by workers", "what the design does")
+    grid = table(
+        "part",
+        "capacity",
+        f"load at {load.workers}",
+        "saturated by workers",
+        "what the design does",
+    )
     grid.title = (
-        f"{load.workers} workers, episodes of {load.episode_s:g} s and {load.steps} steps, chunks of {load.chunk}, "
+        f"{load.workers} workers, episodes of {load.episode_s:g} s and {load.steps} steps, chunks "
+        f"of {load.chunk}, "
         f"batches of {load.batch} in {load.act_ms:g} ms"
     )
     for row in rows:
@@ -127,7 +160,9 @@ def show_parts(rows: list[dict[str, Any]], load: Load) -> None:
 
 
 def main(
-    scaling: Annotated[Path, typer.Argument(help="The figures of `python -m benchmarks.scaling --out`.")],
+    scaling: Annotated[
+        Path, typer.Argument(help="The figures of `python -m benchmarks.scaling --out`.")
+    ],
     workers: Annotated[int, typer.Option(min=1)] = 1000,
     steps: Annotated[int, typer.Option(min=1, help="Of an episode.")] = 250,
     episode_s: Annotated[float, typer.Option(min=0.1, help="Its length.")] = 30.0,

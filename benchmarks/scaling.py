@@ -1,14 +1,16 @@
 """Scaling of episodes a minute with the number of workers, and the capacity of one driver.
 
-Environment and policy sleep, so that many workers run on few cores and only the overhead is measured. On clusters of
-one to three hosts (`benchmarks.hosts`), or on a running one, evaluations with increasing numbers of workers take turns
-with one of a single worker; the rate is that while all were playing, so that their start does not count. Every node has
-a replica for each of its workers, so that none waits for another's batch. Links between the hosts have the given rate
-and delay, and the bytes that hosts send are counted, from the begin of an evaluation to its end. On the first cluster,
-all workers also share one replica a node, with single actions and with chunks.
+Environment and policy sleep, so that many workers run on few cores and only the overhead is
+measured. On clusters of one to three hosts (`benchmarks.hosts`), or on a running one, evaluations
+with increasing numbers of workers take turns with one of a single worker; the rate is that while
+all were playing, so that their start does not count. Every node has a replica for each of its
+workers, so that none waits for another's batch. Links between the hosts have the given rate and
+delay, and the bytes that hosts send are counted, from the begin of an evaluation to its end. On the
+first cluster, all workers also share one replica a node, with single actions and with chunks.
 
-The driver is measured by short evaluations with steps, episodes and workers in different proportions. Its CPU time is
-fitted by the costs of an episode, a step, and a second of a busy worker.
+The driver is measured by short evaluations with steps, episodes and workers in different
+proportions. Its CPU time is fitted by the costs of an episode, a step, and a second of a busy
+worker.
 """
 
 from __future__ import annotations
@@ -36,7 +38,8 @@ from vlagents_ray.cli.console import errors, out, progress, table
 from vlagents_ray.errors import ConfigError
 from vlagents_ray_cluster.tune.line_process import LineProcess, our_environment
 
-OWN, SHARED, CHUNKS = "own", "shared", "chunks"  # applications: a replica a worker; one a node, acts and chunks
+# applications: a replica a worker; one a node, acts and chunks.
+OWN, SHARED, CHUNKS = "own", "shared", "chunks"
 CHUNK = 8  # rows
 IMAGE_BYTES = 224 * 224 * 3  # of each act's observation
 _START_S = 300.0
@@ -49,7 +52,9 @@ _COST_S = 5.0
 
 @dataclass(frozen=True, slots=True)
 class ScalingPlan:
-    """The evaluations of `measure_scaling`. The times are near those of a simulator and a VLA on a GPU."""
+    """The evaluations of `measure_scaling`. The times are near those of a simulator and a VLA on
+    a GPU.
+    """
 
     workers: tuple[int, ...] = (1, 2, 4, 8, 16)
     nodes: tuple[int, ...] = (1, 2, 3)  # sizes of clusters; ignored on a running one
@@ -63,7 +68,9 @@ class ScalingPlan:
 
     def __post_init__(self) -> None:
         if self.workers[0] != 1 or list(self.workers) != sorted(set(self.workers)):
-            raise ConfigError(f"workers: got {list(self.workers)}, want ascending numbers from 1 on")
+            raise ConfigError(
+                f"workers: got {list(self.workers)}, want ascending numbers from 1 on"
+            )
 
     @property
     def most(self) -> int:
@@ -92,7 +99,9 @@ def measure_scaling(
     for nodes in clusters:
         shared = nodes == clusters[0]
         with driving(plan, nodes, address, shared=shared) as (driver, size, made):
-            found["clusters"].append(measure_cluster(plan, size, driver, progress, made, shared=shared))
+            found["clusters"].append(
+                measure_cluster(plan, size, driver, progress, made, shared=shared)
+            )
             if nodes == clusters[-1]:
                 progress("the driver's costs")
                 found["driver"] = _driver_costs(plan, driver)
@@ -103,7 +112,8 @@ def measure_scaling(
 def driving(
     plan: ScalingPlan, nodes: int, address: str | None = None, *, shared: bool = False
 ) -> Iterator[tuple[LineProcess, int, Sequence[Host]]]:
-    """Start a driver and its policies on `nodes` hosts or at `address`; yields it, the nodes' number, and the hosts.
+    """Start a driver and its policies on `nodes` hosts or at `address`; yields it, the nodes'
+    number, and the hosts.
 
     `shared` adds the policies of workers that share a replica.
     """
@@ -125,7 +135,9 @@ def driving(
                 link.set(Conditions(plan.delay_ms, mbit=plan.mbit))
             # Ray's workers would wait for other processes here; our own server sets the same.
             environment = our_environment() | {"RAY_worker_niceness": "0"}
-            cluster = stack.enter_context(ray_cluster(made, slots, environment, resources=resources))
+            cluster = stack.enter_context(
+                ray_cluster(made, slots, environment, resources=resources)
+            )
             address, start = cluster.address, cluster.head.command
         settings = {
             "address": address,
@@ -146,7 +158,8 @@ def measure_cluster(
     *,
     shared: bool = False,
 ) -> dict[str, Any]:
-    """Measure rates by number of workers, in rounds that play each once; `shared` adds workers that share a replica.
+    """Measure rates by number of workers, in rounds that play each once; `shared` adds workers that
+    share a replica.
 
     `made` are the hosts whose traffic is counted.
     """
@@ -167,25 +180,38 @@ def measure_cluster(
                 f"{one.rate:.1f} episodes/min, {one.wall_s:.1f} s"
             )
     single = [one.rate for one in played[OWN, 1]]
-    return {"nodes": nodes, "rows": [row(plan, app, workers, played[app, workers], single) for app, workers in kinds]}
+    return {
+        "nodes": nodes,
+        "rows": [row(plan, app, workers, played[app, workers], single) for app, workers in kinds],
+    }
 
 
 def row(
-    plan: ScalingPlan, app: str, workers: int, played: Sequence[PlayedEpisodes], single: Sequence[float]
+    plan: ScalingPlan,
+    app: str,
+    workers: int,
+    played: Sequence[PlayedEpisodes],
+    single: Sequence[float],
 ) -> dict[str, Any]:
     """Compute medians over rounds; `single` has the episodes of one worker in the same rounds.
 
-    Linear is that many times the single worker of the round; with chunks, which no single worker played, the rate that
-    the sleeps alone allow.
+    Linear is that many times the single worker of the round; with chunks, which no single worker
+    played, the rate that the sleeps alone allow.
     """
     rates = [one.rate for one in played]
     sent = [one.sent_bytes / one.acts for one in played if one.sent_bytes is not None]
-    linear = [workers * each for each in single] if app != CHUNKS else [plan.ideal(workers, app)] * len(rates)
+    linear = (
+        [workers * each for each in single]
+        if app != CHUNKS
+        else [plan.ideal(workers, app)] * len(rates)
+    )
     return {
         "app": app,
         "workers": workers,
         "episodes_per_minute": statistics.median(rates),
-        "of_linear": statistics.median(rate / each for rate, each in zip(rates, linear, strict=True)),
+        "of_linear": statistics.median(
+            rate / each for rate, each in zip(rates, linear, strict=True)
+        ),
         "of_ideal": statistics.median(rates) / plan.ideal(workers, app),
         "wall_s": statistics.median(one.wall_s for one in played),
         "failures": sum(one.failures for one in played),
@@ -194,7 +220,8 @@ def row(
         "sent_bytes_per_act": statistics.median(sent) if sent else None,
         "driver_share": statistics.median(one.driver_s / one.span_s for one in played),
         "daemon_shares": {
-            name: statistics.median(one.daemons_s[name] / one.span_s for one in played) for name in played[0].daemons_s
+            name: statistics.median(one.daemons_s[name] / one.span_s for one in played)
+            for name in played[0].daemons_s
         },
         "rounds": rates,
     }
@@ -223,15 +250,18 @@ def _driver_costs(plan: ScalingPlan, driver: LineProcess) -> dict[str, Any]:
             "driver_share": busy.driver_s / busy.span_s,
             "driver_ms_per_episode": 1e3 * busy.driver_s / busy.episodes,
         },
-        "saturated_workers": {f"{seconds:g}": saturation(costs, seconds, 250) for seconds in (3.0, 30.0, 300.0)},
+        "saturated_workers": {
+            f"{seconds:g}": saturation(costs, seconds, 250) for seconds in (3.0, 30.0, 300.0)
+        },
     }
 
 
 def fit(rounds: Sequence[ScalingRound], played: Sequence[PlayedEpisodes]) -> dict[str, float]:
-    """Fit the CPU time of a driver, ms, for an episode, a step, a second of each worker, and a second.
+    """Fit the CPU time of a driver, ms, for an episode, a step, a second of each worker, and a
+    second.
 
-    By least squares of relative errors, so that short rounds count as much as long ones. A cost below 0 is left out,
-    and the others are fitted without it.
+    By least squares of relative errors, so that short rounds count as much as long ones. A cost
+    below 0 is left out, and the others are fitted without it.
     """
     names = ["episode", "step", "worker_second", "second"]
     causes = np.array(
@@ -274,12 +304,19 @@ def show_scaling(found: Mapping[str, Any]) -> None:
     )
     rows.title = (
         f"{plan['steps']} steps of {plan['step_ms']:g} ms, policy {plan['policy_ms']:g} ms, "
-        f"medians of {plan['rounds']} rounds on {found['cores']} cores, links of {plan['mbit']:g} Mbit/s and "
-        f"{plan['delay_ms']:g} ms; near: workers on a replica's node; an act's image has {IMAGE_BYTES} bytes"
+        f"medians of {plan['rounds']} rounds on {found['cores']} cores, links of {plan['mbit']:g} "
+        "Mbit/s and "
+        f"{plan['delay_ms']:g} ms; near: workers on a replica's node; an act's image has "
+        f"{IMAGE_BYTES} bytes"
     )
     for cluster in found["clusters"]:
         for row in cluster["rows"]:
-            counts = (str(cluster["nodes"]), str(row["workers"]), row["app"], f"{row['episodes_per_minute']:.1f}")
+            counts = (
+                str(cluster["nodes"]),
+                str(row["workers"]),
+                row["app"],
+                f"{row['episodes_per_minute']:.1f}",
+            )
             ratios = (f"{row['of_linear']:.3f}", f"{row['of_ideal']:.3f}", f"{row['wall_s']:.1f}")
             sent = "" if row["sent_bytes_per_act"] is None else f"{row['sent_bytes_per_act']:.0f}"
             rows.add_row(*counts, *ratios, ", ".join(row["transports"]), f"{row['near']:.0%}", sent)
@@ -291,37 +328,57 @@ def show_driver(found: Mapping[str, Any]) -> None:
     """Print the driver's costs, and its capacity in workers."""
     costs, flooded = found["costs_ms"], found["flooded"]
     out.print(
-        f"the driver's CPU time: {costs['episode']:.2f} ms an episode, {costs['step'] * 1e3:.1f} µs a step, "
-        f"{costs['worker_second']:.2f} ms a second for each worker, {costs['second']:.1f} ms a second at all\n"
+        f"the driver's CPU time: {costs['episode']:.2f} ms an episode, {costs['step'] * 1e3:.1f} "
+        "µs a step, "
+        f"{costs['worker_second']:.2f} ms a second for each worker, {costs['second']:.1f} ms a "
+        "second at all\n"
         f"flooded by {flooded['workers']} workers: {flooded['episodes_per_s']:.0f} episodes/s, "
-        f"{flooded['driver_ms_per_episode']:.2f} ms each, {100 * flooded['driver_share']:.0f} % of a core",
+        f"{flooded['driver_ms_per_episode']:.2f} ms each, {100 * flooded['driver_share']:.0f} % of "
+        "a core",
     )
     for seconds, workers in found["saturated_workers"].items():
         out.print(f"episodes of {seconds} s: one driver is saturated by {workers:.0f} workers")
 
 
 def main(
-    workers: Annotated[str, typer.Option(help="Numbers of workers, ascending from 1.")] = "1,2,4,8,16",
-    nodes: Annotated[str, typer.Option(help="Sizes of the clusters, of hosts that are made on this machine.")] = (
-        "1,2,3"
-    ),
+    workers: Annotated[
+        str, typer.Option(help="Numbers of workers, ascending from 1.")
+    ] = "1,2,4,8,16",
+    nodes: Annotated[
+        str, typer.Option(help="Sizes of the clusters, of hosts that are made on this machine.")
+    ] = ("1,2,3"),
     rounds: Annotated[int, typer.Option(min=1)] = 3,
-    step_ms: Annotated[float, typer.Option(min=0, help="Each step of the environment sleeps so long.")] = 20.0,
+    step_ms: Annotated[
+        float, typer.Option(min=0, help="Each step of the environment sleeps so long.")
+    ] = 20.0,
     policy_ms: Annotated[float, typer.Option(min=0, help="And each batch of the policy.")] = 50.0,
-    seconds: Annotated[float, typer.Option(min=0.1, help="That all workers play together, about.")] = 8.0,
-    mbit: Annotated[float, typer.Option(min=1, help="Mbit/s of a link between two hosts that are made.")] = 1000.0,
+    seconds: Annotated[
+        float, typer.Option(min=0.1, help="That all workers play together, about.")
+    ] = 8.0,
+    mbit: Annotated[
+        float, typer.Option(min=1, help="Mbit/s of a link between two hosts that are made.")
+    ] = 1000.0,
     delay_ms: Annotated[float, typer.Option(min=0, help="Of such a link, each way.")] = 5.0,
     address: Annotated[
-        str | None, typer.Option(help="A running Ray cluster in place of those hosts; they want root.")
+        str | None,
+        typer.Option(help="A running Ray cluster in place of those hosts; they want root."),
     ] = None,
     out_file: Out = None,
 ) -> None:
-    """Measure episodes a minute by the number of workers and nodes, and the cost of the evaluation's driver."""
+    """Measure episodes a minute by the number of workers and nodes, and the cost of the
+    evaluation's driver.
+    """
     with errors():
         plan = ScalingPlan(
-            workers=tuple(parse_counts(workers, "--workers")), nodes=tuple(parse_counts(nodes, "--nodes")),
-            rounds=rounds, step_ms=step_ms, policy_ms=policy_ms, seconds=seconds, mbit=mbit, delay_ms=delay_ms,
-        )  # fmt: skip
+            workers=tuple(parse_counts(workers, "--workers")),
+            nodes=tuple(parse_counts(nodes, "--nodes")),
+            rounds=rounds,
+            step_ms=step_ms,
+            policy_ms=policy_ms,
+            seconds=seconds,
+            mbit=mbit,
+            delay_ms=delay_ms,
+        )
         found = measure_scaling(plan, address, progress)
     show_scaling(found)
     show_driver(found["driver"])

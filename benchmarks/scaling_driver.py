@@ -1,8 +1,10 @@
-"""The driver of `bench scaling`, a process at the cluster's head: `python -m benchmarks.scaling_driver JSON`.
+"""The driver of `bench scaling`, a process at the cluster's head: `python -m
+benchmarks.scaling_driver JSON`.
 
-It serves policies that sleep, writes a line of JSON when they are ready, and answers each `ScalingRound`, a line of
-JSON, with a `PlayedEpisodes`. Like `vlagents-ray eval`, it is Serve's client and the evaluation's driver in one
-process, so that its CPU time, over all threads, is a driver's.
+It serves policies that sleep, writes a line of JSON when they are ready, and answers each
+`ScalingRound`, a line of JSON, with a `PlayedEpisodes`. Like `vlagents-ray eval`, it is Serve's
+client and the evaluation's driver in one process, so that its CPU time, over all threads, is a
+driver's.
 """
 
 from __future__ import annotations
@@ -21,7 +23,15 @@ from typing import Any, NamedTuple
 from benchmarks.environments import ACTION_DIM, SLEEPING_ENV
 from benchmarks.overhead import recorded, steady
 from benchmarks.processes import cpu_seconds, program
-from vlagents_ray.evaluate import EvalConfig, PolicyConfig, Progress, Results, SuiteConfig, WorkerConfig, evaluate
+from vlagents_ray.evaluate import (
+    EvalConfig,
+    PolicyConfig,
+    Progress,
+    Results,
+    SuiteConfig,
+    WorkerConfig,
+    evaluate,
+)
 from vlagents_ray.evaluate.episode.records import EpisodeResult
 from vlagents_ray.evaluate.plan.cases import EvalCase
 from vlagents_ray.policies.noop import Noop, NoopConfig
@@ -65,7 +75,8 @@ class ScalingRound:
 class PlayedEpisodes(NamedTuple):
     """The figures of a `ScalingRound`."""
 
-    episodes_per_minute: float | None  # while all workers were playing; None with a policy in their own processes
+    # While all workers were playing; None with a policy in their own processes.
+    episodes_per_minute: float | None
     wall_s: float  # of the whole evaluation, start of the workers included
     transports: list[str]
     failures: int  # attempts
@@ -77,7 +88,8 @@ class PlayedEpisodes(NamedTuple):
     daemons_s: dict[str, float]  # and of Ray's on this node
     near: float = 1.0  # share of the workers whose observations do not leave their node
     acts: int = 1  # of all recorded episodes
-    sent_bytes: int | None = None  # by all hosts to others, start of the workers included; None: not counted
+    # By all hosts to others, start of the workers included; None: not counted.
+    sent_bytes: int | None = None
 
     @property
     def rate(self) -> float:
@@ -106,12 +118,18 @@ class ScalingLedger(Progress):
 
 
 def play(one: ScalingRound, out: Path) -> PlayedEpisodes:
-    """Play a round; `out` is a new folder. Raises `EnvFailed` if its workers were never all playing."""
+    """Play a round; `out` is a new folder. Raises `EnvFailed` if its workers were never all
+    playing.
+    """
     policy = PolicyConfig(name="noop", url=None if one.app is None else f"serve://{one.app}")
     options: dict[str, Any] = {"step_ms": one.step_ms, "max_steps": one.steps, "size": one.size}
     config = EvalConfig(
         policies=[policy],
-        suites=[SuiteConfig(envs=[SLEEPING_ENV], env_options=options, episodes=one.workers * one.episodes)],
+        suites=[
+            SuiteConfig(
+                envs=[SLEEPING_ENV], env_options=options, episodes=one.workers * one.episodes
+            )
+        ],
         workers=one.workers,
         worker=WorkerConfig(cpus=1.0),  # one worker for each CPU of a node
         video="none",
@@ -159,9 +177,17 @@ def main() -> None:
     out = own_stdout()
     settings = json.loads(sys.argv[1])
     fleets = {app: Fleet(**fleet) for app, fleet in settings["fleets"].items()}
-    parts = {app: deployment("noop", **fleet.args(app, settings["policy_ms"])) for app, fleet in fleets.items()}
-    with running_server(together(parts), address=settings["address"]), tempfile.TemporaryDirectory() as top:
-        print(json.dumps({"nodes": sum(node["Alive"] for node in ray.nodes())}), file=out, flush=True)
+    parts = {
+        app: deployment("noop", **fleet.args(app, settings["policy_ms"]))
+        for app, fleet in fleets.items()
+    }
+    with (
+        running_server(together(parts), address=settings["address"]),
+        tempfile.TemporaryDirectory() as top,
+    ):
+        print(
+            json.dumps({"nodes": sum(node["Alive"] for node in ray.nodes())}), file=out, flush=True
+        )
         for number, line in enumerate(sys.stdin):
             played = play(ScalingRound(**json.loads(line)), Path(top) / str(number))
             print(json.dumps(played._asdict()), file=out, flush=True)

@@ -1,9 +1,10 @@
-"""Endurance of one evaluation with many episodes and killed workers: memory, speed, and lost episodes.
+"""Endurance of one evaluation with many episodes and killed workers: memory, speed, and lost
+episodes.
 
-Images are small and steps few, so that the work around an episode is measured. The gap is the time between an episode's
-last step and the next one's reset in the same worker: the result, its way to the driver, the database, and the next
-job. The youngest worker is killed at intervals; the eldest plays from the first episode to the last, and its memory and
-the driver's are sampled.
+Images are small and steps few, so that the work around an episode is measured. The gap is the time
+between an episode's last step and the next one's reset in the same worker: the result, its way to
+the driver, the database, and the next job. The youngest worker is killed at intervals; the eldest
+plays from the first episode to the last, and its memory and the driver's are sampled.
 """
 
 from __future__ import annotations
@@ -56,7 +57,9 @@ class SoakPlan:
 
     @property
     def window(self) -> int:
-        """The number of first, and of last, episodes that are compared: at most a quarter of all."""
+        """The number of first, and of last, episodes that are compared: at most a quarter of
+        all.
+        """
         return min(1000, self.episodes // 4)
 
 
@@ -68,7 +71,9 @@ class ResourceSample(NamedTuple):
     eldest: int | None  # of the first worker; None once it has ended
 
 
-def measure_soak(soak: SoakPlan, progress: Callable[[str], None] = lambda _: None) -> dict[str, Any]:
+def measure_soak(
+    soak: SoakPlan, progress: Callable[[str], None] = lambda _: None
+) -> dict[str, Any]:
     """Play the evaluation and watch it; returns plain JSON values."""
     ledger = SoakLedger(progress)
     cpus = max(os.cpu_count() or 1, soak.workers)
@@ -83,7 +88,11 @@ def measure_soak(soak: SoakPlan, progress: Callable[[str], None] = lambda _: Non
             suites=[
                 SuiteConfig(
                     envs=[TIMED_ENV],
-                    env_options={"notes": str(notes), "size": soak.size, "max_steps": soak.max_steps},
+                    env_options={
+                        "notes": str(notes),
+                        "size": soak.size,
+                        "max_steps": soak.max_steps,
+                    },
                     episodes=soak.episodes,
                 )
             ],
@@ -102,7 +111,8 @@ class SoakLedger(Progress):
     """The time of each recorded episode, and the driver's CPU time by then."""
 
     def __init__(self, progress: Callable[[str], None]) -> None:
-        self.at_s, self.cpu_s = array("d"), array("d")  # of time.time(); small compared with the growth to detect
+        # Of time.time(); small compared with the growth to detect.
+        self.at_s, self.cpu_s = array("d"), array("d")
         self._progress = progress
 
     def episode(self, cell: EvalCase, result: EpisodeResult) -> None:
@@ -137,14 +147,24 @@ class SoakWatcher:
     def _watch(self) -> None:
         since: float | None = None  # the first episode, or the last kill
         while not self._stop.wait(_EVERY_S):
-            self._seen += [pid for file in self._notes.glob("*.txt") if (pid := int(file.stem)) not in self._seen]
+            self._seen += [
+                pid
+                for file in self._notes.glob("*.txt")
+                if (pid := int(file.stem)) not in self._seen
+            ]
             if not self._seen:
                 continue
             self.samples.append(
-                ResourceSample(len(self._ledger.at_s), resident(os.getpid()) or 0, resident(self._seen[0]))
+                ResourceSample(
+                    len(self._ledger.at_s), resident(os.getpid()) or 0, resident(self._seen[0])
+                )
             )
             since = since or time.monotonic()
-            if self._soak.kill_every_s and time.monotonic() - since >= self._soak.kill_every_s and self._kill():
+            if (
+                self._soak.kill_every_s
+                and time.monotonic() - since >= self._soak.kill_every_s
+                and self._kill()
+            ):
                 since = time.monotonic()
 
     def _kill(self) -> bool:
@@ -201,32 +221,45 @@ def report(
             "last": 1e3 * (cpu[-1] - cpu[-window]) / (window - 1),
         },
         "memory": {
-            "driver": growth([(one.episodes, one.driver) for one in watcher.samples], soak.episodes),
+            "driver": growth(
+                [(one.episodes, one.driver) for one in watcher.samples], soak.episodes
+            ),
             "worker": growth(
-                [(one.episodes, one.eldest) for one in watcher.samples if one.eldest is not None], soak.episodes
+                [(one.episodes, one.eldest) for one in watcher.samples if one.eldest is not None],
+                soak.episodes,
             ),
         },
     }
 
 
 def gaps(workers: Iterable[Sequence[EpisodeTimes]]) -> list[float]:
-    """Return the times between two episodes of a worker, s, in the order in which the later ones began."""
+    """Return the times between two episodes of a worker, s, in the order in which the later ones
+    began.
+    """
     pairs = [pair for notes in workers for pair in itertools.pairwise(notes)]
-    return [after.begun - before.ended for before, after in sorted(pairs, key=lambda pair: pair[1].begun)]
+    return [
+        after.begun - before.ended
+        for before, after in sorted(pairs, key=lambda pair: pair[1].begun)
+    ]
 
 
 def growth(samples: Sequence[tuple[int, int]], episodes: int) -> dict[str, float] | None:
     """Fit the growth of resident memory in a thousand episodes, MiB, by least squares.
 
-    `samples` are (episodes, bytes). The first fifth, in which pools and caches fill, and samples after the last
-    episode, when all results are read, are left out. Returns None if too few are left.
+    `samples` are (episodes, bytes). The first fifth, in which pools and caches fill, and samples
+    after the last episode, when all results are read, are left out. Returns None if too few are
+    left.
     """
     settled = [(done, size) for done, size in samples if _SETTLING * episodes <= done < episodes]
     if len({done for done, _ in settled}) < 2:
         return None
     done, size = zip(*settled, strict=True)
     slope = np.polyfit(np.array(done) / 1000, np.array(size) / _MIB, 1)[0]
-    return {"begin_mib": settled[0][1] / _MIB, "end_mib": settled[-1][1] / _MIB, "mib_per_1000": float(slope)}
+    return {
+        "begin_mib": settled[0][1] / _MIB,
+        "end_mib": settled[-1][1] / _MIB,
+        "mib_per_1000": float(slope),
+    }
 
 
 def _spread(gaps_s: Sequence[float]) -> dict[str, float]:
@@ -242,7 +275,10 @@ def soak_outcomes(found: Mapping[str, Any]) -> list[Outcome]:
     once = f"{found['done']} done, {'each key once' if found['keys_once'] else 'not each key once'}"
     return [
         Outcome(
-            "every episode", f"{episodes} done, each key once", once, found["keys_once"] and found["done"] == episodes
+            "every episode",
+            f"{episodes} done, each key once",
+            once,
+            found["keys_once"] and found["done"] == episodes,
         ),
         Outcome(
             "between two episodes of a worker, at first",
@@ -251,10 +287,16 @@ def soak_outcomes(found: Mapping[str, Any]) -> list[Outcome]:
             first < LIMIT_GAP_MS,
         ),
         Outcome(
-            "between two episodes of a worker, at last", f"< {LIMIT_GAP_MS:g} ms", f"{last:.2f} ms", last < LIMIT_GAP_MS
+            "between two episodes of a worker, at last",
+            f"< {LIMIT_GAP_MS:g} ms",
+            f"{last:.2f} ms",
+            last < LIMIT_GAP_MS,
         ),
         Outcome(
-            "the same, last over first", f"≤ {LIMIT_SLOWDOWN}", f"{last / first:.2f}", last <= LIMIT_SLOWDOWN * first
+            "the same, last over first",
+            f"≤ {LIMIT_SLOWDOWN}",
+            f"{last / first:.2f}",
+            last <= LIMIT_SLOWDOWN * first,
         ),
         Outcome(
             "the driver's CPU time for an episode, last over first",
@@ -277,7 +319,8 @@ def _growth(what: str, row: Mapping[str, Any] | None) -> Outcome:
 def show_soak(found: Mapping[str, Any]) -> None:
     """Print the counts and the targets."""
     out.print(
-        f"{found['plan']['episodes']} episodes, {found['episodes_per_minute']:.0f} a minute; workers killed: "
+        f"{found['plan']['episodes']} episodes, {found['episodes_per_minute']:.0f} a minute; "
+        "workers killed: "
         f"{found['killed']}, retries: {found['retries']}, played again: {found['played_again']}",
     )
     show_outcomes(soak_outcomes(found))
@@ -286,10 +329,14 @@ def show_soak(found: Mapping[str, Any]) -> None:
 def main(
     episodes: Annotated[int, typer.Option(min=100)] = 10_000,
     workers: Annotated[int, typer.Option(min=1)] = 2,
-    kill_every: Annotated[float, typer.Option(min=0, help="Seconds between two kills of a worker; 0: none.")] = 30.0,
+    kill_every: Annotated[
+        float, typer.Option(min=0, help="Seconds between two kills of a worker; 0: none.")
+    ] = 30.0,
     out_file: Out = None,
 ) -> None:
-    """Play many short episodes while workers are killed: check memory, overhead, and that each is played once."""
+    """Play many short episodes while workers are killed: check memory, overhead, and that each
+    is played once.
+    """
     with errors():
         found = measure_soak(SoakPlan(episodes, workers, kill_every), progress)
     show_soak(found)

@@ -1,9 +1,12 @@
-"""Seconds from a command to its first episode or action, and to its end, from cold; ours and vla-eval's in turns.
+"""Seconds from a command to its first episode or action, and to its end, from cold; ours and
+vla-eval's in turns.
 
-- `eval --workers 0` and `eval --workers 1`: `vlagents-ray eval` of a policy that does nothing, in one process and with
-  Ray and Serve;
-- vla-eval: its model server with the same policy, and one `vla-eval run` of the same episodes of the same environment;
-- `serve`: `vlagents-ray serve noop`, until a client on this machine has an action, and until Ctrl-C has ended it.
+- `eval --workers 0` and `eval --workers 1`: `vlagents-ray eval` of a policy that does nothing, in
+  one process and with Ray and Serve;
+- vla-eval: its model server with the same policy, and one `vla-eval run` of the same episodes of
+  the same environment;
+- `serve`: `vlagents-ray serve noop`, until a client on this machine has an action, and until Ctrl-C
+  has ended it.
 
 The first is the first reset of an environment, or the first action of the server.
 """
@@ -42,7 +45,9 @@ Seconds = tuple[float, float]  # to the first episode or action, and to the end
 def measure_startup(
     plan: EvaluationPlan, peers_python: Path, progress: Callable[[str], None] = lambda _: None
 ) -> dict[str, Any]:
-    """Measure all ways; returns plain JSON values. vla-eval is in `skipped`, with the reason, if it cannot run here."""
+    """Measure all ways; returns plain JSON values. vla-eval is in `skipped`, with the reason, if
+    it cannot run here.
+    """
     found, skipped, _ = peer_clients([PEER], peers_python)
     rounds: dict[str, list[Seconds]] = {}
     with tempfile.TemporaryDirectory() as top:
@@ -54,15 +59,29 @@ def measure_startup(
                 played = play(plan, run, Path(top) / f"{name} {number}")
                 rounds.setdefault(name, []).append((played.first_s or 0.0, played.wall_s))
             rounds.setdefault(SERVE, []).append(serve_once())
-            progress(f"round {number + 1}/{plan.rounds}: { ({name: each[-1] for name, each in rounds.items()}) }")
-    medians = {name: [statistics.median(column) for column in zip(*each, strict=True)] for name, each in rounds.items()}
-    return {"plan": asdict(plan), "cores": os.cpu_count(), "skipped": skipped, "rounds": rounds, "medians": medians}
+            progress(
+                f"round {number + 1}/{plan.rounds}: "
+                f"{ ({name: each[-1] for name, each in rounds.items()}) }"
+            )
+    medians = {
+        name: [statistics.median(column) for column in zip(*each, strict=True)]
+        for name, each in rounds.items()
+    }
+    return {
+        "plan": asdict(plan),
+        "cores": os.cpu_count(),
+        "skipped": skipped,
+        "rounds": rounds,
+        "medians": medians,
+    }
 
 
 def serve_once() -> Seconds:
     """Serve a policy that does nothing until it has acted once, then end it."""
     port, obs, begun = free_port(), observation(), time.monotonic()
-    with subprocess.Popen([*_COMMAND, "serve", "noop", "--port", str(port)], stdout=subprocess.DEVNULL) as process:
+    with subprocess.Popen(
+        [*_COMMAND, "serve", "noop", "--port", str(port)], stdout=subprocess.DEVNULL
+    ) as process:
         try:
             with RemoteAgent(f"http://{LOOPBACK}:{port}", connect_timeout_s=_LONGEST_S) as agent:
                 agent.reset(obs, "measure")
@@ -77,7 +96,10 @@ def serve_once() -> Seconds:
 def show_startup(found: Mapping[str, Any]) -> None:
     """Print a row for each way."""
     rows = table("", "first s", "whole command s")
-    rows.title = f"{found['plan']['episodes']} episodes, {found['cores']} cores, medians of {found['plan']['rounds']}"
+    rows.title = (
+        f"{found['plan']['episodes']} episodes, {found['cores']} cores, medians of "
+        f"{found['plan']['rounds']}"
+    )
     for name, (first_s, whole_s) in found["medians"].items():
         rows.add_row(name, f"{first_s:.2f}", f"{whole_s:.2f}")
     out.print(rows)

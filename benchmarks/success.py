@@ -1,10 +1,10 @@
 """Does what makes a policy fast, or carries its images and actions, cost success?
 
-The reference policy plays the same seeds of the tabletop in each way of serving: eager and without Ray, which is the
-standard; compiled, in bfloat16, in 8 bits; in batches; over each transport; with JPEG; with each way of executing
-chunks, at delays; with LoRA merged and apart; after a push; behind `upstream` by each protocol. A paired test
-(McNemar, adjusted by Holm for all ways) compares each with the standard, and so does the equality of all actions of an
-episode, to the bit.
+The reference policy plays the same seeds of the tabletop in each way of serving: eager and without
+Ray, which is the standard; compiled, in bfloat16, in 8 bits; in batches; over each transport; with
+JPEG; with each way of executing chunks, at delays; with LoRA merged and apart; after a push; behind
+`upstream` by each protocol. A paired test (McNemar, adjusted by Holm for all ways) compares each
+with the standard, and so does the equality of all actions of an episode, to the bit.
 """
 
 from __future__ import annotations
@@ -51,13 +51,15 @@ TOGETHER = 16  # episodes of a batch
 QUALITIES = (30, 50, 70, 85, 95)  # of JPEG; 85 is the client's
 DELAYS = (0.0, 0.05, 0.15)  # s
 HZ = 20.0  # of the clock at those delays: none, one and three ticks
-LATE: dict[str, dict[str, Any]] = {  # what is executed meanwhile: nothing, the old plan, or what the new one continues
+# What is executed meanwhile: nothing, the old plan, or what the new one continues.
+LATE: dict[str, dict[str, Any]] = {
     "stop and wait": {"meanwhile": "zero"},
     "async": {},
     "real-time chunking": {"real_time_chunking": True},
 }
 _RAW = ImageCodec("raw")
-_ADAPTED = "context"  # the layer with an adapter of rank 4 of random weights, small enough that success remains
+# The layer with an adapter of rank 4 of random weights, small enough that success remains.
+_ADAPTED = "context"
 _KEYS = {
     "cameras": {"front": "observation/image", "wrist": "observation/wrist_image"},
     "state": {"xyzrpy": "observation/state"},
@@ -121,9 +123,15 @@ def ways() -> list[Way]:
         Way("bfloat16", {"dtype": "bfloat16"}),
         Way("int8 weights", {"quantization": "int8"}),
         Way(f"batches of {TOGETHER}", transport="shm", together=TOGETHER),
-        *(Way(name, transport=name, equal=True) for name in ("shm", "plasma", "websocket", "http", "handle")),
+        *(
+            Way(name, transport=name, equal=True)
+            for name in ("shm", "plasma", "websocket", "http", "handle")
+        ),
         Way("lossless images", transport="websocket", codec=ImageCodec("lossless"), equal=True),
-        *(Way(f"JPEG, quality {one}", transport="websocket", codec=ImageCodec("jpeg", one)) for one in QUALITIES),
+        *(
+            Way(f"JPEG, quality {one}", transport="websocket", codec=ImageCodec("jpeg", one))
+            for one in QUALITIES
+        ),
         Way("after a push", transport="shm", pushed=True, equal=True),
         *(Way(f"upstream, {name}", upstream=name) for name in PROTOCOLS),
         Way(f"open loop, all {CHUNK} rows", execute=CHUNK),
@@ -155,9 +163,14 @@ class Players:
     """Plays ways, with one server for all of them, which starts with the first that needs it."""
 
     def __init__(self, checkpoint: Path, folder: Path, episodes: int) -> None:
-        self._checkpoint, self._folder, self._episodes = checkpoint.resolve(), folder.resolve(), episodes
+        self._checkpoint, self._folder, self._episodes = (
+            checkpoint.resolve(),
+            folder.resolve(),
+            episodes,
+        )
         self._stack = contextlib.ExitStack()
-        self._server: tuple[str, dict[str, int]] | None = None  # host:port, and the ports of dialects
+        # host:port, and the ports of dialects.
+        self._server: tuple[str, dict[str, int]] | None = None
 
     def __enter__(self) -> Players:
         return self
@@ -169,16 +182,26 @@ class Players:
         """Play the episodes of a way that have no result in the folder yet, and return all."""
         cameras: dict[str, Any] = {"cameras": ["front", "wrist"], "width": 64, "height": 64}
         suite = SuiteConfig(
-            envs=["tabletop"], env_options=cameras, episodes=self._episodes, num_envs=way.together, clock=way.clock
+            envs=["tabletop"],
+            env_options=cameras,
+            episodes=self._episodes,
+            num_envs=way.together,
+            clock=way.clock,
         )
         options: dict[str, Any] = {"adapter": "own"} if way.adapter else {}
-        policy = PolicyConfig(name=way.name, config=way.config, options=options, execute=way.execute)
+        policy = PolicyConfig(
+            name=way.name, config=way.config, options=options, execute=way.execute
+        )
         place = self._folder / plain(way.name)
-        plan = EvalConfig(policies=[policy], suites=[suite], out=place, video="none", workers=0, resume=True)
+        plan = EvalConfig(
+            policies=[policy], suites=[suite], out=place, video="none", workers=0, resume=True
+        )
         evaluate(plan, agent_factory=lambda: self._agent(way))
         counted = [one for cell in Results.load(place).cells for one in cell.counted]
         found = {one.key.seed: (bool(one.success_once), str(one.actions_sha256)) for one in counted}
-        return Played(way, found, float(np.median([one.policy_ms for one in counted if one.policy_ms])))
+        return Played(
+            way, found, float(np.median([one.policy_ms for one in counted if one.policy_ms]))
+        )
 
     def _agent(self, way: Way) -> Agent:
         if way.upstream is not None:
@@ -195,7 +218,11 @@ class Players:
         host, ports = self._serve()
         url, mapping = PROTOCOLS[protocol]
         contract = {"action": {"dim": 4}, "chunk": 1 if protocol == "vla_eval" else CHUNK}
-        config = {"protocol": protocol, "urls": [url.format(host=host, **ports)], "contract": contract}
+        config = {
+            "protocol": protocol,
+            "urls": [url.format(host=host, **ports)],
+            "contract": contract,
+        }
         return Upstream.from_config(config | {"mapping": mapping})
 
     def _config(self, way: Way) -> dict[str, Any]:
@@ -215,7 +242,9 @@ class Players:
                 "vlagents": {"port": ports["vlagents"]},
             }
             batch = {"max_size": TOGETHER}  # a session that acts alone is a batch of one
-            document = deployment("reference", config=self._config(Way(STANDARD)), batch=batch, dialects=dialects)
+            document = deployment(
+                "reference", config=self._config(Way(STANDARD)), batch=batch, dialects=dialects
+            )
             document.applications[0].name = APP
             server = self._stack.enter_context(running_server(document, num_cpus=2))
             self._server = server.url.removeprefix("http://"), ports
@@ -233,10 +262,15 @@ class Players:
             learner.push(values, pin=True)
 
     def _low_rank(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return A (4, inputs) and B (outputs, 4), whose product has a hundredth of the norm of the layer's weights."""
+        """Return A (4, inputs) and B (outputs, 4), whose product has a hundredth of the norm of
+        the layer's weights.
+        """
         weight = self._weights()[f"{_ADAPTED}.weight"]
         rng = np.random.default_rng(0)
-        down, up = (rng.standard_normal(shape, np.float32) for shape in ((4, weight.shape[1]), (weight.shape[0], 4)))
+        down, up = (
+            rng.standard_normal(shape, np.float32)
+            for shape in ((4, weight.shape[1]), (weight.shape[0], 4))
+        )
         return down, up * np.float32(0.01 * np.linalg.norm(weight) / np.linalg.norm(up @ down))
 
     def _adapter(self) -> Path:
@@ -247,7 +281,10 @@ class Players:
         (folder / ADAPTER_CONFIG).write_text(text)
         named = zip("AB", self._low_rank(), strict=True)
         with (folder / ADAPTER_WEIGHTS).open("wb") as file:
-            write_values(file, {f"base_model.model.{_ADAPTED}.lora_{name}.weight": value for name, value in named})
+            write_values(
+                file,
+                {f"base_model.model.{_ADAPTED}.lora_{name}.weight": value for name, value in named},
+            )
         return folder
 
     def _merged(self) -> Path:
@@ -262,7 +299,9 @@ class Players:
 
 
 def compared(found: Sequence[Played]) -> list[dict[str, Any]]:
-    """Return a row for each way: its rate, its difference from the first, and its equal episodes."""
+    """Return a row for each way: its rate, its difference from the first, and its equal
+    episodes.
+    """
     standard = found[0]
     pairs = [_pairs(one, standard) for one in found]
     adjusted = [1.0, *holm([pair.p_value for pair in pairs[1:]])]
@@ -276,7 +315,9 @@ def compared(found: Sequence[Played]) -> list[dict[str, Any]]:
             **pair.to_json(),
             "difference_95": list(difference_interval([pair])),
             "p_holm": p,
-            "equal": sum(one.episodes[seed][1] == standard.episodes[seed][1] for seed in standard.episodes),
+            "equal": sum(
+                one.episodes[seed][1] == standard.episodes[seed][1] for seed in standard.episodes
+            ),
             "must_be_equal": one.way.equal,
         }
         for one, pair, p in zip(found, pairs, adjusted, strict=True)
@@ -284,37 +325,51 @@ def compared(found: Sequence[Played]) -> list[dict[str, Any]]:
 
 
 def shown(rows: Sequence[Mapping[str, Any]]) -> Table:
-    """Return the table for the terminal; that of the documentation is made by tests/support/tables.py."""
+    """Return the table for the terminal; that of the documentation is made by
+    tests/support/tables.py.
+    """
     found = table("way", "success, %", "difference", "p", "equal", "ms an act")
     for row in rows:
         low, high = (f"{100 * bound:.0f}" for bound in row["interval_95"])
         rate = f"{100 * row['solved'] / row['episodes']:.1f} [{low}, {high}]"
-        cells = rate, f"{100 * row['difference']:+.1f}", f"{row['p_holm']:.2g}", row["equal"], f"{row['act_ms']:.2f}"
+        cells = (
+            rate,
+            f"{100 * row['difference']:+.1f}",
+            f"{row['p_holm']:.2g}",
+            row["equal"],
+            f"{row['act_ms']:.2f}",
+        )
         found.add_row(row["way"], *map(str, cells))
     return found
 
 
 def _pairs(one: Played, standard: Played) -> Pairs:
-    counts = Counter((solved, standard.episodes[seed][0]) for seed, (solved, _) in one.episodes.items())
+    counts = Counter(
+        (solved, standard.episodes[seed][0]) for seed, (solved, _) in one.episodes.items()
+    )
     return Pairs(counts[True, True], counts[True, False], counts[False, True], counts[False, False])
 
 
 def main(
-    checkpoint: Annotated[Path, typer.Option(help="Folder of the reference policy's weights.")] = Path(
-        "reference/checkpoint"
-    ),
+    checkpoint: Annotated[
+        Path, typer.Option(help="Folder of the reference policy's weights.")
+    ] = Path("reference/checkpoint"),
     folder: Annotated[
         Path, typer.Option("--out", help="Folder of the results; what it has is not played again.")
     ] = Path("runs/success"),
     episodes: Annotated[int, typer.Option(min=1, help="Of each way.")] = 500,
-    only: Annotated[str, typer.Option(help="Ways, with semicolons between them; default: all.")] = "",
+    only: Annotated[
+        str, typer.Option(help="Ways, with semicolons between them; default: all.")
+    ] = "",
     out_file: Out = None,
 ) -> None:
     """Play every way, and print the table."""
     with errors(), Players(checkpoint, folder, episodes) as players:
         chosen = [one.strip() for one in only.split(";")] if only else [way.name for way in ways()]
         if unknown := set(chosen) - {way.name for way in ways()}:
-            raise ConfigError(f"--only: got {sorted(unknown)}, want ways of {[way.name for way in ways()]}")
+            raise ConfigError(
+                f"--only: got {sorted(unknown)}, want ways of {[way.name for way in ways()]}"
+            )
         found, skipped = list[Played](), dict[str, str]()
         for way in ways():
             if way.name not in (STANDARD, *chosen):
@@ -329,8 +384,12 @@ def main(
         rows = compared(found)
         out.print(shown(rows))
         save({"ways": rows, "skipped": skipped}, out_file)
-        if broken := [row["way"] for row in rows if row["must_be_equal"] and row["equal"] < row["episodes"]]:
-            raise VLAgentsError(f"actions differ in {broken}, want those of {STANDARD!r} to the bit")
+        if broken := [
+            row["way"] for row in rows if row["must_be_equal"] and row["equal"] < row["episodes"]
+        ]:
+            raise VLAgentsError(
+                f"actions differ in {broken}, want those of {STANDARD!r} to the bit"
+            )
 
 
 if __name__ == "__main__":

@@ -1,9 +1,10 @@
 """Actions a second that many clients get from one replica, against those of the policy alone.
 
-The default policy takes 20 ms for a batch and 1 ms for each observation in it, without using the CPU: with 16 in a
-batch, 444 actions a second are the ideal. Any other policy is measured bare in the same run. All transports take turns.
-A robot among simulations, which acts at random moments, is also measured. So are other policy servers, which compute
-the same policy, also in batches of at most 16 if they can.
+The default policy takes 20 ms for a batch and 1 ms for each observation in it, without using the
+CPU: with 16 in a batch, 444 actions a second are the ideal. Any other policy is measured bare in
+    the same run. All transports take turns.
+A robot among simulations, which acts at random moments, is also measured. So are other policy
+servers, which compute the same policy, also in batches of at most 16 if they can.
 """
 
 from __future__ import annotations
@@ -30,7 +31,13 @@ from benchmarks.closed_loop import Call
 from benchmarks.console import Out, Rounds, Seconds, parse_counts, save, show_skipped
 from benchmarks.drivers import START_S
 from benchmarks.figures import mean_interval, measured_on, median_interval
-from benchmarks.own_clients import LoadGenerator, OwnClient, observation, own_clients, save_observation
+from benchmarks.own_clients import (
+    LoadGenerator,
+    OwnClient,
+    observation,
+    own_clients,
+    save_observation,
+)
 from vlagents_ray.cli.console import errors, out, progress, table
 from vlagents_ray.cli.options import Set, parse_list, parse_settings
 from vlagents_ray.errors import ConfigError
@@ -67,37 +74,56 @@ class ThroughputPlan:
 
     @property
     def ideal(self) -> Callable[[int], float] | None:
-        """The actions a second of K clients if only the policy took time; None if that must be measured."""
+        """The actions a second of K clients if only the policy took time; None if that must be
+        measured.
+        """
         if self.policy != "noop":
             return None
         base = float(self.config.get("base_ms", 0.0))
         each = float(self.config.get("per_item_ms", 0.0))
         if base + each == 0:
             return None
-        return lambda clients: min(clients, self.batch) * 1e3 / (base + each * min(clients, self.batch))
+        return lambda clients: (
+            min(clients, self.batch) * 1e3 / (base + each * min(clients, self.batch))
+        )
 
 
-def measure_throughput(plan: ThroughputPlan, progress: Callable[[str], None] = lambda _: None) -> dict[str, Any]:
-    """Measure the plan, all fleets in turns, in a new random order in each round; returns plain JSON values."""
+def measure_throughput(
+    plan: ThroughputPlan, progress: Callable[[str], None] = lambda _: None
+) -> dict[str, Any]:
+    """Measure the plan, all fleets in turns, in a new random order in each round; returns plain
+    JSON values.
+    """
     found, skipped = own_clients(plan.transports)
     chosen = _one_each(found)
     theirs, absent, versions = others.peer_clients(plan.peers, plan.peers_python)
     skipped |= absent | {one.name: "its server has one client" for one in theirs if not one.several}
     served = deployment(
-        plan.policy, config=dict(plan.config), batch={"max_size": plan.batch}, resources={"num_gpus": plan.num_gpus}
+        plan.policy,
+        config=dict(plan.config),
+        batch={"max_size": plan.batch},
+        resources={"num_gpus": plan.num_gpus},
     )
     most = max(plan.clients)
     with contextlib.ExitStack() as stack:
         bare = None if plan.ideal else stack.enter_context(_bare(plan))
         server = stack.enter_context(running_server(served))
         (app,) = server.apps
-        ours = {one.transport: stack.enter_context(_fleet(one, server.url, app, most)) for one in chosen}
+        ours = {
+            one.transport: stack.enter_context(_fleet(one, server.url, app, most)) for one in chosen
+        }
         obs = Path(stack.enter_context(tempfile.TemporaryDirectory())) / "observation.npz"
         save_observation(observation(), obs)
         running: dict[str, others.PeerServer] = {}
-        peers = {one.name: stack.enter_context(peer_fleet(one, plan, obs, running)) for one in theirs if one.several}
+        peers = {
+            one.name: stack.enter_context(peer_fleet(one, plan, obs, running))
+            for one in theirs
+            if one.several
+        }
         fleets = ours | peers
-        turns: dict[str, _Turns] = {name: _Turns({k: [] for k in plan.clients}, []) for name in fleets}
+        turns: dict[str, _Turns] = {
+            name: _Turns({k: [] for k in plan.clients}, []) for name in fleets
+        }
         bare_rates = []
         order = list(fleets)
         for number in range(plan.rounds):
@@ -120,7 +146,10 @@ def measure_throughput(plan: ThroughputPlan, progress: Callable[[str], None] = l
         "ideal_actions_per_s": best,
         "ideal_is": "bare, measured in the same run" if bare_rates else "by arithmetic",
         "bare_rounds": bare_rates,
-        "transports": {one.transport: {"way": one.name, **_row(plan, turns[one.transport], best)} for one in chosen},
+        "transports": {
+            one.transport: {"way": one.name, **_row(plan, turns[one.transport], best)}
+            for one in chosen
+        },
         "peers": {name: _row(plan, turns[name], best) for name in peers},
         "skipped": skipped,
         "versions": versions,
@@ -145,7 +174,9 @@ class _Part:
 
 @dataclass(frozen=True, slots=True)
 class Fleet:
-    """All clients of one transport or peer: one robot in the first part, simulations in the others, if any."""
+    """All clients of one transport or peer: one robot in the first part, simulations in the
+    others, if any.
+    """
 
     parts: Sequence[_Part]
     turn: Callable[[], AbstractContextManager[None]] = contextlib.nullcontext
@@ -163,7 +194,11 @@ class Fleet:
                 for part, (some, more) in zip(self.parts, shares, strict=True)
                 if some + more
             ]
-            return [calls for part, handle in pending for calls in part.result(handle, seconds + _LATE_S)]
+            return [
+                calls
+                for part, handle in pending
+                for calls in part.result(handle, seconds + _LATE_S)
+            ]
 
 
 @contextlib.contextmanager
@@ -176,16 +211,32 @@ def _fleet(client: OwnClient, url: str, app: str, clients: int) -> Iterator[Flee
 
 @contextlib.contextmanager
 def peer_fleet(
-    client: others.PeerClient, plan: ThroughputPlan, obs: Path, running: dict[str, others.PeerServer]
+    client: others.PeerClient,
+    plan: ThroughputPlan,
+    obs: Path,
+    running: dict[str, others.PeerServer],
 ) -> Iterator[Fleet]:
-    """Start a peer's server, unless `running` has one that it shares, and its clients, within a context."""
+    """Start a peer's server, unless `running` has one that it shares, and its clients, within a
+    context.
+    """
     most = max(plan.clients)
-    policy = {name: float(plan.config.get(name, 0.0)) for name in ("base_ms", "per_item_ms")} | {"batch": plan.batch}
+    policy = {name: float(plan.config.get(name, 0.0)) for name in ("base_ms", "per_item_ms")} | {
+        "batch": plan.batch
+    }
     with contextlib.ExitStack() as stack:
         server = stack.enter_context(others.serving(client, plan.peers_python, running, policy))
-        words = [*client.command(plan.peers_python), "load", *server.address, str(obs), client.mode, json.dumps(policy)]
+        words = [
+            *client.command(plan.peers_python),
+            "load",
+            *server.address,
+            str(obs),
+            client.mode,
+            json.dumps(policy),
+        ]
         children = [
-            stack.enter_context(LineProcess(f"clients of {client.name}", [*words, *map(str, part)], others.alone()))
+            stack.enter_context(
+                LineProcess(f"clients of {client.name}", [*words, *map(str, part)], others.alone())
+            )
             for part in ([(1, most)] if client.one_process else _parts(most))
         ]
         for child in children:
@@ -217,12 +268,18 @@ def _process(client: OwnClient, url: str, robots: int, simulations: int) -> Iter
 def _actor(client: OwnClient, url: str, robots: int, simulations: int) -> Iterator[_Part]:
     import ray
 
-    actor = ray.remote(num_cpus=0)(LoadGenerator).remote(url, client.transport, client.codec, robots, simulations)
+    actor = ray.remote(num_cpus=0)(LoadGenerator).remote(
+        url, client.transport, client.codec, robots, simulations
+    )
     try:
         ray.get(actor.ready.remote(), timeout=START_S)
-        yield _Part(lambda spec: actor.run.remote(**spec), lambda pending, late: ray.get(pending, timeout=late))
+        yield _Part(
+            lambda spec: actor.run.remote(**spec),
+            lambda pending, late: ray.get(pending, timeout=late),
+        )
     finally:
-        with contextlib.suppress(ray.exceptions.RayError):  # `ready` has raised the reason if it never connected
+        # `ready` has raised the reason if it never connected.
+        with contextlib.suppress(ray.exceptions.RayError):
             ray.get(actor.close.remote(), timeout=START_S)
         ray.kill(actor)
 
@@ -230,7 +287,9 @@ def _actor(client: OwnClient, url: str, robots: int, simulations: int) -> Iterat
 @contextlib.contextmanager
 def _bare(plan: ThroughputPlan) -> Iterator[LineProcess]:
     settings = json.dumps({"policy": plan.policy, "config": dict(plan.config), "batch": plan.batch})
-    with LineProcess("the bare policy", [sys.executable, "-m", _BARE, settings], our_environment()) as child:
+    with LineProcess(
+        "the bare policy", [sys.executable, "-m", _BARE, settings], our_environment()
+    ) as child:
         child.read(10 * START_S)  # it may load weights
         yield child
 
@@ -241,7 +300,9 @@ def _shares(clients: int, parts: int) -> list[int]:
 
 
 def _one_each(found: Sequence[OwnClient]) -> list[OwnClient]:
-    """Choose one client for each transport: preferably not an actor; over networks, with the default codec."""
+    """Choose one client for each transport: preferably not an actor; over networks, with the
+    default codec.
+    """
     first: dict[str, OwnClient] = {}
     for one in found:
         kept = first.get(one.transport)
@@ -261,7 +322,9 @@ def _row(plan: ThroughputPlan, turns: _Turns, best: float) -> dict[str, Any]:
     }
 
 
-def _point(plan: ThroughputPlan, clients: int, rounds: Sequence[Sequence[Sequence[Call]]]) -> dict[str, Any]:
+def _point(
+    plan: ThroughputPlan, clients: int, rounds: Sequence[Sequence[Sequence[Call]]]
+) -> dict[str, Any]:
     rates = [rate_of(calls) for calls in rounds]
     rate = statistics.mean(rates)
     flat = [call for calls in rounds for one in calls for call in one]
@@ -279,7 +342,9 @@ def _point(plan: ThroughputPlan, clients: int, rounds: Sequence[Sequence[Sequenc
 
 
 def _waiting(calls: Sequence[Call]) -> dict[str, Any] | None:
-    """Return the robot's round trips, and its waiting time without the inference; None without a call."""
+    """Return the robot's round trips, and its waiting time without the inference; None without a
+    call.
+    """
     if not calls:
         return None
     round_trip = np.array([call[1] for call in calls])
@@ -295,35 +360,56 @@ def _waiting(calls: Sequence[Call]) -> dict[str, Any] | None:
 
 
 def main(
-    transports: Annotated[str, typer.Option(help="With commas between them.")] = "plasma,handle,shm,websocket",
-    clients: Annotated[str, typer.Option(help="Numbers; the largest is compared with the ideal.")] = "1,2,4,8,16,32",
-    batch: Annotated[int, typer.Option(min=1, help="Observations in one forward pass, at most.")] = 16,
+    transports: Annotated[
+        str, typer.Option(help="With commas between them.")
+    ] = "plasma,handle,shm,websocket",
+    clients: Annotated[
+        str, typer.Option(help="Numbers; the largest is compared with the ideal.")
+    ] = "1,2,4,8,16,32",
+    batch: Annotated[
+        int, typer.Option(min=1, help="Observations in one forward pass, at most.")
+    ] = 16,
     seconds: Seconds = 2.0,
     rounds: Rounds = 3,
-    robot_seconds: Annotated[float, typer.Option(min=0, help="How long a robot is watched; 0: not at all.")] = 10.0,
-    policy: Annotated[str | None, typer.Option(help="Default: noop, 20 ms + 1 ms an observation.")] = None,
+    robot_seconds: Annotated[
+        float, typer.Option(min=0, help="How long a robot is watched; 0: not at all.")
+    ] = 10.0,
+    policy: Annotated[
+        str | None, typer.Option(help="Default: noop, 20 ms + 1 ms an observation.")
+    ] = None,
     settings: Set = [],  # noqa: B006
     num_gpus: Annotated[float, typer.Option(min=0, help="That Ray gives to the replica.")] = 0.0,
     peers: others.Peers = "",
     peers_python: others.PeersPython = others.PYTHON,
     out_file: Out = None,
 ) -> None:
-    """Measure actions a second of many clients on one replica, against the ideal, or the bare policy."""
+    """Measure actions a second of many clients on one replica, against the ideal, or the bare
+    policy.
+    """
     with errors():
         origin = measured_on("python -m benchmarks.throughput")
         if settings and policy is None:
             raise ConfigError("--set: is for --policy; name one")
         chosen: dict[str, Any] = (
-            {} if policy is None else {"policy": policy, "config": parse_settings(settings, "--set")}
+            {}
+            if policy is None
+            else {"policy": policy, "config": parse_settings(settings, "--set")}
         )
         if peers and chosen.get("policy", "noop") != "noop":
             raise ConfigError(f"--peers: they sleep as the policy noop does; got --policy {policy}")
         counts = parse_counts(clients, "--clients")
         plan = ThroughputPlan(
-            **chosen, num_gpus=num_gpus, batch=batch, clients=counts, seconds=seconds, rounds=rounds,
-            robot_seconds=robot_seconds, transports=parse_list(transports), peers=parse_list(peers),
+            **chosen,
+            num_gpus=num_gpus,
+            batch=batch,
+            clients=counts,
+            seconds=seconds,
+            rounds=rounds,
+            robot_seconds=robot_seconds,
+            transports=parse_list(transports),
+            peers=parse_list(peers),
             peers_python=peers_python,
-        )  # fmt: skip
+        )
         found = measure_throughput(plan, progress)
     show_throughput(found)
     save({**origin, **found, "versions": origin["versions"] | found["versions"]}, out_file)
@@ -332,25 +418,43 @@ def main(
 def show_throughput(found: Mapping[str, Any]) -> None:
     """Print a row for each number of clients, and a sentence for each transport."""
     rows = table(
-        "transport or peer", "clients", "actions/s", "95 % interval", "of ideal", "mean batch", "p50 ms", "p99 ms"
+        "transport or peer",
+        "clients",
+        "actions/s",
+        "95 % interval",
+        "of ideal",
+        "mean batch",
+        "p50 ms",
+        "p99 ms",
     )
-    rows.title = f"{found['policy']}, ideal {found['ideal_actions_per_s']:.0f} actions/s ({found['ideal_is']})"
+    rows.title = (
+        f"{found['policy']}, ideal {found['ideal_actions_per_s']:.0f} actions/s "
+        f"({found['ideal_is']})"
+    )
     for name, row in (found["transports"] | found["peers"]).items():
         for point in row["curve"]:
             numbers = [point[key] for key in ("of_ideal", "mean_batch", "p50_ms", "p99_ms")]
             cells = ["" if number is None else f"{number:.3g}" for number in numbers]
             interval = "{:.1f} to {:.1f}".format(*point["ci95"]) if point["ci95"] else ""
-            rows.add_row(name, str(point["clients"]), f"{point['actions_per_s']:.1f}", interval, *cells)
+            rows.add_row(
+                name, str(point["clients"]), f"{point['actions_per_s']:.1f}", interval, *cells
+            )
         rows.add_section()
     out.print(rows)
     for name, row in (found["transports"] | found["peers"]).items():
         robot = row["robot"]
         waits = (
-            f"; a robot among simulations waits {robot['wait_p50_ms']:.1f} ms (p99 {robot['wait_p99_ms']:.1f})"
+            (
+                f"; a robot among simulations waits {robot['wait_p50_ms']:.1f} ms (p99 "
+                f"{robot['wait_p99_ms']:.1f})"
+            )
             if robot
             else ""
         )
-        out.print(f"{name}: {row['actions_per_s']:.1f} actions/s, {row['of_ideal']:.3f} of the ideal{waits}")
+        out.print(
+            f"{name}: {row['actions_per_s']:.1f} actions/s, {row['of_ideal']:.3f} of the "
+            f"ideal{waits}"
+        )
     show_skipped(found)
 
 

@@ -1,8 +1,10 @@
-"""TorchRL's own VLA recipe, GRPO on its toy environment, with its inference server and with this one, in turns.
+"""TorchRL's own VLA recipe, GRPO on its toy environment, with its inference server and with this
+one, in turns.
 
-The recipe is `sota-implementations/vla_grpo` of a checkout of TorchRL (github.com/pytorch/rl), copied to a temporary
-folder; with this server, its `utils.py` has one more line. Success is that of the recipe's last greedy evaluation; the
-intervals are Student's over the seeds, as its episodes share the weights of a seed.
+The recipe is `sota-implementations/vla_grpo` of a checkout of TorchRL (github.com/pytorch/rl),
+copied to a temporary folder; with this server, its `utils.py` has one more line. Success is that of
+the recipe's last greedy evaluation; the intervals are Student's over the seeds, as its episodes
+share the weights of a seed.
 """
 
 from __future__ import annotations
@@ -27,21 +29,30 @@ from vlagents_ray.errors import ConfigError
 
 RECIPE = Path("sota-implementations/vla_grpo")
 IMPORT = "from torchrl.weight_update import WeightStrategy\n"  # the last import of its utils.py
-LINE = "from vlagents_ray_learn.torchrl import PolicyServer as ProcessInferenceServer, ServerAddress as MPTransport\n"
+LINE = (
+    "from vlagents_ray_learn.torchrl import PolicyServer as ProcessInferenceServer, "
+    "ServerAddress as MPTransport\n"
+)
 SERVERS = {"TorchRL's server": "", "this server": LINE}
 PYTHON = Path(".venv-torchrl/bin/python")  # made by `make environments FAMILIES=torchrl`
 _FINAL = re.compile(r"Final greedy success rate: (\d\.\d+)")
-_T_95 = (12.706, 4.303, 3.182, 2.776, 2.571, 2.447, 2.365, 2.306, 2.262)  # Student's quantile, for 2 to 10 seeds
+# Student's quantile, for 2 to 10 seeds.
+_T_95 = (12.706, 4.303, 3.182, 2.776, 2.571, 2.447, 2.365, 2.306, 2.262)
 
 
 def prepare(source: Path, folder: Path, line: str) -> Path:
-    """Copy the recipe to a new folder and add a line to its imports; return the path of its program."""
+    """Copy the recipe to a new folder and add a line to its imports; return the path of its
+    program.
+    """
     if not (source / RECIPE / "vla-grpo.py").is_file():
         raise ConfigError(f"--source: got {source}, want a checkout of TorchRL, with {RECIPE}")
     shutil.copytree(source / RECIPE, folder)
     text = (folder / "utils.py").read_text()
     if IMPORT not in text:
-        raise ConfigError(f"{source / RECIPE / 'utils.py'}: got no {IMPORT.strip()!r}; want the recipe of TorchRL 0.14")
+        raise ConfigError(
+            f"{source / RECIPE / 'utils.py'}: got no {IMPORT.strip()!r}; want the recipe of "
+            "TorchRL 0.14"
+        )
     (folder / "utils.py").write_text(text.replace(IMPORT, IMPORT + line))
     return folder / "vla-grpo.py"
 
@@ -58,13 +69,24 @@ def play(program: Path, python: Path, seed: int, words: Sequence[str] = ()) -> d
     Returns:
         `success`, the rate of the last evaluation, and `seconds`, of the whole program.
     """
-    settings = [f"env.seed={seed}", "logger.backend=", "checkpoint.save_iter=0", f"hydra.run.dir={program.parent}/run"]
-    environment = os.environ | {"COMPOSITE_LP_AGGREGATE": "0"}  # as TorchRL's own test of the recipe
+    settings = [
+        f"env.seed={seed}",
+        "logger.backend=",
+        "checkpoint.save_iter=0",
+        f"hydra.run.dir={program.parent}/run",
+    ]
+    # As TorchRL's own test of the recipe.
+    environment = os.environ | {"COMPOSITE_LP_AGGREGATE": "0"}
     begun = time.perf_counter()
     done = subprocess.run(
         [str(python), program.name, *settings, *words],
-        cwd=program.parent, env=environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, check=False,
-    )  # fmt: skip
+        cwd=program.parent,
+        env=environment,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        check=False,
+    )
     seconds = time.perf_counter() - begun
     found = _FINAL.search(done.stdout)
     if done.returncode or found is None:
@@ -73,14 +95,22 @@ def play(program: Path, python: Path, seed: int, words: Sequence[str] = ()) -> d
 
 
 def compare(
-    source: Path, python: Path, seeds: int, words: Sequence[str], progress: Callable[[str], None] = lambda _: None
+    source: Path,
+    python: Path,
+    seeds: int,
+    words: Sequence[str],
+    progress: Callable[[str], None] = lambda _: None,
 ) -> dict[str, Any]:
     """Run the recipe with each server, seed by seed; returns plain JSON values."""
     runs: dict[str, list[dict[str, float]]] = {name: [] for name in SERVERS}
     with tempfile.TemporaryDirectory() as scratch:
-        programs = {name: prepare(source, Path(scratch) / str(i), SERVERS[name]) for i, name in enumerate(SERVERS)}
+        programs = {
+            name: prepare(source, Path(scratch) / str(i), SERVERS[name])
+            for i, name in enumerate(SERVERS)
+        }
         for seed in range(seeds):
-            for name in list(SERVERS)[:: 1 if seed % 2 == 0 else -1]:  # each is first as often as the other
+            # Each is first as often as the other.
+            for name in list(SERVERS)[:: 1 if seed % 2 == 0 else -1]:
                 runs[name].append(play(programs[name], python, seed, words))
                 progress(f"seed {seed}, {name}: {runs[name][-1]}")
     return {"seeds": seeds, "cores": os.cpu_count(), "words": list(words), "runs": runs}
@@ -88,7 +118,10 @@ def compare(
 
 def interval(values: Sequence[float]) -> tuple[float, float, float]:
     """Return the mean and the bounds of its 95 % interval by Student's t; 2 to 10 values."""
-    mean, half = statistics.fmean(values), _T_95[len(values) - 2] * statistics.stdev(values) / math.sqrt(len(values))
+    mean, half = (
+        statistics.fmean(values),
+        _T_95[len(values) - 2] * statistics.stdev(values) / math.sqrt(len(values)),
+    )
     return mean, mean - half, mean + half
 
 
@@ -97,22 +130,35 @@ def show(found: Mapping[str, Any]) -> None:
     rows = table("server", "success, %", "95 %", "s a run", "95 %")
     rows.title = f"TorchRL's vla_grpo, {found['seeds']} seeds, {found['cores']} cores"
     columns = {
-        name: {key: [scale * run[key] for run in runs] for key, scale in (("success", 100), ("seconds", 1))}
+        name: {
+            key: [scale * run[key] for run in runs]
+            for key, scale in (("success", 100), ("seconds", 1))
+        }
         for name, runs in found["runs"].items()
     }
     theirs, ours = columns.values()
     columns["difference"] = {
-        key: [b - a for a, b in zip(theirs[key], ours[key], strict=True)] for key in ("success", "seconds")
+        key: [b - a for a, b in zip(theirs[key], ours[key], strict=True)]
+        for key in ("success", "seconds")
     }
     for name, column in columns.items():
         cells = [interval(column[key]) for key in ("success", "seconds")]
-        rows.add_row(name, *(text for mean, low, high in cells for text in (f"{mean:.1f}", f"{low:.1f} to {high:.1f}")))
+        rows.add_row(
+            name,
+            *(
+                text
+                for mean, low, high in cells
+                for text in (f"{mean:.1f}", f"{low:.1f} to {high:.1f}")
+            ),
+        )
     out.print(rows)
 
 
 def main(
     source: Annotated[Path, typer.Option(help="A checkout of TorchRL.", envvar="TORCHRL_SRC")],
-    words: Annotated[list[str], typer.Argument(help="Settings of the recipe, such as collector.total_iters=50.")] = [],  # noqa: B006
+    words: Annotated[
+        list[str], typer.Argument(help="Settings of the recipe, such as collector.total_iters=50.")
+    ] = [],  # noqa: B006
     seeds: Annotated[int, typer.Option(min=2, max=10)] = 5,
     python: Annotated[Path, typer.Option(help="With TorchRL and this package.")] = PYTHON,
     out_file: Out = None,

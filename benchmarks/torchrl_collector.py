@@ -1,4 +1,6 @@
-"""TorchRL's collector with its inference server, for `benchmarks.rollouts`: `pip install torchrl`."""
+"""TorchRL's collector with its inference server, for `benchmarks.rollouts`: `pip install
+torchrl`.
+"""
 
 from __future__ import annotations
 
@@ -31,7 +33,8 @@ class TorchTabletop(EnvBase):  # type: ignore[misc]
         self._env, self._seeds = Tabletop(**options), itertools.count(first_seed, 1000)
         flag = Categorical(2, shape=(1,), dtype=torch.bool)
         self.observation_spec = Composite(
-            pixels=Unbounded((options["height"], options["width"], 3), dtype=torch.uint8), state=Unbounded((7,))
+            pixels=Unbounded((options["height"], options["width"], 3), dtype=torch.uint8),
+            state=Unbounded((7,)),
         )
         self.action_spec, self.reward_spec = Bounded(-1.0, 1.0, (4,)), Unbounded((1,))
         self.done_spec = Composite(done=flag, terminated=flag.clone(), truncated=flag.clone())
@@ -62,7 +65,9 @@ def _tensors(obs: Obs) -> dict[str, torch.Tensor]:
 
 
 class TorchPolicy(torch.nn.Module):  # type: ignore[misc]
-    """A policy of the benchmark, which is called with as many rows as TorchRL's server has requests."""
+    """A policy of the benchmark, which is called with as many rows as TorchRL's server has
+    requests.
+    """
 
     def __init__(self, name: str, config: dict[str, Any]) -> None:
         super().__init__()
@@ -73,7 +78,9 @@ class TorchPolicy(torch.nn.Module):  # type: ignore[misc]
         rows = state.numpy().reshape(-1, 7)
         seen = [Obs(state={"xyzrpy": row[:6]}, gripper=row[6]) for row in rows]
         acts = self._agent.act_batch(seen, [self._agent] * len(seen))
-        return torch.from_numpy(np.stack([act.action for act in acts])).reshape(*state.shape[:-1], 4)
+        return torch.from_numpy(np.stack([act.action for act in acts])).reshape(
+            *state.shape[:-1], 4
+        )
 
 
 def _module(name: str, config: dict[str, Any], in_keys: list[str]) -> TensorDictModule:
@@ -92,7 +99,8 @@ def rate(
     whole_batches: bool,
     images: bool,
 ) -> float:
-    """Return the steps a second of TorchRL's collector. Call it in a separate process, since its threads never idle.
+    """Return the steps a second of TorchRL's collector. Call it in a separate process, since its
+    threads never idle.
 
     Args:
         policy: The policy's name.
@@ -101,18 +109,23 @@ def rate(
         episodes: Episodes that are measured, a multiple of all environments.
         workers: Processes of environments.
         num_envs: Environments of each of these.
-        grouped: Whether a process holds `num_envs` environments, which the coordinator in this process steps; if not,
-            each environment has its own process, which calls the server's process itself.
+        grouped: Whether a process holds `num_envs` environments, which the coordinator in this
+            process steps; if not, each environment has its own process, which calls the server's
+            process itself.
         whole_batches: Whether the server waits for the requests of all environments.
         images: Whether the policy gets the images.
     """
     total, steps = workers * num_envs, Tabletop(**options).max_steps
     server = InferenceServerConfig(
-        max_batch_size=total, min_batch_size=total if whole_batches else 1, timeout=_TIMEOUT_S if whole_batches else 0.0
+        max_batch_size=total,
+        min_batch_size=total if whole_batches else 1,
+        timeout=_TIMEOUT_S if whole_batches else 0.0,
     )
     collector = AsyncBatchedCollector(
         [functools.partial(TorchTabletop, i, options) for i in range(total)],
-        policy_factory=functools.partial(_module, policy, config, ["state", "pixels"] if images else ["state"]),
+        policy_factory=functools.partial(
+            _module, policy, config, ["state", "pixels"] if images else ["state"]
+        ),
         frames_per_batch=total * steps,
         env_backend="multiprocessing",
         envs_per_worker=num_envs if grouped else 1,

@@ -1,7 +1,8 @@
 """Overhead of `upstream` over another policy server: one `act`, directly and through us, in turns.
 
-The server has openpi's protocol and answers at once, so that only the transport takes time. It is called like openpi's
-own client does, by the policy `upstream` as from our batch queue, and through a whole server of ours.
+The server has openpi's protocol and answers at once, so that only the transport takes time. It is
+called like openpi's own client does, by the policy `upstream` as from our batch queue, and through
+a whole server of ours.
 """
 
 from __future__ import annotations
@@ -123,7 +124,9 @@ class _Server(_Driver):
     """A server of ours in front of the other one, and a client in this process."""
 
     def __init__(self, url: str, obs: Obs, stack: contextlib.ExitStack) -> None:
-        server = stack.enter_context(running_server(deployment("upstream", config=_settings(url)), num_cpus=2))
+        server = stack.enter_context(
+            running_server(deployment("upstream", config=_settings(url)), num_cpus=2)
+        )
         agent = stack.enter_context(RemoteAgent(server.url))
         agent.reset(obs, "a task")
         self.call = lambda: agent.act(obs)
@@ -167,8 +170,12 @@ def _serve(port: int) -> None:
 
 def main(
     calls: Annotated[int, typer.Option(min=1, help="Acts by each way.")] = 2000,
-    size: Annotated[int, typer.Option(min=1, help="Height and width of the two images, pixels.")] = 224,
-    whole: Annotated[bool, typer.Option(help="Measure a whole server of ours, too, which starts Ray.")] = False,
+    size: Annotated[
+        int, typer.Option(min=1, help="Height and width of the two images, pixels.")
+    ] = 224,
+    whole: Annotated[
+        bool, typer.Option(help="Measure a whole server of ours, too, which starts Ray.")
+    ] = False,
     out_file: Out = None,
 ) -> None:
     """Measure the overhead of the policy `upstream` over the policy server behind it."""

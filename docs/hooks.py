@@ -1,7 +1,8 @@
-"""What the site needs beyond docs/: pages and files that stand elsewhere in the repository, at their own paths.
+"""What the site needs beyond docs/: pages and files that stand elsewhere in the repository, at
+their own paths.
 
-Links are written as a checkout has them, so that they also work where the Markdown is read as it is. On the site, docs/
-is the root, and a link out of it leads to a copy of what it names.
+Links are written as a checkout has them, so that they also work where the Markdown is read as it
+is. On the site, docs/ is the root, and a link out of it leads to a copy of what it names.
 """
 
 from __future__ import annotations
@@ -33,7 +34,11 @@ def on_files(files: Files, config: Any) -> Files:
     for file in list(files.documentation_pages()):
         for link in _LINK.finditer(file.content_string):
             path = _path(file.src_uri, link["path"])
-            if not path.startswith("docs/") and (ROOT / path).is_file() and path not in files.src_uris:
+            if (
+                not path.startswith("docs/")
+                and (ROOT / path).is_file()
+                and path not in files.src_uris
+            ):
                 files.append(File.generated(config, path, abs_src_path=str(ROOT / path)))
     return files
 
@@ -53,7 +58,9 @@ def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
 
 
 def on_nav(nav: Any, config: Any, files: Files) -> None:
-    """Write llms.txt, which programs read that look something up for somebody: each page, and what it is about."""
+    """Write llms.txt, which programs read that look something up for somebody: each page, and
+    what it is about.
+    """
     lines = [f"# {config['site_name']}", "", f"> {config['site_description']}"]
     for section in nav.items:
         lines += ["", f"## {section.title}", ""]
@@ -67,11 +74,19 @@ def _pages(section: Any) -> list[Any]:
 
 
 def _entry(page: Any) -> str:
-    """A page's line: its title, where it stands, and its first sentence, which a page in HTML does not have."""
+    """A page's line: its title, where it stands, and its first sentence, which a page in HTML
+    does not have.
+    """
     if not page.file.is_documentation_page():
         return f"- [{page.title}]({page.file.dest_uri})"
-    title, _, rest = re.sub(r"<!--.*?-->", "", page.file.content_string, flags=re.DOTALL).lstrip("# \n").partition("\n")
-    prose = next((block for block in rest.split("\n\n") if re.match(r"\s*(?!```)[\w`*\[]", block)), "")
+    title, _, rest = (
+        re.sub(r"<!--.*?-->", "", page.file.content_string, flags=re.DOTALL)
+        .lstrip("# \n")
+        .partition("\n")
+    )
+    prose = next(
+        (block for block in rest.split("\n\n") if re.match(r"\s*(?!```)[\w`*\[]", block)), ""
+    )
     plain = re.sub(r"\[([^\]]*)\]\([^)]*\)", r"\1", " ".join(prose.split()))
     about = re.split(r"(?<=\.) (?=[A-Z`])", plain)[0].removesuffix(":")
     return f"- [{title.strip()}]({page.file.dest_uri})" + (f": {about}" if about else "")

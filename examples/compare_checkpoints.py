@@ -1,12 +1,13 @@
 """Compare two checkpoints: is the later one better, or was it luck?
 
 Both play the same episodes; the decisive ones are those that only one checkpoint solves. `python
-compare_checkpoints.py` plays 2 x 40 episodes in this process, in seconds, and prints the difference with its interval
-and McNemar's test, for each environment and for all. The checkpoints are simulated: an expert whose hand drifts less
-after longer training.
+compare_checkpoints.py` plays 2 x 40 episodes in this process, in seconds, and prints the difference
+with its interval and McNemar's test, for each environment and for all. The checkpoints are
+simulated: an expert whose hand drifts less after longer training.
 
-`vlagents-ray eval` plays your own checkpoints, and the same lines compare them (docs/tutorials/checkpoints.md).
-`vlagents-ray merge` combines results of different runs in one folder.
+`vlagents-ray eval` plays your own checkpoints, and the same lines compare them
+(docs/tutorials/checkpoints.md). `vlagents-ray merge` combines results of different runs in one
+folder.
 """
 
 import time
@@ -24,7 +25,9 @@ class Trainee(Scripted):
     """A simulated policy with checkpoints."""
 
     def reset(self, obs, instruction, checkpoint_step=0, seed=0, **kwargs):
-        """Begin an episode with that checkpoint; its drift depends on the seed of the episode alone."""
+        """Begin an episode with that checkpoint; its drift depends on the seed of the episode
+        alone.
+        """
         drift = 0.35 * 0.5 ** (checkpoint_step / 5000)  # per action
         self.drift = np.random.default_rng(seed).normal(0, drift, 3).astype(np.float32)
         return super().reset(obs, instruction, **kwargs)
@@ -52,8 +55,14 @@ def main():
     for line in (*found.suites, found.total):
         low, high = line.interval
         pairs = line.pairs
-        print(f"{line.suite}: {pairs.total} pairs; only the later solved {pairs.only_a}, only the other {pairs.only_b}")
-        print(f"  difference of the rates: {low:+.0%} to {high:+.0%} with 95 % confidence, p = {line.adjusted:.2g}")
+        print(
+            f"{line.suite}: {pairs.total} pairs; only the later solved {pairs.only_a}, only the "
+            f"other {pairs.only_b}"
+        )
+        print(
+            f"  difference of the rates: {low:+.0%} to {high:+.0%} with 95 % confidence, p = "
+            f"{line.adjusted:.2g}"
+        )
 
 
 if __name__ == "__main__":

@@ -1,11 +1,14 @@
-"""A client on one screen; copy minimal_client.py into a robot's program, which needs numpy, simplejpeg and websockets.
+"""A client on one screen; copy minimal_client.py into a robot's program, which needs numpy,
+simplejpeg and websockets.
 
     with Policy("ws://gpu-box:8000/v1/stream") as policy:
         policy.reset({"front": image}, {"joints": joints}, instruction="stack the cups")
         answer = policy.act({"front": image}, {"joints": joints})
-        answer["action"]  # (D,) float32, or (H, D) for a chunk; the other keys are "done" and "info"
+        answer["action"]  # (D,) float32, or (H, D) for a chunk; the other keys are "done" and
+        "info"
 
-docs/protocol.md specifies the messages. `vlagents_ray.RemoteAgent` also reconnects and resumes its episode.
+docs/protocol.md specifies the messages. `vlagents_ray.RemoteAgent` also reconnects and resumes its
+episode.
 """
 
 import json
@@ -24,33 +27,60 @@ _PREFIX = struct.Struct("<3sBI")  # b"VLA", protocol version, bytes of the heade
 
 
 class PolicyError(Exception):
-    """An error of the server: `code, text = error.args`, such as "not_reset"; the connection can still be used."""
+    """An error of the server: `code, text = error.args`, such as "not_reset"; the connection can
+    still be used.
+    """
 
 
 class Policy(ExitStack):
-    """One session, open until `close`; `jpeg` is the quality of its images, up to 100, and None sends raw pixels."""
+    """One session, open until `close`; `jpeg` is the quality of its images, up to 100, and None
+    sends raw pixels.
+    """
 
-    def __init__(self, url: str, timeout_s: float = 5.0, jpeg: int | None = 85, api_key: str = "") -> None:
+    def __init__(
+        self, url: str, timeout_s: float = 5.0, jpeg: int | None = 85, api_key: str = ""
+    ) -> None:
         super().__init__()
         key = {"authorization": f"Bearer {api_key}"} if api_key else {}
-        self._socket = self.enter_context(connect(url, compression=None, max_size=2**26, additional_headers=key))
+        self._socket = self.enter_context(
+            connect(url, compression=None, max_size=2**26, additional_headers=key)
+        )
         self._timeout_s, self._jpeg, self._requests = timeout_s, jpeg, 0
 
-    def reset(self, cameras: Arrays, state: Arrays, gripper: float | None = None, **task: Any) -> dict[str, Any]:
-        """Begin an episode with its first observation; `task` may hold an `instruction` and `kwargs` of the policy."""
+    def reset(
+        self, cameras: Arrays, state: Arrays, gripper: float | None = None, **task: Any
+    ) -> dict[str, Any]:
+        """Begin an episode with its first observation; `task` may hold an `instruction` and
+        `kwargs` of the policy.
+        """
         return dict(self._call("reset", cameras, state, gripper, **task)["info"])
 
     def act(self, cameras: Arrays, state: Arrays, gripper: float | None = None) -> dict[str, Any]:
-        """Return the action for (H, W, 3) uint8 RGB images, (D,) numbers, and a gripper from 0, closed, to 1, open."""
+        """Return the action for (H, W, 3) uint8 RGB images, (D,) numbers, and a gripper from 0,
+        closed, to 1, open.
+        """
         return dict(self._call("act", cameras, state, gripper)["act"])
 
-    def _call(self, op: str, cameras: Arrays, state: Arrays, gripper: float | None, **task: Any) -> dict[str, Any]:
+    def _call(
+        self, op: str, cameras: Arrays, state: Arrays, gripper: float | None, **task: Any
+    ) -> dict[str, Any]:
         end = time.monotonic() + self._timeout_s
         self._requests += 1
-        header = {"op": op, "request_id": str(self._requests), "deadline_ms": 900 * self._timeout_s, **task}
+        header = {
+            "op": op,
+            "request_id": str(self._requests),
+            "deadline_ms": 900 * self._timeout_s,
+            **task,
+        }
         images = {name: np.ascontiguousarray(image) for name, image in cameras.items()}
-        form = {n: ["img", i] if self._jpeg else ["nd", i, "|u1", images[n].shape] for i, n in enumerate(images)}
-        blobs = [simplejpeg.encode_jpeg(x, self._jpeg) if self._jpeg else x.tobytes() for x in images.values()]
+        form = {
+            n: ["img", i] if self._jpeg else ["nd", i, "|u1", images[n].shape]
+            for i, n in enumerate(images)
+        }
+        blobs = [
+            simplejpeg.encode_jpeg(x, self._jpeg) if self._jpeg else x.tobytes()
+            for x in images.values()
+        ]
         parts = {n: np.asarray(part).tolist() for n, part in state.items()}
         obs = {"cameras": {n: {"$": form[n]} for n in form}, "gripper": gripper, "state": parts}
         text = json.dumps(header | {"obs": obs, "blobs": [len(blob) for blob in blobs]}).encode()

@@ -1,9 +1,9 @@
 """Wrap your own simulator, so that policies are evaluated in it.
 
-`Crane` is the simulator, with other units, colours and conventions than this project. You write `CraneEnv`. `python
-own_env.py` checks it, in the folder of this file, and `vlagents-ray eval own_env:CraneEnv --policy NAME --out
-runs/crane` evaluates a policy in it; own_policy.py is one that works. `vlagents-ray new env NAME` writes a skeleton
-with its test.
+`Crane` is the simulator, with other units, colours and conventions than this project. You write
+`CraneEnv`. `python own_env.py` checks it, in the folder of this file, and `vlagents-ray eval
+own_env:CraneEnv --policy NAME --out runs/crane` evaluates a policy in it; own_policy.py is one that
+works. `vlagents-ray new env NAME` writes a skeleton with its test.
 """
 
 import numpy as np
@@ -15,12 +15,16 @@ from vlagents_ray.testing import check_env
 
 
 class Crane:
-    """A hook over a floor of 1 x 1 m, and a camera that is mounted with a rotation about its axis."""
+    """A hook over a floor of 1 x 1 m, and a camera that is mounted with a rotation about its
+    axis.
+    """
 
     def load(self, seed, camera_turn):
         self.hook, self.mark = np.random.default_rng(seed).uniform(-450, 450, (2, 2))  # mm
         turn = np.deg2rad(camera_turn)
-        self._to_picture = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]]) / 1500
+        self._to_picture = (
+            np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]]) / 1500
+        )
 
     def drive(self, dx, dy):  # mm
         self.hook = np.clip(self.hook + np.array([dx, dy]), -500, 500)
@@ -44,7 +48,9 @@ class CraneEnv(EvalEnv):
 
     @property
     def contract(self):
-        """The observations and actions: a policy that does not fit is refused before the first step."""
+        """The observations and actions: a policy that does not fit is refused before the first
+        step.
+        """
         return Contract(
             cameras={"front": CameraSpec(self.side, self.side)},
             state={"xy": StateSpec(2, "m")},
@@ -58,7 +64,9 @@ class CraneEnv(EvalEnv):
         return "move the hook to the mark"
 
     def reset(self, *, seed, options=None):
-        """Begin the episode of this seed, which does not depend on earlier episodes or the process."""
+        """Begin the episode of this seed, which does not depend on earlier episodes or the
+        process.
+        """
         self.crane.load(seed, self.camera_turn)
         self.steps = 0
         return self._observe(), {}
@@ -69,8 +77,15 @@ class CraneEnv(EvalEnv):
         self.crane.drive(*(self.STEP_MM * np.clip(one_row(act, self.contract), -1, 1)))
         self.steps += 1
         success = self._distance() < 0.05
-        # Terminated: it cannot continue. Truncated: the step limit. Success is stated apart, and counted.
-        return self._observe(), before - self._distance(), success, self.steps >= self.max_steps, {"success": success}
+        # Terminated: it cannot continue. Truncated: the step limit. Success is stated apart, and
+        # counted.
+        return (
+            self._observe(),
+            before - self._distance(),
+            success,
+            self.steps >= self.max_steps,
+            {"success": success},
+        )
 
     def close(self):
         """Free the simulator."""
@@ -80,7 +95,9 @@ class CraneEnv(EvalEnv):
 
     def _observe(self):
         picture = self.crane.photo(self.side)[..., ::-1].copy()  # RGB, in new arrays each time
-        return Obs(cameras={"front": picture}, state={"xy": (self.crane.hook / 1000).astype(np.float32)})
+        return Obs(
+            cameras={"front": picture}, state={"xy": (self.crane.hook / 1000).astype(np.float32)}
+        )
 
 
 if __name__ == "__main__":

@@ -1,11 +1,12 @@
 """Serve your own policy.
 
-`Servo` finds the red hook and the green mark in the picture of own_env.py, and moves the hook towards the mark; your
-model replaces its 2 x 2 weights. In the folder of this file,
+`Servo` finds the red hook and the green mark in the picture of own_env.py, and moves the hook
+towards the mark; your model replaces its 2 x 2 weights. In the folder of this file,
 
-    python own_policy.py                                        checks it, and plays 20 episodes without a server
-    vlagents-ray serve own_policy:Servo --set camera_turn=120   serves it to robots, simulators and evaluations
-    vlagents-ray eval own_env:CraneEnv --policy http://localhost:8000 --out runs/crane
+    python own_policy.py                                        checks it, and plays 20 episodes
+    without a server vlagents-ray serve own_policy:Servo --set camera_turn=120   serves it to
+    robots, simulators and evaluations vlagents-ray eval own_env:CraneEnv --policy
+    http://localhost:8000 --out runs/crane
 
 `vlagents-ray new policy NAME` writes a skeleton with its test and its deployment file.
 """
@@ -24,22 +25,32 @@ from vlagents_ray.testing import check_agent
 
 
 class ServoConfig(BaseModel, extra="forbid"):
-    """The settings: `--set camera_turn=120`, or `config:` in a deployment file. Unknown keys are refused."""
+    """The settings: `--set camera_turn=120`, or `config:` in a deployment file. Unknown keys are
+    refused.
+    """
 
-    camera_turn: float = Field(default=0.0, description="degrees by which the camera is mounted turned")
+    camera_turn: float = Field(
+        default=0.0, description="degrees by which the camera is mounted turned"
+    )
 
 
 def offset(picture):
-    """Return the vector from hook to mark in a picture, (H, W, 3) uint8 RGB: (2,) picture widths, x right, y down."""
+    """Return the vector from hook to mark in a picture, (H, W, 3) uint8 RGB: (2,) picture
+    widths, x right, y down.
+    """
     red, green = picture[..., 0] > 200, picture[..., 1] > 200
     if not (red.any() and green.any()):
-        raise InvalidObservation("camera 'front': got a picture without a red hook and a green mark, want both in it")
+        raise InvalidObservation(
+            "camera 'front': got a picture without a red hook and a green mark, want both in it"
+        )
     hook, mark = (np.argwhere(colour).mean(axis=0)[::-1] for colour in (red, green))
     return (mark - hook) / picture.shape[1]
 
 
 class Servo(Agent):
-    """Moves the hook along the offset in the picture, rotated by the mounting angle of the camera."""
+    """Moves the hook along the offset in the picture, rotated by the mounting angle of the
+    camera.
+    """
 
     Config = ServoConfig
     trainable = "weights"  # rl_loop.py gives it new ones while it is served
@@ -49,8 +60,13 @@ class Servo(Agent):
 
     @property
     def contract(self):
-        """The inputs and outputs; a robot or an environment that does not fit gets an error with the difference."""
-        return Contract(cameras={"front": CameraSpec()}, action=ActionSpec(dim=2, space="ee_position", delta=True))
+        """The inputs and outputs; a robot or an environment that does not fit gets an error with
+        the difference.
+        """
+        return Contract(
+            cameras={"front": CameraSpec()},
+            action=ActionSpec(dim=2, space="ee_position", delta=True),
+        )
 
     def initialize(self):
         """Load the weights, once in a replica."""
@@ -59,16 +75,26 @@ class Servo(Agent):
         self.weights = {"gain": (10 * back).astype(np.float32)}  # (2, 2), actions per picture width
 
     def reset(self, obs, instruction, spread=0.0, seed=0, **kwargs):
-        """Begin an episode on this session's copy of the policy; the options come from the client."""
+        """Begin an episode on this session's copy of the policy; the options come from the
+        client.
+        """
         self.spread, self.rng = spread, np.random.default_rng(seed)  # of a learner's exploration
         return {}
 
     def act_batch(self, obs, sessions):
-        """Answer all waiting sessions in one forward pass: `sessions[i]` is the copy for `obs[i]`."""
+        """Answer all waiting sessions in one forward pass: `sessions[i]` is the copy for
+        `obs[i]`.
+        """
         seen = np.stack([offset(one.cameras["front"]) for one in obs])  # (B, 2)
         actions = seen @ self.weights["gain"].T
-        tried = [session.rng.normal(0, session.spread, 2) if session.spread else 0.0 for session in sessions]
-        return [Act((action + noise).astype(np.float32)) for action, noise in zip(actions, tried, strict=True)]
+        tried = [
+            session.rng.normal(0, session.spread, 2) if session.spread else 0.0
+            for session in sessions
+        ]
+        return [
+            Act((action + noise).astype(np.float32))
+            for action, noise in zip(actions, tried, strict=True)
+        ]
 
 
 if __name__ == "__main__":
@@ -76,6 +102,8 @@ if __name__ == "__main__":
     with make_env(env) as crane:
         check_agent(Servo(), obs=crane.reset(seed=0)[0])  # raises what is wrong with it
     out = time.strftime("runs/servo-%H%M%S")
-    plan = EvalConfig(policies=[{"name": "servo"}], suites=[{"envs": [env], "episodes": 20}], workers=0, out=out)
+    plan = EvalConfig(
+        policies=[{"name": "servo"}], suites=[{"envs": [env], "episodes": 20}], workers=0, out=out
+    )
     summary = evaluate(plan, agent_factory=lambda: Servo(ServoConfig(camera_turn=120)))
     print_summary(Console(), summary)

@@ -1,13 +1,15 @@
-"""Reinforcement learning with the server in the loop: a policy learns the mounting angle of its camera.
+"""Reinforcement learning with the server in the loop: a policy learns the mounting angle of its
+camera.
 
-The policy of own_policy.py acts in a server, workers play episodes in own_env.py with it, and this program learns from
-their transitions (REINFORCE) and pushes new weights. In the folder of this file, in two terminals:
+The policy of own_policy.py acts in a server, workers play episodes in own_env.py with it, and this
+program learns from their transitions (REINFORCE) and pushes new weights. In the folder of this
+file, in two terminals:
 
     vlagents-ray serve own_policy:Servo
     python rl_loop.py http://localhost:8000
 
-It needs the extra 'learn'. learn/train.py is the same loop around a torch policy that sees images and reads words, with
-cloning, PPO, a teacher and GRPO: docs/tutorials/learn.md.
+It needs the extra 'learn'. learn/train.py is the same loop around a torch policy that sees images
+and reads words, with cloning, PPO, a teacher and GRPO: docs/tutorials/learn.md.
 """
 
 import sys
@@ -36,11 +38,13 @@ class Learner:
         """Take a step along the policy gradient.
 
         Args:
-            columns: Of T transitions: cameras.front (T, H, W, 3) uint8, action (T, 2), reward (T,), the metres gained.
+            columns: Of T transitions: cameras.front (T, H, W, 3) uint8, action (T, 2), reward (T,),
+                the metres gained.
         """
         gain = self.policy.weights["gain"]
         seen = np.stack([offset(picture) for picture in columns["cameras.front"]])  # (T, 2)
-        tried = (columns["action"] - seen @ gain.T) / SPREAD**2  # (T, 2), gradients of the log-probabilities
+        # (T, 2), gradients of the log-probabilities.
+        tried = (columns["action"] - seen @ gain.T) / SPREAD**2
         reward = columns["reward"]
         better = (reward - reward.mean()) / reward.std()  # (T,)
         gradient = (better[:, None] * tried).T @ seen / len(seen)
@@ -54,9 +58,13 @@ def main(url):
     held_out = {"envs": [ENV], "episodes": 20, "seeds": [10_000]}
     out = time.strftime("runs/rl-%H%M%S")
     plan = EvalConfig(policies=[{"name": "servo"}], suites=[held_out], out=out, video="none")
-    evaluation = TrainingEvaluation(learner.policy, plan)  # in this process; with the URL, in workers
+    # In this process; with the URL, in workers.
+    evaluation = TrainingEvaluation(learner.policy, plan)
     exploring = {"policy_options": {"spread": SPREAD}}
-    with Publisher(url) as weights, Rollouts(RolloutPlan(ENV, url, workers=2, num_envs=4, **exploring)) as rollouts:
+    with (
+        Publisher(url) as weights,
+        Rollouts(RolloutPlan(ENV, url, workers=2, num_envs=4, **exploring)) as rollouts,
+    ):
         for iteration in range(ITERATIONS + 1):
             version = weights.push(learner.policy.parameters(), allow_same=True)
             if iteration in (0, ITERATIONS):
@@ -65,7 +73,10 @@ def main(url):
             if iteration < ITERATIONS:
                 rollouts.version = version
                 columns = arrays(rollouts.collect(EPISODES))
-                print(f"servo@{version}: {columns['reward'].mean() * 100:+.1f} cm a step while it explores")
+                print(
+                    f"servo@{version}: {columns['reward'].mean() * 100:+.1f} cm a step while it "
+                    "explores"
+                )
                 learner.improve(columns)
     print(f"the curve: {out}/report.html")
 

@@ -1,12 +1,14 @@
-"""A robot's loop: a steady rate, a guard that checks every action before the arm executes it, and a watchdog.
+"""A robot's loop: a steady rate, a guard that checks every action before the arm executes it, and a
+watchdog.
 
-The arm is simulated, and the policy draws joint targets at random. So the guard refuses distant targets, and the arm
-holds its pose at those ticks. In two terminals:
+The arm is simulated, and the policy draws joint targets at random. So the guard refuses distant
+targets, and the arm holds its pose at those ticks. In two terminals:
 
     vlagents-ray serve random --set chunk=10 --set low=-0.3 --set high=0.3
     python robot_loop.py http://localhost:8000
 
-docs/tutorials/robot.md leads to your own arm, docs/control_loop.md explains chunks, modes and safe actions.
+docs/tutorials/robot.md leads to your own arm, docs/control_loop.md explains chunks, modes and safe
+actions.
 """
 
 import sys
@@ -25,16 +27,26 @@ def main(url):
         low=-1.0,  # rad, of every joint; the stricter of these and the contract's
         high=1.0,
         max_step=0.5,  # rad, from one action to the next
-        measure=lambda obs: obs.state["joints"],  # where the arm is, for the first action and after a stop
+        # Where the arm is, for the first action and after a stop.
+        measure=lambda obs: obs.state["joints"],
     )
     # Stops the arm when an answer is overdue by 1 s, or the loop has not ticked for 0.2 s.
     watchdog = Watchdog(lambda _reason: arm.stop(), {"server": 1.0, "loop": 0.2})
-    # In "async" the next chunk is requested while the last one is executed, so that no tick waits for the network.
+    # In "async" the next chunk is requested while the last one is executed, so that no tick waits
+    # for the network.
     with ChunkPlayer(agent, PlayerSettings(mode="async", safe="hold"), check=guard) as player:
-        report = run_loop(arm, player, hz=50, seconds=2, instruction="stack the cups", watchdog=watchdog)
+        report = run_loop(
+            arm, player, hz=50, seconds=2, instruction="stack the cups", watchdog=watchdog
+        )
     refused = report.safe.get("max_step", 0)
-    print(f"{refused} of {report.jitter['ticks']} actions refused, such as:", report.reasons.get("max_step"))
-    print(f"{report.safe_ticks} ticks without an action of the policy, for this or another reason: {report.safe}")
+    print(
+        f"{refused} of {report.jitter['ticks']} actions refused, such as:",
+        report.reasons.get("max_step"),
+    )
+    print(
+        f"{report.safe_ticks} ticks without an action of the policy, for this or another reason: "
+        f"{report.safe}"
+    )
     print(f"punctual within 2 ms: {report.jitter['on_time']:.1%} of the ticks")
     print(f"watchdog: {report.barks or 'never barked'}")
 

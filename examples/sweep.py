@@ -1,11 +1,13 @@
 """Evaluate a sweep over the rotation of a camera from its calibration and the noise of actions.
 
-Two policies differ in an option of their resets, and five suites in an option of the environment: ten cells, all on the
-same seeds. `python sweep.py`, in the folder of this file, plays them in this process, in seconds, with the policy and
-the environment of own_policy.py and own_env.py; run again, it continues an interrupted sweep.
+Two policies differ in an option of their resets, and five suites in an option of the environment:
+ten cells, all on the same seeds. `python sweep.py`, in the folder of this file, plays them in this
+process, in seconds, with the policy and the environment of own_policy.py and own_env.py; run again,
+it continues an interrupted sweep.
 
-As a file, the same plan is played by `vlagents-ray eval FILE` with a served policy and many workers:
-evaluations/sweep.yaml sweeps over the checkpoints of a training run, evaluations/realtime.yaml over latencies.
+As a file, the same plan is played by `vlagents-ray eval FILE` with a served policy and many
+workers: evaluations/sweep.yaml sweeps over the checkpoints of a training run,
+evaluations/realtime.yaml over latencies.
 """
 
 from itertools import groupby
@@ -21,9 +23,15 @@ TURNS, SPREADS = (0, 30, 60, 90, 120), (0.0, 1.0)  # degrees; standard deviation
 def main():
     """Play the episodes without a result, and print a row for each policy."""
     plan = EvalConfig(
-        policies=[{"name": f"spread {spread}", "options": {"spread": spread}} for spread in SPREADS],
+        policies=[
+            {"name": f"spread {spread}", "options": {"spread": spread}} for spread in SPREADS
+        ],
         suites=[
-            {"name": f"{turn}°", "envs": ["own_env:CraneEnv"], "env_options": {"camera_turn": CALIBRATED + turn}}
+            {
+                "name": f"{turn}°",
+                "envs": ["own_env:CraneEnv"],
+                "env_options": {"camera_turn": CALIBRATED + turn},
+            }
             for turn in TURNS
         ],
         out="runs/sweep",

@@ -1,13 +1,16 @@
 """Use a model in another system's server: `policy: upstream`.
 
-Here the server is openpi's: `theirs` implements its protocol in a few lines, in place of `scripts/serve_policy.py` in a
-checkout of openpi. The policy `upstream` connects to it, and an evaluation plays with the policy. `python upstream.py`
-does both in this process. With the real server at ws://gpu-box:9000,
+Here the server is openpi's: `theirs` implements its protocol in a few lines, in place of
+`scripts/serve_policy.py` in a checkout of openpi. The policy `upstream` connects to it, and an
+evaluation plays with the policy. `python upstream.py` does both in this process. With the real
+server at ws://gpu-box:9000,
 
-    python upstream.py ws://gpu-box:9000                 plays the same episodes with its model, if its keys are these
-    vlagents-ray serve deployments/upstream.yaml         puts batches, sessions, keys and the live page before it
+    python upstream.py ws://gpu-box:9000                 plays the same episodes with its model, if
+    its keys are these vlagents-ray serve deployments/upstream.yaml         puts batches, sessions,
+    keys and the live page before it
 
-docs/policies/upstream.md has the other protocols (GR00T, OpenVLA, RoboArena, vla-eval, vlagents) and their keys.
+docs/policies/upstream.md has the other protocols (GR00T, OpenVLA, RoboArena, vla-eval, vlagents)
+and their keys.
 """
 
 import contextlib
@@ -38,9 +41,16 @@ def theirs():
         connection.send(msgpack.packb({"robot": "example"}))  # the server's metadata
         for message in connection:
             observation = msgpack.unpackb(message)
-            pose = np.frombuffer(observation["observation/state"][b"data"], np.float32)  # (6,), m and rad
-            actions = np.tile(np.append(-0.5 * pose[:3], 1).astype(np.float32), (10, 1))  # (10, 4), a chunk
-            array = {b"__ndarray__": True, b"data": actions.tobytes(), b"dtype": "<f4", b"shape": actions.shape}
+            # (6,), m and rad.
+            pose = np.frombuffer(observation["observation/state"][b"data"], np.float32)
+            # (10, 4), a chunk.
+            actions = np.tile(np.append(-0.5 * pose[:3], 1).astype(np.float32), (10, 1))
+            array = {
+                b"__ndarray__": True,
+                b"data": actions.tobytes(),
+                b"dtype": "<f4",
+                b"shape": actions.shape,
+            }
             connection.send(msgpack.packb({"actions": array}))
 
     with serve(answer, "127.0.0.1", 0, max_size=None) as server:
@@ -55,10 +65,17 @@ def theirs():
 
 def main(url):
     """Evaluate the model in a server of openpi."""
-    config = {"protocol": "openpi", "urls": [url], "mapping": MAPPING, "contract": {"action": {"dim": 4}, "chunk": 10}}
+    config = {
+        "protocol": "openpi",
+        "urls": [url],
+        "mapping": MAPPING,
+        "contract": {"action": {"dim": 4}, "chunk": 10},
+    }
     suite = {"envs": ["tabletop/lift"], "episodes": 3}
     out = time.strftime("runs/upstream-%H%M%S")
-    plan = EvalConfig(policies=[{"name": "theirs"}], suites=[suite], out=out, video="none", workers=0)
+    plan = EvalConfig(
+        policies=[{"name": "theirs"}], suites=[suite], out=out, video="none", workers=0
+    )
     print_summary(Console(), evaluate(plan, agent_factory=lambda: Upstream.from_config(config)))
 
 

@@ -1,6 +1,7 @@
 """Writes the card of a reference policy: `python reference/card.py CHECKPOINT EVALUATION...`.
 
-It states the data, the seeds, the commit, the rates of success with their intervals, and the limits.
+It states the data, the seeds, the commit, the rates of success with their intervals, and the
+limits.
 """
 
 from __future__ import annotations
@@ -63,13 +64,17 @@ MADE = "training.json"
 
 
 def rates(results: Sequence[Results]) -> list[str]:
-    """Return the rows of the table of rates, a task each; `misled` is the control, told of other things."""
+    """Return the rows of the table of rates, a task each; `misled` is the control, told of other
+    things.
+    """
     cells = {(cell.policy, cell.env): cell for one in results for cell in one.cells}
     lines = ["| task | success, % | misled, % | seeds |", "|---|---|---|---|"]
     for (policy, env), cell in cells.items():
         if policy == "reference":
             last = max(one.key.seed for one in cell.counted)
-            lines.append(f"| `{env}` | {_rate(cell)} | {_rate(cells['misled', env])} | 0 to {last} |")
+            lines.append(
+                f"| `{env}` | {_rate(cell)} | {_rate(cells['misled', env])} | 0 to {last} |"
+            )
     return lines
 
 
@@ -80,11 +85,16 @@ def _rate(cell: CellResults) -> str:
 
 
 def main(checkpoint: Path, evaluations: list[Path]) -> None:
-    """Write README.md, and rates.json: the solved ones and all episodes of each task, into the folder."""
+    """Write README.md, and rates.json: the solved ones and all episodes of each task, into the
+    folder.
+    """
     results = [Results.load(folder) for folder in evaluations]
     stated, trained = read_checkpoint(checkpoint), json.loads((checkpoint / MADE).read_text())
     data = [
-        f"| `{name}` | {one['episodes']} | {one['frames']} | {', '.join(stated.embodiments[name].cameras.values())} |"
+        (
+            f"| `{name}` | {one['episodes']} | {one['frames']} | "
+            f"{', '.join(stated.embodiments[name].cameras.values())} |"
+        )
         for name, one in trained["robots"].items()
     ]
     text = _TEXT.format(

@@ -1,8 +1,9 @@
 """Record an expert's corrections of the reference policy: `python reference/dagger.py --help`.
 
-The policy plays the tabletop until the expert takes over, at a tick drawn by the seed, as soon as the gripper is open,
-so that it drops nothing. What it then shows are states that the policy reaches (DAgger, arXiv 1011.0686; with an expert
-that takes over: HG-DAgger, arXiv 1810.02890). Episodes that the policy solves before are not recorded.
+The policy plays the tabletop until the expert takes over, at a tick drawn by the seed, as soon as
+the gripper is open, so that it drops nothing. What it then shows are states that the policy reaches
+(DAgger, arXiv 1011.0686; with an expert that takes over: HG-DAgger, arXiv 1810.02890). Episodes
+that the policy solves before are not recorded.
 """
 
 from __future__ import annotations
@@ -34,11 +35,16 @@ def correct(env: EvalEnv, policy: Reference, dataset: Dataset, seed: int) -> boo
     """Play an episode, and keep it if the expert solved it; returns whether it did."""
     obs, _ = env.reset(seed=seed)
     policy.reset(obs, env.instruction, seed=seed)
-    expert, due, rows = TabletopExpert("tabletop"), np.random.default_rng(seed).integers(TAKE_OVER), np.zeros((0, 4))
+    expert, due, rows = (
+        TabletopExpert("tabletop"),
+        np.random.default_rng(seed).integers(TAKE_OVER),
+        np.zeros((0, 4)),
+    )
     episode, led, solved = dataset.begin(env.instruction, env.contract.action), False, False
     for tick in range(env.max_steps):
         if not led and tick >= due and (obs.gripper or 0.0) > OPEN:
-            with contextlib.suppress(InvalidObservation):  # the gripper hides an object; the policy goes on
+            # The gripper hides an object; the policy goes on.
+            with contextlib.suppress(InvalidObservation):
                 expert.reset(obs, env.instruction)
                 led = True
         if led:
@@ -65,10 +71,14 @@ def record(
     checkpoint: Annotated[Path, typer.Argument(help="Of the policy.")],
     out: Annotated[Path, typer.Argument(help="New folder of a LeRobotDataset with interventions.")],
     episodes: Annotated[int, typer.Option(min=1, help="That are played.")] = 800,
-    seed: Annotated[int, typer.Option(help="Of the first one; those of the evaluation begin at 0.")] = 2_000_000,
+    seed: Annotated[
+        int, typer.Option(help="Of the first one; those of the evaluation begin at 0.")
+    ] = 2_000_000,
 ) -> None:
     """Record corrections, losslessly, as the policy gets images without loss."""
-    policy = Reference.from_config({"checkpoint": str(checkpoint), "embodiment": "tabletop", "execute": EXECUTE})
+    policy = Reference.from_config(
+        {"checkpoint": str(checkpoint), "embodiment": "tabletop", "execute": EXECUTE}
+    )
     policy.initialize()
     begun = time.monotonic()
     with make_env("tabletop", cameras=["front", "wrist"], width=64, height=64) as env:
@@ -78,12 +88,19 @@ def record(
 
 
 @app.command("compare")
-def compare_after(out: Annotated[Path, typer.Argument(help="Results of before and after, on the same seeds.")]) -> None:
+def compare_after(
+    out: Annotated[Path, typer.Argument(help="Results of before and after, on the same seeds.")],
+) -> None:
     """Print the paired comparison of an evaluation, by McNemar's exact test."""
     total = compare(Results.load(out), "after", "before").total
     pairs, (low, high) = total.pairs, total.interval
-    typer.echo(f"solved after only {pairs.only_a}, before only {pairs.only_b}, both {pairs.both} of {pairs.total}")
-    typer.echo(f"difference {pairs.difference:+.1%} [{low:+.1%}, {high:+.1%}], p {pairs.p_value:.2g}")
+    typer.echo(
+        f"solved after only {pairs.only_a}, before only {pairs.only_b}, both {pairs.both} of "
+        f"{pairs.total}"
+    )
+    typer.echo(
+        f"difference {pairs.difference:+.1%} [{low:+.1%}, {high:+.1%}], p {pairs.p_value:.2g}"
+    )
 
 
 if __name__ == "__main__":

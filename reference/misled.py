@@ -17,5 +17,7 @@ class Misled(Reference):
     """The reference policy, whose instruction names the next colour for each, or another deed."""
 
     def _begin(self, instruction: str, seed: int, adapter: str = "") -> None:
-        other = _DEEDS.get(instruction) or " ".join(_COLOURS.get(word, word) for word in instruction.split())
+        other = _DEEDS.get(instruction) or " ".join(
+            _COLOURS.get(word, word) for word in instruction.split()
+        )
         super()._begin(other, seed, adapter)

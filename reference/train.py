@@ -1,8 +1,9 @@
-"""Train the reference policy on LeRobotDatasets, one for each robot: `python reference/train.py --help`.
+"""Train the reference policy on LeRobotDatasets, one for each robot: `python reference/train.py
+--help`.
 
-An interrupted run continues where its last state was kept, and ends with the same weights: each batch, and its noise,
-follow from the seed and the number of the step. So does a second run, on the same processor, with the same torch and
-as many threads.
+An interrupted run continues where its last state was kept, and ends with the same weights: each
+batch, and its noise, follow from the seed and the number of the step. So does a second run, on the
+same processor, with the same torch and as many threads.
 """
 
 from __future__ import annotations
@@ -43,10 +44,12 @@ from vlagents_ray.weights.safetensors import write_values
 from vlagents_ray_learn.open_loop.recorded_dataset import Names, RecordedDataset
 
 BATCH = 256  # frames
-DRAWS = 4  # times that a frame's context is used in a step, each with noise of its own: they cost little
+# Times that a frame's context is used in a step, each with noise of its own: they cost little.
+DRAWS = 4
 RATE, DECAY, CLIP = 3e-3, 0.01, 1.0  # of AdamW from nothing, and the largest norm of a gradient
 WARM_UP = 200  # steps, after which the rate falls as a cosine
-OBJECTS = 1.0  # weight of the error of the places of objects, which teaches early what words mean in images
+# Weight of the error of the places of objects, which teaches early what words mean in images.
+OBJECTS = 1.0
 AVERAGE = 0.999  # of the weights, per step; these are what is saved
 MADE = "training.json"
 KEEP_EVERY = 500  # steps between two kept states
@@ -55,27 +58,36 @@ SHOWN_EVERY = 100  # steps between two lines of the log
 
 @dataclass(frozen=True)
 class Frames:
-    """The frames of all datasets, in the order of robots and episodes; M of them are trained with."""
+    """The frames of all datasets, in the order of robots and episodes; M of them are trained
+    with.
+    """
 
     images: np.ndarray  # (M, cameras, S, S, 3) uint8
     place: torch.Tensor  # (M,) int64, of each among all N
     state: torch.Tensor  # (N, S) in the network's units
-    objects: torch.Tensor  # (N, O) places of objects, of mean 0 and variance 1; NaN where a robot's dataset has none
+    # (N, O) places of objects, of mean 0 and variance 1; NaN where a robot's dataset has none.
+    objects: torch.Tensor
     action: torch.Tensor  # (N, D)
     tokens: torch.Tensor  # (N, L)
     end: torch.Tensor  # (N,) int64, the first frame after the episode's
 
 
 def read(
-    data: Path, cameras: dict[str, dict[str, str]], kept: Path, every: int = 1, start: Checkpoint | None = None
+    data: Path,
+    cameras: dict[str, dict[str, str]],
+    kept: Path,
+    every: int = 1,
+    start: Checkpoint | None = None,
 ) -> tuple[Checkpoint, Frames]:
-    """Read the dataset of each robot in a folder; of one with interventions, only these are trained with.
+    """Read the dataset of each robot in a folder; of one with interventions, only these are trained
+    with.
 
     Args:
         data: The folder, with a dataset for each robot.
         cameras: Of the network -> of the robot, by robot.
         kept: A file for the decoded images, which may be larger than the memory.
-        every: One frame of so many of an episode is trained with: its neighbours are nearly the same.
+        every: One frame of so many of an episode is trained with: its neighbours are nearly the
+            same.
         start: The checkpoint that is trained further, whose words and units stay.
 
     Returns:
@@ -87,10 +99,16 @@ def read(
     robots: dict[str, Embodiment] = {}
     with kept.open("wb") as file:
         for robot, names in cameras.items():
-            dataset, own, around = RecordedDataset(data / robot), list[np.ndarray](), list[np.ndarray]()
+            dataset, own, around = (
+                RecordedDataset(data / robot),
+                list[np.ndarray](),
+                list[np.ndarray](),
+            )
             contract = dataset.contract
             if contract is None:
-                raise typer.BadParameter(f"{data / robot}: was not exported by this project: its info has no contract")
+                raise typer.BadParameter(
+                    f"{data / robot}: was not exported by this project: its info has no contract"
+                )
             parts = list(contract.state) if start is None else start.embodiments[robot].state
             corrected = INTERVENTION_COLUMN in dataset.features
             for session in dataset.sessions():
@@ -99,7 +117,11 @@ def read(
                 for step in dataset.steps(episode, Names(), None):
                     if step.frame % every == 0 and (step.intervention or not corrected):
                         seen = (step.obs.cameras[names[name]] for name in CAMERAS)
-                        file.write(np.stack([resize_with_pad(one, sizes.side, sizes.side) for one in seen]).tobytes())
+                        file.write(
+                            np.stack(
+                                [resize_with_pad(one, sizes.side, sizes.side) for one in seen]
+                            ).tobytes()
+                        )
                         places.append(begun + step.frame)
                     own.append(state_vector(step.obs, parts))
                     around.append(state_vector(step.obs, contract.environment))
@@ -107,35 +129,56 @@ def read(
                 ends += [total] * episode.length
                 texts += [episode.instruction] * episode.length
             found, things = np.stack(own), np.stack(around)
-            robots[robot] = start.embodiments[robot] if start is not None else Embodiment(
-                cameras=names, state=parts, state_mean=found.mean(0).tolist(), state_std=found.std(0).tolist(),
-                action=contract.contract.to_json()["action"],
-            )  # fmt: skip
+            robots[robot] = (
+                start.embodiments[robot]
+                if start is not None
+                else Embodiment(
+                    cameras=names,
+                    state=parts,
+                    state_mean=found.mean(0).tolist(),
+                    state_std=found.std(0).tolist(),
+                    action=contract.contract.to_json()["action"],
+                )
+            )
             states.append(normalised(robots[robot], found, sizes.state))
             objects.append((things - things.mean(0)) / np.maximum(things.std(0), 1e-2))
     words = sorted({word for text in set(texts) for word in words_of(text)})
     sizes = sizes.model_copy(update={"words": len(words)})
     checkpoint = start or Checkpoint(sizes=sizes, words=words, embodiments=robots)
-    images = np.memmap(kept, np.uint8, "r", shape=(len(places), len(CAMERAS), sizes.side, sizes.side, 3))
+    images = np.memmap(
+        kept, np.uint8, "r", shape=(len(places), len(CAMERAS), sizes.side, sizes.side, 3)
+    )
     known = {text: checkpoint.tokens(text) for text in set(texts)}
     widest = max(1, *(one.shape[1] for one in objects))
-    filled = [np.pad(one, ((0, 0), (0, widest - one.shape[1])), constant_values=np.nan) for one in objects]
+    filled = [
+        np.pad(one, ((0, 0), (0, widest - one.shape[1])), constant_values=np.nan) for one in objects
+    ]
     return checkpoint, Frames(
-        images, torch.tensor(places), torch.from_numpy(np.concatenate(states)),
-        torch.from_numpy(np.concatenate(filled).astype(np.float32)), torch.from_numpy(np.stack(actions)),
-        torch.from_numpy(np.stack([known[text] for text in texts])), torch.tensor(ends),
-    )  # fmt: skip
+        images,
+        torch.tensor(places),
+        torch.from_numpy(np.concatenate(states)),
+        torch.from_numpy(np.concatenate(filled).astype(np.float32)),
+        torch.from_numpy(np.stack(actions)),
+        torch.from_numpy(np.stack([known[text] for text in texts])),
+        torch.tensor(ends),
+    )
 
 
 def batches(frames: int, seed: int) -> Iterator[np.ndarray]:
-    """Yield the frames of each step, sorted as they are read from a file: all of them once, then again."""
+    """Yield the frames of each step, sorted as they are read from a file: all of them once, then
+    again.
+    """
     for epoch in range(10**9):
         order = np.random.default_rng([seed, epoch]).permutation(frames)
-        yield from (np.sort(order[at : at + BATCH]) for at in range(0, max(frames - BATCH, 0) + 1, BATCH))
+        yield from (
+            np.sort(order[at : at + BATCH]) for at in range(0, max(frames - BATCH, 0) + 1, BATCH)
+        )
 
 
 class Training(torch.nn.Module):  # type: ignore[misc]  # torch's own types are not read
-    """The network, and a guess of the places of objects from its context, which is for the training alone."""
+    """The network, and a guess of the places of objects from its context, which is for the
+    training alone.
+    """
 
     def __init__(self, sizes: NetworkSizes, objects: int) -> None:
         super().__init__()
@@ -143,9 +186,13 @@ class Training(torch.nn.Module):  # type: ignore[misc]  # torch's own types are 
         self.guess = torch.nn.Linear(2 * sizes.head, objects)
 
     def forward(
-        self, tokens: torch.Tensor, state: torch.Tensor, images: Sequence[torch.Tensor], noisy: torch.Tensor,
+        self,
+        tokens: torch.Tensor,
+        state: torch.Tensor,
+        images: Sequence[torch.Tensor],
+        noisy: torch.Tensor,
         times: torch.Tensor,
-    ) -> tuple[torch.Tensor, torch.Tensor]:  # fmt: skip
+    ) -> tuple[torch.Tensor, torch.Tensor]:
         context = self.network.encode(tokens, state, *images)
         return self.network.velocity(context.repeat(DRAWS, 1), noisy, times), self.guess(context)
 
@@ -153,7 +200,8 @@ class Training(torch.nn.Module):  # type: ignore[misc]  # torch's own types are 
 def loss_of(
     training: Training, frames: Frames, batch: np.ndarray, draws: torch.Generator
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Return the mean squared error of the flow's velocity over a batch, and the error of the places of objects.
+    """Return the mean squared error of the flow's velocity over a batch, and the error of the
+    places of objects.
 
     Times are drawn as for π0 (arXiv 2410.24164), more of them near the noise.
 
@@ -189,7 +237,8 @@ def fit(
     rate: float = RATE,
     start: Path | None = None,
 ) -> ReferenceNetwork:
-    """Return the network after so many steps, from the state in the file `kept` if there is one, else from `start`.
+    """Return the network after so many steps, from the state in the file `kept` if there is one,
+    else from `start`.
 
     Each thread has a part of a batch, which is 1.4 times as fast as operations of several threads.
     """
@@ -210,14 +259,18 @@ def fit(
         first = state["step"]
         typer.echo(f"continues after step {first}")
 
-    def gradients(part: tuple[int, int, np.ndarray]) -> tuple[tuple[float, float], tuple[torch.Tensor, ...]]:
+    def gradients(
+        part: tuple[int, int, np.ndarray],
+    ) -> tuple[tuple[float, float], tuple[torch.Tensor, ...]]:
         step, number, rows = part
         low = list(copies[number].parameters())
         with torch.no_grad():
             torch._foreach_copy_(low, own)
         draws = torch.Generator().manual_seed((seed * 2**32 + step) * threads + number)
         flow, off = loss_of(copies[number], frames, rows, draws)
-        return (flow.item(), off.item()), torch.autograd.grad(flow + OBJECTS * off, low, materialize_grads=True)
+        return (flow.item(), off.item()), torch.autograd.grad(
+            flow + OBJECTS * off, low, materialize_grads=True
+        )
 
     pool = ThreadPoolExecutor(threads, initializer=torch.set_num_threads, initargs=(1,))
     begun, losses = time.monotonic(), list[tuple[float, float]]()
@@ -225,7 +278,9 @@ def fit(
         if step < first:
             continue
         for group in optimizer.param_groups:
-            group["lr"] = rate * min(1.0, (step + 1) / WARM_UP) * 0.5 * (1 + math.cos(math.pi * step / steps))
+            group["lr"] = (
+                rate * min(1.0, (step + 1) / WARM_UP) * 0.5 * (1 + math.cos(math.pi * step / steps))
+            )
         parts = [(step, number, part) for number, part in enumerate(np.array_split(batch, threads))]
         found = list(pool.map(gradients, parts))
         for number, value in enumerate(own):
@@ -239,7 +294,10 @@ def fit(
         if done % SHOWN_EVERY == 0 or done == steps:
             speed = (done - first) * BATCH / (time.monotonic() - begun)
             loss, error = np.mean(losses[-threads * SHOWN_EVERY :], axis=0)
-            typer.echo(f"step {done} of {steps}: loss {loss:.4f}, objects {error:.4f}, {speed:.0f} frames/s")
+            typer.echo(
+                f"step {done} of {steps}: loss {loss:.4f}, objects {error:.4f}, {speed:.0f} "
+                "frames/s"
+            )
         if done % KEEP_EVERY == 0 and done < steps:
             state = {"training": training.state_dict(), "average": average.state_dict(),
                      "optimizer": optimizer.state_dict(), "step": done}  # fmt: skip
@@ -248,7 +306,9 @@ def fit(
     return average.network
 
 
-def save(checkpoint: Checkpoint, network: ReferenceNetwork, folder: Path, trained: dict[str, Any]) -> None:
+def save(
+    checkpoint: Checkpoint, network: ReferenceNetwork, folder: Path, trained: dict[str, Any]
+) -> None:
     """Write a checkpoint; `trained` states how it was made, for its card."""
     folder.mkdir(parents=True, exist_ok=True)
     (folder / MADE).write_text(json.dumps(trained, indent=1) + "\n")
@@ -260,18 +320,23 @@ def save(checkpoint: Checkpoint, network: ReferenceNetwork, folder: Path, traine
 def main(
     data: Annotated[Path, typer.Argument(help="Folder with a LeRobotDataset for each robot.")],
     out: Annotated[Path, typer.Argument(help="Folder of the checkpoint.")],
-    cameras: Annotated[list[str], typer.Option(help="ROBOT=SCENE,WRIST: the robot's names of the cameras.")],
+    cameras: Annotated[
+        list[str], typer.Option(help="ROBOT=SCENE,WRIST: the robot's names of the cameras.")
+    ],
     steps: Annotated[int, typer.Option(min=1, help=f"Of {BATCH} frames each.")] = 11000,
     seed: Annotated[int, typer.Option(min=0)] = 0,
-    every: Annotated[int, typer.Option(min=1, help="Of so many frames of an episode, one is trained with.")] = 1,
+    every: Annotated[
+        int, typer.Option(min=1, help="Of so many frames of an episode, one is trained with.")
+    ] = 1,
     threads: Annotated[int, typer.Option(min=1, help="Others round differently.")] = 2,
     start: Annotated[
-        Path | None, typer.Option(help="Checkpoint that is trained further, instead of from nothing.")
+        Path | None,
+        typer.Option(help="Checkpoint that is trained further, instead of from nothing."),
     ] = None,
     rate: Annotated[float, typer.Option(help="Largest learning rate.")] = RATE,
-    work: Annotated[Path, typer.Option(help="Folder for decoded images and the state of the training.")] = Path(
-        "runs/reference/train"
-    ),
+    work: Annotated[
+        Path, typer.Option(help="Folder for decoded images and the state of the training.")
+    ] = Path("runs/reference/train"),
 ) -> None:
     """Train, and write the checkpoint."""
     torch.use_deterministic_algorithms(True)
@@ -281,14 +346,16 @@ def main(
     begun = None if start is None else read_checkpoint(start)
     checkpoint, frames = read(data, named, work / "images.bin", every, begun)
     typer.echo(
-        f"{len(frames.place)} of {len(frames.state)} frames of {len(named)} robots, {len(checkpoint.words)} words"
+        f"{len(frames.place)} of {len(frames.state)} frames of {len(named)} robots, "
+        f"{len(checkpoint.words)} words"
     )
     network = fit(checkpoint, frames, steps, seed, work / "state.pt", threads, rate, start)
     infos = {robot: RecordedDataset(data / robot).info for robot in named}
     code = code_in(Path(__file__).parent)
     trained = {
         "robots": {
-            robot: {"episodes": info["total_episodes"], "frames": info["total_frames"]} for robot, info in infos.items()
+            robot: {"episodes": info["total_episodes"], "frames": info["total_frames"]}
+            for robot, info in infos.items()
         },
         "trained_frames": len(frames.place),
         "steps": steps,

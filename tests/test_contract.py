@@ -8,7 +8,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from vlagents_ray.contract import ActionSpec, CameraSpec, Contract, StateSpec, differences, require_match
+from vlagents_ray.contract import (
+    ActionSpec,
+    CameraSpec,
+    Contract,
+    StateSpec,
+    differences,
+    require_match,
+)
 from vlagents_ray.errors import (
     ContractMismatch,
     InvalidAction,
@@ -31,7 +38,9 @@ POLICY = Contract(
     chunk=8,
     history=2,
 )
-ENV = replace(POLICY, cameras={**POLICY.cameras, "extra": CameraSpec(64, 64)}, chunk=None, history=None)  # type: ignore[dict-item]
+ENV = replace(
+    POLICY, cameras={**POLICY.cameras, "extra": CameraSpec(64, 64)}, chunk=None, history=None
+)  # type: ignore[dict-item]
 OBS = Obs(
     {"front": np.zeros((224, 224, 3), np.uint8), "wrist": np.zeros((32, 32, 3), np.uint8)},
     0.5,
@@ -102,16 +111,28 @@ def test_the_order_of_the_arms_survives_json_and_is_compared() -> None:
 def test_joints_in_another_order_are_found_by_the_names_that_both_sides_have() -> None:
     env = Contract(action=ActionSpec(names=("left_pan", "left_lift", "left_grip", "right_pan")))
     assert Contract.from_json(json.loads(json.dumps(env.to_json()))) == env
-    assert "names" not in Contract().to_json()["action"], "older versions refuse what they do not know"
+    assert "names" not in Contract().to_json()["action"], (
+        "older versions refuse what they do not know"
+    )
     same = Contract(action=ActionSpec(names=("left_pan.pos", "left_lift.pos", "right_pan.pos")))
     assert differences(same, env) == []
-    assert differences(Contract(action=ActionSpec(names=("joint1", "joint2"))), env) == [], "other names say nothing"
-    found = differences(Contract(action=ActionSpec(names=("left_lift", "left_pan", "right_pan"))), env)
-    assert found[0] == "action.names: number 0 is 'left_lift' of the policy and 'left_pan' of the env; use one order"
+    assert differences(Contract(action=ActionSpec(names=("joint1", "joint2"))), env) == [], (
+        "other names say nothing"
+    )
+    found = differences(
+        Contract(action=ActionSpec(names=("left_lift", "left_pan", "right_pan"))), env
+    )
+    assert found[0] == (
+        "action.names: number 0 is 'left_lift' of the policy and 'left_pan' of the env; use "
+        "one "
+        "order"
+    )
     assert len(found) == 2
 
 
-def test_what_an_act_says_on_demand_survives_json_and_is_left_out_for_those_who_do_not_know_it() -> None:
+def test_what_an_act_says_on_demand_survives_json_and_is_left_out_for_those_who_do_not_know_it() -> (
+    None
+):
     policy = Contract(behaviour=("logprob", "value"))
     assert Contract.from_json(json.loads(json.dumps(policy.to_json()))) == policy
     assert "behaviour" not in Contract().to_json()
@@ -127,7 +148,9 @@ def test_what_an_act_says_on_demand_survives_json_and_is_left_out_for_those_who_
         ([1], InvalidObservation),
     ],
 )
-def test_only_what_the_contract_offers_may_be_wanted(want: object, error: type[Exception] | None) -> None:
+def test_only_what_the_contract_offers_may_be_wanted(
+    want: object, error: type[Exception] | None
+) -> None:
     obs, policy = Obs(info={"want": want}), Contract(behaviour=("logprob",))
     if error is None:
         check_observation(obs, policy)
@@ -182,10 +205,22 @@ def test_a_good_observation_passes() -> None:
         (replace(OBS, state={"joints": np.full(7, np.nan, np.float32)}), InvalidObservation),
         (replace(OBS, state={"joints": np.zeros(6, np.float32)}), InvalidObservation),
         (replace(OBS, state={"joints": np.zeros((1, 7), np.float32)}), InvalidObservation),
-        (replace(OBS, cameras={**OBS.cameras, "front": np.zeros((64, 64, 3), np.uint8)}), InvalidObservation),
-        (replace(OBS, cameras={**OBS.cameras, "front": np.zeros((224, 224, 3), np.float32)}), InvalidObservation),
-        (replace(OBS, cameras={**OBS.cameras, "front": np.zeros((3, 224, 224), np.uint8)}), InvalidObservation),
-        (replace(OBS, cameras={**OBS.cameras, "unknown": np.zeros((0, 4, 3), np.uint8)}), InvalidObservation),
+        (
+            replace(OBS, cameras={**OBS.cameras, "front": np.zeros((64, 64, 3), np.uint8)}),
+            InvalidObservation,
+        ),
+        (
+            replace(OBS, cameras={**OBS.cameras, "front": np.zeros((224, 224, 3), np.float32)}),
+            InvalidObservation,
+        ),
+        (
+            replace(OBS, cameras={**OBS.cameras, "front": np.zeros((3, 224, 224), np.uint8)}),
+            InvalidObservation,
+        ),
+        (
+            replace(OBS, cameras={**OBS.cameras, "unknown": np.zeros((0, 4, 3), np.uint8)}),
+            InvalidObservation,
+        ),
     ],
 )
 def test_each_bad_observation_has_its_error(obs: Obs, error: type[Exception]) -> None:
@@ -209,13 +244,17 @@ def test_a_number_that_is_none_is_found_wherever_it_is(size: int, bad: float) ->
 
 @pytest.mark.parametrize("size", [1, 63, 64, 65, 4096])
 @pytest.mark.parametrize("sign", [1, -1])
-def test_a_number_that_is_too_large_for_any_unit_is_found_wherever_it_is(size: int, sign: int) -> None:
+def test_a_number_that_is_too_large_for_any_unit_is_found_wherever_it_is(
+    size: int, sign: int
+) -> None:
     for at in (0, size // 2, size - 1):
         action = np.zeros(size, np.float32)
         action[at] = sign * LARGEST_ACTION
         check_action(action, None)
         action[at] = sign * 1e30
-        with pytest.raises(InvalidAction, match=r"got a number of size 1e\+30, want at most 1e\+09"):
+        with pytest.raises(
+            InvalidAction, match=r"got a number of size 1e\+30, want at most 1e\+09"
+        ):
             check_action(action, None)
 
 
@@ -224,14 +263,18 @@ def test_actions_become_float32(action: object) -> None:
     assert check_action(action, POLICY).dtype == np.float32
 
 
-@pytest.mark.parametrize("action", [None, "x", np.zeros(6), np.zeros((1, 1, 7)), np.full(7, np.inf), [], object()])
+@pytest.mark.parametrize(
+    "action", [None, "x", np.zeros(6), np.zeros((1, 1, 7)), np.full(7, np.inf), [], object()]
+)
 def test_an_unusable_action_never_gets_through(action: object) -> None:
     with pytest.raises(InvalidAction):
         check_action(action, POLICY)
 
 
 def test_no_numpy_is_left_in_the_json_of_a_contract() -> None:
-    told = Contract(action=ActionSpec(dim=1, low=np.float32(-1.0)), control_hz=np.float64(20.0)).to_json()  # type: ignore[arg-type]
+    told = Contract(
+        action=ActionSpec(dim=1, low=np.float32(-1.0)), control_hz=np.float64(20.0)
+    ).to_json()  # type: ignore[arg-type]
     assert (type(told["control_hz"]), type(told["action"]["low"])) == (float, float)
 
 
@@ -250,23 +293,34 @@ class TestAPolicyOfSeveralPartsServedAsOne:
     def test_the_parts_with_as_many_numbers_are_named(self) -> None:
         [told] = differences(Contract(state={"joints": StateSpec(21)}), self.ENV)
         assert told == (
-            "state 'joints': the policy needs 21 numbers, the env gives 7; if it was trained on several parts, set the "
-            "policy's `state` to them in their order: [joints, tquat, xyzrpy, gripper] has 21 numbers here"
+            "state 'joints': the policy needs 21 numbers, the env gives 7; if it was trained on "
+            "several parts, set the "
+            "policy's `state` to them in their order: [joints, tquat, xyzrpy, gripper] has 21 "
+            "numbers here"
         )
 
     def test_all_choices_are_told_where_there_are_several(self) -> None:
         [told] = differences(Contract(state={"q": StateSpec(8)}), self.ENV)
         assert "the env gives ['joints', 'tquat', 'xyzrpy']" in told
-        assert "`state` to them in their order: [joints, gripper] or [tquat, gripper] have 8 numbers here" in told
+        assert (
+            "`state` to them in their order: [joints, gripper] or [tquat, gripper] have 8 numbers "
+            "here"
+        ) in told
 
     def test_where_none_fit_the_policy_is_another_ones(self) -> None:
         [told] = differences(Contract(state={"joints": StateSpec(9)}), self.ENV)
         assert told.endswith("the env gives 7; is this another task's or robot's policy?")
 
     def test_where_the_parts_are_set_they_are_not_guessed(self) -> None:
-        told = differences(Contract(state={"joints": StateSpec(21), "xyzrpy": StateSpec(6)}), self.ENV)
+        told = differences(
+            Contract(state={"joints": StateSpec(21), "xyzrpy": StateSpec(6)}), self.ENV
+        )
         assert told == [
-            "state 'joints': the policy needs 21 numbers, the env gives 7; is this another task's or robot's policy?"
+            (
+                "state 'joints': the policy needs 21 numbers, the env gives 7; is this another "
+                "task's "
+                "or robot's policy?"
+            )
         ]
 
 
@@ -278,7 +332,9 @@ class TestAPolicyOfSeveralPartsServedAsOne:
         (Contract, "control_hertz", "did you mean 'control_hz'?"),
     ],
 )
-def test_an_unknown_field_is_refused_with_those_that_there_are(cls: type, wrong: str, said: str) -> None:
+def test_an_unknown_field_is_refused_with_those_that_there_are(
+    cls: type, wrong: str, said: str
+) -> None:
     with pytest.raises(TypeError) as caught:
         cls(**{wrong: 1})
     assert said in str(caught.value)

@@ -30,7 +30,9 @@ class Recorded(Agent):
 
     def act(self, obs: Obs) -> Act:
         act = next(self._acts)
-        times = dict(zip(SESSION["stages"], act["ms"], strict=True)) | {"round_trip_ms": act["round_trip_ms"]}
+        times = dict(zip(SESSION["stages"], act["ms"], strict=True)) | {
+            "round_trip_ms": act["round_trip_ms"]
+        }
         return Act(np.array(act["rows"], np.float32), info={"timing": times})
 
 
@@ -40,7 +42,9 @@ def test_three_tasks_of_four_seeds_are_recorded_and_some_fail() -> None:
     ]
     assert {one["solved"] for one in EPISODES} == {True, False}
     assert {len(act["rows"]) for one in EPISODES for act in one["acts"]} == {8}
-    assert all(0 < sum(act["ms"]) <= act["round_trip_ms"] + 0.01 for one in EPISODES for act in one["acts"])
+    assert all(
+        0 < sum(act["ms"]) <= act["round_trip_ms"] + 0.01 for one in EPISODES for act in one["acts"]
+    )
     assert sum(file.stat().st_size for file in FOLDER.iterdir() if file.is_file()) < 1e6
 
 
@@ -63,7 +67,8 @@ def test_the_policy_plays_an_episode_again() -> None:
     agent.initialize()
     again = play(agent, episode["task"], episode["seed"])
     assert again["solved"] == episode["solved"]
-    # Equal to the bit on the recording's kind of processor; others round the network's sums in another order.
+    # Equal to the bit on the recording's kind of processor; others round the network's sums in
+    # another order.
     np.testing.assert_allclose(again["states"], episode["states"], atol=1e-3)
 
 
@@ -92,7 +97,10 @@ def test_the_page_plays_a_session_from_a_file_and_fits(page: Page, width: int, s
     ):
         page.value(f"document.querySelectorAll('#episodes button')[{number}].click()")
         assert page.value("document.getElementById('outcome').textContent").startswith(word)
-        assert page.value("document.getElementById('instruction').textContent") == EPISODES[number]["instruction"]
+        assert (
+            page.value("document.getElementById('instruction').textContent")
+            == EPISODES[number]["instruction"]
+        )
     assert page.value("document.documentElement.scrollWidth") <= width
     assert [url for url in page.asked if not url.startswith((FOLDER.as_uri(), "data:"))] == []
     assert page.said == []
@@ -132,4 +140,6 @@ def press(page: Page, element: str, key: str) -> None:
     codes = {" ": 32, "ArrowRight": 39, "End": 35}
     for event in ("keyDown", "keyUp"):
         typed = text if event == "keyDown" else {}
-        page.call("Input.dispatchKeyEvent", type=event, key=key, windowsVirtualKeyCode=codes[key], **typed)
+        page.call(
+            "Input.dispatchKeyEvent", type=event, key=key, windowsVirtualKeyCode=codes[key], **typed
+        )

@@ -52,10 +52,15 @@ BLOCKS = re.findall(r"```yaml\n(applications:.*?)```", _ENVIRONMENTS, re.DOTALL)
 def test_an_environment_as_it_is_documented_is_accepted(block: str) -> None:
     [application] = yaml.safe_load(block)["applications"]
     ServeApplicationSchema.model_validate(application)
-    assert application.get("runtime_env") or ServerArgs(**application["args"]).environment != EnvironmentArgs()
+    assert (
+        application.get("runtime_env")
+        or ServerArgs(**application["args"]).environment != EnvironmentArgs()
+    )
 
 
-@pytest.mark.parametrize("page", sorted([ROOT / "SECURITY.md", *DOCS.rglob("*.md")]), ids=lambda page: page.name)
+@pytest.mark.parametrize(
+    "page", sorted([ROOT / "SECURITY.md", *DOCS.rglob("*.md")]), ids=lambda page: page.name
+)
 def test_the_tests_that_a_page_names_exist(page: Path) -> None:
     named = set(re.findall(r"`(tests/[\w/]+\.py)`", page.read_text()))
     assert {name for name in named if not (ROOT / name).is_file()} == set()
@@ -85,23 +90,47 @@ EXPLAINED = {
     "slurm.md": ["serve"],
     "troubleshooting.md": ["eval", "serve"],
 }
-OF_OTHERS = {  # options of sbatch, docker, ray, uv, of LeRobot's and GR00T's programs, and of the checkout's scripts
+# Options of sbatch, docker, ray, uv, of LeRobot's and GR00T's programs, and of the checkout's
+# scripts.
+OF_OTHERS = {
     *("--account", "--array", "--mem", "--name", "--nodes", "--ntasks", "--qos", "--requeue"),
-    *("--build-context", "--health-cmd", "--ipc", "--memory", "--shm-size", "--target", "--temp-dir"),
+    *(
+        "--build-context",
+        "--health-cmd",
+        "--ipc",
+        "--memory",
+        "--shm-size",
+        "--target",
+        "--temp-dir",
+    ),
     *("--fps", "--use-sim-policy-wrapper"),
-    *("--chunk", "--dtype", "--help", "--max-lag", "--rows", "--size", "--steps", "--torchrl", "--whole"),
+    *(
+        "--chunk",
+        "--dtype",
+        "--help",
+        "--max-lag",
+        "--rows",
+        "--size",
+        "--steps",
+        "--torchrl",
+        "--whole",
+    ),
 }
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
 def test_an_option_in_a_sentence_is_one_of_a_command_that_the_page_names(page: Path) -> None:
-    """`--episodes` in the text of `open-loop`, whose option is `--only`, sent readers to an error."""
+    """`--episodes` in the text of `open-loop`, whose option is `--only`, sent readers to an
+    error.
+    """
     explained = [f"vlagents-ray {command}" for command in EXPLAINED.get(page.name, [])]
     assert unknown_options(page.read_text(), explained) == []
 
 
 def test_an_option_that_no_command_of_its_page_has_is_found() -> None:
-    text = "`vlagents-ray open-loop DATASET` sends it. `--cameras a=b` maps names, `--only 3` selects"
+    text = (
+        "`vlagents-ray open-loop DATASET` sends it. `--cameras a=b` maps names, `--only 3` selects"
+    )
     assert unknown_options(text) == ["--cameras"]
 
 
@@ -110,7 +139,11 @@ def unknown_options(text: str, explained: Sequence[str] = ()) -> list[str]:
     named = [*explained, *(line for line, _ in commands(text))]
     prose = re.sub(r"```.*?```", "", text, flags=re.DOTALL)
     mentioned = [" ".join(code.split()) for code in re.findall(r"`([^`]*)`", prose)]
-    options = [code.partition(" ")[0].partition("=")[0] for code in mentioned if re.match(r"--\w[^. ]*( |=|$)", code)]
+    options = [
+        code.partition(" ")[0].partition("=")[0]
+        for code in mentioned
+        if re.match(r"--\w[^. ]*( |=|$)", code)
+    ]
     have = set().union(*(options_of(line) for line in named)) | OF_OTHERS
     return [option for option in options if option not in have]
 
@@ -138,14 +171,20 @@ def test_there_are_commands_and_blocks_on_the_pages() -> None:
 
 def test_the_file_of_runs_behind_the_reports_picture_is_accepted() -> None:
     config = EvalConfig.model_validate(read_run(DOCS / "evaluation" / "picture.yaml"))
-    assert [policy.source for policy in config.policies] == ["learner:Learner", "scripted", "random"]
+    assert [policy.source for policy in config.policies] == [
+        "learner:Learner",
+        "scripted",
+        "random",
+    ]
 
 
 def test_files_of_runs_on_the_pages_are_accepted() -> None:
     others = [DOCS / "cluster" / "scaling.md", DOCS / "evaluation" / "robot.md"]
     pages = [*sorted((DOCS / "benchmarks").glob("*.md")), *others]
     blocks = [
-        block for page in pages for block in re.findall(r"```yaml\n(policies:.*?)```", page.read_text(), re.DOTALL)
+        block
+        for page in pages
+        for block in re.findall(r"```yaml\n(policies:.*?)```", page.read_text(), re.DOTALL)
     ]
     assert blocks
     for block in blocks:
@@ -164,7 +203,9 @@ def test_files_of_runs_on_the_pages_are_accepted() -> None:
         ("robosuite#robocasa", robocasa.protocol("OpenDrawer", "target")),
     ],
 )
-def test_a_benchmarks_page_states_the_protocol_that_is_recorded(page: str, protocol: BenchmarkProtocol) -> None:
+def test_a_benchmarks_page_states_the_protocol_that_is_recorded(
+    page: str, protocol: BenchmarkProtocol
+) -> None:
     rows = dict(re.findall(r"^\| (\w+) \| (.*) \|$", section("benchmarks", page), re.MULTILINE))
     assert re.match(r"\d+", rows["steps"]).group() == str(protocol.max_steps)  # type: ignore[union-attr]
     assert rows["rate"] == f"{protocol.control_hz:g} Hz"
@@ -174,7 +215,9 @@ def test_a_benchmarks_page_states_the_protocol_that_is_recorded(page: str, proto
 def test_troubleshooting_has_every_error_with_its_status_and_a_cure_and_no_other() -> None:
     page = _read("troubleshooting.md")
     rows = re.findall(r"^\| `(\w+)` \| (\d+) \| `(\w+)` \| .+ \| .+ \|$", page, re.MULTILINE)
-    assert sorted(rows) == sorted((code, str(error.status), error.__name__) for code, error in BY_CODE.items())
+    assert sorted(rows) == sorted(
+        (code, str(error.status), error.__name__) for code, error in BY_CODE.items()
+    )
     assert len(rows) == len(re.findall(r"^\| `(\w+)` \| \d+ \|", page, re.MULTILINE))
 
 
@@ -183,17 +226,24 @@ PROTOCOL = (DOCS / "protocol.md").read_text()
 
 def test_the_protocol_has_every_key_header_limit_and_type() -> None:
     keys = {*frames._REQUEST_KEYS, *json_messages._KEYS, *values._OBS_KEYS}
-    reply = Reply("r", Act(np.zeros(1, np.float32)), step=1, draining=True, timing={"queue_ms": 1.0})
+    reply = Reply(
+        "r", Act(np.zeros(1, np.float32)), step=1, draining=True, timing={"queue_ms": 1.0}
+    )
     failed = Reply("r", error=Overloaded("full"))
     for one in (reply, failed):
         header, _ = frame_layout.unpack(frames.encode_replies([one, one]), Limits())
         keys |= header.keys() | header["replies"][0].keys()
-        keys |= header["replies"][0].get("act", {}).keys() | header["replies"][0].get("error", {}).keys()
+        keys |= (
+            header["replies"][0].get("act", {}).keys()
+            | header["replies"][0].get("error", {}).keys()
+        )
     keys |= {name for name in dir(messages) if name.endswith("_HEADER")}
     names = {getattr(messages, key, key) for key in keys} - {messages.MACHINE_HEADER}
     types = {np.dtype(code).newbyteorder("<").str.replace("|", "\\|") for code in "?bhiqBHIQefd"}
     names |= types | {field.name for field in fields(Limits)} - {"reply_bytes", "in_flight_bytes"}
-    assert {name for name in names if f"`{name}`" not in PROTOCOL and f'"{name}"' not in PROTOCOL} == set()
+    assert {
+        name for name in names if f"`{name}`" not in PROTOCOL and f'"{name}"' not in PROTOCOL
+    } == set()
 
 
 @pytest.mark.parametrize("name", ["pixels", "state_values", "text", "requests", "history"])
@@ -217,18 +267,25 @@ def test_the_figures_of_the_readme_are_the_measured_ones() -> None:
 def test_the_pictures_are_those_that_their_script_draws() -> None:
     drawn = runpy.run_path(str(DOCS / "pictures" / "flows.py"))
     for name in drawn["FLOWS"]:
-        assert (DOCS / "pictures" / f"{name}.svg").read_text() == drawn["picture"](name), f"run {drawn['__file__']}"
+        assert (DOCS / "pictures" / f"{name}.svg").read_text() == drawn["picture"](name), (
+            f"run {drawn['__file__']}"
+        )
 
 
 def test_every_page_stands_in_the_navigation_of_the_site() -> None:
     navigation = set(re.findall(r"[\w/]+\.md", (ROOT / "mkdocs.yml").read_text()))
     pages = {str(page.relative_to(DOCS)) for page in DOCS.rglob("*.md")}
-    outside = {page.name for page in ROOT.glob("*.md")} | {"examples/README.md", "examples/experts/README.md"}
+    outside = {page.name for page in ROOT.glob("*.md")} | {
+        "examples/README.md",
+        "examples/experts/README.md",
+    }
     assert pages == navigation - outside
     assert len(pages) <= 60, "a reader looks for a subject: extend the page that has it"
 
 
-@pytest.mark.parametrize("page", [*ROOT.glob("*.md"), *DOCS.rglob("*.md")], ids=lambda page: page.name)
+@pytest.mark.parametrize(
+    "page", [*ROOT.glob("*.md"), *DOCS.rglob("*.md")], ids=lambda page: page.name
+)
 def test_what_a_page_links_to_exists(page: Path) -> None:
     prose = re.sub(r"```.*?```", "", page.read_text(), flags=re.DOTALL)
     linked = re.findall(r"\]\((?!\w+:)([^)#\s]+)", prose)

@@ -1,4 +1,6 @@
-"""The files of runs that come with the package are accepted, and the page about them names every key."""
+"""The files of runs that come with the package are accepted, and the page about them names every
+key.
+"""
 
 from __future__ import annotations
 
@@ -14,7 +16,13 @@ from pydantic_core import PydanticUndefined
 from vlagents_ray.cli.evaluate import read_run
 from vlagents_ray.evaluate import EvalConfig, PolicyConfig, SuiteConfig, WorkerConfig
 from vlagents_ray.evaluate.plan.cases import expand
-from vlagents_ray.evaluate.plan.config import ClockConfig, RobotConfig, RobotTask, StopConfig, TrackingConfig
+from vlagents_ray.evaluate.plan.config import (
+    ClockConfig,
+    RobotConfig,
+    RobotTask,
+    StopConfig,
+    TrackingConfig,
+)
 from vlagents_ray.registry import env_suite, names
 from vlagents_ray.serve.launch.deployment_file import read_deployment
 
@@ -22,12 +30,24 @@ ROOT = Path(__file__).parents[1]
 FILES = sorted((ROOT / "evaluations").glob("*.yaml"))
 PAGE = (ROOT / "docs" / "evaluation" / "running.md").read_text()
 MODELS = [
-    EvalConfig, PolicyConfig, SuiteConfig, WorkerConfig, ClockConfig, StopConfig, TrackingConfig, RobotConfig, RobotTask
-]  # fmt: skip
+    EvalConfig,
+    PolicyConfig,
+    SuiteConfig,
+    WorkerConfig,
+    ClockConfig,
+    StopConfig,
+    TrackingConfig,
+    RobotConfig,
+    RobotTask,
+]
 CAMERAS = {"libero": {"front", "wrist"}, "simpler": {"3rd_view_camera"}, "tabletop": {"front"}}
 # Of models that are not told which camera is which.
-WITHOUT_WORDS = {"openpi": {"image": "front", "wrist_image": "wrist"}, "openvla": {"image": "front"}, "lerobot": {},
-                 "reference": {"front": "front", "wrist": "wrist"}}  # fmt: skip
+WITHOUT_WORDS = {
+    "openpi": {"image": "front", "wrist_image": "wrist"},
+    "openvla": {"image": "front"},
+    "lerobot": {},
+    "reference": {"front": "front", "wrist": "wrist"},
+}
 ELSEWHERE = {
     ("EvalConfig", "out"),
     ("EvalConfig", "worker"),
@@ -35,7 +55,9 @@ ELSEWHERE = {
 }  # defaults that are said in words
 
 
-@pytest.mark.parametrize("file", [*FILES, ROOT / "examples" / "raptor" / "flights.yaml"], ids=lambda file: file.stem)
+@pytest.mark.parametrize(
+    "file", [*FILES, ROOT / "examples" / "raptor" / "flights.yaml"], ids=lambda file: file.stem
+)
 def test_an_example_is_accepted(file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(ROOT)
     config = EvalConfig.model_validate(read_run(file))
@@ -68,7 +90,10 @@ def test_a_model_of_an_example_looks_through_cameras_that_its_envs_have(
         [application] = yaml.safe_load((ROOT / policy.source).read_text())["applications"]
         served = application["args"]["policy"]
         assert served != "noop"
-        needs = ({**application["args"]["config"], **policy.config}.get("cameras") or WITHOUT_WORDS[served]).values()
+        needs = (
+            {**application["args"]["config"], **policy.config}.get("cameras")
+            or WITHOUT_WORDS[served]
+        ).values()
         assert all(set(needs) <= cameras for cameras in have)
 
 
@@ -86,5 +111,7 @@ def test_the_page_has_every_key_with_its_default(model: type[BaseModel]) -> None
         if (model.__name__, name) not in ELSEWHERE:
             required = field.default is PydanticUndefined and field.default_factory is None
             assert rows[name] == (
-                "required" if required else f"`{json.dumps(field.get_default(call_default_factory=True))}`"
+                "required"
+                if required
+                else f"`{json.dumps(field.get_default(call_default_factory=True))}`"
             )

@@ -1,4 +1,6 @@
-"""`make demo` and `make setup` on machines with and without a GPU, and without PyTorch's own index."""
+"""`make demo` and `make setup` on machines with and without a GPU, and without PyTorch's own
+index.
+"""
 
 from __future__ import annotations
 
@@ -38,7 +40,9 @@ PROGRAMS = {
 class Machine:
     """A machine on which pip resolves torch to some packages."""
 
-    def __init__(self, folder: Path, packages: Sequence[str], *, gpu: bool = False, reachable: bool = True) -> None:
+    def __init__(
+        self, folder: Path, packages: Sequence[str], *, gpu: bool = False, reachable: bool = True
+    ) -> None:
         self.venv = folder / "venv"
         self._calls = folder / "calls"
         commands = folder / "commands"
@@ -48,7 +52,11 @@ class Machine:
         plan = {"install": [{"metadata": {"name": name}} for name in packages]}
         (folder / "plan").write_text(json.dumps(plan, indent=1))
         self._environment = {
-            **{name: value for name, value in os.environ.items() if not name.startswith(("MAKE", "TORCH", "PIP_"))},
+            **{
+                name: value
+                for name, value in os.environ.items()
+                if not name.startswith(("MAKE", "TORCH", "PIP_"))
+            },
             "PATH": f"{commands}:{os.environ['PATH']}",
             "CALLS": str(self._calls),
             "PLAN": str(folder / "plan"),
@@ -65,13 +73,23 @@ class Machine:
         """Run `make`."""
         command = ["make", "--no-print-directory", f"VENV={self.venv}", *words]
         return subprocess.run(
-            command, cwd=ROOT, env=self._environment, capture_output=True, text=True, timeout=60, check=False
+            command,
+            cwd=ROOT,
+            env=self._environment,
+            capture_output=True,
+            text=True,
+            timeout=60,
+            check=False,
         )
 
     def installs_of_torch(self) -> list[str]:
         """Return the calls that install torch."""
         calls = self._calls.read_text().splitlines()
-        return [call for call in calls if " install " in call and "torch==2.13.0" in call and "--dry-run" not in call]
+        return [
+            call
+            for call in calls
+            if " install " in call and "torch==2.13.0" in call and "--dry-run" not in call
+        ]
 
     def ran(self, program: str) -> bool:
         """Return whether a program was called."""
@@ -83,7 +101,9 @@ PIP = "python -m pip --disable-pip-version-check install torch==2.13.0"
 
 @pytest.mark.parametrize("goal", [["demo"], ["setup"], []])
 @pytest.mark.parametrize("packages", [CUDA_BUILD, NEWER_CUDA_BUILD], ids=["nvidia", "cuda"])
-def test_without_a_gpu_the_cpu_build_is_taken_by_itself(tmp_path: Path, goal: list[str], packages: list[str]) -> None:
+def test_without_a_gpu_the_cpu_build_is_taken_by_itself(
+    tmp_path: Path, goal: list[str], packages: list[str]
+) -> None:
     machine = Machine(tmp_path, packages)
     made = machine.make(*goal)
     assert made.returncode == 0, made.stderr
@@ -116,7 +136,9 @@ def test_otherwise_the_build_that_pip_resolves_is_used_as_it_is(
 
 
 @pytest.mark.parametrize("goal", ["demo", "setup", "test"])
-def test_without_the_index_it_stops_with_a_cure_for_the_command_that_was_typed(tmp_path: Path, goal: str) -> None:
+def test_without_the_index_it_stops_with_a_cure_for_the_command_that_was_typed(
+    tmp_path: Path, goal: str
+) -> None:
     machine = Machine(tmp_path, CUDA_BUILD, reachable=False)
     made = machine.make(goal)
     assert made.returncode != 0
@@ -124,7 +146,11 @@ def test_without_the_index_it_stops_with_a_cure_for_the_command_that_was_typed(t
     assert not machine.ran("vlagents-ray")
     assert "Failed to fetch the index" in made.stderr
     assert f"{goal}: stopped before downloading several GB" in made.stderr
-    for cure in (f"make {goal} TORCH_INDEX_URL=URL", f"PIP_FIND_LINKS=FOLDER make {goal}", f"make {goal} TORCH_CUDA=1"):
+    for cure in (
+        f"make {goal} TORCH_INDEX_URL=URL",
+        f"PIP_FIND_LINKS=FOLDER make {goal}",
+        f"make {goal} TORCH_CUDA=1",
+    ):
         assert cure in made.stderr
     assert "://" not in made.stderr
 

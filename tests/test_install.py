@@ -39,8 +39,18 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
     source, out = tmp_path_factory.mktemp("source"), tmp_path_factory.mktemp("wheel")
     for name in ("pyproject.toml", "README.md", "LICENSE"):
         shutil.copy(ROOT / name, source)
-    shutil.copytree(ROOT / "vlagents_ray", source / "vlagents_ray", ignore=shutil.ignore_patterns("__pycache__"))
-    pip("wheel", "--quiet", "--no-deps", "--no-build-isolation", "--wheel-dir", str(out), str(source))
+    shutil.copytree(
+        ROOT / "vlagents_ray", source / "vlagents_ray", ignore=shutil.ignore_patterns("__pycache__")
+    )
+    pip(
+        "wheel",
+        "--quiet",
+        "--no-deps",
+        "--no-build-isolation",
+        "--wheel-dir",
+        str(out),
+        str(source),
+    )
     (built,) = out.glob("vlagents_ray-*.whl")
     return built
 
@@ -51,12 +61,22 @@ def robot(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     home = tmp_path_factory.mktemp("robot")
     venv.create(home, with_pip=False, symlinks=True)
     python = home / "bin" / "python"
-    pip("--python", str(python), "install", "--quiet", "--no-compile", "--only-binary=:all:", str(wheel))
+    pip(
+        "--python",
+        str(python),
+        "install",
+        "--quiet",
+        "--no-compile",
+        "--only-binary=:all:",
+        str(wheel),
+    )
     return python
 
 
 def run(python: Path, code: str) -> str:
-    done = subprocess.run([python, "-I", "-c", code], check=False, capture_output=True, text=True, timeout=300)
+    done = subprocess.run(
+        [python, "-I", "-c", code], check=False, capture_output=True, text=True, timeout=300
+    )
     assert done.returncode == 0, done.stderr
     return done.stdout.strip()
 
@@ -67,19 +87,29 @@ def test_the_wheel_holds_every_module_and_the_licence_and_no_tests(wheel: Path) 
     assert modules - names == set()
     assert "vlagents_ray/py.typed" in names
     page = ROOT / "vlagents_ray/evaluate/report"
-    resources = {str(path.relative_to(ROOT)) for pattern in ("report.*", "templates/*") for path in page.glob(pattern)}
-    resources |= {str(path.relative_to(ROOT)) for path in (ROOT / "vlagents_ray/cli/skeletons").glob("*/*")}
+    resources = {
+        str(path.relative_to(ROOT))
+        for pattern in ("report.*", "templates/*")
+        for path in page.glob(pattern)
+    }
+    resources |= {
+        str(path.relative_to(ROOT)) for path in (ROOT / "vlagents_ray/cli/skeletons").glob("*/*")
+    }
     assert len(resources) >= 13
     assert resources - names == set()
     assert [name for name in names if name.endswith(".dist-info/licenses/LICENSE")]
-    assert [name for name in names if name.startswith(("benchmarks/", "tests/", "deployments/"))] == []
+    assert [
+        name for name in names if name.startswith(("benchmarks/", "tests/", "deployments/"))
+    ] == []
 
 
 def test_the_installed_package_makes_the_same_wheel_again(
     wheel: Path, robot: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (installed,) = robot.parents[1].glob("lib/*/site-packages/vlagents_ray-*.dist-info")
-    monkeypatch.setattr(importlib.metadata, "distribution", lambda _: importlib.metadata.PathDistribution(installed))
+    monkeypatch.setattr(
+        importlib.metadata, "distribution", lambda _: importlib.metadata.PathDistribution(installed)
+    )
     again = installed_wheel(tmp_path)
     assert again.name == wheel.name
     built, rebuilt = zipfile.ZipFile(wheel), zipfile.ZipFile(again)
@@ -90,8 +120,13 @@ def test_the_installed_package_makes_the_same_wheel_again(
     assert set(rebuilt.read(record).splitlines()) == set(built.read(record).splitlines())
 
 
-def test_a_robot_installs_three_packages_and_those_have_no_dependencies_of_their_own(robot: Path) -> None:
-    installed = {package["name"] for package in json.loads(pip("--python", str(robot), "list", "--format=json"))}
+def test_a_robot_installs_three_packages_and_those_have_no_dependencies_of_their_own(
+    robot: Path,
+) -> None:
+    installed = {
+        package["name"]
+        for package in json.loads(pip("--python", str(robot), "list", "--format=json"))
+    }
     assert installed == {"vlagents-ray"} | LIGHT_DEPENDENCIES
 
 
@@ -107,15 +142,25 @@ print(decode(encode_jpeg(obs.cameras["front"])).shape)
 
 
 def test_a_robot_has_the_command_that_drives_it(robot: Path) -> None:
-    command = [robot.with_name("vlagents-ray"), "robot", "http://127.0.0.1:9", "--env", "tabletop", "--hz", "0"]
+    command = [
+        robot.with_name("vlagents-ray"),
+        "robot",
+        "http://127.0.0.1:9",
+        "--env",
+        "tabletop",
+        "--hz",
+        "0",
+    ]
     ran = subprocess.run(command, check=False, capture_output=True, text=True, timeout=60)
     assert ran.returncode == 2
     assert "vlagents-ray robot: error: argument --hz: got '0', want a number above 0" in ran.stderr
 
 
 def test_the_import_takes_half_a_second_at_the_most(robot: Path) -> None:
-    code = "import time, vlagents_ray, vlagents_ray.robot; print(time.process_time())"  # the interpreter's start, too
-    assert any(float(run(robot, code)) < 0.5 for _ in range(10))  # beside others that want the caches, it takes longer
+    # The interpreter's start, too.
+    code = "import time, vlagents_ray, vlagents_ray.robot; print(time.process_time())"
+    # Beside others that want the caches, it takes longer.
+    assert any(float(run(robot, code)) < 0.5 for _ in range(10))
 
 
 @pytest.fixture(scope="module")
@@ -159,7 +204,9 @@ with RemoteAgent({url!r}, transport={transport!r}) as agent:
     assert int(run(robot, code)) < 80_000
 
 
-def test_what_a_robot_lacks_is_asked_for_by_the_extra_that_brings_it(robot: Path, tmp_path: Path) -> None:
+def test_what_a_robot_lacks_is_asked_for_by_the_extra_that_brings_it(
+    robot: Path, tmp_path: Path
+) -> None:
     code = f"""
 from vlagents_ray.errors import MissingDependency
 from vlagents_ray.registry import require
@@ -170,11 +217,16 @@ for needed in (lambda: Recorder({str(tmp_path)!r}, 50), lambda: require("ray")):
     except MissingDependency as error:
         print(error)
 """
-    assert re.findall(r"pip install 'vlagents-ray\[(\w+)\]'", run(robot, code)) == ["record", "serve"]
+    assert re.findall(r"pip install 'vlagents-ray\[(\w+)\]'", run(robot, code)) == [
+        "record",
+        "serve",
+    ]
 
 
 @pytest.mark.parametrize("words", [["--help"], ["serve", "noop"]], ids=" ".join)
-def test_a_robots_command_says_in_two_lines_what_to_install_for_it(robot: Path, words: list[str]) -> None:
+def test_a_robots_command_says_in_two_lines_what_to_install_for_it(
+    robot: Path, words: list[str]
+) -> None:
     command = [robot.parent / "vlagents-ray", *words]
     done = subprocess.run(command, check=False, capture_output=True, text=True, timeout=300)
     assert (done.returncode, done.stdout) == (1, "")

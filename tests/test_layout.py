@@ -19,7 +19,8 @@ FILES = {
     ".".join(path.relative_to(PACKAGE.parent).with_suffix("").parts).removesuffix(".__init__"): path
     for path in PACKAGE.rglob("*.py")
 }
-# As `ray._raylet`, `ray.serve._private.api`, or a name with an underscore that is imported from Ray.
+# As `ray._raylet`, `ray.serve._private.api`, or a name with an underscore that is imported from
+# Ray.
 _PRIVATE = re.compile(r"\bray(\.\w+)*\._\w|^\s*from ray\S* import .*\b_\w", re.MULTILINE)
 
 
@@ -29,7 +30,9 @@ def tree(module: str) -> ast.Module:
 
 
 def imports(module: str) -> Iterator[str]:
-    """The modules that one imports, those included that only a type checker, or a function, does."""
+    """The modules that one imports, those included that only a type checker, or a function,
+    does.
+    """
     for node in ast.walk(tree(module)):
         if isinstance(node, ast.ImportFrom) and node.module is not None:
             for alias in node.names:
@@ -42,7 +45,9 @@ def imports(module: str) -> Iterator[str]:
 def circles(edges: dict[str, set[str]]) -> list[set[str]]:
     """The groups in which each is reached from each."""
     reached = {start: _reached(start, edges) for start in edges}
-    groups = {frozenset(other for other in reached[one] if one in reached.get(other, ())) for one in edges}
+    groups = {
+        frozenset(other for other in reached[one] if one in reached.get(other, ())) for one in edges
+    }
     return [set(group) for group in groups if len(group) > 1]
 
 
@@ -57,7 +62,10 @@ def _reached(start: str, edges: dict[str, set[str]]) -> set[str]:
 
 
 def test_no_module_imports_itself_by_way_of_others() -> None:
-    edges = {module: {name for name in imports(module) if name in FILES and name != module} for module in FILES}
+    edges = {
+        module: {name for name in imports(module) if name in FILES and name != module}
+        for module in FILES
+    }
     assert circles(edges) == []
 
 
@@ -100,7 +108,9 @@ def test_each_list_of_plugins_has_all_of_them() -> None:
     assert {Requirement(text).name for text in extra} == {"vlagents-ray", *DISTRIBUTIONS}
     assert tools["uv"]["sources"].keys() == {"vlagents-ray", *DISTRIBUTIONS}
     assert tools["uv"]["workspace"]["members"] == ["plugins/vlagents_ray_*"]
-    assert {name for name in tools["mypy"]["packages"] if name.startswith("vlagents_ray_")} == OF_SERVER.keys()
+    assert {
+        name for name in tools["mypy"]["packages"] if name.startswith("vlagents_ray_")
+    } == OF_SERVER.keys()
     contracts = {contract["name"]: contract for contract in tools["importlinter"]["contracts"]}
     assert set(contracts["the core knows no plug-in"]["forbidden_modules"]) == OF_SERVER.keys()
     [installed] = re.findall(r"^PLUGINS \?= (.*)$", (ROOT / "Makefile").read_text(), re.MULTILINE)
@@ -109,7 +119,11 @@ def test_each_list_of_plugins_has_all_of_them() -> None:
 
 def test_architecture_names_each_module_and_folder_of_the_package_and_each_plugin() -> None:
     tree = (ROOT / "ARCHITECTURE.md").read_text()
-    tops = {path.name for path in PACKAGE.iterdir() if path.suffix == ".py" or (path / "__init__.py").exists()}
+    tops = {
+        path.name
+        for path in PACKAGE.iterdir()
+        if path.suffix == ".py" or (path / "__init__.py").exists()
+    }
     unnamed = sorted(name for name in tops - {"__init__.py", "__main__.py"} if name not in tree)
     assert unnamed == []
     assert [name for name in PLUGINS if name not in tree] == []

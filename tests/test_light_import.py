@@ -28,7 +28,20 @@ FILES = (
 FOLDERS = ("chunking", "client", "datasets", "images", "protocol", "robot", "weights")
 LIGHT = [*(f"{name}.py" for name in FILES), *(f"{name}/**/*.py" for name in FOLDERS)]
 HEAVY = {
-    *("ray", "torch", "pydantic", "jinja2", "starlette", "fastapi", "gymnasium", "PIL", "yaml", "typer", "rich", "av"),
+    *(
+        "ray",
+        "torch",
+        "pydantic",
+        "jinja2",
+        "starlette",
+        "fastapi",
+        "gymnasium",
+        "PIL",
+        "yaml",
+        "typer",
+        "rich",
+        "av",
+    ),
     "pyarrow",
 }
 ROUNDS = 5
@@ -43,7 +56,10 @@ def loaded_by(statement: str) -> set[str]:
 
 def import_seconds(module: str) -> float:
     """The best of some fresh interpreters, so that a busy machine does not decide."""
-    code = f"import time; begin = time.perf_counter(); import {module}; print(time.perf_counter() - begin)"
+    code = (
+        f"import time; begin = time.perf_counter(); import {module}; print(time.perf_counter() "
+        "- begin)"
+    )
     return min(float(python(code)) for _ in range(ROUNDS))
 
 
@@ -69,8 +85,8 @@ def test_a_heavy_import_would_be_seen() -> None:
     assert "pydantic" in loaded_by("import vlagents_ray, pydantic") & HEAVY
 
 
-# Imports each module by itself, in a fork of an interpreter that has what comes before most of them: the package, and
-# what a robot installs.
+# Imports each module by itself, in a fork of an interpreter that has what comes before most of
+# them: the package, and what a robot installs.
 EACH_IN_A_FORK = """
 import os, sys, numpy, simplejpeg, vlagents_ray, websockets.sync.client
 for module in sys.argv[1:]:
@@ -85,11 +101,15 @@ for module in sys.argv[1:]:
 def test_no_module_of_a_robots_imports_anything_heavy() -> None:
     lines = [line.split() for line in python(EACH_IN_A_FORK, *light_modules()).splitlines()]
     assert [module for module, *_ in lines] == light_modules()
-    loaded = {module: {name.partition(".")[0] for name in names} & HEAVY for module, *names in lines}
+    loaded = {
+        module: {name.partition(".")[0] for name in names} & HEAVY for module, *names in lines
+    }
     assert {module: heavy for module, heavy in loaded.items() if heavy} == {}
 
 
 @pytest.mark.alone
 def test_importing_the_package_takes_little_longer_than_importing_numpy() -> None:
     ours, numpys = import_seconds("vlagents_ray"), import_seconds("numpy")
-    assert ours < TIMES_NUMPY * numpys, f"import vlagents_ray: {ours:.3f} s, import numpy: {numpys:.3f} s"
+    assert ours < TIMES_NUMPY * numpys, (
+        f"import vlagents_ray: {ours:.3f} s, import numpy: {numpys:.3f} s"
+    )

@@ -29,7 +29,8 @@ def test_no_two_names_become_the_same_in_whatever_order_they_come(names: list[st
 
 
 def test_the_second_of_a_key_is_found_among_many() -> None:
-    pairs = [(str(number), number) for number in range(200_000)]  # in quadratic time, it would take an hour
+    # In quadratic time, it would take an hour.
+    pairs = [(str(number), number) for number in range(200_000)]
     assert len(without_doubles(pairs)) == 200_000
     with pytest.raises(ValueError, match="the key '199999' stands twice"):
         without_doubles([*pairs, pairs[-1]])

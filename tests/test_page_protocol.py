@@ -1,4 +1,6 @@
-"""The servers of pages, which run without HAProxy, end silent connections, and let no address take all of them."""
+"""The servers of pages, which run without HAProxy, end silent connections, and let no address
+take all of them.
+"""
 
 from __future__ import annotations
 
@@ -23,7 +25,9 @@ KEYS = '{"keys": [{"name": "viewer", "sha256": "' + "0" * 64 + '"}]}'
 @contextlib.contextmanager
 def evaluation_page() -> Iterator[int]:
     fleet: Any = SimpleNamespace(viewers=0)
-    with page_server(fleet, ("127.0.0.1", 0), Keys.from_text(KEYS), name="x", videos=lambda _: None) as url:
+    with page_server(
+        fleet, ("127.0.0.1", 0), Keys.from_text(KEYS), name="x", videos=lambda _: None
+    ) as url:
         yield int(url.split(":")[2].split("/")[0])
 
 
@@ -48,7 +52,9 @@ def is_open(client: socket.socket) -> bool:
 
 @PAGES
 @pytest.mark.parametrize("sent", [b"", HALF_A_HEADER], ids=["nothing", "half a header"])
-def test_a_connection_without_a_request_is_closed(page: Any, sent: bytes, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_connection_without_a_request_is_closed(
+    page: Any, sent: bytes, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(page_protocol, "_HEADERS_S", 0.2)
     with page() as port, socket.create_connection(("127.0.0.1", port), 30) as client:
         client.sendall(sent)
@@ -60,10 +66,15 @@ def test_one_address_does_not_take_all_connections(page: Any) -> None:
     with page() as port, contextlib.ExitStack() as held:
         clients = []
         for _number in range(2 * page_protocol._CONNECTIONS):
-            client = held.enter_context(socket.create_connection(("127.0.0.1", port), 30, ("127.0.0.2", 0)))
+            client = held.enter_context(
+                socket.create_connection(("127.0.0.1", port), 30, ("127.0.0.2", 0))
+            )
             clients.append(client)
         deadline = time.monotonic() + 30
-        while sum(map(is_open, clients)) > page_protocol._CONNECTIONS_PER_ADDRESS and time.monotonic() < deadline:
+        while (
+            sum(map(is_open, clients)) > page_protocol._CONNECTIONS_PER_ADDRESS
+            and time.monotonic() < deadline
+        ):
             time.sleep(0.01)
         assert sum(map(is_open, clients)) <= page_protocol._CONNECTIONS_PER_ADDRESS
         with socket.create_connection(("127.0.0.1", port), 30) as viewer:

@@ -1,7 +1,8 @@
-"""What README and the pages under docs/ show works: every Python and shell block is run as typed, or says why not.
+"""What README and the pages under docs/ show works: every Python and shell block is run as typed,
+or says why not.
 
-Each runs in a fresh folder, in which there is what a checkout has and what earlier evaluations left. Those that want a
-served policy, and tutorials, are run by test_served_pages.py.
+Each runs in a fresh folder, in which there is what a checkout has and what earlier evaluations
+left. Those that want a served policy, and tutorials, are run by test_served_pages.py.
 """
 
 from __future__ import annotations
@@ -31,20 +32,35 @@ from vlagents_ray.policies.scripted import Scripted
 
 README = next(page for page in PAGES if page.name == "README.md")
 BLOCKS = [(page, block) for page in PAGES for block in blocks(page.read_text())]
-RUN_HERE = [(page, block) for page, block in BLOCKS if page not in TUTORIALS and not (block.not_run or block.server)]
-SEEDS = {"first": 0, "a": 0, "b": 10, "machine-a": 20, "machine-b": 30} | {f"array/{n}": 100 * n for n in range(4)}
+RUN_HERE = [
+    (page, block)
+    for page, block in BLOCKS
+    if page not in TUTORIALS and not (block.not_run or block.server)
+]
+SEEDS = {"first": 0, "a": 0, "b": 10, "machine-a": 20, "machine-b": 30} | {
+    f"array/{n}": 100 * n for n in range(4)
+}
 
-# What a sentence names can mostly not be typed as it stands ("vlagents-ray serve POLICY"); of the rest, these are run,
+# What a sentence names can mostly not be typed as it stands ("vlagents-ray serve POLICY"); of the
+# rest, these are run,
 RUN = {"vlagents-ray policies", "vlagents-ray robot --help"}
 # and these are not.
 NOT_RUN = {
-    "vlagents-ray doctor": "tests/cli/test_doctor.py runs each check, which starts a Ray and each simulator",
+    "vlagents-ray doctor": (
+        "tests/cli/test_doctor.py runs each check, which starts a Ray and each simulator"
+    ),
     "vlagents-ray envs": "a block of docs/evaluation/index.md runs it",
-    "vlagents-ray serve noop --set delta=false": "it serves until Ctrl-C; test_teleoperation.py reads such a contract",
-    "vlagents-ray serve noop --port 8000": "test_served_pages.py serves so what blocks of this page need",
+    "vlagents-ray serve noop --set delta=false": (
+        "it serves until Ctrl-C; test_teleoperation.py reads such a contract"
+    ),
+    "vlagents-ray serve noop --port 8000": (
+        "test_served_pages.py serves so what blocks of this page need"
+    ),
     "vlagents-ray slurm eval": "the name of a command",
     "vlagents-ray robot --env tabletop --leader keyboard": "tests/cli/test_robot.py types its keys",
-    "vlagents-ray serve my_policies:Reach --set gain=0.3": "test_served_pages.py serves examples/own_policy.py so",
+    "vlagents-ray serve my_policies:Reach --set gain=0.3": (
+        "test_served_pages.py serves examples/own_policy.py so"
+    ),
     "vlagents-ray env make hf --out .venv-hf": "it downloads packages",
     "vlagents-ray env make rcs": "it downloads packages",
 }
@@ -52,11 +68,17 @@ NOT_RUN = {
 
 @pytest.fixture(scope="module")
 def earlier(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Folders of results by the names that pages give them: an expert's at the tabletop, and a sweep of a learner's."""
+    """Folders of results by the names that pages give them: an expert's at the tabletop, and a
+    sweep of a learner's.
+    """
     folder = tmp_path_factory.mktemp("earlier") / "runs"
     for name, seed in SEEDS.items():
         first = name == "first"
-        settings = {"policy": "other" if name == "b" else "scripted", "envs": ["tabletop"], "seed": seed}
+        settings = {
+            "policy": "other" if name == "b" else "scripted",
+            "envs": ["tabletop"],
+            "seed": seed,
+        }
         settings |= {"episodes": 4 if first else 1}
         kept = "all" if first else "none"
         play(flat_config(**settings, out=folder / name, video=kept, record=kept), Scripted)
@@ -73,9 +95,13 @@ def reader(earlier: Path, tmp_path: Path) -> Path:
 
 
 def named(page: Path, block: Block) -> object:
-    """Each command of a shell block starts an interpreter; what quick tests say of them is in test_docs.py."""
+    """Each command of a shell block starts an interpreter; what quick tests say of them is in
+    test_docs.py.
+    """
     marks = [pytest.mark.integration] * (block.ray and page != README)
-    marks += [pytest.mark.server] * block.ray + [pytest.mark.slow] * (block.ray or block.language in SHELL)
+    marks += [pytest.mark.server] * block.ray + [pytest.mark.slow] * (
+        block.ray or block.language in SHELL
+    )
     return pytest.param(page, block, id=f"{page.stem}-{block}", marks=marks)
 
 
@@ -125,9 +151,9 @@ def test_no_command_stands_in_a_block_that_nobody_runs() -> None:
     for page in PAGES:
         fences = re.findall(r"^ *```(\w*)\n(.*?)```", page.read_text(), re.DOTALL | re.MULTILINE)
         others = "".join(code for language, code in fences if language not in SHELL)
-        assert not re.search(r"^ *(\$ )?(\w+=\S+ )*(vlagents-ray|python -m vlagents_ray\S*) ", others, re.MULTILINE), (
-            page
-        )
+        assert not re.search(
+            r"^ *(\$ )?(\w+=\S+ )*(vlagents-ray|python -m vlagents_ray\S*) ", others, re.MULTILINE
+        ), page
 
 
 def test_there_are_such_blocks() -> None:

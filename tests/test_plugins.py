@@ -1,4 +1,6 @@
-"""Plug-ins: what a distribution registers, and what is said of one that is broken or not installed."""
+"""Plug-ins: what a distribution registers, and what is said of one that is broken or not
+installed.
+"""
 
 from __future__ import annotations
 
@@ -38,7 +40,9 @@ NO_ENTRY = "lab_policies.mine:Mine"
 
 @pytest.fixture
 def install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Install:
-    """Install a distribution whose entry points are given by group; its package is `lab_policies`."""
+    """Install a distribution whose entry points are given by group; its package is
+    `lab_policies`.
+    """
     package = tmp_path / "lab_policies"
     package.mkdir()
     (package / "__init__.py").write_text("")
@@ -92,7 +96,10 @@ def test_a_built_in_name_is_not_replaced(install: Install) -> None:
         ),
         ("lab_policies.mine:Mine", r"got lab_policies.mine:Mine, a type; write"),
         ("lab_policies.registry:GONE", r"importing lab_policies.registry:GONE failed"),
-        ("lab_policies.broken:MINE", r"importing .* failed: No module named 'no_such_package'; update that package"),
+        (
+            "lab_policies.broken:MINE",
+            r"importing .* failed: No module named 'no_such_package'; update that package",
+        ),
     ],
 )
 def test_a_plugin_that_cannot_be_loaded_is_named_and_hides_no_other(
@@ -112,7 +119,10 @@ def test_a_plugin_that_cannot_be_loaded_is_named_and_hides_no_other(
 @pytest.mark.parametrize(
     ("value", "message"),
     [
-        ("lab_policies.registry:COMMAND", "command 'lab' of lab-policies cannot be loaded: out of order"),
+        (
+            "lab_policies.registry:COMMAND",
+            "command 'lab' of lab-policies cannot be loaded: out of order",
+        ),
         ("lab_policies.broken:COMMAND", "lab-policies to name a RegistryEntry"),
     ],
 )
@@ -127,10 +137,14 @@ def test_a_command_that_cannot_be_loaded_is_an_error_that_names_its_plugin(
         registry.registered_function("commands", "lab")
 
 
-def test_a_policy_whose_module_raises_is_listed_with_its_error(install: Install, tmp_path: Path) -> None:
+def test_a_policy_whose_module_raises_is_listed_with_its_error(
+    install: Install, tmp_path: Path
+) -> None:
     (tmp_path / "lab_policies" / "mine.py").write_text("raise RuntimeError('out of order')\n")
     install("lab-policies", policies="mine = lab_policies.registry:MINE")
-    with pytest.raises(ConfigError, match="policy 'mine' of lab-policies cannot be loaded: out of order"):
+    with pytest.raises(
+        ConfigError, match="policy 'mine' of lab-policies cannot be loaded: out of order"
+    ):
         registry.policy_class("mine")
     [listed] = [row for row in policies_and_wrappers() if row.name == "mine"]
     assert "out of order" in str(listed.missing)
@@ -142,13 +156,18 @@ def write(results, path, *, limit: int = 3, columns: list[str]) -> int:
 """
 
 
-def test_a_format_of_a_plugin_has_the_settings_of_its_function(install: Install, tmp_path: Path) -> None:
+def test_a_format_of_a_plugin_has_the_settings_of_its_function(
+    install: Install, tmp_path: Path
+) -> None:
     (tmp_path / "lab_policies" / "export.py").write_text(EXPORT)
     with (tmp_path / "lab_policies" / "registry.py").open("a") as file:
         file.write("EXPORT = RegistryEntry('lab_policies.export:write', 'rows of the lab')\n")
     install("lab-policies", exports="lab = lab_policies.registry:EXPORT")
     export = registry.registered_function("exports", "lab")
-    assert settings_of_export("lab", export, ["limit=2", "columns=[env]"]) == {"limit": 2, "columns": ["env"]}
+    assert settings_of_export("lab", export, ["limit=2", "columns=[env]"]) == {
+        "limit": 2,
+        "columns": ["env"],
+    }
     wrong = {
         "limt=2": "limt: there is no such setting; want one of .*; did you mean 'limit'",
         "limit=many": "limit: got 'many', want a valid integer",
@@ -163,11 +182,15 @@ def test_a_format_of_a_plugin_has_the_settings_of_its_function(install: Install,
 def test_a_name_of_two_distributions_is_an_error_that_names_both(install: Install) -> None:
     install("lab-policies", policies="mine = lab_policies.registry:MINE")
     install("other-lab", policies="mine = lab_policies.registry:OTHER")
-    with pytest.raises(ConfigError, match=r"registered .* by lab-policies and other-lab: uninstall one of them"):
+    with pytest.raises(
+        ConfigError, match=r"registered .* by lab-policies and other-lab: uninstall one of them"
+    ):
         registry.policy_class("mine")
 
 
-def test_a_name_of_a_plugin_that_is_not_installed_is_an_error_that_names_it(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_name_of_a_plugin_that_is_not_installed_is_an_error_that_names_it(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     published = {
         "envs": {"shelf": "vlagents-ray-shelf"},
         "policies": {"pi9": "vlagents-ray-models"},
@@ -175,7 +198,9 @@ def test_a_name_of_a_plugin_that_is_not_installed_is_an_error_that_names_it(monk
         "trackers": {"notebook9": "vlagents-ray-tables"},
     }
     monkeypatch.setattr(registry, "published", lambda: published)
-    with pytest.raises(UnknownEnv, match="'shelf' is in vlagents-ray-shelf, which is not installed: pip install"):
+    with pytest.raises(
+        UnknownEnv, match="'shelf' is in vlagents-ray-shelf, which is not installed: pip install"
+    ):
         registry.env_class("shelf/top")
     with pytest.raises(UnknownPolicy, match="policy 'pi9' is in vlagents-ray-models"):
         registry.policy_class("pi9")
@@ -258,7 +283,10 @@ def lab(install: Install, tmp_path: Path) -> None:
 @pytest.mark.usefixtures("lab")
 def test_a_robot_of_a_plugin_is_made_by_its_name_with_the_text_after_the_colon() -> None:
     assert vars(robot_named("--robot", "arm:left")()) == {"name": "left"}
-    with pytest.raises(ConfigError, match="--robot lamp:left: lacks observe, apply, stop; want a class with observe"):
+    with pytest.raises(
+        ConfigError,
+        match="--robot lamp:left: lacks observe, apply, stop; want a class with observe",
+    ):
         robot_named("--robot", "lamp:left")
 
 
@@ -287,18 +315,31 @@ def test_a_subcommand_of_a_plugin_gets_its_arguments_and_is_no_command_of_its_ow
 def test_a_robot_a_leader_and_a_subcommand_that_are_not_installed_name_their_distribution(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    published = {"robots": {"crane": "vlagents-ray-cranes"}, "leaders": {"wheel": "vlagents-ray-cranes"}}
+    published = {
+        "robots": {"crane": "vlagents-ray-cranes"},
+        "leaders": {"wheel": "vlagents-ray-cranes"},
+    }
     published["commands"] = {"robot.lift": "vlagents-ray-cranes"}
     monkeypatch.setattr(registry, "published", lambda: published)
-    with pytest.raises(ConfigError, match="robot 'crane' is in vlagents-ray-cranes, which is not installed: pip inst"):
+    with pytest.raises(
+        ConfigError,
+        match="robot 'crane' is in vlagents-ray-cranes, which is not installed: pip inst",
+    ):
         robot_named("--robot", "crane:4")
-    with pytest.raises(ConfigError, match="leader 'wheel' is in vlagents-ray-cranes, which is not installed"):
+    with pytest.raises(
+        ConfigError, match="leader 'wheel' is in vlagents-ray-cranes, which is not installed"
+    ):
         leader_named("--leader", "wheel")
     assert robot.main(["lift", "crane:4"]) == 2
     error = capsys.readouterr().err
-    assert error.startswith("ConfigError: command 'robot lift' is in vlagents-ray-cranes, which is not installed: pip ")
+    assert error.startswith(
+        "ConfigError: command 'robot lift' is in vlagents-ray-cranes, which is not installed: pip "
+    )
     with pytest.raises(SystemExit):
         robot.main(["--help"])
-    assert "  crane                 not installed: pip install vlagents-ray-cranes" in capsys.readouterr().out
+    assert (
+        "  crane                 not installed: pip install vlagents-ray-cranes"
+        in capsys.readouterr().out
+    )
     monkeypatch.setattr(doctor, "published", lambda: published)
     assert doctor.plugins().detail.endswith("; not installed: vlagents-ray-cranes")

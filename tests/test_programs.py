@@ -1,4 +1,6 @@
-"""docs/programs.md says which programs of others were run, in which versions; `tables` compares its text."""
+"""docs/programs.md says which programs of others were run, in which versions; `tables` compares
+its text.
+"""
 
 from __future__ import annotations
 
@@ -10,7 +12,9 @@ import pytest
 from programs import PROGRAMS
 
 
-def test_what_is_noted_is_of_programs_that_there_are_in_the_versions_that_are_wanted_and_passed() -> None:
+def test_what_is_noted_is_of_programs_that_there_are_in_the_versions_that_are_wanted_and_passed() -> (
+    None
+):
     noted = programs.notes()
     assert list(noted) == [name for name in PROGRAMS if name in noted]
     for name, runs in noted.items():
@@ -29,9 +33,15 @@ def test_outcomes_are_noted_by_program_and_python_beside_those_of_others(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(programs, "NOTED", tmp_path / "programs.json")
-    programs.NOTED.write_text(json.dumps({"vla-eval": {"3.11": {"versions": "vla-eval 0", "passed": 1}}}))
+    programs.NOTED.write_text(
+        json.dumps({"vla-eval": {"3.11": {"versions": "vla-eval 0", "passed": 1}}})
+    )
     plugin = programs.RunPrograms()
-    for name, outcome in (("provael", "passed"), ("provael", "failed"), ("Stable-Baselines3", "skipped")):
+    for name, outcome in (
+        ("provael", "passed"),
+        ("provael", "failed"),
+        ("Stable-Baselines3", "skipped"),
+    ):
         report = pytest.TestReport(
             f"tests/x.py::test[{name}-{outcome}]", ("", 0, ""), {}, outcome, None, "call",
             user_properties=[("program", name)],
@@ -40,7 +50,9 @@ def test_outcomes_are_noted_by_program_and_python_beside_those_of_others(
     plugin.pytest_sessionfinish()
     assert programs.notes() == {
         "vla-eval": {"3.11": {"versions": "vla-eval 0", "passed": 1}},
-        "provael": {"3.12": {"versions": "provael 0.46.0, openpi-client 0.1.2", "passed": 1, "failed": 1}},
+        "provael": {
+            "3.12": {"versions": "provael 0.46.0, openpi-client 0.1.2", "passed": 1, "failed": 1}
+        },
     }
 
 
@@ -48,7 +60,10 @@ def test_each_program_is_run_by_a_test() -> None:
     clients = {one.client for one in PROGRAMS.values()} - {""}
     script = (programs.ROOT / "tests/support/program_clients.py").read_text()
     assert [name for name in clients if f"def {name}(port: int)" not in script] == []
-    files = [*programs.ROOT.glob("tests/*/**/test_*.py"), *programs.ROOT.glob("plugins/*/tests/**/test_*.py")]
+    files = [
+        *programs.ROOT.glob("tests/*/**/test_*.py"),
+        *programs.ROOT.glob("plugins/*/tests/**/test_*.py"),
+    ]
     texts = "".join(file.read_text() for file in files)
     marked = [name for name, one in PROGRAMS.items() if not one.client and f'"{name}"' not in texts]
     assert marked == []

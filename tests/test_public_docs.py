@@ -15,8 +15,23 @@ from surface import MODULES
 
 from vlagents_ray import registry
 
-# A summary that begins with one of these is a fragment, which is understood with the name beside it alone.
-FRAGMENTS = {"as", "how", "it", "likewise", "of", "that", "these", "they", "this", "those", "what", "which", "who"}
+# A summary that begins with one of these is a fragment, which is understood with the name beside it
+# alone.
+FRAGMENTS = {
+    "as",
+    "how",
+    "it",
+    "likewise",
+    "of",
+    "that",
+    "these",
+    "they",
+    "this",
+    "those",
+    "what",
+    "which",
+    "who",
+}
 
 
 @dataclass(frozen=True)
@@ -32,12 +47,21 @@ class Documented:
         """What is wrong with the docstring, in words."""
         summary = " ".join(self.doc.partition("\n\n")[0].split())
         words = re.findall(r"[\w'.`]+", summary)
-        if len(words) < 3 or not re.match(r"[A-Z0-9`(]", summary) or not re.search(r"[.:]$", summary):
+        if (
+            len(words) < 3
+            or not re.match(r"[A-Z0-9`(]", summary)
+            or not re.search(r"[.:]$", summary)
+        ):
             yield f"{self.name}: got the summary {summary!r}, want a whole sentence"
         elif words[0].lower() in FRAGMENTS:
-            yield f"{self.name}: got the summary {summary!r}, want a sentence that does not begin with {words[0]!r}"
+            yield (
+                f"{self.name}: got the summary {summary!r}, want a sentence that does not begin "
+                f"with {words[0]!r}"
+            )
         if len(self.parameters) > 1:
-            named = set(re.findall(r"(?m)^    \*{0,2}(\w+)(?: \([^)]*\))?: \S", section(self.doc, "Args")))
+            named = set(
+                re.findall(r"(?m)^    \*{0,2}(\w+)(?: \([^)]*\))?: \S", section(self.doc, "Args"))
+            )
             if lacking := [name for name in self.parameters if name not in named]:
                 yield f"{self.name}: no line in Args for {', '.join(lacking)}"
             if self.returns and not section(self.doc, "Returns"):
@@ -63,14 +87,17 @@ def public_names() -> Iterator[tuple[str, Any]]:
 def documented(name: str, value: Any) -> Iterator[Documented]:
     """The docstrings of a public name; of a class, those of its methods and properties as well.
 
-    A method that overrides another one inherits its docstring, or the description of its arguments alone.
+    A method that overrides another one inherits its docstring, or the description of its arguments
+    alone.
     """
     if inspect.isfunction(value):
         yield of_function(name, value)
     elif inspect.isclass(value):
         yield of_class(name, value)
         for key, member in vars(value).items():
-            function = member.__func__ if isinstance(member, (classmethod, staticmethod)) else member
+            function = (
+                member.__func__ if isinstance(member, (classmethod, staticmethod)) else member
+            )
             if key.startswith("_") and key != "__call__":
                 continue
             if isinstance(member, property):
@@ -78,14 +105,18 @@ def documented(name: str, value: Any) -> Iterator[Documented]:
             elif inspect.isfunction(function):
                 inherited = any(hasattr(base, key) for base in value.__mro__[1:])
                 if not (inherited and function.__doc__ is None):
-                    found = of_function(f"{name}.{key}", function, method=not isinstance(member, staticmethod))
+                    found = of_function(
+                        f"{name}.{key}", function, method=not isinstance(member, staticmethod)
+                    )
                     yield dataclasses.replace(found, parameters=()) if inherited else found
 
 
 def of_function(name: str, function: Callable[..., Any], *, method: bool = False) -> Documented:
     parameters = tuple(inspect.signature(function).parameters)[method:]
     returned = str(inspect.get_annotations(function).get("return"))
-    returns = returned not in ("None", "NoReturn") and not returned.startswith(("Iterator", "Generator"))
+    returns = returned not in ("None", "NoReturn") and not returned.startswith(
+        ("Iterator", "Generator")
+    )
     return Documented(name, inspect.getdoc(function) or "", parameters, returns)
 
 
@@ -93,16 +124,21 @@ def of_class(name: str, cls: type[Any]) -> Documented:
     """Its docstring with its constructor's; a dataclass says at each field what it is."""
     own = vars(cls).get("__init__")
     doc = inspect.cleandoc(cls.__doc__ or "")
-    # Python itself gives a protocol a constructor, and a class that inherits from one when it is first called.
+    # Python itself gives a protocol a constructor, and a class that inherits from one when it is
+    # first called.
     inherited = not inspect.isfunction(own) or own.__module__ == "typing"
     if inherited or (dataclasses.is_dataclass(cls) and own.__doc__ is None):
         return Documented(name, doc)
     constructor = inspect.cleandoc(own.__doc__ or "")
-    return Documented(name, f"{doc}\n\n{constructor}".strip(), tuple(inspect.signature(own).parameters)[1:])
+    return Documented(
+        name, f"{doc}\n\n{constructor}".strip(), tuple(inspect.signature(own).parameters)[1:]
+    )
 
 
 def test_public_docstrings_are_whole_sentences_and_name_their_arguments() -> None:
-    faults = [fault for found in public_names() for one in documented(*found) for fault in one.faults()]
+    faults = [
+        fault for found in public_names() for one in documented(*found) for fault in one.faults()
+    ]
     assert faults == [], "\n" + "\n".join(faults)
 
 
@@ -122,5 +158,9 @@ def test_a_bad_docstring_is_found(doc: str, fault: str) -> None:
 
 
 def test_a_good_docstring_has_no_fault() -> None:
-    doc = "Add two numbers.\n\nArgs:\n    a: The first.\n    b: The second.\n\nReturns:\n    Their sum.\n"
+    doc = (
+        "Add two numbers.\n\nArgs:\n    a: The first.\n    b: The second.\n\nReturns:\n    "
+        "Their "
+        "sum.\n"
+    )
     assert list(Documented("add", doc, ("a", "b"), returns=True).faults()) == []

@@ -1,4 +1,6 @@
-"""What the repository has beside its code for those who cite, build and publish it is accepted by its own tools."""
+"""What the repository has beside its code for those who cite, build and publish it is accepted
+by its own tools.
+"""
 
 from __future__ import annotations
 
@@ -21,14 +23,22 @@ PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 
 
 def steps(workflow: Path) -> list[dict[str, Any]]:
-    return [step for job in yaml.safe_load(workflow.read_text())["jobs"].values() for step in job["steps"]]
+    return [
+        step
+        for job in yaml.safe_load(workflow.read_text())["jobs"].values()
+        for step in job["steps"]
+    ]
 
 
 @pytest.mark.integration
 def test_workflows_are_well_formed() -> None:
-    program = shutil.which("jactionlint", path=Path(sys.executable).parent) or shutil.which("jactionlint")
+    program = shutil.which("jactionlint", path=Path(sys.executable).parent) or shutil.which(
+        "jactionlint"
+    )
     assert program is not None
-    done = subprocess.run([program, "--shellcheck=", *WORKFLOWS], capture_output=True, text=True, check=False)
+    done = subprocess.run(
+        [program, "--shellcheck=", *WORKFLOWS], capture_output=True, text=True, check=False
+    )
     assert done.returncode == 0, done.stdout + done.stderr
     assert len(WORKFLOWS) == 4
 
@@ -62,7 +72,10 @@ def test_the_citation_names_this_version_and_licence() -> None:
 
 def test_the_table_of_extras_has_a_row_of_each_and_is_of_their_present_requirements() -> None:
     page = resolved.PAGE.read_text()
-    rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in resolved.rows(page).values()]
+    rows = [
+        [cell.strip() for cell in line.strip("|").split("|")]
+        for line in resolved.rows(page).values()
+    ]
     assert list(resolved.rows(page)) == [extra or "none" for extra in resolved.extras()]
     for _, *counts, built in rows:
         assert len(counts) == len(resolved.PYTHONS)
@@ -72,14 +85,18 @@ def test_the_table_of_extras_has_a_row_of_each_and_is_of_their_present_requireme
 
 
 def test_rows_that_are_not_named_stay_as_they_are(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(resolved, "cell", lambda _, python: ("7*", ["`a`"]) if python == "3.13" else ("6", []))
+    monkeypatch.setattr(
+        resolved, "cell", lambda _, python: ("7*", ["`a`"]) if python == "3.13" else ("6", [])
+    )
     old = resolved.rows(resolved.PAGE.read_text())
     new = resolved.table(["record"], old).splitlines()
     assert new[2:] == [*(old | {"record": "| `record` | 6 | 6 | 6 | 7* | `a` |"}).values()]
     assert len(new) == 2 + len(old)
 
 
-def test_a_changed_requirement_or_torch_makes_the_table_old(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_a_changed_requirement_or_torch_makes_the_table_old(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
     before = resolved.digest()
     monkeypatch.setitem(resolved.EXTRAS, "check", [])
     assert resolved.digest() == before  # what only developers install is not in it
@@ -95,14 +112,29 @@ def test_the_digest_of_the_table_is_the_same_in_each_process() -> None:
     command = [sys.executable, "-c", "import resolved; print(resolved.digest())"]
     digests = set()
     for seed in range(4):  # by which Python orders sets of texts
-        env = {**os.environ, "PYTHONHASHSEED": str(seed), "PYTHONPATH": str(Path(resolved.__file__).parent)}
-        digests.add(subprocess.run(command, env=env, capture_output=True, text=True, check=True).stdout)
+        env = {
+            **os.environ,
+            "PYTHONHASHSEED": str(seed),
+            "PYTHONPATH": str(Path(resolved.__file__).parent),
+        }
+        digests.add(
+            subprocess.run(command, env=env, capture_output=True, text=True, check=True).stdout
+        )
     assert len(digests) == 1
 
 
 def test_the_requirements_of_an_extra_are_those_of_the_extras_that_it_names_too() -> None:
-    assert set(resolved.direct("maniskill")) > set(resolved.direct("sim")) > set(resolved.direct("serve"))
-    assert set(resolved.direct("serve")) > set(resolved.direct(None)) == set(PROJECT["dependencies"])
+    assert (
+        set(resolved.direct("maniskill"))
+        > set(resolved.direct("sim"))
+        > set(resolved.direct("serve"))
+    )
+    assert (
+        set(resolved.direct("serve")) > set(resolved.direct(None)) == set(PROJECT["dependencies"])
+    )
     assert not any(
-        one.startswith(PROJECT["name"]) for extra in resolved.EXTRAS if extra != "all" for one in resolved.direct(extra)
+        one.startswith(PROJECT["name"])
+        for extra in resolved.EXTRAS
+        if extra != "all"
+        for one in resolved.direct(extra)
     )

@@ -18,7 +18,10 @@ def shell(code: str, mark: str = "<!-- not run: an example -->") -> Block:
 
 
 def test_only_python_and_shell_blocks_are_taken() -> None:
-    text = "".join(f"```{language}\nx\n```\n" for language in ("python", "yaml", "bash", "", "console", "sh", "json"))
+    text = "".join(
+        f"```{language}\nx\n```\n"
+        for language in ("python", "yaml", "bash", "", "console", "sh", "json")
+    )
     assert [block.language for block in blocks(text)] == ["python", "bash", "console", "sh"]
 
 
@@ -29,9 +32,15 @@ def test_only_python_and_shell_blocks_are_taken() -> None:
         ("<!-- test -->\n", None, False, None),
         ("<!-- test: serve scripted -->\n", "scripted", False, None),
         ("<!-- test with peers -->\n", None, True, None),
-        ("<!-- test: serve deployments/openpi.yaml with peers -->\n", "deployments/openpi.yaml", True, None),
+        (
+            "<!-- test: serve deployments/openpi.yaml with peers -->\n",
+            "deployments/openpi.yaml",
+            True,
+            None,
+        ),
         ("<!-- not run: needs a robot -->\n", None, False, "needs a robot"),
-        ("<!-- not run: needs a robot -->\nSome text.\n", None, False, None),  # it does not stand straight above
+        # It does not stand straight above.
+        ("<!-- not run: needs a robot -->\nSome text.\n", None, False, None),
     ],
 )
 def test_the_comment_above_a_block_says_how_it_is_tested(
@@ -79,16 +88,22 @@ def test_a_shell_block_fails_at_its_first_failing_command(tmp_path: Path) -> Non
 
 
 def test_the_documented_server_stands_for_the_running_one(tmp_path: Path) -> None:
-    block = one('```python\nassert "http://gpu-box:8000/v1" == "http://" + "127.0.0.1:" + "4321/v1"\n```\n')
+    block = one(
+        '```python\nassert "http://gpu-box:8000/v1" == "http://" + "127.0.0.1:" + "4321/v1"\n```\n'
+    )
     run(block, tmp_path, host="127.0.0.1:4321")
 
 
-@pytest.mark.parametrize("code", ["make setup", "git clone URL", "FOO=1 ls -l  # a comment", "ls \\\n  -l", "cd /"])
+@pytest.mark.parametrize(
+    "code", ["make setup", "git clone URL", "FOO=1 ls -l  # a comment", "ls \\\n  -l", "cd /"]
+)
 def test_commands_that_exist_pass_without_being_run(code: str) -> None:
     check_commands(shell(code))
 
 
-@pytest.mark.parametrize("code", ["make no-such-target", "no-such-command --option", "echo 'unfinished"])
+@pytest.mark.parametrize(
+    "code", ["make no-such-target", "no-such-command --option", "echo 'unfinished"]
+)
 def test_commands_that_do_not_exist_fail(code: str) -> None:
     with pytest.raises(AssertionError, match="README line-3"):
         check_commands(shell(code))

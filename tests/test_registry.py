@@ -1,4 +1,6 @@
-"""Names of policies, wrappers and environments, and the cure for an optional package that is not installed."""
+"""Names of policies, wrappers and environments, and the cure for an optional package that is not
+installed.
+"""
 
 from __future__ import annotations
 
@@ -56,7 +58,9 @@ def environments_in(text: str) -> list[str]:
         ("rcs.envs.base", ["rcs"]),
     ],
 )
-def test_a_missing_model_package_is_cured_by_its_requirements_file(module: str, files: list[str]) -> None:
+def test_a_missing_model_package_is_cured_by_its_requirements_file(
+    module: str, files: list[str]
+) -> None:
     text = cure(module)
     assert "pip install" not in text, "an extra of this package would not bring it"
     assert "vlagents-ray env make " in text
@@ -92,17 +96,25 @@ def required() -> Iterator[str]:
 
 @pytest.mark.usefixtures("nothing_installed")
 def test_every_optional_package_has_a_cure() -> None:
-    assert [name for name in sorted(set(required())) if cure(name).startswith("install the package")] == []
+    assert [
+        name for name in sorted(set(required())) if cure(name).startswith("install the package")
+    ] == []
 
 
 def test_the_extras_and_files_that_cures_name_exist() -> None:
-    extras = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
+    extras = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"][
+        "optional-dependencies"
+    ]
     assert set(registry._EXTRAS.keys()) <= extras.keys()
     adapters = (registry.entries("policies") | registry.entries("envs")).values()
     for entry in adapters:
-        project = tomllib.loads((ROOT / tables.folder_of(entry) / "pyproject.toml").read_text())["project"]
+        project = tomllib.loads((ROOT / tables.folder_of(entry) / "pyproject.toml").read_text())[
+            "project"
+        ]
         assert entry.extra is None or entry.extra in project["optional-dependencies"]
-    assert {one.requirements[0] for one in registry.entries("policies").values() if one.requirements} == set(FAMILIES)
+    assert {
+        one.requirements[0] for one in registry.entries("policies").values() if one.requirements
+    } == set(FAMILIES)
     for file in {file for one in adapters for file in one.requirements}:
         assert registry.requirements_file(file).exists()
 
@@ -115,7 +127,9 @@ def test_a_cure_names_each_file_that_lists_the_package(package: str) -> None:
 
 
 def test_an_unknown_name_raises_the_error_of_its_kind() -> None:
-    with pytest.raises(UnknownPolicy, match=r"'scriptd' is not registered.*did you mean 'scripted'"):
+    with pytest.raises(
+        UnknownPolicy, match=r"'scriptd' is not registered.*did you mean 'scripted'"
+    ):
         registry.policy_class("scriptd")
     with pytest.raises(UnknownEnv, match=r"'tabletopp' is not registered.*did you mean 'tabletop'"):
         registry.env_class("tabletopp/reach")
@@ -124,7 +138,9 @@ def test_an_unknown_name_raises_the_error_of_its_kind() -> None:
 def test_requirements_are_found_in_the_package_that_registers_them_and_others_are_refused() -> None:
     assert registry.requirements_file("hf").parent.parent.name == "vlagents_ray_models"
     assert registry.requirements_file("rcs").parent.parent.name == "vlagents_ray_sims"
-    with pytest.raises(ConfigError, match=r"requirements 'lerobt': expected a file.*did you mean 'lerobot'"):
+    with pytest.raises(
+        ConfigError, match=r"requirements 'lerobt': expected a file.*did you mean 'lerobot'"
+    ):
         registry.requirements_file("lerobt")
 
 

@@ -1,4 +1,5 @@
-"""Which tests are imported, that CI skips none but those of missing hardware, and a second try of those that failed.
+"""Which tests are imported, that CI skips none but those of missing hardware, and a second try of
+those that failed.
 
 Tried on small test files.
 """
@@ -46,7 +47,9 @@ def test_the_page_of_the_tests_lists_every_module_of_support() -> None:
     packages = {path.parent.name for path in (tests / "support").glob("*/__init__.py")}
     modules = {path.stem for path in (tests / "support").glob("*.py")} | packages
     page = (tests / "README.md").read_text()
-    assert {name for name in modules if f"`{name}`" not in page and f"support/{name}.py" not in page} == set()
+    assert {
+        name for name in modules if f"`{name}`" not in page and f"support/{name}.py" not in page
+    } == set()
 
 
 def test_what_runs_alone_is_apart_from_its_file_and_clusters_are_played_by_one_process() -> None:
@@ -67,7 +70,9 @@ SUPPORT = Path(__file__).parent / "support"
 
 
 def outcome(folder: Path, *bodies: str, strict: bool = True) -> tuple[int, str]:
-    """Exit status and output of pytest on files that hold one of `bodies` each: test_0.py, test_1.py, …"""
+    """Exit status and output of pytest on files that hold one of `bodies` each: test_0.py,
+    test_1.py, …
+    """
     for number, body in enumerate(bodies):
         (folder / f"test_{number}.py").write_text(f"import pytest\n{body}\n")
     (folder / "pytest.ini").write_text("[pytest]\nmarkers = gpu: needs a GPU\n")
@@ -83,7 +88,8 @@ def outcome(folder: Path, *bodies: str, strict: bool = True) -> tuple[int, str]:
             "COLUMNS": "300",
             "PYTHONPATH": str(SUPPORT),
             "VLAGENTS_FAIL_ON_SKIP": str(int(strict)),
-            "PYTEST_DISABLE_PLUGIN_AUTOLOAD": "1",  # other plugins take longer to load than the test to run
+            # Other plugins take longer to load than the test to run.
+            "PYTEST_DISABLE_PLUGIN_AUTOLOAD": "1",
         },
         capture_output=True,
         text=True,
@@ -103,7 +109,9 @@ SKIPS = {
 
 @pytest.fixture(scope="module")
 def skipping(tmp_path_factory: pytest.TempPathFactory) -> str:
-    """What pytest says of a file for each kind of skip, of one for a GPU, and of an expected failure."""
+    """What pytest says of a file for each kind of skip, of one for a GPU, and of an expected
+    failure.
+    """
     gpu = "@pytest.mark.gpu\ndef test_a(): pytest.skip('no GPU')"
     expected = "@pytest.mark.xfail\ndef test_a(): assert False"
     status, said = outcome(tmp_path_factory.mktemp("skipping"), *SKIPS.values(), gpu, expected)
@@ -113,7 +121,9 @@ def skipping(tmp_path_factory: pytest.TempPathFactory) -> str:
 
 @pytest.mark.parametrize("how", SKIPS)
 def test_a_skip_fails_and_is_told_with_its_reason(how: str, skipping: str) -> None:
-    [failure] = re.findall(rf"^(?:FAILED|ERROR) test_{list(SKIPS).index(how)}\.py.*", skipping, re.MULTILINE)
+    [failure] = re.findall(
+        rf"^(?:FAILED|ERROR) test_{list(SKIPS).index(how)}\.py.*", skipping, re.MULTILINE
+    )
     assert "unexpected skip" in failure
     assert re.search("no.reason", failure)
 
@@ -164,13 +174,22 @@ def run(folder: Path, ci: str) -> tuple[int, str]:
     (folder / "test_some.py").write_text(TESTS)
     environment = {**os.environ, "CI": ci, "PYTEST_DISABLE_PLUGIN_AUTOLOAD": "1"}
     done = subprocess.run(
-        [sys.executable, SCRIPT, "-q"], check=False, cwd=folder, env=environment, capture_output=True, text=True
+        [sys.executable, SCRIPT, "-q"],
+        check=False,
+        cwd=folder,
+        env=environment,
+        capture_output=True,
+        text=True,
     )
     return done.returncode, done.stdout
 
 
-@pytest.mark.parametrize(("ci", "broken", "status"), [("true", False, 0), ("true", True, 1), ("", False, 1)])
-def test_only_what_passes_the_second_time_on_ci_is_flaky(tmp_path: Path, ci: str, broken: bool, status: int) -> None:
+@pytest.mark.parametrize(
+    ("ci", "broken", "status"), [("true", False, 0), ("true", True, 1), ("", False, 1)]
+)
+def test_only_what_passes_the_second_time_on_ci_is_flaky(
+    tmp_path: Path, ci: str, broken: bool, status: int
+) -> None:
     if broken:
         (tmp_path / "broken").touch()
     got, output = run(tmp_path, ci)

@@ -1,4 +1,6 @@
-"""What README and docs show of a served policy works, and each tutorial from its first block to its last."""
+"""What README and docs show of a served policy works, and each tutorial from its first block to
+its last.
+"""
 
 from __future__ import annotations
 
@@ -11,16 +13,33 @@ from pathlib import Path
 
 import pytest
 from ray_processes import serving
-from readme_blocks import DOCUMENTED_HOST, EXAMPLES, PAGES, TUTORIALS, Block, blocks, checkout, code_of, run
+from readme_blocks import (
+    DOCUMENTED_HOST,
+    EXAMPLES,
+    PAGES,
+    TUTORIALS,
+    Block,
+    blocks,
+    checkout,
+    code_of,
+    run,
+)
 
 pytestmark = [pytest.mark.server, pytest.mark.slow]
 
 README = next(page for page in PAGES if page.name == "README.md")
 _SERVED = [
-    (page, block) for page in PAGES if page not in TUTORIALS for block in blocks(page.read_text()) if block.server
+    (page, block)
+    for page in PAGES
+    if page not in TUTORIALS
+    for block in blocks(page.read_text())
+    if block.server
 ]
 # Of examples/: a loop in which the guard refuses the random policy's actions, and the notebook.
-_LOOP = "python examples/robot_loop.py http://gpu-box:8000 >said\ngrep 'refused, .* than max_step allows' said"
+_LOOP = (
+    "python examples/robot_loop.py http://gpu-box:8000 >said\ngrep 'refused, .* than max_step "
+    "allows' said"
+)
 _SERVED += [
     (EXAMPLES / "robot_loop.py", Block("bash", 1, _LOOP, "random")),
     (EXAMPLES / "tour.ipynb", code_of(EXAMPLES / "tour.ipynb", "scripted")),
@@ -54,13 +73,18 @@ def host_of(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Callable[[str 
         yield host
 
 
-def test_modules_of_ones_own_are_served_evaluated_and_trained_from_their_folder(tmp_path: Path) -> None:
+def test_modules_of_ones_own_are_served_evaluated_and_trained_from_their_folder(
+    tmp_path: Path,
+) -> None:
     folder, log = tmp_path / "examples", tmp_path / "log"
     shutil.copytree(EXAMPLES, folder, ignore=shutil.ignore_patterns("runs"))
     with serving("own_policy:Servo", log, None, "--set", "camera_turn=120", cwd=folder) as host:
         said = log.read_text()
         url = f"http://{host}"
-        evaluation = f"vlagents-ray eval own_env:CraneEnv --policy {url} --episodes 2 --workers 1 --out runs/own"
+        evaluation = (
+            f"vlagents-ray eval own_env:CraneEnv --policy {url} --episodes 2 --workers 1 "
+            "--out runs/own"
+        )
         training = f"HOME={Path.home()} python rl_loop.py {url} >learned"  # Ray's token is there
         run(Block("bash", 1, f"{evaluation}\n{training}"), folder, host)
         learned = re.findall(r"^servo@\d+: (\d+)%", (folder / "learned").read_text(), re.MULTILINE)
@@ -85,18 +109,27 @@ def test_modules_of_ones_own_are_served_evaluated_and_trained_from_their_folder(
 
 @pytest.mark.integration
 @pytest.mark.parametrize("page", TUTORIALS, ids=lambda page: page.stem)
-def test_a_tutorial_works_from_top_to_bottom(page: Path, host_of: Callable[[str | None], str], tmp_path: Path) -> None:
+def test_a_tutorial_works_from_top_to_bottom(
+    page: Path, host_of: Callable[[str | None], str], tmp_path: Path
+) -> None:
     for block in blocks(page.read_text()):
         if block.not_run is None:
             run(block, tmp_path, host_of(block.server), page=f"page_{page.stem}")
 
 
 @pytest.mark.parametrize(("page", "block"), [named(*one) for one in SERVED])
-def test_a_block_works(page: Path, block: Block, host_of: Callable[[str | None], str], tmp_path: Path) -> None:
+def test_a_block_works(
+    page: Path, block: Block, host_of: Callable[[str | None], str], tmp_path: Path
+) -> None:
     checkout(tmp_path)
     run(block, tmp_path, host_of(block.server), page=page.stem)
 
 
 def test_there_are_such_blocks() -> None:
-    assert {block.server for _, block in SERVED} >= {"noop", "random", "scripted", "deployments/openpi.yaml"}
+    assert {block.server for _, block in SERVED} >= {
+        "noop",
+        "random",
+        "scripted",
+        "deployments/openpi.yaml",
+    }
     assert len(TUTORIALS) == 6

@@ -1,4 +1,6 @@
-"""Values of settings that have no model: compared with annotations and defaults where these are plain."""
+"""Values of settings that have no model: compared with annotations and defaults where these are
+plain.
+"""
 
 from __future__ import annotations
 
@@ -35,7 +37,17 @@ class Broken:
 @pytest.mark.parametrize(
     ("cls", "given"),
     [
-        (Annotated, {"gain": 1, "steps": np.int64(2), "name": "x", "fast": True, "where": "/tmp", "other": object()}),
+        (
+            Annotated,
+            {
+                "gain": 1,
+                "steps": np.int64(2),
+                "name": "x",
+                "fast": True,
+                "where": "/tmp",
+                "other": object(),
+            },
+        ),
         (Annotated, {"gain": np.float32(1), "name": None}),
         (Bare, {"gain": 0.5, "mode": "slow", "fast": np.True_, "rows": [3], "seed": "any"}),
         (Broken, {"gain": 2}),
@@ -59,6 +71,8 @@ def test_what_fits_is_taken(cls: type, given: dict[str, Any]) -> None:
         (Broken, {"gain": "high"}, "gain: got 'high', want float"),
     ],
 )
-def test_what_does_not_is_told_before_it_is_used(cls: type, given: dict[str, Any], said: str) -> None:
+def test_what_does_not_is_told_before_it_is_used(
+    cls: type, given: dict[str, Any], said: str
+) -> None:
     with pytest.raises(ConfigError, match=said):
         require_arguments("policy P", cls, given)

@@ -24,7 +24,9 @@ PAGES = [
 ]
 pytestmark = [
     pytest.mark.integration,
-    pytest.mark.skipif(not (SITE / "index.html").is_file(), reason="the site is not built: make docs"),
+    pytest.mark.skipif(
+        not (SITE / "index.html").is_file(), reason="the site is not built: make docs"
+    ),
 ]
 
 
@@ -46,7 +48,8 @@ class PageLinks(HTMLParser):
 
 
 def test_every_link_within_the_site_leads_to_a_file_and_an_anchor_in_it() -> None:
-    pages = {page: PageLinks(page) for page in SITE.rglob("*.html") if page.name != "404.html"}  # of a server's root
+    # Of a server's root.
+    pages = {page: PageLinks(page) for page in SITE.rglob("*.html") if page.name != "404.html"}
     broken = set()
     for links in pages.values():
         for target in links.targets:
@@ -85,16 +88,25 @@ def page(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Page]:
 
 @pytest.mark.browser
 @pytest.mark.parametrize(("width", "scheme"), [(1280, "light"), (1280, "dark"), (360, "light")])
-def test_pages_fit_and_ask_for_nothing_outside_of_the_site(page: Page, width: int, scheme: str) -> None:
+def test_pages_fit_and_ask_for_nothing_outside_of_the_site(
+    page: Page, width: int, scheme: str
+) -> None:
     page.asked.clear()
     page.said.clear()
     for name in PAGES:
         page.open(SITE / name, width=width, scheme=scheme)
-        assert page.value("document.body.dataset.mdColorScheme") == ("slate" if scheme == "dark" else "default")
+        assert page.value("document.body.dataset.mdColorScheme") == (
+            "slate" if scheme == "dark" else "default"
+        )
         assert page.value("document.documentElement.scrollWidth") <= width, name
         assert page.value(LINES_OF_A_PATH) in (1, None), name
-        assert page.value("[...document.images].filter(one => !one.naturalWidth).map(one => one.src)") == []
-    assert [url for url in page.asked if not url.startswith((SITE.as_uri(), "data:", "blob:", "about:"))] == []
+        assert (
+            page.value("[...document.images].filter(one => !one.naturalWidth).map(one => one.src)")
+            == []
+        )
+    assert [
+        url for url in page.asked if not url.startswith((SITE.as_uri(), "data:", "blob:", "about:"))
+    ] == []
     assert page.said == []
 
 
@@ -113,8 +125,12 @@ def test_the_search_finds_pages_without_a_server(page: Page) -> None:
     for letter in "watchdog":
         for event in ("keyDown", "keyUp"):
             page.call(
-                "Input.dispatchKeyEvent", type=event, key=letter, **({"text": letter} if event == "keyDown" else {})
+                "Input.dispatchKeyEvent",
+                type=event,
+                key=letter,
+                **({"text": letter} if event == "keyDown" else {}),
             )
     found = '[...document.querySelectorAll(".md-search-result__link")].map(link => link.href)'
     wanted = (SITE / "control_loop.html").as_uri()
-    wait_for(lambda: any(link.startswith(wanted) for link in page.value(found)))  # of the whole word
+    # Of the whole word.
+    wait_for(lambda: any(link.startswith(wanted) for link in page.value(found)))

@@ -18,7 +18,9 @@ VERIFIED = verified.BEGIN.format(r"(\w+)")
 
 
 @pytest.mark.parametrize("family", verified.RUN_WITH)
-def test_a_familys_page_names_the_tests_that_there_are_with_what_became_of_them(family: str) -> None:
+def test_a_familys_page_names_the_tests_that_there_are_with_what_became_of_them(
+    family: str,
+) -> None:
     page = verified.page_of(family).read_text()
     assert verified.with_table(page, family) == page, "run `python tests/support/verified.py`"
 
@@ -26,9 +28,13 @@ def test_a_familys_page_names_the_tests_that_there_are_with_what_became_of_them(
 @pytest.mark.parametrize("family", verified.RUN_WITH)
 def test_what_is_noted_is_of_tests_that_there_are(family: str) -> None:
     tests = dict(verified.marked(family))
-    assert {"parity", "batches", "isolation", "loading"} <= set(tests.values()) <= set(verified.WHAT)
+    assert (
+        {"parity", "batches", "isolation", "loading"} <= set(tests.values()) <= set(verified.WHAT)
+    )
     for noted in (one["tests"] for one in verified.notes(family)):
-        assert noted.keys() <= tests.keys(), f"run `make verified FAMILIES={verified.RUN_WITH[family][0]}`"
+        assert noted.keys() <= tests.keys(), (
+            f"run `make verified FAMILIES={verified.RUN_WITH[family][0]}`"
+        )
         assert not any("failed" in outcomes for outcomes in noted.values())
     for one in verified.notes(family):
         skipped = {name for name, outcomes in one["tests"].items() if "skipped" in outcomes}
@@ -36,19 +42,30 @@ def test_what_is_noted_is_of_tests_that_there_are(family: str) -> None:
 
 
 def test_each_family_with_a_page_is_listed() -> None:
-    shown = [name for page in verified.PAGES.glob("*.md") for name in re.findall(VERIFIED, page.read_text())]
+    shown = [
+        name
+        for page in verified.PAGES.glob("*.md")
+        for name in re.findall(VERIFIED, page.read_text())
+    ]
     assert sorted(shown) == sorted(verified.RUN_WITH)
-    no_families = {page_of(name, one) for name, one in entries("policies").items() if not one.requirements} | {"index"}
+    no_families = {
+        page_of(name, one) for name, one in entries("policies").items() if not one.requirements
+    } | {"index"}
     with_table = {verified.page_of(family).stem for family in shown}
     assert with_table == {page.stem for page in verified.PAGES.glob("*.md")} - no_families
 
 
-def test_a_test_that_is_new_or_gone_changes_the_table(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_test_that_is_new_or_gone_changes_the_table(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(verified, "ROOT", tmp_path.parent)
     monkeypatch.setattr(verified, "FOLDERS", [tmp_path.name])
     (tmp_path / "pi0").mkdir()
     file = tmp_path / "pi0" / "test_it.py"
-    file.write_text('@pytest.mark.verifies("parity")\ndef test_acts_are_theirs(): ...\n\ndef test_other(): ...\n')
+    file.write_text(
+        '@pytest.mark.verifies("parity")\ndef test_acts_are_theirs(): ...\n\ndef test_other(): '
+        "...\n"
+    )
     verified.noted_in("pi0").write_text(
         json.dumps(
             {
@@ -61,7 +78,9 @@ def test_a_test_that_is_new_or_gone_changes_the_table(tmp_path: Path, monkeypatc
             }
         )
     )
-    (file.parent / "test_more.py").write_text('@pytest.mark.verifies("parity")\ndef test_more(): ...\n')
+    (file.parent / "test_more.py").write_text(
+        '@pytest.mark.verifies("parity")\ndef test_more(): ...\n'
+    )
     said = verified.table("pi0")
     assert "| acts as upstream's own code | `test_it.py` | 2 passed, 1 skipped: no GPU |" in said
     assert "| `test_more.py` | not run: no simulator |" in said
@@ -70,7 +89,9 @@ def test_a_test_that_is_new_or_gone_changes_the_table(tmp_path: Path, monkeypatc
     assert "| `test_it.py` | not run: it is newer than these results |" in verified.table("pi0")
 
 
-def test_outcomes_are_noted_by_family_and_test(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_outcomes_are_noted_by_family_and_test(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(verified, "ROOT", tmp_path.parent)
     monkeypatch.setattr(verified, "FOLDERS", [tmp_path.name])
     (tmp_path / "pi0").mkdir()

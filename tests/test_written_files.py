@@ -1,7 +1,8 @@
-"""Files that scripts of tests/support write are up to date: tables of the pages, and tests/surface.txt.
+"""Files that scripts of tests/support write are up to date: tables of the pages, and
+tests/surface.txt.
 
-What README and docs/ say about the registered adapters follows from the registry. What users write down changes only
-where a review sees it.
+What README and docs/ say about the registered adapters follows from the registry. What users write
+down changes only where a review sees it.
 """
 
 from __future__ import annotations
@@ -20,7 +21,9 @@ def test_the_tables_are_up_to_date(file: str) -> None:
 
 
 def test_the_names_of_all_plugins_are_published() -> None:
-    assert tables.PUBLISHED.read_text() == tables.published(), "run `python tests/support/tables.py`"
+    assert tables.PUBLISHED.read_text() == tables.published(), (
+        "run `python tests/support/tables.py`"
+    )
 
 
 def test_the_example_of_a_plugin_is_what_the_skeleton_writes() -> None:
@@ -28,14 +31,20 @@ def test_the_example_of_a_plugin_is_what_the_skeleton_writes() -> None:
     for path, text in expected.items():
         assert path.read_text() == text, "run `python tests/support/tables.py`"
     written = {path for path in tables.PLUGIN.rglob("*") if path.is_file()}
-    ignored = {path for path in written if not {"__pycache__", "homing.egg-info", "runs"}.isdisjoint(path.parts)}
+    ignored = {
+        path
+        for path in written
+        if not {"__pycache__", "homing.egg-info", "runs"}.isdisjoint(path.parts)
+    }
     assert written - ignored == set(expected)
 
 
 def test_each_adapter_has_a_page_and_each_page_an_adapter() -> None:
     for folder, adapters in (("policies", entries("policies")), ("benchmarks", entries("envs"))):
         named = {tables.page_of(name, one) for name, one in adapters.items() if one.about}
-        assert {page.stem for page in (tables.ROOT / "docs" / folder).glob("*.md")} - {"index"} == named - {""}
+        assert {page.stem for page in (tables.ROOT / "docs" / folder).glob("*.md")} - {
+            "index"
+        } == named - {""}
 
 
 def test_each_dialect_is_shown_among_the_clients_of_other_systems() -> None:
@@ -62,4 +71,7 @@ def test_a_change_is_seen() -> None:
         ("vlagents_ray.RemoteAgent.act(obs)", "vlagents_ray.RemoteAgent.act(obs, now)"),
     ):
         assert before in was.splitlines()
-        assert surface.lines_that_differ(was, was.replace(before, after)) == [f"- {before}", f"+ {after}"]
+        assert surface.lines_that_differ(was, was.replace(before, after)) == [
+            f"- {before}",
+            f"+ {after}",
+        ]

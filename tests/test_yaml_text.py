@@ -40,7 +40,13 @@ def test_what_yaml_writes_is_read(value: Any) -> None:
 
 @pytest.mark.parametrize(
     "text",
-    ["a: 1\na: 1", "x:\n  a: 1\n  b: 2\n  a: 3", "[{a: 1, b: 2, a: 3}]", "{1: a, 1: b}", '{"a": 1, a: 2}'],
+    [
+        "a: 1\na: 1",
+        "x:\n  a: 1\n  b: 2\n  a: 3",
+        "[{a: 1, b: 2, a: 3}]",
+        "{1: a, 1: b}",
+        '{"a": 1, a: 2}',
+    ],
 )
 def test_a_key_that_is_written_twice_is_an_error_at_any_depth(text: str) -> None:
     with pytest.raises(ValueError, match="is written twice"):
@@ -48,12 +54,23 @@ def test_a_key_that_is_written_twice_is_an_error_at_any_depth(text: str) -> None
 
 
 def test_a_merged_key_may_be_replaced() -> None:
-    assert load_yaml("base: &b {a: 1, c: 2}\nx:\n  <<: *b\n  a: 3") == {"base": {"a": 1, "c": 2}, "x": {"a": 3, "c": 2}}
+    assert load_yaml("base: &b {a: 1, c: 2}\nx:\n  <<: *b\n  a: 3") == {
+        "base": {"a": 1, "c": 2},
+        "x": {"a": 3, "c": 2},
+    }
 
 
 @pytest.mark.parametrize(
     ("text", "value"),
-    [("1e12", 1e12), ("1e-4", 1e-4), ("-2.5E3", -2500.0), (".5e1", 5.0), ("1_000", 1000), ("e12", "e12"), ("1e", "1e")],
+    [
+        ("1e12", 1e12),
+        ("1e-4", 1e-4),
+        ("-2.5E3", -2500.0),
+        (".5e1", 5.0),
+        ("1_000", 1000),
+        ("e12", "e12"),
+        ("1e", "1e"),
+    ],
 )
 def test_a_number_with_an_exponent_is_a_number(text: str, value: object) -> None:
     assert load_yaml(text) == value
@@ -84,7 +101,9 @@ CASES = [case for case in itertools.product(READERS, WRONG) if case not in NO_MI
 
 
 @pytest.mark.parametrize(("reader", "wrong"), CASES)
-def test_each_reader_answers_a_wrong_text_with_its_file(reader: str, wrong: str, tmp_path: Path) -> None:
+def test_each_reader_answers_a_wrong_text_with_its_file(
+    reader: str, wrong: str, tmp_path: Path
+) -> None:
     name, read = READERS[reader]
     text, says = WRONG[wrong]
     (tmp_path / name).write_bytes(text)
@@ -96,7 +115,9 @@ def test_each_reader_answers_a_wrong_text_with_its_file(reader: str, wrong: str,
 
 def test_a_file_of_runs_with_a_key_twice_is_an_error_of_the_command(tmp_path: Path) -> None:
     file = tmp_path / "runs.yaml"
-    file.write_text("policies: [{source: noop}]\nsuites: [{envs: [tabletop]}]\nworkers: 0\nworkers: 3\n")
+    file.write_text(
+        "policies: [{source: noop}]\nsuites: [{envs: [tabletop]}]\nworkers: 0\nworkers: 3\n"
+    )
     done = CliRunner().invoke(app, ["eval", str(file), "--dry-run"])
     assert done.exit_code == 2
     assert "the key 'workers' is written twice" in done.stderr
@@ -108,6 +129,10 @@ def test_no_other_module_reads_yaml() -> None:
     readers = set()
     for file in folder.rglob("*.py"):
         for node in ast.walk(ast.parse(file.read_text())):
-            if isinstance(node, ast.Attribute) and node.attr in ("safe_load", "safe_load_all", "SafeLoader"):
+            if isinstance(node, ast.Attribute) and node.attr in (
+                "safe_load",
+                "safe_load_all",
+                "SafeLoader",
+            ):
                 readers.add(file.relative_to(folder).as_posix())
     assert readers == {"yaml_text.py"}

@@ -1,4 +1,6 @@
-"""Run the command `vlagents-ray` as `python -m vlagents_ray`, where the console script is not on the path."""
+"""Run the command `vlagents-ray` as `python -m vlagents_ray`, where the console script is not on
+the path.
+"""
 
 from vlagents_ray.cli import main
 

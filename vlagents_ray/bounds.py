@@ -1,4 +1,6 @@
-"""Upper bounds of numbers in plans and options, so that a slip of the keyboard is answered at once, not computed."""
+"""Upper bounds of numbers in plans and options, so that a slip of the keyboard is answered at
+once, not computed.
+"""
 
 from __future__ import annotations
 

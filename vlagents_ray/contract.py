@@ -1,9 +1,10 @@
 """The contracts of policies and of robots or environments, and their comparison.
 
-Both sides state a `Contract`: the inputs and the actions that a policy needs and returns, and those that a robot or an
-env provides and accepts. `require_match` compares them before the first step and lists every difference with its cure.
-`None` means "not stated", and a field that is not stated is not compared. Images are always upright RGB; the env of a
-simulator that renders upside down rotates them.
+Both sides state a `Contract`: the inputs and the actions that a policy needs and returns, and those
+that a robot or an env provides and accepts. `require_match` compares them before the first step and
+lists every difference with its cure. `None` means "not stated", and a field that is not stated is
+not compared. Images are always upright RGB; the env of a simulator that renders upside down rotates
+them.
 """
 
 from __future__ import annotations
@@ -47,7 +48,9 @@ class StateSpec:
 @says_its_fields("; the rows of a chunk are Contract(chunk=…)")
 @dataclass(frozen=True, slots=True)
 class ActionSpec:
-    """The meaning of the numbers in an action, (dim,) float32, or in each row of a chunk of actions."""
+    """The meaning of the numbers in an action, (dim,) float32, or in each row of a chunk of
+    actions.
+    """
 
     dim: int | None = None
     space: str | None = None  # the commanded quantity: "joint", "ee_position", "ee_pose", ...
@@ -60,11 +63,14 @@ class ActionSpec:
     high: float | None = None  # upper bound of every number
     # Names of several arms in the row's order: the command of each, then its gripper.
     arms: tuple[str, ...] | None = None
-    names: tuple[str, ...] | None = None  # of the joints in the row's order, with or without grippers
+    # Of the joints in the row's order, with or without grippers.
+    names: tuple[str, ...] | None = None
 
     @property
     def relative(self) -> bool | None:
-        """Whether zeros command no motion (deltas, velocities) instead of a target pose; None if that is not stated."""
+        """Whether zeros command no motion (deltas, velocities) instead of a target pose; None if
+        that is not stated.
+        """
         return True if self.delta or "velocity" in (self.space or "") else self.delta
 
     def gripper_columns(self, dim: int) -> list[int]:
@@ -76,7 +82,8 @@ class ActionSpec:
             dim: The number of values in an action.
 
         Returns:
-            The columns in rising order; empty if neither `gripper_open` nor `gripper_closed` is set.
+            The columns in rising order; empty if neither `gripper_open` nor `gripper_closed` is
+            set.
 
         Raises:
             ConfigError: `arms` does not divide `dim`.
@@ -86,14 +93,16 @@ class ActionSpec:
         arms = len(self.arms or ("",))
         if dim % arms:
             raise ConfigError(
-                f"action.arms: expected a number of values that {arms} arms {self.arms} share equally, got {dim}; "
+                f"action.arms: expected a number of values that {arms} arms {self.arms} share "
+                f"equally, got {dim}; "
                 "correct `arms` or `dim` of the contract"
             )
         width = dim // arms
         return [(arm + 1) * width - 1 for arm in range(arms)]
 
     def delta_columns(self, dim: int) -> list[int]:
-        """Return the columns of an action that are deltas or velocities; raises as `gripper_columns` does.
+        """Return the columns of an action that are deltas or velocities; raises as
+        `gripper_columns` does.
 
         Args:
             dim: The number of values in an action.
@@ -110,7 +119,8 @@ class ActionSpec:
 @says_its_fields()
 @dataclass(frozen=True, slots=True)
 class Contract:
-    """The inputs and actions of a policy, or of a robot or env, to be compared with the other side's.
+    """The inputs and actions of a policy, or of a robot or env, to be compared with the other
+    side's.
 
     The comments at the fields describe the meaning for each side.
     """
@@ -120,13 +130,17 @@ class Contract:
     gripper: bool | None = None  # policy: needs `Obs.gripper`; env: provides it
     instruction: bool | None = None  # policy: needs an instruction; env: provides one
     action: ActionSpec = field(default_factory=ActionSpec)  # policy: returns; env: accepts
-    control_hz: float | None = None  # policy: rate of its training data, Hz; env: rate of its steps, Hz
+    # policy: rate of its training data, Hz; env: rate of its steps, Hz.
+    control_hz: float | None = None
     chunk: int | None = None  # policy: rows of an `Act`; env: rows it accepts at once (None: any)
     history: int | None = None  # policy: consecutive observations it keeps per session
-    behaviour: tuple[str, ...] | None = None  # policy: values that an `Act` has on request, e.g. "logprob", "value"
+    # policy: values that an `Act` has on request, e.g. "logprob", "value".
+    behaviour: tuple[str, ...] | None = None
 
     def to_json(self) -> dict[str, Any]:
-        """Return the contract as plain JSON values, which processes with another version of numpy can read."""
+        """Return the contract as plain JSON values, which processes with another version of
+        numpy can read.
+        """
         stated = asdict(self)
         if self.behaviour is None:
             del stated["behaviour"]  # only policies for learners state it
@@ -149,11 +163,19 @@ class Contract:
         for name, spec in (("cameras", CameraSpec), ("state", StateSpec)):
             if top.get(name) is not None:
                 if not isinstance(top[name], dict):
-                    raise MalformedMessage(f"contract.{name}: got {type(top[name]).__name__}, want an object")
-                top[name] = {str(k): spec(**closed(spec, v, f"contract.{name}.{k}")) for k, v in top[name].items()}
+                    raise MalformedMessage(
+                        f"contract.{name}: got {type(top[name]).__name__}, want an object"
+                    )
+                top[name] = {
+                    str(k): spec(**closed(spec, v, f"contract.{name}.{k}"))
+                    for k, v in top[name].items()
+                }
         if "action" in top:
             action = closed(ActionSpec, top["action"], "contract.action")
-            lists = {name: _names(action.get(name), f"contract.action.{name}") for name in ("arms", "names")}
+            lists = {
+                name: _names(action.get(name), f"contract.action.{name}")
+                for name in ("arms", "names")
+            }
             top["action"] = ActionSpec(**{**action, **lists})
         return cls(**{**top, "behaviour": _names(top.get("behaviour"), "contract.behaviour")})
 
@@ -167,7 +189,9 @@ def _names(value: object, where: str) -> tuple[str, ...] | None:
 
 
 def differences(policy: Contract, env: Contract) -> list[str]:
-    """List the differences between the contracts of a policy and an env, one sentence each with its cure."""
+    """List the differences between the contracts of a policy and an env, one sentence each with
+    its cure.
+    """
     found, given = [], env.cameras or {}
     for name, need in ((policy.cameras or {}) if env.cameras is not None else {}).items():
         if (have := given.get(name)) is None:
@@ -177,23 +201,31 @@ def differences(policy: Contract, env: Contract) -> list[str]:
             )
         elif _differ(need.height, have.height) or _differ(need.width, have.width):
             found.append(
-                f"camera {name!r}: the policy needs {need.height}x{need.width} pixels (height x width), "
+                f"camera {name!r}: the policy needs {need.height}x{need.width} pixels (height x "
+                "width), "
                 f"the env gives {have.height}x{have.width}; set the env's camera size"
             )
     found += _state_differences(policy, env)
     if policy.gripper and env.gripper is False:
-        found.append("gripper: the policy needs Obs.gripper, which the env does not provide; fill it, 1 = open")
+        found.append(
+            "gripper: the policy needs Obs.gripper, which the env does not provide; fill it, 1 = "
+            "open"
+        )
     if policy.instruction and env.instruction is False:
-        found.append("instruction: the policy needs one, the env has none; set it in the env's options")
+        found.append(
+            "instruction: the policy needs one, the env has none; set it in the env's options"
+        )
     found += _action_differences(policy.action, env.action)
     if _differ(policy.control_hz, env.control_hz):
         found.append(
-            f"control_hz: the policy was made for {policy.control_hz} Hz, the env runs at {env.control_hz} Hz; "
+            f"control_hz: the policy was made for {policy.control_hz} Hz, the env runs at "
+            f"{env.control_hz} Hz; "
             f"set the env's control rate"
         )
     if _differ(policy.chunk, env.chunk):
         found.append(
-            f"chunk: the policy returns {policy.chunk} rows, the env takes {env.chunk}; set the policy's chunk length"
+            f"chunk: the policy returns {policy.chunk} rows, the env takes {env.chunk}; set the "
+            "policy's chunk length"
         )
     return found
 
@@ -206,7 +238,8 @@ def _differ(a: object, b: object) -> bool:
 def _state_differences(policy: Contract, env: Contract) -> Iterator[str]:
     if env.state is None:
         return
-    alone = len(policy.state or {}) == 1 and not policy.gripper  # the part may be several of the env's, concatenated
+    # The part may be several of the env's, concatenated.
+    alone = len(policy.state or {}) == 1 and not policy.gripper
     for name, need in (policy.state or {}).items():
         have = env.state.get(name)
         cure = _parts_cure(need.dim, env) if alone else ""
@@ -218,13 +251,22 @@ def _state_differences(policy: Contract, env: Contract) -> Iterator[str]:
             continue
         if _differ(need.dim, have.dim):
             cure = cure or "is this another task's or robot's policy?"
-            yield f"state {name!r}: the policy needs {need.dim} numbers, the env gives {have.dim}; {cure}"
+            yield (
+                f"state {name!r}: the policy needs {need.dim} numbers, the env gives "
+                f"{have.dim}; "
+                f"{cure}"
+            )
         if _differ(need.unit, have.unit):
-            yield f"state {name!r}: the policy needs {need.unit!r}, the env gives {have.unit!r}; convert it"
+            yield (
+                f"state {name!r}: the policy needs {need.unit!r}, the env gives {have.unit!r}; "
+                "convert it"
+            )
 
 
 def _parts_cure(dim: int | None, env: Contract) -> str:
-    """Name parts of the env's state whose sizes add up to `dim`, as a cure; "" if there are none."""
+    """Name parts of the env's state whose sizes add up to `dim`, as a cure; "" if there are
+    none.
+    """
     widths = {name: spec.dim for name, spec in sorted((env.state or {}).items()) if spec.dim}
     if env.gripper:
         widths["gripper"] = 1
@@ -240,8 +282,10 @@ def _parts_cure(dim: int | None, env: Contract) -> str:
         return ""
     shown = " or ".join(f"[{', '.join(parts)}]" for parts in found[:_SHOWN])
     return (
-        f"if it was trained on several parts, set the policy's `state` to them in their order: {shown}"
-        f"{' or others' if len(found) > _SHOWN else ''} {'has' if len(found) == 1 else 'have'} {dim} numbers here"
+        "if it was trained on several parts, set the policy's `state` to them in their order: "
+        f"{shown}"
+        f"{' or others' if len(found) > _SHOWN else ''} {'has' if len(found) == 1 else 'have'} "
+        f"{dim} numbers here"
     )
 
 
@@ -251,20 +295,33 @@ def _action_differences(policy: ActionSpec, env: ActionSpec) -> Iterator[str]:
         if _differ(gives, takes):
             yield f"action.{name}: the policy gives {gives!r}, the env takes {takes!r}; {cure}"
     for number, ours, theirs in reordered(policy.names or (), env.names or ()):
-        yield f"action.names: number {number} is {ours!r} of the policy and {theirs!r} of the env; use one order"
+        yield (
+            f"action.names: number {number} is {ours!r} of the policy and {theirs!r} of the "
+            "env; "
+            "use one order"
+        )
     if policy.low is not None and env.low is not None and policy.low < env.low:
-        yield f"action.low: the policy goes down to {policy.low}, the env takes {env.low}; scale or clip the actions"
+        yield (
+            f"action.low: the policy goes down to {policy.low}, the env takes {env.low}; scale "
+            "or clip the actions"
+        )
     if policy.high is not None and env.high is not None and policy.high > env.high:
-        yield f"action.high: the policy goes up to {policy.high}, the env takes {env.high}; scale or clip the actions"
+        yield (
+            f"action.high: the policy goes up to {policy.high}, the env takes {env.high}; scale "
+            "or clip the actions"
+        )
 
 
 def reordered(ours: Sequence[str], theirs: Sequence[str]) -> list[tuple[int, str, str]]:
-    """Return where two lists have the joints that both name in another order: (number, ours, theirs).
+    """Return where two lists have the joints that both name in another order: (number, ours,
+    theirs).
 
     LeRobot's suffix ".pos" does not count.
     """
     mine, others = ([name.removesuffix(".pos") for name in names] for names in (ours, theirs))
-    pairs = zip((one for one in mine if one in others), (one for one in others if one in mine), strict=False)
+    pairs = zip(
+        (one for one in mine if one in others), (one for one in others if one in mine), strict=False
+    )
     return [(mine.index(one), one, other) for one, other in pairs if one != other]
 
 
@@ -281,15 +338,23 @@ _ACTION_CURES = {
 
 
 def require_match(policy: Contract | None, env: Contract | None, where: str = "") -> None:
-    """Raise `ContractMismatch` with every difference of a policy and an env; `where` names both in an evaluation."""
+    """Raise `ContractMismatch` with every difference of a policy and an env; `where` names both
+    in an evaluation.
+    """
     if policy is not None and env is not None and (found := differences(policy, env)):
-        raise ContractMismatch(f"{where}policy and env do not fit:\n" + "\n".join(f"- {line}" for line in found))
+        raise ContractMismatch(
+            f"{where}policy and env do not fit:\n" + "\n".join(f"- {line}" for line in found)
+        )
 
 
 def closed(
-    cls: type, data: object, where: str, error: type[MalformedMessage | ConfigError] = MalformedMessage
+    cls: type,
+    data: object,
+    where: str,
+    error: type[MalformedMessage | ConfigError] = MalformedMessage,
 ) -> dict[str, Any]:
-    """Return the entries of `data`; raise `error` unless it is a mapping with only fields of the dataclass `cls`.
+    """Return the entries of `data`; raise `error` unless it is a mapping with only fields of the
+    dataclass `cls`.
 
     Fields that are numbers, texts or booleans are checked; the caller reads all others.
     """

@@ -1,8 +1,10 @@
-"""The contract of a dataset of demonstrations, and its transfer into checkpoints trained on the dataset.
+"""The contract of a dataset of demonstrations, and its transfer into checkpoints trained on the
+dataset.
 
-LeRobot copies nothing of a dataset's `info.json` into a checkpoint, but all of its `stats.json`, with which a policy
-normalises. So the contract is written to `info.json` for readers and also to `stats.json`, as a feature whose values
-are the bytes of the contract's JSON. It reaches the checkpoint with every version of LeRobot.
+LeRobot copies nothing of a dataset's `info.json` into a checkpoint, but all of its `stats.json`,
+with which a policy normalises. So the contract is written to `info.json` for readers and also to
+`stats.json`, as a feature whose values are the bytes of the contract's JSON. It reaches the
+checkpoint with every version of LeRobot.
 """
 
 from __future__ import annotations
@@ -35,9 +37,11 @@ class DatasetContract:
     """The meaning of the numbers and images of a dataset."""
 
     contract: Contract  # of a policy that is trained on the dataset
-    state: tuple[str, ...] = ()  # concatenated parts of `observation.state`; "gripper" is `Obs.gripper`
+    # Concatenated parts of `observation.state`; "gripper" is `Obs.gripper`.
+    state: tuple[str, ...] = ()
     cameras: Mapping[str, str] = field(default_factory=dict)  # feature -> camera
-    angles: Mapping[int, Centre] = field(default_factory=dict)  # (first) index in `observation.state` -> centre, rad
+    # (first) index in `observation.state` -> centre, rad.
+    angles: Mapping[int, Centre] = field(default_factory=dict)
     environment: tuple[str, ...] = ()  # concatenated parts of `observation.environment_state`
 
     @property
@@ -47,10 +51,11 @@ class DatasetContract:
         return sum((specs[part].dim or 0) if part in specs else 1 for part in self.state)
 
     def wrapped(self, state: np.ndarray) -> np.ndarray:
-        """Return `observation.state`, (..., D) float32, with each of `angles` within pi of its centre.
+        """Return `observation.state`, (..., D) float32, with each of `angles` within pi of its
+        centre.
 
-        A robot's angle jumps by a full turn between -pi and pi, and so does the angle of a rotation vector; a wrapped
-        angle jumps where the demonstrations have no values.
+        A robot's angle jumps by a full turn between -pi and pi, and so does the angle of a rotation
+        vector; a wrapped angle jumps where the demonstrations have no values.
         """
         if not self.angles:
             return state
@@ -58,7 +63,9 @@ class DatasetContract:
         for place, centre in self.angles.items():
             if isinstance(centre, tuple):
                 vector = slice(place, place + 3)
-                changed[..., vector] = _near_vector(state[..., vector].astype(np.float64), np.array(centre))
+                changed[..., vector] = _near_vector(
+                    state[..., vector].astype(np.float64), np.array(centre)
+                )
             else:
                 changed[..., place] = _near(state[..., place].astype(np.float64), centre)
         return changed
@@ -69,13 +76,18 @@ class DatasetContract:
             "state": list(self.state),
             "environment": list(self.environment),
             "cameras": dict(self.cameras),
-            "angles": {str(at): list(one) if isinstance(one, tuple) else one for at, one in self.angles.items()},
+            "angles": {
+                str(at): list(one) if isinstance(one, tuple) else one
+                for at, one in self.angles.items()
+            },
             "contract": self.contract.to_json(),
         }
 
     @classmethod
     def from_json(cls, data: Any) -> DatasetContract:
-        """Read a contract from the result of `to_json`; raises `ConfigError` if this version cannot read it."""
+        """Read a contract from the result of `to_json`; raises `ConfigError` if this version
+        cannot read it.
+        """
         try:
             found = cls(
                 Contract.from_json(data["contract"]),
@@ -84,25 +96,33 @@ class DatasetContract:
                 {int(place): _centre(centre) for place, centre in data["angles"].items()},
                 tuple(map(str, data["environment"])),
             )
-            if unknown := {*found.state, *found.environment} - {*(found.contract.state or {}), GRIPPER}:
+            if unknown := {*found.state, *found.environment} - {
+                *(found.contract.state or {}),
+                GRIPPER,
+            }:
                 raise ValueError(f"its contract has no state {sorted(unknown)}")
             numbers = {at: np.atleast_1d(centre) for at, centre in found.angles.items()}
             if odd := [
-                at for at, one in numbers.items() if not 0 <= at <= found.width - len(one) or np.isnan(one).any()
+                at
+                for at, one in numbers.items()
+                if not 0 <= at <= found.width - len(one) or np.isnan(one).any()
             ]:
                 raise ValueError(f"its state has no angles at {odd}")
         except (MalformedMessage, AttributeError, KeyError, TypeError, ValueError) as error:
             raise ConfigError(
                 f"the contract of the dataset in the checkpoint cannot be read "
-                f"({type(error).__name__}: {error}); was the dataset written by a newer vlagents-ray, or merged of "
-                f"datasets with different contracts? Update this one, or export the results of `vlagents-ray merge`"
+                f"({type(error).__name__}: {error}); was the dataset written by a newer "
+                "vlagents-ray, or merged of "
+                "datasets with different contracts? Update this one, or export the results of "
+                "`vlagents-ray merge`"
             ) from error
         return found
 
     def to_statistics(self, frames: int) -> dict[str, dict[str, list[int]]]:
         """Return the entry of `stats.json` with the contract, for a dataset of `frames` frames.
 
-        It has all statistics of a feature, since LeRobot's tools average them when they merge datasets.
+        It has all statistics of a feature, since LeRobot's tools average them when they merge
+        datasets.
         """
         text = list(json.dumps(self.to_json(), separators=(",", ":"), ensure_ascii=False).encode())
         same = dict.fromkeys(("min", "max", BYTES, "q01", "q10", "q50", "q90", "q99"), text)
@@ -110,7 +130,9 @@ class DatasetContract:
 
     @classmethod
     def from_statistics(cls, numbers: Iterable[float]) -> DatasetContract:
-        """Read a contract from the numbers of `to_statistics` as LeRobot stores them; raises `ConfigError`."""
+        """Read a contract from the numbers of `to_statistics` as LeRobot stores them; raises
+        `ConfigError`.
+        """
         try:
             data = json.loads(bytes(round(number) for number in numbers))
         except ValueError as error:
@@ -121,12 +143,14 @@ class DatasetContract:
 def state_parts(
     width: int, policy: Contract | None, chosen: Sequence[str] | None = None, *, option: str
 ) -> list[tuple[str, int]]:
-    """Divide `observation.state` of a dataset, or of a robot with LeRobot's names, into parts for a policy.
+    """Divide `observation.state` of a dataset, or of a robot with LeRobot's names, into parts for a
+    policy.
 
     Args:
         width: The number of values in `observation.state`.
         policy: The policy's contract, with the sizes of its parts.
-        chosen: The parts in their order, "gripper" for `Obs.gripper`; by default those of the contract, or `joints`.
+        chosen: The parts in their order, "gripper" for `Obs.gripper`; by default those of the
+            contract, or `joints`.
         option: The option that sets `chosen`, with an example, for the error message.
 
     Returns:
@@ -144,16 +168,23 @@ def state_parts(
     left = width - sum(dim or 0 for dim in dims.values())
     if len(unknown) == 1:
         dims[unknown[0]] = left
-    if left < (len(unknown) == 1) or len(unknown) > 1 or sum(dim or 0 for dim in dims.values()) != width:
+    if (
+        left < (len(unknown) == 1)
+        or len(unknown) > 1
+        or sum(dim or 0 for dim in dims.values()) != width
+    ):
         raise ConfigError(
-            f"observation.state: got {width} numbers, want them divided into {parts} of the policy, of which the sizes "
+            f"observation.state: got {width} numbers, want them divided into {parts} of the "
+            "policy, of which the sizes "
             f"are {dims}; name the parts in their order: {option}"
         )
     return [(part, dim or 0) for part, dim in dims.items()]
 
 
 def wanted_parts(policy: Contract | None) -> list[str]:
-    """Return the parts of the state that a policy's contract names, "gripper" for `Obs.gripper` last."""
+    """Return the parts of the state that a policy's contract names, "gripper" for `Obs.gripper`
+    last.
+    """
     return [] if policy is None else [*(policy.state or {}), *([GRIPPER] if policy.gripper else [])]
 
 
@@ -167,7 +198,8 @@ def divided_state(
         parts: The parts of each feature and their sizes, as returned by `state_parts`.
 
     Returns:
-        The parts for `Obs.state`, (size,) float32 each, and the value for `Obs.gripper`, or None if there is none.
+        The parts for `Obs.state`, (size,) float32 each, and the value for `Obs.gripper`, or None if
+        there is none.
     """
     state: dict[str, np.ndarray] = {}
     gripper = None
@@ -183,7 +215,8 @@ def divided_state(
 
 
 def angles_in(part: str, unit: str | None, dim: int) -> range:
-    """Return the indices of the angles in a part of the state that wrap at -pi and pi, by the part's unit.
+    """Return the indices of the angles in a part of the state that wrap at -pi and pi, by the
+    part's unit.
 
     The numbers of a rotation vector (`rotation_vector_in`) and of a quaternion are not such angles.
     """
@@ -195,9 +228,11 @@ def angles_in(part: str, unit: str | None, dim: int) -> range:
 
 
 def rotation_vector_in(part: str, unit: str | None, dim: int) -> int | None:
-    """Return the index of the first number of a rotation vector (axis times angle) in a part of the state, or None.
+    """Return the index of the first number of a rotation vector (axis times angle) in a part of the
+    state, or None.
 
-    Such a part has "axis" in its name, as in `xyz_axis_angle`, and only a position before the vector.
+    Such a part has "axis" in its name, as in `xyz_axis_angle`, and only a position before the
+    vector.
     """
     return {("rad", 3): 0, ("m+rad", 6): 3}.get((unit or "", dim)) if "axis" in part else None
 
@@ -208,7 +243,8 @@ def usual_unit(part: str) -> str | None:
 
 
 def centre_between(lowest: float, highest: float) -> float | None:
-    """Return the centre of an angle, given only its range in the dataset; None if the range is within [-pi, pi].
+    """Return the centre of an angle, given only its range in the dataset; None if the range is
+    within [-pi, pi].
 
     Wrapping around this centre does not change values within the range.
     """
@@ -217,14 +253,19 @@ def centre_between(lowest: float, highest: float) -> float | None:
 
 
 def centre_of(episodes: Sequence[np.ndarray]) -> float | None:
-    """Return the centre around which to wrap an angle, (N,) rad in each episode: opposite to the widest empty arc.
+    """Return the centre around which to wrap an angle, (N,) rad in each episode: opposite to the
+    widest empty arc.
 
     Returns:
-        The centre; None if the angle never jumps, within an episode or from one to the next, or if it counts full
-        turns.
+        The centre; None if the angle never jumps, within an episode or from one to the next, or if
+        it counts full turns.
     """
     values = np.concatenate(episodes).astype(np.float64)
-    if not len(values) or np.abs(values).max() > math.pi + _SLACK or np.abs(np.diff(values)).max(initial=0) <= math.pi:
+    if (
+        not len(values)
+        or np.abs(values).max() > math.pi + _SLACK
+        or np.abs(np.diff(values)).max(initial=0) <= math.pi
+    ):
         return None
     circle = np.sort(values)
     arcs = np.diff(circle, append=circle[0] + _TURN)
@@ -239,8 +280,8 @@ def rotation_centre_of(episodes: Sequence[np.ndarray]) -> tuple[float, float, fl
         episodes: The rotation vector in each episode, (N, 3) rad.
 
     Returns:
-        The centre, at most pi long; None if the vector never jumps, within an episode or from one to the next, or if
-        its length counts full turns.
+        The centre, at most pi long; None if the vector never jumps, within an episode or from one
+        to the next, or if its length counts full turns.
     """
     vectors = np.concatenate(episodes).astype(np.float64)
     angles = np.linalg.norm(vectors, axis=1, keepdims=True)
@@ -264,10 +305,11 @@ def _centre(value: Any) -> Centre:
 
 
 def _near_vector(vectors: np.ndarray, centre: np.ndarray) -> np.ndarray:
-    """Replace rotation vectors by those of the same rotations that are nearest to `centre`, (..., 3) each.
+    """Replace rotation vectors by those of the same rotations that are nearest to `centre`, (...,
+    3) each.
 
-    Adding full turns to the angle about the same axis gives the same rotation. Vectors that are already the nearest
-    stay bit-identical, and a zero vector, which has no axis, stays zero.
+    Adding full turns to the angle about the same axis gives the same rotation. Vectors that are
+    already the nearest stay bit-identical, and a zero vector, which has no axis, stays zero.
     """
     angles = np.linalg.norm(vectors, axis=-1, keepdims=True)
     axes = np.divide(vectors, angles, out=np.zeros_like(vectors), where=angles > 0)
@@ -276,6 +318,8 @@ def _near_vector(vectors: np.ndarray, centre: np.ndarray) -> np.ndarray:
 
 
 def _near(angles: np.ndarray, centre: float | np.ndarray) -> np.ndarray:
-    """Shift angles by full turns to within pi of `centre`; angles already within stay bit-identical."""
+    """Shift angles by full turns to within pi of `centre`; angles already within stay
+    bit-identical.
+    """
     off = angles - centre
     return np.where(np.abs(off) > math.pi, centre + (off + math.pi) % _TURN - math.pi, angles)

@@ -15,9 +15,9 @@
     ├── ConfigError (also ValueError)       UnknownPolicy (UnknownWrapper), UnknownEnv, WeightsLost
     └── EnvFailed, StorageFailed, ClusterLost, MissingDependency (also ImportError)
 
-`code` is stable: by default the name of the class, "unknown_session" of `UnknownSession`. A server sends it in a
-problem+json document, with `status` as the HTTP status. A message states the received and the expected value, and the
-cure.
+`code` is stable: by default the name of the class, "unknown_session" of `UnknownSession`. A server
+sends it in a problem+json document, with `status` as the HTTP status. A message states the received
+and the expected value, and the cure.
 """
 
 from __future__ import annotations
@@ -33,7 +33,8 @@ _SHOWN_ITEMS = 8  # of a list or dict in an error
 def shown(value: object, most: int = 80) -> str:
     """Return a short text, at most `most` characters, of a value from the network, for an error.
 
-    Its time and memory do not depend on the size of the value, whereas `repr` or `str` would write all of it first.
+    Its time and memory do not depend on the size of the value, whereas `repr` or `str` would write
+    all of it first.
     """
     text = _shown(value, most, 3)
     return text if len(text) <= most else f"{text[: most - 1]}…"
@@ -42,7 +43,11 @@ def shown(value: object, most: int = 80) -> str:
 def _shown(value: object, most: int, levels: int) -> str:
     if isinstance(value, str | bytes | bytearray):
         return repr(value[:most]) + ("…" if len(value) > most else "")
-    if value is None or isinstance(value, bool | float) or (isinstance(value, int) and value.bit_length() <= 128):
+    if (
+        value is None
+        or isinstance(value, bool | float)
+        or (isinstance(value, int) and value.bit_length() <= 128)
+    ):
         return repr(value)
     if not isinstance(value, dict | list | tuple | set | frozenset):
         shape = getattr(value, "shape", None)
@@ -50,18 +55,27 @@ def _shown(value: object, most: int, levels: int) -> str:
     parts = []
     for item in islice(value, _SHOWN_ITEMS if levels else 0):
         key = f"{_shown(item, most, 0)}: " if isinstance(value, dict) else ""
-        parts.append(key + _shown(value[item] if isinstance(value, dict) else item, most, levels - 1))
+        parts.append(
+            key + _shown(value[item] if isinstance(value, dict) else item, most, levels - 1)
+        )
     if len(value) > len(parts):
         parts.append("…")
-    left, right = ("[", "]") if isinstance(value, list) else ("(", ")") if isinstance(value, tuple) else ("{", "}")
+    left, right = (
+        ("[", "]")
+        if isinstance(value, list)
+        else ("(", ")")
+        if isinstance(value, tuple)
+        else ("{", "}")
+    )
     return f"{left}{', '.join(parts)}{right}"
 
 
 def printable(text: str) -> str:
-    """Return a text of another party without characters that command a terminal or forge a line of a log.
+    """Return a text of another party without characters that command a terminal or forge a line of
+    a log.
 
-    Control and format characters, such as escape sequences, become "�". Line feeds and tabs stay, but each further line
-    is indented, so that it cannot pass for a record of its own.
+    Control and format characters, such as escape sequences, become "�". Line feeds and tabs stay,
+    but each further line is indented, so that it cannot pass for a record of its own.
     """
     if text.isprintable():
         return text
@@ -82,7 +96,9 @@ class VLAgentsError(Exception):
     status: ClassVar[int] = 500
 
     def __str__(self) -> str:
-        """Return the message without control characters, as parts of it may come from a server or a client."""
+        """Return the message without control characters, as parts of it may come from a server
+        or a client.
+        """
         return printable(super().__str__())
 
 
@@ -93,7 +109,9 @@ class InvalidInput(VLAgentsError, ValueError):
 
 
 class MalformedMessage(InvalidInput):
-    """The bytes cannot be decoded: they are truncated, not JSON, not an image, or have an unknown key."""
+    """The bytes cannot be decoded: they are truncated, not JSON, not an image, or have an
+    unknown key.
+    """
 
     code = "malformed"
 
@@ -106,7 +124,9 @@ class MessageTooLarge(InvalidInput):
 
 
 class InvalidObservation(InvalidInput):
-    """An observation has a wrong shape, type or value (e.g. NaN), or lacks what the policy's contract names."""
+    """An observation has a wrong shape, type or value (e.g. NaN), or lacks what the policy's
+    contract names.
+    """
 
     status = 422
 
@@ -115,18 +135,26 @@ class MissingCamera(InvalidObservation):
     """The policy's contract names a camera that the observation lacks."""
 
     def __init__(self, name: str, have: Iterable[str] = ()) -> None:
-        super().__init__(f"camera {name!r} is missing: got {sorted(have)}; send it, or rename one of yours to {name!r}")
+        super().__init__(
+            f"camera {name!r} is missing: got {sorted(have)}; send it, or rename one of yours to "
+            f"{name!r}"
+        )
 
 
 class MissingState(InvalidObservation):
     """The policy's contract names a part of the proprioception that the observation lacks."""
 
     def __init__(self, name: str, have: Iterable[str] = ()) -> None:
-        super().__init__(f"state {name!r} is missing: got {sorted(have)}; send it, or rename one of yours to {name!r}")
+        super().__init__(
+            f"state {name!r} is missing: got {sorted(have)}; send it, or rename one of yours to "
+            f"{name!r}"
+        )
 
 
 class NotOffered(InvalidObservation):
-    """The observation's `info["want"]` names a value that the policy's contract does not list under `behaviour`."""
+    """The observation's `info["want"]` names a value that the policy's contract does not list
+    under `behaviour`.
+    """
 
 
 class UnknownSession(InvalidInput):
@@ -142,7 +170,9 @@ class UnknownApp(InvalidInput):
 
 
 class UnknownCheckpoint(InvalidInput):
-    """A reset named a checkpoint that the deployment does not offer; the message lists the offered ones."""
+    """A reset named a checkpoint that the deployment does not offer; the message lists the
+    offered ones.
+    """
 
 
 class NotReset(InvalidInput):
@@ -158,13 +188,17 @@ class ContractMismatch(InvalidInput):
 
 
 class InvalidWeights(InvalidInput):
-    """Pushed weights have an unknown or missing name, another shape or type, or a value that is not finite."""
+    """Pushed weights have an unknown or missing name, another shape or type, or a value that is
+    not finite.
+    """
 
     status = 422
 
 
 class UnchangedWeights(InvalidInput):
-    """Pushed weights equal those that the policy holds, so that probably the wrong ones were pushed."""
+    """Pushed weights equal those that the policy holds, so that probably the wrong ones were
+    pushed.
+    """
 
     status = 409
 
@@ -176,7 +210,9 @@ class NotTrainable(InvalidInput):
 
 
 class WeightsNotStaged(InvalidInput):
-    """The version of weights to be served was never staged here, or was dropped since its learner was silent."""
+    """The version of weights to be served was never staged here, or was dropped since its
+    learner was silent.
+    """
 
     status = 409
 
@@ -201,7 +237,9 @@ class TooManyRequests(VLAgentsError):
 
 
 class Overloaded(VLAgentsError):
-    """The replica has no memory left for the request, which was not executed: send it again later."""
+    """The replica has no memory left for the request, which was not executed: send it again
+    later.
+    """
 
     status = 503
     retry_after_s: float = 1.0  # seconds to wait before the next attempt
@@ -212,17 +250,23 @@ class PolicyFailed(VLAgentsError):
 
 
 class InvalidAction(PolicyFailed):
-    """The policy returned an action that must not reach a robot: not an array, a wrong shape, or NaN."""
+    """The policy returned an action that must not reach a robot: not an array, a wrong shape, or
+    NaN.
+    """
 
     def __init__(
-        self, *args: object, cause: Literal["invalid", "limits", "max_step", "dynamics", "leader"] = "invalid"
+        self,
+        *args: object,
+        cause: Literal["invalid", "limits", "max_step", "dynamics", "leader"] = "invalid",
     ) -> None:
         super().__init__(*args)
         self.cause = cause  # see `vlagents_ray.chunking.fallback.Cause`
 
 
 class CheckpointFailed(PolicyFailed):
-    """The checkpoint named in a reset did not load; others keep working, and the next reset tries to load it again."""
+    """The checkpoint named in a reset did not load; others keep working, and the next reset
+    tries to load it again.
+    """
 
 
 class PolicyUnavailable(VLAgentsError):
@@ -234,7 +278,8 @@ class PolicyUnavailable(VLAgentsError):
 
 
 class NoReplica(PolicyUnavailable):
-    """No replica of the application runs: its policy is loading or waits for resources, or the last replica died.
+    """No replica of the application runs: its policy is loading or waits for resources, or the last
+    replica died.
 
     Clients raise it also if nothing accepts connections at the server's address.
     """
@@ -245,7 +290,9 @@ class ConnectionLost(PolicyUnavailable):
 
 
 class DeadlineExceeded(VLAgentsError, TimeoutError):
-    """No answer arrived within the caller's deadline; a request that a server answers with this was not executed."""
+    """No answer arrived within the caller's deadline; a request that a server answers with this
+    was not executed.
+    """
 
     status = 504
 
@@ -261,7 +308,9 @@ class ConfigError(VLAgentsError, ValueError):
 
 
 class WeightsLost(ConfigError):
-    """The policy acts with other weights than the learner's: it was restarted since the push, or not pushed to."""
+    """The policy acts with other weights than the learner's: it was restarted since the push, or
+    not pushed to.
+    """
 
 
 class UnknownPolicy(ConfigError):
@@ -281,7 +330,9 @@ class EnvFailed(VLAgentsError):
 
 
 class StorageFailed(VLAgentsError):
-    """Results cannot be written, e.g. to a full disk or a read-only folder; results written before are kept."""
+    """Results cannot be written, e.g. to a full disk or a read-only folder; results written
+    before are kept.
+    """
 
 
 class ClusterLost(VLAgentsError):
@@ -289,7 +340,9 @@ class ClusterLost(VLAgentsError):
 
 
 class MissingDependency(VLAgentsError, ImportError):
-    """An optional package is not installed; the message names the extra or the requirements file with it."""
+    """An optional package is not installed; the message names the extra or the requirements file
+    with it.
+    """
 
 
 def _tree(cls: type[VLAgentsError]) -> Iterable[type[VLAgentsError]]:
@@ -306,7 +359,9 @@ BY_CODE: dict[str, type[VLAgentsError]] = {cls.code: cls for cls in _tree(VLAgen
 
 
 def from_code(code: str, detail: str) -> VLAgentsError:
-    """Make the error with a server's `code` and message; an unknown code gives a plain `VLAgentsError`."""
+    """Make the error with a server's `code` and message; an unknown code gives a plain
+    `VLAgentsError`.
+    """
     cls = BY_CODE.get(code, VLAgentsError)
     error = cls.__new__(cls)
     Exception.__init__(error, detail)

@@ -1,4 +1,5 @@
-"""Obs, Act and Agent: the interface of the paper "VLAgents: A Policy Server for Efficient VLA Inference".
+"""Obs, Act and Agent: the interface of the paper "VLAgents: A Policy Server for Efficient VLA
+Inference".
 
 A policy written as in the paper is served unchanged to many sessions at once:
 
@@ -33,27 +34,37 @@ if TYPE_CHECKING:
 
     from vlagents_ray.contract import Contract
 
-# The keys of `Obs.info` and `Act.info` that have a meaning here; others are also allowed, with values of the types that
-# `Obs.info` names.
+# The keys of `Obs.info` and `Act.info` that have a meaning here; others are also allowed, with
+# values of the types that `Obs.info` names.
 GOAL_IMAGE = "goal_image"  # (H, W, 3) uint8 RGB, for goal-conditioned policies
 DEPTH = "depth"  # {camera: (H, W) float32, metres; or uint16, millimetres}
-SAMPLES = "samples"  # in an observation: the number of samples of its action distribution to return, N
-# In the Act: {"mean", "std": shaped as the action; "samples": (N, *action)} float32, and for each name of WANT the
-# act's value for every sample, with N as the first dimension.
+# In an observation: the number of samples of its action distribution to return, N.
+SAMPLES = "samples"
+# In the Act: {"mean", "std": shaped as the action; "samples": (N, *action)} float32, and for each
+# name of WANT the act's value for every sample, with N as the first dimension.
 DISTRIBUTION = "distribution"
-WANT = "want"  # in an observation: names of values in `Contract.behaviour` that the Act returns beside the action
-BEHAVIOUR = "behaviour"  # in the Act: {name: number, or one for each row or token}, e.g. the action's "logprob", nats
-CAPTURED = "captured_at"  # in an observation: the time at which its first sensor was read, s since 1970 (`time.time`)
-DEADLINE = "deadline_ms"  # in an observation: the time after which `RemoteAgent` abandons the request, ms
-# Real-time chunking (Black, Galliker & Levine 2025, https://arxiv.org/abs/2506.07339), in an observation: when the
-# answer arrives, DELAY rows of LEFTOVER have been executed; the new chunk begins with them, and continues the rest.
+# In an observation: names of values in `Contract.behaviour` that the Act returns beside the action.
+WANT = "want"
+# In the Act: {name: number, or one for each row or token}, e.g. the action's "logprob", nats.
+BEHAVIOUR = "behaviour"
+# In an observation: the time at which its first sensor was read, s since 1970 (`time.time`)
+CAPTURED = "captured_at"
+# In an observation: the time after which `RemoteAgent` abandons the request, ms.
+DEADLINE = "deadline_ms"
+# Real-time chunking (Black, Galliker & Levine 2025, https://arxiv.org/abs/2506.07339), in an
+# observation: when the answer arrives, DELAY rows of LEFTOVER have been executed; the new chunk
+# begins with them, and continues the rest.
 LEFTOVER = "leftover_actions"  # (H', D) float32: the current plan from this observation's tick on
-DELAY = "delay_ticks"  # int: expected ticks until the answer arrives, at most the rows of LEFTOVER; 0: also unknown
-# In the Act of a policy that was trained to be given rows: how many of LEFTOVER its chunk begins with. If more have
-# been executed when it arrives, it continues from a pose that the robot has left, and is dropped.
+# int: expected ticks until the answer arrives, at most the rows of LEFTOVER; 0: also unknown.
+DELAY = "delay_ticks"
+# In the Act of a policy that was trained to be given rows: how many of LEFTOVER its chunk begins
+# with. If more have been executed when it arrives, it continues from a pose that the robot has
+# left, and is dropped.
 GIVEN = "given_rows"  # int
-EXECUTED = "executed_actions"  # in an observation, (N, D): actions not of the policy, executed since the last request
-# In the Act of a served policy: its weights, {"version": int, "fingerprint": str}. Version 0 is the loaded checkpoint.
+# In an observation, (N, D): actions not of the policy, executed since the last request.
+EXECUTED = "executed_actions"
+# In the Act of a served policy: its weights, {"version": int, "fingerprint": str}. Version 0 is the
+# loaded checkpoint.
 POLICY = "policy"
 # In the Act of a chunk player:
 SAFE = "safe"  # str: the reason why this is the safe action; absent if the action is the policy's
@@ -64,34 +75,42 @@ AGE = "age_ticks"  # int: ticks since the observation from which the action was 
 PLANNED = "planned"  # (H, D) float32: the chunk of the action
 CHUNK, ROW = "chunk", "row"  # int: its number in the episode, and the row of the action
 AGE_MS = "age_ms"  # float: the same in ms, from its capture until the player returned the action
-SILENT = "silent_s"  # float: seconds since the oldest unanswered request, retries included; 0.0 if there is none
+# float: seconds since the oldest unanswered request, retries included; 0.0 if there is none.
+SILENT = "silent_s"
 OF_THE_LOOP = (SAFE, CAUSE, INTERVENTION, WANTED, AGE, PLANNED, CHUNK, ROW, AGE_MS, SILENT)
-"""The names of `Act.info` that only a chunk player on the robot writes, and that a control loop reads."""
+"""The names of `Act.info` that only a chunk player on the robot writes, and that a control loop
+reads.
+"""
 
 
 @dataclass(slots=True)
 class Obs:
     """An observation: the sensor readings of a robot or an environment at one moment.
 
-    `state` has a name for each part of the proprioception: `joints` (D,) rad; `xyzrpy` (6,) m and rad in the robot's
-    base frame; `tquat` (7,) m and quaternion xyzw. A robot of several arms prefixes them: `left/joints`,
-    `right/joints`. With one camera: `Obs(cameras={"front": image}, gripper=1.0, state={"joints": joints})`.
+    `state` has a name for each part of the proprioception: `joints` (D,) rad; `xyzrpy` (6,) m and
+    rad in the robot's base frame; `tquat` (7,) m and quaternion xyzw. A robot of several arms
+    prefixes them: `left/joints`, `right/joints`. With one camera: `Obs(cameras={"front": image},
+    gripper=1.0, state={"joints": joints})`.
     """
 
     cameras: dict[str, np.ndarray] = field(default_factory=dict)  # (H, W, 3) uint8 RGB, upright
     gripper: float | None = None  # in [0, 1], 1 = open
     state: dict[str, np.ndarray] = field(default_factory=dict)  # (D,) float32
-    info: dict[str, Any] = field(default_factory=dict)  # None, bool, int, float, str, bytes, array, list, dict
-    prepared: Any = field(default=None, repr=False, compare=False)  # the server's result of `Agent.prepare`, or None
+    # None, bool, int, float, str, bytes, array, list, dict.
+    info: dict[str, Any] = field(default_factory=dict)
+    # The server's result of `Agent.prepare`, or None.
+    prepared: Any = field(default=None, repr=False, compare=False)
 
 
 @dataclass(slots=True)
 class Act:
     """A policy's answer: one action, or a chunk of actions to be executed in order."""
 
-    action: np.ndarray  # (D,), or (H, D) for a chunk, float32, in the units of the contract's action
+    # (D,), or (H, D) for a chunk, float32, in the units of the contract's action.
+    action: np.ndarray
     done: bool = False  # the policy considers its task finished
-    info: dict[str, Any] = field(default_factory=dict)  # as in `Obs.info`; `timing`: see `RemoteAgent.act`
+    # As in `Obs.info`; `timing`: see `RemoteAgent.act`.
+    info: dict[str, Any] = field(default_factory=dict)
 
     def rows(self) -> np.ndarray:
         """Return the action as a chunk, (H, D); a single action has H = 1."""
@@ -101,43 +120,55 @@ class Act:
 class Agent:
     """The interface of a policy, which local policies, `RemoteAgent` and `ChunkPlayer` implement.
 
-    A subclass defines `act`, or `act_batch` if one forward pass can serve several sessions. Everything else has a
-    default.
+    A subclass defines `act`, or `act_batch` if one forward pass can serve several sessions.
+    Everything else has a default.
     """
 
     Config: ClassVar[type | None] = None
-    """Optional: a pydantic model of the settings with `extra="forbid"`, whose instance is passed to `__init__`."""
+    """Optional: a pydantic model of the settings with `extra="forbid"`, whose instance is passed
+    to `__init__`.
+    """
 
     shared: ClassVar[tuple[str, ...]] = ()
-    """Names of the attributes that all sessions of a replica share (weights, processors, clients)."""
+    """Names of the attributes that all sessions of a replica share (weights, processors,
+    clients).
+    """
 
     trainable: ClassVar[str | None] = None
-    """Optional: the name of the attribute that a learner trains, so that new weights can be pushed into a server.
+    """Optional: the name of the attribute that a learner trains, so that new weights can be pushed
+    into a server.
 
-    It holds a torch module, or nested dicts and lists of arrays and modules, and is shared by all sessions. "a.b" is
-    the attribute b of the attribute a, which is then shared as a whole.
+    It holds a torch module, or nested dicts and lists of arrays and modules, and is shared by all
+    sessions. "a.b" is the attribute b of the attribute a, which is then shared as a whole.
     """
 
     weights_id: dict[str, Any] | None = None
-    """Optional: {"digest": …, "revision": …}, which identify the weights loaded by `initialize`, and more for metadata.
+    """Optional: {"digest": …, "revision": …}, which identify the weights loaded by `initialize`,
+    and more for metadata.
 
-    A server reports them, and an evaluation separates results of different digests. If this is None, the digest is
-    that of the files that `initialize` found by `vlagents_ray.policies.base.checkpoint.find_checkpoint`.
+    A server reports them, and an evaluation separates results of different digests. If this is
+    None, the digest is that of the files that `initialize` found by
+    `vlagents_ray.policies.base.checkpoint.find_checkpoint`.
     """
 
     statistics: dict[str, Any] | None = None
-    """Optional: ranges of the training's numbers as in LeRobot's `stats.json`, {"action": {"min": …, "max": …}, …}.
+    """Optional: ranges of the training's numbers as in LeRobot's `stats.json`, {"action": {"min":
+    …, "max": …}, …}.
 
-    They are in the robot's units; None stands for a number that is not known. "parts" names the parts of the state in
-    their order. A server's metadata have them among the `weights`, and `vlagents-ray robot` compares them with the
-    robot before its first motion.
+    They are in the robot's units; None stands for a number that is not known. "parts" names the
+    parts of the state in their order. A server's metadata have them among the `weights`, and
+    `vlagents-ray robot` compares them with the robot before its first motion.
     """
 
     check: Callable[[np.ndarray, np.ndarray | None], np.ndarray] | None = None
-    """Optional: a check that every action from `act` has passed, given the action and the previous one, (D,) each."""
+    """Optional: a check that every action from `act` has passed, given the action and the
+    previous one, (D,) each.
+    """
 
     control: Any = None
-    """Optional: the `vlagents_ray.chunking.control.Control` of the robot, which `act` reads at each tick."""
+    """Optional: the `vlagents_ray.chunking.control.Control` of the robot, which `act` reads at
+    each tick.
+    """
 
     @classmethod
     def from_config(cls, config: Mapping[str, Any]) -> Self:
@@ -155,11 +186,17 @@ class Agent:
         try:
             return cls(cls.Config(**config))  # type: ignore[call-arg]
         except (TypeError, ValueError) as error:
-            message = wrong_settings(error, cls.Config, "--set") if isinstance(error, ValueError) else error
+            message = (
+                wrong_settings(error, cls.Config, "--set")
+                if isinstance(error, ValueError)
+                else error
+            )
             raise ConfigError(f"policy {cls.__name__}: {message}") from error
 
     def shared_objects(self) -> list[Any]:
-        """Return the objects that `shared` names; an agent that wraps another one adds that agent's objects."""
+        """Return the objects that `shared` names; an agent that wraps another one adds that
+        agent's objects.
+        """
         trainable = () if self.trainable is None else (self.trainable.partition(".")[0],)
         names = dict.fromkeys((*self.shared, *trainable))
         return [getattr(self, name, None) for name in names]
@@ -167,7 +204,8 @@ class Agent:
     def parameters(self) -> dict[str, Any]:
         """Return references to the values that a learner trains, by name.
 
-        Names of a torch module are those of its `state_dict`; those of nested dicts are their keys, joined with "/".
+        Names of a torch module are those of its `state_dict`; those of nested dicts are their keys,
+        joined with "/".
 
         Raises:
             NotTrainable: The agent has none, i.e. `trainable` is None.
@@ -177,13 +215,13 @@ class Agent:
     def load_parameters(self, named: Mapping[str, Any]) -> None:
         """Act with these values from now on; a server calls this between two batches.
 
-        The default replaces the values in `trainable` by reference, and copies those on a GPU to the addresses of the
-        old ones, so that CUDA graphs stay valid. An agent that derives other values from its parameters overrides
-        this, computes them again, and calls the default.
+        The default replaces the values in `trainable` by reference, and copies those on a GPU to
+        the addresses of the old ones, so that CUDA graphs stay valid. An agent that derives other
+        values from its parameters overrides this, computes them again, and calls the default.
 
         Args:
-            named: A value for each name of `parameters`, of the same shape, type and device. They have been checked,
-                and do not change later; the agent must not change them either.
+            named: A value for each name of `parameters`, of the same shape, type and device. They
+                have been checked, and do not change later; the agent must not change them either.
 
         Raises:
             NotTrainable: The agent has none, i.e. `trainable` is None.
@@ -193,101 +231,123 @@ class Agent:
     def _trainable(self) -> Any:
         if self.trainable is None:
             raise NotTrainable(
-                f"{type(self).__name__}: names no parameters to train; set `trainable` to the name of the attribute "
+                f"{type(self).__name__}: names no parameters to train; set `trainable` to the name "
+                "of the attribute "
                 f"with its torch module or its dicts of arrays"
             )
         try:
             return attrgetter(self.trainable)(self)
         except AttributeError as error:
-            raise NotTrainable(f"trainable: {error}; call initialize() first, or correct the name") from error
+            raise NotTrainable(
+                f"trainable: {error}; call initialize() first, or correct the name"
+            ) from error
 
     @property
     def contract(self) -> Contract | None:
-        """The inputs that the policy needs and the actions that it returns; None to check nothing."""
+        """The inputs that the policy needs and the actions that it returns; None to check
+        nothing.
+        """
         return None
 
     @property
     def continues_plans(self) -> bool:
-        """Whether a chunk continues the plan in `Obs.info` (`LEFTOVER`); if not, the plan is ignored."""
+        """Whether a chunk continues the plan in `Obs.info` (`LEFTOVER`); if not, the plan is
+        ignored.
+        """
         return False
 
     def initialize(self) -> None:
-        """Load the weights and everything else that takes long; called once in a replica, before any `reset`."""
+        """Load the weights and everything else that takes long; called once in a replica, before
+        any `reset`.
+        """
 
     def reset(self, obs: Obs, instruction: str | None, **kwargs: Any) -> dict[str, Any]:
         """Begin an episode.
 
-        A server calls this on a fresh copy of the initialized agent, so no state of an earlier episode is left.
+        A server calls this on a fresh copy of the initialized agent, so no state of an earlier
+        episode is left.
 
         Args:
             obs: The first observation of the episode.
             instruction: The task in words; None if it has none.
-            kwargs: Options: `seed` (int), of the session's random generator; from an evaluation also `env`, its name.
+            kwargs: Options: `seed` (int), of the session's random generator; from an evaluation
+                also `env`, its name.
 
         Returns:
-            Information about the episode, with values of the types that `Obs.info` may have; often empty.
+            Information about the episode, with values of the types that `Obs.info` may have; often
+            empty.
         """
         return {}
 
     def observe(self, obs: Obs) -> None:
         """Add an observation to the history without computing an action.
 
-        Policies with a history override this. When a session is resumed on another replica, it is `reset` with
-        its first observation, and this is then called with the last observations on which it had acted.
+        Policies with a history override this. When a session is resumed on another replica, it is
+        `reset` with its first observation, and this is then called with the last observations on
+        which it had acted.
 
         Args:
             obs: The observation.
         """
 
     def prepare(self, obs: Obs) -> Any:
-        """Compute values that depend only on one observation and the instruction, such as resized images and tokens.
+        """Compute values that depend only on one observation and the instruction, such as resized
+        images and tokens.
 
-        A server may call this on a session's copy while other sessions, or an earlier request of this one, are acted
-        on, on several threads at once, and sets `obs.prepared` to the result before `act`. The call is optional: `act`
-        computes the same if `obs.prepared` is None. An error fails the request of that observation. Override this if it
-        takes a noticeable part of the time of `act`.
+        A server may call this on a session's copy while other sessions, or an earlier request of
+        this one, are acted on, on several threads at once, and sets `obs.prepared` to the result
+        before `act`. The call is optional: `act` computes the same if `obs.prepared` is None. An
+        error fails the request of that observation. Override this if it takes a noticeable part of
+        the time of `act`.
 
         Args:
             obs: The observation to act on next; it must not be changed.
 
         Returns:
-            Any object that does not share memory with the observation. The agent and its shared objects must not be
-            changed (for instance the padding of a tokenizer); read only values that `initialize` and `reset` have set
-            and that new weights do not change.
+            Any object that does not share memory with the observation. The agent and its shared
+            objects must not be changed (for instance the padding of a tokenizer); read only values
+            that `initialize` and `reset` have set and that new weights do not change.
         """
         return None
 
     def act(self, obs: Obs) -> Act:
         """Compute an action, or a chunk of actions.
 
-        An agent defines this, or `act_batch`, which the default implementation calls with a batch of one.
+        An agent defines this, or `act_batch`, which the default implementation calls with a batch
+        of one.
 
         Args:
             obs: The observation to act on; it must not be changed.
 
         Returns:
-            The action, (D,) float32, or a chunk of them, (H, D), in arrays that later calls do not change.
+            The action, (D,) float32, or a chunk of them, (H, D), in arrays that later calls do not
+            change.
         """
         if type(self).act_batch is Agent.act_batch:
-            raise NotImplementedError(f"{type(self).__name__} must define act(obs) -> Act, or act_batch")
+            raise NotImplementedError(
+                f"{type(self).__name__} must define act(obs) -> Act, or act_batch"
+            )
         [act] = self.act_batch([obs], [self])
         if isinstance(act, Exception):
             raise act
         return act
 
     def act_batch(self, obs: Sequence[Obs], sessions: Sequence[Agent]) -> list[Act | Exception]:
-        """Compute the actions of several sessions at once, in one forward pass where the model can batch.
+        """Compute the actions of several sessions at once, in one forward pass where the model can
+        batch.
 
-        `self` is the initialized agent. The action of a session must not depend on the other sessions in the batch.
+        `self` is the initialized agent. The action of a session must not depend on the other
+        sessions in the batch.
 
         Args:
             obs: One observation for each session.
-            sessions: The sessions' copies of the agent, which hold their instruction, history and random generator;
-                `obs[i]` belongs to `sessions[i]`, and no session occurs twice.
+            sessions: The sessions' copies of the agent, which hold their instruction, history and
+                random generator; `obs[i]` belongs to `sessions[i]`, and no session occurs twice.
 
         Returns:
-            One action, or chunk of actions, for each session, in their order. An exception in the place of an action
-            fails the request of that session alone; an exception that is raised fails the whole batch.
+            One action, or chunk of actions, for each session, in their order. An exception in the
+            place of an action fails the request of that session alone; an exception that is raised
+            fails the whole batch.
         """
         acts: list[Act | Exception] = []
         for session, one in zip(sessions, obs, strict=True):
@@ -298,25 +358,34 @@ class Agent:
         return acts
 
     def interrupt(self) -> None:
-        """Drop the planned actions: the robot was stopped or moved, and did not execute the last action of `act`."""
+        """Drop the planned actions: the robot was stopped or moved, and did not execute the last
+        action of `act`.
+        """
 
     def sleep(self) -> None:
-        """Free the memory of an accelerator that is not that of `parameters`, such as of CUDA graphs, until `wake`.
+        """Free the memory of an accelerator that is not that of `parameters`, such as of CUDA
+        graphs, until `wake`.
 
-        A server calls this when a learner needs the memory, and moves the parameters to the host itself.
+        A server calls this when a learner needs the memory, and moves the parameters to the host
+        itself.
         """
 
     def wake(self) -> None:
-        """Make what `sleep` freed; torch tensors of `parameters` are the same objects at other addresses."""
+        """Make what `sleep` freed; torch tensors of `parameters` are the same objects at other
+        addresses.
+        """
 
     def check_health(self) -> None:
         """Raise an exception if this agent can never act again, e.g. after the loss of its GPU.
 
-        A server calls this every few seconds, also while a batch runs, and replaces the replica if it raises.
+        A server calls this every few seconds, also while a batch runs, and replaces the replica if
+        it raises.
         """
 
     def close(self) -> None:
-        """Free the resources that `initialize` acquired; a server calls this once, when the replica stops."""
+        """Free the resources that `initialize` acquired; a server calls this once, when the
+        replica stops.
+        """
 
     def __enter__(self) -> Self:
         return self
@@ -326,7 +395,9 @@ class Agent:
 
 
 def copied(obs: Obs) -> Obs:
-    """Copy an observation with its arrays, since a caller may write the next observation into the same memory."""
+    """Copy an observation with its arrays, since a caller may write the next observation into
+    the same memory.
+    """
     return Obs(
         {name: np.array(image) for name, image in obs.cameras.items()},
         obs.gripper,

@@ -1,7 +1,8 @@
-"""The HTTP protocol of the small servers without HAProxy: the page of an evaluation, and the operator's page.
+"""The HTTP protocol of the small servers without HAProxy: the page of an evaluation, and the
+operator's page.
 
-uvicorn waits for the headers of a request without a time limit, and accepts any number of connections: strangers could
-use up the descriptors of the process that runs the robots.
+uvicorn waits for the headers of a request without a time limit, and accepts any number of
+connections: strangers could use up the descriptors of the process that runs the robots.
 """
 
 from __future__ import annotations
@@ -15,8 +16,9 @@ from uvicorn.protocols.http.auto import AutoHTTPProtocol
 _HEADERS_S = 5.0  # maximum time without a request, s; a connection is closed within twice that time
 _CONNECTIONS = 128  # maximum number of connections
 _CONNECTIONS_PER_ADDRESS = 32
-# Maximum number of connections that wait to be accepted. asyncio accepts as many in one turn of its loop, during which
-# nothing else is answered: with uvicorn's 2048, a client that connects and leaves delays each answer by 15 ms.
+# Maximum number of connections that wait to be accepted. asyncio accepts as many in one turn of its
+# loop, during which nothing else is answered: with uvicorn's 2048, a client that connects and
+# leaves delays each answer by 15 ms.
 BACKLOG = 16
 
 
@@ -29,19 +31,22 @@ class PageProtocol(AutoHTTPProtocol):  # type: ignore[misc, valid-type]
         host = self.client and self.client[0]
         from_host = sum(1 for other in self.connections if other.client and other.client[0] == host)
         if len(self.connections) > _CONNECTIONS or from_host > _CONNECTIONS_PER_ADDRESS:
-            # uvicorn would count it until the loop's next turn, in which one address may have connected 2,000 times:
-            # other addresses would then be over the limit of all connections.
+            # uvicorn would count it until the loop's next turn, in which one address may have
+            # connected 2,000 times: other addresses would then be over the limit of all
+            # connections.
             self.connections.discard(self)
             transport.abort()
             return
-        # asyncio sets this only if the listener was made with the protocol's number, which `create_server` leaves at 0;
-        # without it, the body of an answer waits for 40 ms for the client to acknowledge its head.
+        # asyncio sets this only if the listener was made with the protocol's number, which
+        # `create_server` leaves at 0; without it, the body of an answer waits for 40 ms for the
+        # client to acknowledge its head.
         transport.get_extra_info("socket").setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         self._last_cycle: Any = None
         self.loop.call_later(_HEADERS_S, self._close_if_silent)
 
     def _close_if_silent(self) -> None:
-        if self.transport.is_closing() or self.transport.get_protocol() is not self:  # it is a WebSocket now
+        # It is a WebSocket now.
+        if self.transport.is_closing() or self.transport.get_protocol() is not self:
             return
         answering = self.cycle is not None and not self.cycle.response_complete
         if not answering and self.cycle is self._last_cycle:

@@ -1,10 +1,11 @@
-"""Names of policies, environments, robots, commands and others, the location of their code, and their requirements.
+"""Names of policies, environments, robots, commands and others, the location of their code, and
+their requirements.
 
-A name leads to a `RegistryEntry`, whose class is imported only when it is used. Plug-ins add entries through the
-entry-point groups `vlagents_ray.policies`, `.wrappers`, `.envs`, `.dialects`, `.robots`, `.leaders`, `.commands`,
-`.replica`, `.pages`, `.exports` and `.trackers`: an entry point names a `RegistryEntry` in a module that imports
-nothing large. A `"module:Class"` in a deployment file works without registration. Wrappers change the observations of
-any policy, or its actions.
+A name leads to a `RegistryEntry`, whose class is imported only when it is used. Plug-ins add
+entries through the entry-point groups `vlagents_ray.policies`, `.wrappers`, `.envs`, `.dialects`,
+`.robots`, `.leaders`, `.commands`, `.replica`, `.pages`, `.exports` and `.trackers`: an entry point
+names a `RegistryEntry` in a module that imports nothing large. A `"module:Class"` in a deployment
+file works without registration. Wrappers change the observations of any policy, or its actions.
 
 The tables of README and docs/ are made from these entries: `python tests/support/tables.py`.
 """
@@ -24,7 +25,14 @@ from pathlib import Path
 from types import MappingProxyType, ModuleType
 from typing import Any
 
-from vlagents_ray.errors import ConfigError, MissingDependency, UnknownEnv, UnknownPolicy, UnknownWrapper, VLAgentsError
+from vlagents_ray.errors import (
+    ConfigError,
+    MissingDependency,
+    UnknownEnv,
+    UnknownPolicy,
+    UnknownWrapper,
+    VLAgentsError,
+)
 from vlagents_ray.naming import did_you_mean
 
 logger = logging.getLogger(__name__)
@@ -34,16 +42,21 @@ CORE = "vlagents-ray"  # the distribution of this package
 
 @dataclass(frozen=True, slots=True)
 class RegistryEntry:
-    """A policy, wrapper, environment, dialect, robot or command: where its code is, what it is, and what it needs."""
+    """A policy, wrapper, environment, dialect, robot or command: where its code is, what it is,
+    and what it needs.
+    """
 
-    # "module:Class". Of an export and a leader (see `robot.leaders.OpenLeader`), "module:function". Of a command, that
-    # or "module:app", a typer.Typer; the function of a subcommand, such as "robot.check", takes the arguments and
-    # returns the exit status.
+    # "module:Class". Of an export and a leader (see `robot.leaders.OpenLeader`), "module:function".
+    # Of a command, that or "module:app", a typer.Typer; the function of a subcommand, such as
+    # "robot.check", takes the arguments and returns the exit status.
     target: str
-    # Its models or tasks, for the tables of README and docs/; empty: no row in them. Of others, one line for --help.
+    # Its models or tasks, for the tables of README and docs/; empty: no row in them. Of others, one
+    # line for --help.
     about: str = ""
-    needs: tuple[str, ...] = ()  # import names; the first one may be in a source named by `checkouts`
-    # Files NAME.txt in `requirements/` of the target's package that install these, the usual one first.
+    # Import names; the first one may be in a source named by `checkouts`.
+    needs: tuple[str, ...] = ()
+    # Files NAME.txt in `requirements/` of the target's package that install these, the usual one
+    # first.
     requirements: tuple[str, ...] = ()
     extra: str | None = None  # extra of its distribution that installs them
     checkouts: tuple[str, ...] = ()  # variables, one of which names a checkout of the authors' code
@@ -51,10 +64,13 @@ class RegistryEntry:
     tasks: str = "/<task>"  # of an environment or a robot: the pattern after its name
     deployment: str | None = None  # file of deployments/ with its settings; None: its own name
     weights: bool = False  # whether a checkout has weights of it, which deployments/NAME.yaml names
-    # A URL, or "page#section" below docs/policies or docs/benchmarks; "": no page; None: the page of its own name.
+    # A URL, or "page#section" below docs/policies or docs/benchmarks; "": no page; None: the page
+    # of its own name.
     page: str | None = None
-    by_default: bool = False  # of a part of a replica: whether it is on in each server, with its default settings
-    distribution: str = CORE  # that registers it; of a plug-in, the name of its entry point's distribution
+    # Of a part of a replica: whether it is on in each server, with its default settings.
+    by_default: bool = False
+    # That registers it; of a plug-in, the name of its entry point's distribution.
+    distribution: str = CORE
 
 
 POLICIES: dict[str, RegistryEntry] = {
@@ -103,8 +119,8 @@ WRAPPERS: dict[str, RegistryEntry] = {
     "absolute_actions": RegistryEntry("vlagents_ray.policies.absolute_actions:AbsoluteActions"),
 }
 
-# Formats of `vlagents-ray export`. A function (results, path, **settings) writes the episodes and returns their number;
-# its keyword-only parameters are the settings of `--set`.
+# Formats of `vlagents-ray export`. A function (results, path, **settings) writes the episodes and
+# returns their number; its keyword-only parameters are the settings of `--set`.
 EXPORTS: dict[str, RegistryEntry] = {
     "json": RegistryEntry("vlagents_ray.evaluate.exports:to_json", "an object for each episode"),
     "csv": RegistryEntry("vlagents_ray.evaluate.exports:to_csv", "a line for each episode"),
@@ -117,7 +133,8 @@ _BUILT_IN: dict[str, dict[str, RegistryEntry]] = {
     "dialects": {},  # other systems' protocols, the names under `dialects` in a deployment file
     "robots": {},  # the names before the colon of `vlagents-ray robot --robot NAME:ARGUMENT`
     "leaders": {},  # operators' devices, `vlagents-ray robot --leader NAME`
-    "commands": {},  # those of this package are in `cli.main`; "robot.NAME" is a subcommand of `vlagents-ray robot`
+    # Those of this package are in `cli.main`; "robot.NAME" is a subcommand of `vlagents-ray robot`.
+    "commands": {},
     "replica": {},  # parts of a replica
     "pages": {},  # that show an evaluation while it runs
     "exports": EXPORTS,
@@ -159,10 +176,13 @@ _EXTRAS: dict[str, tuple[str, ...]] = {
     "rerun": ("rerun",),
 }
 
-# import name -> how to install a package that is in no extra and no requirements of an installed plug-in
+# import name -> how to install a package that is in no extra and no requirements of an installed
+# plug-in
 _ELSEWHERE = {
     "torch": "run `pip install torch` in the policy's environment",
-    "torchao": "run `pip install torchao` in the policy's environment; its requirements file leaves it out",
+    "torchao": (
+        "run `pip install torchao` in the policy's environment; its requirements file leaves it out"
+    ),
 }
 # packages installed as dependencies of those of the families
 _BROUGHT = {"torchvision": "torch", "tokenizers": "transformers", "safetensors": "transformers"} | {
@@ -181,7 +201,8 @@ def require(module: str, *, extra: str | None = None, distribution: str = CORE) 
         distribution: The distribution of that extra.
 
     Raises:
-        MissingDependency: The module is not installed; the message names the extra or the requirements file with it.
+        MissingDependency: The module is not installed; the message names the extra or the
+            requirements file with it.
     """
     try:
         return importlib.import_module(module)
@@ -189,7 +210,9 @@ def require(module: str, *, extra: str | None = None, distribution: str = CORE) 
         top = module.partition(".")[0]
         if error.name is None or error.name.partition(".")[0] != top:
             raise  # the module is installed, but lacks a dependency, which this error names
-        raise MissingDependency(f"{module!r} is not installed; {_install(top, extra, distribution)}") from error
+        raise MissingDependency(
+            f"{module!r} is not installed; {_install(top, extra, distribution)}"
+        ) from error
 
 
 def _install(package: str, extra: str | None = None, distribution: str = CORE) -> str:
@@ -197,7 +220,9 @@ def _install(package: str, extra: str | None = None, distribution: str = CORE) -
     simulators = [entry for entry in entries("envs").values() if package in entry.needs]
     policies = entries("policies").values()
     users = [entry for entry in (*simulators, *policies) if package in entry.needs]
-    extra = extra or next((name for name, installed in _EXTRAS.items() if package in installed), None)
+    extra = extra or next(
+        (name for name, installed in _EXTRAS.items() if package in installed), None
+    )
     if extra:
         return pip_install(extra, distribution)
     with_extra = next((entry for entry in users if entry.extra), None)
@@ -205,7 +230,8 @@ def _install(package: str, extra: str | None = None, distribution: str = CORE) -
         return pip_install(with_extra.extra, with_extra.distribution)
     if simulators:
         return (
-            f"run `vlagents-ray env make {simulators[0].requirements[0]}` and give the evaluation's "
+            f"run `vlagents-ray env make {simulators[0].requirements[0]}` and give the "
+            "evaluation's "
             f"workers that environment's Python, `runtime_env: {{py_executable: ...}}`"
         )
     needed = _BROUGHT.get(package, package)
@@ -213,9 +239,12 @@ def _install(package: str, extra: str | None = None, distribution: str = CORE) -
     environments = sorted({entry.requirements[0] for entry in families})
     if environments:
         several = len(environments) > 1
-        family = f"; NAME is that of the policy's family: {', '.join(environments)}" if several else ""
+        family = (
+            f"; NAME is that of the policy's family: {', '.join(environments)}" if several else ""
+        )
         return (
-            f"run `vlagents-ray env make {'NAME' if several else environments[0]}` and name the environment in "
+            f"run `vlagents-ray env make {'NAME' if several else environments[0]}` and name the "
+            "environment in "
             f"the deployment's `environment`{family}"
         )
     return _ELSEWHERE.get(package, f"install the package that provides {package!r}")
@@ -230,7 +259,8 @@ def require_needs(kind: str, name: str) -> None:
 
 
 def requirements_file(name: str) -> Path:
-    """Return the requirements file that a policy or environment names, such as "hf", in its package.
+    """Return the requirements file that a policy or environment names, such as "hf", in its
+    package.
 
     Raises:
         ConfigError: No installed policy or environment names it.
@@ -274,7 +304,9 @@ def find_entry(kind: str, name: str) -> RegistryEntry | None:
 
 
 def entries(kind: str) -> dict[str, RegistryEntry]:
-    """Return the entries of all names of `kind`; one that cannot be loaded is left out, and its error is logged."""
+    """Return the entries of all names of `kind`; one that cannot be loaded is left out, and its
+    error is logged.
+    """
     found = {}
     for name in names(kind):
         try:
@@ -298,8 +330,12 @@ def _entry_points(kind: str) -> Mapping[str, tuple[EntryPoint, ...]]:
 
 
 @functools.cache
-def _installed_entry_points(group: str, _path: tuple[str, ...]) -> Mapping[str, tuple[EntryPoint, ...]]:
-    """Return the entry points of a group on this path; reading those of all installed packages takes 20 ms."""
+def _installed_entry_points(
+    group: str, _path: tuple[str, ...]
+) -> Mapping[str, tuple[EntryPoint, ...]]:
+    """Return the entry points of a group on this path; reading those of all installed packages
+    takes 20 ms.
+    """
     by_name: dict[str, tuple[EntryPoint, ...]] = {}
     for point in entry_points(group=group):
         by_name[point.name] = (*by_name.get(point.name, ()), point)
@@ -308,21 +344,29 @@ def _installed_entry_points(group: str, _path: tuple[str, ...]) -> Mapping[str, 
 
 @functools.cache
 def _load(points: tuple[EntryPoint, ...]) -> RegistryEntry:
-    """Load the entry that an entry point names; raises `ConfigError` if it is none, or if there are several."""
+    """Load the entry that an entry point names; raises `ConfigError` if it is none, or if there
+    are several.
+    """
     point = points[0]
     distributions = sorted({_distribution_of(other) for other in points})
     if len({other.value for other in points}) > 1:
         raise ConfigError(
-            f"{point.name!r} is registered in {point.group} by {' and '.join(distributions)}: uninstall one of them"
+            f"{point.name!r} is registered in {point.group} by {' and '.join(distributions)}: "
+            "uninstall one of them"
         )
-    expected = f"{point.group}: expected {point.name!r} of {distributions[0]} to name a RegistryEntry"
+    expected = (
+        f"{point.group}: expected {point.name!r} of {distributions[0]} to name a RegistryEntry"
+    )
     try:
         entry = point.load()
     except Exception as error:  # the plug-in's module may raise any error
-        raise ConfigError(f"{expected}, but importing {point.value} failed: {error}; update that package") from error
+        raise ConfigError(
+            f"{expected}, but importing {point.value} failed: {error}; update that package"
+        ) from error
     if not isinstance(entry, RegistryEntry):
         raise ConfigError(
-            f"{expected}, got {point.value}, a {type(entry).__name__}; write ENTRY = RegistryEntry('module:Class') "
+            f"{expected}, got {point.value}, a {type(entry).__name__}; write ENTRY = "
+            "RegistryEntry('module:Class') "
             f"in a module that imports nothing large, and name that"
         )
     return replace(entry, distribution=distributions[0])
@@ -334,20 +378,26 @@ def _distribution_of(point: EntryPoint) -> str:
 
 def plugin_distributions() -> list[str]:
     """Return the installed distributions that register names, other than this package's own."""
-    points = (point for kind in _BUILT_IN for found in _entry_points(kind).values() for point in found)
+    points = (
+        point for kind in _BUILT_IN for found in _entry_points(kind).values() for point in found
+    )
     return sorted({_distribution_of(point) for point in points if point.dist is not None})
 
 
 @functools.cache
 def published() -> Mapping[str, Mapping[str, str]]:
-    """Return the distribution of each name that the project's own plug-ins register, by kind, installed or not."""
+    """Return the distribution of each name that the project's own plug-ins register, by kind,
+    installed or not.
+    """
     file = Path(__file__).with_name("published.json")
     read: dict[str, dict[str, str]] = json.loads(file.read_text())
     return MappingProxyType(read)
 
 
 def not_installed(kind: str) -> dict[str, str]:
-    """Return the names of `kind` in plug-ins of the project that are not installed, with their distributions."""
+    """Return the names of `kind` in plug-ins of the project that are not installed, with their
+    distributions.
+    """
     installed = names(kind)
     return {name: dist for name, dist in published().get(kind, {}).items() if name not in installed}
 
@@ -378,17 +428,23 @@ def env_suite(name: str) -> str:
 
 
 def env_task(name: str) -> str | None:
-    """Return the task within the suite: "PushCube-v1" of "maniskill/PushCube-v1"; None if there is none."""
+    """Return the task within the suite: "PushCube-v1" of "maniskill/PushCube-v1"; None if there
+    is none.
+    """
     return None if _is_class(name) else name.partition("/")[2] or None
 
 
 def _is_class(name: str) -> bool:
-    """Return whether an env's name is "module:Class"; a task may also have a colon, as in "gymnasium/MODULE:ID"."""
+    """Return whether an env's name is "module:Class"; a task may also have a colon, as in
+    "gymnasium/MODULE:ID".
+    """
     return ":" in name and name.partition("/")[0] not in names("envs")
 
 
 def registered_class(kind: str, name: str, unknown: type[ConfigError] = ConfigError) -> type[Any]:
-    """Return the class registered as `name`, or given as "module:Class"; raises `unknown` if there is none."""
+    """Return the class registered as `name`, or given as "module:Class"; raises `unknown` if
+    there is none.
+    """
     return named_class(_importable_target(kind, name, unknown), unknown)
 
 
@@ -396,13 +452,16 @@ def registered_function(kind: str, name: str) -> Any:
     """Return the function or `typer.Typer` registered as `name`, or given as "module:function".
 
     Raises:
-        ConfigError: There is none, or it cannot be loaded, for whatever reason; the message names the plug-in.
+        ConfigError: There is none, or it cannot be loaded, for whatever reason; the message names
+            the plug-in.
     """
     return load_target(_importable_target(kind, name, ConfigError))
 
 
 def _importable_target(kind: str, name: str, unknown: type[ConfigError]) -> str:
-    """Return the target of a registered name, whose plug-in can be imported; "module:NAME" is returned unchanged."""
+    """Return the target of a registered name, whose plug-in can be imported; "module:NAME" is
+    returned unchanged.
+    """
     entry = find_entry(kind, name)
     if entry is not None and entry.distribution != CORE:
         _require_importable(kind, name, entry)
@@ -411,18 +470,22 @@ def _importable_target(kind: str, name: str, unknown: type[ConfigError]) -> str:
         distribution = not_installed(kind).get(name)
         if distribution is not None:
             raise unknown(
-                f"{_SINGULAR[kind]} {_shown(kind, name)!r} is in {distribution}, which is not installed: "
+                f"{_SINGULAR[kind]} {_shown(kind, name)!r} is in {distribution}, which is not "
+                "installed: "
                 f"{pip_install(distribution=distribution)}"
             )
         known = names(kind)
         raise unknown(
-            f"{name!r} is not registered: want one of {sorted(known)}, or 'module:Class'{did_you_mean(name, known)}"
+            f"{name!r} is not registered: want one of {sorted(known)}, or "
+            f"'module:Class'{did_you_mean(name, known)}"
         )
     return target
 
 
 def _shown(kind: str, name: str) -> str:
-    """Return a name as a user types it: the subcommand "robot.check" is `vlagents-ray robot check`."""
+    """Return a name as a user types it: the subcommand "robot.check" is `vlagents-ray robot
+    check`.
+    """
     return name.replace(".", " ") if kind == "commands" else name
 
 
@@ -456,13 +519,16 @@ def load_target(name: str, unknown: type[ConfigError] = ConfigError) -> Any:
     if not colon:
         raise unknown(f"{name!r}: expected 'module:Class'")
     if module.endswith(".py"):
-        raise unknown(f"{name!r} names a file: want an importable module, as in 'my_policies:{attribute}'")
+        raise unknown(
+            f"{name!r} names a file: want an importable module, as in 'my_policies:{attribute}'"
+        )
     try:
         loaded = importlib.import_module(module)
     except ModuleNotFoundError as error:
         if error.name and (module == error.name or module.startswith(error.name + ".")):
             raise unknown(
-                f"{name!r}: no module {error.name!r} is installed, or lies in the working directory {Path.cwd()}; "
+                f"{name!r}: no module {error.name!r} is installed, or lies in the working "
+                f"directory {Path.cwd()}; "
                 f"go to its folder, add that to PYTHONPATH, or install it"
                 f"{did_you_mean(error.name, (file.stem for file in Path.cwd().glob('*.py')))}"
             ) from error
@@ -470,5 +536,8 @@ def load_target(name: str, unknown: type[ConfigError] = ConfigError) -> Any:
     found = getattr(loaded, attribute, None)
     if found is None:
         classes = [other for other, value in vars(loaded).items() if isinstance(value, type)]
-        raise unknown(f"{name!r}: module {module!r} has no class {attribute!r}{did_you_mean(attribute, classes)}")
+        raise unknown(
+            f"{name!r}: module {module!r} has no class "
+            f"{attribute!r}{did_you_mean(attribute, classes)}"
+        )
     return found

@@ -15,7 +15,14 @@ from vlagents_ray.errors import ConfigError, shown
 from vlagents_ray.naming import did_you_mean
 
 _BOUNDS = ("less_than", "less_than_equal", "greater_than", "greater_than_equal")
-_WORD_ERRORS = ("int_parsing", "float_parsing", "bool_parsing", "list_type", "sequence_str", *_BOUNDS)
+_WORD_ERRORS = (
+    "int_parsing",
+    "float_parsing",
+    "bool_parsing",
+    "list_type",
+    "sequence_str",
+    *_BOUNDS,
+)
 # How to write a value, by the type of error and the type of the value.
 _SPELLINGS = {
     ("list_type", dict): "; begin each of its entries with '- '",
@@ -23,7 +30,8 @@ _SPELLINGS = {
     ("string_type", datetime.date): "; put it in quotation marks",
 }
 _WANT = "Input should be "  # pydantic's wording
-# Types of values that a plain type allows: also numpy's, and whole numbers for a float, since YAML reads 1 as int.
+# Types of values that a plain type allows: also numpy's, and whole numbers for a float, since YAML
+# reads 1 as int.
 _PLAIN: dict[type, tuple[type, ...]] = {
     bool: (bool, np.bool_),
     int: (numbers.Integral,),
@@ -36,8 +44,9 @@ _PLAIN: dict[type, tuple[type, ...]] = {
 def require_arguments(what: str, function: Callable[..., Any], given: Mapping[str, Any]) -> None:
     """Raise `ConfigError` unless a function accepts these keyword arguments.
 
-    The type of a value is compared with its parameter's annotation, or with the default if there is no annotation. Only
-    numbers, strings, booleans and None are compared; values of other types are left to the function.
+    The type of a value is compared with its parameter's annotation, or with the default if there is
+    no annotation. Only numbers, strings, booleans and None are compared; values of other types are
+    left to the function.
 
     Args:
         what: The object that the function makes, for the message.
@@ -59,16 +68,24 @@ def require_arguments(what: str, function: Callable[..., Any], given: Mapping[st
         annotations = {}
     for name, value in given.items():
         parameter = signature.parameters.get(name)
-        if parameter is None or value is parameter.default:  # a value for **kwargs, or the default itself
+        # A value for **kwargs, or the default itself.
+        if parameter is None or value is parameter.default:
             continue
         default = parameter.default  # without an annotation, the default 1 allows 0.5 as well
         own = Any if default is None else float if type(default) is int else type(default)
         annotation: Any = annotations.get(name, own)
-        kinds = list(get_args(annotation)) if get_origin(annotation) in (Union, UnionType) else [annotation]
+        kinds = (
+            list(get_args(annotation))
+            if get_origin(annotation) in (Union, UnionType)
+            else [annotation]
+        )
         if not all(isinstance(kind, type) and kind in _PLAIN for kind in kinds):
             continue
         # A boolean does not count as a number.
-        if not any(isinstance(value, _PLAIN[kind]) and (kind is bool or type(value) is not bool) for kind in kinds):
+        if not any(
+            isinstance(value, _PLAIN[kind]) and (kind is bool or type(value) is not bool)
+            for kind in kinds
+        ):
             wanted = " or ".join("None" if kind is type(None) else kind.__name__ for kind in kinds)
             raise ConfigError(f"{what}: {name}: got {value!r}, want {wanted}")
 
@@ -77,8 +94,8 @@ def wrong_settings(error: ValueError, model: type | None = None, option: str | N
     """Return the message of an error about settings.
 
     Args:
-        error: An error; if it is pydantic's, the message has a line for each wrong setting, without the values, which
-            may be secrets.
+        error: An error; if it is pydantic's, the message has a line for each wrong setting, without
+            the values, which may be secrets.
         model: The pydantic model of the settings, whose fields are listed if one is unknown.
         option: The option of the command line that sets them, such as "--set".
     """
@@ -94,13 +111,19 @@ def _sentence(item: Mapping[str, Any], model: type | None, option: str | None) -
     message = str(item["msg"]).removeprefix("Value error, ")
     name = str(item["loc"][-1]) if item["loc"] else ""
     beside = _fields(model, item["loc"][:-1])
-    got = item["input"] if isinstance(item["input"], (bool, int, float)) else type(item["input"]).__name__
-    if item["type"] in _WORD_ERRORS and isinstance(item["input"], str):  # in place of a number or a list: no secret
+    got = (
+        item["input"]
+        if isinstance(item["input"], (bool, int, float))
+        else type(item["input"]).__name__
+    )
+    # In place of a number or a list: no secret.
+    if item["type"] in _WORD_ERRORS and isinstance(item["input"], str):
         got = shown(item["input"])
         message = message.partition(", unable to")[0]
         if item["type"] in ("list_type", "sequence_str"):
             message += f", such as [{item['input'][:40]}]"
-    if item["type"] == "literal_error" and isinstance(item["input"], str):  # a word of a list is no secret
+    # A word of a list is no secret.
+    if item["type"] == "literal_error" and isinstance(item["input"], str):
         got = shown(item["input"])
         message += did_you_mean(item["input"], item["ctx"]["expected"].split("'")[1::2])
     if message.startswith(_WANT):
@@ -114,7 +137,10 @@ def _sentence(item: Mapping[str, Any], model: type | None, option: str | None) -
         message += did_you_mean(name, beside.keys() - {name})
     elif item["type"] == "missing":
         example = next(iter(getattr(beside.get(name), "examples", None) or ()), "…")
-        message = f"is missing; give {f'`{name}: {example}`' if option is None else f'{option} {where}={example}'}"
+        message = (
+            "is missing; give "
+            f"{f'`{name}: {example}`' if option is None else f'{option} {where}={example}'}"
+        )
     elif item["type"] == "extra_forbidden":
         takes = sorted(beside)
         message = "there is no such setting"

@@ -1,4 +1,5 @@
-"""Test suites for policies and environments, which all those of this package pass and yours can also use.
+"""Test suites for policies and environments, which all those of this package pass and yours can
+also use.
 
     from vlagents_ray.testing import check_agent, check_env
 
@@ -8,7 +9,8 @@
     def test_my_policy_keeps_its_contract():
         check_agent(MyPolicy())
 
-Each raises `ContractViolation` with the first violation that it finds, and closes the agent or environment.
+Each raises `ContractViolation` with the first violation that it finds, and closes the agent or
+environment.
 """
 
 from __future__ import annotations
@@ -55,7 +57,9 @@ def require_wireable(value: object, where: str) -> None:
         return
     if isinstance(value, np.ndarray):
         if value.dtype.kind not in "biuf":
-            raise ContractViolation(f"{where}: got an array of {value.dtype}, want numbers or bools")
+            raise ContractViolation(
+                f"{where}: got an array of {value.dtype}, want numbers or bools"
+            )
     elif isinstance(value, dict):
         for key, item in value.items():
             if not isinstance(key, str):
@@ -66,7 +70,8 @@ def require_wireable(value: object, where: str) -> None:
             require_wireable(item, f"{where}[{i}]")
     else:
         raise ContractViolation(
-            f"{where}: got {type(value).__module__}.{type(value).__qualname__}, which a message cannot carry; "
+            f"{where}: got {type(value).__module__}.{type(value).__qualname__}, which a message "
+            "cannot carry; "
             f"want None, bool, int, float, str, bytes, numpy arrays, lists and dicts of them"
         )
 
@@ -90,13 +95,20 @@ def difference(a: object, b: object, where: str, atol: float = 0.0) -> str | Non
     if isinstance(a, (list, tuple)) and isinstance(b, (list, tuple)):
         if len(a) != len(b):
             return f"{where} has {len(a)} items once and {len(b)} the other time"
-        in_items = (difference(x, y, f"{where}[{i}]", atol) for i, (x, y) in enumerate(zip(a, b, strict=True)))
+        in_items = (
+            difference(x, y, f"{where}[{i}]", atol)
+            for i, (x, y) in enumerate(zip(a, b, strict=True))
+        )
         return next((found for found in in_items if found), None)
-    return None if type(a) is type(b) and a == b else f"{where} is {a!r} once and {b!r} the other time"
+    return (
+        None if type(a) is type(b) and a == b else f"{where} is {a!r} once and {b!r} the other time"
+    )
 
 
 def _plain(value: object) -> object:
-    """Convert tensors and images to arrays, and objects that have attributes but no equality to dictionaries."""
+    """Convert tensors and images to arrays, and objects that have attributes but no equality to
+    dictionaries.
+    """
     if isinstance(value, Act):  # without its info, which may contain times
         return {"action": value.action, "done": value.done}
     if isinstance(value, Obs):
@@ -104,8 +116,12 @@ def _plain(value: object) -> object:
     if is_dataclass(value) and not isinstance(value, type):
         return {part.name: getattr(value, part.name) for part in fields(value)}
     if hasattr(value, "__array__") and not isinstance(value, (np.ndarray, np.generic)):
-        return np.asarray(value.float() if "bfloat16" in str(getattr(value, "dtype", "")) else value)  # type: ignore[attr-defined]
-    return vars(value) if type(value).__eq__ is object.__eq__ and hasattr(value, "__dict__") else value
+        if "bfloat16" in str(getattr(value, "dtype", "")):  # which NumPy lacks
+            value = value.float()  # type: ignore[attr-defined]
+        return np.asarray(value)
+    return (
+        vars(value) if type(value).__eq__ is object.__eq__ and hasattr(value, "__dict__") else value
+    )
 
 
 def _array_difference(a: np.ndarray, b: np.ndarray, where: str, atol: float) -> str | None:
@@ -116,11 +132,16 @@ def _array_difference(a: np.ndarray, b: np.ndarray, where: str, atol: float) -> 
     off = np.abs(a.astype(np.float64) - b.astype(np.float64))
     if off.max() <= atol:
         return None
-    return f"{where} differs in {np.count_nonzero(off > atol)} of {a.size} numbers, by up to {off.max():.4g}"
+    return (
+        f"{where} differs in {np.count_nonzero(off > atol)} of {a.size} numbers, by up to "
+        f"{off.max():.4g}"
+    )
 
 
 def require_same(a: Any, b: Any, where: str, because: str, atol: float = 0.0) -> None:
-    """Raise `ContractViolation` with the difference and the reason `because` unless two values are equal."""
+    """Raise `ContractViolation` with the difference and the reason `because` unless two values
+    are equal.
+    """
     if found := difference(a, b, where, atol):
         raise ContractViolation(f"{found}; {because}")
 
@@ -147,24 +168,30 @@ def check_agent(
 ) -> None:
     """Check that an agent implements the interface of `Agent`; initializes and closes it.
 
-    Three sessions, copies of the initialized agent, run with an observation, an instruction and a seed each: first in
-    sequence, then interleaved, with prepared observations, then in batches of 1, 2 and 3. Their actions must not depend
-    on the other sessions, nor on whether `prepare` was called. If the agent defines `prepare`, several threads call it
-    while sessions are reset and acted on, as in a server, and every result must equal that of a single thread.
+    Three sessions, copies of the initialized agent, run with an observation, an instruction and a
+    seed each: first in sequence, then interleaved, with prepared observations, then in batches of
+    1, 2 and 3. Their actions must not depend on the other sessions, nor on whether `prepare` was
+    called. If the agent defines `prepare`, several threads call it while sessions are reset and
+    acted on, as in a server, and every result must equal that of a single thread.
 
     Args:
         agent: The agent, not initialized yet.
-        obs: The observations of the sessions, in turn; by default random values that fit the contract.
-        instructions: The instructions of the sessions, in turn; pass valid ones if the policy parses them.
+        obs: The observations of the sessions, in turn; by default random values that fit the
+            contract.
+        instructions: The instructions of the sessions, in turn; pass valid ones if the policy
+            parses them.
         reset_kwargs: Further arguments of each `reset`, beside `seed`.
         steps: The number of calls of `act` in a session.
-        atol: The largest difference between an action in a batch and the same action of a single session.
+        atol: The largest difference between an action in a batch and the same action of a single
+            session.
 
     Raises:
         ContractViolation: The agent does not implement the interface; the message names the place.
     """
     if not isinstance(agent, Agent):
-        raise ContractViolation(f"agent: got {agent!r}, want an object of a class that derives from vlagents_ray.Agent")
+        raise ContractViolation(
+            f"agent: got {agent!r}, want an object of a class that derives from vlagents_ray.Agent"
+        )
     agent.initialize()
     contract = agent.contract
     if contract is not None and not isinstance(contract, Contract):
@@ -178,11 +205,15 @@ def check_agent(
     because = "the same observations, instruction and seed must give the same actions"
     for i, again in enumerate([suite.play_alone(i, steps) for i in range(_SESSIONS)]):
         require_same(alone[i], again, f"act of session {i}", because)
-    because = "it depends on other sessions: keep what belongs to an episode in self, and out of `shared`"
+    because = (
+        "it depends on other sessions: keep what belongs to an episode in self, and out of `shared`"
+    )
     sessions = [suite.begin(i) for i in range(_SESSIONS)]
     for step in range(steps):
         for i, session in enumerate(sessions):
-            require_same(alone[i][step], suite.act(i, session), f"act {step} of session {i}", because)
+            require_same(
+                alone[i][step], suite.act(i, session), f"act {step} of session {i}", because
+            )
     if type(agent).prepare is not Agent.prepare:
         because = "`prepare` must compute what `act` computes without it"
         for i, session in enumerate([suite.begin(i) for i in range(_SESSIONS)]):
@@ -201,19 +232,28 @@ def check_agent(
 
 
 def _check_threads(suite: _AgentSuite, first: list[Act]) -> None:
-    """Check that threads can prepare observations while sessions, with the acts `first`, are reset and acted on."""
+    """Check that threads can prepare observations while sessions, with the acts `first`, are
+    reset and acted on.
+    """
     sessions = [suite.begin(i) for i in range(_SESSIONS)]
     serial = [suite.prepare(i, session) for i, session in enumerate(sessions)]
     ended = threading.Event()
     cure = suite.cure = (
-        "a server calls `prepare` on several threads, also while others are reset and acted on: change nothing in it "
-        "that sessions share, such as a tokenizer's padding; compute tokens in `reset`, or hold a lock"
+        "a server calls `prepare` on several threads, also while others are reset and acted on: "
+        "change nothing in it "
+        "that sessions share, such as a tokenizer's padding; compute tokens in `reset`, or hold a "
+        "lock"
     )
 
     def prepare(number: int) -> None:
         while not ended.is_set():
             i = number % _SESSIONS
-            require_same(serial[i], suite.prepare(i, sessions[i]), f"prepare of session {i} on a thread", cure)
+            require_same(
+                serial[i],
+                suite.prepare(i, sessions[i]),
+                f"prepare of session {i} on a thread",
+                cure,
+            )
 
     with ThreadPoolExecutor(_THREADS) as threads:
         running = [threads.submit(prepare, number) for number in range(_THREADS)]
@@ -274,7 +314,9 @@ class _AgentSuite:
         for _ in range(steps):
             given.append(self.act(i, session))
             kept.append(copy.deepcopy(given[-1]))
-        require_same(kept, given, "an earlier act", "a later one changed it: give a new array each time")
+        require_same(
+            kept, given, "an earlier act", "a later one changed it: give a new array each time"
+        )
         return kept
 
     def act(self, i: int, session: Agent, *, prepared: bool = False) -> Act:
@@ -295,7 +337,9 @@ class _AgentSuite:
         views = self._views[: len(sessions)]
         before = copy.deepcopy(views)
         acts = self._agent.act_batch(views, sessions)
-        require_same(before, views, "the observations", "act_batch changed the caller's: work on copies")
+        require_same(
+            before, views, "the observations", "act_batch changed the caller's: work on copies"
+        )
         if not isinstance(acts, list) or len(acts) != len(sessions):
             got = f"{len(acts)} of them" if isinstance(acts, list) else type(acts).__name__
             raise ContractViolation(f"act_batch: got {got}, want a list of {len(sessions)} acts")
@@ -313,11 +357,17 @@ class _AgentSuite:
 
     def _checked(self, act: object, where: str) -> Act:
         if isinstance(act, Exception):
-            raise ContractViolation(f"{where}: failed with {act!r} for an observation that `act` takes") from act
+            raise ContractViolation(
+                f"{where}: failed with {act!r} for an observation that `act` takes"
+            ) from act
         if not isinstance(act, Act):
             raise ContractViolation(f"{where}: got {type(act).__name__}, want an Act")
         if not isinstance(act.action, np.ndarray) or act.action.dtype != np.float32:
-            got = act.action.dtype if isinstance(act.action, np.ndarray) else type(act.action).__name__
+            got = (
+                act.action.dtype
+                if isinstance(act.action, np.ndarray)
+                else type(act.action).__name__
+            )
             raise ContractViolation(f"{where}: the action is {got}, want a numpy array of float32")
         try:
             check_action(act.action, self._contract)
@@ -325,7 +375,9 @@ class _AgentSuite:
             raise ContractViolation(f"{where}: {error}") from error
         chunk = self._contract.chunk if self._contract is not None else None
         if chunk not in (None, len(act.rows())):
-            raise ContractViolation(f"{where}: the action has {len(act.rows())} rows, the contract states {chunk}")
+            raise ContractViolation(
+                f"{where}: the action has {len(act.rows())} rows, the contract states {chunk}"
+            )
         if type(act.done) is not bool:
             raise ContractViolation(f"{where}: done is {type(act.done).__name__}, want a bool")
         require_wireable(act.info, f"{where}: info")
@@ -333,7 +385,11 @@ class _AgentSuite:
 
 
 def random_observation(
-    contract: Contract | None, seed: int, *, side: int = _SIDE, dims: Mapping[str, int] | None = None
+    contract: Contract | None,
+    seed: int,
+    *,
+    side: int = _SIDE,
+    dims: Mapping[str, int] | None = None,
 ) -> Obs:
     """Make a random observation that fits a contract; equal seeds give equal observations.
 
@@ -352,7 +408,9 @@ def random_observation(
     sizes = {name: part.dim or (dims or {}).get(name, _DIM) for name, part in state.items()}
     return Obs(
         cameras={
-            name: rng.integers(0, 256, (camera.height or side, camera.width or side, 3), dtype=np.uint8)
+            name: rng.integers(
+                0, 256, (camera.height or side, camera.width or side, 3), dtype=np.uint8
+            )
             for name, camera in cameras.items()
         },
         gripper=float(rng.uniform()),
@@ -371,27 +429,34 @@ def check_env(
 ) -> None:
     """Check that an environment implements the interface of `EvalEnv`; closes it.
 
-    Random actions are executed in an episode of each of the two seeds, and then in the first episode again.
+    Random actions are executed in an episode of each of the two seeds, and then in the first
+    episode again.
 
     Args:
         env: The environment, not reset yet.
         steps: The number of actions in an episode.
         seeds: The seeds of two different episodes.
         options: The options of each `reset`.
-        same_steps: Whether the same actions must also lead to the same observations; if False, only the first
-            observation of a seed must be the same, as for a simulator that is not reproducible bit for bit.
+        same_steps: Whether the same actions must also lead to the same observations; if False, only
+            the first observation of a seed must be the same, as for a simulator that is not
+            reproducible bit for bit.
         step_limit: Whether one episode runs until `env.max_steps`; False if that takes too long.
 
     Raises:
-        ContractViolation: The environment does not implement the interface; the message names the place.
+        ContractViolation: The environment does not implement the interface; the message names the
+            place.
     """
     if not isinstance(env, EvalEnv):
-        raise ContractViolation(f"env: got {env!r}, want an EvalEnv; make one of Gymnasium by make_env('gymnasium/ID')")
+        raise ContractViolation(
+            f"env: got {env!r}, want an EvalEnv; make one of Gymnasium by make_env('gymnasium/ID')"
+        )
     contract = env.contract
     if not isinstance(contract, Contract):
         raise ContractViolation(f"contract: got {type(contract).__name__}, want a Contract")
     if contract.action.dim is None:
-        raise ContractViolation("contract.action.dim: got None, want the number of components of an action")
+        raise ContractViolation(
+            "contract.action.dim: got None, want the number of components of an action"
+        )
     if type(env.max_steps) is not int or env.max_steps < 1:
         raise ContractViolation(f"max_steps: got {env.max_steps!r}, want an int of at least 1")
     require_wireable(env.describe(), "describe()")
@@ -402,13 +467,20 @@ def check_env(
     first = suite.play(seeds[0], actions)
     other = suite.play(seeds[1], actions)
     again = suite.play(seeds[0], actions)
-    because = "an episode must be a pure function of its seed and options, whatever was played before"
+    because = (
+        "an episode must be a pure function of its seed and options, whatever was played before"
+    )
     require_same(first.instruction, again.instruction, "instruction", because)
     require_same(first.seen[0], again.seen[0], "the first observation", because)
     if same_steps:
         for i, (a, b) in enumerate(zip(first.seen, again.seen, strict=False)):
             require_same(a, b, f"the observation after step {i}", because)
-        require_same(first.outcomes, again.outcomes, "[reward, terminated, truncated, success] of the steps", because)
+        require_same(
+            first.outcomes,
+            again.outcomes,
+            "[reward, terminated, truncated, success] of the steps",
+            because,
+        )
         suite.check_unseen(seeds[0], actions, first)
     because = "a later step or reset changed it: give new arrays each time"
     for rollout in (first, other, again):
@@ -440,7 +512,9 @@ class _EnvSuite:
         spec = self._contract.action
         low = -1.0 if spec.low is None else spec.low
         high = 1.0 if spec.high is None else spec.high
-        return list(np.random.default_rng(0).uniform(low, high, (count, spec.dim or 1)).astype(np.float32))
+        return list(
+            np.random.default_rng(0).uniform(low, high, (count, spec.dim or 1)).astype(np.float32)
+        )
 
     def play(self, seed: int, actions: list[np.ndarray]) -> _Rollout:
         obs = self.reset(seed)
@@ -467,16 +541,22 @@ class _EnvSuite:
         if not isinstance(instruction, str):
             raise ContractViolation(f"instruction: got {kind_of(instruction)}, want a str")
         if self._contract.instruction and not instruction:
-            raise ContractViolation("instruction: is empty, but the contract states that the env has one")
+            raise ContractViolation(
+                "instruction: is empty, but the contract states that the env has one"
+            )
         return obs
 
     def step(self, action: np.ndarray) -> tuple[Obs, list[Any]]:
-        """Execute an action; return the observation, and reward, terminated, truncated and success."""
+        """Execute an action; return the observation, and reward, terminated, truncated and
+        success.
+        """
         sent = action.copy()
         result = self._env.step(Act(sent))
         require_same(action, sent, "the action", "step must leave the caller's array as it is")
         if not isinstance(result, tuple) or len(result) != 5:
-            raise ContractViolation(f"step: got {kind_of(result)}, want (Obs, reward, terminated, truncated, info)")
+            raise ContractViolation(
+                f"step: got {kind_of(result)}, want (Obs, reward, terminated, truncated, info)"
+            )
         obs, *outcome, info = result
         _check_obs(obs, self._contract, "step")
         kinds = (("reward", float), ("terminated", bool), ("truncated", bool))
@@ -486,22 +566,33 @@ class _EnvSuite:
         if not isinstance(info, dict):
             raise ContractViolation(f"step: info is {kind_of(info)}, want a dict")
         if type(info.get("success")) is not bool:
-            raise ContractViolation(f"step: info['success'] is {kind_of(info.get('success'))}, want a bool")
+            raise ContractViolation(
+                f"step: info['success'] is {kind_of(info.get('success'))}, want a bool"
+            )
         require_wireable(info, "step: info")
         return obs, [*outcome, info["success"]]
 
     def check_unseen(self, seed: int, actions: list[np.ndarray], seen: _Rollout) -> None:
-        """Repeat the episode `seen` with `looked_at` False before the last step; only images may be absent."""
+        """Repeat the episode `seen` with `looked_at` False before the last step; only images may
+        be absent.
+        """
         self.reset(seed)
         last = len(seen.outcomes) - 1
         because = "`looked_at` may omit images and must change nothing else"
         for i, (action, expected) in enumerate(zip(actions, seen.seen[1:], strict=False)):
             self._env.looked_at = i == last
             obs, reward, terminated, truncated, info = self._env.step(Act(action.copy()))
-            a, b = (one if i == last else Obs({}, one.gripper, one.state) for one in (expected, obs))
+            a, b = (
+                one if i == last else Obs({}, one.gripper, one.state) for one in (expected, obs)
+            )
             require_same(a, b, f"the observation after step {i}", because)
             outcome = [reward, terminated, truncated, info["success"]]
-            require_same(seen.outcomes[i], outcome, f"[reward, terminated, truncated, success] of step {i}", because)
+            require_same(
+                seen.outcomes[i],
+                outcome,
+                f"[reward, terminated, truncated, success] of step {i}",
+                because,
+            )
 
     def check_invalid_actions(self, seed: int) -> None:
         self.reset(seed)
@@ -516,7 +607,9 @@ class _EnvSuite:
             except InvalidAction:
                 continue
             except Exception as error:
-                raise ContractViolation(f"step: an action {what} raised {error!r}, want InvalidAction") from error
+                raise ContractViolation(
+                    f"step: an action {what} raised {error!r}, want InvalidAction"
+                ) from error
             raise ContractViolation(f"step: an action {what} was executed, want InvalidAction")
         self.step(good)
 
@@ -543,9 +636,16 @@ def _check_obs(obs: object, contract: Contract, where: str) -> None:
     for name, part in obs.state.items():
         if part.dtype != np.float32:
             raise ContractViolation(f"{where}: state {name!r} is {part.dtype}, want float32")
-    for kind, have, stated in (("cameras", obs.cameras, contract.cameras), ("state", obs.state, contract.state)):
+    for kind, have, stated in (
+        ("cameras", obs.cameras, contract.cameras),
+        ("state", obs.state, contract.state),
+    ):
         if stated is not None and set(have) != set(stated):
-            raise ContractViolation(f"{where}: {kind} are {sorted(have)}, the contract states {sorted(stated)}")
+            raise ContractViolation(
+                f"{where}: {kind} are {sorted(have)}, the contract states {sorted(stated)}"
+            )
     if contract.gripper is False and obs.gripper is not None:
-        raise ContractViolation(f"{where}: gripper is {obs.gripper}, the contract states that there is none")
+        raise ContractViolation(
+            f"{where}: gripper is {obs.gripper}, the contract states that there is none"
+        )
     require_wireable(obs.info, f"{where}: Obs.info")

@@ -1,9 +1,10 @@
 """OpenTelemetry: the tracer of this process, if the environment enables traces; the extra "otel".
 
-`VLAGENTS_RAY_OTEL=1` turns tracing on, both in a client's process and in a server's. A request carries its trace in
-the observation's `info["traceparent"]`, in the format of https://www.w3.org/TR/trace-context/, over every transport.
-The spans go to the program's own tracer provider if it has set one; otherwise to an OTLP exporter, which
-OpenTelemetry's own variables configure (`OTEL_EXPORTER_OTLP_ENDPOINT`, `OTEL_SERVICE_NAME`, `OTEL_TRACES_SAMPLER`).
+`VLAGENTS_RAY_OTEL=1` turns tracing on, both in a client's process and in a server's. A request
+carries its trace in the observation's `info["traceparent"]`, in the format of
+https://www.w3.org/TR/trace-context/, over every transport. The spans go to the program's own tracer
+provider if it has set one; otherwise to an OTLP exporter, which OpenTelemetry's own variables
+configure (`OTEL_EXPORTER_OTLP_ENDPOINT`, `OTEL_SERVICE_NAME`, `OTEL_TRACES_SAMPLER`).
 """
 
 from __future__ import annotations

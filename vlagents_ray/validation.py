@@ -7,7 +7,13 @@ import math
 import numpy as np
 
 from vlagents_ray.contract import Contract, _differ
-from vlagents_ray.errors import InvalidAction, InvalidObservation, MissingCamera, MissingState, NotOffered
+from vlagents_ray.errors import (
+    InvalidAction,
+    InvalidObservation,
+    MissingCamera,
+    MissingState,
+    NotOffered,
+)
 from vlagents_ray.interface import WANT, Obs
 
 LARGEST_ACTION = 1e9  # beyond it no number of an action has a meaning, in any unit
@@ -16,28 +22,48 @@ _UINT8, _FLOAT32 = np.dtype(np.uint8), np.dtype(np.float32)
 
 
 def check_observation(obs: Obs, contract: Contract | None) -> None:
-    """Raise `InvalidObservation` unless `obs` is well formed and has the inputs that `contract` names."""
+    """Raise `InvalidObservation` unless `obs` is well formed and has the inputs that `contract`
+    names.
+    """
     for name, image in obs.cameras.items():
-        if not isinstance(image, np.ndarray) or image.ndim != 3 or image.shape[2] != 3 or image.dtype != _UINT8:
-            raise InvalidObservation(f"camera {name!r}: got {described(image)}, want (H, W, 3) uint8 RGB")
+        if (
+            not isinstance(image, np.ndarray)
+            or image.ndim != 3
+            or image.shape[2] != 3
+            or image.dtype != _UINT8
+        ):
+            raise InvalidObservation(
+                f"camera {name!r}: got {described(image)}, want (H, W, 3) uint8 RGB"
+            )
         if not image.size:
-            raise InvalidObservation(f"camera {name!r}: got {described(image)}, want one pixel at least")
+            raise InvalidObservation(
+                f"camera {name!r}: got {described(image)}, want one pixel at least"
+            )
     if "" in obs.cameras or "" in obs.state:
-        raise InvalidObservation("observation: got a camera or state without a name (''), want a name for each")
+        raise InvalidObservation(
+            "observation: got a camera or state without a name (''), want a name for each"
+        )
     for name, part in obs.state.items():
         if not isinstance(part, np.ndarray) or part.ndim != 1 or part.dtype.kind not in "fiu":
             raise InvalidObservation(f"state {name!r}: got {described(part)}, want (D,) float32")
         if not _finite(part):
-            raise InvalidObservation(f"state {name!r}: got NaN or infinity, want finite numbers; check the sensor")
+            raise InvalidObservation(
+                f"state {name!r}: got NaN or infinity, want finite numbers; check the sensor"
+            )
     if obs.gripper is not None and not 0.0 <= obs.gripper <= 1.0:
-        raise InvalidObservation(f"gripper: got {obs.gripper}, want a number in [0, 1] where 1 = open")
+        raise InvalidObservation(
+            f"gripper: got {obs.gripper}, want a number in [0, 1] where 1 = open"
+        )
     if WANT in obs.info:
         wanted, offered = obs.info[WANT], (contract and contract.behaviour) or ()
         if not isinstance(wanted, list) or not all(isinstance(name, str) for name in wanted):
-            raise InvalidObservation(f"info[{WANT!r}]: got {described(wanted)}, want a list of names")
+            raise InvalidObservation(
+                f"info[{WANT!r}]: got {described(wanted)}, want a list of names"
+            )
         if unknown := sorted(set(wanted) - set(offered)):
             raise NotOffered(
-                f"info[{WANT!r}]: got {unknown}, want some of {sorted(offered)}, the `behaviour` of the policy's "
+                f"info[{WANT!r}]: got {unknown}, want some of {sorted(offered)}, the `behaviour` "
+                "of the policy's "
                 f"contract; take a policy that returns it, or leave it out"
             )
     if contract is not None and (contract.cameras or contract.state or contract.gripper):
@@ -51,25 +77,32 @@ def _check_needs(obs: Obs, contract: Contract) -> None:
         height, width = obs.cameras[name].shape[:2]
         if _differ(camera.height, height) or _differ(camera.width, width):
             raise InvalidObservation(
-                f"camera {name!r}: got {height}x{width}, want {camera.height}x{camera.width}; resize before sending"
+                f"camera {name!r}: got {height}x{width}, want {camera.height}x{camera.width}; "
+                "resize before sending"
             )
     for name, spec in (contract.state or {}).items():
         if name not in obs.state:
             raise MissingState(name, have=obs.state)
         if _differ(spec.dim, obs.state[name].shape[0]):
             raise InvalidObservation(
-                f"state {name!r}: got {obs.state[name].shape}, want ({spec.dim},); see the policy's contract"
+                f"state {name!r}: got {obs.state[name].shape}, want ({spec.dim},); see the "
+                "policy's contract"
             )
     if contract.gripper and obs.gripper is None:
         raise InvalidObservation("gripper: got none, want a number in [0, 1] where 1 = open")
 
 
 def check_action(action: object, contract: Contract | None) -> np.ndarray:
-    """Return the action as (D,) or (H, D) float32; raises `InvalidAction` if it must not be sent to a robot."""
+    """Return the action as (D,) or (H, D) float32; raises `InvalidAction` if it must not be sent
+    to a robot.
+    """
     try:
         array = np.ascontiguousarray(action, dtype=_FLOAT32)
-    except (TypeError, ValueError, RuntimeError) as error:  # RuntimeError: a torch tensor that requires grad
-        raise InvalidAction(f"action: got {described(action)}, want (D,) or (H, D) float32") from error
+    except (TypeError, ValueError, RuntimeError) as error:
+        # RuntimeError: a torch tensor that requires grad
+        raise InvalidAction(
+            f"action: got {described(action)}, want (D,) or (H, D) float32"
+        ) from error
     if array.ndim not in (1, 2) or array.size == 0:
         raise InvalidAction(f"action: got {described(action)}, want (D,) or (H, D) float32")
     largest = _largest(array)
@@ -86,7 +119,9 @@ def check_action(action: object, contract: Contract | None) -> np.ndarray:
 
 
 def _finite(array: np.ndarray) -> bool:
-    """Return whether all numbers are finite; for a robot's few numbers Python is four times as fast as numpy."""
+    """Return whether all numbers are finite; for a robot's few numbers Python is four times as
+    fast as numpy.
+    """
     if array.size <= _FEW:
         return all(map(math.isfinite, array.ravel().tolist()))
     return bool(np.isfinite(array).all())

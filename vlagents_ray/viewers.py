@@ -23,7 +23,17 @@ import numpy as np
 
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.images.jpeg_png import encode_jpeg
-from vlagents_ray.interface import AGE, CAPTURED, INTERVENTION, PLANNED, SAFE, SILENT, WANTED, Act, Obs
+from vlagents_ray.interface import (
+    AGE,
+    CAPTURED,
+    INTERVENTION,
+    PLANNED,
+    SAFE,
+    SILENT,
+    WANTED,
+    Act,
+    Obs,
+)
 from vlagents_ray.registry import require
 
 __all__ = ["EpisodeViewer", "ViewerFrame", "open_viewer"]
@@ -38,12 +48,15 @@ _NICE = 5  # the writing thread has a lower priority than the loop
 
 @dataclass(frozen=True, slots=True)
 class ViewerFrame:
-    """An observation, the chunk planned from it and the action executed next; its arrays do not change later."""
+    """An observation, the chunk planned from it and the action executed next; its arrays do not
+    change later.
+    """
 
     tick: int  # of the episode
     time: float  # s since 1970, of the observation
     cameras: Mapping[str, np.ndarray] = field(default_factory=dict)  # (H, W, 3) uint8 RGB
-    state: Mapping[str, np.ndarray] = field(default_factory=dict)  # (D,) float32; the gripper is a part
+    # (D,) float32; the gripper is a part.
+    state: Mapping[str, np.ndarray] = field(default_factory=dict)
     executed: np.ndarray | None = None  # (D,) float32
     planned: np.ndarray | None = None  # (D,) float32, the row of the newest chunk for this tick
     chunk: np.ndarray | None = None  # (H, D) float32, if a new one begins
@@ -60,27 +73,35 @@ class ViewerFrame:
             what: Further fields.
 
         Returns:
-            The frame, with the time of `info["captured_at"]` if the observation states it, else the current time.
+            The frame, with the time of `info["captured_at"]` if the observation states it, else the
+            current time.
         """
         state = {name: np.array(part) for name, part in obs.state.items()}
         if obs.gripper is not None:
             state["gripper"] = np.array([obs.gripper], np.float32)
         cameras = {name: np.array(image) for name, image in obs.cameras.items()}
-        return cls(tick, **{"time": obs.info.get(CAPTURED, time.time()), **what}, cameras=cameras, state=state)
+        return cls(
+            tick,
+            **{"time": obs.info.get(CAPTURED, time.time()), **what},
+            cameras=cameras,
+            state=state,
+        )
 
 
 class RerunRecordings:
     """Writes a recording of each episode, on the timelines `tick` and `time`.
 
-    Cameras are `cameras/NAME`, parts of the state `state/NAME`, the actions `action/executed`, `action/planned` and
-    `action/chunk`, times and other numbers `timing/NAME`, and notes `log`.
+    Cameras are `cameras/NAME`, parts of the state `state/NAME`, the actions `action/executed`,
+    `action/planned` and `action/chunk`, times and other numbers `timing/NAME`, and notes `log`.
     """
 
     def __init__(self, target: str) -> None:
         """Write `TARGET/EPISODE.rrd`, or send to the viewer at an address; see `open_viewer`."""
         is_live = target == "live" or target.startswith("rerun+")
         if "://" in target and not is_live:
-            raise ConfigError(f"rerun: got {target!r}, want a folder, 'live', or an address such as {LIVE}")
+            raise ConfigError(
+                f"rerun: got {target!r}, want a folder, 'live', or an address such as {LIVE}"
+            )
         self.target = LIVE if target == "live" else target
         self._rerun = require("rerun")
         self._folder = None if is_live else Path(target)
@@ -90,7 +111,9 @@ class RerunRecordings:
             # If nothing listens at the address, the SDK would retry forever.
             where = urlsplit(self.target)
             try:
-                with socket.create_connection((where.hostname or "", where.port or _PORT), CLOSING_S):
+                with socket.create_connection(
+                    (where.hostname or "", where.port or _PORT), CLOSING_S
+                ):
                     pass
             except OSError as error:
                 raise ConfigError(
@@ -101,10 +124,14 @@ class RerunRecordings:
             try:
                 self._folder.mkdir(parents=True, exist_ok=True)
             except OSError as error:
-                raise ConfigError(f"viewer {target}: {error}; want a folder that can be written to") from error
+                raise ConfigError(
+                    f"viewer {target}: {error}; want a folder that can be written to"
+                ) from error
 
     def begin(self, name: str, instruction: str) -> RerunEpisode:
-        """Begin an episode; `name` is also the name of its file, and an empty `instruction` is not shown."""
+        """Begin an episode; `name` is also the name of its file, and an empty `instruction` is
+        not shown.
+        """
         recording = self._rerun.RecordingStream("vlagents_ray", recording_id=uuid4())
         if self._folder is None:
             recording.connect_grpc(self.target)
@@ -150,8 +177,8 @@ def open_viewer(target: str) -> EpisodeViewer:
     """Open a viewer.
 
     Args:
-        target: A folder for `.rrd` files; the address of a viewer, "rerun+http://HOST:PORT/proxy"; or "live", the
-            viewer on this machine.
+        target: A folder for `.rrd` files; the address of a viewer, "rerun+http://HOST:PORT/proxy";
+            or "live", the viewer on this machine.
 
     Returns:
         The viewer, which the caller closes.
@@ -170,9 +197,9 @@ class EpisodeViewer:
             with viewer.episode("stack_0", "stack the cups"):
                 viewer.add(ViewerFrame.of(obs, tick=0, executed=action))
 
-    `add` puts the frame into a queue and returns. If the queue is full, because the disk or the other side of a live
-    connection is slow, the frame is dropped and counted in `dropped`. If writing fails, the rest of the episode is not
-    shown; the error is logged, and kept in `error`.
+    `add` puts the frame into a queue and returns. If the queue is full, because the disk or the
+    other side of a live connection is slow, the frame is dropped and counted in `dropped`. If
+    writing fails, the rest of the episode is not shown; the error is logged, and kept in `error`.
 
     Args:
         target: Where episodes are written to.
@@ -199,7 +226,8 @@ class EpisodeViewer:
 
     @contextlib.contextmanager
     def episode(self, name: str, instruction: str = "") -> Iterator[None]:
-        """Show the frames that are added within the context as one episode, however the context ends.
+        """Show the frames that are added within the context as one episode, however the context
+        ends.
 
         Args:
             name: The name of the episode, and of its file.
@@ -220,18 +248,29 @@ class EpisodeViewer:
         self._queue.put(frame)
 
     def close(self) -> None:
-        """Write the queued frames, and close the target; a live viewer has two seconds to receive them."""
+        """Write the queued frames, and close the target; a live viewer has two seconds to
+        receive them.
+        """
         if not self._closed:
             self._closed = True
             self._queue.put(None)
             self._thread.join(self._recordings.closing_s)
             if self._thread.is_alive():
-                self.error = self.error or TimeoutError(f"nothing at {self._recordings.target} takes what is left")
+                self.error = self.error or TimeoutError(
+                    f"nothing at {self._recordings.target} takes what is left"
+                )
 
     def report(self) -> str:
         """Return a line with the number of episodes shown and frames dropped."""
-        line = f"rerun: {self.episodes} episodes in {self._recordings.target}, {self.dropped} frames dropped"
-        return line if self.error is None else f"{line}; stopped by {type(self.error).__name__}: {self.error}"
+        line = (
+            f"rerun: {self.episodes} episodes in {self._recordings.target}, {self.dropped} "
+            "frames dropped"
+        )
+        return (
+            line
+            if self.error is None
+            else f"{line}; stopped by {type(self.error).__name__}: {self.error}"
+        )
 
     def __enter__(self) -> EpisodeViewer:
         return self
@@ -270,15 +309,27 @@ class LoopView:
         self._note = ""
 
     def episode(self, instruction: str) -> contextlib.AbstractContextManager[None]:
-        """Show the frames added within the context as one episode, with its time (UTC) as its name."""
+        """Show the frames added within the context as one episode, with its time (UTC) as its
+        name.
+        """
         if self._viewer is None:
             return contextlib.nullcontext()
         now = time.time()
         name = f"{time.strftime('%Y%m%d_%H%M%S', time.gmtime(now))}_{int(now * 1e3) % 1000:03d}"
         return self._viewer.episode(name, instruction)
 
-    def add(self, obs: Obs, act: Act, executed: np.ndarray | None, tick: int, work_s: float, stop: str = "") -> None:
-        """Show a tick with the time that the loop worked, `work_s`, and the reason of a stop; never waits."""
+    def add(
+        self,
+        obs: Obs,
+        act: Act,
+        executed: np.ndarray | None,
+        tick: int,
+        work_s: float,
+        stop: str = "",
+    ) -> None:
+        """Show a tick with the time that the loop worked, `work_s`, and the reason of a stop;
+        never waits.
+        """
         if (viewer := self._viewer) is None:
             return
         if not viewer.has_room:

@@ -10,7 +10,8 @@ from typing import Any
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.registry import CORE, require
 
-# YAML 1.1 reads only `1.0e+12` as a number, and `1e12` as text; YAML 1.2 and JSON read both as numbers.
+# YAML 1.1 reads only `1.0e+12` as a number, and `1e12` as text; YAML 1.2 and JSON read both as
+# numbers.
 _FLOAT = re.compile(r"[-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)[eE][-+]?[0-9]+")
 
 
@@ -36,7 +37,9 @@ def load_yaml(text: str, *, extra: str = "serve", distribution: str = CORE) -> A
 
 
 def read_yaml(file: Path | str, *, extra: str = "serve") -> Any:
-    """Return the document in a file; raise `ConfigError` if it cannot be read or `load_yaml` raises."""
+    """Return the document in a file; raise `ConfigError` if it cannot be read or `load_yaml`
+    raises.
+    """
     try:
         return load_yaml(Path(file).read_text(encoding="utf-8"), extra=extra)
     except OSError as error:

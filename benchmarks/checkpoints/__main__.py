@@ -14,13 +14,22 @@ from vlagents_ray.cli.console import errors, out
 def main(
     family: Annotated[str, typer.Argument(help="pi0, smolvla, pi05, act, diffusion or openvla.")],
     folder: Annotated[Path, typer.Argument(help="A new folder.")],
-    size: Annotated[Literal["full", "small"], typer.Option(help="full: as published; small: for a CPU.")] = "full",
-    dtype: Annotated[str | None, typer.Option(help="Of the weights; default: bfloat16, if the family has it.")] = None,
+    size: Annotated[
+        Literal["full", "small"], typer.Option(help="full: as published; small: for a CPU.")
+    ] = "full",
+    dtype: Annotated[
+        str | None, typer.Option(help="Of the weights; default: bfloat16, if the family has it.")
+    ] = None,
 ) -> None:
-    """Write random weights of a family's true size, and a deployment file; run it in the family's environment."""
+    """Write random weights of a family's true size, and a deployment file; run it in the
+    family's environment.
+    """
     with errors():
         written = write_checkpoint(family, folder, size, dtype)
-    out.print(f"{written.parameters:,} parameters: python -m benchmarks.policy {folder / 'deployment.yaml'} --out FILE")
+    out.print(
+        f"{written.parameters:,} parameters: python -m benchmarks.policy "
+        f"{folder / 'deployment.yaml'} --out FILE"
+    )
 
 
 if __name__ == "__main__":

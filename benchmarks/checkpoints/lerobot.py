@@ -21,29 +21,51 @@ from vlagents_ray_models.lerobot.checkpoint import require_served
 
 JOINTS = 6  # an SO-100
 _IMAGE_TOKENS = ("<image>", "<fake_token_around_image>", "<global-img>", "<end_of_utterance>")
-# SmolVLM2-500M, of which SmolVLA takes the first 16 layers (huggingface.co/HuggingFaceTB/SmolVLM2-500M-Video-Instruct)
+# SmolVLM2-500M, of which SmolVLA takes the first 16 layers
+# (huggingface.co/HuggingFaceTB/SmolVLM2-500M-Video-Instruct)
 SMOLVLM: Mapping[str, Any] = {
     "scale_factor": 4,
     "vision": {
-        "hidden_size": 768, "intermediate_size": 3072, "num_hidden_layers": 12, "num_attention_heads": 12,
-        "image_size": 512, "patch_size": 16, "max_image_size": {"longest_edge": 512},
+        "hidden_size": 768,
+        "intermediate_size": 3072,
+        "num_hidden_layers": 12,
+        "num_attention_heads": 12,
+        "image_size": 512,
+        "patch_size": 16,
+        "max_image_size": {"longest_edge": 512},
     },
     "text": {
-        "hidden_size": 960, "intermediate_size": 2560, "num_hidden_layers": 32, "num_attention_heads": 15,
-        "num_key_value_heads": 5, "head_dim": 64, "vocab_size": 49280, "max_position_embeddings": 8192,
-        "rope_theta": 100000, "rms_norm_eps": 1e-5,
+        "hidden_size": 960,
+        "intermediate_size": 2560,
+        "num_hidden_layers": 32,
+        "num_attention_heads": 15,
+        "num_key_value_heads": 5,
+        "head_dim": 64,
+        "vocab_size": 49280,
+        "max_position_embeddings": 8192,
+        "rope_theta": 100000,
+        "rms_norm_eps": 1e-5,
     },
-}  # fmt: skip
+}
 _SMALL_SMOLVLM: Mapping[str, Any] = {
     "scale_factor": 4,
-    "vision": SMOLVLM["vision"] | {
-        "hidden_size": 192, "intermediate_size": 768, "num_hidden_layers": 4, "num_attention_heads": 3,
+    "vision": SMOLVLM["vision"]
+    | {
+        "hidden_size": 192,
+        "intermediate_size": 768,
+        "num_hidden_layers": 4,
+        "num_attention_heads": 3,
     },
-    "text": SMOLVLM["text"] | {
-        "hidden_size": 384, "intermediate_size": 1024, "num_hidden_layers": 8, "num_attention_heads": 6,
-        "num_key_value_heads": 2, "vocab_size": 400,
+    "text": SMOLVLM["text"]
+    | {
+        "hidden_size": 384,
+        "intermediate_size": 1024,
+        "num_hidden_layers": 8,
+        "num_attention_heads": 6,
+        "num_key_value_heads": 2,
+        "vocab_size": 400,
     },
-}  # fmt: skip
+}
 
 
 def write(recipe: Recipe) -> WrittenCheckpoint:
@@ -69,18 +91,24 @@ def make_policy(recipe: Recipe) -> tuple[Any, Any]:
     policy_class = require("lerobot.policies.factory").get_policy_class(config.type)
     filled = recipe.family in ("act", "diffusion")  # Diffusion runs its backbone when it is made
     device = config.device
-    with contextlib.nullcontext() if filled else parameters_on_meta(), contextlib.redirect_stdout(io.StringIO()):
+    with (
+        contextlib.nullcontext() if filled else parameters_on_meta(),
+        contextlib.redirect_stdout(io.StringIO()),
+    ):
         config.device = device if filled else "meta"
         policy = policy_class(config)
     config.device = device
     if recipe.family == "smolvla" and recipe.dtype == "bfloat16":
-        # as published: the language model's weights, with which LeRobot began, are bfloat16, and the rest is float32
+        # as published: the language model's weights, with which LeRobot began, are bfloat16, and
+        # the rest is float32
         policy.model.vlm_with_expert.vlm.to(require("torch").bfloat16)
         config.load_vlm_weights = True
     return policy, config
 
 
-def make_config(name: str, inputs: Mapping[str, Any], actions: int = JOINTS, **settings: Any) -> Any:
+def make_config(
+    name: str, inputs: Mapping[str, Any], actions: int = JOINTS, **settings: Any
+) -> Any:
     """Return LeRobot's config of a policy with these `features`, on the CPU."""
     types = require("lerobot.configs.types")
     features = {
@@ -88,7 +116,9 @@ def make_config(name: str, inputs: Mapping[str, Any], actions: int = JOINTS, **s
         "output_features": {"action": types.PolicyFeature(types.FeatureType.ACTION, (actions,))},
     }
     factory = require("lerobot.policies.factory")
-    return factory.make_policy_config(name, device="cpu", push_to_hub=False, **{**features, **settings})
+    return factory.make_policy_config(
+        name, device="cpu", push_to_hub=False, **{**features, **settings}
+    )
 
 
 def features(cameras: Sequence[str], side: int, state: int = JOINTS) -> dict[str, Any]:
@@ -102,13 +132,23 @@ def features(cameras: Sequence[str], side: int, state: int = JOINTS) -> dict[str
 def make_statistics(
     state: int = JOINTS, actions: int = JOINTS, cameras: Sequence[str] = ()
 ) -> dict[str, dict[str, np.ndarray]]:
-    """Return statistics of an invented dataset; none is the identity, and all cameras share theirs."""
+    """Return statistics of an invented dataset; none is the identity, and all cameras share
+    theirs.
+    """
     rng = np.random.default_rng(0)
 
     def of(*shape: int) -> dict[str, np.ndarray]:
         mean, spread = rng.uniform(-0.2, 0.2, shape), rng.uniform(0.5, 1.5, shape)
-        bounds = {"min": mean - spread, "max": mean + spread, "q01": mean - spread, "q99": mean + spread}
-        return {name: value.astype(np.float32) for name, value in {"mean": mean, "std": spread, **bounds}.items()}
+        bounds = {
+            "min": mean - spread,
+            "max": mean + spread,
+            "q01": mean - spread,
+            "q99": mean + spread,
+        }
+        return {
+            name: value.astype(np.float32)
+            for name, value in {"mean": mean, "std": spread, **bounds}.items()
+        }
 
     found = {"observation.state": of(state), "action": of(actions)}
     return found | dict.fromkeys(cameras, of(3, 1, 1))
@@ -118,13 +158,17 @@ def write_processors(folder: Path, config: Any) -> None:
     """Write the pipelines before and after a policy, with the statistics of its features."""
     [state], [actions] = config.robot_state_feature.shape, config.action_feature.shape
     statistics = make_statistics(state, actions, list(config.image_features))
-    for pipeline in require("lerobot.policies.factory").make_pre_post_processors(config, dataset_stats=statistics):
+    for pipeline in require("lerobot.policies.factory").make_pre_post_processors(
+        config, dataset_stats=statistics
+    ):
         pipeline.save_pretrained(folder)
 
 
 @contextlib.contextmanager
 def local_tokenizer(kind: str, folder: Path) -> Iterator[None]:
-    """Make π0's and π0.5's pipelines name a tokenizer in `folder` instead of LeRobot's, which is a download."""
+    """Make π0's and π0.5's pipelines name a tokenizer in `folder` instead of LeRobot's, which is
+    a download.
+    """
     if not folder.is_dir():
         yield
         return
@@ -138,7 +182,9 @@ def local_tokenizer(kind: str, folder: Path) -> Iterator[None]:
 
 
 def write_smolvlm(folder: Path, size: Mapping[str, Any]) -> Any:
-    """Write config and processor of SmolVLM to `folder`, which a SmolVLA's config names; returns the config."""
+    """Write config and processor of SmolVLM to `folder`, which a SmolVLA's config names; returns
+    the config.
+    """
     transformers = require("transformers")
     pad, begin, end = SPECIAL.values()
     tokens = byte_level([pad, begin, end, *_IMAGE_TOKENS])
@@ -152,12 +198,18 @@ def write_smolvlm(folder: Path, size: Mapping[str, Any]) -> Any:
         scale_factor=size["scale_factor"],
         pad_token_id=ids["pad_token"],
         vision_config=dict(size["vision"]),
-        text_config={"model_type": "llama", **{f"{name}_id": number for name, number in ids.items()}, **size["text"]},
+        text_config={
+            "model_type": "llama",
+            **{f"{name}_id": number for name, number in ids.items()},
+            **size["text"],
+        },
     )
     config.save_pretrained(folder)
     video = require("transformers.models.smolvlm.video_processing_smolvlm").SmolVLMVideoProcessor()
     images = transformers.SmolVLMImageProcessor()
-    transformers.SmolVLMProcessor(images, tokenizer, video, chat_template=None).save_pretrained(folder)
+    transformers.SmolVLMProcessor(images, tokenizer, video, chat_template=None).save_pretrained(
+        folder
+    )
     return config
 
 
@@ -175,20 +227,29 @@ def _smolvla(recipe: Recipe) -> Any:
 
 def _pi05(recipe: Recipe) -> Any:
     if recipe.size == "small":
-        raise ConfigError("--size small: LeRobot's pi05 has no smaller size; make pi0, whose network is alike, or full")
+        raise ConfigError(
+            "--size small: LeRobot's pi05 has no smaller size; make pi0, whose network is alike, "
+            "or full"
+        )
     require_served("pi05", recipe.folder)
     cameras = ("base_0_rgb", "left_wrist_0_rgb", "right_wrist_0_rgb")
     return make_config("pi05", features(cameras, 224, 32), 32, dtype=recipe.dtype)
 
 
 def _act(recipe: Recipe) -> Any:
-    small: dict[str, Any] = {"dim_model": 256, "dim_feedforward": 1024, "n_heads": 4} if recipe.size == "small" else {}
-    return make_config("act", features(("top", "wrist"), 224), pretrained_backbone_weights=None, **small)
+    small: dict[str, Any] = (
+        {"dim_model": 256, "dim_feedforward": 1024, "n_heads": 4} if recipe.size == "small" else {}
+    )
+    return make_config(
+        "act", features(("top", "wrist"), 224), pretrained_backbone_weights=None, **small
+    )
 
 
 def _diffusion(recipe: Recipe) -> Any:
     small: dict[str, Any] = {"down_dims": (128, 256, 512)} if recipe.size == "small" else {}
-    return make_config("diffusion", features(("top", "wrist"), 96), pretrained_backbone_weights=None, **small)
+    return make_config(
+        "diffusion", features(("top", "wrist"), 96), pretrained_backbone_weights=None, **small
+    )
 
 
 _CONFIGS: Mapping[str, Callable[[Recipe], Any]] = {

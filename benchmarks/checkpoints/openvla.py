@@ -18,7 +18,8 @@ from vlagents_ray.registry import require
 from vlagents_ray_models.openvla.prismatic import FILE, find_source, model_classes
 
 ACTION_DIM, PROPRIO_DIM = 7, 8
-VOCABULARY = 32064  # Llama's 32000 and one for padding, in multiples of 64: action tokens count from its end
+# Llama's 32000 and one for padding, in multiples of 64: action tokens count from its end.
+VOCABULARY = 32064
 BINS, _MULTIPLE = 256, 64
 _PADDING = 32000
 _SIDE = 224  # px
@@ -39,7 +40,12 @@ class PrismaticSize:
 
 
 SMALL = PrismaticSize(
-    {"hidden_size": 256, "intermediate_size": 688, "num_hidden_layers": 8, "num_attention_heads": 8},
+    {
+        "hidden_size": 256,
+        "intermediate_size": 688,
+        "num_hidden_layers": 8,
+        "num_attention_heads": 8,
+    },
     ("vit_tiny_patch16_224", "vit_tiny_patch16_224"),
 )
 
@@ -48,12 +54,19 @@ def write(recipe: Recipe) -> WrittenCheckpoint:
     """Write the checkpoint of OpenVLA-7B's config, or of `SMALL`."""
     source, folder = find_source(None), recipe.folder
     model, processor = make_model(recipe, source)
-    parameters = write_weights(model, folder, changes={"language_model.lm_head.weight": answer_with_actions})
+    parameters = write_weights(
+        model, folder, changes={"language_model.lm_head.weight": answer_with_actions}
+    )
     model.config.save_pretrained(folder)
     processor.save_pretrained(folder)
     make_tokenizer().save_pretrained(folder)
     (folder / FILE).write_text(json.dumps(make_statistics([_DATASET])))
-    settings = {"checkpoint": str(folder), "source_dir": str(source), "dtype": recipe.dtype, "unnorm_key": _DATASET}
+    settings = {
+        "checkpoint": str(folder),
+        "source_dir": str(source),
+        "dtype": recipe.dtype,
+        "unnorm_key": _DATASET,
+    }
     return WrittenCheckpoint("openvla", parameters, settings)
 
 
@@ -61,7 +74,9 @@ def make_model(recipe: Recipe, source: Path) -> tuple[Any, Any]:
     """Return the model, on the device meta, and its image processor, by the code in `source`."""
     ensure_torchvision()
     size = SMALL if recipe.size == "small" else None
-    model_class, processor_class = model_classes(recipe.folder, str(source), trust_remote_code=False)
+    model_class, processor_class = model_classes(
+        recipe.folder, str(source), trust_remote_code=False
+    )
     with parameters_on_meta():
         model = model_class(make_config(model_class.config_class, size))
     model.to(getattr(require("torch"), recipe.dtype))
@@ -70,7 +85,9 @@ def make_model(recipe: Recipe, source: Path) -> tuple[Any, Any]:
 
 
 def make_config(config_class: Any, size: PrismaticSize | None = None, **settings: Any) -> Any:
-    """Return OpenVLA's config with the published sizes, or with `size`, and with any other `settings`."""
+    """Return OpenVLA's config with the published sizes, or with `size`, and with any other
+    `settings`.
+    """
     text: dict[str, Any] = {"vocab_size": VOCABULARY, "pad_token_id": _PADDING}
     if size is not None:
         text |= size.text
@@ -89,7 +106,9 @@ def make_config(config_class: Any, size: PrismaticSize | None = None, **settings
 
 
 def answer_with_actions(head: Any) -> None:
-    """Make a language model's head, (V, D), answer with action tokens, like that of a trained model."""
+    """Make a language model's head, (V, D), answer with action tokens, like that of a trained
+    model.
+    """
     last = VOCABULARY - _MULTIPLE
     head[: last - BINS] = 0
     head[last:] = 0
@@ -128,5 +147,10 @@ def make_statistics(datasets: Sequence[str]) -> dict[str, Any]:
 
 def _ranges(rng: np.random.Generator, dim: int) -> dict[str, Any]:
     middle, reach = rng.normal(size=dim), rng.uniform(0.5, 2, dim)
-    ends = {"q01": middle - reach, "q99": middle + reach, "min": middle - 2 * reach, "max": middle + 2 * reach}
+    ends = {
+        "q01": middle - reach,
+        "q99": middle + reach,
+        "min": middle - 2 * reach,
+        "max": middle + 2 * reach,
+    }
     return {name: values.tolist() for name, values in ends.items()}

@@ -40,7 +40,9 @@ def write(recipe: Recipe) -> WrittenCheckpoint:
     processor.save_pretrained(recipe.folder)
     # one part of the state, so that its length is known
     return WrittenCheckpoint(
-        "pi0", parameters, {"checkpoint": str(recipe.folder), "state": ["joints"], "dtype": recipe.dtype}
+        "pi0",
+        parameters,
+        {"checkpoint": str(recipe.folder), "state": ["joints"], "dtype": recipe.dtype},
     )
 
 
@@ -62,7 +64,9 @@ def transformers_class(name: str) -> Any:
 
 
 def make_config(processor: Any, size: Pi0Size | None = None, **settings: Any) -> Any:
-    """Return transformers' `PI0Config` with the published sizes, or with `size`, and with any other `settings`."""
+    """Return transformers' `PI0Config` with the published sizes, or with `size`, and with any
+    other `settings`.
+    """
     config_class = transformers_class("PI0Config")
     published = config_class()
     vision_language, expert = published.vlm_config.to_dict(), published.dit_config.to_dict()
@@ -73,13 +77,23 @@ def make_config(processor: Any, size: Pi0Size | None = None, **settings: Any) ->
         words = len(processor.tokenizer) + _SPARE_TOKENS
         vision_language["projection_dim"] = size.width
         vision_language["text_config"] |= {
-            "hidden_size": size.width, "intermediate_size": 4 * size.width, "vocab_size": words, **shared
-        }  # fmt: skip
+            "hidden_size": size.width,
+            "intermediate_size": 4 * size.width,
+            "vocab_size": words,
+            **shared,
+        }
         vision_language["vision_config"] |= {
-            "hidden_size": size.width, "intermediate_size": 2 * size.width, "patch_size": size.patch,
-            "num_hidden_layers": size.vision_layers, "num_attention_heads": 4,
-        }  # fmt: skip
-        expert |= {"hidden_size": size.expert_width, "intermediate_size": 4 * size.expert_width, **shared}
+            "hidden_size": size.width,
+            "intermediate_size": 2 * size.width,
+            "patch_size": size.patch,
+            "num_hidden_layers": size.vision_layers,
+            "num_attention_heads": 4,
+        }
+        expert |= {
+            "hidden_size": size.expert_width,
+            "intermediate_size": 4 * size.expert_width,
+            **shared,
+        }
     return config_class(vlm_config=vision_language, dit_config=expert, **settings)
 
 

@@ -40,12 +40,15 @@ FAMILIES = {
 }
 
 
-def write_checkpoint(family: str, folder: Path, size: SizeName = "full", dtype: str | None = None) -> WrittenCheckpoint:
+def write_checkpoint(
+    family: str, folder: Path, size: SizeName = "full", dtype: str | None = None
+) -> WrittenCheckpoint:
     """Write a checkpoint of random weights, and a deployment file that serves it with this Python.
 
     Args:
         family: One of `FAMILIES`.
-        folder: Where the checkpoint and `deployment.yaml` are written; it must not exist, or be empty.
+        folder: Where the checkpoint and `deployment.yaml` are written; it must not exist, or be
+            empty.
         size: "full" is the published size, "small" some tens of millions of parameters.
         dtype: Of the weights; None: the family's usual one.
 
@@ -53,18 +56,24 @@ def write_checkpoint(family: str, folder: Path, size: SizeName = "full", dtype: 
         The written checkpoint.
 
     Raises:
-        ConfigError: The family, the type of the weights or the size is unknown, or the folder is not empty.
+        ConfigError: The family, the type of the weights or the size is unknown, or the folder is
+            not empty.
         MissingDependency: The family's packages are not installed in this Python.
     """
     known = FAMILIES.get(family)
     if known is None:
-        raise ConfigError(f"family: got {family!r}, want one of {list(FAMILIES)}{did_you_mean(family, FAMILIES)}")
+        raise ConfigError(
+            f"family: got {family!r}, want one of {list(FAMILIES)}{did_you_mean(family, FAMILIES)}"
+        )
     dtype = dtype or known.dtypes[0]
     if dtype not in known.dtypes:
-        raise ConfigError(f"--dtype: got {dtype!r}, {family} is made in {' or '.join(known.dtypes)}")
+        raise ConfigError(
+            f"--dtype: got {dtype!r}, {family} is made in {' or '.join(known.dtypes)}"
+        )
     if missing := [name for name in known.packages if importlib.util.find_spec(name) is None]:
         raise MissingDependency(
-            f"{family}: {sys.executable} has no {', '.join(missing)}; run this command in the family's environment: "
+            f"{family}: {sys.executable} has no {', '.join(missing)}; run this command in the "
+            "family's environment: "
             f"`vlagents-ray env make {known.environment} --out .venv-{known.environment}`, then "
             f"`.venv-{known.environment}/bin/python -m benchmarks.checkpoints {family} {folder}`"
         )
@@ -90,7 +99,12 @@ def _write_deployment(file: Path, family: str, written: WrittenCheckpoint) -> No
         "batch": {"max_size": _LARGEST_BATCH},
         "resources": {"num_gpus": int(require("torch").cuda.is_available())},
     }
-    app = {"name": family, "route_prefix": "/", "import_path": "vlagents_ray.serve.app:build", "args": args}
+    app = {
+        "name": family,
+        "route_prefix": "/",
+        "import_path": "vlagents_ray.serve.app:build",
+        "args": args,
+    }
     document = {"http_options": {"host": "127.0.0.1", "port": 8000}, "applications": [app]}
     head = f"# {family} with {written.parameters:,} random parameters: its actions mean nothing.\n"
     file.write_text(head + yaml.safe_dump(document, sort_keys=False))

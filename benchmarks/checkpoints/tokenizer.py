@@ -11,7 +11,9 @@ SENTENCES = ("pick up the cube\n", "open the drawer\n")
 SPECIAL = {"pad_token": "<pad>", "bos_token": "<bos>", "eos_token": "<eos>"}
 
 
-def byte_level(special: Sequence[str], sentences: Sequence[str] = SENTENCES, vocabulary: int = 300) -> Any:
+def byte_level(
+    special: Sequence[str], sentences: Sequence[str] = SENTENCES, vocabulary: int = 300
+) -> Any:
     """Train a `tokenizers.Tokenizer` of bytes and the frequent parts of a few sentences.
 
     Args:
@@ -34,7 +36,9 @@ def byte_level(special: Sequence[str], sentences: Sequence[str] = SENTENCES, voc
 
 
 def fast_tokenizer(tokens: Any = None, **named: Any) -> Any:
-    """Return transformers' tokenizer with the special tokens `named`, or `SPECIAL`; `tokens` is one of `byte_level`."""
+    """Return transformers' tokenizer with the special tokens `named`, or `SPECIAL`; `tokens` is
+    one of `byte_level`.
+    """
     named = named or SPECIAL
     tokens = byte_level(list(SPECIAL.values())) if tokens is None else tokens
     return require("transformers").PreTrainedTokenizerFast(tokenizer_object=tokens, **named)

@@ -1,7 +1,7 @@
 """Random weights in safetensors files, written one tensor at a time.
 
-A model on the device meta has names, shapes and types, but no values. Each tensor gets its values when it is written,
-so that memory holds one tensor, not the model.
+A model on the device meta has names, shapes and types, but no values. Each tensor gets its values
+when it is written, so that memory holds one tensor, not the model.
 """
 
 from __future__ import annotations
@@ -18,13 +18,22 @@ from vlagents_ray.errors import ConfigError
 from vlagents_ray.registry import require
 
 SHARD_BYTES = 5 * 10**9
-_TYPES = {"float32": "F32", "bfloat16": "BF16", "float16": "F16", "int64": "I64", "int32": "I32", "bool": "BOOL"}
+_TYPES = {
+    "float32": "F32",
+    "bfloat16": "BF16",
+    "float16": "F16",
+    "int64": "I64",
+    "int32": "I32",
+    "bool": "BOOL",
+}
 _SPREAD = 0.1  # of scales around 1, and of biases around 0
 
 
 @contextmanager
 def parameters_on_meta() -> Iterator[None]:
-    """Create parameters of modules made within without values; buffers keep theirs, which a checkpoint may lack."""
+    """Create parameters of modules made within without values; buffers keep theirs, which a
+    checkpoint may lack.
+    """
     module_class = require("torch").nn.Module
     parameter_class = require("torch").nn.Parameter
     register = module_class.register_parameter
@@ -51,13 +60,16 @@ def write_weights(
     """Write parameters and saved buffers of a model to `folder`, in their types.
 
     Args:
-        model: The model. A tensor on the device meta gets random values; any other one keeps its own.
+        model: The model. A tensor on the device meta gets random values; any other one keeps its
+            own.
         folder: Gets model.safetensors, or, of a larger model, several shards and their index.
-        shard_bytes: The size of a shard, at most, unless a single tensor is larger; None: everything is in one file.
+        shard_bytes: The size of a shard, at most, unless a single tensor is larger; None:
+            everything is in one file.
         changes: Functions by the name of a tensor that change its values before they are written.
 
     Returns:
-        The number of parameters; one that has several names counts once, and is written under its first name.
+        The number of parameters; one that has several names counts once, and is written under its
+        first name.
 
     Raises:
         ConfigError: The disk has too little space.
@@ -73,11 +85,15 @@ def write_weights(
         filled += _size(tensor)
     total, free = sum(map(_size, tensors.values())), shutil.disk_usage(folder).free
     if total > free:
-        raise ConfigError(f"{folder}: got {free / 1e9:.1f} GB of free space, want {total / 1e9:.1f} GB")
+        raise ConfigError(
+            f"{folder}: got {free / 1e9:.1f} GB of free space, want {total / 1e9:.1f} GB"
+        )
     files = _file_names(len(shards))
     generator = require("torch").Generator().manual_seed(0)
     for file, names in zip(files, shards, strict=True):
-        _write_file(folder / file, {name: tensors[name] for name in names}, generator, changes or {})
+        _write_file(
+            folder / file, {name: tensors[name] for name in names}, generator, changes or {}
+        )
     if len(files) > 1:
         places = {name: file for file, names in zip(files, shards, strict=True) for name in names}
         index = {"metadata": {"total_size": total}, "weight_map": places}
@@ -86,7 +102,9 @@ def write_weights(
 
 
 def fill(tensor: Any, name: str, generator: Any) -> None:
-    """Fill a tensor with random values that preserve the scale of activations: 1 / sqrt(inputs) for a matrix."""
+    """Fill a tensor with random values that preserve the scale of activations: 1 / sqrt(inputs)
+    for a matrix.
+    """
     if not tensor.is_floating_point():
         tensor.zero_()
         return
@@ -115,9 +133,14 @@ def _file_names(count: int) -> list[str]:
 
 
 def _write_file(
-    path: Path, tensors: Mapping[str, Any], generator: Any, changes: Mapping[str, Callable[[Any], None]]
+    path: Path,
+    tensors: Mapping[str, Any],
+    generator: Any,
+    changes: Mapping[str, Callable[[Any], None]],
 ) -> None:
-    """Write a safetensors file: 8 bytes with the length of the header, the header (JSON), and the tensors' bytes."""
+    """Write a safetensors file: 8 bytes with the length of the header, the header (JSON), and
+    the tensors' bytes.
+    """
     torch = require("torch")
     header: dict[str, Any] = {"__metadata__": {"format": "pt"}}
     end = 0

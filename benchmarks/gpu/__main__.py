@@ -1,8 +1,9 @@
 """What only a GPU can show, in at most ten minutes: `make gpu`. It needs neither Ray nor a network.
 
-Each step runs in a process of its own within a time limit, so that a crash costs one step. After each step, the folder
-`--out` has what was found so far: gpu.json, gpu.md with tables, and gpu.log with the output of all steps. The exit
-status is 0 if all criteria were met. `--dry` runs the same steps in small sizes on a CPU, and judges no time.
+Each step runs in a process of its own within a time limit, so that a crash costs one step. After
+each step, the folder `--out` has what was found so far: gpu.json, gpu.md with tables, and gpu.log
+with the output of all steps. The exit status is 0 if all criteria were met. `--dry` runs the same
+steps in small sizes on a CPU, and judges no time.
 """
 
 from __future__ import annotations
@@ -21,10 +22,14 @@ from benchmarks.gpu.steps import STEPS
 
 
 def main(
-    out: Annotated[Path, typer.Option(envvar="OUT", help="The folder of the report.")] = Path("build/gpu"),
+    out: Annotated[Path, typer.Option(envvar="OUT", help="The folder of the report.")] = Path(
+        "build/gpu"
+    ),
     steps: Annotated[str, typer.Option(help=f"Some of {', '.join(STEPS)}; default: all.")] = "",
     seconds: Annotated[float, typer.Option(min=1, help="For all steps together.")] = 570.0,
-    rows: Annotated[str, typer.Option(help="The batch sizes of the steps graphs and compiled.")] = "1,4,16",
+    rows: Annotated[
+        str, typer.Option(help="The batch sizes of the steps graphs and compiled.")
+    ] = "1,4,16",
     dry: Annotated[bool, typer.Option("--dry", help="Small sizes, on a CPU.")] = False,
 ) -> None:
     """Measure and check everything that needs a GPU."""
@@ -35,9 +40,13 @@ def main(
     (out / "gpu.log").unlink(missing_ok=True)
     memory = Path("/dev/shm")  # noqa: S108 - the checkpoints of 7 GB are read several times
     with tempfile.TemporaryDirectory(dir=memory if memory.is_dir() else None) as scratch:
-        os.environ["TORCHINDUCTOR_CACHE_DIR"] = f"{scratch}/programs"  # so that the first start compiles all
-        os.environ.setdefault("PYTORCH_NVML_BASED_CUDA_CHECK", "1")  # imports must not initialise CUDA before a fork
-        plan = Plan(out.absolute(), Path(scratch), dry, seconds, tuple(parse_counts(rows, "--rows")))
+        # So that the first start compiles all.
+        os.environ["TORCHINDUCTOR_CACHE_DIR"] = f"{scratch}/programs"
+        # Imports must not initialise CUDA before a fork.
+        os.environ.setdefault("PYTORCH_NVML_BASED_CUDA_CHECK", "1")
+        plan = Plan(
+            out.absolute(), Path(scratch), dry, seconds, tuple(parse_counts(rows, "--rows"))
+        )
         met = Runner(plan, {name: STEPS[name] for name in names}).run()
     raise typer.Exit(0 if met else 1)
 

@@ -1,4 +1,5 @@
-"""What the steps of `benchmarks.gpu` import, once for all: their processes are forked from one that has imported this.
+"""What the steps of `benchmarks.gpu` import, once for all: their processes are forked from one that
+has imported this.
 
 Nothing here may initialize CUDA, which does not survive a fork.
 """

@@ -48,13 +48,17 @@ class Plan:
     rows: tuple[int, ...] = (1, 4, 16)  # batch sizes that are compiled
 
     def checkpoint(self, family: str) -> dict[str, Any]:
-        """Return the settings of a policy with the family's random checkpoint, which the step "checkpoint" wrote."""
+        """Return the settings of a policy with the family's random checkpoint, which the step
+        "checkpoint" wrote.
+        """
         found: dict[str, Any] = json.loads((self.scratch / f"{family}.json").read_text())
         return found
 
 
 class Lab:
-    """What a step uses and finds; each finding is written at once, as the step may not live to its end."""
+    """What a step uses and finds; each finding is written at once, as the step may not live to
+    its end.
+    """
 
     def __init__(self, plan: Plan, step: str) -> None:
         self.plan, self.dry, self._file = plan, plan.dry, plan.scratch / f"step-{step}.json"
@@ -69,20 +73,34 @@ class Lab:
 
     @contextlib.contextmanager
     def lines_of(self, thread: str | tuple[str, ...], title: str) -> Iterator[None]:
-        """Show, also while this context runs, the lines of the package in which threads spend it, by their names."""
+        """Show, also while this context runs, the lines of the package in which threads spend
+        it, by their names.
+        """
         seen, over = Counter[str](), threading.Event()
 
         def look() -> None:
             begun = time.perf_counter()
             while not over.wait(_LOOK_S):
                 now, frames = time.perf_counter(), sys._current_frames()
-                idents = [one.ident or 0 for one in threading.enumerate() if one.name.startswith(thread)]
-                stack = [frame for ident in idents for frame, _ in traceback.walk_stack(frames.get(ident))]
+                idents = [
+                    one.ident or 0 for one in threading.enumerate() if one.name.startswith(thread)
+                ]
+                stack = [
+                    frame
+                    for ident in idents
+                    for frame, _ in traceback.walk_stack(frames.get(ident))
+                ]
                 lines = {(Path(one.f_code.co_filename), one.f_lineno) for one in stack}
                 for path, line in lines:
                     if "vlagents_ray" in path.parts:
                         seen[f"{path.name}:{line}"] += round((now - begun) * 1e3)
-                self.show(**{title: [f"{ms / 1e3:.1f} s at {line}" for line, ms in seen.most_common(_LINES)]})
+                self.show(
+                    **{
+                        title: [
+                            f"{ms / 1e3:.1f} s at {line}" for line, ms in seen.most_common(_LINES)
+                        ]
+                    }
+                )
                 begun = now
 
         watch = threading.Thread(target=look, daemon=True)
@@ -116,21 +134,27 @@ class Lab:
 
     @property
     def graphs(self) -> bool | str:
-        """The mode of CUDA graphs of eager cores; a CPU has none, and takes the compiler that the runner sets."""
+        """The mode of CUDA graphs of eager cores; a CPU has none, and takes the compiler that
+        the runner sets.
+        """
         return self.size("graphs", True)  # type: ignore[no-any-return]
 
     def settings(self, **changed: Any) -> dict[str, Any]:
         """Return the settings of π0 with three cameras, in bfloat16."""
         return {**self.plan.checkpoint("pi0"), "cameras": CAMERAS, "device": self.device, **changed}
 
-    def measured(self, policy: str = "pi0", config: Mapping[str, Any] | None = None, *, largest: int) -> BareAndQueued:
+    def measured(
+        self, policy: str = "pi0", config: Mapping[str, Any] | None = None, *, largest: int
+    ) -> BareAndQueued:
         """Return a policy that is loaded as a context."""
         config = self.settings(max_rows=largest) if config is None else config
         return BareAndQueued(build_agent(policy, config), view, max_size=largest, patience=0.1)
 
     @contextlib.contextmanager
     def engine(self, **changed: Any) -> Iterator[Engine]:
-        """Yield an engine with π0, in CUDA graphs for one and eight rows, and a second checkpoint to choose."""
+        """Yield an engine with π0, in CUDA graphs for one and eight rows, and a second
+        checkpoint to choose.
+        """
         rows = self.size(8, 2)
         config = self.settings(**{"compile": self.graphs, "batch_sizes": [1, rows], **changed})
         offered = Checkpoints(partial(build_agent, "pi0"), config, {"other": {"seed": 1}}, loaded=2)
@@ -173,7 +197,9 @@ class Acting:
     def __init__(self, acts: Sequence[Callable[[], object]]) -> None:
         self._calls: list[tuple[float, float, str]] = []  # end, ms, error
         self._over = threading.Event()
-        self._threads = [threading.Thread(target=self._act, args=[act], daemon=True) for act in acts]
+        self._threads = [
+            threading.Thread(target=self._act, args=[act], daemon=True) for act in acts
+        ]
 
     def __enter__(self) -> Self:
         for thread in self._threads:
@@ -186,21 +212,31 @@ class Acting:
             thread.join(LATE_S)
 
     def during(self, action: Callable[[], object], least: int = 1) -> dict[str, Any]:
-        """Run an action and wait for at least so many calls; return the figures of the calls that ended meanwhile."""
+        """Run an action and wait for at least so many calls; return the figures of the calls
+        that ended meanwhile.
+        """
         begun, before = time.perf_counter(), len(self._calls)
         action()
         took_s, ends = time.perf_counter() - begun, time.perf_counter() + LATE_S
         while len(self._calls) < before + least and time.perf_counter() < ends:
             self._over.wait(0.01)
         calls = self._calls[before:]
-        times, errors = [ms for _, ms, _ in calls], sorted({error for _, _, error in calls if error})
+        times, errors = (
+            [ms for _, ms, _ in calls],
+            sorted({error for _, _, error in calls if error}),
+        )
         if not calls:
             raise TimeoutError(f"no act ended within {LATE_S:g} s")
         return {
-            "seconds": took_s, "acts": len(calls), "failed": sum(bool(error) for _, _, error in calls),
-            "acts_per_s": len(calls) / (time.perf_counter() - begun), "median_ms": float(np.median(times)),
-            "p99_ms": float(np.quantile(times, 0.99)), "worst_ms": max(times), "errors": "; ".join(errors)[:300],
-        }  # fmt: skip
+            "seconds": took_s,
+            "acts": len(calls),
+            "failed": sum(bool(error) for _, _, error in calls),
+            "acts_per_s": len(calls) / (time.perf_counter() - begun),
+            "median_ms": float(np.median(times)),
+            "p99_ms": float(np.quantile(times, 0.99)),
+            "worst_ms": max(times),
+            "errors": "; ".join(errors)[:300],
+        }
 
     def _act(self, act: Callable[[], object]) -> None:
         while not self._over.is_set():

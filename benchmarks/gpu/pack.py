@@ -1,6 +1,7 @@
 """All that `benchmarks.gpu` needs on a machine without a network, in one folder: `make gpu-pack`.
 
-That machine has Linux on x86-64, Python 3.12, pip, and torch with torchvision and numpy, which are not in the folder.
+That machine has Linux on x86-64, Python 3.12, pip, and torch with torchvision and numpy, which are
+not in the folder.
 """
 
 from __future__ import annotations
@@ -18,15 +19,41 @@ PYTHON = "3.12"
 # What `benchmarks.gpu` imports of the repository besides itself; `run.sh` installs their wheels.
 PLUGINS = ("cluster", "learn", "models")
 PROJECTS = [str(ROOT), *(str(ROOT / f"plugins/vlagents_ray_{name}") for name in PLUGINS)]
-MOST_MIB = 55.0  # beside the repository's own files, such a folder still fits into an upload of 64 MiB
+# Beside the repository's own files, such a folder still fits into an upload of 64 MiB.
+MOST_MIB = 55.0
 PACKAGES = (
-    "transformers==5.23.*", "pydantic", "simplejpeg", "websockets", "starlette", "uvicorn", "python-multipart",
-    "msgpack", "typer", "pytest", "pytest-timeout", "hypothesis",
-)  # fmt: skip
+    "transformers==5.23.*",
+    "pydantic",
+    "simplejpeg",
+    "websockets",
+    "starlette",
+    "uvicorn",
+    "python-multipart",
+    "msgpack",
+    "typer",
+    "pytest",
+    "pytest-timeout",
+    "hypothesis",
+)
 THERE = ("numpy", "torch", "hf_xet")  # with torch; hf_xet only serves downloads
-PLATFORMS = ("manylinux_2_28", "manylinux_2_27", "manylinux_2_24", "manylinux_2_17", "manylinux2014", "manylinux1")
-FOLDERS = ("vlagents_ray", "benchmarks", "pyproject.toml", "conftest.py", "tests/__init__.py",
-           "tests/support", "tests/policies/compilation", "plugins/vlagents_ray_learn/tests")  # fmt: skip
+PLATFORMS = (
+    "manylinux_2_28",
+    "manylinux_2_27",
+    "manylinux_2_24",
+    "manylinux_2_17",
+    "manylinux2014",
+    "manylinux1",
+)
+FOLDERS = (
+    "vlagents_ray",
+    "benchmarks",
+    "pyproject.toml",
+    "conftest.py",
+    "tests/__init__.py",
+    "tests/support",
+    "tests/policies/compilation",
+    "plugins/vlagents_ray_learn/tests",
+)
 RUN = """#!/bin/bash
 # Measures all that needs a GPU: bash run.sh [OPTIONS of python -m benchmarks.gpu]. The report is in $OUT or build/gpu.
 set -eu
@@ -42,7 +69,11 @@ cd "$here/repository"
 """
 
 
-def main(out: Annotated[Path, typer.Option(help="The folder, which is replaced.")] = Path("build/gpu-pack")) -> None:
+def main(
+    out: Annotated[Path, typer.Option(help="The folder, which is replaced.")] = Path(
+        "build/gpu-pack"
+    ),
+) -> None:
     """Collect the files of the repository, wheels, and run.sh."""
     out = out.absolute()
     shutil.rmtree(out, ignore_errors=True)
@@ -50,9 +81,20 @@ def main(out: Annotated[Path, typer.Option(help="The folder, which is replaced."
     wheels.mkdir(parents=True)
     platforms = [word for name in PLATFORMS for word in ("--platform", f"{name}_x86_64")]
     pip = [sys.executable, "-m", "pip", "--disable-pip-version-check"]
-    target = ["--python-version", PYTHON, "--implementation", "cp", *platforms, "--only-binary=:all:"]
-    subprocess.run([*pip, "download", "--quiet", *target, "--dest", str(wheels), *PACKAGES], check=True)
-    subprocess.run([*pip, "wheel", "--quiet", "--no-deps", "--wheel-dir", str(wheels), *PROJECTS], check=True)
+    target = [
+        "--python-version",
+        PYTHON,
+        "--implementation",
+        "cp",
+        *platforms,
+        "--only-binary=:all:",
+    ]
+    subprocess.run(
+        [*pip, "download", "--quiet", *target, "--dest", str(wheels), *PACKAGES], check=True
+    )
+    subprocess.run(
+        [*pip, "wheel", "--quiet", "--no-deps", "--wheel-dir", str(wheels), *PROJECTS], check=True
+    )
     for wheel in wheels.iterdir():
         if wheel.name.startswith(tuple(f"{name}-" for name in THERE)):
             wheel.unlink()
@@ -65,7 +107,9 @@ def main(out: Annotated[Path, typer.Option(help="The folder, which is replaced."
             shutil.copy(source, copy)
     (out / "run.sh").write_text(RUN)
     mib = sum(file.stat().st_size for file in out.rglob("*") if file.is_file()) / 2**20
-    typer.echo(f"{out}: {mib:.1f} MiB, {len(list(wheels.iterdir()))} wheels; there: bash {out.name}/run.sh")
+    typer.echo(
+        f"{out}: {mib:.1f} MiB, {len(list(wheels.iterdir()))} wheels; there: bash {out.name}/run.sh"
+    )
     if mib > MOST_MIB:
         raise typer.Exit(1)
 

@@ -28,7 +28,9 @@ from vlagents_ray.serve.python_env.child_start import die_with_parent
 
 _SPARE_S = 15.0  # without which no step is started
 _STACKS_S = (
-    1.0  # before the limit of a step, when the log gets the stacks of all its threads, at which Python may crash
+    # Before the limit of a step, when the log gets the stacks of all its threads, at which Python
+    # may crash.
+    1.0
 )
 
 
@@ -45,11 +47,16 @@ def _child(plan: Plan, name: str, run: Callable[[Lab], None], limit_s: float) ->
         if plan.dry:
             Compilation.backend = "eager"
             pi0.SMALL = pi0.Pi0Size(width=64, expert_width=32, layers=2, vision_layers=1, patch=56)
-            require("torch").set_num_threads(1)  # for so small a model, threads only wait for one another
+            # For so small a model, threads only wait for one another.
+            require("torch").set_num_threads(1)
         run(lab)
     except BaseException as error:  # noqa: BLE001 - a step may raise any error, which is its result
         traceback.print_exc()
-        lab.check("runs to its end", " ".join(f"{type(error).__name__}: {error}".split())[:400], equal="its end")
+        lab.check(
+            "runs to its end",
+            " ".join(f"{type(error).__name__}: {error}".split())[:400],
+            equal="its end",
+        )
         sys.stdout.flush()
         os._exit(1)  # without waiting for the threads of a broken step
 
@@ -69,7 +76,9 @@ class Runner:
         beside: tuple[str, BaseProcess, float] | None = None
         for name, step in self._steps.items():
             if self._left() < _SPARE_S:
-                self._record(name, {"figures": {}, "checks": [_unmet("runs", "no time was left", "it runs")]})
+                self._record(
+                    name, {"figures": {}, "checks": [_unmet("runs", "no time was left", "it runs")]}
+                )
                 continue
             started = (name, self._start(name), time.monotonic())
             if step.beside in self._steps:
@@ -79,7 +88,8 @@ class Runner:
             if beside is not None:
                 self._finish(*beside)
                 beside = None
-            if name == "facts" and not _passed(self._results[name]):  # CUDA may not survive the fork
+            # CUDA may not survive the fork.
+            if name == "facts" and not _passed(self._results[name]):
                 self._context = multiprocessing.get_context("spawn")
                 self._finish(name, self._start(name), time.monotonic())
         if beside is not None:
@@ -117,12 +127,19 @@ class Runner:
 
     def _record(self, name: str, found: Mapping[str, Any]) -> None:
         self._results[name] = found
-        document = {**self._origin, "dry": self._plan.dry, "seconds": time.monotonic() - self._begun,
-                    "steps": self._results}  # fmt: skip
+        document = {
+            **self._origin,
+            "dry": self._plan.dry,
+            "seconds": time.monotonic() - self._begun,
+            "steps": self._results,
+        }
         (self._plan.out / "gpu.json").write_text(json.dumps(document, indent=1) + "\n")
         (self._plan.out / "gpu.md").write_text(to_markdown(document))
         unmet = [check for check in found["checks"] if check["passed"] is False]
-        typer.echo(f"{name}: {found.get('seconds', 0):.1f} s, {'all met' if not unmet else f'{len(unmet)} not met'}")
+        typer.echo(
+            f"{name}: {found.get('seconds', 0):.1f} s, "
+            f"{'all met' if not unmet else f'{len(unmet)} not met'}"
+        )
         for check in unmet:
             typer.echo(f"  {check['name']}: got {check['got']}, want {check['want']}")
 
@@ -138,7 +155,14 @@ def _unmet(name: str, got: Any, want: str) -> dict[str, Any]:
 def to_markdown(document: Mapping[str, Any]) -> str:
     """Return the report of a run."""
     versions = ", ".join(f"{name} {version}" for name, version in document["versions"].items())
-    lines = [f"Measured {document['date']} by `{document['command']}` in {document['seconds']:.0f} s. {versions}.", ""]
+    lines = [
+        (
+            f"Measured {document['date']} by `{document['command']}` in {document['seconds']:.0f} "
+            "s. "
+            f"{versions}."
+        ),
+        "",
+    ]
     if document["dry"]:
         lines += ["A dry run on a CPU, in small sizes: its times mean nothing.", ""]
     checks = [
@@ -149,8 +173,16 @@ def to_markdown(document: Mapping[str, Any]) -> str:
     lines += [*_table(checks), ""]
     for name, step in document["steps"].items():
         lines += [f"## {name}, {step.get('seconds', 0):.1f} s", ""]
-        tables = {key: value for key, value in step["figures"].items() if isinstance(value, list) and value}
-        lines += [f"- {key}: {_cell(value)}" for key, value in step["figures"].items() if key not in tables]
+        tables = {
+            key: value
+            for key, value in step["figures"].items()
+            if isinstance(value, list) and value
+        }
+        lines += [
+            f"- {key}: {_cell(value)}"
+            for key, value in step["figures"].items()
+            if key not in tables
+        ]
         for key, rows in tables.items():
             listed = _table(rows) if isinstance(rows[0], dict) else [f"- {row}" for row in rows]
             lines += ["", f"{key}:", "", *listed]

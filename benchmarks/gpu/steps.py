@@ -21,7 +21,16 @@ from typing import Any
 import numpy as np
 
 from benchmarks.checkpoints.recipes import FAMILIES, write_checkpoint
-from benchmarks.gpu.lab import INSTRUCTION, LATE_S, Acting, Lab, Session, row_error, seconds_of, view
+from benchmarks.gpu.lab import (
+    INSTRUCTION,
+    LATE_S,
+    Acting,
+    Lab,
+    Session,
+    row_error,
+    seconds_of,
+    view,
+)
 from benchmarks.network import profile, waits
 from benchmarks.policy import BareAndQueued
 from vlagents_ray.contract import Contract
@@ -41,11 +50,18 @@ GPU_TESTS = (
     "plugins/vlagents_ray_learn/tests/test_one_gpu.py",
 )  # they need no Ray
 PUBLISHED = (  # by others, for comparison
-    "π0.5 on an H100, 3 cameras, in process: 52.4, 65.1, 91.9, 147.4 ms for 1, 2, 4, 8 rows (SGLang 0.5.23)",
+    (
+        "π0.5 on an H100, 3 cameras, in process: 52.4, 65.1, 91.9, 147.4 ms for 1, 2, 4, 8 rows "
+        "(SGLang 0.5.23)"
+    ),
     "the same, by WebSocket: 77 ms for 1 robot, 162 ms for 4 (SGLang 0.5.23)",
-    "π0 on an RTX 4090, 2 cameras: 40 to 50 ms in CUDA graphs, 27.3 ms with own kernels (arXiv 2510.26742)",
+    (
+        "π0 on an RTX 4090, 2 cameras: 40 to 50 ms in CUDA graphs, 27.3 ms with own kernels (arXiv "
+        "2510.26742)"
+    ),
 )
-_H100_TFLOPS = 600  # of matrix products in bfloat16; about 800 were seen, and less says that something else is wrong
+# Of matrix products in bfloat16; about 800 were seen, and less says that something else is wrong.
+_H100_TFLOPS = 600
 
 
 def facts(lab: Lab) -> None:
@@ -58,21 +74,36 @@ def facts(lab: Lab) -> None:
         capture_output=True, text=True, check=False,
     ).stdout.strip()  # fmt: skip
     lab.show(
-        gpu=said or "none", torch=torch.__version__, cuda=torch.version.cuda, cores=os.cpu_count(),
-        triton=importlib.util.find_spec("triton") is not None, compiler=shutil.which("gcc") or shutil.which("cc"),
+        gpu=said or "none",
+        torch=torch.__version__,
+        cuda=torch.version.cuda,
+        cores=os.cpu_count(),
+        triton=importlib.util.find_spec("triton") is not None,
+        compiler=shutil.which("gcc") or shutil.which("cc"),
         cudnn=None if lab.dry else torch.backends.cudnn.version(),
-    )  # fmt: skip
+    )
     side, count = lab.size(8192, 256), lab.size(2**28, 2**20)
     a = torch.randn(side, side, device=lab.device, dtype=torch.bfloat16)
     tflops = 2 * side**3 / seconds_of(lab, lambda: a @ a) / 1e12
-    here, pinned = torch.empty(count, dtype=torch.uint8), torch.empty(count, dtype=torch.uint8, pin_memory=not lab.dry)
+    here, pinned = (
+        torch.empty(count, dtype=torch.uint8),
+        torch.empty(count, dtype=torch.uint8, pin_memory=not lab.dry),
+    )
     there = torch.empty(count, dtype=torch.uint8, device=lab.device)
     copies = {
-        "on the device": (there.clone(), there), "to the device": (there, here), "from the device": (here, there),
-        "to the device, pinned": (there, pinned), "from the device, pinned": (pinned, there),
-    }  # fmt: skip
-    rates = {name: count / seconds_of(lab, partial(a.copy_, b)) / 1e9 for name, (a, b) in copies.items()}
-    lab.show(bf16_tflops=tflops, copies=[{"copy": name, "gb_per_s": rate} for name, rate in rates.items()])
+        "on the device": (there.clone(), there),
+        "to the device": (there, here),
+        "from the device": (here, there),
+        "to the device, pinned": (there, pinned),
+        "from the device, pinned": (pinned, there),
+    }
+    rates = {
+        name: count / seconds_of(lab, partial(a.copy_, b)) / 1e9 for name, (a, b) in copies.items()
+    }
+    lab.show(
+        bf16_tflops=tflops,
+        copies=[{"copy": name, "gb_per_s": rate} for name, rate in rates.items()],
+    )
     if "H100" in str(said) or "H200" in str(said):
         lab.check("matrix products in bfloat16, TFLOP/s", tflops, least=_H100_TFLOPS, speed=True)
 
@@ -81,10 +112,26 @@ def gpu_tests(lab: Lab) -> None:
     """The tests that need a GPU, but no Ray."""
     words = ["--collect-only"] if lab.dry else ["--tb=short"]
     done = subprocess.run(
-        [sys.executable, "-m", "pytest", *GPU_TESTS, "-m", "gpu", "-q", "--import-mode=importlib", "-W", "default",
-         "-p", "no:cacheprovider", *words],
-        cwd=ROOT, capture_output=True, text=True, check=False,
-    )  # fmt: skip
+        [
+            sys.executable,
+            "-m",
+            "pytest",
+            *GPU_TESTS,
+            "-m",
+            "gpu",
+            "-q",
+            "--import-mode=importlib",
+            "-W",
+            "default",
+            "-p",
+            "no:cacheprovider",
+            *words,
+        ],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
     sys.stdout.write(done.stdout + done.stderr)
     lab.show(pytest=(done.stdout.strip().splitlines() or ["nothing"])[-1])
     lab.check("pytest's exit status", done.returncode, equal=0)
@@ -100,9 +147,13 @@ def checkpoint(lab: Lab) -> None:
             lab.show(**{family: f"not installed: {str(error).partition(';')[0]}"})
             continue
         (lab.plan.scratch / f"{family}.json").write_text(json.dumps(made.config))
-        lab.show(**{family: f"{made.parameters:,} parameters in {time.perf_counter() - begun:.1f} s"})
+        lab.show(
+            **{family: f"{made.parameters:,} parameters in {time.perf_counter() - begun:.1f} s"}
+        )
         if family == "pi0":
-            lab.check("parameters of π0, billions", round(made.parameters / 1e9, 2), equal=3.5, speed=True)
+            lab.check(
+                "parameters of π0, billions", round(made.parameters / 1e9, 2), equal=3.5, speed=True
+            )
 
 
 def curve(lab: Lab, measured: BareAndQueued, sizes: Sequence[int]) -> list[dict[str, Any]]:
@@ -111,18 +162,28 @@ def curve(lab: Lab, measured: BareAndQueued, sizes: Sequence[int]) -> list[dict[
     for size in sizes:
         forget_peak()
         bare, queued = measured.bare(size, seconds), measured.queued(size, seconds, "robot")
-        rows.append({
-            "rows": size, "network_ms": bare["network_ms"], "bare_ms": bare["batch_ms"],
-            "queued_ms": 1e3 * size / max(queued.actions_per_s, 1e-9), "actions_per_s": queued.actions_per_s,
-            "mean_batch": queued.mean_batch, "peak_mib": peak_mib(),
-            "of_network": queued.actions_per_s * bare["network_ms"] / 1e3 / size,
-        })  # fmt: skip
+        rows.append(
+            {
+                "rows": size,
+                "network_ms": bare["network_ms"],
+                "bare_ms": bare["batch_ms"],
+                "queued_ms": 1e3 * size / max(queued.actions_per_s, 1e-9),
+                "actions_per_s": queued.actions_per_s,
+                "mean_batch": queued.mean_batch,
+                "peak_mib": peak_mib(),
+                "of_network": queued.actions_per_s * bare["network_ms"] / 1e3 / size,
+            }
+        )
         lab.show(curve=rows)
     return rows
 
 
-def one_act(lab: Lab, measured: BareAndQueued, sizes: Sequence[int], rows: Sequence[Mapping[str, Any]]) -> None:
-    """Look into one act of each size: launches, the time in which the GPU works, its gaps, and waits for it."""
+def one_act(
+    lab: Lab, measured: BareAndQueued, sizes: Sequence[int], rows: Sequence[Mapping[str, Any]]
+) -> None:
+    """Look into one act of each size: launches, the time in which the GPU works, its gaps, and
+    waits for it.
+    """
     looked = []
     for size in sizes:
         batch = measured.batch(range(size))
@@ -135,9 +196,11 @@ def one_act(lab: Lab, measured: BareAndQueued, sizes: Sequence[int], rows: Seque
 
 
 def neighbours(lab: Lab, measured: BareAndQueued, size: int) -> float:
-    """Compare acts of one episode: at each place of a full batch with other neighbours there, and with the one alone.
+    """Compare acts of one episode: at each place of a full batch with other neighbours there, and
+    with the one alone.
 
-    In one place, equal kernels compute a row, so that its neighbours change no bit; alone, other ones round elsewhere.
+    In one place, equal kernels compute a row, so that its neighbours change no bit; alone, other
+    ones round elsewhere.
 
     Returns:
         The largest error of an act in a batch, relative to the one alone.
@@ -156,16 +219,23 @@ def neighbours(lab: Lab, measured: BareAndQueued, size: int) -> float:
 
 
 def speed(lab: Lab, mode: bool | str) -> None:
-    """Load π0, eager or compiled; measure it by batch size, and compare its acts with the eager ones."""
+    """Load π0, eager or compiled; measure it by batch size, and compare its acts with the eager
+    ones.
+    """
     mode = lab.graphs if mode == "graphs" else mode
     sizes = lab.size([*lab.plan.rows], [1, 2])
     every = sizes if mode else lab.size([1, 4, 8, 16, 32], [1, 2])
-    config = lab.settings(max_rows=every[-1], compile=mode, **({"batch_sizes": sizes} if mode else {}))
+    config = lab.settings(
+        max_rows=every[-1], compile=mode, **({"batch_sizes": sizes} if mode else {})
+    )
     with contextlib.ExitStack() as loaded:
         with lab.lines_of("policy", "start"):
             measured = loaded.enter_context(lab.measured(config=config, largest=every[-1]))
         memory = {} if lab.dry else require("torch").cuda.memory_stats()
-        held = {kind: memory.get(f"{kind}_bytes.all.current", 0) / 2**20 for kind in ("allocated", "reserved")}
+        held = {
+            kind: memory.get(f"{kind}_bytes.all.current", 0) / 2**20
+            for kind in ("allocated", "reserved")
+        }
         lab.show(load_s=measured.load_s, **{f"{kind}_mib": value for kind, value in held.items()})
         lab.check("parts that are not compiled", measured.engine.models.uncompiled, equal=[])
         rows = curve(lab, measured, every)
@@ -173,7 +243,9 @@ def speed(lab: Lab, mode: bool | str) -> None:
         rounded = neighbours(lab, measured, sizes[-1])
         one_act(lab, measured, [sizes[0], sizes[-1]], rows)
     share = next(row["of_network"] for row in rows if row["rows"] == sizes[-1])
-    lab.check(f"queued, as a share of the network alone, {sizes[-1]} rows", share, least=0.95, speed=True)
+    lab.check(
+        f"queued, as a share of the network alone, {sizes[-1]} rows", share, least=0.95, speed=True
+    )
     file = lab.plan.scratch / "eager.npz"
     if not mode:
         np.savez(file, **{**acts, "rounded": np.array(rounded), "ms": np.array(rows[0]["bare_ms"])})  # type: ignore[arg-type]
@@ -181,12 +253,20 @@ def speed(lab: Lab, mode: bool | str) -> None:
         return
     eager = np.load(file)
     lab.show(
-        bit_equal_to_eager=all(np.array_equal(found, eager[name]) for name, found in acts.items() if name in eager)
+        bit_equal_to_eager=all(
+            np.array_equal(found, eager[name]) for name, found in acts.items() if name in eager
+        )
     )
     errors = [row_error(found, eager[name]) for name, found in acts.items() if name in eager]
-    limit = max(TOLERANCE["bfloat16"], float(eager["rounded"]))  # or what another batch size changes
+    # Or what another batch size changes.
+    limit = max(TOLERANCE["bfloat16"], float(eager["rounded"]))
     lab.check("error of compiled acts of other inputs", max(errors), most=limit)
-    lab.check("eager time over compiled time, one row", eager["ms"] / rows[0]["bare_ms"], least=2, speed=True)
+    lab.check(
+        "eager time over compiled time, one row",
+        eager["ms"] / rows[0]["bare_ms"],
+        least=2,
+        speed=True,
+    )
 
 
 def again(lab: Lab) -> None:
@@ -208,11 +288,18 @@ def loading(lab: Lab) -> None:
                 beside = acting.during(lambda: Session(engine, 100, checkpoint="other").ask())
         lab.show(acts=[{"while": "alone", **alone}, {"while": "a checkpoint loads", **beside}])
         lab.check("failed acts", beside["failed"], equal=0)
-        lab.check("longest act, of the longest one without", beside["worst_ms"] / alone["worst_ms"], most=2, speed=True)
+        lab.check(
+            "longest act, of the longest one without",
+            beside["worst_ms"] / alone["worst_ms"],
+            most=2,
+            speed=True,
+        )
 
 
 def pushes(lab: Lab) -> None:
-    """Push weights of the model's size to acting sessions: from this process, through the CPU, from another process."""
+    """Push weights of the model's size to acting sessions: from this process, through the CPU,
+    from another process.
+    """
     from vlagents_ray.serve.weights import PushOptions
     from vlagents_ray.weights.trainable import own_copy
     from vlagents_ray_learn.publisher import Publisher
@@ -233,11 +320,17 @@ def pushes(lab: Lab) -> None:
 
         def pushed(way: str, push: Callable[[], object]) -> None:
             forget_peak()
-            with Acting([robot.ask for robot in robots]) as acting, lab.lines_of(threads, f"push from {way}"):
+            with (
+                Acting([robot.ask for robot in robots]) as acting,
+                lab.lines_of(threads, f"push from {way}"),
+            ):
                 found = acting.during(push, 2 * len(robots))
             reserved = {} if lab.dry else {"reserved_mib": torch.cuda.memory_reserved() / 2**20}
-            changed = not np.array_equal(act(), before)  # both alone, as batches of other sizes round differently
-            rows.append({"from": way, **found, "peak_mib": peak_mib(), **reserved, "changed": changed})
+            # Both alone, as batches of other sizes round differently.
+            changed = not np.array_equal(act(), before)
+            rows.append(
+                {"from": way, **found, "peak_mib": peak_mib(), **reserved, "changed": changed}
+            )
             lab.show(model_mib=model_mib, pushes=rows)
 
         def take(values: Any, version: int) -> None:
@@ -250,22 +343,31 @@ def pushes(lab: Lab) -> None:
         pushed("no push", lambda: time.sleep(lab.size(1, 0)))
         pushed("the CPU", lambda: publisher.push(on_cpu, mode="keep"))
         with other_learner(lab, first) as values:
-            pushed("another process", lambda: take(values, 9))  # the loaded checkpoint moves to the host
+            # The loaded checkpoint moves to the host.
+            pushed("another process", lambda: take(values, 9))
             pushed("another process, again", lambda: take(values, 10))
         pushed("this process, the first ones", lambda: publisher.push(first, mode="keep"))
         lab.check("failed acts", sum(row["failed"] for row in rows), equal=0)
         lab.check(
-            "the acts change with the weights", [row["changed"] for row in rows], equal=[False, True, True, True, False]
+            "the acts change with the weights",
+            [row["changed"] for row in rows],
+            equal=[False, True, True, True, False],
         )
-        lab.check("seconds of a push from another process", rows[3]["seconds"], most=0.3, speed=True)
-        held = max(row["peak_mib"] for row in rows) - model_mib  # without this step's copy of the first ones
+        lab.check(
+            "seconds of a push from another process", rows[3]["seconds"], most=0.3, speed=True
+        )
+        # Without this step's copy of the first ones.
+        held = max(row["peak_mib"] for row in rows) - model_mib
         lab.check("peak memory, times the model", held / model_mib, most=3.2, speed=True)
 
 
 @contextlib.contextmanager
 def other_learner(lab: Lab, like: Mapping[str, Any]) -> Iterator[Any]:
     """Yield values that another process shares, of the names, shapes and types of `like`."""
-    shapes = {name: (tuple(value.shape), str(value.dtype).removeprefix("torch.")) for name, value in like.items()}
+    shapes = {
+        name: (tuple(value.shape), str(value.dtype).removeprefix("torch."))
+        for name, value in like.items()
+    }
     context = multiprocessing.get_context("spawn")
     ours, theirs = context.Pipe()
     process = context.Process(target=_learn, args=(theirs, shapes, lab.device), daemon=True)
@@ -308,7 +410,10 @@ def http_server(engine: Engine) -> Iterator[str]:
     contract = engine.contract and engine.contract.to_json()
     about = {"policy": "pi0", "version": "0", "protocol": PROTOCOL_VERSION, "contract": contract,
              "stream": asdict(own.address)}  # fmt: skip
-    app, port = AccessMiddleware(build_http_app(engine, lambda: about, DEFAULT_LIMITS), None, "app"), free_port()
+    app, port = (
+        AccessMiddleware(build_http_app(engine, lambda: about, DEFAULT_LIMITS), None, "app"),
+        free_port(),
+    )
     server = uvicorn.Server(uvicorn.Config(app, port=port, log_level="warning", lifespan="off"))
     thread = threading.Thread(target=lambda: asyncio.run(server.serve()), daemon=True)
     thread.start()
@@ -326,12 +431,17 @@ def _drive(pipe: Any, url: str, counts: Sequence[int], seconds: float, contract:
     die_with_parent()
     rows = []
     for count in counts:
-        agents = [RemoteAgent(url, transport="websocket", codec="jpeg", connect_timeout_s=60) for _ in range(count)]
+        agents = [
+            RemoteAgent(url, transport="websocket", codec="jpeg", connect_timeout_s=60)
+            for _ in range(count)
+        ]
         views = [view(contract, seed) for seed in range(count)]
         for seed, agent in enumerate(agents):
             agent.reset(views[seed], INSTRUCTION, seed=seed)
             agent.act(views[seed])
-        with Acting([partial(one.act, obs) for one, obs in zip(agents, views, strict=True)]) as acting:
+        with Acting(
+            [partial(one.act, obs) for one, obs in zip(agents, views, strict=True)]
+        ) as acting:
             rows.append({"robots": count, **acting.during(partial(time.sleep, seconds), 2 * count)})
         for agent in agents:
             agent.close()
@@ -343,7 +453,9 @@ def served(lab: Lab) -> None:
     counts = lab.size([1, 4, 8], [1, 2])
     config = lab.settings(max_rows=counts[-1], compile=lab.graphs, batch_sizes=counts)
     with lab.measured(config=config, largest=counts[-1]) as measured:
-        network = {count: measured.bare(count, lab.size(0.5, 0.02))["network_ms"] for count in counts}
+        network = {
+            count: measured.bare(count, lab.size(0.5, 0.02))["network_ms"] for count in counts
+        }
         with http_server(measured.engine) as url:
             context = multiprocessing.get_context("spawn")
             ours, theirs = context.Pipe()
@@ -358,17 +470,26 @@ def served(lab: Lab) -> None:
         row["of_network"] = row["acts_per_s"] * row["network_ms"] / 1e3 / row["robots"]
     lab.show(robots=rows, published=PUBLISHED)
     lab.check("failed acts", sum(row["failed"] for row in rows), equal=0)
-    lab.check(f"share of the network alone, {counts[-1]} robots", rows[-1]["of_network"], least=0.9, speed=True)
+    lab.check(
+        f"share of the network alone, {counts[-1]} robots",
+        rows[-1]["of_network"],
+        least=0.9,
+        speed=True,
+    )
 
 
 def learning(lab: Lab) -> None:
-    """Samples, plans that continue, and log-probabilities in bfloat16 against those that a float32 learner computes."""
+    """Samples, plans that continue, and log-probabilities in bfloat16 against those that a
+    float32 learner computes.
+    """
     from vlagents_ray.policies.flow import logprob_of_chain
     from vlagents_ray_models.pi0 import flow_velocity
 
     torch, count = require("torch"), lab.size(8, 2)
-    server, learner = (build_agent("pi0", lab.settings(dtype=dtype, noise_level=0.5, max_rows=1 + count))
-                       for dtype in ("bfloat16", "float32"))  # fmt: skip
+    server, learner = (
+        build_agent("pi0", lab.settings(dtype=dtype, noise_level=0.5, max_rows=1 + count))
+        for dtype in ("bfloat16", "float32")
+    )
     for agent in (server, learner):
         agent.initialize()
     obs = view(server.contract, 0)
@@ -395,9 +516,15 @@ def learning(lab: Lab) -> None:
     chain = torch.from_numpy(said["replay"]["chain"])[None].to(lab.device)
     with torch.no_grad():
         velocity = flow_velocity(model.network, inputs, torch.float32)
-        again = logprob_of_chain(velocity, chain, said["replay"]["noise_level"])[0, :, : plain.action.shape[-1]]
+        again = logprob_of_chain(velocity, chain, said["replay"]["noise_level"])[
+            0, :, : plain.action.shape[-1]
+        ]
     off = again.float().cpu().numpy() - said["logprob"]
-    lab.show(logprob_ms=stated_ms, log_ratio_std_of_a_number=float(off.std()), log_ratio_of_a_chunk=float(off.sum()))
+    lab.show(
+        logprob_ms=stated_ms,
+        log_ratio_std_of_a_number=float(off.std()),
+        log_ratio_of_a_chunk=float(off.sum()),
+    )
     lab.check("log-probabilities are finite", bool(np.isfinite(off).all()), equal=True)
 
 
@@ -409,8 +536,13 @@ def numerics(lab: Lab) -> None:
     for precision in ("highest", "high"):
         torch.set_float32_matmul_precision(precision)
         error = float((a @ a - (a.double() @ a.double())).abs().max())
-        rows.append({"float32 products": precision, "tflops": 2 * side**3 / seconds_of(lab, lambda: a @ a) / 1e12,
-                     "largest_error": error})  # fmt: skip
+        rows.append(
+            {
+                "float32 products": precision,
+                "tflops": 2 * side**3 / seconds_of(lab, lambda: a @ a) / 1e12,
+                "largest_error": error,
+            }
+        )
     torch.set_float32_matmul_precision("highest")
     lab.show(products=rows)
     if importlib.util.find_spec("torchao") is None:
@@ -418,14 +550,18 @@ def numerics(lab: Lab) -> None:
         return
     for kind in ("int8", "float8"):
         try:
-            with lab.measured(config=lab.settings(max_rows=1, quantization=kind), largest=1) as measured:
+            with lab.measured(
+                config=lab.settings(max_rows=1, quantization=kind), largest=1
+            ) as measured:
                 bare = measured.bare(1, lab.size(1.0, 0.02))
                 acts = np.stack(measured.actions(1, 1))
         except VLAgentsError as error:
             lab.show(**{kind: str(error)[:300]})
             continue
         off = row_error(acts, np.load(lab.plan.scratch / "eager.npz")["rows_1"])
-        lab.show(**{kind: f"{bare['batch_ms']:.2f} ms, peak {peak_mib():.0f} MiB, off by {off:.3f}"})
+        lab.show(
+            **{kind: f"{bare['batch_ms']:.2f} ms, peak {peak_mib():.0f} MiB, off by {off:.3f}"}
+        )
 
 
 def jax_beside(lab: Lab) -> None:
@@ -473,7 +609,9 @@ def families(lab: Lab) -> None:
 
 
 def destruction(lab: Lab) -> None:
-    """Exhaust the memory, then fail the GPU: one row still acts, and the health check reports the failure."""
+    """Exhaust the memory, then fail the GPU: one row still acts, and the health check reports
+    the failure.
+    """
     torch, largest = require("torch"), lab.size(16, 2)
     with lab.engine(compile=False, batch_sizes=None, max_rows=largest) as engine:
         agent: Any = engine.models.own_weights._agent

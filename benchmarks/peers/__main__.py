@@ -11,7 +11,9 @@ from benchmarks.peers import FOLDER, TORCH, TORCH_REQUIREMENTS, set_up
 from vlagents_ray.cli.console import errors, out, progress
 
 
-def main(folder: Annotated[Path, typer.Option("--dir", help="Folder of the environment.")] = FOLDER) -> None:
+def main(
+    folder: Annotated[Path, typer.Option("--dir", help="Folder of the environment.")] = FOLDER,
+) -> None:
     """Install other policy servers, at pinned versions, in separate Python environments."""
     with errors():
         python = set_up(folder, progress=progress)

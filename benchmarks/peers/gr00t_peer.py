@@ -1,6 +1,7 @@
 """GR00T's protocol, written for this benchmark after its documentation: the package is not on PyPI.
 
-ZMQ REQ and REP, msgpack, arrays as the bytes of `.npy` files. Like GR00T's, the server answers one request at a time.
+ZMQ REQ and REP, msgpack, arrays as the bytes of `.npy` files. Like GR00T's, the server answers one
+request at a time.
 """
 
 from __future__ import annotations
@@ -23,7 +24,11 @@ def _encode(value: Any) -> Any:
 
 
 def _decode(value: dict[str, Any]) -> Any:
-    return np.load(io.BytesIO(value["as_npy"]), allow_pickle=False) if "__ndarray_class__" in value else value
+    return (
+        np.load(io.BytesIO(value["as_npy"]), allow_pickle=False)
+        if "__ndarray_class__" in value
+        else value
+    )
 
 
 def to_bytes(message: Any) -> bytes:

@@ -1,8 +1,10 @@
-"""LeRobot: `lerobot-eval` with a policy that does nothing and the environment that all systems play.
+"""LeRobot: `lerobot-eval` with a policy that does nothing and the environment that all systems
+play.
 
-It steps `workers` environments in its own process, one after another, with one call of the policy. (Its environments
-in processes, `--eval.use_async_envs`, end with an error in 0.4.4, which looks for `envs` in them.) It always makes
-videos of the first ten episodes, and resets an environment again at an episode's end.
+It steps `workers` environments in its own process, one after another, with one call of the policy.
+(Its environments in processes, `--eval.use_async_envs`, end with an error in 0.4.4, which looks for
+`envs` in them.) It always makes videos of the first ten episodes, and resets an environment again
+at an episode's end.
 """
 
 from __future__ import annotations
@@ -44,10 +46,14 @@ class TimedGym(gym.Env):  # type: ignore[misc]
             name: gym.spaces.Box(0, 255, one.shape, np.uint8) for name, one in obs["pixels"].items()
         }
         state = gym.spaces.Box(-np.inf, np.inf, obs["agent_pos"].shape, np.float32)
-        self.observation_space = gym.spaces.Dict({"pixels": gym.spaces.Dict(spaces), "agent_pos": state})
+        self.observation_space = gym.spaces.Dict(
+            {"pixels": gym.spaces.Dict(spaces), "agent_pos": state}
+        )
         self.action_space = gym.spaces.Box(-1, 1, (self._env.contract.action.dim,), np.float32)
 
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Any, dict[str, Any]]:
         self._seed = self._seed if seed is None else seed
         return self._named(self._env.reset(seed=self._seed)[0]), {"is_success": False}
 
@@ -120,9 +126,14 @@ class NothingPolicy(PreTrainedPolicy):  # type: ignore[misc]
         return self.select_action(batch)[:, None]
 
 
-def make_nothing_pre_post_processors(*_: Any, **__: Any) -> tuple[PolicyProcessorPipeline, PolicyProcessorPipeline]:
+def make_nothing_pre_post_processors(
+    *_: Any, **__: Any
+) -> tuple[PolicyProcessorPipeline, PolicyProcessorPipeline]:
     """Return processors that do nothing, by the name that LeRobot derives from the policy's."""
-    actions = {"to_transition": policy_action_to_transition, "to_output": transition_to_policy_action}
+    actions = {
+        "to_transition": policy_action_to_transition,
+        "to_output": transition_to_policy_action,
+    }
     return PolicyProcessorPipeline(steps=[]), PolicyProcessorPipeline(steps=[], **actions)
 
 
@@ -132,10 +143,15 @@ def main() -> None:
     out = peer.own_stdout()
     gym.register("gym_timed/episodes", entry_point=TimedGym)
     sys.argv[1:] = [
-        "--env.type=timed", "--policy.type=nothing", "--policy.push_to_hub=false", "--policy.device=cpu",
-        f"--eval.n_episodes={PLAN['episodes']}", f"--eval.batch_size={PLAN['workers']}", f"--seed={PLAN['seed']}",
+        "--env.type=timed",
+        "--policy.type=nothing",
+        "--policy.push_to_hub=false",
+        "--policy.device=cpu",
+        f"--eval.n_episodes={PLAN['episodes']}",
+        f"--eval.batch_size={PLAN['workers']}",
+        f"--seed={PLAN['seed']}",
         f"--output_dir={PLAN['folder']}/lerobot",
-    ]  # fmt: skip
+    ]
     eval_main()
     print(json.dumps({}), file=out, flush=True)
 

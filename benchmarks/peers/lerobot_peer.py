@@ -1,8 +1,9 @@
-"""LeRobot's asynchronous inference: its gRPC `PolicyServer`, and the calls of its `RobotClient`, which needs a robot.
+"""LeRobot's asynchronous inference: its gRPC `PolicyServer`, and the calls of its `RobotClient`,
+which needs a robot.
 
-An act is `SendObservations` and then `GetActions`, as its control loop makes them. The server does not wait until
-`inference_latency` has passed, 33 ms by default, and no processors run before and after the policy. It has one queue
-with one place for all clients, so it serves one robot at a time.
+An act is `SendObservations` and then `GetActions`, as its control loop makes them. The server does
+not wait until `inference_latency` has passed, 33 ms by default, and no processors run before and
+after the policy. It has one queue with one place for all clients, so it serves one robot at a time.
 """
 
 from __future__ import annotations
@@ -19,13 +20,15 @@ import numpy as np
 import peer
 import torch
 
-_OPERATORS = torch.library.Library("torchvision", "FRAGMENT")  # a torchvision whose build does not fit torch lacks them
+# A torchvision whose build does not fit torch lacks them.
+_OPERATORS = torch.library.Library("torchvision", "FRAGMENT")
 for _name in ("nms", "qnms"):
     _OPERATORS.define(f"{_name}(Tensor dets, Tensor scores, float iou_threshold) -> Tensor")
 
 from lerobot.async_inference import helpers  # noqa: E402
 
-helpers.get_logger = functools.partial(helpers.get_logger, log_to_file=False)  # else a folder in the working directory
+# Else a folder in the working directory.
+helpers.get_logger = functools.partial(helpers.get_logger, log_to_file=False)
 
 from lerobot.async_inference import policy_server  # noqa: E402
 from lerobot.async_inference.configs import PolicyServerConfig  # noqa: E402
@@ -51,7 +54,9 @@ class LerobotPolicy:
     @property
     def config(self) -> Any:
         image = SimpleNamespace(shape=(3, 224, 224))
-        return SimpleNamespace(image_features={f"observation.images.camera_{i}": image for i in range(2)})
+        return SimpleNamespace(
+            image_features={f"observation.images.camera_{i}": image for i in range(2)}
+        )
 
     def predict_action_chunk(self, _observation: dict[str, torch.Tensor]) -> torch.Tensor:
         return torch.from_numpy(self.policy()[None])
@@ -62,26 +67,37 @@ def serve(host: str, port: int, policy: peer.Policy) -> None:
     LerobotPolicy.policy = policy
     policy_server.SUPPORTED_POLICIES.append(NAME)
     policy_server.get_policy_class = {NAME: LerobotPolicy}.__getitem__
-    policy_server.make_pre_post_processors = lambda *_, **__: (lambda obs: obs, lambda action: action)
+    policy_server.make_pre_post_processors = lambda *_, **__: (
+        lambda obs: obs,
+        lambda action: action,
+    )
     policy_server.serve(PolicyServerConfig(host=host, port=port, inference_latency=0.0))
 
 
 def connect(target: peer.Target) -> peer.Client:
     """Connect as LeRobot's `RobotClient` does."""
     joints = {f"joint_{i}": float(value) for i, value in enumerate(target.state)}
-    features = dict.fromkeys(joints, float) | {name: image.shape for name, image in target.cameras.items()}
+    features = dict.fromkeys(joints, float) | {
+        name: image.shape for name, image in target.cameras.items()
+    }
     obs = {**joints, **target.cameras, "task": "measure"}
     stub = services_pb2_grpc.AsyncInferenceStub(
         grpc.insecure_channel(f"{target.host}:{target.port}", grpc_channel_options())
     )
     stub.Ready(services_pb2.Empty())
-    wanted = helpers.RemotePolicyConfig(NAME, "", hw_to_dataset_features(features, "observation", use_video=False), 1)
+    wanted = helpers.RemotePolicyConfig(
+        NAME, "", hw_to_dataset_features(features, "observation", use_video=False), 1
+    )
     stub.SendPolicyInstructions(services_pb2.PolicySetup(data=pickle.dumps(wanted)))
     steps = itertools.count()
 
     def act(obs: dict[str, Any]) -> np.ndarray:
-        timed = helpers.TimedObservation(timestamp=time.time(), timestep=next(steps), observation=obs, must_go=True)
-        stub.SendObservations(send_bytes_in_chunks(pickle.dumps(timed), services_pb2.Observation, silent=True))
+        timed = helpers.TimedObservation(
+            timestamp=time.time(), timestep=next(steps), observation=obs, must_go=True
+        )
+        stub.SendObservations(
+            send_bytes_in_chunks(pickle.dumps(timed), services_pb2.Observation, silent=True)
+        )
         (action,) = pickle.loads(stub.GetActions(services_pb2.Empty()).data)  # noqa: S301 - LeRobot's protocol
         return action.get_action().numpy()
 

@@ -1,8 +1,8 @@
 """openpi: its client from PyPI (`openpi-client`), images as raw bytes.
 
-Its server is not on PyPI. This one equals openpi's `WebsocketPolicyServer`: the asyncio server of `websockets` without
-compression or size limit, the metadata first, then msgpack in and out by openpi's own `msgpack_numpy`, inference on the
-event loop, and both timings in the reply.
+Its server is not on PyPI. This one equals openpi's `WebsocketPolicyServer`: the asyncio server of
+`websockets` without compression or size limit, the metadata first, then msgpack in and out by
+openpi's own `msgpack_numpy`, inference on the event loop, and both timings in the reply.
 """
 
 from __future__ import annotations
@@ -19,7 +19,9 @@ from openpi_client import msgpack_numpy
 from openpi_client.websocket_client_policy import WebsocketClientPolicy
 
 
-async def handler(policy: peer.Policy, websocket: websockets.asyncio.server.ServerConnection) -> None:
+async def handler(
+    policy: peer.Policy, websocket: websockets.asyncio.server.ServerConnection
+) -> None:
     """Serve one connection."""
     packer = msgpack_numpy.Packer()
     await websocket.send(packer.pack({}))
@@ -44,7 +46,9 @@ def serve(host: str, port: int, policy: peer.Policy) -> None:
 
     async def forever() -> None:
         handle = functools.partial(handler, policy)
-        async with websockets.asyncio.server.serve(handle, host, port, compression=None, max_size=None) as server:
+        async with websockets.asyncio.server.serve(
+            handle, host, port, compression=None, max_size=None
+        ) as server:
             await server.serve_forever()
 
     asyncio.run(forever())

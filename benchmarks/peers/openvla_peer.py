@@ -1,9 +1,10 @@
 """OpenVLA's REST server: FastAPI and uvicorn, `POST /act`, arrays as `json_numpy` writes them.
 
-OpenVLA is not on PyPI. This is the server of its `vla-scripts/deploy.py` around a policy that does nothing, and the
-client of its documentation: `requests.post(url, json=...).json()` with `json_numpy` patched in, a connection for each
-call. OpenVLA's own request has one image; here it has the benchmark's two, and the joints, as in the fine-tuned forks,
-so that every server gets the same observation.
+OpenVLA is not on PyPI. This is the server of its `vla-scripts/deploy.py` around a policy that does
+nothing, and the client of its documentation: `requests.post(url, json=...).json()` with
+`json_numpy` patched in, a connection for each call. OpenVLA's own request has one image; here it
+has the benchmark's two, and the joints, as in the fine-tuned forks, so that every server gets the
+same observation.
 """
 
 from __future__ import annotations
@@ -30,7 +31,10 @@ def predict_action(policy: peer.Policy, payload: dict[str, Any]) -> JSONResponse
         payload = json.loads(payload["encoded"])
     for name in ("image", "wrist_image"):
         if not isinstance(payload[name], np.ndarray):
-            raise TypeError(f"{name}: got {type(payload[name]).__name__}, want an array; is json_numpy patched in?")
+            raise TypeError(
+                f"{name}: got {type(payload[name]).__name__}, want an array; is json_numpy patched "
+                "in?"
+            )
     (action,) = policy()
     return JSONResponse(json_numpy.dumps(action)) if double_encoded else JSONResponse(action)
 

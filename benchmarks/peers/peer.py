@@ -1,4 +1,5 @@
-"""Common parts of the scripts: the line protocol, the policy, and the end of a process with the benchmark.
+"""Common parts of the scripts: the line protocol, the policy, and the end of a process with the
+benchmark.
 
 It imports only the standard library and numpy, as it runs in other environments.
 """
@@ -35,22 +36,32 @@ else:  # the peers' Python has no vlagents_ray: files are loaded by their paths
         spec.loader.exec_module(module)
         return module
 
-    _LINES, _START = _load("benchmarks/line_client.py"), _load("vlagents_ray/serve/python_env/child_start.py")
-    die_with_parent, obey, own_stdout, timed = _START.die_with_parent, _LINES.obey, _START.own_stdout, _LINES.timed
+    _LINES, _START = (
+        _load("benchmarks/line_client.py"),
+        _load("vlagents_ray/serve/python_env/child_start.py"),
+    )
+    die_with_parent, obey, own_stdout, timed = (
+        _START.die_with_parent,
+        _LINES.obey,
+        _START.own_stdout,
+        _LINES.timed,
+    )
     ClosedLoop = _load("benchmarks/closed_loop.py").ClosedLoop
 
 __all__ = ["Client", "Policy", "Target", "die_with_parent", "run", "wait_for_port"]
 
 _START_S = 400.0
 
-if Path(sys.argv[0]).resolve().parent == Path(__file__).resolve().parent:  # also in processes that a script spawns
+# Also in processes that a script spawns.
+if Path(sys.argv[0]).resolve().parent == Path(__file__).resolve().parent:
     die_with_parent()
 
 
 class Policy:
     """Seven numbers for each row of a batch, of which the first is the size of the batch.
 
-    A batch of B takes `base_ms + per_item_ms * B`. Only one batch is computed at a time, as on an accelerator.
+    A batch of B takes `base_ms + per_item_ms * B`. Only one batch is computed at a time, as on an
+    accelerator.
     """
 
     def __init__(self, base_ms: float = 0.0, per_item_ms: float = 0.0, batch: int = 1) -> None:
@@ -80,7 +91,8 @@ class Target:
 
     host: str
     port: int
-    arrays: Mapping[str, np.ndarray]  # camera_0, … (H, W, 3) uint8 RGB; joints (7,) float32; gripper () float64
+    # camera_0, … (H, W, 3) uint8 RGB; joints (7,) float32; gripper () float64.
+    arrays: Mapping[str, np.ndarray]
     mode: str
     policy: Policy
     clients: int  # of this process
@@ -102,7 +114,8 @@ class Client:
     observe: Callable[[], Any]
     act: Callable[[Any], Any]
     close: Callable[[], None] = lambda: None
-    before: Callable[[int, float], None] = lambda _clients, _end: None  # each run: number of clients, and its end
+    # Each run: number of clients, and its end.
+    before: Callable[[int, float], None] = lambda _clients, _end: None
 
 
 def end_with_stdin(end: Callable[[], None] = lambda: None) -> None:
@@ -118,14 +131,18 @@ def end_with_stdin(end: Callable[[], None] = lambda: None) -> None:
 
 
 def _stdin_has_ended() -> bool:
-    """Return whether the parent of this process has ended, possibly before `die_with_parent` was called."""
+    """Return whether the parent of this process has ended, possibly before `die_with_parent` was
+    called.
+    """
     poller = select.poll()
     poller.register(0, select.POLLIN)
     return any(events & select.POLLHUP for _, events in poller.poll(0))
 
 
 def wait_for_port(host: str, port: int) -> None:
-    """Wait until a server listens; `TimeoutError` after three minutes. Ends this process if its input ends."""
+    """Wait until a server listens; `TimeoutError` after three minutes. Ends this process if its
+    input ends.
+    """
     deadline = time.monotonic() + _START_S
     while True:
         try:
@@ -149,11 +166,12 @@ def run(
 ) -> None:
     """Run the command of a script.
 
-    Its commands are `serve HOST PORT POLICY`; `drive HOST PORT OBS.npz MODE POLICY`, a client that makes calls in its
-    turn; `load … ROBOTS SIMULATIONS`, with the same words before, clients that make load; `evaluate HOST PORT PLAN`,
-    which writes a line when all its episodes are played and all its processes have ended. POLICY and PLAN are JSON.
-    Without `serve`, the clients' process starts its server. `end` ends what the server's process has started, if that
-    does not end with it.
+    Its commands are `serve HOST PORT POLICY`; `drive HOST PORT OBS.npz MODE POLICY`, a client that
+    makes calls in its turn; `load … ROBOTS SIMULATIONS`, with the same words before, clients that
+    make load; `evaluate HOST PORT PLAN`, which writes a line when all its episodes are played and
+    all its processes have ended. POLICY and PLAN are JSON. Without `serve`, the clients' process
+    starts its server. `end` ends what the server's process has started, if that does not end with
+    it.
     """
     die_with_parent()
     out = own_stdout()

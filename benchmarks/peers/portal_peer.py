@@ -1,7 +1,8 @@
-"""portal: its `BatchServer`, with the batching in a process of its own, its default, and its `Client`.
+"""portal: its `BatchServer`, with the batching in a process of its own, its default, and its
+`Client`.
 
-It waits until a batch is full, however long that takes, so there is a method for each size, and clients call the one of
-their number, or of the largest batch. The server polls without a pause.
+It waits until a batch is full, however long that takes, so there is a method for each size, and
+clients call the one of their number, or of the largest batch. The server polls without a pause.
 """
 
 from __future__ import annotations

@@ -1,8 +1,9 @@
-"""Plain Ray Serve, without this project: a deployment with `@serve.batch`, as in Ray's documentation.
+"""Plain Ray Serve, without this project: a deployment with `@serve.batch`, as in Ray's
+documentation.
 
-In mode "http" a client posts a msgpack of raw bytes on a connection that it keeps; in mode "handle" it is another
-driver of the same cluster, with the deployment's handle. `max_ongoing_requests` is raised, or no batch would have more
-than five rows; `batch_wait_timeout_s` is Ray's default, 10 ms.
+In mode "http" a client posts a msgpack of raw bytes on a connection that it keeps; in mode "handle"
+it is another driver of the same cluster, with the deployment's handle. `max_ongoing_requests` is
+raised, or no batch would have more than five rows; `batch_wait_timeout_s` is Ray's default, 10 ms.
 """
 
 from __future__ import annotations
@@ -16,7 +17,8 @@ import msgpack
 import numpy as np
 import peer
 
-os.environ.setdefault("RAY_AUTH_MODE", "token")  # Ray's default where it starts a cluster, but not where it joins one
+# Ray's default where it starts a cluster, but not where it joins one.
+os.environ.setdefault("RAY_AUTH_MODE", "token")
 
 import ray
 import requests
@@ -48,7 +50,10 @@ class Model:
         if request.method == "GET":
             return Response(ray.get_runtime_context().gcs_address)
         packed = msgpack.unpackb(await request.body())
-        obs = {name: np.frombuffer(data, dtype).reshape(shape) for name, (data, dtype, shape) in packed.items()}
+        obs = {
+            name: np.frombuffer(data, dtype).reshape(shape)
+            for name, (data, dtype, shape) in packed.items()
+        }
         return Response((await self.infer(obs)).tobytes())
 
 
@@ -69,7 +74,8 @@ def connect(target: peer.Target) -> peer.Client:
             answer = requests.get(url, timeout=_START_S)
             answer.raise_for_status()
             break
-        except requests.RequestException:  # its proxy resets connections while it learns of the replica
+        except requests.RequestException:
+            # its proxy resets connections while it learns of the replica
             if time.monotonic() > deadline:
                 raise
             time.sleep(0.2)
@@ -81,7 +87,9 @@ def connect(target: peer.Target) -> peer.Client:
     session = requests.Session()
 
     def act(obs: dict[str, np.ndarray]) -> np.ndarray:
-        packed: dict[str, Any] = {name: (array.tobytes(), str(array.dtype), array.shape) for name, array in obs.items()}
+        packed: dict[str, Any] = {
+            name: (array.tobytes(), str(array.dtype), array.shape) for name, array in obs.items()
+        }
         answer = session.post(url, msgpack.packb(packed))
         answer.raise_for_status()
         return np.frombuffer(answer.content, np.float32)

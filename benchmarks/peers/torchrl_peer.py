@@ -1,7 +1,8 @@
-"""TorchRL: its `InferenceServer` in a process, by its fastest transport between processes, `process_slot`.
+"""TorchRL: its `InferenceServer` in a process, by its fastest transport between processes,
+`process_slot`.
 
-Each client has a slot in shared memory. Clients can only be made where the server was started, so the process of the
-clients starts it.
+Each client has a slot in shared memory. Clients can only be made where the server was started, so
+the process of the clients starts it.
 """
 
 from __future__ import annotations
@@ -27,7 +28,8 @@ class TorchrlPolicy(torch.nn.Module):
 
 def _observation(target: peer.Target) -> TensorDict:
     return TensorDict(
-        {"state": torch.from_numpy(target.state)} | {n: torch.from_numpy(i) for n, i in target.cameras.items()}
+        {"state": torch.from_numpy(target.state)}
+        | {n: torch.from_numpy(i) for n, i in target.cameras.items()}
     )
 
 
@@ -39,7 +41,9 @@ def _server(target: peer.Target) -> InferenceServer:
         service_backend="process",
         transport="process_slot",
         request_spec=_observation(target),
-        response_spec=TensorDict({"action": torch.zeros(7), "policy_version": torch.zeros((), dtype=torch.long)}),
+        response_spec=TensorDict(
+            {"action": torch.zeros(7), "policy_version": torch.zeros((), dtype=torch.long)}
+        ),
         num_clients=target.clients,
         max_batch_size=target.policy.batch,
     ).start()

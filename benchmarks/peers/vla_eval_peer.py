@@ -2,9 +2,10 @@
 
 Images are sent by its default codec, PNG, unless `mode` names another ("jpeg", "raw").
 
-An evaluation is one model server and a `vla-eval run --no-docker` for each shard, all on one recording, and then
-`vla-eval export`, as in its script for sharded runs. Videos are off, its default; images are raw, since compression for
-a server on the same machine only costs time. `run ...` and `export ...` are its commands of those names.
+An evaluation is one model server and a `vla-eval run --no-docker` for each shard, all on one
+recording, and then `vla-eval export`, as in its script for sharded runs. Videos are off, its
+default; images are raw, since compression for a server on the same machine only costs time. `run
+...` and `export ...` are its commands of those names.
 """
 
 from __future__ import annotations
@@ -36,7 +37,9 @@ class VlaEvalPolicy(PredictModelServer):
     def predict(self, obs: dict[str, Any], ctx: Any) -> dict[str, Any]:
         return {"actions": self._policy()[0]}
 
-    def predict_batch(self, obs_batch: list[dict[str, Any]], ctx_batch: list[Any]) -> list[dict[str, Any]]:
+    def predict_batch(
+        self, obs_batch: list[dict[str, Any]], ctx_batch: list[Any]
+    ) -> list[dict[str, Any]]:
         return [{"actions": action} for action in self._policy(len(obs_batch))]
 
 
@@ -66,7 +69,11 @@ class VlaEvalTimed(StepBenchmark):
 
     def make_obs(self, raw_obs: Any, task: dict[str, Any]) -> dict[str, Any]:
         state = np.concatenate(list(raw_obs.state.values()))
-        return {"images": raw_obs.cameras, "task_description": self._env.instruction, "state": state}
+        return {
+            "images": raw_obs.cameras,
+            "task_description": self._env.instruction,
+            "state": state,
+        }
 
     def get_step_result(self, step_result: StepResult) -> dict[str, Any]:
         return {"success": step_result.info["success"]}
@@ -86,7 +93,9 @@ def connect(target: peer.Target) -> peer.Client:
     connection = Connection(f"ws://{target.host}:{target.port}")
     loop.run_until_complete(connection.connect())
     loop.run_until_complete(connection.start_episode({"task": {"name": "measure"}}))
-    return peer.Client(lambda: obs, lambda obs: loop.run_until_complete(connection.act(obs))["actions"])
+    return peer.Client(
+        lambda: obs, lambda obs: loop.run_until_complete(connection.act(obs))["actions"]
+    )
 
 
 def evaluate(host: str, port: int, plan: dict[str, Any]) -> None:
@@ -99,12 +108,23 @@ def evaluate(host: str, port: int, plan: dict[str, Any]) -> None:
         "params": {"seed": plan["seed"], "env": plan["env"]},
     }
     config = folder / "run.yaml"
-    config.write_text(json.dumps({"server": {"url": f"ws://{host}:{port}"}, "benchmarks": [benchmark]}))
-    common = ["--output-dir", str(folder), "--eval-id", "bench", "--num-shards", str(plan["workers"]), "--shard-id"]
+    config.write_text(
+        json.dumps({"server": {"url": f"ws://{host}:{port}"}, "benchmarks": [benchmark]})
+    )
+    common = [
+        "--output-dir",
+        str(folder),
+        "--eval-id",
+        "bench",
+        "--num-shards",
+        str(plan["workers"]),
+        "--shard-id",
+    ]
     server = _start("serve", host, str(port), "{}")
     peer.wait_for_port(host, port)
     shards = [
-        _start("run", "--no-docker", "--config", str(config), *common, str(shard)) for shard in range(plan["workers"])
+        _start("run", "--no-docker", "--config", str(config), *common, str(shard))
+        for shard in range(plan["workers"])
     ]
     for shard in shards:
         _wait(shard)

@@ -1,12 +1,14 @@
 """vlagents, the paper's own system: its server, and its `RemoteAgent` with mode "shm" or "jpeg".
 
-The policy derives from its `Agent` and calls `super().act`, which decodes the cameras, as its documentation requires.
-Its client sends JPEG with simplejpeg's defaults, quality 85 and 4:4:4. The server is that of `vlagents start-server`.
-Its client changes the observation, so each call gets a new one.
+The policy derives from its `Agent` and calls `super().act`, which decodes the cameras, as its
+documentation requires. Its client sends JPEG with simplejpeg's defaults, quality 85 and 4:4:4. The
+server is that of `vlagents start-server`. Its client changes the observation, so each call gets a
+new one.
 
-An evaluation is its `run-eval` with `same_machine`, raw images, and no videos. Each configuration has its own process
-and server, so several processes are several configurations of one environment, with consecutive seeds. `start-server
-...` is its command of that name, with this file's agent registered.
+An evaluation is its `run-eval` with `same_machine`, raw images, and no videos. Each configuration
+has its own process and server, so several processes are several configurations of one environment,
+with consecutive seeds. `start-server ...` is its command of that name, with this file's agent
+registered.
 """
 
 from __future__ import annotations
@@ -54,8 +56,11 @@ class VlagentsTabletop(EvalEnv):
     def make_gym(self) -> Any:
         return self._make(**self.env_kwargs)
 
-    def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Obs, dict[str, Any]]:
-        if seed is None:  # after each episode; its observation is not used, so it costs nothing here
+    def reset(
+        self, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Obs, dict[str, Any]]:
+        # After each episode; its observation is not used, so it costs nothing here.
+        if seed is None:
             return self._last, {}
         obs, info = self.env.reset(seed=seed)
         return self._translated(obs), info
@@ -89,7 +94,10 @@ def serve(host: str, port: int, policy: peer.Policy) -> None:
     service = AgentService(VlagentsPolicy(), NAME)
     with service:
         rpyc.ThreadedServer(
-            service, port=port, hostname=host, protocol_config={"allow_pickle": True, "allow_public_attrs": True}
+            service,
+            port=port,
+            hostname=host,
+            protocol_config={"allow_pickle": True, "allow_public_attrs": True},
         ).start()
 
 
@@ -102,7 +110,11 @@ def connect(target: peer.Target) -> peer.Client:
         return Obs(obs={"robot": robot}, language_instruction="measure")
 
     agent = RemoteAgent(
-        target.host, target.port, NAME, on_same_machine=target.mode == "shm", jpeg_encoding=target.mode == "jpeg"
+        target.host,
+        target.port,
+        NAME,
+        on_same_machine=target.mode == "shm",
+        jpeg_encoding=target.mode == "jpeg",
     )
     return peer.Client(observe, lambda obs: agent.act(obs).acts[0]["robot"].action, agent.close)
 
@@ -110,7 +122,8 @@ def connect(target: peer.Target) -> peer.Client:
 def evaluate(host: str, port: int, plan: dict[str, Any]) -> None:
     """Run vlagents' `run-eval`; processes other than the first use the next ports."""
     folder = Path(plan["folder"])
-    server = folder / "python"  # `run-eval` starts PYTHON -m vlagents start-server ..., which has no agent of ours
+    # `run-eval` starts PYTHON -m vlagents start-server ..., which has no agent of ours.
+    server = folder / "python"
     server.write_text(f"#!/bin/sh\nshift 2\nexec '{sys.executable}' '{__file__}' \"$@\"\n")
     server.chmod(0o755)
     each = plan["episodes"] // plan["workers"]
@@ -125,7 +138,13 @@ def evaluate(host: str, port: int, plan: dict[str, Any]) -> None:
         }
         for process in range(plan["workers"])
     ]
-    agent = {"host": host, "port": port, "agent_name": NAME, "agent_kwargs": {}, "python_path": str(server)}
+    agent = {
+        "host": host,
+        "port": port,
+        "agent_name": NAME,
+        "agent_kwargs": {},
+        "python_path": str(server),
+    }
     words = [
         "run-eval",
         f"--output-path={folder}",

@@ -1,7 +1,9 @@
-"""The recording that index.html plays: `python docs/demo/record.py` plays the reference policy, and writes session.js.
+"""The recording that index.html plays: `python docs/demo/record.py` plays the reference policy, and
+writes session.js.
 
-The policy is served, and asked over a WebSocket, as by a robot. Each act returns a chunk of eight rows, of which four
-are executed. States are those of the simulator, in its base frame (`vlagents_ray.envs.tabletop`).
+The policy is served, and asked over a WebSocket, as by a robot. Each act returns a chunk of eight
+rows, of which four are executed. States are those of the simulator, in its base frame
+(`vlagents_ray.envs.tabletop`).
 """
 
 from __future__ import annotations
@@ -31,13 +33,20 @@ _HEAD = "const SESSION = "  # a script, as a page that was opened as a file may 
 def main() -> None:
     """Play all episodes by a server, and write them."""
     served = deployment("reference", config=POLICY)
-    with running_server(served, num_cpus=2) as server, RemoteAgent(server.url, transport="websocket") as agent:
+    with (
+        running_server(served, num_cpus=2) as server,
+        RemoteAgent(server.url, transport="websocket") as agent,
+    ):
         episodes = [play(agent, task, seed) for task in TASKS for seed in SEEDS]
     rates = json.loads((CHECKPOINT / "rates.json").read_text())["tabletop"]
     recording = {"version": version("vlagents-ray"), "cores": os.cpu_count(), "stages": STAGES}
     recording |= {"geometry": geometry(), "palette": render.PALETTE}
-    recording |= {"rates": {task: rates[f"tabletop/{task}"] for task in TASKS}, "episodes": episodes}
-    lines = json.dumps(recording, separators=(",", ":")).replace('{"task"', '\n{"task"')  # an episode in each
+    recording |= {
+        "rates": {task: rates[f"tabletop/{task}"] for task in TASKS},
+        "episodes": episodes,
+    }
+    # An episode in each.
+    lines = json.dumps(recording, separators=(",", ":")).replace('{"task"', '\n{"task"')
     FILE.write_text(f"{_HEAD}{lines};\n")
 
 
@@ -51,16 +60,23 @@ def play(agent: Agent, task: str, seed: int) -> dict[str, Any]:
         while not over:
             act = agent.act(obs)
             timing = act.info.get("timing", {})
-            total, *stages = [round(timing.get(stage, 0.0), 3) for stage in ("round_trip_ms", *STAGES)]
+            total, *stages = [
+                round(timing.get(stage, 0.0), 3) for stage in ("round_trip_ms", *STAGES)
+            ]
             # All digits that float32 has, so that the actions, played again, give the same states.
             rows = [[float(f"{number:.9g}") for number in row] for row in act.rows()]
-            acts.append({"step": len(states) - 1, "round_trip_ms": total, "ms": stages, "rows": rows})
+            acts.append(
+                {"step": len(states) - 1, "round_trip_ms": total, "ms": stages, "rows": rows}
+            )
             for row in act.rows()[:EXECUTE]:
                 obs, _, _, truncated, info = env.step(Act(row))
                 states.append(state(scene))
                 if over := truncated or info["success"]:
                     break
-        typer.echo(f"{task}, seed {seed}: {env.instruction!r}, {len(states) - 1} steps, solved: {info['success']}")
+        typer.echo(
+            f"{task}, seed {seed}: {env.instruction!r}, {len(states) - 1} steps, solved: "
+            f"{info['success']}"
+        )
         return {
             "task": task,
             "seed": seed,
@@ -74,11 +90,14 @@ def play(agent: Agent, task: str, seed: int) -> dict[str, Any]:
 
 
 def state(scene: world.TabletopWorld) -> list[float]:
-    """Return x, y, z of the fingertips and the gap, m; the number of the held puck, or -1; x, y, z of each puck, m."""
+    """Return x, y, z of the fingertips and the gap, m; the number of the held puck, or -1; x, y,
+    z of each puck, m.
+    """
     held = next((i for i, puck in enumerate(scene.pucks) if puck is scene.held), -1)
     pucks = [place for puck in scene.pucks for place in (puck.x, puck.y, puck.z)]
     return [
-        held if i == 4 else _rounded(one) for i, one in enumerate((scene.x, scene.y, scene.z, scene.gap, 0, *pucks))
+        held if i == 4 else _rounded(one)
+        for i, one in enumerate((scene.x, scene.y, scene.z, scene.gap, 0, *pucks))
     ]
 
 

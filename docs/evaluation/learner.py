@@ -1,4 +1,6 @@
-"""A policy for the picture of the report: the scripted expert, with a hand that steadies over training."""
+"""A policy for the picture of the report: the scripted expert, with a hand that steadies over
+training.
+"""
 
 from __future__ import annotations
 
@@ -16,11 +18,15 @@ class LearnerConfig(BaseModel, extra="forbid"):
 
     task: str | None = None
     checkpoint_step: int = Field(default=0, ge=0)
-    drift: float = Field(default=0.3, ge=0, description="standard deviation of the drift before training, per action")
+    drift: float = Field(
+        default=0.3, ge=0, description="standard deviation of the drift before training, per action"
+    )
 
 
 class Learner(Scripted):
-    """Adds to each action of an episode the same drift, which halves every 5000 steps of training."""
+    """Adds to each action of an episode the same drift, which halves every 5000 steps of
+    training.
+    """
 
     Config: ClassVar[type] = LearnerConfig
 

@@ -1,4 +1,5 @@
-"""Stable-Baselines3's PPO on an environment of this package: prints steps and mean return, and learns Pendulum.
+"""Stable-Baselines3's PPO on an environment of this package: prints steps and mean return, and
+learns Pendulum.
 
 pip install stable-baselines3 '.[learn,sim]'
 python stable_baselines.py
@@ -18,7 +19,9 @@ from vlagents_ray_learn import as_vector_env
 
 
 class StableBaselinesEnv(VecEnv):
-    """A `gymnasium.vector.VectorEnv` with autoreset "same_step", as Stable-Baselines3's own kind of vector env."""
+    """A `gymnasium.vector.VectorEnv` with autoreset "same_step", as Stable-Baselines3's own kind
+    of vector env.
+    """
 
     def __init__(self, envs: Any) -> None:
         self.envs = envs
@@ -35,7 +38,9 @@ class StableBaselinesEnv(VecEnv):
     def step_wait(self) -> tuple[Any, np.ndarray, np.ndarray, list[dict[str, Any]]]:
         observations, rewards, terminated, truncated, infos = self.envs.step(self.actions)
         over = terminated | truncated
-        each: list[dict[str, Any]] = [{"TimeLimit.truncated": bool(one)} for one in truncated & ~terminated]
+        each: list[dict[str, Any]] = [
+            {"TimeLimit.truncated": bool(one)} for one in truncated & ~terminated
+        ]
         for i in np.flatnonzero(over):
             each[i]["terminal_observation"] = infos["final_obs"][i]
         return observations, rewards.astype(np.float32), over, each
@@ -49,7 +54,9 @@ class StableBaselinesEnv(VecEnv):
     def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
         raise NotImplementedError
 
-    def env_method(self, method_name: str, *args: Any, indices: Any = None, **kwargs: Any) -> list[Any]:
+    def env_method(
+        self, method_name: str, *args: Any, indices: Any = None, **kwargs: Any
+    ) -> list[Any]:
         raise NotImplementedError
 
     def env_is_wrapped(self, wrapper_class: Any, indices: Any = None) -> list[bool]:
@@ -72,8 +79,16 @@ def main(steps: int = 72_000) -> None:
     """Train for so many steps."""
     options = {"cameras": {}, "unit_actions": True}
     envs = as_vector_env("gymnasium/Pendulum-v1", 8, observation="state", env_options=options)
-    settings: dict[str, Any] = {"n_steps": 256, "batch_size": 128, "gamma": 0.9, "learning_rate": 1e-3, "seed": 0}
-    PPO("MlpPolicy", VecMonitor(StableBaselinesEnv(envs)), **settings).learn(steps, callback=Curve())
+    settings: dict[str, Any] = {
+        "n_steps": 256,
+        "batch_size": 128,
+        "gamma": 0.9,
+        "learning_rate": 1e-3,
+        "seed": 0,
+    }
+    PPO("MlpPolicy", VecMonitor(StableBaselinesEnv(envs)), **settings).learn(
+        steps, callback=Curve()
+    )
     envs.close()
 
 

@@ -1,6 +1,8 @@
-"""The pictures of an observation's way to the policy and back: `python docs/pictures/flows.py` writes them anew.
+"""The pictures of an observation's way to the policy and back: `python docs/pictures/flows.py`
+writes them anew.
 
-Every text stands on a colour of its own, so that one file is readable on a light page and on a dark one.
+Every text stands on a colour of its own, so that one file is readable on a light page and on a dark
+one.
 """
 
 from __future__ import annotations
@@ -12,8 +14,8 @@ FOLDER = Path(__file__).parent
 _CLIENT, _WAY, _SERVER, _POLICY, _LINE = "#3949ab", "#546e7a", "#00695c", "#a0430a", "#8490a3"
 _BOX_W, _BOX_H, _ROW, _TOP, _LEFT, _RIGHT, _WIDTH = 230, 58, 96, 52, 20, 430, 680
 
-# Name of the picture -> what it shows; the client's boxes and the server's, from top to bottom, each with the place of
-# its code; and what lies between the last two: title, what crosses.
+# Name of the picture -> what it shows; the client's boxes and the server's, from top to bottom,
+# each with the place of its code; and what lies between the last two: title, what crosses.
 FLOWS: dict[str, tuple[str, list[tuple[str, str]], list[tuple[str, str]], tuple[str, str]]] = {
     "flow": (
         "One way to the policy, and the same way back",
@@ -55,7 +57,9 @@ FLOWS: dict[str, tuple[str, list[tuple[str, str]], list[tuple[str, str]], tuple[
 
 
 def picture(name: str) -> str:
-    """The picture as SVG: a request runs down on the left, across, and up on the right; its reply runs back."""
+    """The picture as SVG: a request runs down on the left, across, and up on the right; its
+    reply runs back.
+    """
     title, client, server, (way, crosses) = FLOWS[name]
     rows = max(len(client), len(server))
     height = _TOP + (rows - 1) * _ROW + _BOX_H + 22
@@ -63,7 +67,10 @@ def picture(name: str) -> str:
         f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {_WIDTH} {height}" role="img">',
         '<g font-size="16" font-family="system-ui, sans-serif" text-anchor="middle">',
         f"<title>{escape(title)}</title>",
-        '<marker id="tip" viewBox="0 0 8 8" refX="7" refY="4" markerWidth="7" markerHeight="7" orient="auto">',
+        (
+            '<marker id="tip" viewBox="0 0 8 8" refX="7" refY="4" markerWidth="7" markerHeight="7" '
+            'orient="auto">'
+        ),
         f'<path d="M0 0L8 4L0 8z" fill="{_LINE}"/></marker>',
     ]
     for x, boxes, label, colour in (
@@ -72,7 +79,8 @@ def picture(name: str) -> str:
     ):
         top = _y(rows, len(boxes), 0)
         parts.append(
-            f'<rect x="{x - 14}" y="{top - 20}" width="{_BOX_W + 28}" height="{height - top + 14}" rx="14" fill="none" '
+            f'<rect x="{x - 14}" y="{top - 20}" width="{_BOX_W + 28}" height="{height - top + 14}" '
+            'rx="14" fill="none" '
             f'stroke="{_LINE}" stroke-width="1.5" stroke-dasharray="5 4"/>'
         )
         parts += _pill(x + _BOX_W // 2, top - 20, label)
@@ -110,7 +118,10 @@ def _box(x: int, y: int, width: int, title: str, where: str, colour: str) -> lis
 def _pill(x: int, y: int, text: str) -> list[str]:
     width = 9 * len(text) + 18
     return [
-        f'<rect x="{x - width // 2}" y="{y - 10}" width="{width}" height="20" rx="10" fill="{_WAY}"/>',
+        (
+            f'<rect x="{x - width // 2}" y="{y - 10}" width="{width}" height="20" rx="10" '
+            f'fill="{_WAY}"/>'
+        ),
         f'<text x="{x}" y="{y + 5}" fill="#fff" font-size="14">{escape(text)}</text>',
     ]
 
@@ -130,7 +141,10 @@ def _label(x: int, y: int, title: str, text: str) -> list[str]:
 
 
 def _arrow(x1: int, y1: int, x2: int, y2: int) -> str:
-    return f'<path d="M{x1} {y1}L{x2} {y2}" stroke="{_LINE}" stroke-width="2.5" marker-end="url(#tip)"/>'
+    return (
+        f'<path d="M{x1} {y1}L{x2} {y2}" stroke="{_LINE}" stroke-width="2.5" '
+        'marker-end="url(#tip)"/>'
+    )
 
 
 if __name__ == "__main__":

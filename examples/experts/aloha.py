@@ -13,10 +13,12 @@ from vlagents_ray.policies.experts import sim_vector
 from vlagents_ray.registry import env_task
 
 _SHOULDER = 0.12705  # height of the shoulder's axis over the table, m
-_UPPER = np.array([0.05955, 0.3])  # from the shoulder to the elbow with all joints at 0: forward, up, m
+# From the shoulder to the elbow with all joints at 0: forward, up, m.
+_UPPER = np.array([0.05955, 0.3])
 _FOREARM = 0.3  # from the elbow to the wrist's axis, m
 _HAND = 0.2  # from the wrist's axis to between the fingers' pads, m
-_BASES = {"left": (-0.469, 0.5, 1.0), "right": (0.469, 0.5, -1.0)}  # x, y, m, and the direction that the arm faces
+# x, y, m, and the direction that the arm faces.
+_BASES = {"left": (-0.469, 0.5, 1.0), "right": (0.469, 0.5, -1.0)}
 _OPEN, _CLOSED = 1.0, 0.0
 _TILT = math.radians(60)  # of a hand that grasps from above, so that it does not hit the other one
 _OBJECTS = {"transfer_cube": 7, "insertion": 14}  # numbers of `info["sim_state"]`
@@ -33,17 +35,29 @@ class HandPose:
 
 
 def joints(arm: str, pose: HandPose) -> list[float]:
-    """Return the joint angles of an arm and its gripper's position, 7 numbers; the nearest ones if out of reach."""
+    """Return the joint angles of an arm and its gripper's position, 7 numbers; the nearest ones
+    if out of reach.
+    """
     base_x, base_y, facing = _BASES[arm]
     x, y = facing * (pose.xyz[0] - base_x), facing * (pose.xyz[1] - base_y)
     out = math.hypot(x, y) - _HAND * math.cos(pose.pitch)
     up = pose.xyz[2] - _SHOULDER + _HAND * math.sin(pose.pitch)
     upper, away = math.hypot(*_UPPER), math.hypot(out, up)
     cosine = (upper**2 + away**2 - _FOREARM**2) / (2 * upper * away)
-    raised = math.atan2(out, up) - math.acos(min(max(cosine, -1.0), 1.0))  # of the upper arm, from the vertical
-    below = math.atan2(upper * math.cos(raised) - up, out - upper * math.sin(raised))  # of the forearm
+    # Of the upper arm, from the vertical.
+    raised = math.atan2(out, up) - math.acos(min(max(cosine, -1.0), 1.0))
+    # Of the forearm.
+    below = math.atan2(upper * math.cos(raised) - up, out - upper * math.sin(raised))
     shoulder = raised - math.atan2(*_UPPER)
-    return [math.atan2(y, x), shoulder, below - shoulder, 0.0, pose.pitch - below, pose.roll, pose.gripper]
+    return [
+        math.atan2(y, x),
+        shoulder,
+        below - shoulder,
+        0.0,
+        pose.pitch - below,
+        pose.roll,
+        pose.gripper,
+    ]
 
 
 Waypoints = list[tuple[int, HandPose]]
@@ -51,12 +65,16 @@ Waypoints = list[tuple[int, HandPose]]
 
 
 class AlohaExpert:
-    """Moves each hand along waypoints over the objects, which it finds in `info["sim_state"]`; actions are (14,)."""
+    """Moves each hand along waypoints over the objects, which it finds in `info["sim_state"]`;
+    actions are (14,).
+    """
 
     def __init__(self, env_name: str) -> None:
         self._task = env_task(env_name) or "transfer_cube"
         if self._task not in _OBJECTS:
-            raise ContractMismatch(f"no expert for {env_name!r}: want one of {[f'aloha/{task}' for task in _OBJECTS]}")
+            raise ContractMismatch(
+                f"no expert for {env_name!r}: want one of {[f'aloha/{task}' for task in _OBJECTS]}"
+            )
         self._way: dict[str, list[tuple[int, np.ndarray]]] = {}
         self._step = 0
 
@@ -64,7 +82,10 @@ class AlohaExpert:
         objects = sim_vector(obs, _OBJECTS[self._task], f"aloha/{self._task}")
         plan = (_transfer if self._task == "transfer_cube" else _insertion)(objects)
         self._way = {
-            arm: [(0, _now(obs, arm)), *((step, np.array(joints(arm, pose))) for step, pose in plan[arm])]
+            arm: [
+                (0, _now(obs, arm)),
+                *((step, np.array(joints(arm, pose))) for step, pose in plan[arm]),
+            ]
             for arm in _BASES
         }
         self._step = 0
@@ -73,11 +94,15 @@ class AlohaExpert:
         if not self._way:
             raise NotReset("aloha expert: act before reset; call reset(obs, instruction) first")
         self._step += 1
-        return Act(np.concatenate([_at(self._way[arm], self._step) for arm in _BASES]).astype(np.float32))
+        return Act(
+            np.concatenate([_at(self._way[arm], self._step) for arm in _BASES]).astype(np.float32)
+        )
 
 
 def _transfer(objects: np.ndarray) -> dict[str, Waypoints]:
-    """Let the right hand lift the cube to the middle, and the left hand, turned by 90 degrees, take it."""
+    """Let the right hand lift the cube to the middle, and the left hand, turned by 90 degrees,
+    take it.
+    """
     x, y = objects[:2]
     middle, side = (0.0, 0.5, 0.25), math.pi / 2
     return {
@@ -93,7 +118,8 @@ def _transfer(objects: np.ndarray) -> dict[str, Waypoints]:
 def _insertion(objects: np.ndarray) -> dict[str, Waypoints]:
     """Lift the peg with the right hand and the socket with the left one, and move them together."""
     peg, socket = objects[:2], objects[7:9]
-    held = {"right": (peg, 1.0, 0.22), "left": (socket, -1.0, 0.2)}  # the peg is grasped 2 cm lower than the socket
+    # The peg is grasped 2 cm lower than the socket.
+    held = {"right": (peg, 1.0, 0.22), "left": (socket, -1.0, 0.2)}
     return {
         arm: [
             *_grasp(x, y, 10),
@@ -125,4 +151,6 @@ def _now(obs: Obs, arm: str) -> np.ndarray:
 def _at(way: list[tuple[int, np.ndarray]], step: int) -> np.ndarray:
     """Return the command of a step, (7,), between the poses before and after it."""
     steps = [at for at, _ in way]
-    return np.array([np.interp(step, steps, [pose[i] for _, pose in way]) for i in range(len(way[0][1]))])
+    return np.array(
+        [np.interp(step, steps, [pose[i] for _, pose in way]) for i in range(len(way[0][1]))]
+    )

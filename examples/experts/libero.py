@@ -1,4 +1,6 @@
-"""An expert for LIBERO's tasks, from the simulator's state: it moves objects, closes drawers and turns knobs."""
+"""An expert for LIBERO's tasks, from the simulator's state: it moves objects, closes drawers and
+turns knobs.
+"""
 
 from __future__ import annotations
 
@@ -25,14 +27,17 @@ _TWIST = 1.2  # rad, of a stove's knob
 class Grip:
     """The grasp and release of a kind of object."""
 
-    offset: tuple[float, float, float] = (0.0, 0.0, 0.0)  # from the object's origin to the hand when it closes, m
-    along: str = ""  # the object's axis, x or y, along which the fingers close; the offset is then in its frame
+    # From the object's origin to the hand when it closes, m.
+    offset: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    # The object's axis, x or y, along which the fingers close; the offset is then in its frame.
+    along: str = ""
     foot_m: float = 0.0  # height of the object's origin above its lowest point
 
 
 # Round objects are grasped in the middle, whatever their orientation.
 _GRIPS = {
-    "akita_black_bowl": Grip((0.0, 0.048, 0.035)),  # bowls are wider than the hand: a finger goes inside
+    # Bowls are wider than the hand: a finger goes inside.
+    "akita_black_bowl": Grip((0.0, 0.048, 0.035)),
     "white_bowl": Grip((0.0, 0.036, 0.022)),
     "porcelain_mug": Grip((0.055, 0.0, 0.095), "x"),  # the rim on the other side of the handle
     "white_yellow_mug": Grip((-0.06, 0.0, 0.085), "x"),
@@ -78,7 +83,8 @@ _ORDER = ("turnon", "on", "in", "close")
 
 
 class LiberoExpert(PickExpert):
-    """Meets the predicates of the goal one after the other, and repeats those that are then still unmet.
+    """Meets the predicates of the goal one after the other, and repeats those that are then still
+    unmet.
 
     It opens neither drawers nor microwaves: such goals are refused.
     """
@@ -94,7 +100,9 @@ class LiberoExpert(PickExpert):
     def reset(self, obs: Obs, instruction: str) -> None:
         unknown = sorted({kind for kind, *_ in self._state(obs)["goal"]} - set(_MOTIONS))
         if unknown:
-            raise ContractMismatch(f"{self._name}: the expert meets goals of {sorted(_MOTIONS)}, not {unknown}")
+            raise ContractMismatch(
+                f"{self._name}: the expert meets goals of {sorted(_MOTIONS)}, not {unknown}"
+            )
         self._tries = {}
         self._choose(obs)
         super().reset(obs, instruction)
@@ -119,7 +127,9 @@ class LiberoExpert(PickExpert):
     def _hand(self, obs: Obs) -> tuple[np.ndarray, np.ndarray]:
         pose = obs.state.get("xyz_axis_angle")
         if pose is None or pose.shape != (6,):
-            raise InvalidObservation("state 'xyz_axis_angle': want (6,), m and rad, as LIBERO's env gives it")
+            raise InvalidObservation(
+                "state 'xyz_axis_angle': want (6,), m and rad, as LIBERO's env gives it"
+            )
         return pose[:3].astype(np.float64), rotation(pose[3:].astype(np.float64))
 
     def _aim(self, hand: np.ndarray, obs: Obs) -> None:
@@ -142,9 +152,15 @@ class LiberoExpert(PickExpert):
         if phase in ("over", "down"):
             if grip.along:
                 yaw = yaw_of(state["quaternions"][name])
-            else:  # the rim away from the cabinet, whose open drawer the hand would meet; then other sides
-                cabinets = [at[1] for other, at in state["positions"].items() if "cabinet_1" in other]
-                yaw = (math.pi if cabinets and cabinets[0] > 0 else 0.0) + math.pi / 2 * (self._tries[name] - 1)
+            else:
+                # the rim away from the cabinet, whose open drawer the hand would meet; then other
+                # sides
+                cabinets = [
+                    at[1] for other, at in state["positions"].items() if "cabinet_1" in other
+                ]
+                yaw = (math.pi if cabinets and cabinets[0] > 0 else 0.0) + math.pi / 2 * (
+                    self._tries[name] - 1
+                )
             self._turn(yaw + (math.pi / 2 if grip.along == "x" else 0.0))
             self._target = thing + rotation(yaw * UP) @ np.array(grip.offset)
             if phase == "over":
@@ -159,14 +175,21 @@ class LiberoExpert(PickExpert):
             above = there + hand - thing  # of the hand, with the object above its place
             contained = place.endswith("contain_region")
             drop = 0.1 if contained and "caddy" not in place else grip.foot_m + 0.02
-            self._target = np.array([above[0], above[1], hand[2] if phase == "carry" else above[2] + drop])
+            self._target = np.array(
+                [above[0], above[1], hand[2] if phase == "carry" else above[2] + drop]
+            )
 
     def _aim_at_drawer(self, drawer: np.ndarray, phase: str) -> None:
-        """Push the handle from the front, with the narrow side of the hand towards the other drawers."""
-        front = -math.copysign(1.0, drawer[1])  # cabinets stand on both sides of the table and face its middle
+        """Push the handle from the front, with the narrow side of the hand towards the other
+        drawers.
+        """
+        # Cabinets stand on both sides of the table and face its middle.
+        front = -math.copysign(1.0, drawer[1])
         self._turn(math.pi / 2)
         if phase in ("over", "down"):
-            self._target = drawer + np.array([0.0, front * (_HANDLE_M + 0.06), OVER_M if phase == "over" else 0.0])
+            self._target = drawer + np.array(
+                [0.0, front * (_HANDLE_M + 0.06), OVER_M if phase == "over" else 0.0]
+            )
         elif phase == "push":
             self._target = self._target - np.array([0.0, front * (0.06 + _TRAVEL_M), 0.0])
 
@@ -180,10 +203,13 @@ class LiberoExpert(PickExpert):
 
     def _state(self, obs: Obs) -> dict[str, Any]:
         state = obs.info.get("sim_state")
-        if not isinstance(state, dict) or not {"goal", "unmet", "positions", "quaternions"} <= set(state):
+        if not isinstance(state, dict) or not {"goal", "unmet", "positions", "quaternions"} <= set(
+            state
+        ):
             got: Any = sorted(state) if isinstance(state, dict) else type(state).__name__
             raise InvalidObservation(
-                f"info['sim_state']: got {got}, want goal, unmet, positions and quaternions, as the env {self._name} "
+                f"info['sim_state']: got {got}, want goal, unmet, positions and quaternions, as "
+                f"the env {self._name} "
                 f"gives them; this expert cannot act on images"
             )
         return state

@@ -21,7 +21,9 @@ class MetaWorldExpert:
         oracles: dict[str, Any] = require("metaworld.policies").ENV_POLICY_MAP
         task = env_task(env_name) or "reach-v3"
         if task not in oracles:
-            raise ContractMismatch(f"Meta-World has no oracle for {env_name!r}: want one of {sorted(oracles)}")
+            raise ContractMismatch(
+                f"Meta-World has no oracle for {env_name!r}: want one of {sorted(oracles)}"
+            )
         self._name = env_name
         self._oracle = oracles[task]()
 
@@ -29,5 +31,7 @@ class MetaWorldExpert:
         sim_vector(obs, _SIZE, self._name)
 
     def act(self, obs: Obs) -> Act:
-        action = np.asarray(self._oracle.get_action(sim_vector(obs, _SIZE, self._name)), dtype=np.float32)
+        action = np.asarray(
+            self._oracle.get_action(sim_vector(obs, _SIZE, self._name)), dtype=np.float32
+        )
         return Act(action=np.clip(action, -1.0, 1.0))

@@ -1,7 +1,8 @@
-"""Experts for robosuite's OSC_POSE, which pick an object from above: the base class, and robosuite's tasks.
+"""Experts for robosuite's OSC_POSE, which pick an object from above: the base class, and
+robosuite's tasks.
 
-They read the positions of the objects from the simulator's state. An action is (7,) for one arm: 0.05 m and 0.5 rad a
-unit, gripper -1 open, 1 closed.
+They read the positions of the objects from the simulator's state. An action is (7,) for one arm:
+0.05 m and 0.5 rad a unit, gripper -1 open, 1 closed.
 """
 
 from __future__ import annotations
@@ -37,7 +38,9 @@ class PickPhase:
 
 
 class PickExpert(ABC):
-    """Moves the hand through a sequence of poses, each of which is computed when its phase begins."""
+    """Moves the hand through a sequence of poses, each of which is computed when its phase
+    begins.
+    """
 
     per_m: ClassVar[float] = 10.0
     """Units of the action for a metre of the remaining distance; 20 command all of it."""
@@ -46,7 +49,8 @@ class PickExpert(ABC):
         self._name, self._phases = name, phases
         self._first: np.ndarray | None = None  # (3, 3), of the hand: its fingers close along y
         self._phase, self._spent = 0, 0
-        self._target, self._turned = np.zeros(3), np.eye(3)  # of the hand in this phase: (3,) m, (3, 3)
+        # Of the hand in this phase: (3,) m, (3, 3)
+        self._target, self._turned = np.zeros(3), np.eye(3)
 
     def reset(self, obs: Obs, instruction: str) -> None:
         hand, self._first = self._hand(obs)
@@ -67,13 +71,17 @@ class PickExpert(ABC):
                 self._finished(hand, obs)
             phase = self._phases[self._phase]
         self._spent += 1
-        return _towards(hand, orientation, self._target, self._turned, phase.gripper, per_m=self.per_m)
+        return _towards(
+            hand, orientation, self._target, self._turned, phase.gripper, per_m=self.per_m
+        )
 
     def _finished(self, hand: np.ndarray, obs: Obs) -> None:  # noqa: B027 - an expert of one object has nothing to do
         """Begin other phases after the last one."""
 
     def _turn(self, yaw: float) -> None:
-        """Turn the hand, by the smaller of two angles, so that its fingers close across the direction `yaw`, rad."""
+        """Turn the hand, by the smaller of two angles, so that its fingers close across the
+        direction `yaw`, rad.
+        """
         near = (yaw + math.pi / 2) % math.pi - math.pi / 2
         if self._first is not None:
             self._turned = rotation(np.array([0.0, 0.0, near])) @ self._first
@@ -93,9 +101,11 @@ class Handling:
 
     name: str  # robosuite's
     handle_m: float = 0.0  # from the object's origin to the grasp, along its own x axis
-    aligned: bool = False  # the fingers close across that axis, and the object is turned by its nearest right angle
+    # The fingers close across that axis, and the object is turned by its nearest right angle.
+    aligned: bool = False
     lift_m: float = 0.12  # to pass over other objects
-    release_m: float | None = None  # height of its origin above the place when the hand opens; None: only lifted
+    # Height of its origin above the place when the hand opens; None: only lifted.
+    release_m: float | None = None
 
 
 _HANDLED = {
@@ -118,7 +128,9 @@ _PLACE = (
 
 
 class RobosuiteExpert(PickExpert):
-    """Grasps the task's object from above, lifts it and, if the task has one, moves it to its place."""
+    """Grasps the task's object from above, lifts it and, if the task has one, moves it to its
+    place.
+    """
 
     per_m = 20.0
 
@@ -186,7 +198,9 @@ def _towards(
     *,
     per_m: float,
 ) -> Act:
-    """Compute the action that moves the hand from a position (3,) m and an orientation (3, 3) towards a pose."""
+    """Compute the action that moves the hand from a position (3,) m and an orientation (3, 3)
+    towards a pose.
+    """
     move = np.clip((target - hand) * per_m, -1.0, 1.0)
     turn = np.clip(_rotation_vector(upright @ orientation.T) * _PER_RAD, -_MOST_TURN, _MOST_TURN)
     return Act(np.concatenate([move, turn, [gripper]]).astype(np.float32))
@@ -205,10 +219,17 @@ def rotation(rotation_vector: np.ndarray) -> np.ndarray:
         return np.eye(3)
     x, y, z = rotation_vector / angle
     cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    turned: np.ndarray = np.eye(3) + math.sin(angle) * cross + (1.0 - math.cos(angle)) * (cross @ cross)
+    turned: np.ndarray = (
+        np.eye(3) + math.sin(angle) * cross + (1.0 - math.cos(angle)) * (cross @ cross)
+    )
     return turned
 
 
 def _rotation_vector(turned: np.ndarray) -> np.ndarray:
     """Convert a matrix (3, 3) to a rotation vector (3,) rad, with sines for the small angles."""
-    return np.array([turned[2, 1] - turned[1, 2], turned[0, 2] - turned[2, 0], turned[1, 0] - turned[0, 1]]) / 2
+    return (
+        np.array(
+            [turned[2, 1] - turned[1, 2], turned[0, 2] - turned[2, 0], turned[1, 0] - turned[0, 1]]
+        )
+        / 2
+    )

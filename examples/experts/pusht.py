@@ -1,4 +1,6 @@
-"""An expert for PushT: tries pushes from all sides of the block in its own simulator, and plays the best."""
+"""An expert for PushT: tries pushes from all sides of the block in its own simulator, and plays
+the best.
+"""
 
 from __future__ import annotations
 
@@ -23,8 +25,8 @@ _PUSH_STEPS = 12
 _STEP_COSTS_PX = 0.15  # least reduction of the error by a further step
 _WORSE_PX = 5.0  # a trial ends once its error is this much above its lowest one
 _ASTRAY_PX = 2.0  # largest error of the predicted corners of the block before a new plan
-# The agent follows its target as a critically damped spring of 10 rad/s. In a step, 0.1 s, it covers this share of the
-# distance, and its velocity carries it on for this long.
+# The agent follows its target as a critically damped spring of 10 rad/s. In a step, 0.1 s, it
+# covers this share of the distance, and its velocity carries it on for this long.
 _COVERED = 1 - 2 / math.e
 _CARRIED_S = 0.1 / math.e
 
@@ -36,10 +38,12 @@ class _Step(NamedTuple):
 
 
 class PushTExpert:
-    """Solves PushT by `info["sim_state"]` of `vlagents_ray.envs.gymnasium`; actions are (2,) in [0, 512] px.
+    """Solves PushT by `info["sim_state"]` of `vlagents_ray.envs.gymnasium`; actions are (2,) in [0,
+    512] px.
 
-    A push moves straight towards the block, from one of several places around it, at one of three speeds. The expert
-    chooses the push, and the step at which it ends, that brings the block's corners nearest to the target's.
+    A push moves straight towards the block, from one of several places around it, at one of three
+    speeds. The expert chooses the push, and the step at which it ends, that brings the block's
+    corners nearest to the target's.
     """
 
     def __init__(self, env_name: str) -> None:
@@ -49,7 +53,8 @@ class PushTExpert:
         self._sim.reset(seed=0)
         parts = [self._shapely.Polygon(part.get_vertices()) for part in self._sim.block.shapes]
         outline = self._shapely.union_all(parts).normalize()
-        self._corners: np.ndarray = self._shapely.get_coordinates(outline)  # (N, 2) px, in the block's frame
+        # (N, 2) px, in the block's frame.
+        self._corners: np.ndarray = self._shapely.get_coordinates(outline)
         self._target = self._placed(self._sim.goal_pose)
         [disc] = self._sim.agent.shapes
         self._reach = disc.radius + _CLEAR_PX  # from the block to the agent's centre
@@ -77,7 +82,9 @@ class PushTExpert:
         lowest = math.inf
         for share in np.arange(0, 1, _APART_PX / around.length):
             place = around.exterior.interpolate(share, normalized=True)
-            begin, touched = self._shapely.get_coordinates(self._shapely.shortest_line(place, block))
+            begin, touched = self._shapely.get_coordinates(
+                self._shapely.shortest_line(place, block)
+            )
             if begin.min() < 0 or begin.max() > _FIELD_PX:
                 continue
             way = list(self._play(state, self._way(around, state[:2], begin)))
@@ -97,7 +104,9 @@ class PushTExpert:
         return best
 
     def _way(self, around: Any, start: np.ndarray, end: np.ndarray) -> np.ndarray:
-        """Return the places of the steps from `start` to `end`, (N, 2) px, along a polygon around the block."""
+        """Return the places of the steps from `start` to `end`, (N, 2) px, along a polygon
+        around the block.
+        """
         ring = around.exterior
         first, last = (ring.project(self._shapely.Point(place)) for place in (start, end))
         sides = []
@@ -116,7 +125,9 @@ class PushTExpert:
             rest = rest[chosen + 1 :]
         line = self._shapely.LineString(corners)
         steps = max(math.ceil(line.length / _WALK_PX), 1)
-        places = self._shapely.line_interpolate_point(line, np.arange(1, steps + 1) / steps, normalized=True)
+        places = self._shapely.line_interpolate_point(
+            line, np.arange(1, steps + 1) / steps, normalized=True
+        )
         return np.asarray(self._shapely.get_coordinates(places))
 
     def _play(self, state: np.ndarray, places: np.ndarray) -> Iterator[_Step]:
@@ -124,13 +135,16 @@ class PushTExpert:
         sim = self._sim
         sim._setup()  # a new space, since a used one keeps its contacts
         sim.agent.position, sim.agent.velocity = tuple(state[:2]), tuple(state[2:4])
-        sim.block.angle = state[6]  # before the position, as it turns the block about its centre of gravity
+        # Before the position, as it turns the block about its centre of gravity.
+        sim.block.angle = state[6]
         sim.block.position = tuple(state[4:6])
         for place in places:
             towards = state[:2] + (place - state[:2] - _CARRIED_S * state[2:4]) / _COVERED
             action = np.clip(towards, 0, _FIELD_PX).astype(np.float32)
             solves = sim.step(action)[2]
-            state = np.array([*sim.agent.position, *sim.agent.velocity, *sim.block.position, sim.block.angle])
+            state = np.array(
+                [*sim.agent.position, *sim.agent.velocity, *sim.block.position, sim.block.angle]
+            )
             yield _Step(action, state, solves)
 
     def _placed(self, pose: np.ndarray) -> np.ndarray:

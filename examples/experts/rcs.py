@@ -16,9 +16,9 @@ _CUBOID = "PickTask_box_joint"
 class RcsPick:
     """Moves above the cuboid, aligns with it, moves down, closes the gripper, and lifts.
 
-    Its actions are those of the control mode `tquat`, absolute, (8,): metres and quaternion xyzw in the robot's
-    base frame, then the gripper, 1 open, 0 closed. The hand points down, and its fingers close along
-    the cuboid's shorter side, 32 mm.
+    Its actions are those of the control mode `tquat`, absolute, (8,): metres and quaternion xyzw in
+    the robot's base frame, then the gripper, 1 open, 0 closed. The hand points down, and its
+    fingers close along the cuboid's shorter side, 32 mm.
     """
 
     _STEP_M = 0.02  # largest change of the commanded position in a step
@@ -65,7 +65,8 @@ class RcsPick:
         pose = obs.info.get("objects", {}).get(_CUBOID)
         if not isinstance(pose, np.ndarray) or pose.shape != (7,):
             raise InvalidObservation(
-                f"info['objects'][{_CUBOID!r}]: got {type(pose).__name__}, want (7,) float64; this expert is for "
+                f"info['objects'][{_CUBOID!r}]: got {type(pose).__name__}, want (7,) float64; this "
+                "expert is for "
                 f"{self._name} in the control mode tquat"
             )
         return pose
@@ -78,7 +79,9 @@ def _tool(obs: Obs) -> np.ndarray:
 
 
 def _turn(wxyz: np.ndarray) -> float:
-    """Return a lying cuboid's rotation about the vertical in [-pi/2, pi/2], as half a turn makes no difference."""
+    """Return a lying cuboid's rotation about the vertical in [-pi/2, pi/2], as half a turn makes
+    no difference.
+    """
     turn = 2 * math.atan2(wxyz[3], wxyz[0])
     return math.remainder(turn, math.pi)
 

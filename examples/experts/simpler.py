@@ -12,9 +12,11 @@ from vlagents_ray.policies.experts import sim_vector
 _OPEN, _CLOSED = 1.0, 0.0
 _STEP_M = 0.04  # largest command along an axis
 _STEP_RAD = 0.2  # largest command about the vertical
-_OVER_M = 0.08  # height of the gripper above the object before the grasp, and above the target after the release
+# Height of the gripper above the object before the grasp, and above the target after the release.
+_OVER_M = 0.08
 _LIFT_M = 0.10
-_LOWEST_M = 0.0135  # height of the gripper above the robot's foot; lower, the fingers press on the table
+# Height of the gripper above the robot's foot; lower, the fingers press on the table.
+_LOWEST_M = 0.0135
 _DROP_M = 0.04  # height of the object's centre above the target's at the release
 
 
@@ -49,14 +51,19 @@ class SimplerExpert:
     def reset(self, obs: Obs, instruction: str) -> None:
         places, yaw = self._state(obs)
         self._begin(0, places)
-        self._turn = (yaw + np.pi / 2) % np.pi - np.pi / 2  # the fingers open across the object, in either direction
+        # The fingers open across the object, in either direction.
+        self._turn = (yaw + np.pi / 2) % np.pi - np.pi / 2
 
     def act(self, obs: Obs) -> Act:
         places, _ = self._state(obs)
         _, _, gripper, commanded = places
         stage = _STAGES[self._stage]
         arrived = float(np.linalg.norm(gripper - self._goal)) < stage.near_m and not self._turn
-        if self._stage + 1 < len(_STAGES) and self._steps and (arrived or self._steps >= stage.steps):
+        if (
+            self._stage + 1 < len(_STAGES)
+            and self._steps
+            and (arrived or self._steps >= stage.steps)
+        ):
             self._begin(self._stage + 1, places)
             stage = _STAGES[self._stage]
         self._steps += 1
@@ -87,6 +94,8 @@ class SimplerExpert:
             self._goal = self._goal + _OVER_M * up
 
     def _state(self, obs: Obs) -> tuple[np.ndarray, float]:
-        """Return the positions of object, target, gripper and its command, (4, 3) m, and the object's yaw, rad."""
+        """Return the positions of object, target, gripper and its command, (4, 3) m, and the
+        object's yaw, rad.
+        """
         exact = sim_vector(obs, 13, self._name).astype(np.float64)
         return exact[:12].reshape(4, 3), float(exact[12])

@@ -1,4 +1,6 @@
-"""The student's perception: the places of each colour on the table, and the colour in the instruction."""
+"""The student's perception: the places of each colour on the table, and the colour in the
+instruction.
+"""
 
 from __future__ import annotations
 
@@ -11,7 +13,8 @@ from vlagents_ray.envs.tabletop.render import ELEVATION, VIEW
 from vlagents_ray.envs.tabletop.world import PUCK_HEIGHT
 from vlagents_ray.errors import InvalidObservation
 
-_ANGLES = {"red": 1.0, "yellow": 46.0, "green": 133.0, "blue": 216.0, "purple": 274.0}  # degrees of the colour wheel
+# Degrees of the colour wheel.
+_ANGLES = {"red": 1.0, "yellow": 46.0, "green": 133.0, "blue": 216.0, "purple": 274.0}
 WORDS = tuple(_ANGLES)
 _HUES = 12  # bins of the colour wheel
 BINS = 2 * _HUES  # those of pale colours, then those of full ones
@@ -27,8 +30,8 @@ def places(image: np.ndarray) -> np.ndarray:
         image: The camera's image, (H, W, 3) uint8.
 
     Returns:
-        For each bin the number of its pixels in units of 20, and the middle x and y of them in dm on the table as the
-        camera is aimed at it, 0 if there are none, (24, 3) float32.
+        For each bin the number of its pixels in units of 20, and the middle x and y of them in dm
+        on the table as the camera is aimed at it, 0 if there are none, (24, 3) float32.
     """
     height, width = image.shape[:2]
     pixels = image.reshape(-1, 3).astype(np.float32) / 255.0
@@ -42,23 +45,30 @@ def places(image: np.ndarray) -> np.ndarray:
         [(green - blue) / chroma % 6, (blue - red) / chroma + 2],
         (red - green) / chroma + 4,
     )
-    bins = np.rint(sextant / 6 * _HUES).astype(np.int64) % _HUES + _HUES * (chroma > _FULL * brightest)
+    bins = np.rint(sextant / 6 * _HUES).astype(np.int64) % _HUES + _HUES * (
+        chroma > _FULL * brightest
+    )
     number = np.bincount(bins, minlength=BINS)
     rows, columns = np.divmod(seen, width)
     scale = min(width, height) / (10 * VIEW)  # pixels per dm
     x = (columns + 0.5 - width / 2) / scale
     y = (height / 2 - rows - 0.5) / scale / math.sin(ELEVATION)
-    middle = [np.bincount(bins, weights=one, minlength=BINS) / np.maximum(number, 1) for one in (x, y)]
+    middle = [
+        np.bincount(bins, weights=one, minlength=BINS) / np.maximum(number, 1) for one in (x, y)
+    ]
     return np.stack([number / _PIXELS, *middle], axis=1).astype(np.float32)
 
 
 def puck_position(image: np.ndarray, colour: str) -> tuple[float, float] | None:
-    """Return the position of a puck, (x, y) m, from the middle of its pixels; None if fewer than three are visible."""
+    """Return the position of a puck, (x, y) m, from the middle of its pixels; None if fewer than
+    three are visible.
+    """
     middle = round(_ANGLES[colour] / 360 * _HUES)
     number, x, y = places(image)[[_HUES + (middle + step) % _HUES for step in (-1, 0, 1)]].T
     if number.sum() * _PIXELS < 3:
         return None
-    above = PUCK_HEIGHT / 2 / math.tan(ELEVATION)  # m, apparent additional distance of the puck's middle
+    # m, apparent additional distance of the puck's middle.
+    above = PUCK_HEIGHT / 2 / math.tan(ELEVATION)
     return float(number @ x / number.sum()) / 10, float(number @ y / number.sum()) / 10 - above
 
 
@@ -70,5 +80,7 @@ def named_colour(instruction: str | None) -> str:
     """
     found = re.search(r"the (\w+) puck", instruction or "")
     if found is None or found[1] not in WORDS:
-        raise InvalidObservation(f"instruction: got {instruction!r}, want 'lift the COLOUR puck' with one of {WORDS}")
+        raise InvalidObservation(
+            f"instruction: got {instruction!r}, want 'lift the COLOUR puck' with one of {WORDS}"
+        )
     return found[1]

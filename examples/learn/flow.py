@@ -1,12 +1,14 @@
-"""The reference policy, which acts by flow matching, becomes faster by reinforcement learning from pixels.
+"""The reference policy, which acts by flow matching, becomes faster by reinforcement learning from
+pixels.
 
     python examples/learn/flow.py learn grpo --out runs/grpo-0
     python examples/learn/flow.py learn ppo --seed 1 --out runs/ppo-1
     python examples/learn/flow.py compare runs/grpo-0 runs/grpo-1
 
-An action of the learner is an action chunk, with the log-probability of its random steps (Flow-SDE). Policy, rollouts
-and learner share this process, without Ray; with --max-lag the policy is served, and a worker plays while the learner
-learns. docs/tutorials/learn.md explains it. It needs torch, pyarrow and a checkout.
+An action of the learner is an action chunk, with the log-probability of its random steps
+(Flow-SDE). Policy, rollouts and learner share this process, without Ray; with --max-lag the policy
+is served, and a worker plays while the learner learns. docs/tutorials/learn.md explains it. It
+needs torch, pyarrow and a checkout.
 """
 
 from __future__ import annotations
@@ -48,7 +50,15 @@ from vlagents_ray.serve.launch.deployment_file import deployment, together
 from vlagents_ray.serve.launch.server import running_server
 from vlagents_ray.serve.local_agent import LocalPolicy
 from vlagents_ray.weights.safetensors import write_values
-from vlagents_ray_learn import Publisher, RolloutPlan, Rollouts, TrainingEvaluation, answers, arrays, log_ratio
+from vlagents_ray_learn import (
+    Publisher,
+    RolloutPlan,
+    Rollouts,
+    TrainingEvaluation,
+    answers,
+    arrays,
+    log_ratio,
+)
 
 CHECKPOINT = Path(__file__).parents[2] / "reference" / "checkpoint"
 ENV = ROBOT = "tabletop"
@@ -56,9 +66,11 @@ ENV_OPTIONS: dict[str, Any] = {"cameras": ["front", "wrist"], "width": 64, "heig
 EXECUTE = 4  # rows of a chunk
 TICKS = 40  # of an episode of the training; with fewer, too few are solved at first
 NUM_ENVS = 64  # that act in one batch
-SHORT, LONG = 32, 80  # ticks of the evaluations: the policy is to become faster, and to stay as reliable
+# Ticks of the evaluations: the policy is to become faster, and to stay as reliable.
+SHORT, LONG = 32, 80
 TRAINING = 20_000_000  # first seed of the training's episodes; those of the evaluations begin at 0
-HEAD = ("noisy", "when", "why", "blocks", "result")  # the flow's modules, which alone are trained, as in πRL
+# The flow's modules, which alone are trained, as in πRL.
+HEAD = ("noisy", "when", "why", "blocks", "result")
 NOISE = 0.6  # of the random steps; larger deviations change the reward by more, and so say more
 DISCOUNT = 0.96  # per tick
 CLIP = 0.2  # of PPO's ratio (arXiv 1707.06347)
@@ -91,21 +103,29 @@ class Learned(NamedTuple):
 
     acts: int  # with an advantage
     clipped: float  # share of their rows
-    log_ratio: float  # standard deviation before the first step, nats; 0 if learner and policy agree
+    # Standard deviation before the first step, nats; 0 if learner and policy agree.
+    log_ratio: float
 
 
 class FlowLearner:
-    """Trains the flow of the reference network by GRPO or PPO; what it sees and reads stays as it is."""
+    """Trains the flow of the reference network by GRPO or PPO; what it sees and reads stays as
+    it is.
+    """
 
     def __init__(self, method: Method, seed: int, epochs: int) -> None:
         torch.manual_seed(seed)
         self._method, self._epochs, self._rng = method, epochs, np.random.default_rng(seed)
         self._checkpoint = read_checkpoint(CHECKPOINT)
         self.network = read_network(self._checkpoint.sizes, CHECKPOINT)
-        self._trained = {n: v for n, v in self.network.named_parameters() if n.partition(".")[0] in HEAD}
+        self._trained = {
+            n: v for n, v in self.network.named_parameters() if n.partition(".")[0] in HEAD
+        }
         width = 2 * self._checkpoint.sizes.head
         self._value = torch.nn.Sequential(
-            torch.nn.LayerNorm(width), torch.nn.Linear(width, 128), torch.nn.SiLU(), torch.nn.Linear(128, 1)
+            torch.nn.LayerNorm(width),
+            torch.nn.Linear(width, 128),
+            torch.nn.SiLU(),
+            torch.nn.Linear(128, 1),
         )
         flow, value = list(self._trained.values()), list(self._value.parameters())
         groups = [{"params": flow, "lr": RATE}, {"params": value, "lr": VALUE_RATE}]
@@ -120,7 +140,8 @@ class FlowLearner:
         """Take steps of the optimizer on whole episodes.
 
         Args:
-            columns: The transitions, with `logprob` and `replay.chain`; each act has EXECUTE of them.
+            columns: The transitions, with `logprob` and `replay.chain`; each act has EXECUTE of
+                them.
         """
         contexts, chains = self._contexts(columns), torch.from_numpy(columns["replay.chain"].copy())
         stated = torch.from_numpy(columns["logprob"].reshape(-1, EXECUTE).copy())
@@ -137,7 +158,12 @@ class FlowLearner:
                 ratio, part = (logprob - stated[batch]).exp(), gain[batch]
                 loss = -torch.minimum(ratio * part, ratio.clamp(1 - CLIP, 1 + CLIP) * part).mean()
                 if targets is not None:
-                    loss = loss + (self._value(contexts[batch]).squeeze(-1) - targets[batch]).square().mean()
+                    loss = (
+                        loss
+                        + (self._value(contexts[batch]).squeeze(-1) - targets[batch])
+                        .square()
+                        .mean()
+                    )
                 clipped.append(float(((ratio - 1).abs() > CLIP).float().mean()))
                 self._optimizer.zero_grad()
                 loss.backward()
@@ -149,14 +175,18 @@ class FlowLearner:
     def _advantages(
         self, columns: Mapping[str, np.ndarray], contexts: torch.Tensor
     ) -> tuple[torch.Tensor, torch.Tensor | None]:
-        """Return the advantages of the rows of acts, (A, EXECUTE), and for PPO the targets of their values, (A,)."""
+        """Return the advantages of the rows of acts, (A, EXECUTE), and for PPO the targets of
+        their values, (A,).
+        """
         if self._method == "grpo":
             return torch.from_numpy(group_advantages(columns, DISCOUNT).reshape(-1, EXECUTE)), None
         rows = first_rows(columns)
         with torch.no_grad():
             value = self._value(contexts).squeeze(-1).numpy()
         success = np.logical_or.reduceat(columns["success"], rows)
-        each, targets = advantages({"t": columns["t"][rows], "success": success, "value": value}, DISCOUNT**EXECUTE)
+        each, targets = advantages(
+            {"t": columns["t"][rows], "success": success, "value": value}, DISCOUNT**EXECUTE
+        )
         kept = until_solved(columns).reshape(-1, EXECUTE)
         before = kept.any(1)
         gain = kept * ((each - each[before].mean()) / (each[before].std() + 1e-6))[:, None]
@@ -165,21 +195,36 @@ class FlowLearner:
     def _logprob(self, contexts: torch.Tensor, chains: torch.Tensor) -> torch.Tensor:
         """Return the log-probabilities of the executed rows of acts, (B, EXECUTE), nats."""
         ones = torch.ones(len(contexts))
-        found = logprob_of_chain(lambda a, time: self.network.velocity(contexts, a, time * ones), chains, NOISE)
+        found = logprob_of_chain(
+            lambda a, time: self.network.velocity(contexts, a, time * ones), chains, NOISE
+        )
         summed: torch.Tensor = found[:, :EXECUTE].sum(2)
         return summed
 
     def _contexts(self, columns: Mapping[str, np.ndarray]) -> torch.Tensor:
         """Return what the flow gets of images, state and words at each act, (A, C)."""
-        rows, robot, found = first_rows(columns), self._checkpoint.embodiments[ROBOT], list[torch.Tensor]()
+        rows, robot, found = (
+            first_rows(columns),
+            self._checkpoint.embodiments[ROBOT],
+            list[torch.Tensor](),
+        )
         tokens = {text: self._checkpoint.tokens(text) for text in set(columns["instruction"])}
         parts = [name.removeprefix("state.") for name in columns if name.startswith("state.")]
-        for some in np.array_split(rows, max(1, len(rows) // 64)):  # so many images stay in the cache
-            obs = [Obs({}, float(columns["gripper"][i]), {p: columns[f"state.{p}"][i] for p in parts}) for i in some]
+        # So many images stay in the cache.
+        for some in np.array_split(rows, max(1, len(rows) // 64)):
+            obs = [
+                Obs({}, float(columns["gripper"][i]), {p: columns[f"state.{p}"][i] for p in parts})
+                for i in some
+            ]
             state = normalised(
-                robot, np.stack([state_vector(o, robot.state) for o in obs]), self._checkpoint.sizes.state
+                robot,
+                np.stack([state_vector(o, robot.state) for o in obs]),
+                self._checkpoint.sizes.state,
             )
-            images = [torch.from_numpy(columns[f"cameras.{robot.cameras[name]}"][some]) for name in CAMERAS]
+            images = [
+                torch.from_numpy(columns[f"cameras.{robot.cameras[name]}"][some])
+                for name in CAMERAS
+            ]
             words = torch.from_numpy(np.stack([tokens[columns["instruction"][i]] for i in some]))
             seen = pixels(torch.stack(images, 1)).unbind(1)
             with torch.no_grad():
@@ -198,16 +243,27 @@ class FlowRun:
 
     def __init__(self, plan: FlowPlan) -> None:
         self._plan, self._learner = plan, FlowLearner(plan.method, plan.seed, plan.epochs)
-        self._config = {"checkpoint": str(CHECKPOINT), "embodiment": ROBOT, "execute": EXECUTE, "noise_level": NOISE}
+        self._config = {
+            "checkpoint": str(CHECKPOINT),
+            "embodiment": ROBOT,
+            "execute": EXECUTE,
+            "noise_level": NOISE,
+        }
         self._evaluated = Reference.from_config(self._config)
         self._evaluated.initialize()
 
     def learn(self) -> None:
-        """Learn; the results are in the plan's folder, and the new checkpoint in its folder `checkpoint`."""
+        """Learn; the results are in the plan's folder, and the new checkpoint in its folder
+        `checkpoint`.
+        """
         plan, learner = self._plan, self._learner
         curve, whole = self._evaluation(SHORT), self._evaluation(LONG)
         self._play(whole)
-        with self._policy() as (target, acting), Publisher(target) as weights, self._rollouts(acting) as rollouts:
+        with (
+            self._policy() as (target, acting),
+            Publisher(target) as weights,
+            self._rollouts(acting) as rollouts,
+        ):
             for iteration in range(plan.iterations):
                 if iteration % plan.evaluate_every == 0:
                     self._play(curve)
@@ -217,10 +273,14 @@ class FlowRun:
                 played = time.monotonic()
                 learned = learner.improve(columns)
                 if learned.acts:
-                    rollouts.version = weights.push(learner.state(), partial=True, version=learner.version)
+                    rollouts.version = weights.push(
+                        learner.state(), partial=True, version=learner.version
+                    )
                 print(
-                    f"iteration {iteration + 1}: {solved:.1%} of {plan.episodes} episodes solved, {played - begun:.1f} "
-                    f"s; {learned.acts} acts, {learned.clipped:.0%} clipped, log ratio {learned.log_ratio:.1g}, "
+                    f"iteration {iteration + 1}: {solved:.1%} of {plan.episodes} episodes solved, "
+                    f"{played - begun:.1f} "
+                    f"s; {learned.acts} acts, {learned.clipped:.0%} clipped, log ratio "
+                    f"{learned.log_ratio:.1g}, "
                     f"{time.monotonic() - played:.1f} s; {rollouts.stats.stale} stale episodes"
                 )
         self._play(curve)
@@ -235,21 +295,32 @@ class FlowRun:
     def _evaluation(self, ticks: int) -> TrainingEvaluation:
         plan, options = self._plan, ENV_OPTIONS | {"max_steps": ticks}
         suite = {"envs": [ENV], "env_options": options, "episodes": plan.held_out, "num_envs": 16}
-        settings = {"policies": [{"name": plan.method, "execute": EXECUTE}], "suites": [suite], "workers": 0}
-        config = EvalConfig.model_validate(settings | {"out": plan.out / f"within_{ticks}", "video": "none"})
+        settings = {
+            "policies": [{"name": plan.method, "execute": EXECUTE}],
+            "suites": [suite],
+            "workers": 0,
+        }
+        config = EvalConfig.model_validate(
+            settings | {"out": plan.out / f"within_{ticks}", "video": "none"}
+        )
         return TrainingEvaluation(self._evaluated, config)
 
     def _play(self, evaluation: TrainingEvaluation) -> None:
         self._evaluated.load_parameters(self._evaluated.parameters() | self._learner.state())
         newest = evaluation.play(self._learner.version).totals[-1]
-        print(f"{newest.contender}: {newest.success_once.rate:.1%} of {self._plan.held_out} held-out episodes solved")
+        print(
+            f"{newest.contender}: {newest.success_once.rate:.1%} of {self._plan.held_out} held-out "
+            "episodes solved"
+        )
 
     @contextlib.contextmanager
     def _policy(self) -> Iterator[tuple[Any, Any]]:
         """Yield the target of pushes, and the policy of a `RolloutPlan`."""
         args = {"config": self._config, "batch": {"max_size": NUM_ENVS}}
         if self._plan.max_lag is None:
-            policy = LocalPolicy(ServerArgs.model_validate(args | {"policy": "reference"}), self._config)
+            policy = LocalPolicy(
+                ServerArgs.model_validate(args | {"policy": "reference"}), self._config
+            )
             yield policy.engine, lambda: policy
         else:
             served = together({"flow": deployment("reference", **args)})
@@ -277,7 +348,10 @@ class FlowRun:
         folder.mkdir(parents=True, exist_ok=True)
         shutil.copy(CHECKPOINT / CONFIG, folder)
         with (folder / WEIGHTS).open("wb") as file:
-            write_values(file, {name: value.numpy() for name, value in self._learner.network.state_dict().items()})
+            write_values(
+                file,
+                {name: value.numpy() for name, value in self._learner.network.state_dict().items()},
+            )
 
 
 @app.command()
@@ -290,19 +364,27 @@ def learn(
     held_out: Annotated[int, typer.Option(min=1, help="Episodes of an evaluation.")] = 500,
     evaluate_every: Annotated[int, typer.Option(min=1, help="Iterations.")] = 5,
     max_lag: Annotated[
-        int | None, typer.Option(min=0, help="Play while learning, with weights at most so many versions old.")
+        int | None,
+        typer.Option(min=0, help="Play while learning, with weights at most so many versions old."),
     ] = None,
 ) -> None:
     """Improve the reference policy from pixels, by the reward of the environment alone."""
     torch.set_num_threads(1)  # its networks are small
-    settings = {"iterations": iterations, "episodes": episodes, "held_out": held_out, "evaluate_every": evaluate_every}
+    settings = {
+        "iterations": iterations,
+        "episodes": episodes,
+        "held_out": held_out,
+        "evaluate_every": evaluate_every,
+    }
     run = {"method": method, "out": out, "seed": seed, "max_lag": max_lag}
     with errors(FlowPlan):
         FlowRun(FlowPlan.model_validate(settings | run)).learn()
 
 
 @app.command("compare")
-def compare_runs(folders: Annotated[list[Path], typer.Argument(help="Of runs with different seeds.")]) -> None:
+def compare_runs(
+    folders: Annotated[list[Path], typer.Argument(help="Of runs with different seeds.")],
+) -> None:
     """Compare each run's first and last version on the same seeds, by McNemar's exact test."""
     with errors(FlowPlan):
         for ticks in (SHORT, LONG):
@@ -315,11 +397,15 @@ def compare_runs(folders: Annotated[list[Path], typer.Argument(help="Of runs wit
                 before, after = (pairs.both + pairs.only_b, pairs.both + pairs.only_a)
                 gains.append(pairs.difference)
                 print(
-                    f"{folder}, within {ticks} ticks: {before / pairs.total:.1%} before, {after / pairs.total:.1%} "
+                    f"{folder}, within {ticks} ticks: {before / pairs.total:.1%} before, "
+                    f"{after / pairs.total:.1%} "
                     f"after, of {pairs.total}; p {pairs.p_value:.2g}"
                 )
             if len(gains) > 1:
-                print(f"gain: {np.mean(gains):+.1%}, standard deviation {np.std(gains, ddof=1):.1%} of runs")
+                print(
+                    f"gain: {np.mean(gains):+.1%}, standard deviation {np.std(gains, ddof=1):.1%} "
+                    "of runs"
+                )
 
 
 if __name__ == "__main__":

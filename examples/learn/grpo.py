@@ -14,11 +14,13 @@ _EPSILON = 1e-6  # beside the standard deviation of a group
 
 
 def group_advantages(columns: Mapping[str, np.ndarray], discount: float = 1.0) -> np.ndarray:
-    """Return the advantages of the actions by the groups of episodes from one start state, (T,) float32.
+    """Return the advantages of the actions by the groups of episodes from one start state, (T,)
+    float32.
 
-    An episode's reward is 1 if the task was solved at any step, times the discount for each step before that one. Each
-    of its actions has the advantage (reward - mean of the group) / (standard deviation of the group + 1e-6) (GRPO,
-    arXiv 2402.03300). It is 0 after the task was solved, and in groups of equal rewards (DAPO, arXiv 2503.14476).
+    An episode's reward is 1 if the task was solved at any step, times the discount for each step
+    before that one. Each of its actions has the advantage (reward - mean of the group) / (standard
+    deviation of the group + 1e-6) (GRPO, arXiv 2402.03300). It is 0 after the task was solved, and
+    in groups of equal rewards (DAPO, arXiv 2503.14476).
     """
     starts, lengths = episodes(columns)
     kept = until_solved(columns)
@@ -28,7 +30,9 @@ def group_advantages(columns: Mapping[str, np.ndarray], discount: float = 1.0) -
     gain = np.zeros(len(starts))
     for number in np.unique(group):
         members = group == number
-        gain[members] = (reward[members] - reward[members].mean()) / (reward[members].std() + _EPSILON)
+        gain[members] = (reward[members] - reward[members].mean()) / (
+            reward[members].std() + _EPSILON
+        )
     return np.where(kept, np.repeat(gain, lengths), 0.0).astype(np.float32)
 
 
@@ -42,11 +46,14 @@ class GRPOLearner(NetworkLearner):
     network_class = TokenNetwork
 
     def improve(self, columns: Mapping[str, np.ndarray], steps: int) -> None:
-        """Take steps of GRPO on the transitions of the student's own episodes, without a value and a reference policy.
+        """Take steps of GRPO on the transitions of the student's own episodes, without a value and
+        a reference policy.
 
         Args:
-            columns: The transitions, with `logprob` and `replay.tokens`, of whole groups of episodes.
-            steps: The number of steps; 0 are taken if no group has both solved and unsolved episodes.
+            columns: The transitions, with `logprob` and `replay.tokens`, of whole groups of
+                episodes.
+            steps: The number of steps; 0 are taken if no group has both solved and unsolved
+                episodes.
         """
         gain = group_advantages(columns)
         kept = np.flatnonzero(gain)

@@ -16,7 +16,8 @@ from student import ACTION, INPUTS, LookingNetwork, Network, inputs, seeded
 from vlagents_ray.client import RemoteAgent
 from vlagents_ray.interface import Obs
 
-DISCOUNT, TRACE = 0.98, 0.95  # gamma and lambda of generalised advantage estimation (arXiv 1506.02438)
+# Gamma and lambda of generalised advantage estimation (arXiv 1506.02438)
+DISCOUNT, TRACE = 0.98, 0.95
 _CLIP = 0.2  # of PPO's ratio (arXiv 1707.06347)
 _RATE, _LOOK_RATE = 2e-3, 1e-2  # learning rates of the network, and of its choice of colours
 _PPO = 0.01  # weight of PPO's loss beside the teacher's advice
@@ -47,8 +48,8 @@ def episodes(columns: Mapping[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]
 def advice(teacher: RemoteAgent, columns: Mapping[str, np.ndarray]) -> np.ndarray:
     """Get a served teacher's action at each observation of whole episodes.
 
-    Each episode is a session of the teacher, and one message has the next step of all sessions, so that the server
-    computes them in batches.
+    Each episode is a session of the teacher, and one message has the next step of all sessions, so
+    that the server computes them in batches.
 
     Args:
         teacher: The teacher's client.
@@ -64,12 +65,16 @@ def advice(teacher: RemoteAgent, columns: Mapping[str, np.ndarray]) -> np.ndarra
         sessions = teacher.sessions(len(starts))
         for session in sessions:
             opened.callback(session.close)
-        for answer in teacher.reset_batch([seen[i] for i in starts], [texts[i] for i in starts], sessions):
+        for answer in teacher.reset_batch(
+            [seen[i] for i in starts], [texts[i] for i in starts], sessions
+        ):
             if isinstance(answer, Exception):
                 raise answer
         for step in range(max(lengths)):
             going = np.flatnonzero(lengths > step)
-            acts = teacher.act_batch([seen[starts[i] + step] for i in going], [sessions[i] for i in going])
+            acts = teacher.act_batch(
+                [seen[starts[i] + step] for i in going], [sessions[i] for i in going]
+            )
             for i, act in zip(going, acts, strict=True):
                 if isinstance(act, Exception):
                     raise act
@@ -78,18 +83,22 @@ def advice(teacher: RemoteAgent, columns: Mapping[str, np.ndarray]) -> np.ndarra
 
 
 def until_solved(columns: Mapping[str, np.ndarray]) -> np.ndarray:
-    """Return which transitions come before the task was solved, or solve it, (T,) bool: only these are learned from."""
+    """Return which transitions come before the task was solved, or solve it, (T,) bool: only
+    these are learned from.
+    """
     (starts, lengths), success = episodes(columns), columns["success"]
     before = np.cumsum(success) - success  # number of solved steps in the rows before each
     kept: np.ndarray = before == np.repeat(before[starts], lengths)
     return kept
 
 
-def advantages(columns: Mapping[str, np.ndarray], discount: float = DISCOUNT) -> tuple[np.ndarray, np.ndarray]:
+def advantages(
+    columns: Mapping[str, np.ndarray], discount: float = DISCOUNT
+) -> tuple[np.ndarray, np.ndarray]:
     """Return the advantages of the actions, and the targets of the values, each (T,) float32.
 
-    The reward is 1 for the step that solves the task, which ends the episode here; both are 0 after it. An episode that
-    the step limit ends is continued by the value of its last observation.
+    The reward is 1 for the step that solves the task, which ends the episode here; both are 0 after
+    it. An episode that the step limit ends is continued by the value of its last observation.
     """
     value, success, kept = columns["value"], columns["success"], until_solved(columns)
     gain = np.zeros(len(value), np.float32)
@@ -98,13 +107,17 @@ def advantages(columns: Mapping[str, np.ndarray], discount: float = DISCOUNT) ->
         last = i + 1 == len(value) or columns["t"][i + 1] == 0
         if last or success[i]:
             following, later = (0.0 if success[i] else float(value[i])), 0.0
-        later = float(success[i]) + discount * following - float(value[i]) + discount * TRACE * later
+        later = (
+            float(success[i]) + discount * following - float(value[i]) + discount * TRACE * later
+        )
         gain[i], following = later, float(value[i])
     return gain, np.where(kept, gain + value, 0.0).astype(np.float32)
 
 
 class NetworkLearner(ABC):
-    """Trains a student's network by behaviour cloning, and by its subclass's algorithm on the student's episodes."""
+    """Trains a student's network by behaviour cloning, and by its subclass's algorithm on the
+    student's episodes.
+    """
 
     want: tuple[str, ...]
     """What the student states for `improve`, beside its actions."""
@@ -123,8 +136,12 @@ class NetworkLearner(ABC):
         """The number of steps so far."""
         self.network = seeded(self.network_class, seed)
         look = list(self.network.look.parameters())
-        others = [one for name, one in self.network.named_parameters() if not name.startswith("look.")]
-        self._optimizer = torch.optim.Adam([{"params": look, "lr": _LOOK_RATE}, {"params": others, "lr": _RATE}])
+        others = [
+            one for name, one in self.network.named_parameters() if not name.startswith("look.")
+        ]
+        self._optimizer = torch.optim.Adam(
+            [{"params": look, "lr": _LOOK_RATE}, {"params": others, "lr": _RATE}]
+        )
         self._seen = np.empty((0, INPUTS), np.float32)
         self._advised = np.empty((0, ACTION), np.float32)  # the teacher's action at each
 
@@ -146,7 +163,8 @@ class NetworkLearner(ABC):
         """Continue from a checkpoint."""
         self.steps = checkpoint["steps"]
         self.network.load_state_dict(checkpoint["network"])
-        self._optimizer.load_state_dict(deepcopy(checkpoint["optimizer"]))  # torch would share and change it
+        # Torch would share and change it.
+        self._optimizer.load_state_dict(deepcopy(checkpoint["optimizer"]))
         self._seen, self._advised = checkpoint["seen"].numpy(), checkpoint["advised"].numpy()
 
     def add_advice(self, seen: np.ndarray, actions: np.ndarray) -> None:
@@ -224,7 +242,11 @@ class PPOLearner(NetworkLearner):
 
     def improve(self, columns: Mapping[str, np.ndarray], steps: int) -> None:
         rng = self._begin_improving()
-        seen, (gain, targets), kept = inputs_of(columns), advantages(columns), np.flatnonzero(until_solved(columns))
+        seen, (gain, targets), kept = (
+            inputs_of(columns),
+            advantages(columns),
+            np.flatnonzero(until_solved(columns)),
+        )
         gain = (gain - gain[kept].mean()) / (gain[kept].std() + 1e-6)
         for _ in range(steps):
             rows = kept[self._drawn(rng, len(kept))]
@@ -232,7 +254,9 @@ class PPOLearner(NetworkLearner):
             normal = torch.distributions.Normal(mean, self.network.log_std.exp())
             logprob = normal.log_prob(self._tensor(columns["action"], rows)).sum(-1)
             ratio = (logprob - self._tensor(columns["logprob"], rows)).exp()
-            loss = ((value - self._tensor(targets, rows)) ** 2).mean() - self._clipped(ratio, self._tensor(gain, rows))
+            loss = ((value - self._tensor(targets, rows)) ** 2).mean() - self._clipped(
+                ratio, self._tensor(gain, rows)
+            )
             self._step(self._advised_loss(loss, rng))
 
     def _advised_loss(self, loss: Any, _: np.random.Generator) -> Any:
@@ -240,7 +264,9 @@ class PPOLearner(NetworkLearner):
 
 
 class RPDLearner(PPOLearner):
-    """Trains by refined policy distillation (arXiv 2503.05833): the distance to a teacher's advice is in PPO's loss."""
+    """Trains by refined policy distillation (arXiv 2503.05833): the distance to a teacher's
+    advice is in PPO's loss.
+    """
 
     steps_at_once = NetworkLearner.steps_at_once  # the advice has no noise, and stays valid
     rate = None

@@ -1,4 +1,6 @@
-"""The student: a small trainable policy of images and words, with a value, for learners of reinforcement."""
+"""The student: a small trainable policy of images and words, with a value, for learners of
+reinforcement.
+"""
 
 from __future__ import annotations
 
@@ -57,7 +59,9 @@ class LookingNetwork(nn.Module):
         """Return the inputs of the network's heads, (B, FEATURES), from inputs (B, INPUTS)."""
         seen, robot, word = inputs.split([3 * BINS, STATE, len(WORDS)], dim=-1)
         seen = seen.unflatten(-1, (BINS, 3))
-        scores = 8 * self.look(word).unflatten(-1, (_LOOKS, BINS)) + torch.log(seen[:, None, :, 0] + 1e-4)
+        scores = 8 * self.look(word).unflatten(-1, (_LOOKS, BINS)) + torch.log(
+            seen[:, None, :, 0] + 1e-4
+        )
         looked = scores.softmax(-1) @ seen  # (B, LOOKS, 3)
         away = self.aim(looked[..., 1:]) - robot[:, None, :2]
         scales = [away, torch.tanh(4 * away), torch.tanh(20 * away)]
@@ -68,7 +72,11 @@ def head(out: int) -> nn.Module:
     """Return a new perceptron from features to `out` numbers."""
     hidden = 192
     return nn.Sequential(
-        nn.Linear(FEATURES, hidden), nn.SiLU(), nn.Linear(hidden, hidden), nn.SiLU(), nn.Linear(hidden, out)
+        nn.Linear(FEATURES, hidden),
+        nn.SiLU(),
+        nn.Linear(hidden, hidden),
+        nn.SiLU(),
+        nn.Linear(hidden, out),
     )
 
 
@@ -93,7 +101,9 @@ def seeded(make: Callable[[], nn.Module], seed: int) -> Any:
 
 
 class Student(Agent):
-    """Acts by the mean of a normal distribution, or draws from it if a log-probability is requested."""
+    """Acts by the mean of a normal distribution, or draws from it if a log-probability is
+    requested.
+    """
 
     trainable = "network"
     shared = ("network",)
@@ -112,7 +122,9 @@ class Student(Agent):
 
     @property
     def contract(self) -> Contract:
-        return replace(Tabletop.known_contract({"width": None, "height": None}), behaviour=self.behaviour)
+        return replace(
+            Tabletop.known_contract({"width": None, "height": None}), behaviour=self.behaviour
+        )
 
     def reset(self, obs: Obs, instruction: str | None, **kwargs: Any) -> dict[str, Any]:
         """Begin an episode of `tabletop/lift`.
@@ -128,7 +140,9 @@ class Student(Agent):
         return self.act_batch([obs], [self])[0]
 
     def act_batch(self, obs: Sequence[Obs], sessions: Sequence[Agent]) -> list[Act | Exception]:
-        """Compute the actions of all sessions, in passes of one size, so that neighbours change no bit of a result."""
+        """Compute the actions of all sessions, in passes of one size, so that neighbours change
+        no bit of a result.
+        """
         rows = np.zeros((-len(obs) // _ROWS * -_ROWS, INPUTS), np.float32)
         for row, one, session in zip(rows, obs, sessions, strict=False):
             row[:] = inputs(one, session._colour)

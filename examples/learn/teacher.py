@@ -1,4 +1,6 @@
-"""The teacher: it lifts a puck by feedback from each observation, so that it can advise in any state."""
+"""The teacher: it lifts a puck by feedback from each observation, so that it can advise in any
+state.
+"""
 
 from __future__ import annotations
 
@@ -17,13 +19,16 @@ _GRASP_Z = 0.006  # m
 _FUNNEL = 3.0  # m of height per m of distance from the puck, beyond the nearest `_CENTRED`
 _CENTRED, _AT, _LOW = 0.004, 0.008, 0.012  # m
 _HIGHEST = 0.08  # m, above the height for grasps
-_CLEAR, _MOVED = 0.06, 0.02  # m: the fingers hide a part of the puck if they are lower, which shifts it by up to 13 mm
+# m: the fingers hide a part of the puck if they are lower, which shifts it by up to 13 mm.
+_CLEAR, _MOVED = 0.06, 0.02
 _HELD = (0.5, 0.7)  # the opening of fingers around a puck
 _OPEN, _CLOSED = 1.0, -1.0
 
 
 class Teacher(Agent):
-    """Descends to the last visible position of the puck in a funnel, closes the fingers, and lifts it."""
+    """Descends to the last visible position of the puck in a funnel, closes the fingers, and
+    lifts it.
+    """
 
     def __init__(self) -> None:
         self._colour: str | None = None

@@ -12,8 +12,12 @@ TOKENS = 11  # bins of each number of an action, whose middles are from -1 to 1
 
 
 def tokens_of(actions: np.ndarray) -> np.ndarray:
-    """Return the nearest token of each number of actions, int64; the outermost for those beyond [-1, 1]."""
-    found: np.ndarray = np.rint((np.clip(actions, -1.0, 1.0) + 1.0) / 2 * (TOKENS - 1)).astype(np.int64)
+    """Return the nearest token of each number of actions, int64; the outermost for those beyond
+    [-1, 1].
+    """
+    found: np.ndarray = np.rint((np.clip(actions, -1.0, 1.0) + 1.0) / 2 * (TOKENS - 1)).astype(
+        np.int64
+    )
     return found
 
 
@@ -24,14 +28,18 @@ def actions_of(tokens: np.ndarray) -> np.ndarray:
 
 
 class TokenNetwork(LookingNetwork):
-    """Maps inputs (B, INPUTS) to log-probabilities of tokens (B, 4, TOKENS) and entropies (B,), nats."""
+    """Maps inputs (B, INPUTS) to log-probabilities of tokens (B, 4, TOKENS) and entropies (B,),
+    nats.
+    """
 
     def __init__(self) -> None:
         super().__init__()
         self.policy = head(ACTION * TOKENS)
 
     def forward(self, inputs: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        logprobs = self.policy(self.features(inputs)).unflatten(-1, (ACTION, TOKENS)).log_softmax(-1)
+        logprobs = (
+            self.policy(self.features(inputs)).unflatten(-1, (ACTION, TOKENS)).log_softmax(-1)
+        )
         return logprobs, -(logprobs.exp() * logprobs).sum((-2, -1))
 
 
@@ -46,7 +54,12 @@ class TokenStudent(Student):
 
     def _draw(self, draws: np.random.Generator, *outputs: Any) -> tuple[np.ndarray, dict[str, Any]]:
         logprobs, entropy = outputs
-        tokens = (logprobs + draws.gumbel(size=logprobs.shape)).argmax(-1)  # drawn from the softmax: the Gumbel trick
+        # Drawn from the softmax: the Gumbel trick.
+        tokens = (logprobs + draws.gumbel(size=logprobs.shape)).argmax(-1)
         logprob = np.take_along_axis(logprobs, tokens[:, None], -1)[:, 0]
-        said = {"logprob": logprob[None], "entropy": float(entropy), "replay": {"tokens": tokens[None]}}
+        said = {
+            "logprob": logprob[None],
+            "entropy": float(entropy),
+            "replay": {"tokens": tokens[None]},
+        }
         return actions_of(tokens), said

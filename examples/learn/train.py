@@ -1,11 +1,12 @@
-"""A small policy learns to lift pucks of the tabletop from images and words, in minutes on two cores.
+"""A small policy learns to lift pucks of the tabletop from images and words, in minutes on two
+cores.
 
     python examples/learn/train.py
     python examples/learn/train.py examples/learn/rpd.yaml --seed 1 --out runs/rpd-1
 
-A teacher records demonstrations, and a student clones them (BC). The clone continues with the teacher's advice (RPD),
-or alone (PPO, GRPO), and each version is evaluated on the same seeds. docs/tutorials/learn.md explains it. It needs
-torch and the extra 'learn'.
+A teacher records demonstrations, and a student clones them (BC). The clone continues with the
+teacher's advice (RPD), or alone (PPO, GRPO), and each version is evaluated on the same seeds.
+docs/tutorials/learn.md explains it. It needs torch and the extra 'learn'.
 """
 
 from __future__ import annotations
@@ -38,14 +39,17 @@ ENV = "tabletop/lift"
 ENV_OPTIONS: dict[str, Any] = {"width": 96, "height": 96, "max_steps": 30}
 TEACHER = "teacher"
 FAILURES = 10  # of the policy's server, in one iteration, after which the run ends
-HELD_OUT, TRAINING = 10_000_000, 20_000_000  # first seeds: no episode is both played for training and evaluated
+# First seeds: no episode is both played for training and evaluated.
+HELD_OUT, TRAINING = 10_000_000, 20_000_000
 
 
 Method = Literal["bc", "rpd", "ppo", "grpo"]
 
 
 class LearnPlan(BaseModel):
-    """The amount of training, and the folder of results. Each method except "bc" improves the clone that "bc" makes."""
+    """The amount of training, and the folder of results. Each method except "bc" improves the
+    clone that "bc" makes.
+    """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -58,12 +62,14 @@ class LearnPlan(BaseModel):
     iterations: Count = 10  # of each method
     episodes: Count = 32  # of the student in each iteration
     groups: Count = 8  # episodes from one start state, in "grpo"
-    steps: Count | None = None  # of the optimizer in each iteration; default: rpd 500, ppo 40, grpo 20
+    # Of the optimizer in each iteration; default: rpd 500, ppo 40, grpo 20.
+    steps: Count | None = None
     evaluate_every: Count = 5  # iterations
     held_out: Count = 200  # episodes of an evaluation, the same for each version
     workers: Count = 2
     num_envs: Count = 16  # environments of a worker
-    track: list[str] = []  # trackers that show success rates beside `out`, against the optimizer's steps
+    # Trackers that show success rates beside `out`, against the optimizer's steps.
+    track: list[str] = []
 
 
 class MethodParts(NamedTuple):
@@ -86,13 +92,15 @@ Played = TypeVar("Played")
 
 
 def learn(plan: LearnPlan) -> Summary:
-    """Record demonstrations, clone them, improve the clone by each method, and compare all versions.
+    """Record demonstrations, clone them, improve the clone by each method, and compare all
+    versions.
 
     Args:
         plan: The settings of the run.
 
     Returns:
-        The summary of all versions, whose numbers are the optimizer's steps: "bc@2000", "rpd@4500", …
+        The summary of all versions, whose numbers are the optimizer's steps: "bc@2000", "rpd@4500",
+        …
 
     Raises:
         ConfigError: The folder has another run, or has one and `resume` is off.
@@ -101,17 +109,23 @@ def learn(plan: LearnPlan) -> Summary:
     # Ray starts the replicas with these variables, and they import the policies from this folder.
     os.environ["PYTHONPATH"] = os.pathsep.join(filter(None, [HERE, os.environ.get("PYTHONPATH")]))
     checkpoints = RunCheckpoints(plan)
-    sources = {TEACHER: "teacher:Teacher"} | {method: METHODS[method].student for method in plan.methods}
+    sources = {TEACHER: "teacher:Teacher"} | {
+        method: METHODS[method].student for method in plan.methods
+    }
     policies = {app: deployment(source, batch={"max_size": 64}) for app, source in sources.items()}
     with running_server(together(policies), ingress=False):
         return LearnRun(plan, checkpoints).summary()
 
 
 class RunCheckpoints:
-    """The state of each method after its last iteration, in `out`/checkpoints, in files that are written atomically."""
+    """The state of each method after its last iteration, in `out`/checkpoints, in files that are
+    written atomically.
+    """
 
     def __init__(self, plan: LearnPlan) -> None:
-        """Begin a run, or continue one with the same settings; raises `ConfigError` as `learn` does."""
+        """Begin a run, or continue one with the same settings; raises `ConfigError` as `learn`
+        does.
+        """
         self._folder = plan.out / "checkpoints"
         file = self._folder / "plan.json"
         mine = plan.model_dump_json(exclude={"methods", "out", "resume", "iterations", "track"})
@@ -119,9 +133,14 @@ class RunCheckpoints:
             self._folder.mkdir(parents=True, exist_ok=True)
             file.write_text(mine)
         elif not plan.resume:
-            raise ConfigError(f"{plan.out} already has a run: go on with it (resume), or choose another folder")
+            raise ConfigError(
+                f"{plan.out} already has a run: go on with it (resume), or choose another folder"
+            )
         elif (its := file.read_text()) != mine:
-            raise ConfigError(f"{plan.out} has a run with other settings: got {mine}, want {its}, or another folder")
+            raise ConfigError(
+                f"{plan.out} has a run with other settings: got {mine}, want {its}, or another "
+                "folder"
+            )
 
     def save(self, name: str, state: Mapping[str, Any]) -> None:
         """Write the state of a method; if that fails, the last one is kept."""
@@ -143,7 +162,8 @@ class LearnRun:
 
     def __init__(self, plan: LearnPlan, checkpoints: RunCheckpoints) -> None:
         self._plan, self._checkpoints = plan, checkpoints
-        self._clones: dict[str, dict[str, Any]] = {}  # checkpoints of learners, by the student that they train
+        # Checkpoints of learners, by the student that they train.
+        self._clones: dict[str, dict[str, Any]] = {}
 
     def summary(self) -> Summary:
         """Run all methods, and return the summary of all versions."""
@@ -156,7 +176,9 @@ class LearnRun:
     def _demonstrations(self) -> dict[str, Any]:
         with self._rollouts(TEACHER) as rollouts:
             columns = arrays(rollouts.collect(self._plan.demonstrations))
-            print(f"demonstrations: {_solved(columns)} of {self._plan.demonstrations} episodes solved")
+            print(
+                f"demonstrations: {_solved(columns)} of {self._plan.demonstrations} episodes solved"
+            )
             arrived = {"seen": inputs_of(columns), "actions": columns["action"].copy()}
         found = {name: torch.from_numpy(values) for name, values in arrived.items()}
         self._checkpoints.save("demonstrations", found)
@@ -178,23 +200,36 @@ class LearnRun:
         learner = parts.learner(plan.seed)
         learner.restore(state["learner"])
         last = plan.iterations if parts.learns else 0
-        clone_is_bc = parts.learns and "bc" in plan.methods and parts.student == METHODS["bc"].student
-        evaluated = {*range(plan.evaluate_every if clone_is_bc else 0, last, plan.evaluate_every), last}
+        clone_is_bc = (
+            parts.learns and "bc" in plan.methods and parts.student == METHODS["bc"].student
+        )
+        evaluated = {
+            *range(plan.evaluate_every if clone_is_bc else 0, last, plan.evaluate_every),
+            last,
+        }
         with (
             Publisher(_url(method)) as weights,
             self._rollouts(
-                method, want=learner.want, first=state["position"], groups=plan.groups if parts.grouped else 1
+                method,
+                want=learner.want,
+                first=state["position"],
+                groups=plan.groups if parts.grouped else 1,
             ) as rollouts,
             RemoteAgent(_url(TEACHER)) as teacher,
         ):
             for iteration in range(min(state["iteration"], last), last + 1):
                 if iteration in evaluated:
-                    summary = self._played(weights, learner, lambda: self._evaluate(method, learner.steps))
+                    summary = self._played(
+                        weights, learner, lambda: self._evaluate(method, learner.steps)
+                    )
                 if iteration == last:
                     break
-                columns = arrays(self._played(weights, learner, lambda: self._collect(rollouts, learner.steps)))
+                columns = arrays(
+                    self._played(weights, learner, lambda: self._collect(rollouts, learner.steps))
+                )
                 print(
-                    f"{method}@{learner.steps}: {_solved(columns)} of {plan.episodes} episodes of the training solved"
+                    f"{method}@{learner.steps}: {_solved(columns)} of {plan.episodes} episodes of "
+                    "the training solved"
                 )
                 if parts.advised:
                     learner.add_advice(inputs_of(columns), advice(teacher, columns))
@@ -203,7 +238,9 @@ class LearnRun:
                 self._checkpoints.save(method, progress | {"learner": learner.checkpoint()})
         return summary
 
-    def _played(self, weights: Publisher, learner: NetworkLearner, play: Callable[[], Played]) -> Played:
+    def _played(
+        self, weights: Publisher, learner: NetworkLearner, play: Callable[[], Played]
+    ) -> Played:
         """Play with the learner's weights; push them again if the replica was restarted."""
         failures = 0
         while True:
@@ -221,7 +258,9 @@ class LearnRun:
         rollouts.version = version
         return rollouts.collect(self._plan.episodes)
 
-    def _rollouts(self, policy: str, want: Sequence[str] = (), first: int = 0, groups: int = 1) -> Rollouts:
+    def _rollouts(
+        self, policy: str, want: Sequence[str] = (), first: int = 0, groups: int = 1
+    ) -> Rollouts:
         return Rollouts(
             RolloutPlan(
                 ENV,
@@ -239,7 +278,11 @@ class LearnRun:
     def _evaluate(self, method: Method, version: int) -> Summary:
         mine = self._plan
         suite = SuiteConfig(
-            envs=[ENV], env_options=ENV_OPTIONS, seeds=[HELD_OUT], episodes=mine.held_out, num_envs=mine.num_envs
+            envs=[ENV],
+            env_options=ENV_OPTIONS,
+            seeds=[HELD_OUT],
+            episodes=mine.held_out,
+            num_envs=mine.num_envs,
         )
         plan = EvalConfig(
             policies=[PolicyConfig(name=method)],
@@ -251,7 +294,10 @@ class LearnRun:
         )
         summary = TrainingEvaluation(_url(method), plan).play(version)
         [newest] = [total for total in summary.totals if total.contender == f"{method}@{version}"]
-        print(f"{newest.contender}: {newest.success_once.rate:.1%} of {mine.held_out} held-out episodes solved")
+        print(
+            f"{newest.contender}: {newest.success_once.rate:.1%} of {mine.held_out} held-out "
+            "episodes solved"
+        )
         return summary
 
 
@@ -265,14 +311,27 @@ def _solved(columns: Mapping[str, np.ndarray]) -> int:
 
 
 def main(
-    file: Annotated[Path | None, typer.Argument(help="Settings (.yaml), such as examples/learn/rpd.yaml.")] = None,
+    file: Annotated[
+        Path | None, typer.Argument(help="Settings (.yaml), such as examples/learn/rpd.yaml.")
+    ] = None,
     out_dir: Annotated[Path | None, typer.Option("--out", help="Folder of the results.")] = None,
-    seed: Annotated[int | None, typer.Option(help="Of the networks and of the training's episodes.")] = None,
+    seed: Annotated[
+        int | None, typer.Option(help="Of the networks and of the training's episodes.")
+    ] = None,
     resume: Annotated[bool, typer.Option("--resume", help="Go on with what is in --out.")] = False,
-    track: Annotated[str, typer.Option(help="Show success rates in: wandb, trackio, tensorboard.")] = "",
+    track: Annotated[
+        str, typer.Option(help="Show success rates in: wandb, trackio, tensorboard.")
+    ] = "",
 ) -> None:
-    """Train a small policy to lift pucks: from demonstrations, with a teacher's advice, and alone."""
-    given = {"out": out_dir, "seed": seed, "resume": resume or None, "track": parse_list(track) or None}
+    """Train a small policy to lift pucks: from demonstrations, with a teacher's advice, and
+    alone.
+    """
+    given = {
+        "out": out_dir,
+        "seed": seed,
+        "resume": resume or None,
+        "track": parse_list(track) or None,
+    }
     with errors(LearnPlan):
         settings = {} if file is None else read_run_file(file, "file of settings", "`methods`")
         settings |= {name: value for name, value in given.items() if value is not None}

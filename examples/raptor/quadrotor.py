@@ -1,8 +1,11 @@
-"""Simulated quadrotors of random size, mass, motors and disturbance, which have to come to a target and hover there.
+"""Simulated quadrotors of random size, mass, motors and disturbance, which have to come to a target
+and hover there.
 
-Dynamics, distribution and conventions are those of the training of RAPTOR (https://arxiv.org/abs/2509.11481) in
-https://github.com/rl-tools/rl-tools, commit cda0a54e: include/rl_tools/rl/environments/l2f/operations_generic and
-src/foundation_policy/pre_training/sample_dynamics_parameters.cpp. `python quadrotor.py` checks the environment.
+Dynamics, distribution and conventions are those of the training of RAPTOR
+(https://arxiv.org/abs/2509.11481) in https://github.com/rl-tools/rl-tools, commit cda0a54e:
+include/rl_tools/rl/environments/l2f/operations_generic and
+src/foundation_policy/pre_training/sample_dynamics_parameters.cpp. `python quadrotor.py` checks the
+environment.
 """
 
 import numpy as np
@@ -14,14 +17,15 @@ from vlagents_ray.testing import check_env
 
 DT = 0.01  # s
 GRAVITY = 9.81  # m/s²
-# The distribution scales the Crazyflie: thrust of a rotor as a polynomial in its speed in [0, 1], here as a share of
-# the largest thrust; moments of inertia about x, y and z, here in units of the first; distance of the rotors from the
-# body's x and y axes, m; mass, kg.
+# The distribution scales the Crazyflie: thrust of a rotor as a polynomial in its speed in [0, 1],
+# here as a share of the largest thrust; moments of inertia about x, y and z, here in units of the
+# first; distance of the rotors from the body's x and y axes, m; mass, kg.
 THRUST = np.array([0.00352526, 0.01437313, 0.09223048]) / 0.11012887
 INERTIA = np.array([9.416556729130406, 9.644051701582312, 17.45951732253285]) / 9.416556729130406
 ARM, MASS = 0.028, 0.0306
-# A flight ends as one of the training does, beyond 20 times the distance of the rotors from the centre or 35 rad/s, but
-# not beyond 2 m/s: quadrotors of all sizes begin with up to 1 m/s in each direction, tilted and with slow rotors.
+# A flight ends as one of the training does, beyond 20 times the distance of the rotors from the
+# centre or 35 rad/s, but not beyond 2 m/s: quadrotors of all sizes begin with up to 1 m/s in each
+# direction, tilted and with slow rotors.
 FARTHEST, LARGEST_RATE = 20, 35.0
 HOVER_M, HOVER_STEPS = 0.2, 100  # the success: within this distance of the target for 1 s
 
@@ -44,13 +48,17 @@ def sample(rng):
         "mass": mass,
         "arm": arm,
         "thrust": thrust,
-        "inertia": np.sqrt(2) * arm * thrust / rng.uniform(40.0, 1200.0),  # kg m² about x, by the torque, rad/s²
+        # Kg m² about x, by the torque, rad/s².
+        "inertia": np.sqrt(2) * arm * thrust / rng.uniform(40.0, 1200.0),
         "torque_constant": rng.uniform(0.005, 0.05),  # m, torque of a rotor about z by its thrust
         "rising": rng.uniform(0.03, 0.10),  # s, time constant of the motors when they accelerate
         "falling": rng.uniform(0.03, 0.30),  # s
     }
     spread = rng.uniform(0, 0.3 * (thrust_to_weight - 1)) * thrust_to_weight * mass / 3
-    quadrotor |= {f"force_{axis}": force for axis, force in zip("xyz", rng.normal(0, spread, 3), strict=True)}  # N
+    # N.
+    quadrotor |= {
+        f"force_{axis}": force for axis, force in zip("xyz", rng.normal(0, spread, 3), strict=True)
+    }
     state = np.zeros(17)
     state[3] = 1.0
     state[13:] = rng.uniform(0, 0.5, 4)
@@ -63,11 +71,12 @@ def sample(rng):
 
 
 class Quadrotors:
-    """N quadrotors that fly at the same time, each as if it were alone: all arithmetic is by element.
+    """N quadrotors that fly at the same time, each as if it were alone: all arithmetic is by
+    element.
 
     Attributes:
-        state: (17, N), the position, m; the orientation, a quaternion wxyz; the velocity, m/s; the angular velocity in
-            the body's axes, rad/s; and the speeds of the rotors in [0, 1].
+        state: (17, N), the position, m; the orientation, a quaternion wxyz; the velocity, m/s; the
+            angular velocity in the body's axes, rad/s; and the speeds of the rotors in [0, 1].
         action: (4, N), the last action; at first the one that holds the rotors' speeds.
         parameters: The values of the quadrotors by name, each (N,), in the units of `sample`.
     """
@@ -75,10 +84,13 @@ class Quadrotors:
     def __init__(self, seeds):
         """Begin a flight for each seed, which determines the quadrotor and its start."""
         drawn = [sample(np.random.default_rng(seed)) for seed in seeds]
-        self.parameters = {name: np.array([quadrotor[name] for quadrotor, _ in drawn]) for name in drawn[0][0]}
+        self.parameters = {
+            name: np.array([quadrotor[name] for quadrotor, _ in drawn]) for name in drawn[0][0]
+        }
         self.state = np.stack([state for _, state in drawn], axis=1)
         self.action = 2 * self.state[13:] - 1
-        self.radius = np.sqrt(2) * self.parameters["arm"]  # (N,), distance of the rotors from the centre, m
+        # (N,), distance of the rotors from the centre, m.
+        self.radius = np.sqrt(2) * self.parameters["arm"]
 
     def step(self, action, flying=True):
         """Fly for `DT` with an action, (4, N), which sets the rotors' speeds: -1 is 0 and 1 is 1.
@@ -101,7 +113,9 @@ class Quadrotors:
         body = self.parameters
         (w, x, y, z), (p, q, r), rotors = state[3:7], state[10:13], state[13:]
         # The rotors are at front right, back right, back left and front left.
-        t0, t1, t2, t3 = body["thrust"] * (THRUST[0] + THRUST[1] * rotors + THRUST[2] * rotors * rotors)
+        t0, t1, t2, t3 = body["thrust"] * (
+            THRUST[0] + THRUST[1] * rotors + THRUST[2] * rotors * rotors
+        )
         lift = t0 + t1 + t2 + t3
         torque_x = body["arm"] * (-t0 - t1 + t2 + t3)
         torque_y = body["arm"] * (-t0 + t1 + t2 - t3)
@@ -191,11 +205,20 @@ class HoverBatch(BatchEnv):
         self.near = np.where(distance < HOVER_M, self.near + 1, 0)
         infos = [{"success": bool(near >= HOVER_STEPS)} for near in self.near]
         truncated = [self.steps >= self.max_steps] * len(acts)
-        return self._observe(), (-distance).tolist(), self.flights.crashed().tolist(), truncated, infos
+        return (
+            self._observe(),
+            (-distance).tolist(),
+            self.flights.crashed().tolist(),
+            truncated,
+            infos,
+        )
 
     def _observe(self):
         parts = self.flights.observe()
-        return [Obs(state={name: part[i] for name, part in parts.items()}) for i in range(len(self.near))]
+        return [
+            Obs(state={name: part[i] for name, part in parts.items()})
+            for i in range(len(self.near))
+        ]
 
     def close(self):
         """Free nothing."""

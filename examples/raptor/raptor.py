@@ -1,7 +1,9 @@
-"""Serve RAPTOR (https://arxiv.org/abs/2509.11481), a recurrent policy that flies quadrotors it has never seen.
+"""Serve RAPTOR (https://arxiv.org/abs/2509.11481), a recurrent policy that flies quadrotors it has
+never seen.
 
 Its trained weights are on PyPI: `pip install foundation-policy==1.0.2` (MIT). In this folder
-`vlagents-ray serve raptor.yaml` serves it, and `vlagents-ray eval flights.yaml` flies 500 quadrotors with it.
+`vlagents-ray serve raptor.yaml` serves it, and `vlagents-ray eval flights.yaml` flies 500
+quadrotors with it.
 """
 
 from pathlib import Path
@@ -22,18 +24,24 @@ INPUTS = {  # in the order of the network's 22 inputs
 
 
 class Raptor(Agent):
-    """A gated recurrent unit (GRU) between dense layers; an action sets the motors clockwise from front right."""
+    """A gated recurrent unit (GRU) between dense layers; an action sets the motors clockwise
+    from front right.
+    """
 
     trainable = "weights"
-    # A resumed session gets its last 128 observations again: the GRU forgets earlier ones, and acts as before to 3e-7.
-    contract = Contract(state=INPUTS, action=ActionSpec(dim=4, space="rotor_speed"), control_hz=100.0, history=129)
+    # A resumed session gets its last 128 observations again: the GRU forgets earlier ones, and acts
+    # as before to 3e-7.
+    contract = Contract(
+        state=INPUTS, action=ActionSpec(dim=4, space="rotor_speed"), control_hz=100.0, history=129
+    )
 
     def initialize(self):
         folder = Path(require("foundation_policy").__file__).parent
         with require("h5py").File(find_checkpoint(str(folder / "blob" / "checkpoint.h5"))) as file:
             layers = file["actor/layers"]
             names = [f"{number}/{name}" for number in layers for name in layers[number]]
-            self.weights = {name: np.squeeze(layers[name]["parameters"]) for name in names}  # float32
+            # float32.
+            self.weights = {name: np.squeeze(layers[name]["parameters"]) for name in names}
 
     def reset(self, obs, instruction, **kwargs):
         self.hidden = self.weights["1/initial_hidden_state"]  # (16,)
@@ -43,7 +51,9 @@ class Raptor(Agent):
         self.act(obs)
 
     def act_batch(self, obs, sessions):
-        inputs = np.stack([np.concatenate([one.state[name] for name in INPUTS]) for one in obs]).astype(np.float32)
+        inputs = np.stack(
+            [np.concatenate([one.state[name] for name in INPUTS]) for one in obs]
+        ).astype(np.float32)
         hidden = np.stack([session.hidden for session in sessions])
         new = self._dense("1/%s_input", np.maximum(self._dense("0/%s", inputs), 0))
         old = self._dense("1/%s_hidden", hidden)
@@ -55,4 +65,6 @@ class Raptor(Agent):
 
     def _dense(self, name, inputs):
         """Multiply vector by vector, so that an action is the same to the bit in any batch."""
-        return (self.weights[name % "weights"] @ inputs[..., np.newaxis])[..., 0] + self.weights[name % "biases"]
+        return (self.weights[name % "weights"] @ inputs[..., np.newaxis])[..., 0] + self.weights[
+            name % "biases"
+        ]

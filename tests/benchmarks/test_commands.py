@@ -1,4 +1,6 @@
-"""Mistakes on the command line of `python -m benchmarks.NAME` are reported before anything starts."""
+"""Mistakes on the command line of `python -m benchmarks.NAME` are reported before anything
+starts.
+"""
 
 from __future__ import annotations
 

@@ -12,12 +12,18 @@ MINUTES = 1 / 60
 
 @pytest.mark.parametrize("arms", [1, 2])
 @pytest.mark.parametrize("relative", [False, True], ids=["absolute", "relative"])
-def test_minutes_with_faults_have_no_jump_and_no_command_after_a_stop(relative: bool, arms: int) -> None:
+def test_minutes_with_faults_have_no_jump_and_no_command_after_a_stop(
+    relative: bool, arms: int
+) -> None:
     normal = day.play_day(0, 2 * MINUTES, faults=False, relative=relative, arms=arms)
     assert normal.stops == 0
     assert normal.moving_s > 100  # of 120
-    assert normal.held.get("dynamics", 0) < 10, "without a fault the guard refuses hardly any of 6000 actions"
-    report = day.play_day(3, 10 * MINUTES, normal_step=normal.largest_step, relative=relative, arms=arms)
+    assert normal.held.get("dynamics", 0) < 10, (
+        "without a fault the guard refuses hardly any of 6000 actions"
+    )
+    report = day.play_day(
+        3, 10 * MINUTES, normal_step=normal.largest_step, relative=relative, arms=arms
+    )
     assert report.violations == []
     assert report.stops > 3
     assert report.restarts > 0
@@ -31,7 +37,9 @@ def test_a_seed_replays_each_command() -> None:
     assert first.digest != other.digest
 
 
-def test_a_guard_without_limits_lets_jumps_through_which_the_day_finds(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_guard_without_limits_lets_jumps_through_which_the_day_finds(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     monkeypatch.setattr(day, "LIMITS", Limits())
     report = day.play_day(3, 3 * MINUTES, normal_step=0.02)
     assert any("a step of" in one for one in report.violations)
@@ -47,6 +55,8 @@ def test_a_restart_from_afar_would_be_found(monkeypatch: pytest.MonkeyPatch) -> 
 def test_the_cost_of_a_tick_is_measured_with_and_without_the_guard() -> None:
     measured = day.measure_ticks(200)
     assert list(measured) == [
-        f"{part}, {joints} joints" for joints in (7, 14) for part in ("guard", "loop", "loop without guard")
+        f"{part}, {joints} joints"
+        for joints in (7, 14)
+        for part in ("guard", "loop", "loop without guard")
     ]
     assert all(0 < figures["p50_us"] <= figures["p99_us"] for figures in measured.values())

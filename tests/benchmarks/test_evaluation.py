@@ -1,4 +1,6 @@
-"""Whole evaluations against the peers': everybody plays the same, and whoever did not is found out."""
+"""Whole evaluations against the peers': everybody plays the same, and whoever did not is found
+out.
+"""
 
 from __future__ import annotations
 
@@ -40,7 +42,10 @@ def play_here(notes: Path, seeds: range, steps: int = FEW.max_steps) -> None:
 
 
 def test_the_noted_tabletop_is_the_tabletop(tmp_path: Path) -> None:
-    with make_env(TIMED_ENV, **FEW.env(tmp_path)) as noted, make_env("tabletop", width=32, height=32) as plain:
+    with (
+        make_env(TIMED_ENV, **FEW.env(tmp_path)) as noted,
+        make_env("tabletop", width=32, height=32) as plain,
+    ):
         assert noted.contract == plain.contract == known_contract(TIMED_ENV, FEW.env(tmp_path))
         ours, theirs = noted.reset(seed=5)[0], plain.reset(seed=5)[0]
         assert np.array_equal(ours.cameras["front"], theirs.cameras["front"])
@@ -96,7 +101,9 @@ def test_ours_without_workers_plays_the_plan_soon_after_its_start(tmp_path: Path
 
 
 @pytest.mark.parametrize(("seeds", "steps"), [(range(3), 3), (range(1, 5), 3), (range(4), 2)])
-def test_whoever_plays_something_else_is_not_compared(tmp_path: Path, seeds: range, steps: int) -> None:
+def test_whoever_plays_something_else_is_not_compared(
+    tmp_path: Path, seeds: range, steps: int
+) -> None:
     with pytest.raises(ProcessFailed, match="want each of 4 once with 3"):
         play(FEW, lambda _folder, notes: play_here(notes, seeds, steps), tmp_path / "other")
 
@@ -107,7 +114,11 @@ def test_ratios_are_above_one_where_we_are_faster() -> None:
 
 
 def test_against_one_process_all_cores_must_count() -> None:
-    found = {"cores": 8, "plan": {"workers": 2}, "ratios": {"vlagents": {"median": 1.9}, "vla-eval": {"median": 1.9}}}
+    found = {
+        "cores": 8,
+        "plan": {"workers": 2},
+        "ratios": {"vlagents": {"median": 1.9}, "vla-eval": {"median": 1.9}},
+    }
     assert [one.met for one in evaluation_outcomes(found)] == [False, True]
 
 

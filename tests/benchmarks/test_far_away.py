@@ -1,4 +1,6 @@
-"""A robot whose policy is far away, over a link that delays, loses and is cut, and through a tunnel."""
+"""A robot whose policy is far away, over a link that delays, loses and is cut, and through a
+tunnel.
+"""
 
 from __future__ import annotations
 
@@ -84,7 +86,9 @@ def far() -> Iterator[Far]:
 
 def test_the_link_delays_loses_and_cuts_packets_and_heals(far: Far) -> None:
     echo = LineProcess("the echo", far.cloud.command([sys.executable, "-c", ECHO]), end_s=0.1)
-    asker = LineProcess("the asker", far.home.command([sys.executable, "-c", ASK, far.link.address]))
+    asker = LineProcess(
+        "the asker", far.home.command([sys.executable, "-c", ASK, far.link.address])
+    )
     with echo, asker:
         echo.read(30)
 
@@ -106,11 +110,15 @@ def test_the_link_delays_loses_and_cuts_packets_and_heals(far: Far) -> None:
         assert len(round_trips_s(50)) == 50
 
 
-def test_a_robot_stands_while_the_link_is_cut_and_then_goes_on_by_itself_with_what_it_sees_then(far: Far) -> None:
+def test_a_robot_stands_while_the_link_is_cut_and_then_goes_on_by_itself_with_what_it_sees_then(
+    far: Far,
+) -> None:
     with robot(far.home, f"http://{far.link.address}:{PORT}") as arm:
         _, before = far.server.request("sessions", 30)
         conditions = Conditions(delay_ms=40, loss=0.01, mbit=20)
-        found, healed = run(arm, far.link, conditions, 3.5, 1.0, seconds=90, mode="async", recovers=True)
+        found, healed = run(
+            arm, far.link, conditions, 3.5, 1.0, seconds=90, mode="async", recovers=True
+        )
     wait_for(lambda: far.server.request("sessions", 30)[0] == 0)  # none stays behind
     _, opened = far.server.request("sessions", 30)
     assert healed is not None
@@ -121,21 +129,28 @@ def test_a_robot_stands_while_the_link_is_cut_and_then_goes_on_by_itself_with_wh
     assert found["safe"]
     assert acted[-round(HZ) :].all()
     drove = np.flatnonzero(acted)
-    seen = drove - np.array(ticks["age_ticks"])  # the tick of the observation behind each executed action
+    # The tick of the observation behind each executed action.
+    seen = drove - np.array(ticks["age_ticks"])
     assert max(ticks["age_ticks"]) <= MAX_AGE_S * HZ + 1
-    assert not ((at[drove] > healed - 1.0) & (at[drove] < healed)).any()  # it stood at the end of the cut
-    assert (at[seen[at[drove] > healed]] > healed).all()  # nothing that was planned before is executed after it
+    # It stood at the end of the cut.
+    assert not ((at[drove] > healed - 1.0) & (at[drove] < healed)).any()
+    # Nothing that was planned before is executed after it.
+    assert (at[seen[at[drove] > healed]] > healed).all()
     assert ticks["twice"] == 0
     assert opened - before == 1 + len(ticks["resumed"])
 
 
 @contextmanager
 def tunnel(near: Host, far: Host, address: str, *forwarded: str) -> Iterator[None]:
-    """`ssh` at `near` to the `sshd` of a user at `far`, with what is forwarded: -L or -R and its ports."""
+    """`ssh` at `near` to the `sshd` of a user at `far`, with what is forwarded: -L or -R and its
+    ports.
+    """
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         for key in ("host", "user"):
-            subprocess.run(["ssh-keygen", "-q", "-t", "ed25519", "-N", "", "-f", folder / key], check=True)
+            subprocess.run(
+                ["ssh-keygen", "-q", "-t", "ed25519", "-N", "", "-f", folder / key], check=True
+            )
         (folder / "config").write_text(CONFIG.format(folder=folder))
         for path in (folder, folder / "host", folder / "user.pub", folder / "config"):
             shutil.chown(path, USER, USER)
@@ -145,8 +160,24 @@ def tunnel(near: Host, far: Host, address: str, *forwarded: str) -> Iterator[Non
             try:
                 assert sshd.stderr is not None
                 assert "listening" in sshd.stderr.readline()
-                known = ["-F", "none", "-o", "StrictHostKeyChecking=no", "-o", f"UserKnownHostsFile={folder / 'known'}"]
-                options = ["-f", "-N", "-o", "BatchMode=yes", "-o", "ExitOnForwardFailure=yes", *known, *forwarded]
+                known = [
+                    "-F",
+                    "none",
+                    "-o",
+                    "StrictHostKeyChecking=no",
+                    "-o",
+                    f"UserKnownHostsFile={folder / 'known'}",
+                ]
+                options = [
+                    "-f",
+                    "-N",
+                    "-o",
+                    "BatchMode=yes",
+                    "-o",
+                    "ExitOnForwardFailure=yes",
+                    *known,
+                    *forwarded,
+                ]
                 with near.start(
                     ["ssh", *options, "-i", str(folder / "user"), "-p", "2222", f"{USER}@{address}"]
                 ) as ssh:
@@ -161,7 +192,10 @@ def test_a_robot_reaches_its_policy_through_a_tunnel_from_either_side(far: Far) 
         pytest.skip(f"no {SSHD} (Debian: openssh-server)")
     far.link.set(Conditions(delay_ms=10))
     from_home = tunnel(far.home, far.cloud, far.link.address, "-L", f"9000:127.0.0.1:{PORT}")
-    with from_home, tunnel(far.cloud, far.home, far.link.other_address, "-R", f"9001:127.0.0.1:{PORT}"):
+    with (
+        from_home,
+        tunnel(far.cloud, far.home, far.link.other_address, "-R", f"9001:127.0.0.1:{PORT}"),
+    ):
         urls = [f"http://127.0.0.1:{port}" for port in (9000, 9001)]
         said = far.home.run([sys.executable, "-c", DRIVE, *urls]).splitlines()
     assert [json.loads(line)[::2] for line in said] == [["websocket", 50]] * 2

@@ -1,4 +1,6 @@
-"""The steps of `make gpu` run in processes of their own, and the report says what each found, or why it ended."""
+"""The steps of `make gpu` run in processes of their own, and the report says what each found, or
+why it ended.
+"""
 
 from __future__ import annotations
 
@@ -54,7 +56,9 @@ def found(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
     """The report of steps of all kinds."""
     plan = Plan(tmp_path_factory.mktemp("out"), tmp_path_factory.mktemp("scratch"), dry=True)
     steps = {"finds": finds, "misses": misses, "fails": fails, "dies": dies, "hangs": hangs}
-    runner = Runner(plan, {name: Step(run, 3 if run is hangs else 60) for name, run in steps.items()})
+    runner = Runner(
+        plan, {name: Step(run, 3 if run is hangs else 60) for name, run in steps.items()}
+    )
     assert runner.run() is False
     assert (plan.out / "gpu.md").read_text().count("**no**") == 4
     log = (plan.out / "gpu.log").read_text()
@@ -97,25 +101,38 @@ def test_a_dry_run_judges_no_time(found: dict[str, Any]) -> None:
 def test_steps_without_time_are_named(tmp_path: Path) -> None:
     runner = Runner(Plan(tmp_path, tmp_path, dry=True, seconds=1), {"finds": Step(finds, 60)})
     assert runner.run() is False
-    assert json.loads((tmp_path / "gpu.json").read_text())["steps"]["finds"]["checks"][0]["got"] == "no time was left"
+    assert (
+        json.loads((tmp_path / "gpu.json").read_text())["steps"]["finds"]["checks"][0]["got"]
+        == "no time was left"
+    )
 
 
 def test_it_runs_without_ray_and_needs_no_torch_to_start() -> None:
     code = (
         "import sys; sys.modules['ray'] = None\n"
-        "import benchmarks.gpu.__main__, vlagents_ray_learn.publisher, vlagents_ray.serve.endpoints.http\n"
+        "import benchmarks.gpu.__main__, vlagents_ray_learn.publisher, "
+        "vlagents_ray.serve.endpoints.http\n"
         "assert 'torch' not in sys.modules"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
 
 
-def test_what_is_packed_for_a_machine_without_a_network_exists_and_has_what_is_imported_there() -> None:
+def test_what_is_packed_for_a_machine_without_a_network_exists_and_has_what_is_imported_there() -> (
+    None
+):
     assert [name for name in pack.FOLDERS if not (pack.ROOT / name).exists()] == []
-    files = [*(pack.ROOT / "benchmarks" / "gpu").glob("*.py"), *(pack.ROOT / name for name in GPU_TESTS)]
+    files = [
+        *(pack.ROOT / "benchmarks" / "gpu").glob("*.py"),
+        *(pack.ROOT / name for name in GPU_TESTS),
+    ]
     text = "\n".join(file.read_text() for file in files)
     imported = set(re.findall(r"^ *from (vlagents_ray\w*)", text, re.MULTILINE))
-    packed = {path.parent.name for project in pack.PROJECTS for path in Path(project).glob("vlagents_ray*/py.typed")}
+    packed = {
+        path.parent.name
+        for project in pack.PROJECTS
+        for path in Path(project).glob("vlagents_ray*/py.typed")
+    }
     assert imported <= packed
 
 
@@ -126,7 +143,9 @@ def test_the_steps_fit_into_the_ten_minutes_of_a_machine() -> None:
 
 def test_the_network_is_timed_alone_and_once(monkeypatch: pytest.MonkeyPatch) -> None:
     clock = iter(range(100))
-    monkeypatch.setattr("benchmarks.network.time", SimpleNamespace(perf_counter=lambda: float(next(clock))))
+    monkeypatch.setattr(
+        "benchmarks.network.time", SimpleNamespace(perf_counter=lambda: float(next(clock)))
+    )
     timer, rows = NetworkTimer(), [SimpleNamespace(is_cuda=False)]
     with timer.loading():
         inner = Compilation(False).core("inner", lambda x: x)
@@ -146,7 +165,13 @@ def test_a_timed_core_is_part_of_another_as_without_a_timer() -> None:
 
 
 def test_gaps_are_between_kernels_that_may_overlap() -> None:
-    spans = [(0.0, 10.0, "a"), (2.0, 4.0, "b"), (15.0, 20.0, "c"), (18.0, 21.0, "d"), (31.0, 32.0, "e")]
+    spans = [
+        (0.0, 10.0, "a"),
+        (2.0, 4.0, "b"),
+        (15.0, 20.0, "c"),
+        (18.0, 21.0, "d"),
+        (31.0, 32.0, "e"),
+    ]
     assert busy_time(spans) == (17.0, [(10.0, "e"), (5.0, "c")])
     assert busy_time([]) == (0.0, [])
 

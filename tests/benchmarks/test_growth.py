@@ -36,7 +36,9 @@ class SlowAgent:
 
 def test_a_robot_skips_the_ticks_that_pass_during_an_act(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(robots, "connect", lambda *_: SlowAgent())
-    with contextlib.closing(robots.ConnectedRobots("http://127.0.0.1:9", "websocket", 2)) as connected:
+    with contextlib.closing(
+        robots.ConnectedRobots("http://127.0.0.1:9", "websocket", 2)
+    ) as connected:
         assert connected.replicas == [7, 7]
         begun = time.monotonic()
         ms = connected.run(begun, begun + 1, hz=10)

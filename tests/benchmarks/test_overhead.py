@@ -1,4 +1,6 @@
-"""The benchmark of an evaluation's overhead, and CPU time of other processes, count what they say."""
+"""The benchmark of an evaluation's overhead, and CPU time of other processes, count what they
+say.
+"""
 
 from __future__ import annotations
 
@@ -49,11 +51,15 @@ def test_it_measures_the_tabletop() -> None:
     assert data["bare_cpu_ms_per_step"][0] > 0
 
 
-BURN = "import sys, time\nwhile time.process_time() < 0.5: pass\nprint(flush=True)\nsys.stdin.read()"
+BURN = (
+    "import sys, time\nwhile time.process_time() < 0.5: pass\nprint(flush=True)\nsys.stdin.read()"
+)
 
 
 def test_what_a_process_used_is_counted_and_stays_counted_when_it_has_ended() -> None:
-    with subprocess.Popen([sys.executable, "-c", BURN], stdin=subprocess.PIPE, stdout=subprocess.PIPE) as burning:
+    with subprocess.Popen(
+        [sys.executable, "-c", BURN], stdin=subprocess.PIPE, stdout=subprocess.PIPE
+    ) as burning:
         assert burning.stdout is not None
         assert burning.stdin is not None
         begun = time.time()

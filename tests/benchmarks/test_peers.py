@@ -1,4 +1,6 @@
-"""Clients in other languages and other policy servers: which are measured, and a script that stands for one."""
+"""Clients in other languages and other policy servers: which are measured, and a script that
+stands for one.
+"""
 
 from __future__ import annotations
 
@@ -55,7 +57,9 @@ def connect(target):
 peer.run(serve, connect)
 """
 PYTHON = Path(sys.executable)
-FEW = ThroughputPlan(config={"base_ms": 2.0, "per_item_ms": 1.0}, batch=2, clients=(2,), peers_python=PYTHON)
+FEW = ThroughputPlan(
+    config={"base_ms": 2.0, "per_item_ms": 1.0}, batch=2, clients=(2,), peers_python=PYTHON
+)
 
 
 @pytest.fixture(name="fake")
@@ -79,7 +83,9 @@ def gone(pid: int) -> bool:
         return True
 
 
-def test_a_driver_gets_the_observation_and_makes_the_calls_it_is_told_to(fake: PeerClient, obs: Path) -> None:
+def test_a_driver_gets_the_observation_and_makes_the_calls_it_is_told_to(
+    fake: PeerClient, obs: Path
+) -> None:
     with peer_connected(fake, PYTHON, obs, {}) as driver:
         driver.ready()
         assert len(driver.measure(25)) == 25
@@ -90,7 +96,9 @@ def test_server_and_driver_end_with_the_context(fake: PeerClient, obs: Path) -> 
     with peer_connected(fake, PYTHON, obs, {}) as driver:
         driver.ready()
         driver_pid = driver.pid  # type: ignore[attr-defined]
-        running = subprocess.run(["pgrep", "-f", fake.script], capture_output=True, text=True, check=True)
+        running = subprocess.run(
+            ["pgrep", "-f", fake.script], capture_output=True, text=True, check=True
+        )
         pids = [int(pid) for pid in running.stdout.split()]
         assert driver_pid in pids
         assert len(pids) == 2
@@ -107,14 +115,17 @@ def test_a_driver_that_breaks_tells_why(fake: PeerClient, obs: Path) -> None:
 
 
 @pytest.mark.parametrize("command", ["serve", "drive"])
-def test_a_killed_bench_takes_its_processes_along(fake: PeerClient, obs: Path, command: str) -> None:
+def test_a_killed_bench_takes_its_processes_along(
+    fake: PeerClient, obs: Path, command: str
+) -> None:
     """A driver waits on its input, a server serves; neither is told that the bench has died."""
     port = free_port()
     words = [str(PYTHON), fake.script, command, "127.0.0.1", str(port)]
     words += ["{}"] if command == "serve" else [str(obs), "raw", "{}"]
     code = (
         "import subprocess, sys, time\n"
-        "p = subprocess.Popen(sys.argv[1:], stdin=subprocess.PIPE)\nprint(p.pid, flush=True)\ntime.sleep(60)"
+        "p = subprocess.Popen(sys.argv[1:], stdin=subprocess.PIPE)\nprint(p.pid, "
+        "flush=True)\ntime.sleep(60)"
     )
     with subprocess.Popen([PYTHON, "-c", code, *words], stdout=subprocess.PIPE, text=True) as bench:
         assert bench.stdout is not None
@@ -157,11 +168,16 @@ with peer_connected(one, Path(sys.executable), Path(sys.argv[2]), {}) as driver:
 """
 
 
-def test_a_killed_bench_takes_the_processes_of_a_server_along_that_it_has_stopped(tmp_path: Path, obs: Path) -> None:
+def test_a_killed_bench_takes_the_processes_of_a_server_along_that_it_has_stopped(
+    tmp_path: Path, obs: Path
+) -> None:
     script = tmp_path / "polling_peer.py"
     script.write_text(FAKE.removesuffix("peer.run(serve, connect)\n") + POLLING)
     with subprocess.Popen(
-        [PYTHON, "-c", KILLED, str(script), str(obs)], stdout=subprocess.PIPE, text=True, cwd=SCRIPTS.parents[1]
+        [PYTHON, "-c", KILLED, str(script), str(obs)],
+        stdout=subprocess.PIPE,
+        text=True,
+        cwd=SCRIPTS.parents[1],
     ) as bench:
         assert bench.stdout is not None
         assert bench.stdout.readline() == "stopped\n"
@@ -177,7 +193,9 @@ def state(pid: int) -> str:
     return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0]
 
 
-def test_a_server_that_polls_is_stopped_between_the_turns_of_its_clients(fake: PeerClient, obs: Path) -> None:
+def test_a_server_that_polls_is_stopped_between_the_turns_of_its_clients(
+    fake: PeerClient, obs: Path
+) -> None:
     polling = replace(fake, polls=True, shares=True)
     running: dict[str, PeerServer] = {}
     with peer_connected(polling, PYTHON, obs, running) as driver:
@@ -196,7 +214,10 @@ def test_a_server_that_polls_is_stopped_between_the_turns_of_its_clients(fake: P
 def test_clients_of_one_script_share_a_server_if_it_says_so(fake: PeerClient, obs: Path) -> None:
     for shares in (True, False):
         one, running = replace(fake, shares=shares), {}
-        with serving(one, PYTHON, running, {}) as first, serving(one, PYTHON, running, {}) as second:
+        with (
+            serving(one, PYTHON, running, {}) as first,
+            serving(one, PYTHON, running, {}) as second,
+        ):
             assert (first.address == second.address) is shares
 
 
@@ -208,7 +229,8 @@ def test_a_fleet_makes_load_with_the_policy_of_the_plan(fake: PeerClient, obs: P
             robot, simulation = fleet.run(1, 1, 0.3)
         assert len(both) == 2
         for calls in (*both, simulation, robot):
-            assert all(rest == [5.0, 3] for _, _, *rest in calls)  # 2 ms and 1 ms a row, of which the fake says three
+            # 2 ms and 1 ms a row, of which the fake says three.
+            assert all(rest == [5.0, 3] for _, _, *rest in calls)
         assert 0 < len(robot) < len(simulation)
 
 
@@ -228,15 +250,22 @@ def test_a_peer_answers_its_own_clients(client: PeerClient, obs: Path) -> None:
         robot, simulation = fleet.run(1, 1, 2.0)
     assert robot
     assert simulation
-    assert {(inference, rows) for _, _, inference, rows in (*robot, *simulation)} <= {(3.0, 1), (4.0, 2)}
+    assert {(inference, rows) for _, _, inference, rows in (*robot, *simulation)} <= {
+        (3.0, 1),
+        (4.0, 2),
+    }
 
 
-def test_a_peer_does_not_get_the_settings_of_our_running_server(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_peer_does_not_get_the_settings_of_our_running_server(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     monkeypatch.setenv("RAY_SERVE_ENABLE_HA_PROXY", "1")
     monkeypatch.setenv("VLAGENTS_RAY_HOST", "127.0.0.1")
     monkeypatch.setenv("RAY_USAGE_STATS_ENABLED", "0")
     changes = alone()
-    assert [changes.get(name, "kept") for name in ("RAY_SERVE_ENABLE_HA_PROXY", "VLAGENTS_RAY_HOST")] == [None, None]
+    assert [
+        changes.get(name, "kept") for name in ("RAY_SERVE_ENABLE_HA_PROXY", "VLAGENTS_RAY_HOST")
+    ] == [None, None]
     assert "RAY_USAGE_STATS_ENABLED" not in changes
 
 
@@ -250,7 +279,8 @@ def test_a_peer_that_is_not_installed_is_skipped_by_name_with_the_cure(tmp_path:
     found, skipped, _ = peer_clients(["openpi"], tmp_path / "python")
     assert found == []
     assert "benchmarks.peers" in skipped["openpi"]
-    found, skipped, _ = peer_clients(["vlagents"], Path(sys.executable))  # rpyc conflicts with nothing, but is not here
+    # Rpyc conflicts with nothing, but is not here.
+    found, skipped, _ = peer_clients(["vlagents"], Path(sys.executable))
     assert found == []
     assert set(skipped) == {"vlagents"}
     assert "vlagents, rpyc not installed" in skipped["vlagents"]
@@ -269,11 +299,18 @@ def test_all_clients_are_measured_in_turns() -> None:
     typescript_client.build()
     with client_servers() as urls:
         found = clients.measure_clients(urls["VLAGENTS_TEST_URL"], 20)
-    assert [trips.name for trips in found.ours] == ["Python, websocket", "Python, http", clients.CPP, *clients.NODE]
+    assert [trips.name for trips in found.ours] == [
+        "Python, websocket",
+        "Python, http",
+        clients.CPP,
+        *clients.NODE,
+    ]
     assert all(trips.rounds.shape == (1, 20) and trips.median > 0 for trips in found.ours)
 
 
-def test_a_client_that_was_not_built_is_named_with_the_cure(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_client_that_was_not_built_is_named_with_the_cure(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(clients, "TYPESCRIPT", tmp_path)
     with pytest.raises(ConfigError, match="npm run build"):
         clients.measure_clients("http://127.0.0.1:9", 1)

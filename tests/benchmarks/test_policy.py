@@ -28,11 +28,17 @@ class Picky(Noop):
     @property
     def contract(self) -> Contract:
         cameras = {"front": CameraSpec(20, 30), "wrist": CameraSpec()}
-        return Contract(cameras=cameras, state={"pose": StateSpec()}, action=ActionSpec(dim=7), chunk=1)
+        return Contract(
+            cameras=cameras, state={"pose": StateSpec()}, action=ActionSpec(dim=7), chunk=1
+        )
 
     def act_batch(self, obs: Sequence[Obs], sessions: Sequence[Agent]) -> list[Act | Exception]:
         for one in obs:
-            if one.cameras["front"].shape != (20, 30, 3) or one.cameras["wrist"].shape != (48, 48, 3):
+            if one.cameras["front"].shape != (20, 30, 3) or one.cameras["wrist"].shape != (
+                48,
+                48,
+                3,
+            ):
                 raise InvalidObservation("images")
             if one.state["pose"].shape != (9,):
                 raise InvalidObservation("pose: want (9,)")
@@ -50,10 +56,14 @@ def test_larger_batches_give_more_actions_bare_and_behind_the_queue() -> None:
     one, four = found["batches"]
     assert (one["batch"], four["batch"]) == (1, 4)
     for way in ("bare", "queued"):
-        best_of_one, best_of_four = (max(r["actions_per_s"] for r in size["rounds"][way]) for size in (one, four))
-        assert best_of_four > 1.5 * best_of_one  # the best, as a busy machine slows down some rounds
+        best_of_one, best_of_four = (
+            max(r["actions_per_s"] for r in size["rounds"][way]) for size in (one, four)
+        )
+        # The best, as a busy machine slows down some rounds.
+        assert best_of_four > 1.5 * best_of_one
         assert len(one["rounds"][way]) == 5
-    assert one["bare"]["actions_per_s"] < 1000 / 11  # a sleep is never shorter than it was asked to be
+    # A sleep is never shorter than it was asked to be.
+    assert one["bare"]["actions_per_s"] < 1000 / 11
     assert one["queued"]["round_trip_ms"] > 11
     assert one["queued"]["mean_batch"] == pytest.approx(1)
     assert 1 < four["queued"]["mean_batch"] <= 4
@@ -77,7 +87,10 @@ def test_no_batch_is_larger_than_those_of_a_compiled_model() -> None:
 
 def test_one_policy_of_a_file_is_named(tmp_path: Path) -> None:
     file = tmp_path / "two.yaml"
-    app = "  - {{name: {0}, route_prefix: /{0}, import_path: vlagents_ray.serve.app:build, args: {{policy: {0}}}}}\n"
+    app = (
+        "  - {{name: {0}, route_prefix: /{0}, import_path: vlagents_ray.serve.app:build, args: "
+        "{{policy: {0}}}}}\n"
+    )
     file.write_text("applications:\n" + app.format("noop") + app.format("random"))
     assert policy_application(str(file), "random").args["policy"] == "random"
     with pytest.raises(ConfigError, match=r"noop.*random"):
@@ -93,4 +106,6 @@ def test_a_policy_is_measured_with_other_settings_than_its_files(tmp_path: Path)
     assert done.exit_code == 0, done.output
     [row] = json.loads((tmp_path / "found.json").read_text())["batches"]
     assert row["bare"]["batch_ms"] >= 20
-    assert row["queued_share"] == pytest.approx(row["queued"]["actions_per_s"] / row["bare"]["actions_per_s"])
+    assert row["queued_share"] == pytest.approx(
+        row["queued"]["actions_per_s"] / row["bare"]["actions_per_s"]
+    )

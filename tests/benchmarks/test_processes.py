@@ -30,19 +30,26 @@ for child in children:
 
 @pytest.fixture(name="family")
 def running_family() -> Iterator[tuple[int, list[int]]]:
-    """Yield a process, and those that it has started: a replica, Ray's idle worker, and another program."""
+    """Yield a process, and those that it has started: a replica, Ray's idle worker, and another
+    program.
+    """
     names = ["ray::ServeReplica:noop:policy.act", "ray::IDLE", "openpi_peer.py"]
     with ExitStack() as stack:
         parent = stack.enter_context(
             subprocess.Popen(
-                [sys.executable, "-c", PARENT, *names], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+                [sys.executable, "-c", PARENT, *names],
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                text=True,
             )
         )
         assert parent.stdin is not None
         assert parent.stdout is not None
         stack.callback(parent.stdin.close)
         children = [int(pid) for pid in parent.stdout.readline().split()]
-        wait_for(lambda: [program(pid) for pid in children] == ["ServeReplica", "IDLE", "openpi_peer.py"])
+        wait_for(
+            lambda: [program(pid) for pid in children] == ["ServeReplica", "IDLE", "openpi_peer.py"]
+        )
         yield parent.pid, children
 
 
@@ -56,14 +63,20 @@ def test_a_server_is_all_that_its_process_has_started_but_rays_daemons_and_other
     assert not {parent, replica, idle, peer} & set(server_processes(os.getpid(), [parent]))
 
 
-SLEEP = "import sys, time\nfor line in sys.stdin:\n  for _ in range(200): time.sleep(0.001)\n  print(flush=True)"
+SLEEP = (
+    "import sys, time\nfor line in sys.stdin:\n  for _ in range(200): time.sleep(0.001)\n  "
+    "print(flush=True)"
+)
 
 
 def test_a_thread_waits_once_each_time_that_it_sleeps() -> None:
-    with subprocess.Popen([sys.executable, "-c", SLEEP], stdin=subprocess.PIPE, stdout=subprocess.PIPE) as sleeping:
+    with subprocess.Popen(
+        [sys.executable, "-c", SLEEP], stdin=subprocess.PIPE, stdout=subprocess.PIPE
+    ) as sleeping:
         assert sleeping.stdin is not None
         assert sleeping.stdout is not None
-        for meter in (UsageMeter([sleeping.pid]), UsageMeter([sleeping.pid])):  # the first counts the process's start
+        # The first counts the process's start.
+        for meter in (UsageMeter([sleeping.pid]), UsageMeter([sleeping.pid])):
             with meter.counting():
                 sleeping.stdin.write(b"\n")
                 sleeping.stdin.flush()
@@ -75,7 +88,9 @@ def test_a_thread_waits_once_each_time_that_it_sleeps() -> None:
 
 
 def test_the_use_while_idle_is_not_that_of_an_act(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Two processes, read before and after each span: one is idle at 0.1 CPU s and 10 waits a second."""
+    """Two processes, read before and after each span: one is idle at 0.1 CPU s and 10 waits a
+    second.
+    """
     moments = iter([0.0, 2.0, 5.0, 6.0])
     monkeypatch.setattr(processes, "time", SimpleNamespace(monotonic=lambda: next(moments)))
     monkeypatch.setattr(processes, "program", {1: "replica", 2: "haproxy"}.__getitem__)
@@ -84,7 +99,8 @@ def test_the_use_while_idle_is_not_that_of_an_act(monkeypatch: pytest.MonkeyPatc
             (1.0, {"7": (100, 5)}), (8.0, {"8": (3, 3)}),  # the idle span of 2 s
             (1.2, {"7": (120, 5)}), (8.0, {"8": (3, 3)}),
             (2.0, {"7": (200, 5)}), (8.0, {"8": (3, 3)}),  # a span of 1 s with ten acts
-            (2.3, {"7": (230, 6), "9": (10, 0)}), None,  # a thread began; the other process has ended
+            # A thread began; the other process has ended.
+            (2.3, {"7": (230, 6), "9": (10, 0)}), None,
         ]
     )  # fmt: skip
     monkeypatch.setattr(processes, "_counters", lambda _: next(counters))
@@ -96,13 +112,16 @@ def test_the_use_while_idle_is_not_that_of_an_act(monkeypatch: pytest.MonkeyPatc
         pass
     found = meter.per_act(10)
     assert found.pop("programs") == pytest.approx({"replica": 20, "haproxy": 0})
-    assert found == pytest.approx({"cpu_ms": 20, "voluntary_switches": 3, "involuntary_switches": 0.1})
+    assert found == pytest.approx(
+        {"cpu_ms": 20, "voluntary_switches": 3, "involuntary_switches": 0.1}
+    )
 
 
 def test_all_is_counted_of_a_process_that_polls(monkeypatch: pytest.MonkeyPatch) -> None:
     moments = iter([0.0, 1.0, 1.0, 2.0])
     monkeypatch.setattr(processes, "time", SimpleNamespace(monotonic=lambda: next(moments)))
-    counters = iter([(0.0, {}), (1.0, {}), (1.0, {}), (1.5, {})])  # its client holds half of its core in the turn
+    # Its client holds half of its core in the turn.
+    counters = iter([(0.0, {}), (1.0, {}), (1.0, {}), (1.5, {})])
     monkeypatch.setattr(processes, "_counters", lambda _: next(counters))
     meter = UsageMeter([1])
     with meter.counting():

@@ -1,4 +1,6 @@
-"""Round trips: which ways are measured in turns, and what medians, intervals and ratios say of known data."""
+"""Round trips: which ways are measured in turns, and what medians, intervals and ratios say of
+known data.
+"""
 
 from __future__ import annotations
 
@@ -9,7 +11,14 @@ import numpy as np
 import pytest
 
 from benchmarks.drivers import Driver
-from benchmarks.figures import RoundTrips, lost_db, measured_on, median_interval, median_ratio, ratios
+from benchmarks.figures import (
+    RoundTrips,
+    lost_db,
+    measured_on,
+    median_interval,
+    median_ratio,
+    ratios,
+)
 from benchmarks.hop import CHILD, IN_PROCESS, measure_hop
 from benchmarks.own_clients import OWN_CLIENTS, connect, observation, own_clients
 from benchmarks.processes import DAEMONS
@@ -41,7 +50,9 @@ def test_all_take_turns_in_short_rounds_and_nobody_is_always_the_first() -> None
     log: list[str] = []
     drivers: Mapping[str, Driver] = {name: Turns(name, log) for name in "abc"}
     found = in_turns(drivers, 3 * ROUND - 15, lambda _: None)
-    assert {name: trips.rounds.shape for name, trips in found.items()} == dict.fromkeys("abc", (3, ROUND))
+    assert {name: trips.rounds.shape for name, trips in found.items()} == dict.fromkeys(
+        "abc", (3, ROUND)
+    )
     assert [sorted(log[i : i + 3]) for i in (0, 3, 6)] == [["a", "b", "c"]] * 3
     assert len(set(log[::3])) > 1
     assert in_turns(drivers, 10, lambda _: None)["a"].rounds.shape == (1, 10)
@@ -74,13 +85,18 @@ def test_ways_have_names_of_their_own() -> None:
 
 
 def test_a_codec_is_written_in_words() -> None:
-    assert connect("http://127.0.0.1:1", "websocket", "jpeg 90 420", rank="robot").transport == "websocket"
+    assert (
+        connect("http://127.0.0.1:1", "websocket", "jpeg 90 420", rank="robot").transport
+        == "websocket"
+    )
     with pytest.raises(ValueError, match="codec"):
         connect("http://127.0.0.1:1", "websocket", "gif")
 
 
 def trips(name: str, median: float, rounds: int = 20, seed: int = 0) -> RoundTrips:
-    return RoundTrips(name, np.random.default_rng(seed).lognormal(np.log(median), 0.2, (rounds, 25)))
+    return RoundTrips(
+        name, np.random.default_rng(seed).lognormal(np.log(median), 0.2, (rounds, 25))
+    )
 
 
 def test_the_interval_holds_the_median() -> None:
@@ -89,7 +105,13 @@ def test_the_interval_holds_the_median() -> None:
     assert median_interval(np.array([3.0])) == (3, 3)
     one = RoundTrips("x", numbers.reshape(1, -1))
     assert one.median == 51
-    assert one.to_json() == {"way": "x", "calls": 101, "median_ms": 51, "ci95_ms": [41, 62], "p99_ms": 100}
+    assert one.to_json() == {
+        "way": "x",
+        "calls": 101,
+        "median_ms": 51,
+        "ci95_ms": [41, 62],
+        "p99_ms": 100,
+    }
 
 
 def test_a_ratio_lies_in_its_interval_and_the_truth_does_too() -> None:
@@ -129,7 +151,8 @@ def test_every_one_of_ours_is_compared_with_every_one_of_theirs() -> None:
 def test_what_images_lost() -> None:
     sent = {"front": np.full((4, 4, 3), 100, np.uint8)}
     assert lost_db(sent, sent) is None
-    assert lost_db({"front": sent["front"] + np.uint8(1)}, sent) == pytest.approx(48.13, abs=0.01)  # 20 log10(255)
+    # 20 log10(255)
+    assert lost_db({"front": sent["front"] + np.uint8(1)}, sent) == pytest.approx(48.13, abs=0.01)
 
 
 def test_what_figures_depend_on_is_json_without_names_of_hosts() -> None:

@@ -1,4 +1,6 @@
-"""Scaling and endurance, on made-up numbers and in small: what is linear, what a driver costs, what is lost."""
+"""Scaling and endurance, on made-up numbers and in small: what is linear, what a driver costs,
+what is lost.
+"""
 
 from __future__ import annotations
 
@@ -24,7 +26,9 @@ PLAN = ScalingPlan(workers=(1, 4), rounds=3)
 
 def played(rate: float, **changes: object) -> PlayedEpisodes:
     """A round in which nothing but its rate matters."""
-    usual = PlayedEpisodes(rate, 30.0, ["shm"], 0, 100, 20.0, 20.0, 0.4, dict.fromkeys(DAEMONS, 0.2))
+    usual = PlayedEpisodes(
+        rate, 30.0, ["shm"], 0, 100, 20.0, 20.0, 0.4, dict.fromkeys(DAEMONS, 0.2)
+    )
     return usual._replace(**changes)  # type: ignore[arg-type]
 
 
@@ -46,7 +50,10 @@ def test_linear_is_so_many_times_the_single_worker_of_the_same_round() -> None:
 
 
 def test_bytes_between_hosts_are_those_of_an_act() -> None:
-    rounds = [played(10, sent_bytes=sent, acts=100, near=near) for sent, near in ((1000, 1), (3000, 0.5), (9000, 1))]
+    rounds = [
+        played(10, sent_bytes=sent, acts=100, near=near)
+        for sent, near in ((1000, 1), (3000, 0.5), (9000, 1))
+    ]
     found = row(PLAN, OWN, 4, rounds, [10] * 3)
     assert (found["near"], found["sent_bytes_per_act"]) == (0.5, 30)
 
@@ -55,7 +62,9 @@ def test_the_ideal_is_what_sleeping_alone_allows() -> None:
     """50 steps of 20 ms, and 50 acts of 50 ms, or 7 of chunks of 8 rows."""
     assert PLAN.ideal(4, OWN) == PLAN.ideal(4, SHARED) == pytest.approx(4 * 60 / 3.5)
     assert PLAN.ideal(4, CHUNKS) == pytest.approx(4 * 60 / 1.35)
-    assert row(PLAN, CHUNKS, 4, [played(PLAN.ideal(4, CHUNKS) / 2)], [1.0])["of_linear"] == pytest.approx(0.5)
+    assert row(PLAN, CHUNKS, 4, [played(PLAN.ideal(4, CHUNKS) / 2)], [1.0])[
+        "of_linear"
+    ] == pytest.approx(0.5)
 
 
 def test_a_driver_costs_what_its_rounds_say() -> None:
@@ -70,7 +79,9 @@ def test_a_driver_costs_what_its_rounds_say() -> None:
         used = true["episode"] * episodes + true["step"] * episodes * steps
         used += true["worker_second"] * busy_s + true["second"] * span_s
         rounds.append(ScalingRound(4, episodes // 4, steps, 1.0))
-        found.append(played(1.0, episodes=episodes, span_s=span_s, busy_s=busy_s, driver_s=used / 1e3))
+        found.append(
+            played(1.0, episodes=episodes, span_s=span_s, busy_s=busy_s, driver_s=used / 1e3)
+        )
     assert fit(rounds, found) == pytest.approx(true)
 
 
@@ -103,7 +114,16 @@ SCALING = {
 
 
 def test_the_part_with_the_least_room_saturates_first() -> None:
-    load = Load(workers=1000, steps=100, episode_s=30.0, chunk=10, act_ms=60.0, batch=10, replicas=2, mbit=100.0)
+    load = Load(
+        workers=1000,
+        steps=100,
+        episode_s=30.0,
+        chunk=10,
+        act_ms=60.0,
+        batch=10,
+        replicas=2,
+        mbit=100.0,
+    )
     rows = parts(SCALING, load)
     found = {row["name"]: row["saturates"] for row in rows}
     assert next(iter(found)) == "learner's link"
@@ -141,7 +161,8 @@ def test_a_gap_lies_between_two_episodes_of_one_worker() -> None:
 def test_growth_is_what_settled_memory_gains_in_a_thousand_episodes() -> None:
     filling = [(done, done * MIB) for done in range(0, 2000, 100)]
     settled = [(done, 50 * MIB + done * MIB // 500) for done in range(2000, 9_501, 100)]
-    found = growth([*filling, *settled, (10_000, 900 * MIB)], 10_000)  # all results are read at the end
+    # All results are read at the end.
+    found = growth([*filling, *settled, (10_000, 900 * MIB)], 10_000)
     assert found is not None
     assert found["mib_per_1000"] == pytest.approx(2)
     assert (found["begin_mib"], found["end_mib"]) == (54, 69)
@@ -161,9 +182,13 @@ def measured(**changes: object) -> dict[str, object]:
     steady = {"median": 2.0, "p95": 4.0}
     flat = {"begin_mib": 100.0, "end_mib": 101.0, "mib_per_1000": 0.1}
     return {
-        "plan": {"episodes": 10_000}, "keys_once": True, "done": 10_000, "gap_ms": {"first": steady, "last": steady},
-        "driver_cpu_ms": {"first": 1.0, "last": 1.0}, "memory": {"driver": flat, "worker": flat},
-    } | changes  # fmt: skip
+        "plan": {"episodes": 10_000},
+        "keys_once": True,
+        "done": 10_000,
+        "gap_ms": {"first": steady, "last": steady},
+        "driver_cpu_ms": {"first": 1.0, "last": 1.0},
+        "memory": {"driver": flat, "worker": flat},
+    } | changes
 
 
 @pytest.mark.parametrize(
@@ -172,11 +197,17 @@ def measured(**changes: object) -> dict[str, object]:
         ({}, []),
         ({"done": 9_999}, ["every episode"]),
         ({"keys_once": False}, ["every episode"]),
-        ({"gap_ms": {"first": {"median": 2.0}, "last": {"median": 4.0}}}, ["the same, last over first"]),
+        (
+            {"gap_ms": {"first": {"median": 2.0}, "last": {"median": 4.0}}},
+            ["the same, last over first"],
+        ),
         ({"gap_ms": {"first": {"median": 6.0}, "last": {"median": 4.0}}}, [GAP + "at first"]),
-        ({"memory": {"driver": {"begin_mib": 1, "end_mib": 9, "mib_per_1000": 1.0}}}, ["memory of the driver"]),
+        (
+            {"memory": {"driver": {"begin_mib": 1, "end_mib": 9, "mib_per_1000": 1.0}}},
+            ["memory of the driver"],
+        ),
     ],
-)  # fmt: skip
+)
 def test_the_verdict_names_what_is_missed(changes: dict[str, object], missed: list[str]) -> None:
     assert [one.what for one in soak_outcomes(measured(**changes)) if not one.met] == missed
 
@@ -185,7 +216,8 @@ def test_the_verdict_names_what_is_missed(changes: dict[str, object], missed: li
 @pytest.mark.integration
 @pytest.mark.ray
 def test_killed_workers_lose_no_episode_and_repeat_none() -> None:
-    for _ in range(4):  # on a busy machine one worker may play all of them while the other one starts
+    # On a busy machine one worker may play all of them while the other one starts.
+    for _ in range(4):
         found = measure_soak(SoakPlan(episodes=300, kill_every_s=0.1, max_steps=40))
         assert found["keys_once"]
         assert found["done"] == 300

@@ -25,9 +25,16 @@ def played(folder: Path, *names: str, episodes: int = 2) -> dict[str, dict[str, 
 
 
 def test_ways_in_this_process(tmp_path: Path) -> None:
-    rows = played(tmp_path, "again", "bfloat16", "ensemble", "async, 50 ms", "LoRA apart", "LoRA merged")
+    rows = played(
+        tmp_path, "again", "bfloat16", "ensemble", "async, 50 ms", "LoRA apart", "LoRA merged"
+    )
     assert rows["again"]["equal"] == 2
-    assert rows["bfloat16"]["equal"] == rows["async, 50 ms"]["equal"] == rows["LoRA apart"]["equal"] == 0
+    assert (
+        rows["bfloat16"]["equal"]
+        == rows["async, 50 ms"]["equal"]
+        == rows["LoRA apart"]["equal"]
+        == 0
+    )
     again = played(tmp_path, "again")["again"]
     assert again == rows["again"]  # nothing was played again
 
@@ -35,14 +42,23 @@ def test_ways_in_this_process(tmp_path: Path) -> None:
 @pytest.mark.integration
 @pytest.mark.ray
 def test_ways_through_a_server(tmp_path: Path) -> None:
-    names = ["batches of 16", "shm", "JPEG, quality 30", "after a push", "upstream, openpi", "upstream, gr00t"]
+    names = [
+        "batches of 16",
+        "shm",
+        "JPEG, quality 30",
+        "after a push",
+        "upstream, openpi",
+        "upstream, gr00t",
+    ]
     rows = played(tmp_path, *names)
     assert rows["shm"]["equal"] == rows["after a push"]["equal"] == 2
     assert rows["JPEG, quality 30"]["equal"] == 0
     assert rows["upstream, openpi"]["episodes"] == rows["upstream, gr00t"]["episodes"] == 2
 
 
-def test_actions_that_differ_where_they_must_not_are_an_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_actions_that_differ_where_they_must_not_are_an_error(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     other = success.Way("again", {"steps": 2}, equal=True)
     monkeypatch.setattr(success, "ways", lambda: [success.Way(success.STANDARD), other])
     with pytest.raises(typer.Exit):
@@ -51,7 +67,9 @@ def test_actions_that_differ_where_they_must_not_are_an_error(tmp_path: Path, mo
 
 def test_the_difference_is_that_of_paired_episodes() -> None:
     def of(name: str, *solved: bool) -> success.Played:
-        return success.Played(success.Way(name), {seed: (one, f"{name}{one}") for seed, one in enumerate(solved)}, 1.0)
+        return success.Played(
+            success.Way(name), {seed: (one, f"{name}{one}") for seed, one in enumerate(solved)}, 1.0
+        )
 
     standard = of("a", *[True] * 8, False, False)
     same, again, worse = success.compared([standard, standard, of("b", *[False] * 8, False, True)])

@@ -8,7 +8,14 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks.autoscaling import AutoscalingPlan, LoadPhase, ScaleSample, by_second, plot_autoscaling, report
+from benchmarks.autoscaling import (
+    AutoscalingPlan,
+    LoadPhase,
+    ScaleSample,
+    by_second,
+    plot_autoscaling,
+    report,
+)
 from benchmarks.bare_policy import BarePolicy
 from benchmarks.closed_loop import ClosedLoop
 from benchmarks.figures import mean_interval
@@ -65,12 +72,15 @@ def test_robots_think_and_a_late_answer_ends_a_client() -> None:
 
 def test_the_interval_of_a_mean_is_students() -> None:
     assert mean_interval([1.0]) is None
-    assert mean_interval([9.0, 10.0, 11.0]) == pytest.approx((10 - 4.303 / 3**0.5, 10 + 4.303 / 3**0.5))
+    assert mean_interval([9.0, 10.0, 11.0]) == pytest.approx(
+        (10 - 4.303 / 3**0.5, 10 + 4.303 / 3**0.5)
+    )
 
 
 def test_a_bare_policy_is_run_in_full_batches() -> None:
     bare = BarePolicy("noop", {"base_ms": 10}, batch=8)
-    rates = [bare.rate(0.1) for _ in range(5)]  # eight for each sleep of at least 10 ms; one at a time would be 100
+    # Eight for each sleep of at least 10 ms; one at a time would be 100.
+    rates = [bare.rate(0.1) for _ in range(5)]
     assert 100 < max(rates) <= 800
 
 
@@ -93,7 +103,12 @@ def test_each_burst_has_its_own_figures_and_times_count_from_the_first(tmp_path:
     found = report(AutoscalingPlan(), samples, phases)
     assert [one["at"] for one in found["samples"]] == [-1, 1, 4]
     robots, none = found["phases"]
-    assert (robots["begun"], robots["ended"], robots["most_replicas"], robots["acts"]) == (0, 2, 1, 3)
+    assert (robots["begun"], robots["ended"], robots["most_replicas"], robots["acts"]) == (
+        0,
+        2,
+        1,
+        3,
+    )
     assert (robots["median_ms"], robots["longest_ms"]) == pytest.approx((20, 30))
     assert none["failed"] == ["reset: no replica"]
     assert math.isnan(none["median_ms"])

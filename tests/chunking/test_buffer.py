@@ -1,4 +1,6 @@
-"""Chunks that overlap, and what is done next; the age of observations, whatever the wall clock does."""
+"""Chunks that overlap, and what is done next; the age of observations, whatever the wall clock
+does.
+"""
 
 from __future__ import annotations
 
@@ -84,7 +86,9 @@ def test_an_answer_one_step_too_late_is_good_for_its_last_row_if_there_is_no_oth
         (np.maximum, [1, 20, 30]),
     ],
 )
-def test_a_tick_that_two_chunks_have_a_row_for_is_merged_as_chosen(merge: object, expected: list[float]) -> None:
+def test_a_tick_that_two_chunks_have_a_row_for_is_merged_as_chosen(
+    merge: object, expected: list[float]
+) -> None:
     plan = ChunkBuffer(merge)
     plan.add(chunk(0, 0, [1, 2]))
     plan.add(chunk(1, 1, [20, 30]))
@@ -133,7 +137,9 @@ def test_a_policy_that_chunks_in_real_time_is_told_of_no_more_rows_than_are_left
         ([3, 3, *[6] * 10, *[2] * 9], 2),  # and a faster one
     ],
 )
-def test_the_expected_delay_leaves_out_a_cold_start_and_a_stall(delays: list[int], expected: int) -> None:
+def test_the_expected_delay_leaves_out_a_cold_start_and_a_stall(
+    delays: list[int], expected: int
+) -> None:
     estimate = DelayEstimate()
     for delay in delays:
         estimate.add(delay)
@@ -160,7 +166,8 @@ def test_rows_are_handed_out_one_by_one_and_replaced_at_once() -> None:
     assert plan.executed == 4
     with pytest.raises(PolicyFailed, match="no row is left for step 4"):
         plan.take()
-    plan.replace(np.array([[6.0], [7.0], [8.0]], np.float32), step=2)  # two of its rows would have been executed before
+    # Two of its rows would have been executed before.
+    plan.replace(np.array([[6.0], [7.0], [8.0]], np.float32), step=2)
     assert plan.take().row == 2
     assert plan.next is None
 
@@ -191,7 +198,9 @@ def clocks(monkeypatch: pytest.MonkeyPatch) -> Clocks:
 
 
 @pytest.mark.parametrize("jump_s", [-3600.0, -0.05, 0.0, 3600.0])
-def test_one_that_is_handed_in_again_grows_old_whatever_the_clock_does(clocks: Clocks, jump_s: float) -> None:
+def test_one_that_is_handed_in_again_grows_old_whatever_the_clock_does(
+    clocks: Clocks, jump_s: float
+) -> None:
     stamp = clocks.wall_s - 0.3
     clocks.age(stamp)
     clocks.wall_s += jump_s
@@ -200,7 +209,9 @@ def test_one_that_is_handed_in_again_grows_old_whatever_the_clock_does(clocks: C
 
 
 @pytest.mark.parametrize("jump_s", [-3600.0, 3600.0])
-def test_a_jump_costs_the_observation_that_it_fell_into_and_no_other(clocks: Clocks, jump_s: float) -> None:
+def test_a_jump_costs_the_observation_that_it_fell_into_and_no_other(
+    clocks: Clocks, jump_s: float
+) -> None:
     before = clocks.wall_s
     clocks.go_on(0.01)
     clocks.wall_s += jump_s
@@ -209,7 +220,9 @@ def test_a_jump_costs_the_observation_that_it_fell_into_and_no_other(clocks: Clo
     assert clocks.age(clocks.wall_s - 0.01) == pytest.approx(0.01)
 
 
-def test_an_observation_is_as_old_as_it_says_and_a_clock_only_a_little_ahead_is_borne(clocks: Clocks) -> None:
+def test_an_observation_is_as_old_as_it_says_and_a_clock_only_a_little_ahead_is_borne(
+    clocks: Clocks,
+) -> None:
     assert clocks.age(clocks.wall_s - 0.3) == pytest.approx(0.3)
     assert clocks.age(None) == 0
     assert clocks.age(clocks.wall_s + 0.05) == 0

@@ -1,4 +1,6 @@
-"""Interventions: who moves the robot at a tick, what the policy learns of it, and how it begins again."""
+"""Interventions: who moves the robot at a tick, what the policy learns of it, and how it begins
+again.
+"""
 
 from __future__ import annotations
 
@@ -25,7 +27,9 @@ ROW = 0.01  # between two rows of a chunk
 
 
 class Near(Agent):
-    """Continues from where the robot stands, in small steps, as a policy with absolute targets does."""
+    """Continues from where the robot stands, in small steps, as a policy with absolute targets
+    does.
+    """
 
     contract = Contract(action=ActionSpec(dim=2, delta=False, low=-5.0, high=5.0))
 
@@ -110,7 +114,9 @@ MODES: list[dict[str, Any]] = [
 
 
 @pytest.mark.parametrize("options", MODES)
-def test_the_hand_over_takes_one_tick_in_both_directions(make: Any, options: dict[str, Any]) -> None:
+def test_the_hand_over_takes_one_tick_in_both_directions(
+    make: Any, options: dict[str, Any]
+) -> None:
     arm, leader = make(Near(), **options)
     assert INTERVENTION not in arm.tick().info
     leader.held = True
@@ -124,7 +130,9 @@ def test_the_hand_over_takes_one_tick_in_both_directions(make: Any, options: dic
 
 
 @pytest.mark.parametrize("options", MODES)
-def test_each_frame_of_a_correction_has_what_the_policy_wanted(make: Any, options: dict[str, Any]) -> None:
+def test_each_frame_of_a_correction_has_what_the_policy_wanted(
+    make: Any, options: dict[str, Any]
+) -> None:
     agent = Near()
     arm, leader = make(agent, **options)
     for _ in range(3):
@@ -136,12 +144,16 @@ def test_each_frame_of_a_correction_has_what_the_policy_wanted(make: Any, option
         arm.settle()
         known += WANTED in act.info and act.info[WANTED].shape == (2,)
     assert len(leader.given) == 20
-    assert known >= (16 if options == MODES[1] else 20), "at the tick of a request in open loop, nobody waits for it"
+    assert known >= (16 if options == MODES[1] else 20), (
+        "at the tick of a request in open loop, nobody waits for it"
+    )
     assert max(agent.at) > 0.5, "the policy is asked with what a human has made of the scene"
 
 
 @pytest.mark.parametrize("options", MODES)
-def test_after_the_release_only_answers_to_new_observations_are_executed(make: Any, options: dict[str, Any]) -> None:
+def test_after_the_release_only_answers_to_new_observations_are_executed(
+    make: Any, options: dict[str, Any]
+) -> None:
     agent = Near()
     guard = Guard(agent.contract, max_step=0.08, measure=lambda obs: obs.state["joints"])
     arm, leader = make(agent, check=guard, **options)
@@ -160,7 +172,9 @@ def test_after_the_release_only_answers_to_new_observations_are_executed(make: A
             first = act
         arm.settle()
     assert first is not None
-    assert first.action[0] - released[0] <= (first.info["row"] + 1) * ROW + 1e-6, "a plan of before would lie elsewhere"
+    assert first.action[0] - released[0] <= (first.info["row"] + 1) * ROW + 1e-6, (
+        "a plan of before would lie elsewhere"
+    )
     assert max(steps) <= 0.08 + 1e-6
     assert all(LEFTOVER not in info for info in agent.asked[asked : asked + 1])
     assert agent.at[asked] == pytest.approx(float(released[0]))
@@ -191,7 +205,9 @@ def test_an_answer_in_progress_at_the_release_is_dropped(make: Any) -> None:
 
 def test_a_jump_after_the_release_never_reaches_the_robot(make: Any) -> None:
     agent = Near(jump=1.0)
-    arm, leader = make(agent, check=Guard(agent.contract, max_step=0.1, measure=lambda obs: obs.state["joints"]))
+    arm, leader = make(
+        agent, check=Guard(agent.contract, max_step=0.1, measure=lambda obs: obs.state["joints"])
+    )
     leader.held = True
     for _ in range(3):
         arm.tick()
@@ -213,7 +229,13 @@ def test_every_action_of_a_human_passes_the_guard(make: Any) -> None:
     arm, leader = make(Near(), check=check, mode="async")
     arm.tick()
     leader.held = True
-    for wrong in (row(np.nan), row(3.0), row(9.0), np.zeros(3, np.float32), np.zeros((2, 2), np.float32)):
+    for wrong in (
+        row(np.nan),
+        row(3.0),
+        row(9.0),
+        np.zeros(3, np.float32),
+        np.zeros((2, 2), np.float32),
+    ):
         leader.command = wrong
         at = arm.pose.copy()
         act = arm.tick()
@@ -280,7 +302,8 @@ def test_a_loop_of_the_users_own_says_what_it_executed(make: Any) -> None:
     arm.tick()
     act = arm.tick()
     assert agent.asked[-1][EXECUTED].tolist() == [row(0.3).tolist()]
-    assert (act.info["age_ticks"], act.info["row"]) == (0, 0)  # three rows of the first chunk have passed
+    # Three rows of the first chunk have passed.
+    assert (act.info["age_ticks"], act.info["row"]) == (0, 0)
     with pytest.raises(InvalidAction, match="above the limit"):
         arm.player.observe(arm.seen(), action=row(9.0))
 
@@ -306,10 +329,14 @@ def test_real_time_chunking_never_states_a_plan_that_nobody_executes(make: Any) 
         arm.tick()
         arm.settle()
     rest = next(info[LEFTOVER] for info in agent.asked[asked:] if LEFTOVER in info)
-    assert rest[0, 0] == pytest.approx(float(arm.pose[0]), abs=5 * ROW), "the plan from after the release"
+    assert rest[0, 0] == pytest.approx(float(arm.pose[0]), abs=5 * ROW), (
+        "the plan from after the release"
+    )
 
 
-@pytest.mark.parametrize("failure", [PolicyFailed("no memory"), InvalidObservation("a camera"), RuntimeError("a bug")])
+@pytest.mark.parametrize(
+    "failure", [PolicyFailed("no memory"), InvalidObservation("a camera"), RuntimeError("a bug")]
+)
 @pytest.mark.parametrize("options", MODES)
 def test_errors_of_the_policy_take_no_robot_from_a_human(
     make: Any, options: dict[str, Any], failure: Exception
@@ -390,7 +417,13 @@ def test_a_human_takes_over_from_a_pause_and_gives_back_to_the_policy(make: Any)
     arm, leader = make(Near())
     control = arm.player.control
     states = []
-    for held, command in ((False, None), (False, control.pause), (True, None), (True, None), (False, None)):
+    for held, command in (
+        (False, None),
+        (False, control.pause),
+        (True, None),
+        (True, None),
+        (False, None),
+    ):
         leader.held = held
         if command is not None:
             command()
@@ -421,7 +454,9 @@ def test_a_leader_that_breaks_pauses_the_robot(make: Any) -> None:
     assert "division by zero" in arm.tick().info[SAFE]
 
 
-def test_without_a_safe_action_that_passes_a_pause_or_a_wrong_human_ends_the_loop(make: Any) -> None:
+def test_without_a_safe_action_that_passes_a_pause_or_a_wrong_human_ends_the_loop(
+    make: Any,
+) -> None:
     arm, leader = make(Near(), safe=row(9.0), check=Guard(Near.contract))
     leader.held = True
     leader.command = row(9.0)
@@ -437,7 +472,10 @@ def test_without_a_safe_action_that_passes_a_pause_or_a_wrong_human_ends_the_loo
     class Unstated(Near):
         contract = Contract(action=ActionSpec(dim=2))
 
-    with ChunkPlayer(Unstated(), override=ScriptedLeader(row(0))) as player, pytest.raises(ConfigError, match="safe"):
+    with (
+        ChunkPlayer(Unstated(), override=ScriptedLeader(row(0))) as player,
+        pytest.raises(ConfigError, match="safe"),
+    ):
         player.reset(Obs(), "stack")
 
 
@@ -458,9 +496,12 @@ def test_a_command_between_any_two_lines_of_a_tick_is_not_lost(line: int, comman
         if frame.f_code is not Control.update.__code__:
             return None
         if event == "line" and frame.f_lineno == wanted and not threads:
-            threads.append(threading.Thread(target=getattr(control, command), args=("by the operator",)))
+            threads.append(
+                threading.Thread(target=getattr(control, command), args=("by the operator",))
+            )
             threads[0].start()
-            threads[0].join(0.01)  # longer if the state is locked; then it is the next one that counts
+            # Longer if the state is locked; then it is the next one that counts.
+            threads[0].join(0.01)
         return trace
 
     before = sys.gettrace()

@@ -36,7 +36,9 @@ def test_the_contract_decides(spec: ActionSpec, expected: object) -> None:
         ("freeze", ActionSpec(), "want one of"),
     ],
 )
-def test_a_choice_that_would_or_might_move_the_robot_is_refused(safe: Safe, spec: ActionSpec, cure: str) -> None:
+def test_a_choice_that_would_or_might_move_the_robot_is_refused(
+    safe: Safe, spec: ActionSpec, cure: str
+) -> None:
     with pytest.raises(ConfigError, match=cure):
         SafeAction(safe, spec)
 
@@ -47,7 +49,10 @@ def test_the_last_actions_gripper_is_held_and_an_own_action_taken_as_it_is() -> 
     home = np.array([1.0, 2.0, 3.0])
     own: list[Safe] = [home, lambda obs: obs.state["joints"]]
     for safe in own:
-        assert SafeAction(safe, ActionSpec())(Obs(state={"joints": home}), LAST).tolist() == home.tolist()
+        assert (
+            SafeAction(safe, ActionSpec())(Obs(state={"joints": home}), LAST).tolist()
+            == home.tolist()
+        )
     SafeAction("hold", ActionSpec())(Obs(), LAST)[:] = 9
     assert LAST[0] == np.float32(0.3), "the last action itself is not handed out"
 
@@ -62,6 +67,9 @@ def test_what_is_made_from_the_last_action_wants_one() -> None:
 def test_before_the_first_action_a_gripper_is_kept_as_it_is_measured() -> None:
     spec = ActionSpec(dim=3, delta=True, gripper_open=1.0, gripper_closed=-1.0)
     assert SafeAction("auto", spec)(Obs(gripper=0.75), None).tolist() == [0, 0, 0.5]
-    for unknown, obs in ((spec, Obs()), (ActionSpec(dim=3, delta=True, gripper_open=1.0), Obs(gripper=1.0))):
+    for unknown, obs in (
+        (spec, Obs()),
+        (ActionSpec(dim=3, delta=True, gripper_open=1.0), Obs(gripper=1.0)),
+    ):
         with pytest.raises(InvalidAction, match="before the first action"):
             SafeAction("auto", unknown)(obs, None)

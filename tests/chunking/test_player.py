@@ -38,7 +38,9 @@ class Counting(Agent):
 
     shared = ("seen",)
 
-    def __init__(self, *, gated: bool = False, rows: int = HORIZON, done_at: int | None = None) -> None:
+    def __init__(
+        self, *, gated: bool = False, rows: int = HORIZON, done_at: int | None = None
+    ) -> None:
         self.seen: list[dict[str, Any]] = []  # info of the observations that it was asked about
         self.failure: Exception | None = None
         self.rows = rows
@@ -98,8 +100,14 @@ Playing = Callable[..., tuple[Counting, ChunkPlayer]]
     [
         (3, {}, [0, 0.1, 0.2, 3, 3.1, 3.2, 6], [0, 3, 6]),  # whole chunks
         (3, {"execute": 2}, [0, 0.1, 2, 2.1, 4], [0, 2, 4]),
-        (1, {"deadline_s": 30.0}, [0, 1, 2, 3], [0, 1, 2, 3]),  # within the deadline an answer is waited for
-        (6, {"mode": "ensemble", "ensemble_m": 0.0}, [0, (0.1 + 1) / 2, (0.2 + 1.1 + 2) / 3], [0, 1, 2]),
+        # Within the deadline an answer is waited for.
+        (1, {"deadline_s": 30.0}, [0, 1, 2, 3], [0, 1, 2, 3]),
+        (
+            6,
+            {"mode": "ensemble", "ensemble_m": 0.0},
+            [0, (0.1 + 1) / 2, (0.2 + 1.1 + 2) / 3],
+            [0, 1, 2],
+        ),
     ],
 )
 def test_a_chunk_is_executed_as_far_as_the_mode_says(
@@ -114,9 +122,11 @@ def test_async_executes_the_old_chunk_while_the_next_is_made(playing: Playing) -
     agent, player = playing(Counting(gated=True), mode="async")
     assert play(player, range(3)) == [0, 0.1, 0.2]  # asked at tick 1, no answer yet
     let(agent, player)
-    assert play(player, range(3, 5)) == [1.2, 1.3]  # rows 2 and 3 of the answer to tick 1: its first two are late
+    # Rows 2 and 3 of the answer to tick 1: its first two are late.
+    assert play(player, range(3, 5)) == [1.2, 1.3]
     wait_for(lambda: len(agent.seen) == 3)
-    assert [info["t"] for info in agent.seen] == [0, 1, 3]  # one request at a time, and then the newest observation
+    # One request at a time, and then the newest observation.
+    assert [info["t"] for info in agent.seen] == [0, 1, 3]
 
 
 def test_a_policy_of_single_actions_has_one_for_each_tick(playing: Playing) -> None:
@@ -130,7 +140,9 @@ def test_a_policy_of_single_actions_has_one_for_each_tick(playing: Playing) -> N
     assert done == [0, 0, 1, 2, 3, 4, 5, 6]  # each a tick late
 
 
-def test_a_policy_of_single_actions_that_takes_three_ticks_has_one_for_each_third(playing: Playing) -> None:
+def test_a_policy_of_single_actions_that_takes_three_ticks_has_one_for_each_third(
+    playing: Playing,
+) -> None:
     agent, player = playing(Counting(gated=True, rows=1), mode="async")
     held = []
     for t in range(12):
@@ -149,7 +161,9 @@ def test_async_asks_no_more_often_than_told(playing: Playing) -> None:
     assert agent.seen[1]["t"] == 4
 
 
-def test_async_executes_no_row_beyond_the_horizon_or_for_which_others_were_executed(playing: Playing) -> None:
+def test_async_executes_no_row_beyond_the_horizon_or_for_which_others_were_executed(
+    playing: Playing,
+) -> None:
     _, player = playing(Counting(gated=True), mode="async", horizon=2)
     play(player, range(2))
     assert "safe" in player.act(obs(2)).info
@@ -170,7 +184,8 @@ def test_without_an_action_in_time_the_safe_one_is_given_and_says_so(playing: Pl
     assert "waiting" in act.info["safe"]
     assert act.info["silent_s"] > 0
     let(agent, player)
-    late = player.act(obs(HORIZON + 1))  # the answer to tick 1, of whose rows five had others executed in their place
+    # The answer to tick 1, of whose rows five had others executed in their place.
+    late = player.act(obs(HORIZON + 1))
     assert (late.info["row"], late.info["age_ticks"]) == (5, HORIZON)
     assert "safe" not in late.info
     assert "safe" in player.act(obs(HORIZON + 2)).info
@@ -236,7 +251,9 @@ def seen_at(t: int, captured_at: float) -> Obs:
     return Obs(info={"t": t, "captured_at": captured_at})
 
 
-def test_what_was_captured_too_long_ago_is_neither_executed_nor_asked_about(playing: Playing) -> None:
+def test_what_was_captured_too_long_ago_is_neither_executed_nor_asked_about(
+    playing: Playing,
+) -> None:
     agent, player = playing(Counting(), deadline_s=30.0, max_age_s=60.0)
     play(player, range(HORIZON))
     frozen = time.time() - 3600
@@ -267,7 +284,9 @@ def test_a_plan_grows_old_from_when_its_observation_was_captured(playing: Playin
         assert play(player, range(8, 9)) == [8]  # asked again, though five rows were left
 
 
-def test_after_an_interrupt_nothing_is_executed_that_was_planned_or_asked_before(playing: Playing) -> None:
+def test_after_an_interrupt_nothing_is_executed_that_was_planned_or_asked_before(
+    playing: Playing,
+) -> None:
     agent, player = playing(Counting(gated=True), mode="async")
     assert play(player, range(3)) == [0, 0.1, 0.2]  # asked at tick 1
     player.interrupt()
@@ -291,7 +310,9 @@ class Pose:
 
 def test_the_first_action_is_compared_with_the_measured_pose(playing: Playing) -> None:
     pose = Pose(5.0)
-    agent, player = playing(Counting(gated=True), mode="async", check=Guard(max_step=0.15, measure=pose))
+    agent, player = playing(
+        Counting(gated=True), mode="async", check=Guard(max_step=0.15, measure=pose)
+    )
     act = player.act(obs(0))
     assert "larger step than max_step" in act.info["safe"]
     assert act.action.tolist() == [5, 5]  # where it stands
@@ -301,9 +322,13 @@ def test_the_first_action_is_compared_with_the_measured_pose(playing: Playing) -
     assert play(player, range(2, 4)) == [1, 1.1]
 
 
-def test_after_an_interrupt_the_measured_pose_counts_and_not_what_was_commanded_before(playing: Playing) -> None:
+def test_after_an_interrupt_the_measured_pose_counts_and_not_what_was_commanded_before(
+    playing: Playing,
+) -> None:
     pose = Pose(0.0)
-    agent, player = playing(Counting(gated=True), mode="async", check=Guard(max_step=0.15, measure=pose))
+    agent, player = playing(
+        Counting(gated=True), mode="async", check=Guard(max_step=0.15, measure=pose)
+    )
     assert play(player, range(3)) == [0, 0.1, 0.2]
     let(agent, player)
     player.interrupt()
@@ -313,7 +338,9 @@ def test_after_an_interrupt_the_measured_pose_counts_and_not_what_was_commanded_
     assert play(player, range(4, 6)) == [3, 3.1]
 
 
-def test_after_an_interrupt_nothing_leads_back_to_what_was_commanded_before_it(playing: Playing) -> None:
+def test_after_an_interrupt_nothing_leads_back_to_what_was_commanded_before_it(
+    playing: Playing,
+) -> None:
     pose = Pose(0.0)
     home = np.full(2, -9.0, np.float32)
     guard = Guard(low=0.0, high=1.0, max_step=0.15, measure=pose)
@@ -329,9 +356,13 @@ def test_after_an_interrupt_nothing_leads_back_to_what_was_commanded_before_it(p
     agent.gate.release(100)
 
 
-def test_after_safe_actions_one_may_begin_at_the_measured_pose_or_at_the_last_action(playing: Playing) -> None:
+def test_after_safe_actions_one_may_begin_at_the_measured_pose_or_at_the_last_action(
+    playing: Playing,
+) -> None:
     pose = Pose(0.0)
-    agent, player = playing(Counting(gated=True), mode="async", check=Guard(max_step=0.15, measure=pose))
+    agent, player = playing(
+        Counting(gated=True), mode="async", check=Guard(max_step=0.15, measure=pose)
+    )
     play(player, range(HORIZON))
     pose.at = 9.0
     assert "safe" in player.act(obs(6)).info
@@ -385,7 +416,9 @@ def test_a_broken_answer_is_not_executed(playing: Playing) -> None:
 def test_an_action_that_the_guard_refuses_is_replaced_by_the_safe_one_or_by_the_last(
     playing: Playing, safe: Any
 ) -> None:
-    _, player = playing(Counting(rows=3), deadline_s=30.0, check=Guard(low=0.0, high=2.5), safe=safe)
+    _, player = playing(
+        Counting(rows=3), deadline_s=30.0, check=Guard(low=0.0, high=2.5), safe=safe
+    )
     assert play(player, range(3)) == [0, 0.1, 0.2]
     act = player.act(obs(3))
     assert act.action.tolist() == pytest.approx([0.2, 0.2])
@@ -410,7 +443,9 @@ def test_without_a_safe_action_what_the_guard_refuses_is_raised(
 
 
 @pytest.mark.parametrize("wrong", [np.full(3, 0.1), np.full((1, 2), 0.1), np.full(2, np.nan)])
-def test_a_safe_action_that_no_robot_could_take_is_replaced_without_a_guard(playing: Playing, wrong: Any) -> None:
+def test_a_safe_action_that_no_robot_could_take_is_replaced_without_a_guard(
+    playing: Playing, wrong: Any
+) -> None:
     _, player = playing(Counting(gated=True, rows=1), mode="async", safe=lambda _: wrong)
     assert play(player, range(1)) == [0]
     assert player.act(obs(1)).action.tolist() == [0, 0]
@@ -424,13 +459,17 @@ def test_where_holding_would_go_on_moving_a_refused_safe_action_is_raised() -> N
     with ChunkPlayer(agent, PlayerSettings(mode="async"), check=Guard(low=0.5)) as player:
         player.reset(obs(1))
         assert player.act(obs(1)).action.tolist() == [1, 1]
-        with pytest.raises(InvalidAction, match=r"waiting.*the safe action is refused, too.*below the limit 0\.5"):
+        with pytest.raises(
+            InvalidAction, match=r"waiting.*the safe action is refused, too.*below the limit 0\.5"
+        ):
             player.act(obs(2))
         agent.gate.release(100)
 
 
 @pytest.mark.parametrize("delta", [None, False])
-def test_a_safe_action_that_does_not_fit_is_refused_before_the_robot_moves(delta: bool | None) -> None:
+def test_a_safe_action_that_does_not_fit_is_refused_before_the_robot_moves(
+    delta: bool | None,
+) -> None:
     agent = Counting()
     agent.contract = Contract(action=ActionSpec(dim=2, delta=delta))
     with ChunkPlayer(agent, PlayerSettings(mode="async", safe="zero")) as player:
@@ -456,10 +495,18 @@ def test_done_is_said_with_the_last_row_of_the_chunk_that_says_so(playing: Playi
     assert len(agent.seen) == 2
 
 
-@pytest.mark.parametrize("options", [{}, {"execute": 2}, {"horizon": 2}, {"execute": 1, "horizon": 3}], ids=str)
+@pytest.mark.parametrize(
+    "options", [{}, {"execute": 2}, {"horizon": 2}, {"execute": 1, "horizon": 3}], ids=str
+)
 @pytest.mark.parametrize(
     "mode",
-    [{}, {"deadline_s": 30.0}, {"mode": "ensemble"}, {"mode": "async"}, {"mode": "async", "real_time_chunking": True}],
+    [
+        {},
+        {"deadline_s": 30.0},
+        {"mode": "ensemble"},
+        {"mode": "async"},
+        {"mode": "async", "real_time_chunking": True},
+    ],
     ids=str,
 )
 def test_a_chunk_with_done_is_executed_whole_in_every_mode(
@@ -514,7 +561,8 @@ def test_a_reply_that_was_lost_replays_nothing() -> None:
     player.close()
     served.close()
     assert resumed
-    assert all(value == pytest.approx(t - age + 0.1 * age) for t, value, age in done)  # each of its own tick
+    # Each of its own tick.
+    assert all(value == pytest.approx(t - age + 0.1 * age) for t, value, age in done)
 
 
 class Continuing(Agent):
@@ -552,18 +600,25 @@ def test_real_time_chunking_over_the_wire_joins_chunks_without_a_jump(real_time:
 
 
 class Given(Counting):
-    """Trained with prefixes: its chunks begin with at most two rows of the plan, and go on faster each time."""
+    """Trained with prefixes: its chunks begin with at most two rows of the plan, and go on
+    faster each time.
+    """
 
     def act(self, obs: Obs) -> Act:
         plain, left = super().act(obs), obs.info.get(LEFTOVER)
         if left is None:
             return plain
         given = min(obs.info[DELAY] or 2, 2)
-        more = left[given - 1] + 0.1 * len(self.seen) * np.arange(1, self.rows - given + 1)[:, np.newaxis]
+        more = (
+            left[given - 1]
+            + 0.1 * len(self.seen) * np.arange(1, self.rows - given + 1)[:, np.newaxis]
+        )
         return Act(np.concatenate([left[:given], more]).astype(np.float32), info={GIVEN: given})
 
 
-def test_an_answer_later_than_the_rows_it_was_given_is_dropped_and_the_plan_goes_on(playing: Playing) -> None:
+def test_an_answer_later_than_the_rows_it_was_given_is_dropped_and_the_plan_goes_on(
+    playing: Playing,
+) -> None:
     agent, player = playing(Given(gated=True, rows=10), mode="async", real_time_chunking=True)
     actions, chunks = [], []
     for t, ticks in ((0, 2), (2, 4), (6, 1), (7, 1)):  # each answer comes after so many ticks
@@ -573,7 +628,9 @@ def test_an_answer_later_than_the_rows_it_was_given_is_dropped_and_the_plan_goes
             chunks.append(act.info["chunk"])
             assert "safe" not in act.info
         let(agent, player)
-    assert chunks == [0, 0, 1, 1, 1, 1, 1, 3], "the third answer came after four rows, of which it was given one"
+    assert chunks == [0, 0, 1, 1, 1, 1, 1, 3], (
+        "the third answer came after four rows, of which it was given one"
+    )
     assert actions == pytest.approx([0, 0.1, 0.2, 0.4, 0.6, 0.8, 1.0, 1.4])
 
 

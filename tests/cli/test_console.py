@@ -19,7 +19,11 @@ from vlagents_ray.envs.tabletop import Tabletop
 from vlagents_ray.registry import entries, names
 
 CLI = Path(console.__file__).parent
-CURE = "pip install 'vlagents-ray[libero]' [/] \\[red] and /a/very/long/path/" + "of-an-interpreter/" * 8 + "bin/python"
+CURE = (
+    "pip install 'vlagents-ray[libero]' [/] \\[red] and /a/very/long/path/"
+    + "of-an-interpreter/" * 8
+    + "bin/python"
+)
 
 
 @pytest.fixture(params=[True, False], ids=["terminal", "pipe"])
@@ -45,7 +49,9 @@ def test_a_table_cuts_nothing_off(shown: io.StringIO) -> None:
     rows.add_row("libero", CURE)
     console.out.print(rows)
     said = shown.getvalue()
-    assert re.sub(r"\s", "", CURE) in re.sub(r"\s|libero(?= )", "", said.replace("name", "").replace("cure", ""))
+    assert re.sub(r"\s", "", CURE) in re.sub(
+        r"\s|libero(?= )", "", said.replace("name", "").replace("cure", "")
+    )
     assert "…" not in said
     if not console.out.is_terminal:
         assert f"libero {CURE}" in re.sub(" +", " ", said)
@@ -58,14 +64,23 @@ class Elsewhere(Tabletop):
 
     @classmethod
     def tasks(cls) -> list[str]:
-        return [*(f"goal/{number}" for number in range(50)), "other", "long/1", "long/2", "odd/1", "odd/3"]
+        return [
+            *(f"goal/{number}" for number in range(50)),
+            "other",
+            "long/1",
+            "long/2",
+            "odd/1",
+            "odd/3",
+        ]
 
 
 def test_envs_are_listed_with_their_cures_and_ranges_of_tasks(
     shown: io.StringIO, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(
-        listing, "names", lambda _: {"elsewhere": f"{__name__}:Elsewhere", "too": f"{__name__}:Elsewhere"}
+        listing,
+        "names",
+        lambda _: {"elsewhere": f"{__name__}:Elsewhere", "too": f"{__name__}:Elsewhere"},
     )
     monkeypatch.setattr(listing, "env_class", lambda _: Elsewhere)
     envs()
@@ -82,13 +97,17 @@ def test_envs_are_listed_with_their_cures_and_ranges_of_tasks(
     assert "'nope' is not registered; there are elsewhere, too" in shown.getvalue()
 
 
-def test_a_listing_is_as_wide_as_a_terminal_and_has_a_line_for_each_elsewhere(shown: io.StringIO) -> None:
+def test_a_listing_is_as_wide_as_a_terminal_and_has_a_line_for_each_elsewhere(
+    shown: io.StringIO,
+) -> None:
     policies()
     rows = shown.getvalue().partition("\n\n")[0].splitlines()
     if console.out.is_terminal:
         assert max(map(len, rows)) <= 80
     else:
-        assert sorted(row.split()[0] for row in rows[1:]) == sorted([*names("policies"), *names("wrappers")])
+        assert sorted(row.split()[0] for row in rows[1:]) == sorted(
+            [*names("policies"), *names("wrappers")]
+        )
     assert "…" not in shown.getvalue()
 
 
@@ -101,13 +120,18 @@ def test_what_installs_the_rest_is_said_once_for_all_that_want_it(
     policies()
     rest = shown.getvalue().partition("\n\n")[2].splitlines()
     assert rest[0] == "for the rest, whose Python a deployment names as `environment`:"
-    of_hf = sorted(name for name, one in entries("policies").items() if one.requirements[:1] == ("hf",))
+    of_hf = sorted(
+        name for name, one in entries("policies").items() if one.requirements[:1] == ("hf",)
+    )
     assert {"pi0", "vjepa2_ac"} <= set(of_hf)
     assert f"  vlagents-ray env make hf  # {', '.join(of_hf)}" in rest
     assert "  vlagents-ray env make openvla  # openvla, openvla_oft" in rest
     assert "  export VJEPA2_SRC=FOLDER  # a checkout, for vjepa2_ac" in rest
     assert not any("OPENVLA" in line for line in rest)
-    assert "  onnx: not in this environment (onnxruntime): pip install 'vlagents-ray-models[onnx]'" in rest
+    assert (
+        "  onnx: not in this environment (onnxruntime): pip install 'vlagents-ray-models[onnx]'"
+        in rest
+    )
 
 
 def test_of_one_policy_all_is_said(shown: io.StringIO, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -115,7 +139,11 @@ def test_of_one_policy_all_is_said(shown: io.StringIO, monkeypatch: pytest.Monke
     monkeypatch.delenv("OPENPI_SRC", raising=False)
     policies("noop")
     assert shown.getvalue().splitlines() == [
-        "noop: A policy that does nothing, in an adjustable time, to measure everything around a policy.",
+        (
+            "noop: A policy that does nothing, in an adjustable time, to measure everything around "
+            "a "
+            "policy."
+        ),
         "  ready",
         "  settings: action_dim=7, delta=None, chunk=1, base_ms=0.0, per_item_ms=0.0",
     ]
@@ -129,7 +157,9 @@ def test_of_one_policy_all_is_said(shown: io.StringIO, monkeypatch: pytest.Monke
 
 
 def test_an_environment_that_has_a_family_is_ready_for_it(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(listing.importlib.util, "find_spec", lambda name: None if name == "openpi" else object())
+    monkeypatch.setattr(
+        listing.importlib.util, "find_spec", lambda name: None if name == "openpi" else object()
+    )
     monkeypatch.delenv("OPENPI_SRC", raising=False)
     assert "its source" in str(listing.missing_packages("openpi"))
     monkeypatch.setenv("OPENPI_SRC", "/src/openpi")
@@ -141,18 +171,27 @@ def test_no_command_prints_on_a_console_or_in_a_table_of_its_own() -> None:
     for file in CLI.rglob("*.py"):
         text = file.read_text()
         if file.name != "console.py":
-            assert not re.search(r"\bConsole\(|Console\(stderr|\[bold\]|\[/\]|from_markup", text), file.name
-            for made in re.findall(r"\bTable\((.*)\)", text):  # evaluation/run.py, doctor.py, which fold
+            assert not re.search(r"\bConsole\(|Console\(stderr|\[bold\]|\[/\]|from_markup", text), (
+                file.name
+            )
+            # evaluation/run.py, doctor.py, which fold.
+            for made in re.findall(r"\bTable\((.*)\)", text):
                 assert 'overflow="fold"' in text, (file.name, made)
 
 
-def test_a_command_loads_neither_ray_nor_torch_unasked_and_ends_without_looking_for_garbage_once_more() -> None:
+def test_a_command_loads_neither_ray_nor_torch_unasked_and_ends_without_looking_for_garbage_once_more() -> (
+    None
+):
     """In all of Ray, for half a second."""
     code = (
-        "import atexit, gc, sys; from vlagents_ray.cli import main; sys.argv = ['vlagents-ray', '--help']; "
-        "atexit.register(lambda: print(gc.get_freeze_count() > 0, {'ray', 'torch'} & set(sys.modules))); main()"
+        "import atexit, gc, sys; from vlagents_ray.cli import main; sys.argv = ['vlagents-ray', "
+        "'--help']; "
+        "atexit.register(lambda: print(gc.get_freeze_count() > 0, {'ray', 'torch'} & "
+        "set(sys.modules))); main()"
     )
-    ran = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True, timeout=120)
+    ran = subprocess.run(
+        [sys.executable, "-c", code], check=True, capture_output=True, text=True, timeout=120
+    )
     assert ran.stdout.splitlines()[-1] == "True set()"
 
 

@@ -33,7 +33,9 @@ def nvidia_smi(folder: Path, monkeypatch: pytest.MonkeyPatch, script: str) -> No
 
 
 def table(monkeypatch: pytest.MonkeyPatch, *rows: Check) -> tuple[int, str]:
-    monkeypatch.setattr(doctor, "checks", lambda *_: ((f"row {i}", row) for i, row in enumerate(rows)))
+    monkeypatch.setattr(
+        doctor, "checks", lambda *_: ((f"row {i}", row) for i, row in enumerate(rows))
+    )
     text = io.StringIO()
     code = doctor.run(Console(file=text, width=200))
     return code, text.getvalue()
@@ -46,7 +48,17 @@ def test_every_check_gives_a_row_of_its_own_and_none_breaks() -> None:
     found = list(doctor.checks(port=0))
     rows = [row for _, row in found]
     names = [name for name, _ in found]
-    for expected in ("Python", "Ray", "plug-ins", "HAProxy", "GPU", "Vulkan", "EGL", "shared memory", "open files"):
+    for expected in (
+        "Python",
+        "Ray",
+        "plug-ins",
+        "HAProxy",
+        "GPU",
+        "Vulkan",
+        "EGL",
+        "shared memory",
+        "open files",
+    ):
         assert names.count(expected) == 1
     assert [row for row in rows if "the check itself broke" in row.detail] == []
     assert [row for row in rows if row.status != "ok" and not row.cure] == []
@@ -72,12 +84,19 @@ def test_a_check_that_raises_becomes_a_row_with_its_cure_if_there_is_one() -> No
     assert row.status == "warn"
     assert "ZeroDivisionError: driver" in row.detail
     missing = MissingDependency("'av' is not installed; pip install 'vlagents-ray[sim]'")
-    assert doctor.guarded(raising(missing)) == Check("warn", "'av' is not installed", "pip install 'vlagents-ray[sim]'")
+    assert doctor.guarded(raising(missing)) == Check(
+        "warn", "'av' is not installed", "pip install 'vlagents-ray[sim]'"
+    )
 
 
-def test_another_ray_than_those_that_are_tested_is_a_warning(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_another_ray_than_those_that_are_tested_is_a_warning(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     assert doctor.ray().status == "ok"
-    monkeypatch.setattr("importlib.metadata.requires", lambda _: ["numpy", 'ray[serve]<2.61,>=2.60; extra == "serve"'])
+    monkeypatch.setattr(
+        "importlib.metadata.requires",
+        lambda _: ["numpy", 'ray[serve]<2.61,>=2.60; extra == "serve"'],
+    )
     for version in ("2.60.0", "2.60.1"):
         monkeypatch.setattr("importlib.metadata.version", lambda _, version=version: version)
         assert doctor.ray().status == "ok"
@@ -91,7 +110,9 @@ def test_haproxy_really_starts() -> None:
     assert doctor.haproxy().status == "ok"
 
 
-def test_an_haproxy_that_does_not_start_is_a_warning(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_an_haproxy_that_does_not_start_is_a_warning(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
     binary = tmp_path / "haproxy"
     binary.write_text("#!/bin/sh\necho 'no libssl' >&2; exit 127\n")
     binary.chmod(0o755)
@@ -101,7 +122,9 @@ def test_an_haproxy_that_does_not_start_is_a_warning(monkeypatch: pytest.MonkeyP
     assert "no libssl" in row.detail
 
 
-def test_no_gpu_or_one_that_its_driver_lost_is_a_warning(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_no_gpu_or_one_that_its_driver_lost_is_a_warning(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
     monkeypatch.setenv("PATH", str(tmp_path))
     assert doctor.gpu().status == "warn"
     monkeypatch.undo()
@@ -111,24 +134,57 @@ def test_no_gpu_or_one_that_its_driver_lost_is_a_warning(monkeypatch: pytest.Mon
     assert "Driver/library version mismatch" in row.detail
 
 
-TORCH = {"version": "2.13.0", "cuda": "13.0", "device": None, "why": "error 802: system not yet initialized"}
+TORCH = {
+    "version": "2.13.0",
+    "cuda": "13.0",
+    "device": None,
+    "why": "error 802: system not yet initialized",
+}
 JAX = {"version": "0.5.3", "cuda": "12", "device": None, "why": "no platforms are present"}
 
 
 @pytest.mark.parametrize(
     ("name", "found", "driver", "status", "said", "cure"),
     [
-        ("torch", TORCH | {"device": "NVIDIA H100"}, "580.65.06", "ok", "2.13.0, for CUDA 13.0, uses NVIDIA H100", ""),
+        (
+            "torch",
+            TORCH | {"device": "NVIDIA H100"},
+            "580.65.06",
+            "ok",
+            ("2.13.0, for CUDA 13.0, uses NVIDIA H100"),
+            "",
+        ),
         ("torch", TORCH, "580.65.06", "warn", "cannot use the GPU: error 802", "dmesg"),
-        ("torch", TORCH, "570.124.06", "warn", "needs driver 580 or newer; got 570.124.06", "env make"),
+        (
+            "torch",
+            TORCH,
+            "570.124.06",
+            "warn",
+            "needs driver 580 or newer; got 570.124.06",
+            "env make",
+        ),
         ("torch", TORCH | {"cuda": "12.8"}, "570.124.06", "warn", "cannot use the GPU", "dmesg"),
-        ("torch", TORCH | {"cuda": None}, "580.65.06", "warn", "for CPUs only", "--force-reinstall torch"),
+        (
+            "torch",
+            TORCH | {"cuda": None},
+            "580.65.06",
+            "warn",
+            "for CPUs only",
+            "--force-reinstall torch",
+        ),
         ("torch", TORCH | {"cuda": None}, None, "ok", "for CPUs only; no GPU here", ""),
-        ("jax", JAX | {"device": "NVIDIA H100"}, "535.1", "ok", "0.5.3, for CUDA 12, uses NVIDIA H100", ""),
+        (
+            "jax",
+            JAX | {"device": "NVIDIA H100"},
+            "535.1",
+            "ok",
+            ("0.5.3, for CUDA 12, uses NVIDIA H100"),
+            "",
+        ),
         ("jax", JAX, "470.1", "warn", "needs driver 525 or newer; got 470.1", "update the driver"),
         ("jax", JAX | {"cuda": None}, "535.1", "warn", "for CPUs only", "'jax[cuda12]==0.5.3'"),
     ],
-)  # fmt: skip
+)
 def test_a_library_counts_only_if_it_can_use_the_gpu(
     name: str, found: dict[str, str], driver: str | None, status: str, said: str, cure: str
 ) -> None:
@@ -154,10 +210,16 @@ class TestAPolicysPython:
         python.chmod(0o755)
         return python
 
-    def test_is_one_of_env_make_here_unless_others_are_named(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        self.interpreter(".venv-hf", f"echo '{json.dumps({'headers': '/none', 'libraries': {'torch': TORCH}})}'")
+    def test_is_one_of_env_make_here_unless_others_are_named(
+        self, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        self.interpreter(
+            ".venv-hf", f"echo '{json.dumps({'headers': '/none', 'libraries': {'torch': TORCH}})}'"
+        )
         other = self.interpreter(
-            "other", f"echo 'a warning'; echo '{json.dumps({'headers': '/none', 'libraries': {'jax': JAX}})}'"
+            "other",
+            "echo 'a warning'; echo "
+            f"'{json.dumps({'headers': '/none', 'libraries': {'jax': JAX}})}'",
         )
         monkeypatch.setattr(doctor, "guarded", lambda _: Check("ok", ""))
         found = dict(doctor.checks())
@@ -209,8 +271,13 @@ def test_triton_needs_a_compiler_and_pythons_headers(
 def test_a_machine_on_which_workers_without_a_gpu_could_not_render_is_told(
     monkeypatch: pytest.MonkeyPatch, software: bool, status: str
 ) -> None:
-    devices = (EglDevice(0, software=False, cuda=0), *([EglDevice(1, software=True, cuda=None)] if software else []))
-    found = graphics.RenderProbe(ok=True, seconds=1.0, device="NVIDIA H200/PCIe/SSE2", devices=devices)
+    devices = (
+        EglDevice(0, software=False, cuda=0),
+        *([EglDevice(1, software=True, cuda=None)] if software else []),
+    )
+    found = graphics.RenderProbe(
+        ok=True, seconds=1.0, device="NVIDIA H200/PCIe/SSE2", devices=devices
+    )
     monkeypatch.setattr(graphics, "egl_probe", lambda: found)
     row = doctor.egl()
     assert row.status == status
@@ -221,24 +288,34 @@ def test_a_machine_on_which_workers_without_a_gpu_could_not_render_is_told(
     ("judged", "status", "said"),
     [
         (doctor.judge_shared_memory(total=32 * GB, free=30 * GB, memory=64 * GB), "ok", ""),
-        (doctor.judge_shared_memory(total=0.064 * GB, free=0.064 * GB, memory=16 * GB), "warn", "--shm-size=5g"),
-        (doctor.judge_shared_memory(total=100 * GB, free=100 * GB, memory=1000 * GB), "ok", ""),  # Ray caps its store
+        (
+            doctor.judge_shared_memory(total=0.064 * GB, free=0.064 * GB, memory=16 * GB),
+            "warn",
+            "--shm-size=5g",
+        ),
+        # Ray caps its store.
+        (doctor.judge_shared_memory(total=100 * GB, free=100 * GB, memory=1000 * GB), "ok", ""),
         (doctor.judge_temp_dir("/tmp", total=1000 * GB, free=0.5 * GB), "fail", ""),
         (doctor.judge_temp_dir("/tmp", total=1000 * GB, free=3 * GB), "warn", ""),
         (doctor.judge_temp_dir("/tmp", total=1000 * GB, free=20 * GB), "warn", ""),
         (doctor.judge_temp_dir("/tmp", total=1000 * GB, free=200 * GB), "ok", ""),
-        (doctor.judge_temp_dir("/tmp/" + "x" * 60, total=100 * GB, free=90 * GB), "fail", "107"),  # bytes of a socket
+        # Bytes of a socket.
+        (doctor.judge_temp_dir("/tmp/" + "x" * 60, total=100 * GB, free=90 * GB), "fail", "107"),
         (doctor.judge_open_files(1024, 1024), "warn", ""),
         (doctor.judge_open_files(1024, 1_048_576), "ok", ""),  # as Ray raises them
         (doctor.judge_open_files(65536, 65536), "ok", ""),
     ],
 )
-def test_what_a_machine_has_is_judged_by_what_ray_will_need(judged: Check, status: str, said: str) -> None:
+def test_what_a_machine_has_is_judged_by_what_ray_will_need(
+    judged: Check, status: str, said: str
+) -> None:
     assert judged.status == status
     assert said in judged.detail + judged.cure
 
 
-def test_rays_temporary_folder_is_the_one_that_is_judged(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_rays_temporary_folder_is_the_one_that_is_judged(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
     monkeypatch.setenv("RAY_TMPDIR", str(tmp_path / "missing"))
     row = doctor.temp_dir()
     assert row.status == "fail"
@@ -263,7 +340,9 @@ def test_a_containers_memory_limit_is_what_counts(tmp_path: Path) -> None:
     assert doctor.memory_bytes(limit) == machines
 
 
-@pytest.mark.parametrize(("version", "status"), [((3, 10), "warn"), ((3, 11), "ok"), ((3, 12), "warn")])
+@pytest.mark.parametrize(
+    ("version", "status"), [((3, 10), "warn"), ((3, 11), "ok"), ((3, 12), "warn")]
+)
 def test_a_python_that_is_not_supported_for_servers_is_a_warning(
     version: tuple[int, int], status: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:

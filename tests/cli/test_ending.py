@@ -61,10 +61,16 @@ def test_it_ends_with_one_sentence(body: str, leave_s: float) -> None:
 
 def test_a_servers_sentence_is_the_last_line_whatever_rays_native_threads_say_of_it() -> None:
     native = "[os.write(2, b'E native\\n') and time.sleep(0.001) for _ in iter(int, 1)]"
-    body = f"import os, threading; threading.Thread(target=lambda: {native}, daemon=True).start(); loss.wait()"
+    body = (
+        f"import os, threading; threading.Thread(target=lambda: {native}, "
+        "daemon=True).start(); "
+        "loss.wait()"
+    )
     ended = run(body)
     assert ended.returncode == 1
-    assert re.fullmatch(r"(E native\n)+error ClusterLost: the raylet has ended; start it again\n", ended.stderr)
+    assert re.fullmatch(
+        r"(E native\n)+error ClusterLost: the raylet has ended; start it again\n", ended.stderr
+    )
 
 
 def test_a_command_that_leaves_ray_by_itself_is_left_alone() -> None:
@@ -74,7 +80,9 @@ def test_a_command_that_leaves_ray_by_itself_is_left_alone() -> None:
 
 
 @pytest.mark.parametrize("noticed", [True, False])
-def test_one_that_was_interrupted_says_so_though_the_signal_ended_ray_as_well(noticed: bool) -> None:
+def test_one_that_was_interrupted_says_so_though_the_signal_ended_ray_as_well(
+    noticed: bool,
+) -> None:
     farewell = "atexit.unregister(time.sleep); atexit.register(time.sleep, 1)"
     body = f"time.sleep({0.5 if noticed else 0}); {farewell}; raise KeyboardInterrupt"
     ended = run(body)
@@ -94,7 +102,9 @@ def test_a_server_that_hangs_while_it_leaves_ends_and_says_where() -> None:
 @pytest.mark.parametrize("number", [2, 15], ids=["Ctrl-C", "SIGTERM"])
 def test_an_interrupt_that_python_drops_ends_the_command_all_the_same(number: int) -> None:
     """A server that had it in one of Ray's callbacks, as it started, served on for ever."""
-    dropped = f"class Gone:\n            def __del__(self): __import__('signal').raise_signal({number})"
+    dropped = (
+        f"class Gone:\n            def __del__(self): __import__('signal').raise_signal({number})"
+    )
     body = f"{dropped}\n        Gone()\n        atexit.unregister(time.sleep)\n        loss.wait()"
     ended = run(body, lost="60, Lost")
     assert ended.returncode == 130
@@ -120,10 +130,23 @@ def test_sigterm_while_ray_starts_interrupts_the_command() -> None:
             signal.raise_signal(signal.SIGTERM)
 
 
-@pytest.mark.parametrize("words", [["policies"], ["robot", "http://127.0.0.1:9"]], ids=["policies", "robot"])
-def test_ctrl_c_while_modules_are_imported_ends_the_command_without_a_traceback(words: list[str]) -> None:
-    command = [sys.executable, "-X", "importtime", "-c", "from vlagents_ray.cli import main; main()", *words]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+@pytest.mark.parametrize(
+    "words", [["policies"], ["robot", "http://127.0.0.1:9"]], ids=["policies", "robot"]
+)
+def test_ctrl_c_while_modules_are_imported_ends_the_command_without_a_traceback(
+    words: list[str],
+) -> None:
+    command = [
+        sys.executable,
+        "-X",
+        "importtime",
+        "-c",
+        "from vlagents_ray.cli import main; main()",
+        *words,
+    ]
+    with subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    ) as process:
         assert process.stderr is not None
         for line in process.stderr:
             if line.endswith("numpy.version\n"):
@@ -135,10 +158,19 @@ def test_ctrl_c_while_modules_are_imported_ends_the_command_without_a_traceback(
     assert printed == ["error interrupted before the command began; nothing was started or written"]
 
 
-def run(body: str, leave_s: float = 30, lost: str = "0.05, Lost") -> subprocess.CompletedProcess[str]:
-    """Run a command with this body in a process of its own; with another period, Ray is well for so long."""
+def run(
+    body: str, leave_s: float = 30, lost: str = "0.05, Lost"
+) -> subprocess.CompletedProcess[str]:
+    """Run a command with this body in a process of its own; with another period, Ray is well for
+    so long.
+    """
     code = COMMAND.format(body=body, leave_s=leave_s).replace("0.05, Lost", lost)
     environment = os.environ | {"COLUMNS": "200"}
     return subprocess.run(
-        [sys.executable, "-c", code], check=False, capture_output=True, text=True, timeout=60, env=environment
+        [sys.executable, "-c", code],
+        check=False,
+        capture_output=True,
+        text=True,
+        timeout=60,
+        env=environment,
     )

@@ -23,7 +23,14 @@ from vlagents_ray.cli import evaluate as command
 from vlagents_ray.cli import evaluation as run
 from vlagents_ray.cli.evaluation import forecasts, live_address, print_plan
 from vlagents_ray.cli.main import app
-from vlagents_ray.evaluate import EvalConfig, OutOfTime, PolicyConfig, Results, SuiteConfig, WorkerConfig
+from vlagents_ray.evaluate import (
+    EvalConfig,
+    OutOfTime,
+    PolicyConfig,
+    Results,
+    SuiteConfig,
+    WorkerConfig,
+)
 from vlagents_ray.evaluate.episode.failures import Failure
 from vlagents_ray.evaluate.episode.records import EpisodeResult
 from vlagents_ray.evaluate.plan.cases import cells
@@ -44,15 +51,23 @@ def said(*words: str) -> str:
 @pytest.fixture
 def no_server(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(
-        "vlagents_ray.serve.launch.server.running_server", lambda *_, **__: pytest.fail("started a server")
+        "vlagents_ray.serve.launch.server.running_server",
+        lambda *_, **__: pytest.fail("started a server"),
     )
 
 
-def test_a_zero_is_a_number_of_retries_steps_and_seconds(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_a_zero_is_a_number_of_retries_steps_and_seconds(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
     seen: list[Any] = []
-    monkeypatch.setattr(run, "run_evaluation", lambda config, _address, **_: seen.append(config.retries))
+    monkeypatch.setattr(
+        run, "run_evaluation", lambda config, _address, **_: seen.append(config.retries)
+    )
     monkeypatch.setattr(run, "watch_training", lambda *_args, **options: seen.append(options))
-    for options in (["--retries", "0"], ["--watch", str(tmp_path), "--settle-s", "0", "--until", "0"]):
+    for options in (
+        ["--retries", "0"],
+        ["--watch", str(tmp_path), "--settle-s", "0", "--until", "0"],
+    ):
         done = CliRunner().invoke(app, [*WORDS, "--out", str(tmp_path / "out"), *options])
         assert done.exit_code == 0, done.output
     assert seen == [0, {"settle_s": 0.0, "until": 0, "marker": None, "live": None}]
@@ -67,14 +82,22 @@ def test_workers_take_the_resources_that_are_said_unless_the_file_says_more(
     suites = "{envs: [tabletop]}, {name: b, envs: [tabletop], worker: {threads: 2}}"
     more = "{name: c, envs: [tabletop], worker: {cpus: 3}}"
     file.write_text(f"policies: [{{url: 'http://127.0.0.1:9'}}]\nsuites: [{suites}, {more}]\n")
-    done = CliRunner().invoke(app, ["eval", str(file), "--worker-cpus", "1", "--worker-gpus", "0.25"])
+    done = CliRunner().invoke(
+        app, ["eval", str(file), "--worker-cpus", "1", "--worker-gpus", "0.25"]
+    )
     assert done.exit_code == 0, done.output
     [config] = seen
     kinds = [suite.worker or config.worker for suite in config.suites]
-    assert [(worker.cpus, worker.gpus) for worker in kinds] == [(1.0, 0.25), (1.0, 0.25), (3.0, 0.25)]
+    assert [(worker.cpus, worker.gpus) for worker in kinds] == [
+        (1.0, 0.25),
+        (1.0, 0.25),
+        (3.0, 0.25),
+    ]
 
 
-def test_out_of_time_has_an_exit_status_of_its_own(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_out_of_time_has_an_exit_status_of_its_own(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
     ends: list[float] = []
 
     def evaluate(_config: EvalConfig, *, end_at: float, **_: Any) -> NoReturn:
@@ -83,7 +106,9 @@ def test_out_of_time_has_an_exit_status_of_its_own(monkeypatch: pytest.MonkeyPat
 
     monkeypatch.setattr(run, "evaluate", evaluate)
     monkeypatch.setattr(run, "print_summary", lambda *_: None)
-    monkeypatch.setattr(run, "served", lambda config, *_, **__: contextlib.nullcontext((config, {})))
+    monkeypatch.setattr(
+        run, "served", lambda config, *_, **__: contextlib.nullcontext((config, {}))
+    )
     words = [*WORDS, "--out", str(tmp_path / "out"), "--end-at", "2027-01-31T18:30+00:00"]
     done = CliRunner().invoke(app, words, env={"COLUMNS": "200"})
     assert done.exit_code == 75, done.output
@@ -96,16 +121,24 @@ def test_a_policy_that_does_not_fit_is_refused_before_anything_starts(tmp_path: 
     words = ["eval", "libero/libero_spatial/0", "--policy", "noop", "--set", "action_dim=4"]
     done = CliRunner().invoke(app, [*words, "--out", str(tmp_path / "out")], env={"COLUMNS": "200"})
     assert done.exit_code == 1, done.output
-    fits_not = "'noop' in 'libero/libero_spatial/0': policy and env do not fit: - action.dim: the policy gives 4, the"
+    fits_not = (
+        "'noop' in 'libero/libero_spatial/0': policy and env do not fit: - action.dim: the "
+        "policy gives 4, the"
+    )
     assert fits_not in " ".join(done.stderr.split())
     assert not (tmp_path / "out").exists()
 
 
 def test_a_file_of_several_policies_is_refused_with_its_cure(tmp_path: Path) -> None:
-    app_of = "{{name: {0}, route_prefix: /{0}, import_path: 'vlagents_ray.serve.app:build', args: {{policy: noop}}}}"
+    app_of = (
+        "{{name: {0}, route_prefix: /{0}, import_path: 'vlagents_ray.serve.app:build', args: "
+        "{{policy: noop}}}}"
+    )
     file = tmp_path / "two.yaml"
     file.write_text(f"applications: [{app_of.format('a')}, {app_of.format('b')}]")
-    assert "want one application" in said("eval", "tabletop", "--policy", str(file), "--out", str(tmp_path / "out"))
+    assert "want one application" in said(
+        "eval", "tabletop", "--policy", str(file), "--out", str(tmp_path / "out")
+    )
 
 
 def lost(out: Path, **changes: Any) -> EvalConfig:
@@ -116,7 +149,9 @@ def lost(out: Path, **changes: Any) -> EvalConfig:
     with Store(config) as store:
         store.begin_run(config, {})
         first, *others = plan(store.cells)
-        failure = Failure("worker", "env_failed", "env step: RuntimeError: it exploded\nand more", "")
+        failure = Failure(
+            "worker", "env_failed", "env step: RuntimeError: it exploded\nand more", ""
+        )
         store.record_attempt(first, failure, retried=False)
         store.record(EpisodeResult(first.key, "infra_failed", error="env_failed: it exploded"), 4)
         for job in others:
@@ -126,11 +161,15 @@ def lost(out: Path, **changes: Any) -> EvalConfig:
 
 
 def end_of(config: EvalConfig, monkeypatch: pytest.MonkeyPatch) -> tuple[int, str]:
-    """The exit status of `eval` and what it said at last, after an evaluation that left these results."""
+    """The exit status of `eval` and what it said at last, after an evaluation that left these
+    results.
+    """
     summary = summarize(Results.load(config.out))
     monkeypatch.setattr(run, "evaluate", lambda *_args, **_options: summary)
     monkeypatch.setattr(command, "config_from_options", lambda *_: config)
-    monkeypatch.setattr(run, "served", lambda config, *_, **__: contextlib.nullcontext((config, {})))
+    monkeypatch.setattr(
+        run, "served", lambda config, *_, **__: contextlib.nullcontext((config, {}))
+    )
     done = CliRunner().invoke(app, [*WORDS, "--out", str(config.out)], env={"COLUMNS": "200"})
     assert "Traceback" not in done.output
     return done.exit_code, " ".join(done.stderr.split())
@@ -143,11 +182,14 @@ def test_an_episode_without_a_result_ends_the_command_with_status_1(
     assert status == 1
     assert stated == (
         "error 1 of 4 episodes have no result: lost to infrastructure, the last one to env_failed: "
-        "env step: RuntimeError: it exploded; the report lists every attempt under Errors, --resume tries them again"
+        "env step: RuntimeError: it exploded; the report lists every attempt under Errors, "
+        "--resume tries them again"
     )
 
 
-def test_a_cell_that_stopped_early_misses_nothing(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_a_cell_that_stopped_early_misses_nothing(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
     config = lost(tmp_path, stop={"target": 0.01, "at_least": 1})
     with Store(config.model_copy(update={"resume": True})) as store:
         store.record(EpisodeResult(plan(store.cells)[0].key, "done", True, True, 3), 1)
@@ -158,7 +200,9 @@ def test_a_cell_that_stopped_early_misses_nothing(monkeypatch: pytest.MonkeyPatc
     assert end_of(config, monkeypatch) == (0, "")
 
 
-def test_only_what_was_asked_for_now_is_missed(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_only_what_was_asked_for_now_is_missed(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
     config = lost(tmp_path)
     suite = SuiteConfig(envs=["tabletop"], name="b", seeds=[9])
     other = config.model_copy(update={"resume": True, "accept_changes": True, "suites": [suite]})
@@ -184,7 +228,9 @@ def test_only_what_was_asked_for_now_is_missed(monkeypatch: pytest.MonkeyPatch, 
 def test_options_that_cannot_hold_are_refused_before_anything_starts(
     words: list[str], text: str, tmp_path: Path
 ) -> None:
-    assert text in said("eval", "tabletop", "--policy", "scripted", "--out", str(tmp_path / "out"), *words)
+    assert text in said(
+        "eval", "tabletop", "--policy", "scripted", "--out", str(tmp_path / "out"), *words
+    )
     assert not (tmp_path / "out").exists()
 
 
@@ -194,7 +240,9 @@ def test_a_page_whose_plugin_is_not_installed_is_named_before_anything_starts(
     monkeypatch: pytest.MonkeyPatch, words: list[str], tmp_path: Path
 ) -> None:
     monkeypatch.setattr(registry, "_entry_points", lambda _: {})
-    message = said("eval", "tabletop", "--policy", "scripted", "--out", str(tmp_path / "out"), *words)
+    message = said(
+        "eval", "tabletop", "--policy", "scripted", "--out", str(tmp_path / "out"), *words
+    )
     assert "page of evaluations 'live' is in vlagents-ray-live, which is not installed" in message
     assert "pip install vlagents-ray-live" in message
     assert not (tmp_path / "out").exists()
@@ -207,9 +255,21 @@ def test_each_option_that_is_a_setting_is_one_of_a_single_model() -> None:
         for option in inspect.signature(command.evaluate_command).parameters
     }
     of_the_run_itself = {
-        "what", "watch", "until", "settle_s", "marker", "dry_run", "end_at", "replica_per_gpu", "address", "live",
-        "live_at", "arm", "operator", "unblind",
-    }  # fmt: skip
+        "what",
+        "watch",
+        "until",
+        "settle_s",
+        "marker",
+        "dry_run",
+        "end_at",
+        "replica_per_gpu",
+        "address",
+        "live",
+        "live_at",
+        "arm",
+        "operator",
+        "unblind",
+    }
     assert {option for option, found in places.items() if len(found) != 1} == of_the_run_itself
     assert all(not places[option] for option in of_the_run_itself)
 
@@ -226,7 +286,9 @@ def test_a_dry_run_keeps_warnings_of_what_is_meant_off_the_terminal(
     monkeypatch.setattr(run, "print_plan", measure)
     done = CliRunner().invoke(app, [*WORDS, "--out", str(tmp_path / "out"), "--dry-run"])
     assert done.exit_code == 0, done.output
-    assert [record.getMessage() for record in caplog.records if record.getMessage() in warnings] == [warnings[1]]
+    assert [
+        record.getMessage() for record in caplog.records if record.getMessage() in warnings
+    ] == [warnings[1]]
 
 
 def test_a_page_has_a_port_of_its_own_if_another_has_the_usual_one() -> None:
@@ -245,7 +307,9 @@ def config(tmp_path: Path) -> Callable[..., EvalConfig]:
     return make
 
 
-def test_what_was_played_is_not_planned_again_and_tells_the_time(config: Callable[..., EvalConfig]) -> None:
+def test_what_was_played_is_not_planned_again_and_tells_the_time(
+    config: Callable[..., EvalConfig],
+) -> None:
     results = play(config(episodes=3))
     [played, other] = forecasts(cells(config(envs=[LINE, OTHER_LINE], episodes=9)), results)
     assert (played.finished, played.left) == (3, 6)
@@ -261,10 +325,14 @@ def test_nothing_is_left_of_a_cell_that_stopped(config: Callable[..., EvalConfig
 
 
 def test_the_plan_is_printed_without_asking_any_policy(
-    config: Callable[..., EvalConfig], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    config: Callable[..., EvalConfig],
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setenv("COLUMNS", "150")
-    settings = config(episodes=5, policy_url="http://127.0.0.1:9", steps=[10, 20], envs=[LINE, OTHER_LINE])
+    settings = config(
+        episodes=5, policy_url="http://127.0.0.1:9", steps=[10, 20], envs=[LINE, OTHER_LINE]
+    )
     print_plan(settings)
     text = capsys.readouterr().out
     assert "4 cells" in text

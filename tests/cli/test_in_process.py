@@ -51,7 +51,11 @@ POISON = [sys.executable, "-c", WITHOUT_RAY]
 
 
 def deployment(**args: object) -> dict[str, object]:
-    return {"applications": [{"name": "a", "import_path": IMPORT_PATH, "args": {"policy": "stepped:Stepped", **args}}]}
+    return {
+        "applications": [
+            {"name": "a", "import_path": IMPORT_PATH, "args": {"policy": "stepped:Stepped", **args}}
+        ]
+    }
 
 
 @pytest.fixture
@@ -62,27 +66,46 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         (tmp_path / f"w-{step}.txt").write_text(str(length))
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("PYTHONPATH", PYTHONPATH)
-    for name in ("RAY_ADDRESS", "PYTHONBREAKPOINT"):  # Ray sets the latter in a process that connects
+    # Ray sets the latter in a process that connects.
+    for name in ("RAY_ADDRESS", "PYTHONBREAKPOINT"):
         monkeypatch.delenv(name, raising=False)
     return tmp_path
 
 
-def test_named_policies_deployment_files_and_checkpoints_are_played_without_ray(folder: Path) -> None:
+def test_named_policies_deployment_files_and_checkpoints_are_played_without_ray(
+    folder: Path,
+) -> None:
     choices = {"late": {"checkpoint": "w-2.txt"}}
     own = deployment(config={"checkpoint": "w-1.txt"}, checkpoints={"choices": choices})
     (folder / "own.yaml").write_text(yaml.safe_dump(own))
-    swept = {"name": "swept", "source": "stepped:Stepped", "config": {"checkpoint": "w-{step}.txt"}, "steps": [1, 2]}
+    swept = {
+        "name": "swept",
+        "source": "stepped:Stepped",
+        "config": {"checkpoint": "w-{step}.txt"},
+        "steps": [1, 2],
+    }
     chosen = {"name": "chosen", "source": "own.yaml", "options": {"checkpoint": "late"}}
     still = {"name": "still", "source": "noop", "config": {"action_dim": 1}}
-    plan = {"policies": [swept, chosen, still], "suites": [{"envs": [LINE], "episodes": 4}], "video": "none"}
+    plan = {
+        "policies": [swept, chosen, still],
+        "suites": [{"envs": [LINE], "episodes": 4}],
+        "video": "none",
+    }
     (folder / "runs.yaml").write_text(yaml.safe_dump(plan))
     done = subprocess.run(
-        [*POISON, "eval", "runs.yaml"], capture_output=True, text=True, timeout=120, check=False, cwd=folder
+        [*POISON, "eval", "runs.yaml"],
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=False,
+        cwd=folder,
     )
     assert done.returncode == 0, done.stdout + done.stderr
     assert "a short evaluation, in this process without Ray (--workers 1 plays" in done.stdout
     cells = {cell.contender: cell for cell in Results.load(folder / "runs" / "runs").cells}
-    actions = {name: [one.result.actions_sha256 for one in cell.episodes] for name, cell in cells.items()}
+    actions = {
+        name: [one.result.actions_sha256 for one in cell.episodes] for name, cell in cells.items()
+    }
     assert actions["swept@2"] == actions["chosen"]
     assert len({tuple(one) for one in actions.values()}) == 3
     assert {one.result.checkpoint for one in cells["swept@1"].episodes} == {"w-1.txt"}
@@ -91,7 +114,11 @@ def test_named_policies_deployment_files_and_checkpoints_are_played_without_ray(
 
 REFUSED: Mapping[str, tuple[dict[str, object], list[str], str]] = {
     "cluster": ({"url": "serve://pi0"}, [], "serve://pi0 is inside a Ray cluster; want 1 or more"),
-    "address": ({"source": "noop"}, ["--address", "auto"], "got 0 with --address, want 1 or more in a cluster"),
+    "address": (
+        {"source": "noop"},
+        ["--address", "auto"],
+        "got 0 with --address, want 1 or more in a cluster",
+    ),
     "packages": (
         {"source": "packages.yaml"},
         [],
@@ -146,7 +173,9 @@ def test_a_dry_run_names_the_workers_with_which_the_run_itself_is_played(
         (folder / f"{name}.yaml").write_text(yaml.safe_dump(config))
     plan = {"policies": [{"source": "noop"}], "suites": [{"envs": [LINE], "episodes": 4}]} | changes
     (folder / "runs.yaml").write_text(yaml.safe_dump(plan))
-    done = CliRunner().invoke(app, ["eval", "runs.yaml", "--dry-run", *words], env={"COLUMNS": "300"})
+    done = CliRunner().invoke(
+        app, ["eval", "runs.yaml", "--dry-run", *words], env={"COLUMNS": "300"}
+    )
     assert done.exit_code == 0, done.output
     where = {0: "in one process, without Ray", 1: "with 1 worker;", 3: "with 3 workers;"}[workers]
     assert where in done.stdout
@@ -154,10 +183,24 @@ def test_a_dry_run_names_the_workers_with_which_the_run_itself_is_played(
     assert not (folder / "runs").exists()
 
 
-def test_a_debugger_stops_in_the_policy_with_the_terminal_and_leaving_it_ends_the_command(folder: Path) -> None:
+def test_a_debugger_stops_in_the_policy_with_the_terminal_and_leaving_it_ends_the_command(
+    folder: Path,
+) -> None:
     ours, its = pty.openpty()
-    words = [*POISON, "eval", LINE, "--policy", "stepped:Stepped", "--set", "checkpoint=w-1.txt", "--out", "out"]
-    with subprocess.Popen(words, stdin=its, stdout=its, stderr=its, env=os.environ | {"STOP": "1"}) as process:
+    words = [
+        *POISON,
+        "eval",
+        LINE,
+        "--policy",
+        "stepped:Stepped",
+        "--set",
+        "checkpoint=w-1.txt",
+        "--out",
+        "out",
+    ]
+    with subprocess.Popen(
+        words, stdin=its, stdout=its, stderr=its, env=os.environ | {"STOP": "1"}
+    ) as process:
         os.close(its)
         for text, answer in ((b"(Pdb) ", b"self.length * 84\n"), (b"42.0\r\n(Pdb) ", b"q\n")):
             seen = b""

@@ -1,4 +1,6 @@
-"""One Ctrl-C or one SIGTERM ends a command, whichever call hangs: episodes keep their results, a robot is stopped."""
+"""One Ctrl-C or one SIGTERM ends a command, whichever call hangs: episodes keep their results, a
+robot is stopped.
+"""
 
 from __future__ import annotations
 
@@ -74,13 +76,22 @@ class Close(Policy):
     hangs_in = "close"
 """
 SIGNALS = [signal.SIGINT, signal.SIGTERM]
-WITHOUT_RAY = [("Initialize", 0), ("Reset", HANGS_AFTER), ("Acting", HANGS_AFTER), ("Close", EPISODES)]
+WITHOUT_RAY = [
+    ("Initialize", 0),
+    ("Reset", HANGS_AFTER),
+    ("Acting", HANGS_AFTER),
+    ("Close", EPISODES),
+]
 CASES = [(policy, "0", finished, number) for policy, finished in WITHOUT_RAY for number in SIGNALS]
-WITH_RAY = pytest.param("Acting", "1", HANGS_AFTER, signal.SIGTERM, marks=[pytest.mark.ray, pytest.mark.slow])
+WITH_RAY = pytest.param(
+    "Acting", "1", HANGS_AFTER, signal.SIGTERM, marks=[pytest.mark.ray, pytest.mark.slow]
+)
 
 
 def interrupted(words: list[str], number: signal.Signals, folder: Path) -> tuple[int, str]:
-    """Run a command until its file `hangs` exists, send it one signal; returns its status and what it printed."""
+    """Run a command until its file `hangs` exists, send it one signal; returns its status and
+    what it printed.
+    """
     command = subprocess.Popen(
         [sys.executable, "-m", "vlagents_ray", *words],
         cwd=folder,
@@ -105,13 +116,17 @@ def test_one_signal_ends_an_evaluation_that_hangs(
     policy: str, workers: str, finished: int, number: signal.Signals, tmp_path: Path
 ) -> None:
     (tmp_path / "own.py").write_text(MODULE)
-    options = f"--episodes {EPISODES} --env-set max_steps=2 --video none --workers {workers} --out out".split()
+    options = (
+        f"--episodes {EPISODES} --env-set max_steps=2 --video none --workers {workers} --out out"
+    ).split()
     words = ["eval", "tabletop", "--policy", f"own:{policy}", *options]
     status, printed = interrupted(words, number, tmp_path)
     assert status == 130, printed
     assert "Traceback" not in printed
     [error] = [line for line in printed.splitlines() if line.startswith("error ")]
-    assert error == f"error interrupted after {finished} of {EPISODES} episodes; go on with --resume --out out"
+    assert error == (
+        f"error interrupted after {finished} of {EPISODES} episodes; go on with --resume --out out"
+    )
     summary = json.loads((tmp_path / "out" / "summary.json").read_text())
     assert (summary["state"], summary["totals"][0]["episodes"]) == ("interrupted", finished)
 

@@ -32,11 +32,16 @@ def offering(command: Any, name: str = "") -> Iterator[str]:
 def test_what_a_script_reads_is_json(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(doctor, "checks", lambda *_: [("Ray", Check("fail", "none", "install it"))])
     monkeypatch.setattr(listing, "env_class", lambda _: Tabletop)  # others load simulators
-    policies = [{"name": name, "url": f"http://localhost:{port}"} for port, name in enumerate(("a", "b"), 1)]
+    policies = [
+        {"name": name, "url": f"http://localhost:{port}"} for port, name in enumerate(("a", "b"), 1)
+    ]
     out = tmp_path / "out"
     suites = [{"envs": [LINE], "episodes": 2}]
     play(EvalConfig(policies=policies, suites=suites, record="all", video="none", out=out))
-    assert CliRunner().invoke(app, ["bundle", str(out), "--out", str(tmp_path / "b.zip")]).exit_code == 0
+    assert (
+        CliRunner().invoke(app, ["bundle", str(out), "--out", str(tmp_path / "b.zip")]).exit_code
+        == 0
+    )
     words = {
         "policies": [],
         "envs": ["tabletop"],
@@ -55,7 +60,9 @@ def test_what_a_script_reads_is_json(tmp_path: Path, monkeypatch: pytest.MonkeyP
     assert (found["noop"]["kind"], found["noop"]["missing"]) == ("policy", None)
     assert found["noop"]["details"][0] == "action_dim=7"
     assert [one["name"] for one in said["envs"]] == ["tabletop"]
-    assert said["doctor"] == [{"check": "Ray", "status": "fail", "detail": "none", "cure": "install it"}]
+    assert said["doctor"] == [
+        {"check": "Ray", "status": "fail", "detail": "none", "cure": "install it"}
+    ]
     (pair,) = said["report"]["comparisons"]
     assert (pair["a"], pair["b"], pair["lines"][-1]["suite"]) == ("b", "a", "all")  # as on the page
     assert sum(cell["episodes"] for cell in said["report"]["cells"]) == 4

@@ -22,7 +22,20 @@ def keys(*words: str) -> Result:
 
 def test_a_key_is_printed_once_listed_without_it_and_revoked(tmp_path: Path) -> None:
     file = tmp_path / "keys.json"
-    made = keys("new", "arm", "--keys", str(file), "--app", "pi0", "--rate", "60", "--sessions", "2", "--days", "30")
+    made = keys(
+        "new",
+        "arm",
+        "--keys",
+        str(file),
+        "--app",
+        "pi0",
+        "--rate",
+        "60",
+        "--sessions",
+        "2",
+        "--days",
+        "30",
+    )
     assert made.exit_code == 0, made.output
     token = made.stdout.strip()  # nothing else, so that a script can take it
     assert Keys.from_file(file).check(token, "pi0").name == "arm"
@@ -40,7 +53,10 @@ def test_a_key_is_printed_once_listed_without_it_and_revoked(tmp_path: Path) -> 
 
 def test_a_key_may_push_weights_if_it_is_made_for_that(tmp_path: Path) -> None:
     file = tmp_path / "keys.json"
-    tokens = [keys("new", *words, "--keys", str(file)).stdout.strip() for words in (["a", "--scope", "weights"], ["b"])]
+    tokens = [
+        keys("new", *words, "--keys", str(file)).stdout.strip()
+        for words in (["a", "--scope", "weights"], ["b"])
+    ]
     learner, robot = (Keys.from_file(file).check(token, "pi0") for token in tokens)
     learner.admit(scope="weights")
     robot.admit()
@@ -87,7 +103,11 @@ def test_a_server_that_would_not_be_safe_does_not_start(words: list[str], text: 
     [
         ({}, (None, False, False), None),
         ({}, (Path("/k"), False, True), {"keys_file": "/k", "insecure": False, "plain_http": True}),
-        ({"hosts": ["a.b"]}, (None, True, False), {"hosts": ["a.b"], "keys_file": None, "insecure": True}),
+        (
+            {"hosts": ["a.b"]},
+            (None, True, False),
+            {"hosts": ["a.b"], "keys_file": None, "insecure": True},
+        ),
         ({"keys_file": "/k"}, (None, False, True), {"keys_file": "/k", "plain_http": True}),
         ({"insecure": True}, (Path("/k"), False, False), {"keys_file": "/k", "insecure": False}),
     ],

@@ -1,4 +1,6 @@
-"""The mistakes that first users make on a command line: each is answered at once, in one message with its cure."""
+"""The mistakes that first users make on a command line: each is answered at once, in one message
+with its cure.
+"""
 
 from __future__ import annotations
 
@@ -90,7 +92,19 @@ class NoAgent:
 """
 POLICY, SUITE = {"source": "noop"}, {"envs": ["tabletop"]}
 APP = {"import_path": "vlagents_ray.serve.app:build", "args": {"policy": "noop"}}
-EVAL = ["eval", "tabletop", "--episodes", "1", "--workers", "0", "--video", "none", "--out", "out", "--policy"]
+EVAL = [
+    "eval",
+    "tabletop",
+    "--episodes",
+    "1",
+    "--workers",
+    "0",
+    "--video",
+    "none",
+    "--out",
+    "out",
+    "--policy",
+]
 
 
 def run(**changes: Any) -> str:
@@ -105,7 +119,8 @@ def with_args(**changes: Any) -> str:
     return served(args={"policy": "noop"} | changes)
 
 
-# (words, parts of the message); a text in place of a word is the content of a file x.yaml, which the word names.
+# (words, parts of the message); a text in place of a word is the content of a file x.yaml, which
+# the word names.
 COMMANDS: dict[str, tuple[list[str], list[str]]] = {
     "no command of this name": (["evl"], ["evl", "eval"]),
     "no option of this name": (["eval", "tabletop", "--episods", "3"], ["--episods", "--episodes"]),
@@ -118,7 +133,10 @@ COMMANDS: dict[str, tuple[list[str], list[str]]] = {
     "class absent": ([*EVAL, "own:Nope"], ["Nope"]),
     "no agent": ([*EVAL, "own:NoAgent"], ["Agent"]),
     "setting misspelt": ([*EVAL, "noop", "--set", "chunks=2"], ["chunks", "chunk"]),
-    "setting of another type": ([*EVAL, "noop", "--set", "delta=maybe"], ["delta", "'maybe'", "boolean"]),
+    "setting of another type": (
+        [*EVAL, "noop", "--set", "delta=maybe"],
+        ["delta", "'maybe'", "boolean"],
+    ),
     "setting without a value": ([*EVAL, "noop", "--set", "delta"], ["delta", "KEY=VALUE"]),
     "env setting misspelt": ([*EVAL, "noop", "--env-set", "maxsteps=3"], ["maxsteps", "max_steps"]),
     "env setting negative": ([*EVAL, "scripted", "--env-set", "width=-5"], ["width", "-5"]),
@@ -128,23 +146,41 @@ COMMANDS: dict[str, tuple[list[str], list[str]]] = {
         ["1000000"],
     ),
     "until without watch": ([*EVAL, "noop", "--until", "3"], ["--until", "--watch"]),
-    "codec of another name": (["eval", run(policies=[POLICY | {"codec": "png"}])], ["'png'", "'lossless'"]),
-    "transport of another name": (["eval", run(policies=[POLICY | {"transport": "grpc"}])], ["'grpc'", "'auto'"]),
+    "codec of another name": (
+        ["eval", run(policies=[POLICY | {"codec": "png"}])],
+        ["'png'", "'lossless'"],
+    ),
+    "transport of another name": (
+        ["eval", run(policies=[POLICY | {"transport": "grpc"}])],
+        ["'grpc'", "'auto'"],
+    ),
     "file absent": (["eval", "nope.yaml"], ["nope.yaml", "does not exist"]),
-    "file with options of suites": (["eval", run(), "--episodes", "3"], ["episodes", "write that there"]),
+    "file with options of suites": (
+        ["eval", run(), "--episodes", "3"],
+        ["episodes", "write that there"],
+    ),
     "file empty": (["eval", " "], ["a mapping with", "policies"]),
     "file a list": (["eval", "- 1"], ["list", "a mapping with"]),
     "file with a tab": (["eval", "policies:\n\t- x"], ["not YAML", "line 2"]),
     "key twice": (["eval", run(workers=0) + "workers: 3\n"], ["'workers'", "twice", "keep one"]),
     "key misspelt": (["eval", run(suites=[SUITE | {"episods": 3}])], ["episods", "episodes"]),
-    "text for a number": (["eval", run(suites=[SUITE | {"episodes": "two"}])], ["'two'", "integer"]),
+    "text for a number": (
+        ["eval", run(suites=[SUITE | {"episodes": "two"}])],
+        ["'two'", "integer"],
+    ),
     "half an episode": (["eval", run(suites=[SUITE | {"episodes": 2.5}])], ["2.5", "integer"]),
     "negative": (["eval", run(suites=[SUITE | {"episodes": -2}])], ["-2", "1"]),
     "exponent": (["eval", run().replace("envs:", "episodes: 1e12\n  envs:")], ["1000000"]),
     "text for a list": (["eval", run(suites=[{"envs": "tabletop"}])], ["'tabletop'", "[tabletop]"]),
     "word of no list": (["eval", run(video="all_of_them")], ["all_of_them", "'failures'"]),
-    "no space after a colon": (["eval", run(policies=[{"source:scripted": None}])], ["write a space after the colon"]),
-    "entries without a dash": (["eval", run(policies=POLICY)], ["policies: got dict", "begin each of its entries"]),
+    "no space after a colon": (
+        ["eval", run(policies=[{"source:scripted": None}])],
+        ["write a space after the colon"],
+    ),
+    "entries without a dash": (
+        ["eval", run(policies=POLICY)],
+        ["policies: got dict", "begin each of its entries"],
+    ),
     "a word that YAML reads as a boolean": (
         ["eval", run(policies=[{"source": False}])],
         ["source: got False", "quotation marks"],
@@ -155,10 +191,19 @@ COMMANDS: dict[str, tuple[list[str], list[str]]] = {
     ),
     "a list as a path": (["eval", run(out=["a"])], ["out: got list, want a path"]),
     "a number as a path": (["eval", run(out=5)], ["out: got 5, want a path"]),
-    "an anchor at the top": (["eval", "a: &a [tabletop]\n" + run()], ["a: there is no such setting"]),
-    "an anchor in itself": (["eval", "policies: &a [*a]\n"], ["policies.0: got list", "want a mapping"]),
+    "an anchor at the top": (
+        ["eval", "a: &a [tabletop]\n" + run()],
+        ["a: there is no such setting"],
+    ),
+    "an anchor in itself": (
+        ["eval", "policies: &a [*a]\n"],
+        ["policies.0: got list", "want a mapping"],
+    ),
     "several documents": (["eval", run() + "---\n" + run()], ["not YAML", "document"]),
-    "a tag of Python": (["eval", "policies: !!python/object/apply:os.system [id]\n"], ["not YAML", "line 1"]),
+    "a tag of Python": (
+        ["eval", "policies: !!python/object/apply:os.system [id]\n"],
+        ["not YAML", "line 1"],
+    ),
     "nested too deeply": (["eval", "policies: " + "[" * 3000], ["not YAML", "nested too deeply"]),
     "no entries": (["eval", run(policies=[])], ["policies", "at least 1"]),
     "an empty key": (["eval", run(suites=None)], ["suites: got NoneType", "list"]),
@@ -169,7 +214,10 @@ COMMANDS: dict[str, tuple[list[str], list[str]]] = {
         ["--setup: expected a file of shell lines", "no.sh"],
     ),
     "no source": (["eval", run(policies=[{"name": "x"}])], ["source", "url"]),
-    "source and url": (["eval", run(policies=[POLICY | {"url": "http://x:1"}])], ["source", "url", "both"]),
+    "source and url": (
+        ["eval", run(policies=[POLICY | {"url": "http://x:1"}])],
+        ["source", "url", "both"],
+    ),
     "one name twice": (["eval", run(policies=[POLICY, POLICY])], ["name"]),
     "many steps": (
         ["eval", run(policies=[POLICY | {"steps": {"first": 0, "last": 10**9, "every": 1}}])],
@@ -185,12 +233,24 @@ COMMANDS: dict[str, tuple[list[str], list[str]]] = {
     ),
     "serve: file empty": (["serve", " "], ["mapping", "applications"]),
     "serve: hub id": (["serve", "lerobot/smolvla_base"], ["deployments/lerobot.yaml"]),
-    "serve: no checkpoint": (["serve", "pi0"], ["checkpoint", "deployments/pi0.yaml", "docs/policies/pi0.md"]),
+    "serve: no checkpoint": (
+        ["serve", "pi0"],
+        ["checkpoint", "deployments/pi0.yaml", "docs/policies/pi0.md"],
+    ),
     "serve: no keys": (["serve", "noop", "--host", "0.0.0.0"], ["keys new", "--insecure"]),  # noqa: S104
-    "serve: keys file absent": (["serve", "noop", "--keys", "nope.json"], ["nope.json", "keys new"]),
+    "serve: keys file absent": (
+        ["serve", "noop", "--keys", "nope.json"],
+        ["nope.json", "keys new"],
+    ),
     "serve: half of TLS": (["serve", "noop", "--tls-cert", "x.pem"], ["--tls-key"]),
-    "serve: text for a port": (["serve", "noop", "--port", "80x"], ["--port", "got '80x', want a valid integer"]),
-    "serve: port beyond the last": (["serve", "noop", "--port", "99999"], ["--port", "got '99999'", "65535"]),
+    "serve: text for a port": (
+        ["serve", "noop", "--port", "80x"],
+        ["--port", "got '80x', want a valid integer"],
+    ),
+    "serve: port beyond the last": (
+        ["serve", "noop", "--port", "99999"],
+        ["--port", "got '99999'", "65535"],
+    ),
     "serve: a module's file": (["serve", "own.py"], ["'own:MyPolicy'", "'own.py'"]),
     "serve: a module": (["serve", "own"], ["'own:MyPolicy'"]),
     "serve: a module by its path": (["serve", "./own.py"], ["'own:MyPolicy'"]),
@@ -200,12 +260,18 @@ COMMANDS: dict[str, tuple[list[str], list[str]]] = {
     "key: expired at once": (["keys", "new", "x", "--days", "0"], ["--days", "0.001"]),
     "key: name": (["keys", "new", "a b"], ["'a b'", "letters"]),
     "key: rate": (["keys", "new", "x", "--rate", "0"], ["--rate", "0.001"]),
-    "keys: a folder": (["keys", "list", "--keys", "."], ["expected a key file", "folder .", "keys.json"]),
+    "keys: a folder": (
+        ["keys", "list", "--keys", "."],
+        ["expected a key file", "folder .", "keys.json"],
+    ),
     "key: a folder": (["keys", "new", "x", "--keys", "."], ["expected a key file", "folder ."]),
     "key: scope": (["keys", "new", "x", "--scope", "wach"], ["'wach'", "did you mean 'watch'"]),
     "key: rank": (["keys", "new", "x", "--rank", "simulaton"], ["did you mean 'simulation'"]),
     "key: revoke without a file": (["keys", "revoke", "x"], ["keys new"]),
-    "key: revoke another": (["keys", "revoke", "arm1", "--keys", "k.json"], ["arm1", "'arm-1'", "did you mean"]),
+    "key: revoke another": (
+        ["keys", "revoke", "arm1", "--keys", "k.json"],
+        ["arm1", "'arm-1'", "did you mean"],
+    ),
     "new: kind": (["new", "polic", "x"], ["polic", "policy"]),
     "new: name": (["new", "policy", "1 bad"], ["1 bad", "my_policy"]),
     "new: installed": (["new", "policy", "numpy"], ["'numpy'", "hide"]),
@@ -227,29 +293,60 @@ COMMANDS: dict[str, tuple[list[str], list[str]]] = {
         ["export", "done", "--out", "x.csv", "--to", "csv", "--set", "cut_idle=true"],
         ["--set, for --to csv", "cut_idle: there is no such setting"],
     ),
-    "export: folder": (["export", "done", "--out", "no/x.csv", "--to", "csv"], ["no", "make it first"]),
+    "export: folder": (
+        ["export", "done", "--out", "no/x.csv", "--to", "csv"],
+        ["no", "make it first"],
+    ),
     "bundle: folder": (["bundle", "nowhere", "--out", "no/x.zip"], ["no/x.zip", "make it first"]),
-    "export: a folder as the file": (["export", "done", "--to", "csv", "--out", "."], ["expected a file", "folder"]),
-    "bundle: a folder as the file": (["bundle", "done", "--out", "."], ["expected a file", "folder"]),
+    "export: a folder as the file": (
+        ["export", "done", "--to", "csv", "--out", "."],
+        ["expected a file", "folder"],
+    ),
+    "bundle: a folder as the file": (
+        ["bundle", "done", "--out", "."],
+        ["expected a file", "folder"],
+    ),
     "verify: a text": (["verify", "own.py"], ["own.py"]),
     "verify: a folder": (["verify", "."], [".: expected a bundle", "got a folder"]),
-    "verify: results": (["verify", "done"], ["got a folder of results", "`vlagents-ray bundle done`"]),
+    "verify: results": (
+        ["verify", "done"],
+        ["got a folder of results", "`vlagents-ray bundle done`"],
+    ),
     "verify: nothing": (["verify", "nowhere"], ["nowhere", "got no file"]),
     "merge: a folder twice": (["merge", "done", "./done/", "--out", "m"], ["done: is named twice"]),
-    "merge: a folder by a link": (["merge", "done", "link", "--out", "m"], ["link: is named also as done"]),
+    "merge: a folder by a link": (
+        ["merge", "done", "link", "--out", "m"],
+        ["link: is named also as done"],
+    ),
     "report: a folder twice": (["report", "done", "done"], ["done: is named twice"]),
     "demo: a file": (["demo", "--out", "own.py"], ["own.py: expected a folder, got a file"]),
-    "doctor: no such Python": (["doctor", "--python", "nowhere"], ["--python", "nowhere", ".venv-lerobot/bin/python"]),
-    "doctor: an environment's folder": (["doctor", "--python", "venv"], ["a folder; did you mean venv/bin/python?"]),
-    "env make: a module": (["env", "make", "own.py", "--out", "e"], ["own.py", "requirements file"]),
+    "doctor: no such Python": (
+        ["doctor", "--python", "nowhere"],
+        ["--python", "nowhere", ".venv-lerobot/bin/python"],
+    ),
+    "doctor: an environment's folder": (
+        ["doctor", "--python", "venv"],
+        ["a folder; did you mean venv/bin/python?"],
+    ),
+    "env make: a module": (
+        ["env", "make", "own.py", "--out", "e"],
+        ["own.py", "requirements file"],
+    ),
     "replay: nothing there": (["replay", "nowhere"], ["nowhere", "results.db"]),
     "replay: no episode": (["replay", "done"], ["got no episode, want a key as ['tabletop#0@0:"]),
     "replay: a dataset": (["replay", "dataset"], ["dataset", "results.db"]),
-    "open-loop: nothing there": (["open-loop", "nowhere", "--policy", "noop"], ["nowhere", "LeRobotDataset"]),
+    "open-loop: nothing there": (
+        ["open-loop", "nowhere", "--policy", "noop"],
+        ["nowhere", "LeRobotDataset"],
+    ),
     "open-loop: no policy": (["open-loop", "dataset"], ["--policy"]),
-    "open-loop: episodes": (["open-loop", "dataset", "--policy", "noop", "--only", "a-b"], ["'a-b'", "0-9,12"]),
+    "open-loop: episodes": (
+        ["open-loop", "dataset", "--policy", "noop", "--only", "a-b"],
+        ["'a-b'", "0-9,12"],
+    ),
 }
-MADE = {"env setting negative"}  # mistakes that are found when the environment is made, after the folder of results
+# Mistakes that are found when the environment is made, after the folder of results.
+MADE = {"env setting negative"}
 # In this process, until the policy's error: (policy, parts of the message).
 EPISODES = {
     "WithoutAct": ["act or act_batch"],
@@ -267,7 +364,18 @@ EPISODES = {
 @pytest.fixture(scope="module")
 def results(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("results") / "done"
-    options = ["--episodes", "1", "--workers", "0", "--video", "none", "--env-set", "max_steps=2", "--out", str(path)]
+    options = [
+        "--episodes",
+        "1",
+        "--workers",
+        "0",
+        "--video",
+        "none",
+        "--env-set",
+        "max_steps=2",
+        "--out",
+        str(path),
+    ]
     done = CliRunner().invoke(app, ["eval", "tabletop", "--policy", "scripted", *options])
     assert done.exit_code == 0, done.output
     return path
@@ -278,7 +386,8 @@ def folder(tmp_path: Path, results: Path, monkeypatch: pytest.MonkeyPatch) -> Pa
     monkeypatch.chdir(tmp_path)
     monkeypatch.syspath_prepend(tmp_path)
     monkeypatch.delitem(sys.modules, "own", raising=False)
-    monkeypatch.setattr(sys, "dont_write_bytecode", True)  # Python writes it beside own.py, which is no result
+    # Python writes it beside own.py, which is no result.
+    monkeypatch.setattr(sys, "dont_write_bytecode", True)
     (tmp_path / "own.py").write_text(POLICIES)
     (tmp_path / "folder.yaml").mkdir()
     for name, text in (("emptied", ""), ("texted", "no database")):
@@ -306,7 +415,9 @@ def answer(words: list[str]) -> tuple[int, str]:
 
 
 @pytest.mark.parametrize("mistake", COMMANDS)
-def test_a_mistake_on_the_command_line_is_answered_with_its_cure(mistake: str, folder: Path) -> None:
+def test_a_mistake_on_the_command_line_is_answered_with_its_cure(
+    mistake: str, folder: Path
+) -> None:
     words, parts = COMMANDS[mistake]
     (folder / "x.yaml").write_text(words[1] if len(words) > 1 else "")
     before = sorted(os.listdir(folder))
@@ -350,10 +461,16 @@ def test_a_full_disk_is_named_and_nothing_is_left(
     assert sorted(os.listdir(folder)) == before
 
 
-@pytest.mark.parametrize(("word", "guess"), [("robbot", "; did you mean 'robot'?\n"), ("serve", ".\n")])
-def test_a_command_that_the_light_install_lacks_is_answered_with_those_that_it_has(word: str, guess: str) -> None:
+@pytest.mark.parametrize(
+    ("word", "guess"), [("robbot", "; did you mean 'robot'?\n"), ("serve", ".\n")]
+)
+def test_a_command_that_the_light_install_lacks_is_answered_with_those_that_it_has(
+    word: str, guess: str
+) -> None:
     program = "import sys; sys.modules['typer'] = None; from vlagents_ray.cli import main; main()"
-    done = subprocess.run([sys.executable, "-c", program, word], capture_output=True, text=True, check=False)
+    done = subprocess.run(
+        [sys.executable, "-c", program, word], capture_output=True, text=True, check=False
+    )
     assert done.returncode == 1
     assert f"this is the light install of a robot's computer{guess}" in done.stderr
     assert "pip install 'vlagents-ray[serve]'" in done.stderr
@@ -395,5 +512,12 @@ def test_what_is_no_observation_is_not_sent(mistake: str) -> None:
 
 
 def test_an_observation_may_hold_lists_and_other_numbers() -> None:
-    require_obs(Obs({"front": IMAGE}, 1, {"q": [1, 2.5], "w": np.arange(3), "b": np.ones(2, bool)}, {"a": [1]}))  # type: ignore[dict-item]
+    require_obs(
+        Obs(
+            {"front": IMAGE},
+            1,
+            {"q": [1, 2.5], "w": np.arange(3), "b": np.ones(2, bool)},
+            {"a": [1]},
+        )
+    )  # type: ignore[dict-item]
     require_obs(Obs(gripper=np.float32(0.5)))  # type: ignore[arg-type]

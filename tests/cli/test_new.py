@@ -37,9 +37,15 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_skeleton_passes_its_own_test(kind: str, folder: Path) -> None:
     assert new(kind, "my_own")[0] == 0
-    assert {path.name for path in folder.iterdir()} == {"my_own.py", "my_own.yaml", "test_my_own.py"}
+    assert {path.name for path in folder.iterdir()} == {
+        "my_own.py",
+        "my_own.yaml",
+        "test_my_own.py",
+    }
     command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "test_my_own.py"]
-    done = subprocess.run(command, check=False, cwd=folder, env=ENV, capture_output=True, text=True, timeout=300)
+    done = subprocess.run(
+        command, check=False, cwd=folder, env=ENV, capture_output=True, text=True, timeout=300
+    )
     assert done.returncode == 0, done.stdout + done.stderr
 
 
@@ -58,7 +64,13 @@ def test_the_next_steps_run_as_they_are_printed_and_without_pytest(kind: str, fo
     assert len(ran) == {"policy": 2, "env": 2, "dialect": 1}[kind]
     for step in ran:
         done = subprocess.run(
-            ["sh", "-c", step], check=False, cwd=folder, env=environment, capture_output=True, text=True, timeout=300
+            ["sh", "-c", step],
+            check=False,
+            cwd=folder,
+            env=environment,
+            capture_output=True,
+            text=True,
+            timeout=300,
         )
         assert done.returncode == 0, step + done.stdout + done.stderr
     assert (folder / "runs").exists() == (kind != "dialect")
@@ -72,18 +84,32 @@ def test_a_skeleton_of_a_plugin_passes_its_own_test_once_it_is_installed(folder:
     plugin = folder / "my_plugin"
     environment = ENV | {"PYTHONPATH": f"{plugin}:{ENV.get('PYTHONPATH', '')}"}
     # What an editable install registers, without an index.
-    metadata = [sys.executable, "-c", "import setuptools; setuptools.setup()", "--quiet", "egg_info"]
+    metadata = [
+        sys.executable,
+        "-c",
+        "import setuptools; setuptools.setup()",
+        "--quiet",
+        "egg_info",
+    ]
     subprocess.run(metadata, check=True, cwd=plugin, capture_output=True, timeout=60)
     command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "test_my_plugin.py"]
     done = subprocess.run(
-        command, check=False, cwd=plugin, env=environment, capture_output=True, text=True, timeout=300
+        command,
+        check=False,
+        cwd=plugin,
+        env=environment,
+        capture_output=True,
+        text=True,
+        timeout=300,
     )
     assert done.returncode == 0, done.stdout + done.stderr
     listed = subprocess.run(
         ["sh", "-c", "vlagents-ray policies my_plugin && vlagents-ray my_plugin --help"],
         check=True, cwd=plugin, env=environment, capture_output=True, text=True, timeout=60,
     )  # fmt: skip
-    assert "my_plugin: The policy MyPlugin: moves each joint towards zero.\n  ready" in listed.stdout
+    assert (
+        "my_plugin: The policy MyPlugin: moves each joint towards zero.\n  ready" in listed.stdout
+    )
     assert "Print how many calls a server's policy has answered" in listed.stdout
 
 
@@ -108,7 +134,9 @@ def test_a_skeleton_of_a_policy_is_served_and_one_of_an_environment_evaluated(fo
     assert [new("policy", "my_policy")[0], new("env", "my_env")[0]] == [0, 0]
     log = folder / "log"
     with serving("my_policy.yaml", log, cwd=folder) as host, RemoteAgent(f"http://{host}") as agent:
-        obs = Obs({"front": np.zeros((96, 96, 3), np.uint8)}, state={"xyzrpy": np.ones(6, np.float32)})
+        obs = Obs(
+            {"front": np.zeros((96, 96, 3), np.uint8)}, state={"xyzrpy": np.ones(6, np.float32)}
+        )
         agent.reset(obs, "lift the cup")
         assert agent.act(obs).action.shape == (4,)
         words = f"tabletop --policy http://{host} --episodes 2 --workers 0 --out runs/policy"
@@ -117,7 +145,9 @@ def test_a_skeleton_of_a_policy_is_served_and_one_of_an_environment_evaluated(fo
     assert (folder / "runs" / "my_env" / "results.db").is_file()
 
 
-def test_clients_of_a_skeleton_of_a_dialect_are_answered(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_clients_of_a_skeleton_of_a_dialect_are_answered(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     assert new("dialect", "my_dialect")[0] == 0
     monkeypatch.syspath_prepend(folder)
     [application] = yaml.safe_load((folder / "my_dialect.yaml").read_text())["applications"]
@@ -132,14 +162,18 @@ def test_what_is_there_stays_and_nothing_is_written_beside_it(kind: str, folder:
         (folder / there).write_text("years of work")
         status, said = new(kind, "mine")
         assert (status, there in said) == (2, True)
-        assert [(path.name, path.read_text()) for path in folder.iterdir()] == [(there, "years of work")]
+        assert [(path.name, path.read_text()) for path in folder.iterdir()] == [
+            (there, "years of work")
+        ]
         (folder / there).unlink()
     said = new(kind, "mine")[1]
     assert "test_mine.py" in said
     assert f"vlagents-ray {'eval' if kind == 'env' else 'serve'} mine.yaml" in said
 
 
-@pytest.mark.parametrize("name", ["", "My", "my-policy", "../up", "a/b", "class", "1st", "numpy", "vlagents_ray"])
+@pytest.mark.parametrize(
+    "name", ["", "My", "my-policy", "../up", "a/b", "class", "1st", "numpy", "vlagents_ray"]
+)
 def test_a_name_that_is_no_module_of_ones_own_is_refused(name: str, folder: Path) -> None:
     status, said = new("policy", name)
     assert (status, "NAME" in said) == (2, True)
@@ -147,9 +181,12 @@ def test_a_name_that_is_no_module_of_ones_own_is_refused(name: str, folder: Path
 
 
 @pytest.mark.parametrize(
-    ("name", "kind"), [("noop", "policy"), ("openvla", "policy"), ("live", "part of a server"), ("eval", "command")]
+    ("name", "kind"),
+    [("noop", "policy"), ("openvla", "policy"), ("live", "part of a server"), ("eval", "command")],
 )
-def test_a_plugin_of_a_name_that_is_registered_is_refused(name: str, kind: str, folder: Path) -> None:
+def test_a_plugin_of_a_name_that_is_registered_is_refused(
+    name: str, kind: str, folder: Path
+) -> None:
     """Its own test could not pass."""
     status, said = new("plugin", name)
     assert (status, f"'{name}' is the name of a {kind} already" in said) == (2, True)

@@ -53,13 +53,24 @@ def command_at(path: tuple[str, ...]) -> Any:
 
 def test_the_numeric_options_are_found() -> None:
     names = {(path[-1], option) for path, option, _ in OPTIONS}
-    assert {("eval", "--episodes"), ("new", "--days"), ("tune", "--minutes"), ("serve", "--port")} <= names
+    assert {
+        ("eval", "--episodes"),
+        ("new", "--days"),
+        ("tune", "--minutes"),
+        ("serve", "--port"),
+    } <= names
     assert len(names) >= 20
 
 
-@pytest.mark.parametrize(("path", "option", "parameter"), OPTIONS, ids=lambda one: str(one).strip("<>")[:40])
+@pytest.mark.parametrize(
+    ("path", "option", "parameter"), OPTIONS, ids=lambda one: str(one).strip("<>")[:40]
+)
 def test_a_number_out_of_its_bounds_is_answered_at_once(
-    path: tuple[str, ...], option: str, parameter: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    path: tuple[str, ...],
+    option: str,
+    parameter: Any,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.chdir(tmp_path)
     for slip in SLIPS:
@@ -85,7 +96,9 @@ def test_a_number_out_of_its_bounds_is_answered_at_once(
     ],
     ids=" ".join,
 )
-def test_a_number_inside_a_text_has_bounds(words: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_number_inside_a_text_has_bounds(
+    words: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.chdir(tmp_path)
     (tmp_path / "dataset" / "meta").mkdir(parents=True)
     (tmp_path / "dataset" / "meta" / "info.json").write_text("{}")
@@ -104,7 +117,10 @@ def unbounded(schema: Any, where: str = "") -> Iterator[str]:
         for part in schema:
             yield from unbounded(part, where)
     elif isinstance(schema, dict):
-        if schema.get("type") in ("integer", "number") and not {"maximum", "exclusiveMaximum"} & schema.keys():
+        if (
+            schema.get("type") in ("integer", "number")
+            and not {"maximum", "exclusiveMaximum"} & schema.keys()
+        ):
             yield where
         for name, part in schema.items():
             inner = name in ("$defs", "properties", "anyOf", "items", "additionalProperties")
@@ -121,5 +137,7 @@ def test_a_sweep_or_a_plan_of_too_many_steps_is_not_listed() -> None:
     steps = {"first": 0, "last": 10**12, "every": 1}
     began = time.process_time()
     with pytest.raises(ValueError, match="expected at most 10000 steps"):
-        EvalConfig(policies=[{"source": "noop", "steps": steps}], suites=[{"envs": ["tabletop"]}], out="x")  # type: ignore[list-item,arg-type]
+        EvalConfig(
+            policies=[{"source": "noop", "steps": steps}], suites=[{"envs": ["tabletop"]}], out="x"
+        )  # type: ignore[list-item,arg-type]
     assert time.process_time() - began < 5

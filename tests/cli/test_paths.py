@@ -1,4 +1,6 @@
-"""Each option that takes a path, with each wrong path: one message that names the path, and no traceback."""
+"""Each option that takes a path, with each wrong path: one message that names the path, and no
+traceback.
+"""
 
 from __future__ import annotations
 
@@ -52,17 +54,36 @@ COMMANDS: dict[tuple[str, str], list[str]] = {
     ("keys new", "--keys"): ["x", "--keys", "{path}"],
     ("keys list", "--keys"): ["--keys", "{path}"],
     ("keys revoke", "--keys"): ["x", "--keys", "{path}"],
-    ("slurm eval", "--setup"): ["tabletop", *EPISODE, "--dry-run", "--out", "o", "--setup", "{path}"],
+    ("slurm eval", "--setup"): [
+        "tabletop",
+        *EPISODE,
+        "--dry-run",
+        "--out",
+        "o",
+        "--setup",
+        "{path}",
+    ],
     ("slurm serve", "--setup"): ["noop", "--dry-run", "--out", "o", "--setup", "{path}"],
     ("slurm serve", "--out"): ["noop", "--dry-run", "--out", "{path}"],
 }
-PATHS = ["text", "text/below", "folder/absent/below", "/proc/absent"]  # a file, below a file, below nothing, read-only
+# A file, below a file, below nothing, read-only.
+PATHS = ["text", "text/below", "folder/absent/below", "/proc/absent"]
 # Results replace a file, and with --dry-run nothing is written.
 USABLE = {("report", "--out", "text"), ("export", "--out", "text"), ("bundle", "--out", "text")}
 USABLE |= {("slurm serve", "--out", path) for path in PATHS} | {("slurm serve", "--setup", "text")}
 USABLE |= {("slurm eval", "--setup", "text")}
 # A folder that does not exist is made, with its parents.
-MADE = {"eval", "demo", "merge", "slurm eval", "slurm serve", "replay", "open-loop", "verify", "env make"}
+MADE = {
+    "eval",
+    "demo",
+    "merge",
+    "slurm eval",
+    "slurm serve",
+    "replay",
+    "open-loop",
+    "verify",
+    "env make",
+}
 
 
 def commands(command: Any, name: str = "") -> Iterator[tuple[str, Any]]:
@@ -84,13 +105,16 @@ def options_with_paths() -> set[tuple[str, str]]:
 
 
 def test_each_option_with_a_path_has_a_row() -> None:
-    assert options_with_paths() == {*COMMANDS, ("eval", "--watch")}  # this waits until the folder is made
+    # This waits until the folder is made.
+    assert options_with_paths() == {*COMMANDS, ("eval", "--watch")}
 
 
 @pytest.fixture(scope="module")
 def results(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("results") / "done"
-    done = CliRunner().invoke(app, ["eval", "tabletop", *EPISODE, "--env-set", "max_steps=2", "--out", str(folder)])
+    done = CliRunner().invoke(
+        app, ["eval", "tabletop", *EPISODE, "--env-set", "max_steps=2", "--out", str(folder)]
+    )
     assert done.exit_code == 0, done.output
     return folder
 
@@ -102,21 +126,32 @@ def is_wrong(command: str, option: str, path: str) -> bool:
 
 
 @pytest.mark.parametrize(
-    ("command", "option", "path"), [(*words, path) for words in COMMANDS for path in PATHS if is_wrong(*words, path)]
+    ("command", "option", "path"),
+    [(*words, path) for words in COMMANDS for path in PATHS if is_wrong(*words, path)],
 )
 def test_a_wrong_path_is_named_in_one_message(
-    command: str, option: str, path: str, results: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    command: str,
+    option: str,
+    path: str,
+    results: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.chdir(tmp_path)
     (tmp_path / "done").symlink_to(results)
     (tmp_path / "text").write_text("no file of this kind: [")
     (tmp_path / "folder").mkdir()
     (tmp_path / "r.txt").write_text("")
-    deployment = "applications: [{import_path: 'vlagents_ray.serve.app:build', args: {policy: noop}}]"
+    deployment = (
+        "applications: [{import_path: 'vlagents_ray.serve.app:build', args: {policy: noop}}]"
+    )
     (tmp_path / "d.yaml").write_text(deployment)
     words = [*command.split(), *(word.format(path=path) for word in COMMANDS[command, option])]
     done = CliRunner().invoke(app, words, env={"COLUMNS": "1000", "TERMINAL_WIDTH": "1000"})
-    assert done.exception is None or isinstance(done.exception, SystemExit), (words, repr(done.exception))
+    assert done.exception is None or isinstance(done.exception, SystemExit), (
+        words,
+        repr(done.exception),
+    )
     assert "Traceback" not in done.output
     if (command, option, path) not in USABLE:
         assert done.exit_code != 0, done.output

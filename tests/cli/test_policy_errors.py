@@ -1,4 +1,6 @@
-"""`eval` of policies that fail: the terminal says the error, and the exit status that there is no result."""
+"""`eval` of policies that fail: the terminal says the error, and the exit status that there is
+no result.
+"""
 
 from __future__ import annotations
 
@@ -46,12 +48,20 @@ class Failing(ToZero):
         return Act(np.full(1, np.nan, np.float32))
 
 
-def eval_of(out: Path, agent: functools.partial[Agent], monkeypatch: pytest.MonkeyPatch, **settings: Any) -> Result:
+def eval_of(
+    out: Path, agent: functools.partial[Agent], monkeypatch: pytest.MonkeyPatch, **settings: Any
+) -> Result:
     """Run the command in this process."""
-    config = flat_config(**{"envs": [LINE], "episodes": 4, "out": out, "video": "none", "workers": 0, **settings})
+    config = flat_config(
+        **{"envs": [LINE], "episodes": 4, "out": out, "video": "none", "workers": 0, **settings}
+    )
     monkeypatch.setattr(command, "config_from_options", lambda *_: config)
-    monkeypatch.setattr(run, "served", lambda *_, **__: contextlib.nullcontext((config, {"policy": agent})))
-    return CliRunner().invoke(app, ["eval", LINE, "--policy", "http://127.0.0.1:9"], env={"COLUMNS": "300"})
+    monkeypatch.setattr(
+        run, "served", lambda *_, **__: contextlib.nullcontext((config, {"policy": agent}))
+    )
+    return CliRunner().invoke(
+        app, ["eval", LINE, "--policy", "http://127.0.0.1:9"], env={"COLUMNS": "300"}
+    )
 
 
 WORDS = {
@@ -75,17 +85,24 @@ def test_a_policy_that_always_fails_says_so_and_ends_with_a_status_of_its_own(
     assert "every episode ended by an error of the policy" in done.stderr
 
 
-def test_a_policy_that_fails_now_and_then_has_a_rate(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_policy_that_fails_now_and_then_has_a_rate(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     done = eval_of(tmp_path / "out", functools.partial(Failing, "nan", (1, 2)), monkeypatch)
     assert done.exit_code == 0, done.output
     assert "2 episodes ended by an error of the policy" in done.stdout
 
 
-def test_errors_of_the_policy_in_a_row_stop_the_evaluation(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_errors_of_the_policy_in_a_row_stop_the_evaluation(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     agent = functools.partial(Failing, "key")
     done = eval_of(tmp_path / "out", agent, monkeypatch, episodes=50, abort_after=3)
     assert done.exit_code == run.POLICY_ERRORS, done.output
-    assert "3 episodes in a row ended by an error of the policy: policy_failed: policy act: KeyError" in done.stderr
+    assert (
+        "3 episodes in a row ended by an error of the policy: policy_failed: policy act: KeyError"
+        in done.stderr
+    )
     assert "3/50" in done.stdout
 
 
@@ -121,14 +138,18 @@ class Shrinking(Agent):
 
 def test_an_action_of_another_size_than_the_first_is_an_error_of_the_policy() -> None:
     agent = Shrinking()
-    [result] = run_episodes(SequentialBatch([Unstated()]), agent, [agent], [EpisodeKey("a", 0, 0, "b")])
+    [result] = run_episodes(
+        SequentialBatch([Unstated()]), agent, [agent], [EpisodeKey("a", 0, 0, "b")]
+    )
     assert isinstance(result, EpisodeResult)
     assert (result.status, bool(result.success_at_end)) == ("policy_error", False)
     assert "got (1, 3), want 5 numbers a row" in (result.error or "")
 
 
 @pytest.mark.parametrize("text", ["@handle", "%2", "`x`", "*all", "a: b: c", "!tag"])
-def test_a_setting_that_is_not_yaml_is_text_but_not_an_unfinished_list_mapping_or_quotation(text: str) -> None:
+def test_a_setting_that_is_not_yaml_is_text_but_not_an_unfinished_list_mapping_or_quotation(
+    text: str,
+) -> None:
     assert parse_settings([f"name={text}"], "--set") == {"name": text}
     for unfinished in ("[1, 2", "{a: 1", '"open'):
         with pytest.raises(ConfigError, match="not YAML"):

@@ -44,8 +44,16 @@ def test_a_page_stands_beside_its_results_and_one_of_several_folders_where_it_is
 def test_results_that_another_process_writes_are_watched_until_ctrl_c(tmp_path: Path) -> None:
     record(runs(tmp_path / "out", episodes=2))
     page = LivePage()
-    command = [Path(sys.executable).parent / "vlagents-ray", "report", tmp_path / "out", "--live-at", page.address]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True) as watching:
+    command = [
+        Path(sys.executable).parent / "vlagents-ray",
+        "report",
+        tmp_path / "out",
+        "--live-at",
+        page.address,
+    ]
+    with subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
+    ) as watching:
         wait_for(lambda: page.evaluation() or watching.poll() is not None)
         said = page.evaluation()
         watching.send_signal(signal.SIGINT)

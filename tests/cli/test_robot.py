@@ -1,4 +1,6 @@
-"""`vlagents-ray robot`: a human at a terminal drives a simulation, or corrects a policy, and it is recorded."""
+"""`vlagents-ray robot`: a human at a terminal drives a simulation, or corrects a policy, and it
+is recorded.
+"""
 
 from __future__ import annotations
 
@@ -40,8 +42,12 @@ def robot(*words: str) -> Any:
 
 
 @contextlib.contextmanager
-def at_a_terminal(code: str, *options: str) -> Iterator[tuple[Any, Callable[[str], object], Iterator[str]]]:
-    """Run Python code at a terminal of its own: its process, a function that types keys there, and its output."""
+def at_a_terminal(
+    code: str, *options: str
+) -> Iterator[tuple[Any, Callable[[str], object], Iterator[str]]]:
+    """Run Python code at a terminal of its own: its process, a function that types keys there,
+    and its output.
+    """
     ours, its = pty.openpty()
     with subprocess.Popen(
         [sys.executable, "-c", code, *options],
@@ -56,7 +62,11 @@ def at_a_terminal(code: str, *options: str) -> Iterator[tuple[Any, Callable[[str
         too_long = threading.Timer(60, process.kill)  # then no further line comes
         too_long.start()
         try:
-            yield process, lambda keys: os.write(ours, keys.encode()), map(str.strip, process.stdout)
+            yield (
+                process,
+                lambda keys: os.write(ours, keys.encode()),
+                map(str.strip, process.stdout),
+            )
         finally:
             too_long.cancel()
             process.kill()
@@ -69,7 +79,10 @@ def frames(root: Path, episode: int) -> dict[str, Any]:
 
 
 def labels(root: Path) -> list[str]:
-    return [pq.read_table(path).to_pylist()[0]["label"] for path in sorted(root.glob("meta/episodes/*/*.parquet"))]
+    return [
+        pq.read_table(path).to_pylist()[0]["label"]
+        for path in sorted(root.glob("meta/episodes/*/*.parquet"))
+    ]
 
 
 def until(lines: Iterator[str], text: str) -> None:
@@ -103,7 +116,17 @@ def test_a_human_drives_a_simulation_and_labels_its_episodes(tmp_path: Path) -> 
 
 
 def test_a_human_corrects_a_policy(tmp_path: Path) -> None:
-    words = ["robot", "scripted", *QUICK, "--leader", "keyboard", "--record", str(tmp_path), "--hz", "10"]
+    words = [
+        "robot",
+        "scripted",
+        *QUICK,
+        "--leader",
+        "keyboard",
+        "--record",
+        str(tmp_path),
+        "--hz",
+        "10",
+    ]
     with at_a_terminal(MAIN, *words) as (process, press, lines):
         until(lines, "the policy moves the robot")
         press("s")
@@ -144,7 +167,17 @@ def test_episodes_are_shown_in_a_viewer(tmp_path: Path) -> None:
 
 
 def test_ctrl_c_says_what_was_recorded(tmp_path: Path) -> None:
-    words = ["robot", "scripted", *QUICK, "--episodes", "9", "--hz", "200", "--record", str(tmp_path)]
+    words = [
+        "robot",
+        "scripted",
+        *QUICK,
+        "--episodes",
+        "9",
+        "--hz",
+        "200",
+        "--record",
+        str(tmp_path),
+    ]
     with subprocess.Popen(
         [sys.executable, "-c", MAIN, *words], stdout=subprocess.PIPE, stderr=subprocess.PIPE
     ) as process:
@@ -155,7 +188,10 @@ def test_ctrl_c_says_what_was_recorded(tmp_path: Path) -> None:
         _, said = process.communicate(timeout=60)
     kept = len(list(tmp_path.glob("data/*/*.parquet")))
     assert kept in (2, 3), "with the running one, if it had begun"
-    assert (process.returncode, said.decode()) == (130, f"error interrupted; {kept} episodes are in {tmp_path}\n")
+    assert (process.returncode, said.decode()) == (
+        130,
+        f"error interrupted; {kept} episodes are in {tmp_path}\n",
+    )
 
 
 @pytest.mark.parametrize(
@@ -176,7 +212,16 @@ def test_wrong_settings_are_refused_with_the_cure(words: list[str], cure: str) -
 
 def test_a_simulation_has_the_limits_of_a_file(tmp_path: Path) -> None:
     (tmp_path / "slow.json").write_text('{"velocity": 1e-6}')
-    words = ["scripted", *QUICK, "--episodes", "1", "--hz", "200", "--limits", str(tmp_path / "slow.json")]
+    words = [
+        "scripted",
+        *QUICK,
+        "--episodes",
+        "1",
+        "--hz",
+        "200",
+        "--limits",
+        str(tmp_path / "slow.json"),
+    ]
     run = robot(*words)
     assert run.exit_code == 1, run.output
     assert "got velocity" in run.output
@@ -185,7 +230,10 @@ def test_a_simulation_has_the_limits_of_a_file(tmp_path: Path) -> None:
 def test_a_person_restarts_the_command_by_a_signal() -> None:
     said: list[str] = []
     stopped = threading.Event()
-    with Watchdog(lambda _: stopped.set(), {"loop": 0.05}) as watchdog, restarting(watchdog, said.append):
+    with (
+        Watchdog(lambda _: stopped.set(), {"loop": 0.05}) as watchdog,
+        restarting(watchdog, said.append),
+    ):
         assert stopped.wait(30)
         os.kill(os.getpid(), signal.SIGUSR1)
         assert watchdog.control.stopped  # it hangs still
@@ -302,7 +350,9 @@ command.main(["http://nowhere"])
 
 
 class Served(Agent):
-    """In place of the agent that the command would connect: absolute targets that grow by 0.01 a tick."""
+    """In place of the agent that the command would connect: absolute targets that grow by 0.01 a
+    tick.
+    """
 
     transport = "local"
     contract: Contract | None = Contract(action=ActionSpec(dim=2, delta=False), chunk=1)  # type: ignore[assignment]
@@ -335,10 +385,14 @@ ATTEMPTS = 5  # what else the machine does in such a second may mislead
 
 @pytest.mark.parametrize("mode", ["async", "open_loop", "ensemble"])
 @pytest.mark.usefixtures("served")
-def test_a_policy_of_single_actions_drives_in_each_mode(capsys: pytest.CaptureFixture[str], mode: str) -> None:
+def test_a_policy_of_single_actions_drives_in_each_mode(
+    capsys: pytest.CaptureFixture[str], mode: str
+) -> None:
     for _ in range(ATTEMPTS):
         status = drive([*SHORT, "--hz", "10", "--mode", mode])
-        said = re.search(r"ticks without an action of the policy: (\d+) of (\d+)", capsys.readouterr().out)
+        said = re.search(
+            r"ticks without an action of the policy: (\d+) of (\d+)", capsys.readouterr().out
+        )
         assert said is not None
         safe, ticks = map(int, said.groups())
         if safe < 0.5 * ticks:  # none where the machine is not busy
@@ -347,13 +401,18 @@ def test_a_policy_of_single_actions_drives_in_each_mode(capsys: pytest.CaptureFi
     assert status == (1 if safe else 0)
 
 
-def test_the_simulated_robot_takes_actions_of_which_nothing_is_stated(served: Callable[..., None]) -> None:
+def test_the_simulated_robot_takes_actions_of_which_nothing_is_stated(
+    served: Callable[..., None],
+) -> None:
     served(contract=Contract(action=ActionSpec(dim=2)))
-    assert drive(["http://nowhere", "--seconds", "0.3", "--hz", "10"]) in (0, 1, 3)  # a busy machine may miss ticks
+    # A busy machine may miss ticks.
+    assert drive(["http://nowhere", "--seconds", "0.3", "--hz", "10"]) in (0, 1, 3)
 
 
 def test_a_run_of_safe_actions_does_not_look_like_success(
-    served: Callable[..., None], capsys: pytest.CaptureFixture[str], caplog: pytest.LogCaptureFixture
+    served: Callable[..., None],
+    capsys: pytest.CaptureFixture[str],
+    caplog: pytest.LogCaptureFixture,
 ) -> None:
     served(slow_s=0.3)
     for _ in range(ATTEMPTS):  # on a busy machine there may be hardly a tick within the time
@@ -371,7 +430,9 @@ def test_the_command_lets_a_human_take_over_and_records_that(
     served: Callable[..., None], capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
     served(contract=Contract(action=ActionSpec(dim=2, delta=False)))
-    assert drive([*SHORT, "--leader", "scripted_leader:HoldingLeader", "--record", str(tmp_path)]) == 0
+    assert (
+        drive([*SHORT, "--leader", "scripted_leader:HoldingLeader", "--record", str(tmp_path)]) == 0
+    )
     said = capsys.readouterr().out
     ticks = int(re.search(r"an operator moved the robot: (\d+)", said)[1])  # type: ignore[index]
     rows = pq.read_table(tmp_path / "data/chunk-000/file-000.parquet").to_pydict()
@@ -386,10 +447,22 @@ SIMULATED = "vlagents_ray.robot.simulated:SimulatedRobot"
 @pytest.mark.parametrize(
     ("contract", "words", "said"),
     [
-        (RELATIVE, [*SHORT, "--safe", "hold"], "ConfigError: safe: got 'hold', which .*give safe='zero', or 'auto'"),
-        (RELATIVE, [*SHORT, "--measure", "joints"], "ConfigError: measure: got one for relative actions"),
+        (
+            RELATIVE,
+            [*SHORT, "--safe", "hold"],
+            "ConfigError: safe: got 'hold', which .*give safe='zero', or 'auto'",
+        ),
+        (
+            RELATIVE,
+            [*SHORT, "--measure", "joints"],
+            "ConfigError: measure: got one for relative actions",
+        ),
         (None, ["http://nowhere", "--robot", SIMULATED], "safe='hold'"),
-        (None, [*SHORT, "--robot", "builtins:dict"], "--robot builtins:dict: lacks observe, apply, stop; want a class"),
+        (
+            None,
+            [*SHORT, "--robot", "builtins:dict"],
+            "--robot builtins:dict: lacks observe, apply, stop; want a class",
+        ),
     ],
 )
 def test_what_does_not_fit_ends_the_command_before_anything_is_timed(
@@ -417,13 +490,25 @@ def test_what_does_not_fit_ends_the_command_before_anything_is_timed(
         (["--max-age-s", "0"], "argument --max-age-s: got '0', want a number above 0"),
         (["--deadline-ms", "-1"], "argument --deadline-ms: got '-1', want a number from 0"),
         (["--silent-s", "soon"], "argument --silent-s: got 'soon', want a number above 0"),
-        (["--mode", "open_loop", "--rtc"], "--merge and --rtc: got one of them with --mode open_loop"),
-        (["--leader", "elsewhere:Pedal"], "--leader elsewhere:Pedal: No module named 'elsewhere'; go to the folder of"),
-        (["--robot", "elsewhere:Arm"], "--robot elsewhere:Arm: No module named 'elsewhere'; go to the folder of"),
+        (
+            ["--mode", "open_loop", "--rtc"],
+            "--merge and --rtc: got one of them with --mode open_loop",
+        ),
+        (
+            ["--leader", "elsewhere:Pedal"],
+            "--leader elsewhere:Pedal: No module named 'elsewhere'; go to the folder of",
+        ),
+        (
+            ["--robot", "elsewhere:Arm"],
+            "--robot elsewhere:Arm: No module named 'elsewhere'; go to the folder of",
+        ),
     ],
 )
 def test_options_are_checked_before_a_server_is_asked(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], options: list[str], wanted: str
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    options: list[str],
+    wanted: str,
 ) -> None:
     monkeypatch.setattr("vlagents_ray.cli.robot.RemoteAgent", None)
     try:
@@ -487,7 +572,8 @@ sys.exit(command.main(["http://gpu-box:8000", "--robot", "arm:Arm", "--seconds",
 
 
 @pytest.mark.parametrize(
-    ("wish", "status"), [(signal.SIGINT, 130), (signal.SIGTERM, 128 + signal.SIGTERM), (signal.SIGHUP, 129)]
+    ("wish", "status"),
+    [(signal.SIGINT, 130), (signal.SIGTERM, 128 + signal.SIGTERM), (signal.SIGHUP, 129)],
 )
 def test_a_signal_ends_a_run_on_an_arm_with_its_table_and_its_recording(
     tmp_path: Path, wish: signal.Signals, status: int
@@ -507,13 +593,23 @@ def test_a_signal_ends_a_run_on_an_arm_with_its_table_and_its_recording(
 
 
 @pytest.mark.parametrize(
-    ("key", "label", "status"), [("y", "success", 0), ("n", "failure", 0), ("q", "none", 0), ("x", None, 0)]
+    ("key", "label", "status"),
+    [("y", "success", 0), ("n", "failure", 0), ("q", "none", 0), ("x", None, 0)],
 )
 @pytest.mark.parametrize("leader", ["arm:Leader", "keyboard"])
 def test_the_keys_on_an_arm_are_named_at_the_start_and_end_and_label_the_run(
     tmp_path: Path, leader: str, key: str, label: str | None, status: int
 ) -> None:
-    words = ["--record", str(tmp_path / "demos"), "--leader", leader, "--step", "0.01", "--deadline-ms", "5000"]
+    words = [
+        "--record",
+        str(tmp_path / "demos"),
+        "--leader",
+        leader,
+        "--step",
+        "0.01",
+        "--deadline-ms",
+        "5000",
+    ]
     with at_a_terminal(ON_AN_ARM, *words) as (process, press, lines):
         until(lines, "keys: p pauses")
         until(lines, "the arm moves")
@@ -576,7 +672,10 @@ ARM = ["--robot", SIMULATED]
         (["--1234567"], "unrecognized arguments: --1234567; --help lists the options"),
         (["--ca", "x"], "read from a variable: export SSL_CERT_FILE=ca.pem"),
         (["--cacert=x"], "read from a variable: export SSL_CERT_FILE=ca.pem"),
-        (["--api-key", "vlr_secret"], "read from a variable: export VLAGENTS_RAY_API_KEY=vlr_...\n$"),
+        (
+            ["--api-key", "vlr_secret"],
+            "read from a variable: export VLAGENTS_RAY_API_KEY=vlr_...\n$",
+        ),
         (["--robot-set", "foo=1"], "--robot-set without --robot; name the robot"),
         (["--robot", "{here}:FaultyArn"], "has no 'FaultyArn'; did you mean 'FaultyArm'"),
         (["--robot", "json:Armature"], "has no 'Armature'; write the name of a class"),
@@ -604,10 +703,16 @@ ARM = ["--robot", SIMULATED]
         (["--robot", "ros:/nowhere.yaml"], "cannot be read as a file of ROS topics"),
         ([*ARM, "--robot-set", "foo=1"], "unexpected keyword argument 'foo'; it takes"),
         ([*ARM, "--robot-set", "foo"], "want KEY=VALUE"),
-        (["--robot", "{here}:FaultyArm", "--robot-set", "port=/dev/x"], "could not be made: OSError: .*port /dev/x"),
+        (
+            ["--robot", "{here}:FaultyArm", "--robot-set", "port=/dev/x"],
+            "could not be made: OSError: .*port /dev/x",
+        ),
         (["--robot", "{here}:FaultyArm", "--robot-set", "port=3"], "port: got 3, want str"),
         (["--robot", "broken_syntax:Arm"], "SyntaxError: .*correct the module 'broken_syntax'"),
-        (["--robot", "raising_module:Arm"], "ZeroDivisionError: .*correct the module 'raising_module'"),
+        (
+            ["--robot", "raising_module:Arm"],
+            "ZeroDivisionError: .*correct the module 'raising_module'",
+        ),
         (["--robot", "lerobot:nothing"], "lerobot"),
         (["--robot", ":Arm"], "--robot :Arm"),
         (["--robot", "a..b:Arm"], "--robot a..b:Arm"),
@@ -615,7 +720,10 @@ ARM = ["--robot", SIMULATED]
         (["--leader", "builtins:dict"], "lacks engaged, action"),
         (["--leader", "broken_syntax:Leader"], "SyntaxError"),
         (["--measure", "elbow", *ARM, "--max-step", "1"], "elbow"),
-        (["--measure", "jonts", *ARM], "--measure: got 'jonts', want a part of the robot's state, one of .*'joints'"),
+        (
+            ["--measure", "jonts", *ARM],
+            "--measure: got 'jonts', want a part of the robot's state, one of .*'joints'",
+        ),
     ],
 )
 @pytest.mark.usefixtures("served")
@@ -634,7 +742,10 @@ def test_each_wrong_argument_is_an_error_with_its_cure(
     (tmp_path / "file").write_text("a file")
     (tmp_path / "damaged/meta").mkdir(parents=True)
     (tmp_path / "damaged/meta/info.json").write_text("{")
-    places = {name: str(tmp_path / name) for name in ("file", "damaged")} | {"folder": str(tmp_path), "here": HERE}
+    places = {name: str(tmp_path / name) for name in ("file", "damaged")} | {
+        "folder": str(tmp_path),
+        "here": HERE,
+    }
     given = [word.format(**places) for word in words]
     try:
         status: object = drive([*SHORT, "--seconds", "0.05", *given])

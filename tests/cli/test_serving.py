@@ -22,12 +22,21 @@ from vlagents_ray.cli.serve import connection_lines
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.registry import POLICIES, names, policy_class
 from vlagents_ray.serve.launch import deployment_file
-from vlagents_ray.serve.launch.deployment_file import deployment, own_settings, read_deployment, with_gateways_at
+from vlagents_ray.serve.launch.deployment_file import (
+    deployment,
+    own_settings,
+    read_deployment,
+    with_gateways_at,
+)
 from vlagents_ray.serve.ports import EVERYWHERE, LOOPBACK
 from vlagents_ray.yaml_text import read_yaml
 
-INFO = "INFO 2026-11-21 17:02:51,406 proxy 127.0.0.1 -- HAProxy starting on node 321f (HTTP port: 8977)."
-MEANT = "WARNING 2026-11-21 17:02:48,881 controller 3438 -- HTTPOptions.host='127.0.0.1' won't accept connections from HAProxy on other nodes; cross-node routing will fail"  # fmt: skip  # noqa: E501
+INFO = (
+    "INFO 2026-11-21 17:02:51,406 proxy 127.0.0.1 -- HAProxy starting on node 321f (HTTP port: "
+    "8977)."
+)
+MEANT = ("WARNING 2026-11-21 17:02:48,881 controller 3438 -- HTTPOptions.host='127.0.0.1' won't "
+         "accept connections from HAProxy on other nodes; cross-node routing will fail")  # fmt: skip
 PROBLEM = "ERROR 2026-11-21 17:02:51,406 controller 3438 -- Deploying app 'x' failed"
 PRINTED = "INFO: loading the weights"  # by a policy
 HAPROXY = "HAProxyManager pid=7"
@@ -61,25 +70,45 @@ def test_only_problems_and_what_a_policy_prints_are_shown_and_the_rest_is_in_the
     ray: Processes, capsys: pytest.CaptureFixture[str]
 ) -> None:
     with quiet_ray("serve-8000") as file:
-        ray.say(INFO, ":job_id:01000000", ":actor_name:HAProxyManager", INFO, MEANT, PROBLEM, PRINTED, pid=7)
+        ray.say(
+            INFO,
+            ":job_id:01000000",
+            ":actor_name:HAProxyManager",
+            INFO,
+            MEANT,
+            PROBLEM,
+            PRINTED,
+            pid=7,
+        )
         wait_for(lambda: file is not None and MEANT in file.read_text())
         ray.say(INFO)
-    assert capsys.readouterr().err.splitlines() == [f"({HAPROXY}) {line}" for line in (PROBLEM, PRINTED)]
+    assert capsys.readouterr().err.splitlines() == [
+        f"({HAPROXY}) {line}" for line in (PROBLEM, PRINTED)
+    ]
     assert file is not None
     assert file.name.startswith("serve-8000-")
     assert stat.S_IMODE(file.stat().st_mode) == 0o600
-    expected = [f"(ray pid=7) {INFO}", f"({HAPROXY}) {INFO}", f"({HAPROXY}) {MEANT}", f"(ray pid=1) {INFO}"]
+    expected = [
+        f"(ray pid=7) {INFO}",
+        f"({HAPROXY}) {INFO}",
+        f"({HAPROXY}) {MEANT}",
+        f"(ray pid=1) {INFO}",
+    ]
     assert file.read_text().splitlines() == expected
 
 
 def test_after_an_interrupt_what_serves_actors_print_goes_to_the_log_and_what_a_policy_prints_is_shown(
     ray: Processes, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A signal to the whole process group also ends HAProxy, and Serve's actors print tracebacks of its crash."""
+    """A signal to the whole process group also ends HAProxy, and Serve's actors print tracebacks
+    of its crash.
+    """
     monkeypatch.setattr("vlagents_ray.cli.ray_session.is_interrupted", lambda: True)
     crash = "RuntimeError: Failed to update and reload HAProxy"
     with quiet_ray("serve") as file:
-        for pid, actor in enumerate(("HAProxyManager", "ProxyActor", "ServeController", "ServeReplica:noop:Policy")):
+        for pid, actor in enumerate(
+            ("HAProxyManager", "ProxyActor", "ServeController", "ServeReplica:noop:Policy")
+        ):
             ray.say(f":actor_name:{actor}", crash, pid=pid)
         wait_for(lambda: file is not None and file.read_text().count(crash) == 3)
     assert capsys.readouterr().err.splitlines() == [f"(ServeReplica:noop:Policy pid=3) {crash}"]
@@ -123,7 +152,12 @@ def test_the_same_holds_for_what_ray_logs_in_this_process(
 
 
 LOAD_FAILURE = [
-    "ERROR 2026-11-25 07:36:46,517 controller 2516 -- Exception in Replica(id='kfzcaljf', ...), it will be stopped.",
+    (
+        "ERROR 2026-11-25 07:36:46,517 controller 2516 -- Exception in Replica(id='kfzcaljf', "
+        "...), "
+        "it "
+        "will be stopped."
+    ),
     "Traceback (most recent call last):",
     "FileNotFoundError: [Errno 2] No such file or directory: 'nope.npz'",
     "ERROR 2026-11-25 07:36:46,530 controller 2516 -- Failed to update the deployments ['Policy'].",
@@ -166,7 +200,9 @@ def test_an_empty_file_does_not_stay(ray: Processes, tmp_path: Path) -> None:
 
 def test_a_server_says_its_policy_its_page_and_where_each_kind_of_client_connects() -> None:
     dialects = {"openpi": {"mapping": "openpi-libero"}, "gr00t": {"port": 5556}, "vlagents": {}}
-    config = with_gateways_at(deployment("noop", config={"action_dim": 7}, dialects=dialects), EVERYWHERE)
+    config = with_gateways_at(
+        deployment("noop", config={"action_dim": 7}, dialects=dialects), EVERYWHERE
+    )
     said = list(connection_lines(config, {"noop": "https://127.0.0.1:8000"}, EVERYWHERE))
     assert said[0] == "serving noop at https://127.0.0.1:8000"
     assert said[1].startswith("  from other machines: https://")
@@ -182,7 +218,9 @@ def test_a_server_says_its_policy_its_page_and_where_each_kind_of_client_connect
 
 def test_a_server_names_the_pages_of_the_parts_that_are_on(monkeypatch: pytest.MonkeyPatch) -> None:
     def pages(**settings: Any) -> list[str]:
-        lines = connection_lines(deployment("noop", **settings), {"noop": "http://127.0.0.1:8000"}, LOOPBACK)
+        lines = connection_lines(
+            deployment("noop", **settings), {"noop": "http://127.0.0.1:8000"}, LOOPBACK
+        )
         return [line for line in lines if "page" in line]
 
     assert pages() == ["  live page: http://127.0.0.1:8000/live"]
@@ -202,8 +240,14 @@ def test_the_page_of_a_server_with_keys_is_asked_for_with_one(tmp_path: Path) ->
 
 
 def _needing_settings() -> list[str]:
-    configs = {name: getattr(policy_class(name).Config, "model_fields", {}) for name in names("policies")}
-    return [name for name, fields in configs.items() if any(field.is_required() for field in fields.values())]
+    configs = {
+        name: getattr(policy_class(name).Config, "model_fields", {}) for name in names("policies")
+    }
+    return [
+        name
+        for name, fields in configs.items()
+        if any(field.is_required() for field in fields.values())
+    ]
 
 
 @pytest.mark.parametrize("policy", _needing_settings())

@@ -1,4 +1,6 @@
-"""Own modules are found where the command is typed, and what is mistyped is said before anything starts."""
+"""Own modules are found where the command is typed, and what is mistyped is said before anything
+starts.
+"""
 
 from __future__ import annotations
 
@@ -50,7 +52,8 @@ RUNS: dict[str, dict[str, object]] = {
     "low": {"workers": -1},
     "listed": {"suites": [{"envs": ["tabletop"], "episods": 3}]},
 }
-# What the console script does, whose first entry of `sys.path` is its own folder and not the working directory.
+# What the console script does, whose first entry of `sys.path` is its own folder and not the
+# working directory.
 SCRIPT = """
 import sys
 sys.path[0] = sys.argv.pop(1)
@@ -98,22 +101,46 @@ EVAL = ("--out", "runs/x", "--policy")
 @pytest.mark.parametrize(
     ("words", "wanted"),
     [
-        (("serve", "my_policies:Reach", "--set", "gian=1"), "it takes .'gain'.; did you mean 'gain'"),
-        (("serve", "my_policies:Reech"), "module 'my_policies' has no class 'Reech'; did you mean 'Reach'"),
+        (
+            ("serve", "my_policies:Reach", "--set", "gian=1"),
+            "it takes .'gain'.; did you mean 'gain'",
+        ),
+        (
+            ("serve", "my_policies:Reech"),
+            "module 'my_policies' has no class 'Reech'; did you mean 'Reach'",
+        ),
         (("serve", "my_polices:Reach"), "did you mean 'my_policies'"),
         (("serve", "scriptd"), "did you mean 'scripted'"),
-        (("serve", "noop", "--set", "chnk=3"), "chnk: there is no such setting; .*did you mean 'chunk'"),
+        (
+            ("serve", "noop", "--set", "chnk=3"),
+            "chnk: there is no such setting; .*did you mean 'chunk'",
+        ),
         (
             ("serve", "noop", "--serve-set", "batch.maxsize=3"),
             "batch.maxsize: there is no such setting.*did you mean 'max_size'",
         ),
         (("serve", "noop", "--serve-set", "wrapers=[arro]"), "did you mean 'wrappers'"),
-        (("eval", "my_envs:MyEnv", *EVAL, "my_policies:Reach", "--set", "gian=1"), "did you mean 'gain'"),
-        (("eval", "my_envs:MyEnv", *EVAL, "my_policies:Reach", "--env-set", "widht=9"), "did you mean 'width'"),
-        (("eval", "tabletop/lft", *EVAL, "scripted"), "tabletop has no task 'lft': want one of .*did you mean 'lift'"),
+        (
+            ("eval", "my_envs:MyEnv", *EVAL, "my_policies:Reach", "--set", "gian=1"),
+            "did you mean 'gain'",
+        ),
+        (
+            ("eval", "my_envs:MyEnv", *EVAL, "my_policies:Reach", "--env-set", "widht=9"),
+            "did you mean 'width'",
+        ),
+        (
+            ("eval", "tabletop/lft", *EVAL, "scripted"),
+            "tabletop has no task 'lft': want one of .*did you mean 'lift'",
+        ),
         (("eval", "libero/libero_spatail/1", *EVAL, "scripted"), "did you mean 'libero_spatial'"),
-        (("eval", "libero/libero_spatial/12", *EVAL, "scripted"), "has no task '12': want 0 to 9, or a name"),
-        (("eval", "tabletop", *EVAL, "scripted", "--worker-gpus", "0.5"), "a worker wants 0.5 GPUs, this"),
+        (
+            ("eval", "libero/libero_spatial/12", *EVAL, "scripted"),
+            "has no task '12': want 0 to 9, or a name",
+        ),
+        (
+            ("eval", "tabletop", *EVAL, "scripted", "--worker-gpus", "0.5"),
+            "a worker wants 0.5 GPUs, this",
+        ),
         (
             ("eval", "tabletop", *EVAL, "scripted", "--video", "alll"),
             "video: got 'alll', want 'none', 'failures' or 'all'; did you mean 'all'",
@@ -126,18 +153,36 @@ EVAL = ("--out", "runs/x", "--policy")
             ("serve", "runs/act/last"),
             "want a policy or a deployment file; .*lerobot.yaml --set checkpoint=runs/act/last",
         ),
-        (("eval", "tabletop", *EVAL, "./typ.yaml"), "/typ.yaml does not exist; did you mean 'typo.yaml'"),
+        (
+            ("eval", "tabletop", *EVAL, "./typ.yaml"),
+            "/typ.yaml does not exist; did you mean 'typo.yaml'",
+        ),
         (
             ("eval", "tabletop", *EVAL, "deployments/act.yaml"),
             "deployments/act.yaml does not exist; a checkout has deployments/",
         ),
-        (("eval", "tabletop", "--policy", "scripted"), "error got no --out, want --out; or a file of runs"),
-        (("eval", "tabletop", "--out", "runs/x"), "error got no --policy, want --policy; or a file of runs"),
+        (
+            ("eval", "tabletop", "--policy", "scripted"),
+            "error got no --out, want --out; or a file of runs",
+        ),
+        (
+            ("eval", "tabletop", "--out", "runs/x"),
+            "error got no --policy, want --policy; or a file of runs",
+        ),
         (("eval", "absent.yaml"), "'absent.yaml' does not exist"),
-        (("eval", "typo.yaml"), "worker: got 2, want a mapping with some of .'cpus', .*did you mean 'workers'"),
+        (
+            ("eval", "typo.yaml"),
+            "worker: got 2, want a mapping with some of .'cpus', .*did you mean 'workers'",
+        ),
         (("eval", "low.yaml"), "workers: got -1, want greater than or equal to 0"),
-        (("eval", "listed.yaml"), "suites.0.episods: there is no such setting; .*did you mean 'episodes'"),
-        (("serve", "my_policies:Loaded"), "policy Loaded: checkpoint: is missing; give --set checkpoint=…"),
+        (
+            ("eval", "listed.yaml"),
+            "suites.0.episods: there is no such setting; .*did you mean 'episodes'",
+        ),
+        (
+            ("serve", "my_policies:Loaded"),
+            "policy Loaded: checkpoint: is missing; give --set checkpoint=…",
+        ),
         (("serve", "my_policies:Reach", "--set", "gain"), "got 'gain', want KEY=VALUE"),
     ],
 )
@@ -160,19 +205,34 @@ def test_what_is_wrong_is_said_at_once_in_one_line_and_with_what_was_meant(
     [
         ("serve", "lerobot", "--set", "checkpoint=weights"),
         ("eval", "tabletop", *EVAL, "lerobot", "--set", "checkpoint=weights"),
-        ("eval", "tabletop", *EVAL, "lerobot", "--set", "checkpoint=weights/{step}", "--watch", "weights"),
+        (
+            "eval",
+            "tabletop",
+            *EVAL,
+            "lerobot",
+            "--set",
+            "checkpoint=weights/{step}",
+            "--watch",
+            "weights",
+        ),
     ],
 )
 def test_a_family_whose_packages_are_missing_is_said_before_anything_starts_or_is_waited_for(
     folder: Path, monkeypatch: pytest.MonkeyPatch, words: tuple[str, ...]
 ) -> None:
     monkeypatch.chdir(folder)
-    monkeypatch.setitem(POLICIES, "lerobot", replace(entries("policies")["lerobot"], needs=("no_such_package",)))
+    monkeypatch.setitem(
+        POLICIES, "lerobot", replace(entries("policies")["lerobot"], needs=("no_such_package",))
+    )
     monkeypatch.setattr(
-        "vlagents_ray.serve.launch.server.running_server", lambda *_, **__: pytest.fail("a server was started")
+        "vlagents_ray.serve.launch.server.running_server",
+        lambda *_, **__: pytest.fail("a server was started"),
     )
     done = CliRunner().invoke(app, words)
-    assert "policy 'lerobot': not in this environment (no_such_package): `vlagents-ray env make " in done.stderr
+    assert (
+        "policy 'lerobot': not in this environment (no_such_package): `vlagents-ray env make "
+        in done.stderr
+    )
     assert done.exit_code == 1
     assert not (folder / "runs").exists()
 
@@ -182,14 +242,24 @@ def test_a_module_that_is_nowhere_is_looked_for_in_the_working_directory_which_i
 ) -> None:
     monkeypatch.chdir(folder)
     said = said_by("serve", "elsewhere:Policy")
-    assert f"no module 'elsewhere' is installed, or lies in the working directory {folder}; go to its folder" in said
+    assert (
+        f"no module 'elsewhere' is installed, or lies in the working directory {folder}; go to "
+        "its "
+        "folder"
+    ) in said
 
 
-def test_modules_are_found_in_the_folder_where_a_command_is_typed_unless_python_is_kept_from_it(folder: Path) -> None:
+def test_modules_are_found_in_the_folder_where_a_command_is_typed_unless_python_is_kept_from_it(
+    folder: Path,
+) -> None:
     words = ("my_policies:Reech", "--env", "tabletop")
-    assert "module 'my_policies' has no class 'Reech'" in said_by_a_process(folder, "serve", words[0])
+    assert "module 'my_policies' has no class 'Reech'" in said_by_a_process(
+        folder, "serve", words[0]
+    )
     if sys.version_info >= (3, 11):  # Python 3.10 does not know PYTHONSAFEPATH
-        assert "no module 'my_policies'" in said_by_a_process(folder, "robot", *words, PYTHONSAFEPATH="1")
+        assert "no module 'my_policies'" in said_by_a_process(
+            folder, "robot", *words, PYTHONSAFEPATH="1"
+        )
 
 
 def test_a_url_where_nothing_answers_is_told_once_and_waited_for(

@@ -1,4 +1,6 @@
-"""A server with two replicas starts and stops without a word of an error, and prints where its metrics are."""
+"""A server with two replicas starts and stops without a word of an error, and prints where its
+metrics are.
+"""
 
 from __future__ import annotations
 
@@ -19,8 +21,8 @@ from vlagents_ray.serve.launch.deployment_file import IMPORT_PATH
 
 pytestmark = [pytest.mark.server, pytest.mark.slow]
 SERIES = "ray_vlagents_sessions"
-# Ray warns, truly, if a replica of a busy machine does not return the length of its queue within 0.1 s. Servers keep
-# that limit, within which a router leaves a replica that hangs.
+# Ray warns, truly, if a replica of a busy machine does not return the length of its queue within
+# 0.1 s. Servers keep that limit, within which a router leaves a replica that hangs.
 QUEUE_LENGTH_S = {"RAY_SERVE_QUEUE_LENGTH_RESPONSE_DEADLINE_S": "60"}
 
 
@@ -28,7 +30,15 @@ def test_two_replicas_start_and_stop_in_silence(tmp_path: Path) -> None:
     application = {"import_path": IMPORT_PATH, "args": {"policy": "noop", "replicas": 2}}
     (tmp_path / "two.yaml").write_text(yaml.safe_dump({"applications": [application]}))
     port = free_address().rpartition(":")[2]
-    command = [sys.executable, "-c", "from vlagents_ray.cli import main; main()", "serve", "two.yaml", "--port", port]
+    command = [
+        sys.executable,
+        "-c",
+        "from vlagents_ray.cli import main; main()",
+        "serve",
+        "two.yaml",
+        "--port",
+        port,
+    ]
     log = tmp_path / "log"
     with log.open("w") as output:
         server = subprocess.Popen(
@@ -49,7 +59,9 @@ def test_two_replicas_start_and_stop_in_silence(tmp_path: Path) -> None:
         server.wait(START_S)
     printed = log.read_text()
     assert server.returncode == 0, printed
-    expected = r"serving|  policy|  API|  live page|metrics|in a Ray program|log of Ray|Ctrl-C stops"
+    expected = (
+        r"serving|  policy|  API|  live page|metrics|in a Ray program|log of Ray|Ctrl-C stops"
+    )
     assert [line for line in printed.splitlines() if not re.match(expected, line)] == []
 
 

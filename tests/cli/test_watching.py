@@ -44,7 +44,9 @@ def test_what_cannot_be_watched_is_refused_at_once(
     (tmp_path / "runs").mkdir()
     if file is not None:
         (tmp_path / file).touch()
-    config = EvalConfig.model_validate({"policies": policies, "suites": [{"envs": ["tabletop"]}], "out": tmp_path})
+    config = EvalConfig.model_validate(
+        {"policies": policies, "suites": [{"envs": ["tabletop"]}], "out": tmp_path}
+    )
     with pytest.raises(ConfigError, match=text):
         watch_training(config, tmp_path / "runs")
 
@@ -52,7 +54,9 @@ def test_what_cannot_be_watched_is_refused_at_once(
 def test_an_episode_lost_in_any_round_ends_watching_with_status_1_and_no_round_early(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    config = EvalConfig.model_validate({"policies": [SWEPT], "suites": [{"envs": [LINE]}], "out": tmp_path / "o"})
+    config = EvalConfig.model_validate(
+        {"policies": [SWEPT], "suites": [{"envs": [LINE]}], "out": tmp_path / "o"}
+    )
     played: list[list[int]] = []
 
     def play(config: EvalConfig, _progress: Progress, **_: Any) -> Summary:
@@ -60,7 +64,9 @@ def test_an_episode_lost_in_any_round_ends_watching_with_status_1_and_no_round_e
         with Store(config) as store:
             store.begin_run(config, {})
             for job in plan(store.cells):
-                status: Status = "infra_failed" if job.cell.step == 10 and job.key.episode == 3 else "done"
+                status: Status = (
+                    "infra_failed" if job.cell.step == 10 and job.key.episode == 3 else "done"
+                )
                 store.record(EpisodeResult(job.key, status, status == "done"), 1)
             store.end_run("complete")
         return summarize(Results.load(config.out))
@@ -75,24 +81,34 @@ def test_an_episode_lost_in_any_round_ends_watching_with_status_1_and_no_round_e
 
 
 FAMILIES = sorted(
-    name for name in names("policies") if issubclass(getattr(policy_class(name), "Config", None) or object, ModelConfig)
+    name
+    for name in names("policies")
+    if issubclass(getattr(policy_class(name), "Config", None) or object, ModelConfig)
 )
 
 
 def needed(family: str) -> dict[str, Any]:
-    """Return a value for each setting without a default, beside the checkpoint: all of these are texts."""
+    """Return a value for each setting without a default, beside the checkpoint: all of these are
+    texts.
+    """
     fields = policy_class(family).Config.model_fields.items()
     return {name: "any" for name, field in fields if field.is_required() and name != "checkpoint"}
 
 
 def swept(family: str, tmp_path: Path, place: str, **settings: Any) -> EvalConfig:
-    """A sweep over one policy, whose settings are in the evaluation's file or in the deployment file."""
+    """A sweep over one policy, whose settings are in the evaluation's file or in the deployment
+    file.
+    """
     own = {"checkpoint": "/runs/{step}/pretrained_model", **needed(family), **settings}
     policy: dict[str, Any] = {"name": "swept", "source": family, "config": own}
     if place == "deployment":
         file = tmp_path / "policy.yaml"
         args = {"policy": family, "config": own}
-        file.write_text(yaml.safe_dump({"applications": [{"name": "a", "import_path": IMPORT_PATH, "args": args}]}))
+        file.write_text(
+            yaml.safe_dump(
+                {"applications": [{"name": "a", "import_path": IMPORT_PATH, "args": args}]}
+            )
+        )
         policy = {"name": "swept", "source": str(file)}
     return EvalConfig.model_validate(
         {"policies": [policy], "suites": [{"envs": ["tabletop"]}], "out": tmp_path / "out"}
@@ -111,7 +127,9 @@ def test_a_step_is_not_missed_before_the_first_checkpoint_is_there_and_its_first
 
 
 @pytest.mark.parametrize("place", ["evaluation", "deployment"])
-def test_of_the_settings_only_a_step_that_is_swept_may_be_missing(place: str, tmp_path: Path) -> None:
+def test_of_the_settings_only_a_step_that_is_swept_may_be_missing(
+    place: str, tmp_path: Path
+) -> None:
     with pytest.raises(ConfigError, match="chekpoint_dir"):
         _watched(swept("pi0", tmp_path, place, chekpoint_dir="/runs"))
     with pytest.raises(ConfigError, match="max_rows"):

@@ -39,7 +39,10 @@ def test_the_url_and_the_option_decide_or_are_refused_at_once(
 
 
 def test_what_is_wrong_without_a_server_needs_none() -> None:
-    with pytest.raises(InvalidInput, match=r"got 'webp', want one of \['auto', 'exact', 'raw', 'lossless', 'jpeg'\]"):
+    with pytest.raises(
+        InvalidInput,
+        match=r"got 'webp', want one of \['auto', 'exact', 'raw', 'lossless', 'jpeg'\]",
+    ):
         RemoteAgent("http://gpu-box:8000", codec="webp")
     with pytest.raises(NotReset):
         RemoteAgent("http://127.0.0.1:9").act(Obs())
@@ -70,7 +73,9 @@ def test_a_key_that_goes_unencrypted_over_a_network_is_warned_of_once(
     warn_of_plain_http.cache_clear()
     for _ in range(3):
         RemoteAgent(url, api_key=key)
-    lines = [record.getMessage() for record in caplog.records if "unencrypted" in record.getMessage()]
+    lines = [
+        record.getMessage() for record in caplog.records if "unencrypted" in record.getMessage()
+    ]
     assert len(lines) == warned
     assert "vlr_k" not in caplog.text
 

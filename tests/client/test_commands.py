@@ -12,7 +12,9 @@ from vlagents_ray.interface import Act, Obs
 
 
 def told(do: str, **more: str) -> Act:
-    return Act(np.zeros(2, np.float32), info={COMMAND: {"id": f"id of {do}", "do": do, **more}, "other": 1})
+    return Act(
+        np.zeros(2, np.float32), info={COMMAND: {"id": f"id of {do}", "do": do, **more}, "other": 1}
+    )
 
 
 def test_commands_are_obeyed_and_answered_once_an_answer_has_come() -> None:
@@ -22,12 +24,16 @@ def test_commands_are_obeyed_and_answered_once_an_answer_has_come() -> None:
         inbox.came(act)
         assert act.info == {"other": 1}
     assert [command.do for command in inbox.obey(control)] == ["pause", "stop", "success"]
-    assert (control.stops, control.reason) == (["the live page by lab"], "paused from the live page")
+    assert (control.stops, control.reason) == (
+        ["the live page by lab"],
+        "paused from the live page",
+    )
     assert control.over
     answers = {f"id of {do}": "" for do in ("pause", "stop", "success")}
     assert inbox.asking(Obs(info={"a": 1})).info == {"a": 1, COMMANDED: answers}
     inbox.came(PolicyFailed("lost"))
-    assert inbox.asking(Obs()).info == {COMMANDED: answers}  # again, as the first may not have arrived
+    # again, as the first may not have arrived.
+    assert inbox.asking(Obs()).info == {COMMANDED: answers}
     inbox.came(Act(np.zeros(2, np.float32)))
     assert inbox.asking(Obs()).info == {}
 
@@ -59,7 +65,9 @@ def test_what_is_not_allowed_is_refused_and_what_has_another_form_left_out() -> 
         assert inbox.asking(Obs()).info == {}
 
 
-def test_the_name_of_a_key_forges_no_line_of_the_robots_log(caplog: pytest.LogCaptureFixture) -> None:
+def test_the_name_of_a_key_forges_no_line_of_the_robots_log(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
     inbox = CommandInbox()
     inbox.came(told("stop", by="lab\n2026-11-28 INFO robot: restarted by \x1b[2Janna"))
     inbox.obey(Control())

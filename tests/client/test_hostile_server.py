@@ -1,4 +1,6 @@
-"""Servers that send values of wrong types, or answer byte by byte: a client raises the package's errors, in time."""
+"""Servers that send values of wrong types, or answer byte by byte: a client raises the package's
+errors, in time.
+"""
 
 from __future__ import annotations
 
@@ -37,10 +39,29 @@ ADDRESSES = {
 }
 # A value of each type of JSON, references to blobs, and numbers beyond what the types of C hold.
 VALUES: list[Any] = [
-    None, True, 0, -1, 1.5, 1e308, 10**30, "", "x", "\r\nx: y", [], [1], {}, {"a": 1}, [[[[[[[[[[1]]]]]]]]]],
-    {"$": ["nd", 0, "<f4", [7]]}, {"$": ["nd", 0, "|O", [1]]}, {"$": ["nd", 0, "<U1", [7]]}, {"$": ["bin", 0]},
-    {"$": ["img", 0]}, {"$": ["float", "nan"]}, {"$": []},
-]  # fmt: skip
+    None,
+    True,
+    0,
+    -1,
+    1.5,
+    1e308,
+    10**30,
+    "",
+    "x",
+    "\r\nx: y",
+    [],
+    [1],
+    {},
+    {"a": 1},
+    [[[[[[[[[[1]]]]]]]]]],
+    {"$": ["nd", 0, "<f4", [7]]},
+    {"$": ["nd", 0, "|O", [1]]},
+    {"$": ["nd", 0, "<U1", [7]]},
+    {"$": ["bin", 0]},
+    {"$": ["img", 0]},
+    {"$": ["float", "nan"]},
+    {"$": []},
+]
 TIME_LIMIT_S = 1.0
 DRIP_S = 0.2  # between two bytes
 
@@ -48,7 +69,13 @@ DRIP_S = 0.2  # between two bytes
 def places(node: Any, at: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
     """Yield the path of each node of a JSON document."""
     yield at
-    children = node.items() if isinstance(node, dict) else enumerate(node) if isinstance(node, list) else ()
+    children = (
+        node.items()
+        if isinstance(node, dict)
+        else enumerate(node)
+        if isinstance(node, list)
+        else ()
+    )
     for name, child in children:
         yield from places(child, (*at, name))
 
@@ -69,7 +96,14 @@ def frame(header: dict[str, Any], blobs: list[Any]) -> bytes:
 
 
 GOOD_REPLY = encode_replies(
-    [Reply("r", act=Act(np.zeros(7, np.float32), False, {"a": 1, "b": np.zeros(3)}), step=3, timing={"total_ms": 1.0})]
+    [
+        Reply(
+            "r",
+            act=Act(np.zeros(7, np.float32), False, {"a": 1, "b": np.zeros(3)}),
+            step=3,
+            timing={"total_ms": 1.0},
+        )
+    ]
 )
 ERROR_REPLY = encode_replies([Reply("r", error=VLAgentsError("x"))])
 
@@ -87,7 +121,9 @@ def test_a_reply_with_a_value_of_any_type_at_any_place_is_read_or_malformed(repl
             tried += 1
             with contextlib.suppress(VLAgentsError):
                 [read] = decode_replies(frame(changed, [bytes(blob) for blob in blobs]))
-                assert read.act is None or (type(read.act.action) is np.ndarray and type(read.act.info) is dict)
+                assert read.act is None or (
+                    type(read.act.action) is np.ndarray and type(read.act.info) is dict
+                )
                 assert read.info is None or type(read.info) is dict
                 assert all(type(number) in (int, float) for number in read.timing.values())
     assert tried > 50
@@ -125,7 +161,11 @@ def read_request(connection: socket.socket) -> str:
     while b"\r\n\r\n" not in data:
         data += received(connection)
     head, _, body = data.partition(b"\r\n\r\n")
-    lengths = [line.split(b":")[1] for line in head.split(b"\r\n") if line.lower().startswith(b"content-length:")]
+    lengths = [
+        line.split(b":")[1]
+        for line in head.split(b"\r\n")
+        if line.lower().startswith(b"content-length:")
+    ]
     while lengths and len(body) < int(lengths[0]):
         body += received(connection)
     return head.split()[1].decode()
@@ -150,19 +190,25 @@ def http_policy(metadata: Any, act: bytes, status: str = "200 OK") -> Iterator[s
     answers = {
         "/v1/metadata": response(document, "application/json"),
         "/v1/reset": response(frame({"request_id": "r", "info": {}}, []), CONTENT_TYPE),
-        "/v1/act": response(act, CONTENT_TYPE if status == "200 OK" else "application/problem+json", status),
+        "/v1/act": response(
+            act, CONTENT_TYPE if status == "200 OK" else "application/problem+json", status
+        ),
     }
 
     def answer(connection: socket.socket) -> None:
         while True:
-            connection.sendall(answers.get(read_request(connection), response(b"", "text/plain", "403 Forbidden")))
+            connection.sendall(
+                answers.get(read_request(connection), response(b"", "text/plain", "403 Forbidden"))
+            )
 
     with tcp_server(answer) as port:
         yield f"http://127.0.0.1:{port}"
 
 
 def act_once(url: str, transport: str = "http") -> Act:
-    with RemoteAgent(url, transport=transport, timeout_s=TIME_LIMIT_S, connect_timeout_s=TIME_LIMIT_S) as agent:
+    with RemoteAgent(
+        url, transport=transport, timeout_s=TIME_LIMIT_S, connect_timeout_s=TIME_LIMIT_S
+    ) as agent:
         agent.reset(Obs(), "x")
         return agent.act(Obs())
 
@@ -184,8 +230,12 @@ def test_metadata_with_a_value_of_any_type_is_read_or_an_error_of_the_package(en
 
 
 @pytest.mark.parametrize("error", [VLAgentsError, *sorted(BY_CODE.values(), key=repr)])
-def test_text_of_a_server_neither_commands_a_terminal_nor_forges_a_line(error: type[VLAgentsError]) -> None:
-    detail = "\x1b[2J\x1b]52;c;ZXZpbA==\x07 \x9b31m \u202e\r\n2026-11-28 INFO robot: restarted by anna"
+def test_text_of_a_server_neither_commands_a_terminal_nor_forges_a_line(
+    error: type[VLAgentsError],
+) -> None:
+    detail = (
+        "\x1b[2J\x1b]52;c;ZXZpbA==\x07 \x9b31m \u202e\r\n2026-11-28 INFO robot: restarted by anna"
+    )
     problem = {"code": error.code, "detail": detail}
     with http_policy(METADATA, json.dumps(problem).encode(), "403 Forbidden") as url:
         with pytest.raises(VLAgentsError) as raised:
@@ -248,7 +298,9 @@ STATES = ["status line", "headers", "body", "chunks", "informational"]
 
 @pytest.mark.parametrize("state", STATES)
 @pytest.mark.parametrize("client", ["remote agent", "upstream"])
-def test_a_server_that_answers_byte_by_byte_keeps_no_client_beyond_its_time(client: str, state: str) -> None:
+def test_a_server_that_answers_byte_by_byte_keeps_no_client_beyond_its_time(
+    client: str, state: str
+) -> None:
     metadata = response(json.dumps(METADATA).encode(), "application/json")
     with tcp_server(drip_at(state, metadata)) as port:
         url = f"http://127.0.0.1:{port}"
@@ -260,7 +312,9 @@ def test_a_server_that_answers_byte_by_byte_keeps_no_client_beyond_its_time(clie
 
 
 @pytest.mark.parametrize("transport", ["websocket", "auto"])
-def test_a_websocket_whose_handshake_arrives_byte_by_byte_keeps_no_client_beyond_its_time(transport: str) -> None:
+def test_a_websocket_whose_handshake_arrives_byte_by_byte_keeps_no_client_beyond_its_time(
+    transport: str,
+) -> None:
     metadata = response(json.dumps(METADATA).encode(), "application/json")
 
     def answer(connection: socket.socket) -> None:

@@ -1,4 +1,6 @@
-"""A session over the loss of its replica, and many sessions over one connection; no Ray, no sockets."""
+"""A session over the loss of its replica, and many sessions over one connection; no Ray, no
+sockets.
+"""
 
 from __future__ import annotations
 
@@ -86,7 +88,9 @@ Begun = Callable[..., tuple[Replicas, RemoteAgent]]
 
 @pytest.fixture
 def begun(replicas: Callable[[int], Replicas]) -> Iterator[Begun]:
-    """Some replicas and a session that begins at the first of them, with frame 1 and the instruction "stack"."""
+    """Some replicas and a session that begins at the first of them, with frame 1 and the
+    instruction "stack".
+    """
     with contextlib.ExitStack() as made:
 
         def begin(n: int, seed: int | None = None, **options: Any) -> tuple[Replicas, RemoteAgent]:
@@ -132,7 +136,11 @@ def test_a_session_stays_where_it_is_until_another_replica_has_answered(
             assert back.wait(20)
         if back.is_set():
             return connect(self, timeout_s)
-        raise PolicyUnavailable("refused") if look_up == "is refused" else UnknownApp("no application")
+        raise (
+            PolicyUnavailable("refused")
+            if look_up == "is refused"
+            else UnknownApp("no application")
+        )
 
     monkeypatch.setattr(InProcess, "connect", fail)
     monkeypatch.setattr(connection, "_LOOK_UP_PAUSE_S", 0.0)
@@ -145,7 +153,8 @@ def test_a_session_stays_where_it_is_until_another_replica_has_answered(
     assert agent.reconnects == 0
     back.set()
     drawn += act_until_moved(agent, served)
-    assert drawn == np.random.default_rng(3).random(len(drawn)).tolist()  # not one act was lost or repeated
+    # Not one act was lost or repeated.
+    assert drawn == np.random.default_rng(3).random(len(drawn)).tolist()
 
 
 @pytest.mark.parametrize("status", ["ended", "broken"])
@@ -178,7 +187,9 @@ def test_a_look_up_for_a_session_that_no_longer_needs_it_leaves_no_connection(
     assert closed.wait(20)
 
 
-def test_a_session_of_a_dead_replica_begins_again_and_sees_its_history(replicas: Callable[[int], Replicas]) -> None:
+def test_a_session_of_a_dead_replica_begins_again_and_sees_its_history(
+    replicas: Callable[[int], Replicas],
+) -> None:
     served = replicas(2)
     agent = served.agent()
     frame = obs(1)
@@ -220,7 +231,9 @@ def test_the_first_action_since_says_that_the_session_began_again_though_its_own
 def test_a_session_that_did_not_begin_again_in_time_says_so_with_the_next_act(
     executed: bool, begun: Begun, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Beside load the reset's deadline passes, and the next act comes while the reset is in the queue, or after it."""
+    """Beside load the reset's deadline passes, and the next act comes while the reset is in the
+    queue, or after it.
+    """
     served, agent = begun(2)
     served.dead.add(0)
     call, late = InProcess.call, [True]
@@ -245,7 +258,9 @@ def test_a_session_that_did_not_begin_again_in_time_says_so_with_the_next_act(
 def test_an_act_without_time_to_begin_again_exceeds_its_deadline_and_asks_for_no_reset(
     begun: Begun, monkeypatch: pytest.MonkeyPatch, clock: SimulatedTime
 ) -> None:
-    """Another replica has looked for the session until the deadline, and says then that it is unknown."""
+    """Another replica has looked for the session until the deadline, and says then that it is
+    unknown.
+    """
     served, agent = begun(2)
     served.dead.add(0)
     call, late = InProcess.call, [True]
@@ -382,9 +397,14 @@ def test_an_observation_may_allow_less_time(begun: Begun) -> None:
 
 @pytest.mark.parametrize(("timeout_s", "way_s"), [(0.1, 0.01), (2.0, 0.2), (30.0, 0.2)])
 def test_the_server_gives_a_call_up_before_its_caller_does(
-    timeout_s: float, way_s: float, replicas: Callable[[int], Replicas], monkeypatch: pytest.MonkeyPatch
+    timeout_s: float,
+    way_s: float,
+    replicas: Callable[[int], Replicas],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """By a handle, and over HTTP, nobody knows how long a request was under way: it was acted on after its deadline."""
+    """By a handle, and over HTTP, nobody knows how long a request was under way: it was acted on
+    after its deadline.
+    """
     agent = replicas(1).agent()
     agent.reset(obs(1), "stack")
     call, told = InProcess.call, []
@@ -421,7 +441,9 @@ def test_a_vector_of_sessions_travels_in_one_frame(replicas: Callable[[int], Rep
     assert len(served.engines[1].sessions) == 0
 
 
-def test_one_session_that_fails_leaves_its_neighbours_alone(replicas: Callable[[int], Replicas]) -> None:
+def test_one_session_that_fails_leaves_its_neighbours_alone(
+    replicas: Callable[[int], Replicas],
+) -> None:
     served = replicas(1)
     agent = served.agent()
     envs = agent.sessions(3)
@@ -505,7 +527,9 @@ def test_a_call_that_connects_again_too_late_sends_nothing_and_the_next_one_has_
 def test_a_server_that_has_just_answered_is_not_left_for_the_silence_before_that(
     waits: bool, begun: Begun, monkeypatch: pytest.MonkeyPatch, clock: SimulatedTime
 ) -> None:
-    """It was: the first late answer on a new connection, which is slow to begin with, threw that away, too."""
+    """It was: the first late answer on a new connection, which is slow to begin with, threw that
+    away, too.
+    """
     _, agent = begun(1, timeout_s=2.0)
     late, lost = DeadlineExceeded("no answer"), ConnectionLost("gone")
     errors: list[Exception] = [late, late, lost, late] if waits else [late, lost, late]

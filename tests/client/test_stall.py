@@ -1,4 +1,6 @@
-"""A policy that stalls, and where the robot goes on afterwards. Time is counted in ticks; no clock is read."""
+"""A policy that stalls, and where the robot goes on afterwards. Time is counted in ticks; no
+clock is read.
+"""
 
 from __future__ import annotations
 
@@ -12,7 +14,16 @@ import pytest
 from eval_fakes import wait_for
 from in_process_replicas import Replicas
 
-from vlagents_ray import Act, ActionSpec, Agent, ChunkPlayer, Contract, Obs, PlayerSettings, StateSpec
+from vlagents_ray import (
+    Act,
+    ActionSpec,
+    Agent,
+    ChunkPlayer,
+    Contract,
+    Obs,
+    PlayerSettings,
+    StateSpec,
+)
 from vlagents_ray.evaluate.episode.latency import ChunkExecutor
 from vlagents_ray.evaluate.plan.config import ClockConfig
 from vlagents_ray.robot import Guard
@@ -25,18 +36,26 @@ GOAL, GAIN = 3.0, 0.004  # the way to the goal that is made in a tick
 
 
 class Approaching(Agent):
-    """Plans the way to the goal from where it sees the robot: each row a little shorter than the one before."""
+    """Plans the way to the goal from where it sees the robot: each row a little shorter than the
+    one before.
+    """
 
     def __init__(self, delta: bool) -> None:
         self.delta = delta
 
     @property
     def contract(self) -> Contract:
-        return Contract(state={"joints": StateSpec(1)}, action=ActionSpec(dim=1, delta=self.delta), chunk=ROWS)
+        return Contract(
+            state={"joints": StateSpec(1)}, action=ActionSpec(dim=1, delta=self.delta), chunk=ROWS
+        )
 
     def act(self, obs: Obs) -> Act:
         left = (GOAL - float(obs.state["joints"][0])) * (1 - GAIN) ** np.arange(ROWS + 1)
-        return Act((left[:-1] - left[1:] if self.delta else GOAL - left[1:]).astype(np.float32)[:, np.newaxis])
+        return Act(
+            (left[:-1] - left[1:] if self.delta else GOAL - left[1:]).astype(np.float32)[
+                :, np.newaxis
+            ]
+        )
 
 
 class Delayed(Agent):
@@ -72,9 +91,15 @@ class Run(NamedTuple):
 
 
 def drive(
-    agent: Agent, delta: bool, stall: int, check: Guard | None, stalled: Callable[[], None] = lambda: None
+    agent: Agent,
+    delta: bool,
+    stall: int,
+    check: Guard | None,
+    stalled: Callable[[], None] = lambda: None,
 ) -> Run:
-    """The robot goes exactly where it is commanded. The sixth answer takes `stall` ticks, all others `ANSWER`."""
+    """The robot goes exactly where it is commanded. The sixth answer takes `stall` ticks, all
+    others `ANSWER`.
+    """
     delayed = Delayed(agent)
     at: list[float] = []
     moved: list[float] = []
@@ -127,7 +152,8 @@ def check_recovery(run: Run, stall: int) -> None:
     wanted = GAIN * (GOAL - run.at)  # of the policy, where the robot is
     still = np.abs(run.moved) < 1e-5
     assert still.sum() >= stall - ROWS  # it did stall
-    # Not a tick's action is for another place than that at which the robot was: neither a jump, nor a part left out.
+    # Not a tick's action is for another place than that at which the robot was: neither a jump, nor
+    # a part left out.
     assert run.moved[~still] == pytest.approx(wanted[~still], rel=1e-2)
     normal = np.abs(run.moved[: run.fresh - stall]).max()
     assert np.abs(run.moved[run.fresh :]).max() <= 1.5 * normal
@@ -151,7 +177,9 @@ def test_after_a_stall_the_robot_goes_on_from_where_it_is(
         check_recovery(drive(agent, delta, stall, guard), stall)
         return
     with contextlib.closing(Replicas([agent, Approaching(delta)])) as served:
-        check_recovery(drive(served.agent(), delta, stall, guard, lambda: served.dead.add(0)), stall)
+        check_recovery(
+            drive(served.agent(), delta, stall, guard, lambda: served.dead.add(0)), stall
+        )
 
 
 @pytest.mark.parametrize("delta", [False, True])

@@ -67,9 +67,21 @@ def ports(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, int]]:
 @pytest.mark.parametrize(
     ("url", "kind", "said"),
     [
-        ("http://127.0.0.1:{TLS}", ConfigError, "this port speaks TLS; write https://127.0.0.1:{TLS}"),
-        ("http://127.0.0.1:{MUTUAL}", ConfigError, "this port speaks TLS; write https://127.0.0.1:{MUTUAL}"),
-        ("https://127.0.0.1:{PLAIN}", ConfigError, "if the server has none, write http://127.0.0.1:{PLAIN}"),
+        (
+            "http://127.0.0.1:{TLS}",
+            ConfigError,
+            "this port speaks TLS; write https://127.0.0.1:{TLS}",
+        ),
+        (
+            "http://127.0.0.1:{MUTUAL}",
+            ConfigError,
+            "this port speaks TLS; write https://127.0.0.1:{MUTUAL}",
+        ),
+        (
+            "https://127.0.0.1:{PLAIN}",
+            ConfigError,
+            "if the server has none, write http://127.0.0.1:{PLAIN}",
+        ),
         ("http://127.0.0.1:{CLOSED}", PolicyUnavailable, "is it running?"),
         ("https://127.0.0.1:{CLOSED}", PolicyUnavailable, "is it running?"),
         ("http://nowhere.invalid:80", PolicyUnavailable, "nowhere.invalid:80: "),
@@ -87,7 +99,9 @@ def test_a_wrong_address_is_named_within_the_time_of_a_call(
 
 
 @pytest.mark.parametrize("host", ["127.0.0.2", "localhost"])
-def test_a_name_that_the_certificate_does_not_have_is_named_with_the_cure(tmp_path: Path, host: str) -> None:
+def test_a_name_that_the_certificate_does_not_have_is_named_with_the_cure(
+    tmp_path: Path, host: str
+) -> None:
     ours = authority(tmp_path, "ours")
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
     context.load_cert_chain(*ours.sign("server"))
@@ -103,5 +117,8 @@ def test_weights_for_a_port_that_speaks_tls_are_told_the_url(ports: dict[str, in
 
 
 def test_weights_for_an_application_that_does_not_exist_name_the_path() -> None:
-    with http_server(handler=WithoutPaths) as port, pytest.raises(UnknownApp, match="no application at this path"):
+    with (
+        http_server(handler=WithoutPaths) as port,
+        pytest.raises(UnknownApp, match="no application at this path"),
+    ):
         Publisher(f"http://127.0.0.1:{port}/raech").push({"w": np.zeros(1, np.float32)})

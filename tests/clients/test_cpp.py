@@ -1,4 +1,6 @@
-"""The C++ client (clients/cpp) against a real server, the golden files, and servers that misbehave."""
+"""The C++ client (clients/cpp) against a real server, the golden files, and servers that
+misbehave.
+"""
 
 from __future__ import annotations
 
@@ -37,7 +39,14 @@ from vlagents_ray import Act, ActionSpec, Agent, Contract, Obs
 from vlagents_ray.errors import Overloaded
 from vlagents_ray.images.jpeg_png import encode_jpeg
 from vlagents_ray.protocol.frames import decode_requests, encode_replies
-from vlagents_ray.protocol.messages import DEFAULT_LIMITS, PROTOCOL_VERSION, Budget, Limits, Reply, Request
+from vlagents_ray.protocol.messages import (
+    DEFAULT_LIMITS,
+    PROTOCOL_VERSION,
+    Budget,
+    Limits,
+    Reply,
+    Request,
+)
 from vlagents_ray.serve import periodic
 from vlagents_ray.serve.access import api_keys
 from vlagents_ray.serve.access.api_keys import NoKey
@@ -84,17 +93,22 @@ class Visit:
 
 def answer(request: Request, **more: Any) -> bytes:
     """A reply: to an act the action [7], if `more` says nothing else."""
-    what: dict[str, Any] = {"act": Act(np.array([7.0], np.float32))} if request.op == "act" else {"info": {}}
+    what: dict[str, Any] = (
+        {"act": Act(np.array([7.0], np.float32))} if request.op == "act" else {"info": {}}
+    )
     return encode_replies([Reply(request_id=request.request_id, **what | more)])
 
 
 @dataclass
 class ScriptedServer:
     port: int = 0
-    metadata: dict[str, Any] = field(default_factory=lambda: {"protocol": PROTOCOL_VERSION, "policy": "scripted"})
+    metadata: dict[str, Any] = field(
+        default_factory=lambda: {"protocol": PROTOCOL_VERSION, "policy": "scripted"}
+    )
     refuse: Response | None = None  # what each request gets
     visits: list[Visit] = field(default_factory=list)
-    keys: list[str | None] = field(default_factory=list)  # the header `authorization` of each request
+    # The header `authorization` of each request.
+    keys: list[str | None] = field(default_factory=list)
 
     @property
     def url(self) -> str:
@@ -128,7 +142,13 @@ def scripted_server(script: Script) -> Iterator[ScriptedServer]:
             script(visit)
 
     with serve(
-        handle, "127.0.0.1", 0, process_request=process_request, compression=None, max_size=None, close_timeout=1
+        handle,
+        "127.0.0.1",
+        0,
+        process_request=process_request,
+        compression=None,
+        max_size=None,
+        close_timeout=1,
     ) as listening:
         server.port = listening.socket.getsockname()[1]
         thread = threading.Thread(target=listening.serve_forever)
@@ -145,11 +165,15 @@ def scripted_server(script: Script) -> Iterator[ScriptedServer]:
 pytestmark = pytest.mark.compiler
 
 ROWS = 4
-FRAMES = [entry for entry in json.loads((GOLDEN / "index.json").read_text()) if entry["kind"] != "probe"]
+FRAMES = [
+    entry for entry in json.loads((GOLDEN / "index.json").read_text()) if entry["kind"] != "probe"
+]
 
 
 class Watcher(Agent):
-    """Answers with ROWS rows [value, row], and says what it saw; waits for its `gate` if told so."""
+    """Answers with ROWS rows [value, row], and says what it saw; waits for its `gate` if told
+    so.
+    """
 
     contract = Contract(action=ActionSpec(dim=2), chunk=ROWS, history=3)
     shared = ("gate",)
@@ -160,7 +184,11 @@ class Watcher(Agent):
     def reset(self, obs: Obs, instruction: str | None, **kwargs: Any) -> dict[str, Any]:
         self.asked = {"instruction": instruction, **kwargs}
         self.seen = deque([obs.info.get("value")], maxlen=3)
-        return {"first": obs.info.get("value"), "nothing": float("nan"), "some": np.arange(2, dtype=np.uint8)}
+        return {
+            "first": obs.info.get("value"),
+            "nothing": float("nan"),
+            "some": np.arange(2, dtype=np.uint8),
+        }
 
     def observe(self, obs: Obs) -> None:
         self.seen.append(obs.info.get("value"))
@@ -174,11 +202,15 @@ class Watcher(Agent):
         info = {
             "asked": self.asked,
             "seen": list(self.seen),
-            "pixels": {name: image.reshape(-1, 3)[0].tolist() for name, image in obs.cameras.items()},
+            "pixels": {
+                name: image.reshape(-1, 3)[0].tolist() for name, image in obs.cameras.items()
+            },
             "joints": np.asarray(obs.state.get("joints", [])).tolist(),
             "gripper": obs.gripper,
         }
-        return Act(rows[0] if obs.info.get("one") else rows, done=bool(obs.info.get("done")), info=info)
+        return Act(
+            rows[0] if obs.info.get("one") else rows, done=bool(obs.info.get("done")), info=info
+        )
 
 
 @dataclass
@@ -217,7 +249,9 @@ def replica(*, keyed: bool = False) -> Iterator[Replica]:
 
     inside = build_http_app(engine, metadata, Limits())
     with ExitStack() as stack:
-        found.port = stack.enter_context(served(AccessMiddleware(inside, known.keys if keyed else None, "app")))
+        found.port = stack.enter_context(
+            served(AccessMiddleware(inside, known.keys if keyed else None, "app"))
+        )
         stack.callback(own.close)
         stack.callback(engine.close)
         stack.callback(policy.gate.set)
@@ -257,7 +291,8 @@ def test_it_carries_the_reference_of_a_recurrent_policy(programs: Path) -> None:
     with policy_server(Raptor()) as port, CppClient(programs, f"http://127.0.0.1:{port}") as client:
         for sequence in range(2):
             rows = [
-                {name: part.tolist() for name, part in observation(row).state.items()} for row in inputs[:, sequence]
+                {name: part.tolist() for name, part in observation(row).state.items()}
+                for row in inputs[:, sequence]
             ]
             client.reset(state=rows[0])
             actions = [client.act(state=row)["values"] for row in rows]
@@ -285,7 +320,9 @@ def plain(meaning: Any) -> Any:
 
 
 def states(found: Any, meaning: Any) -> bool:
-    """Does a value of a frame say all that a meaning does? It may have further keys, and lack what is a default."""
+    """Does a value of a frame say all that a meaning does? It may have further keys, and lack
+    what is a default.
+    """
     if isinstance(meaning, dict) and isinstance(found, dict):
         return all(states(found.get(key), value) for key, value in meaning.items())
     if isinstance(meaning, list) and isinstance(found, list):
@@ -294,7 +331,9 @@ def states(found: Any, meaning: Any) -> bool:
 
 
 @pytest.mark.parametrize("entry", FRAMES, ids=lambda entry: Path(entry["file"]).stem)
-def test_golden_frames_are_read_with_their_meaning(entry: dict[str, Any], shared_driver: CppClient) -> None:
+def test_golden_frames_are_read_with_their_meaning(
+    entry: dict[str, Any], shared_driver: CppClient
+) -> None:
     data = (GOLDEN / entry["file"]).read_bytes().hex()
     if entry["kind"] == "malformed":
         assert refused(shared_driver, "reply", data=data).code == "malformed"
@@ -321,7 +360,11 @@ def test_golden_frames_are_read_with_their_meaning(entry: dict[str, Any], shared
 def observed(meaning: dict[str, Any]) -> dict[str, Any]:
     """An observation of the golden files as the driver reads one."""
     cameras = {
-        name: {"pixels": bytes(image["values"]).hex(), "height": image["shape"][0], "width": image["shape"][1]}
+        name: {
+            "pixels": bytes(image["values"]).hex(),
+            "height": image["shape"][0],
+            "width": image["shape"][1],
+        }
         for name, image in meaning["cameras"].items()
     }
     gripper = {} if meaning["gripper"] is None else {"gripper": meaning["gripper"]}
@@ -352,7 +395,9 @@ def shared_driver(programs: Path) -> Iterator[CppClient]:
 
 def test_garbage_is_refused_and_never_read_past_its_end(shared_driver: CppClient) -> None:
     random = np.random.default_rng(0)
-    frames = [(GOLDEN / entry["file"]).read_bytes() for entry in FRAMES if entry["kind"] == "replies"]
+    frames = [
+        (GOLDEN / entry["file"]).read_bytes() for entry in FRAMES if entry["kind"] == "replies"
+    ]
     for _ in range(150):
         data = bytearray(frames[random.integers(len(frames))])
         for _ in range(random.integers(1, 4)):
@@ -379,7 +424,9 @@ def test_no_answer_fills_the_memory_of_a_robots_computer(programs: Path) -> None
 @pytest.mark.parametrize("way", ["own port", "server's port", "own port out of reach"])
 def test_an_episode(way: str, server: Replica, programs: Path) -> None:
     if way != "own port":
-        server.stream = None if way == "server's port" else {"port": free_port(), "path": "/v1/stream/none"}
+        server.stream = (
+            None if way == "server's port" else {"port": free_port(), "path": "/v1/stream/none"}
+        )
     with CppClient(programs, server.url, jpeg_quality=0) as client:
         assert client.call("metadata")["policy"] == "watcher"
         assert refused(client).code == "not_reset"
@@ -393,7 +440,11 @@ def test_an_episode(way: str, server: Replica, programs: Path) -> None:
                 gripper=0.5,
                 info={"value": value},
             )
-            assert (act["values"], act["rows"], act["dim"]) == ([value, 0, value, 1, value, 2, value, 3], ROWS, 2)
+            assert (act["values"], act["rows"], act["dim"]) == (
+                [value, 0, value, 1, value, 2, value, 3],
+                ROWS,
+                2,
+            )
             assert act["info"]["pixels"] == {"front": [9] * 3, "wrist": [200] * 3}
             assert (act["info"]["joints"], act["info"]["gripper"]) == (joints, 0.5)
             assert not act["resumed"]
@@ -401,7 +452,12 @@ def test_an_episode(way: str, server: Replica, programs: Path) -> None:
         assert act["info"]["seen"] == [1, 2, 3]
         assert act["timing"]["batch_size"] == 1
         last = client.act(info={"value": 5, "one": True, "done": True})
-        assert (last["chunk"], last["dim"], last["done"], last["values"]) == (False, 2, True, [5, 0])
+        assert (last["chunk"], last["dim"], last["done"], last["values"]) == (
+            False,
+            2,
+            True,
+            [5, 0],
+        )
         assert len(server.engine.sessions) == 1
         client.call("close")
         assert len(server.engine.sessions) == 0
@@ -412,7 +468,9 @@ def test_images_are_jpeg_unless_they_are_files_already(server: Replica, programs
     file = encode_jpeg(np.full((8, 8, 3), 77, np.uint8), quality=95)
     with CppClient(programs, server.url) as client:
         client.reset()
-        pixels = client.act(cameras={"front": rgb(200), "wrist": {"file": file.hex()}})["info"]["pixels"]
+        pixels = client.act(cameras={"front": rgb(200), "wrist": {"file": file.hex()}})["info"][
+            "pixels"
+        ]
         assert np.allclose([pixels["front"], pixels["wrist"]], [[200] * 3, [77] * 3], atol=2)
         sent = client.call("jpeg", obs={"cameras": {"front": rgb(200)}}, quality=90)
         assert sent.startswith("ffd8ff")
@@ -425,7 +483,10 @@ def test_errors_of_the_server_have_its_code(server: Replica, programs: Path) -> 
         client.reset()
         assert refused(client, obs={"gripper": 1e300}).code == "invalid_observation"
         assert client.act(info={"value": 4})["values"][0] == 4  # the session goes on
-        assert refused(client, obs={"cameras": {"front": {"rgb": 0, "height": 0, "width": 9}}}).code == "invalid_input"
+        assert (
+            refused(client, obs={"cameras": {"front": {"rgb": 0, "height": 0, "width": 9}}}).code
+            == "invalid_input"
+        )
     with CppClient(programs, server.url, jpeg_quality=0) as client:
         client.reset()
         large = {"cameras": {"front": {"rgb": 0, "height": 3000, "width": 2000}}}
@@ -478,7 +539,8 @@ def test_a_player_asks_for_the_next_chunk_in_time(server: Replica, programs: Pat
     with CppClient(programs, server.url, ahead=2) as player:
         player.reset()
         commands = [player.act(info={"value": tick}) for tick in range(10)]
-    # Each next chunk is asked for with two rows left, so its first two rows, which these replace, are left out.
+    # Each next chunk is asked for with two rows left, so its first two rows, which these replace,
+    # are left out.
     assert [command["action"] for command in commands] == [
         [0, 0], [0, 1], [0, 2], [0, 3], [2, 2], [2, 3], [4, 2], [4, 3], [6, 2], [6, 3],
     ]  # fmt: skip
@@ -488,7 +550,9 @@ def test_a_player_asks_for_the_next_chunk_in_time(server: Replica, programs: Pat
     assert rows == [[0, 0], [0, 1], [0, 2], [3, 0], [3, 1]]
 
 
-def test_a_player_holds_while_a_chunk_is_late_and_leaves_out_no_row_for_it(server: Replica, programs: Path) -> None:
+def test_a_player_holds_while_a_chunk_is_late_and_leaves_out_no_row_for_it(
+    server: Replica, programs: Path
+) -> None:
     with CppClient(programs, server.url, ahead=1) as player:
         player.reset()
         obs = {"info": {"wait": True, "value": 5}}
@@ -514,7 +578,11 @@ def test_a_player_throws_once_the_rows_are_executed(programs: Path) -> None:
 
 def test_the_example_drives_a_robot(server: Replica, programs: Path) -> None:
     done = subprocess.run(
-        [programs / "loop", server.url, "0.5"], capture_output=True, text=True, timeout=60, check=True
+        [programs / "loop", server.url, "0.5"],
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=True,
     )
     assert "of 2 numbers" in done.stdout
     assert done.stderr == ""
@@ -531,7 +599,13 @@ def obedient(visit: Visit) -> None:
 def test_nobody_is_there(programs: Path) -> None:
     with CppClient(programs, f"http://127.0.0.1:{free_port()}") as client:
         assert refused(client, "reset").code == "unavailable"
-    for url in ("https://127.0.0.1:1", "ftp://127.0.0.1", "http://", "http://127.0.0.1:port", "http://a b:1"):
+    for url in (
+        "https://127.0.0.1:1",
+        "ftp://127.0.0.1",
+        "http://",
+        "http://127.0.0.1:port",
+        "http://a b:1",
+    ):
         with CppClient(programs) as client:
             assert refused(client, "connect", url=url).code == "invalid_input"
 
@@ -539,7 +613,11 @@ def test_nobody_is_there(programs: Path) -> None:
 @pytest.mark.parametrize(
     ("response", "code", "retry_after_s"),
     [
-        (document(503, {"code": "no_replica", "detail": "it loads"}, retry_after="2"), "no_replica", 2.0),
+        (
+            document(503, {"code": "no_replica", "detail": "it loads"}, retry_after="2"),
+            "no_replica",
+            2.0,
+        ),
         (document(503, "no replica"), "unavailable", None),
         (document(401, {"code": "unauthorized", "detail": "a key"}), "unauthorized", None),
         (document(429, "slow down", retry_after="0.5"), "too_many_requests", 0.5),
@@ -552,7 +630,10 @@ def test_nobody_is_there(programs: Path) -> None:
 def test_a_refusal_is_an_error_with_its_code(
     response: Any, code: str, retry_after_s: float | None, programs: Path
 ) -> None:
-    with scripted_server(obedient) as server, CppClient(programs, server.url, key="vlr_a") as client:
+    with (
+        scripted_server(obedient) as server,
+        CppClient(programs, server.url, key="vlr_a") as client,
+    ):
         server.refuse = response
         error = refused(client, "reset")
         assert (error.code, error.retry_after_s) == (code, retry_after_s)
@@ -579,9 +660,21 @@ def _header(length: int, first: int = 0x82) -> bytes:
         (b"\x82\x05abcde", "malformed"),
         (b"\x88\x02\x03\xf0", "connection_lost"),  # closed with 1008
     ],
-    ids=["oversized", "half", "masked", "compressed", "text", "continuation", "ping", "no frame", "closed"],
+    ids=[
+        "oversized",
+        "half",
+        "masked",
+        "compressed",
+        "text",
+        "continuation",
+        "ping",
+        "no frame",
+        "closed",
+    ],
 )
-def test_a_wrong_message_is_an_error_and_the_next_call_begins_again(sent: bytes, code: str, programs: Path) -> None:
+def test_a_wrong_message_is_an_error_and_the_next_call_begins_again(
+    sent: bytes, code: str, programs: Path
+) -> None:
     def script(visit: Visit) -> None:
         visit.answer(visit.request())
         request = visit.request()
@@ -590,7 +683,10 @@ def test_a_wrong_message_is_an_error_and_the_next_call_begins_again(sent: bytes,
             visit.watch()
         visit.answer(request)
 
-    with scripted_server(script) as server, CppClient(programs, server.url, timeout_s=2.0, resume=False) as client:
+    with (
+        scripted_server(script) as server,
+        CppClient(programs, server.url, timeout_s=2.0, resume=False) as client,
+    ):
         client.reset()
         assert refused(client).code == code
         client.reset()
@@ -636,7 +732,11 @@ def test_a_draining_replica_is_left_with_session_and_step(programs: Path) -> Non
         before, after = server.visits
         assert [request.op for request in after.requests] == ["act"]
         assert after.requests[0].session == before.requests[0].session != ""
-        assert [request.step for request in before.requests + after.requests] == [None, 2**62 + 1, 2**62 + 2]
+        assert [request.step for request in before.requests + after.requests] == [
+            None,
+            2**62 + 1,
+            2**62 + 2,
+        ]
 
 
 def test_a_silent_replica_is_left_at_the_next_call(programs: Path) -> None:
@@ -647,7 +747,10 @@ def test_a_silent_replica_is_left_at_the_next_call(programs: Path) -> None:
             visit.watch()
         obedient(visit)
 
-    with scripted_server(script) as server, CppClient(programs, server.url, timeout_s=2.0) as client:
+    with (
+        scripted_server(script) as server,
+        CppClient(programs, server.url, timeout_s=2.0) as client,
+    ):
         client.reset()
         assert refused(client).code == "outcome_unknown"
         assert client.act()["resumed"]
@@ -660,7 +763,9 @@ def test_a_lost_session_waits_for_a_server_that_comes_back(programs: Path) -> No
         visit.answer(visit.request())
         if visit.number == 0:
             visit.request()
-            server.refuse = document(503, {"code": "no_replica", "detail": "it loads"}, retry_after="0.2")
+            server.refuse = document(
+                503, {"code": "no_replica", "detail": "it loads"}, retry_after="0.2"
+            )
             visit.socket.close()
             return
         obedient(visit)
@@ -673,7 +778,10 @@ def test_a_lost_session_waits_for_a_server_that_comes_back(programs: Path) -> No
         server.refuse = None
         assert client.result()["resumed"]
         assert server.visits[1].requests[0].obs.info == {"value": 1}  # type: ignore[union-attr]
-    with scripted_server(script) as server, CppClient(programs, server.url, timeout_s=2.0) as client:
+    with (
+        scripted_server(script) as server,
+        CppClient(programs, server.url, timeout_s=2.0) as client,
+    ):
         client.reset()
         assert refused(client).code == "no_replica"
 

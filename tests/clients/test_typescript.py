@@ -1,4 +1,6 @@
-"""The TypeScript client, by its own tests: golden files, a server that fails as told, and servers of this project."""
+"""The TypeScript client, by its own tests: golden files, a server that fails as told, and
+servers of this project.
+"""
 
 from __future__ import annotations
 
@@ -49,7 +51,9 @@ def node(client: Path, *words: str, environment: dict[str, str] | None = None) -
 
 def passed(said: str) -> int:
     """How many tests passed, of which none was left out."""
-    counts = dict(line.removeprefix("# ").split(" ", 1) for line in said.splitlines() if line.startswith("# "))
+    counts = dict(
+        line.removeprefix("# ").split(" ", 1) for line in said.splitlines() if line.startswith("# ")
+    )
     assert [counts[word] for word in ("fail", "cancelled", "skipped", "todo")] == ["0"] * 4
     return int(counts["pass"])
 
@@ -59,7 +63,17 @@ def test_it_passes_its_tests_with_the_golden_files_and_with_servers_that_fail_or
 ) -> None:
     files = sorted(str(file.relative_to(client)) for file in (client / "test").glob("*.test.mjs"))
     assert (
-        passed(node(client, "--test", "--test-reporter=tap", "--test-concurrency=4", *files, environment=servers)) > 0
+        passed(
+            node(
+                client,
+                "--test",
+                "--test-reporter=tap",
+                "--test-concurrency=4",
+                *files,
+                environment=servers,
+            )
+        )
+        > 0
     )
 
 
@@ -87,7 +101,10 @@ def test_no_answer_fills_the_memory_of_a_robots_computer(client: Path, tmp_path:
 
 def test_it_carries_the_reference_of_a_recurrent_policy(client: Path, tmp_path: Path) -> None:
     inputs, wanted = reference()
-    rows = [[{"state": {n: p.tolist() for n, p in observation(row).state.items()}} for row in pair] for pair in inputs]
+    rows = [
+        [{"state": {n: p.tolist() for n, p in observation(row).state.items()}} for row in pair]
+        for pair in inputs
+    ]
     (tmp_path / "observations").write_text(json.dumps(rows))
     script = """
         import { readFileSync } from "node:fs";
@@ -106,7 +123,12 @@ def test_it_carries_the_reference_of_a_recurrent_policy(client: Path, tmp_path: 
     """
     with policy_server(Raptor()) as port:
         said = node(
-            client, "--input-type=module", "-e", script, f"http://127.0.0.1:{port}", str(tmp_path / "observations")
+            client,
+            "--input-type=module",
+            "-e",
+            script,
+            f"http://127.0.0.1:{port}",
+            str(tmp_path / "observations"),
         )
     assert np.abs(np.array(json.loads(said)) - wanted).max() < TOLERANCE
 

@@ -1,4 +1,5 @@
-"""cluster/docker: what the Dockerfile names is there, and nothing it should not have; each package by its digest.
+"""cluster/docker: what the Dockerfile names is there, and nothing it should not have; each package
+by its digest.
 
 No container engine is needed. Locks get what pyproject.toml and the plug-ins' requirements/ want.
 """
@@ -36,9 +37,13 @@ class Instruction:
 
 
 def instructions(file: Path) -> Iterator[Instruction]:
-    """In order, those before the first FROM in the stage ""; raises `ValueError` for a line that is none."""
+    """In order, those before the first FROM in the stage ""; raises `ValueError` for a line that
+    is none.
+    """
     stage = ""
-    kept = "\n".join(line for line in file.read_text().splitlines() if not line.lstrip().startswith("#"))
+    kept = "\n".join(
+        line for line in file.read_text().splitlines() if not line.lstrip().startswith("#")
+    )
     for line in re.sub(r"\\\n", "", kept).splitlines():
         if not line.strip():
             continue
@@ -56,7 +61,9 @@ FOLDER = ROOT / "cluster" / "docker"
 DOCKERFILE = FOLDER / "Dockerfile"
 LINES = list(instructions(DOCKERFILE))
 STAGES = [line.stage for line in LINES if line.word == "FROM"]
-TARGETS = [line.stage for line in LINES if line.word == "LABEL" and line.stage != "system"] + STAGES[-1:]
+TARGETS = [
+    line.stage for line in LINES if line.word == "LABEL" and line.stage != "system"
+] + STAGES[-1:]
 LOCKS = {  # of the stages that install
     line.stage: found[1]
     for line in LINES
@@ -74,14 +81,20 @@ def of(word: str, stage: str | None = None) -> list[str]:
 
 def copied() -> list[str]:
     """What of the repository is copied into any stage, or mounted while a step runs."""
-    here = [line.text.split()[:-1] for line in LINES if line.word == "COPY" and "from" not in line.flags]
+    here = [
+        line.text.split()[:-1] for line in LINES if line.word == "COPY" and "from" not in line.flags
+    ]
     return [path for paths in here for path in paths] + list(LOCKS.values())
 
 
 def test_hadolint_finds_nothing() -> None:
-    hadolint = shutil.which("hadolint", path=Path(sys.executable).parent) or shutil.which("hadolint")
+    hadolint = shutil.which("hadolint", path=Path(sys.executable).parent) or shutil.which(
+        "hadolint"
+    )
     assert hadolint is not None
-    done = subprocess.run([hadolint, "--no-color", str(DOCKERFILE)], capture_output=True, text=True, check=False)
+    done = subprocess.run(
+        [hadolint, "--no-color", str(DOCKERFILE)], capture_output=True, text=True, check=False
+    )
     assert (done.returncode, done.stdout) == (0, "")
 
 
@@ -101,7 +114,11 @@ def test_other_stages_are_named_before_they_are_copied_from() -> None:
     for line in LINES:
         if line.word == "FROM":
             seen.append(line.stage)
-        sources = [line.flags["from"]] if "from" in line.flags else re.findall(r"from=([\w-]+)", str(line.flags))
+        sources = (
+            [line.flags["from"]]
+            if "from" in line.flags
+            else re.findall(r"from=([\w-]+)", str(line.flags))
+        )
         assert set(sources) <= set(seen[:-1]), line
     assert len(STAGES) == len(set(STAGES))
 
@@ -120,10 +137,16 @@ def test_every_base_is_pinned_and_its_python_is_the_packages() -> None:
         ("0.1.0", "python:3.11.14-slim-bookworm", False),
     ],
 )
-def test_a_version_is_built_on_a_base_with_its_digest_alone(version: str, base: str, built: bool) -> None:
+def test_a_version_is_built_on_a_base_with_its_digest_alone(
+    version: str, base: str, built: bool
+) -> None:
     [step] = [run for run in of("RUN", "system") if "sha256" in run]
     done = subprocess.run(
-        ["sh", "-c", step], env={"VERSION": version, "BASE": base}, capture_output=True, text=True, check=False
+        ["sh", "-c", step],
+        env={"VERSION": version, "BASE": base},
+        capture_output=True,
+        text=True,
+        check=False,
     )
     assert (done.returncode == 0) is built
     assert built or f"got {base}, want a base with its digest" in done.stderr
@@ -164,18 +187,24 @@ def test_every_family_and_every_simulator_has_a_target_and_the_last_is_the_serve
 
 
 @pytest.mark.parametrize("target", TARGETS)
-def test_a_target_brings_its_own_packages_into_the_servers_environment_or_beside_it(target: str) -> None:
+def test_a_target_brings_its_own_packages_into_the_servers_environment_or_beside_it(
+    target: str,
+) -> None:
     environments = {}
     for stage in chain(target):
         for line in [
-            line for line in LINES if line.stage == stage and line.flags.get("from", "").endswith("-packages")
+            line
+            for line in LINES
+            if line.stage == stage and line.flags.get("from", "").endswith("-packages")
         ]:
             kind, _, name = Path(LOCKS[line.flags["from"]]).stem.partition("-")
             assert line.text.split() == [f"/opt/{kind}", f"/opt/{kind}"]
             environments[kind] = name
     in_server = target in SIMULATORS
     assert environments == (
-        {"server": target} if in_server else {"server": "sim"} | ({} if target == "server" else {"family": target})
+        {"server": target}
+        if in_server
+        else {"server": "sim"} | ({} if target == "server" else {"family": target})
     )
     assert f"vlagents-ray-{target}" in "".join(of("LABEL", target)) or target == "server"
 
@@ -185,7 +214,10 @@ def test_what_runs_is_no_root_and_owns_nothing_but_where_it_writes(target: str) 
     stages = [line for stage in reversed(chain(target)) for line in LINES if line.stage == stage]
     users = [i for i, line in enumerate(stages) if line.word == "USER"]
     # Root installs a model's compiler, and no more.
-    assert [stages[i].text for i in users] == ["1000:1000", *(["0:0", "1000:1000"] if target in MODELS else [])]
+    assert [stages[i].text for i in users] == [
+        "1000:1000",
+        *(["0:0", "1000:1000"] if target in MODELS else []),
+    ]
     after = stages[users[-1] :]
     assert not [line for line in after if line.word in ("RUN", "ADD") or "chown" in line.flags]
     assert json.loads(of("VOLUME", "system")[0]) == ["/tmp", "/home/robot", "/results"]
@@ -194,25 +226,40 @@ def test_what_runs_is_no_root_and_owns_nothing_but_where_it_writes(target: str) 
 @pytest.mark.parametrize("target", TARGETS)
 def test_models_alone_have_a_compiler(target: str) -> None:
     """Triton compiles a C program when a model runs on a GPU."""
-    installed = " ".join(run for stage in chain(target) for run in of("RUN", stage) if "apt-get install" in run)
+    installed = " ".join(
+        run for stage in chain(target) for run in of("RUN", stage) if "apt-get install" in run
+    )
     assert ("gcc libc6-dev" in installed) is (target in MODELS)
 
 
-@pytest.mark.parametrize(("package", "headers", "built"), [("triton", 1, True), ("triton", 0, False), ("six", 0, True)])
-def test_triton_needs_the_headers_of_its_python(package: str, headers: bool, built: bool, tmp_path: Path) -> None:
-    """install.sh runs with a uv that installs nothing, and a Python that names a folder of headers."""
+@pytest.mark.parametrize(
+    ("package", "headers", "built"), [("triton", 1, True), ("triton", 0, False), ("six", 0, True)]
+)
+def test_triton_needs_the_headers_of_its_python(
+    package: str, headers: bool, built: bool, tmp_path: Path
+) -> None:
+    """install.sh runs with a uv that installs nothing, and a Python that names a folder of
+    headers.
+    """
     environment, include = tmp_path / "environment", tmp_path / "include"
     for folder in (include, environment / "bin", environment / "lib/python3.11/site-packages"):
         folder.mkdir(parents=True)
-    for file, line in ((tmp_path / "uv", "exit 0"), (environment / "bin/python", f"echo {include}")):
+    for file, line in (
+        (tmp_path / "uv", "exit 0"),
+        (environment / "bin/python", f"echo {include}"),
+    ):
         file.write_text(f"#!/bin/sh\n{line}\n")
         file.chmod(0o755)
     if headers:
         (include / "Python.h").touch()
-    (tmp_path / "lock.txt").write_text(f"# x, for Python 3.11 on y: `make locks` writes it.\n{package}==1.0\n")
+    (tmp_path / "lock.txt").write_text(
+        f"# x, for Python 3.11 on y: `make locks` writes it.\n{package}==1.0\n"
+    )
     command = ["sh", str(FOLDER / "install.sh"), str(environment)]
     path = {"PATH": f"{tmp_path}:{os.environ['PATH']}"}
-    done = subprocess.run(command, cwd=tmp_path, env=path, capture_output=True, text=True, check=False)
+    done = subprocess.run(
+        command, cwd=tmp_path, env=path, capture_output=True, text=True, check=False
+    )
     assert (done.returncode == 0) is built, done.stderr
     assert built or f"no {include}/Python.h" in done.stderr
 
@@ -229,7 +276,11 @@ def test_packages_lie_below_our_code(target: str) -> None:
     copies = [line.flags["from"] for line in LINES if line.stage == target and line.word == "COPY"]
     assert copies[-1] == "code"
     assert "code" not in copies[:-1]
-    ours = [line.stage for line in LINES if line.word == "COPY" and line.text.startswith("vlagents_ray ")]
+    ours = [
+        line.stage
+        for line in LINES
+        if line.word == "COPY" and line.text.startswith("vlagents_ray ")
+    ]
     assert ours == ["code"]
 
 
@@ -280,11 +331,14 @@ def unmet(versions: dict[str, str], requirements: list[str]) -> list[str]:
     """The requirements that no locked version meets."""
     wanted = [Requirement(text) for text in requirements]
     torch = {one.name: one for one in map(Requirement, resolved.overrides(requirements))}
-    wanted = [torch.get(one.name, one) for one in wanted if one.marker is None or one.marker.evaluate()]
+    wanted = [
+        torch.get(one.name, one) for one in wanted if one.marker is None or one.marker.evaluate()
+    ]
     return [
         str(one)
         for one in wanted
-        if (version := versions.get(canonicalize_name(one.name))) is None or not one.specifier.contains(version)
+        if (version := versions.get(canonicalize_name(one.name))) is None
+        or not one.specifier.contains(version)
     ]
 
 
@@ -300,14 +354,22 @@ def test_a_lock_meets_what_its_image_wants_and_has_a_digest_of_every_package(nam
     assert f"for Python {python} on {resolved.PLATFORM}:" in text
     versions = locked(text)
     assert len(versions) > 60
-    torch = [text for text in resolved.overrides(requirements) if Requirement(text).name in versions]
+    torch = [
+        text for text in resolved.overrides(requirements) if Requirement(text).name in versions
+    ]
     assert unmet(versions, [*requirements, *torch]) == [], "run `make locks`"
 
 
 @pytest.mark.parametrize("name", resolved.locks())
 def test_a_lock_has_no_library_of_nvidia_twice(name: str) -> None:
-    """Those of two CUDAs overwrite each other: nvidia-cudnn-cu12 and -cu13 are unpacked into nvidia/cudnn/lib."""
-    packages = [one for one in locked((resolved.LOCKS / f"{name}.txt").read_text()) if one.startswith("nvidia-")]
+    """Those of two CUDAs overwrite each other: nvidia-cudnn-cu12 and -cu13 are unpacked into
+    nvidia/cudnn/lib.
+    """
+    packages = [
+        one
+        for one in locked((resolved.LOCKS / f"{name}.txt").read_text())
+        if one.startswith("nvidia-")
+    ]
     libraries = [re.sub(r"-cu\d+$", "", one) for one in packages]
     assert sorted(libraries) == sorted(set(libraries)), packages
 

@@ -1,4 +1,6 @@
-"""What is lost when machines and networks of a cluster fail: time and attempts, no episode and no result."""
+"""What is lost when machines and networks of a cluster fail: time and attempts, no episode and
+no result.
+"""
 
 from __future__ import annotations
 
@@ -28,7 +30,8 @@ from vlagents_ray.serve.ports import EVERYWHERE
 
 pytestmark = [pytest.mark.hosts, pytest.mark.slow]
 
-until = functools.partial(wait_for, timeout_s=300, every_s=0.25)  # what takes a process, or all results, to find out
+# What takes a process, or all results, to find out.
+until = functools.partial(wait_for, timeout_s=300, every_s=0.25)
 POLICY = "policy"  # a resource of nodes that replicas may run on
 # Joined to the cluster before the command asks its policy, which is inside.
 _SERVED = "import ray; ray.init(log_to_driver=False); from vlagents_ray.cli.main import app; app()"
@@ -50,7 +53,9 @@ except VLAgentsError as error:
 def cluster_of(
     head: Host, nodes: Sequence[tuple[Host, int, bool]], run: Evaluation, **environment: str
 ) -> Iterator[RayCluster]:
-    """A head that plays nothing, and nodes with so many workers, and perhaps a replica; `run` is to be played there."""
+    """A head that plays nothing, and nodes with so many workers, and perhaps a replica; `run` is
+    to be played there.
+    """
     shared = {"PYTHONPATH": PYTHONPATH, "TERM": "dumb", HURRY: str(run.hurry)} | environment
     with ray_cluster([head], cpus=0, environment=shared) as cluster:
         for host, workers, serves in nodes:
@@ -61,13 +66,32 @@ def cluster_of(
 @contextlib.contextmanager
 def serving(head: Host, folder: Path, replicas: int) -> Iterator[str]:
     """`Unhurried` for everybody who has the key that this yields."""
-    args = {"policy": "eval_fakes:Unhurried", "replicas": replicas, "resources": {"num_cpus": 0, "custom": {POLICY: 1}}}
-    application = {"name": "line", "route_prefix": "/", "import_path": "vlagents_ray.serve.app:build", "args": args}
+    args = {
+        "policy": "eval_fakes:Unhurried",
+        "replicas": replicas,
+        "resources": {"num_cpus": 0, "custom": {POLICY: 1}},
+    }
+    application = {
+        "name": "line",
+        "route_prefix": "/",
+        "import_path": "vlagents_ray.serve.app:build",
+        "args": args,
+    }
     file, keys, log = folder / "serve.yaml", folder / "keys.json", folder / "serve.log"
     file.write_text(yaml.safe_dump({"applications": [application]}))
     keys.unlink(missing_ok=True)
     token = new_key(keys, "all")
-    command = ["vlagents-ray", "serve", str(file), "--address", "auto", "--host", EVERYWHERE, "--keys", str(keys)]
+    command = [
+        "vlagents-ray",
+        "serve",
+        str(file),
+        "--address",
+        "auto",
+        "--host",
+        EVERYWHERE,
+        "--keys",
+        str(keys),
+    ]
     with log.open("w") as output, head.start(command, stdout=output, stderr=output) as server:
         try:
             until(lambda: "serving line" in log.read_text() or server.poll() is not None)
@@ -80,8 +104,8 @@ def serving(head: Host, folder: Path, replicas: int) -> Iterator[str]:
 class Evaluation:
     """One that runs at a host; `folder` has its results and its log.
 
-    Its policy is `serving`'s if there is one, else each worker has its own. `episodes` are as many as would take far
-    longer than the test needs; the file `hurry` ends that.
+    Its policy is `serving`'s if there is one, else each worker has its own. `episodes` are as many
+    as would take far longer than the test needs; the file `hurry` ends that.
     """
 
     def __init__(self, folder: Path, episodes: int, workers: int) -> None:
@@ -90,17 +114,32 @@ class Evaluation:
         self._file = folder / "eval.yaml"
         policy = {"name": "line", "url": "serve://line", "execute": 1}
         suite = {"envs": [LINE], "episodes": episodes}
-        run = {"workers": workers, "worker": {"cpus": 1}, "video": "none", "out": str(self.out), "place_timeout_s": 60}
+        run = {
+            "workers": workers,
+            "worker": {"cpus": 1},
+            "video": "none",
+            "out": str(self.out),
+            "place_timeout_s": 60,
+        }
         self._file.write_text(yaml.safe_dump({"policies": [policy], "suites": [suite], **run}))
         self._process: subprocess.Popen[str] | None = None
 
     @contextlib.contextmanager
     def running(self, host: Host, *options: str, token: str | None = None) -> Iterator[None]:
         """From its first episode on; `token` is the server's."""
-        command = ["env", f"{KEY_VARIABLE}={token}", sys.executable, "-c", _OWN if token is None else _SERVED]
+        command = [
+            "env",
+            f"{KEY_VARIABLE}={token}",
+            sys.executable,
+            "-c",
+            _OWN if token is None else _SERVED,
+        ]
         command += ["eval", str(self._file), *options]
         before = len(self.played())
-        with self._log.open("a") as output, host.start(command, stdout=output, stderr=output) as self._process:
+        with (
+            self._log.open("a") as output,
+            host.start(command, stdout=output, stderr=output) as self._process,
+        ):
             try:
                 self.plays(before + 1)
                 yield
@@ -170,7 +209,11 @@ def cut_off(host: Host, seconds: float) -> Iterator[None]:
 def out_of_memory(host: Host, folder: Path) -> Iterator[None]:
     """As far as Ray's memory monitor there can see."""
     fake = folder / "meminfo"
-    none = re.sub(r"(?m)^(MemFree|MemAvailable|Buffers|Cached|SReclaimable):.*", r"\1: 0 kB", MEMORY.read_text())
+    none = re.sub(
+        r"(?m)^(MemFree|MemAvailable|Buffers|Cached|SReclaimable):.*",
+        r"\1: 0 kB",
+        MEMORY.read_text(),
+    )
     fake.write_text(none)
     host.run(["mount", "--bind", str(fake), str(MEMORY)])
     yield
@@ -243,12 +286,17 @@ def test_memory_that_runs_out_costs_attempts_and_a_lost_head_a_resumption(tmp_pa
         with cluster_of(head, [(one, 2, False)], run, RAY_gcs_rpc_server_reconnect_timeout_s="20"):
             with run.running(one):
                 with out_of_memory(one, tmp_path):
-                    until(lambda: any("low on memory" in attempt.error for attempt in run.attempts()))
+                    until(
+                        lambda: any("low on memory" in attempt.error for attempt in run.attempts())
+                    )
                 run.goes_on(by=4)
                 head.kill()
                 run.goes_on(by=2)
                 assert run.ends() == 1
-            assert "ClusterLost: the head of the Ray cluster, 198.18.0.1:6379, has not answered" in run.said()
+            assert (
+                "ClusterLost: the head of the Ray cluster, 198.18.0.1:6379, has not answered"
+                in run.said()
+            )
             assert json.loads((run.out / "summary.json").read_text())["state"] == "stopped"
             until(lambda: workers_on(one) == 0)
         with ray_cluster([one]), run.running(one, "--resume"):

@@ -1,4 +1,6 @@
-"""The Grafana dashboard in cluster/grafana: it asks for what a server exports, and leaves nothing of that out."""
+"""The Grafana dashboard in cluster/grafana: it asks for what a server exports, and leaves
+nothing of that out.
+"""
 
 from __future__ import annotations
 
@@ -61,8 +63,16 @@ def exported() -> dict[str, Series]:
 
 def queries() -> list[tuple[str, str]]:
     """Expression and legend of every line of the dashboard, and the query of its variable."""
-    lines = [(target["expr"], target["legendFormat"]) for panel in DASHBOARD["panels"] for target in panel["targets"]]
-    variables = [(one["query"]["query"], "") for one in DASHBOARD["templating"]["list"] if one["type"] == "query"]
+    lines = [
+        (target["expr"], target["legendFormat"])
+        for panel in DASHBOARD["panels"]
+        for target in panel["targets"]
+    ]
+    variables = [
+        (one["query"]["query"], "")
+        for one in DASHBOARD["templating"]["list"]
+        if one["type"] == "query"
+    ]
     return lines + variables
 
 
@@ -76,7 +86,11 @@ def test_a_query_names_series_and_labels_that_the_server_exports(
     expression: str, legend: str, exported: dict[str, Series]
 ) -> None:
     assert names(expression)
-    grouped = {label.strip() for group in re.findall(r"\bby \(([^)]*)\)", expression) for label in group.split(",")}
+    grouped = {
+        label.strip()
+        for group in re.findall(r"\bby \(([^)]*)\)", expression)
+        for label in group.split(",")
+    }
     shown = set(re.findall(r"\{\{(\w+)\}\}", legend))
     if "sum by" in expression:
         assert shown <= grouped
@@ -87,31 +101,43 @@ def test_a_query_names_series_and_labels_that_the_server_exports(
         assert asked <= exported[name].labels | ({"le"} if name.endswith("_bucket") else set())
 
 
-def test_every_metric_of_the_server_is_on_the_dashboard_and_in_the_documentation(exported: dict[str, Series]) -> None:
+def test_every_metric_of_the_server_is_on_the_dashboard_and_in_the_documentation(
+    exported: dict[str, Series],
+) -> None:
     shown = {name for expression, _ in queries() for name in names(expression)}
     assert {series.metric for series in exported.values()} == {
         exported[name].metric for name in shown if name in exported
     }
     documented = set(re.findall(r"`(vlagents_(?!ray)\w+)`", (ROOT / "docs/serving.md").read_text()))
     assert documented == {
-        re.sub("^ray_", "", name) if name.endswith("_total") else series.metric for name, series in exported.items()
+        re.sub("^ray_", "", name) if name.endswith("_total") else series.metric
+        for name, series in exported.items()
     }
 
 
 def test_the_metric_of_gpus_is_one_of_ray() -> None:
     dashboard = Path(ray.__file__).parent / "dashboard"
-    assert '"node_gpus_utilization": Gauge(' in (dashboard / "modules/reporter/reporter_agent.py").read_text()
+    assert (
+        '"node_gpus_utilization": Gauge('
+        in (dashboard / "modules/reporter/reporter_agent.py").read_text()
+    )
     assert re.search(r'GPU_TAG_KEYS = .*"GpuIndex"', (dashboard / "consts.py").read_text())
 
 
 def test_the_codes_that_queries_ask_for_are_those_of_errors() -> None:
-    asked = [text for expression, _ in queries() for text in re.findall(r'code!?=~?"([^"]+)"', expression)]
+    asked = [
+        text
+        for expression, _ in queries()
+        for text in re.findall(r'code!?=~?"([^"]+)"', expression)
+    ]
     codes = {code for text in asked for code in text.split("|")}
     assert codes
     assert codes <= {"ok", *BY_CODE}
 
 
-def test_every_panel_reads_the_chosen_data_source_has_a_place_of_its_own_and_says_what_it_shows() -> None:
+def test_every_panel_reads_the_chosen_data_source_has_a_place_of_its_own_and_says_what_it_shows() -> (
+    None
+):
     variables = {one["name"]: one for one in DASHBOARD["templating"]["list"]}
     assert variables["datasource"]["type"] == "datasource"
     assert variables["datasource"]["query"] == "prometheus"

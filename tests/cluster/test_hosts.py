@@ -1,4 +1,6 @@
-"""Hosts on one machine: what they share, what not, that nothing of them is left, and Ray on several of them."""
+"""Hosts on one machine: what they share, what not, that nothing of them is left, and Ray on
+several of them.
+"""
 
 from __future__ import annotations
 
@@ -13,7 +15,9 @@ from vlagents_ray.protocol.messages import boot_id
 
 pytestmark = pytest.mark.hosts
 
-REACH = "import socket, sys; socket.create_connection((sys.argv[1], 9000), float(sys.argv[2])).recv(1)"
+REACH = (
+    "import socket, sys; socket.create_connection((sys.argv[1], 9000), float(sys.argv[2])).recv(1)"
+)
 LISTEN = (
     "import socket; s = socket.create_server(('', 9000)); print('listening', flush=True)\n"
     "while True: s.accept()[0].sendall(b'x')"
@@ -38,7 +42,9 @@ def reaches(one: Host, other: Host, within_s: float = 30.0) -> bool:
 
 def test_hosts_are_machines_of_their_own_until_they_are_killed() -> None:
     with hosts(2) as [one, other]:
-        boots = {host.run(["cat", "/proc/sys/kernel/random/boot_id"]).strip() for host in (one, other)}
+        boots = {
+            host.run(["cat", "/proc/sys/kernel/random/boot_id"]).strip() for host in (one, other)
+        }
         assert len(boots | {boot_id()}) == 3
         assert one.run(["hostname"]).strip() == "host1"
         other.run(["touch", "/dev/shm/mine"])
@@ -70,12 +76,23 @@ def test_ray_runs_over_several_hosts() -> None:
         assert cluster.python(WHERE).split() == ["host1", "host2"]
 
 
-EVALUATE = [sys.executable, "-c", "from vlagents_ray.cli import main; main()", "eval", "tabletop", "--policy=scripted"]
+EVALUATE = [
+    sys.executable,
+    "-c",
+    "from vlagents_ray.cli import main; main()",
+    "eval",
+    "tabletop",
+    "--policy=scripted",
+]
 
 
 @pytest.mark.ray
 def test_without_an_address_an_evaluation_has_a_ray_of_its_own(tmp_path: Path) -> None:
-    show = [sys.executable, "-c", "import ray; ray.init(logging_level='ERROR'); print(ray.nodes()[0]['NodeID'])"]
+    show = [
+        sys.executable,
+        "-c",
+        "import ray; ray.init(logging_level='ERROR'); print(ray.nodes()[0]['NodeID'])",
+    ]
     with hosts(1) as [host], ray_cluster([host]):
         host.run([*EVALUATE, "--episodes=1", f"--out={tmp_path / 'out'}"])
         node = host.run(show).split()[-1]

@@ -1,4 +1,6 @@
-"""The manifests in cluster/kuberay: as the schemas want them, in step with each other, and a server that comes up."""
+"""The manifests in cluster/kuberay: as the schemas want them, in step with each other, and a
+server that comes up.
+"""
 
 from __future__ import annotations
 
@@ -38,20 +40,26 @@ SERVICE = RayService.model_validate(manifest("RayService", "policy"))
 JOB = RayJob.model_validate(manifest("RayJob", "evaluation"))
 PODS = {
     "policy-head": SERVICE.cluster.head_group_spec.template,
-    **{f"policy-{group.group_name}": group.template for group in SERVICE.cluster.worker_group_specs},
+    **{
+        f"policy-{group.group_name}": group.template for group in SERVICE.cluster.worker_group_specs
+    },
     "evaluation-head": JOB.cluster.head_group_spec.template,
-    **{f"evaluation-{group.group_name}": group.template for group in JOB.cluster.worker_group_specs},
+    **{
+        f"evaluation-{group.group_name}": group.template for group in JOB.cluster.worker_group_specs
+    },
     "evaluation-submitter": JOB.spec.submitter_pod_template,
     "reader": manifest("Pod", "results-reader"),
 }
-# Wanted of each container by https://kubernetes.io/docs/concepts/security/pod-security-standards/, `restricted`,
-# and a root that is read-only.
+# Wanted of each container by https://kubernetes.io/docs/concepts/security/pod-security-standards/,
+# `restricted`, and a root that is read-only.
 CONTAINER = {
     "allowPrivilegeEscalation": False,
     "capabilities": {"drop": ["ALL"]},
     "readOnlyRootFilesystem": True,
 }
-RAY_PODS = {name: pod for name, pod in PODS.items() if name not in ("evaluation-submitter", "reader")}
+RAY_PODS = {
+    name: pod for name, pod in PODS.items() if name not in ("evaluation-submitter", "reader")
+}
 ROBOT = """
 import sys
 from vlagents_ray import RemoteAgent, Unauthorized
@@ -80,7 +88,11 @@ def values_of(document: Any, key: str) -> list[Any]:
         return [value for one in document for value in values_of(one, key)]
     if not isinstance(document, dict):
         return []
-    return [value for name, one in document.items() for value in ([one] if name == key else values_of(one, key))]
+    return [
+        value
+        for name, one in document.items()
+        for value in ([one] if name == key else values_of(one, key))
+    ]
 
 
 @pytest.mark.parametrize("file", sorted(FOLDER.glob("*.yaml")), ids=lambda file: file.stem)
@@ -121,7 +133,10 @@ def test_the_embedded_deployment_is_one_that_serve_takes(tmp_path: Path) -> None
     args = ServerArgs(**application.args)
     assert args.autoscaling is not None
     cpu = next(group for group in SERVICE.cluster.worker_group_specs if group.group_name == "cpu")
-    room = int(cpu.template["spec"]["containers"][0]["resources"]["limits"]["cpu"]) // args.resources.num_cpus
+    room = (
+        int(cpu.template["spec"]["containers"][0]["resources"]["limits"]["cpu"])
+        // args.resources.num_cpus
+    )
     assert args.autoscaling.max_replicas <= cpu.max_replicas * room
 
 
@@ -130,12 +145,17 @@ def test_the_run_file_and_the_entrypoint_are_ones_that_eval_takes(tmp_path: Path
     run = manifest("ConfigMap", "evaluation-run")["data"]["run.yaml"]
     config = EvalConfig.model_validate(yaml.safe_load(run) | {"out": "runs/x"})
     [cpu] = [group for group in JOB.cluster.worker_group_specs if group.group_name == "cpu"]
-    room = cpu.max_replicas * float(cpu.template["spec"]["containers"][0]["resources"]["limits"]["cpu"])
+    room = cpu.max_replicas * float(
+        cpu.template["spec"]["containers"][0]["resources"]["limits"]["cpu"]
+    )
     assert 1 <= config.worker.cpus <= room / config.workers
     name, *words = shlex.split(JOB.spec.entrypoint)
     assert name == "vlagents-ray"
     (tmp_path / "run.yaml").write_text(run)
-    here = [str(tmp_path / "run.yaml") if word == "/etc/vlagents/run/run.yaml" else word for word in words]
+    here = [
+        str(tmp_path / "run.yaml") if word == "/etc/vlagents/run/run.yaml" else word
+        for word in words
+    ]
     result = CliRunner().invoke(app, [*here, "--dry-run"])
     assert result.exit_code == 0, result.output
 
@@ -190,7 +210,9 @@ def test_a_pod_gets_what_it_asks_for(name: str) -> None:
 def test_a_pod_writes_where_the_image_says(name: str) -> None:
     [volumes] = re.findall(r"^VOLUME (.*)$", DOCKERFILE, re.MULTILINE)
     spec = complete(name)
-    kinds = {volume["name"]: next(key for key in volume if key != "name") for volume in spec["volumes"]}
+    kinds = {
+        volume["name"]: next(key for key in volume if key != "name") for volume in spec["volumes"]
+    }
     for container in spec["containers"]:
         mounts = {mount["mountPath"]: mount for mount in container["volumeMounts"]}
         written = {path for path, mount in mounts.items() if kinds[mount["name"]] == "emptyDir"}
@@ -206,8 +228,12 @@ def test_a_pod_with_a_gpu_keeps_its_programs_for_the_next_one(name: str) -> None
     claims = {one["name"]: one["persistentVolumeClaim"]["claimName"] for one in kept}
     for container in spec["containers"]:
         mounts = {one["mountPath"]: claims.get(one["name"]) for one in container["volumeMounts"]}
-        cache = {one["name"]: one["value"] for one in container.get("env", [])}.get("XDG_CACHE_HOME", "")
-        assert (mounts.get(cache) == "cache") is ("nvidia.com/gpu" in container["resources"]["limits"])
+        cache = {one["name"]: one["value"] for one in container.get("env", [])}.get(
+            "XDG_CACHE_HOME", ""
+        )
+        assert (mounts.get(cache) == "cache") is (
+            "nvidia.com/gpu" in container["resources"]["limits"]
+        )
         # A mount below a volume would have parents that are root's.
         assert not [path for path in mounts for other in mounts if path.startswith(f"{other}/")]
     assert manifest("PersistentVolumeClaim", "cache")["spec"]["accessModes"] == ["ReadWriteMany"]
@@ -228,7 +254,11 @@ def test_the_autoscaler_alone_may_ask_kubernetes(name: str) -> None:
 
 def labels_of(name: str) -> dict[str, str]:
     """With the one that KubeRay adds."""
-    kind = {"ray.io/node-type": "head" if name.endswith("-head") else "worker"} if name in RAY_PODS else {}
+    kind = (
+        {"ray.io/node-type": "head" if name.endswith("-head") else "worker"}
+        if name in RAY_PODS
+        else {}
+    )
     return PODS[name]["metadata"]["labels"] | kind
 
 
@@ -238,18 +268,24 @@ def selected(selector: dict[str, Any]) -> set[str]:
         name
         for name in PODS
         if selector.get("matchLabels", {}).items() <= labels_of(name).items()
-        and all(labels_of(name).get(one["key"]) in one["values"] for one in selector.get("matchExpressions", []))
+        and all(
+            labels_of(name).get(one["key"]) in one["values"]
+            for one in selector.get("matchExpressions", [])
+        )
     }
 
 
 def test_a_budget_keeps_the_heads_and_the_last_worker_that_serves() -> None:
-    budgets = {one["metadata"]["name"]: one["spec"] for one in documents(FOLDER / "disruption.yaml")}
+    budgets = {
+        one["metadata"]["name"]: one["spec"] for one in documents(FOLDER / "disruption.yaml")
+    }
     assert {name: selected(spec["selector"]) for name, spec in budgets.items()} == {
         "policy-head": {"policy-head"},
         "policy-workers": {"policy-cpu", "policy-gpu"},
         "evaluation-head": {"evaluation-head"},
     }
-    for spec in budgets.values():  # of pods whose owner has no scale, Kubernetes takes a number alone
+    # Of pods whose owner has no scale, Kubernetes takes a number alone.
+    for spec in budgets.values():
         assert spec["minAvailable"] == 1
         assert "maxUnavailable" not in spec
 
@@ -257,7 +293,11 @@ def test_a_budget_keeps_the_heads_and_the_last_worker_that_serves() -> None:
 def leaves(name: str) -> list[dict[str, Any]]:
     """The rules of all policies by which a pod may connect to others."""
     policies = [one["spec"] for one in documents(FOLDER / "network.yaml")]
-    mine = [spec for spec in policies if name in selected(spec["podSelector"]) and "Egress" in spec["policyTypes"]]
+    mine = [
+        spec
+        for spec in policies
+        if name in selected(spec["podSelector"]) and "Egress" in spec["policyTypes"]
+    ]
     assert mine, f"{name} reaches everything"
     return [rule for spec in mine for rule in spec["egress"]]
 
@@ -284,7 +324,8 @@ def test_a_pod_reaches_its_own_names_and_public_weights_and_no_private_network(n
     assert reaches(name, "2600::1", 443)
     assert not reaches(name, "8.8.8.8", 80)
     for private in ("10.0.0.1", "172.16.0.1", "192.168.0.1", "169.254.169.254", "fd00::1"):
-        assert reaches(name, private, 443) is name.endswith("-head"), private  # Kubernetes' API, for the autoscaler
+        # Kubernetes' API, for the autoscaler.
+        assert reaches(name, private, 443) is name.endswith("-head"), private
         assert not reaches(name, private, 80), private
     to = [one for rule in leaves(name) for one in rule.get("to", [])]
     others = {
@@ -293,9 +334,15 @@ def test_a_pod_reaches_its_own_names_and_public_weights_and_no_private_network(n
         if "namespaceSelector" not in one
         for pod in selected(one.get("podSelector") or {"matchLabels": {"": ""}})
     }
-    own = {pod for pod in PODS if labels_of(pod)["vlagents-ray/cluster"] == labels_of(name)["vlagents-ray/cluster"]}
+    own = {
+        pod
+        for pod in PODS
+        if labels_of(pod)["vlagents-ray/cluster"] == labels_of(name)["vlagents-ray/cluster"]
+    }
     assert others == (own if name.startswith("policy") else set(PODS))
-    assert {"protocol": "UDP", "port": 53} in [port for rule in leaves(name) for port in rule.get("ports", [])]
+    assert {"protocol": "UDP", "port": 53} in [
+        port for rule in leaves(name) for port in rule.get("ports", [])
+    ]
 
 
 def test_the_namespace_has_kubernetes_hold_pods_to_the_profile() -> None:
@@ -307,7 +354,9 @@ def test_the_namespace_has_kubernetes_hold_pods_to_the_profile() -> None:
 def test_the_object_store_fits_into_the_pods_shared_memory(name: str) -> None:
     cluster, _, group = name.partition("-")
     spec = (SERVICE if cluster == "policy" else JOB).cluster
-    groups = {"head": spec.head_group_spec} | {one.group_name: one for one in spec.worker_group_specs}
+    groups = {"head": spec.head_group_spec} | {
+        one.group_name: one for one in spec.worker_group_specs
+    }
     store = int(groups[group].ray_start_params["object-store-memory"])
     [shm] = [one["emptyDir"] for one in RAY_PODS[name]["spec"]["volumes"] if one["name"] == "shm"]
     memory = RAY_PODS[name]["spec"]["containers"][0]["resources"]["limits"]["memory"]
@@ -329,10 +378,14 @@ def test_manifests_agree_on_names_versions_and_labels() -> None:
     for name, pod in PODS.items():
         label = pod["metadata"]["labels"]["vlagents-ray/cluster"]
         assert label == ("policy" if name.startswith("policy") else "evaluation")
-        assert manifest("NetworkPolicy", label)["spec"]["podSelector"]["matchLabels"] == {"vlagents-ray/cluster": label}
+        assert manifest("NetworkPolicy", label)["spec"]["podSelector"]["matchLabels"] == {
+            "vlagents-ray/cluster": label
+        }
     [backend] = values_of(manifest("Ingress", "policy"), "service")
     assert backend["name"] == f"{SERVICE.metadata.name}-serve-svc"  # as KubeRay names it
-    claims = {one["metadata"]["name"] for one in everything if one["kind"] == "PersistentVolumeClaim"}
+    claims = {
+        one["metadata"]["name"] for one in everything if one["kind"] == "PersistentVolumeClaim"
+    }
     assert set(values_of(everything, "claimName")) == claims
 
 
@@ -363,7 +416,11 @@ def test_the_page_names_files_that_exist_and_settings_that_are_taken() -> None:
         file.name for file in FOLDER.glob("*.yaml")
     }
     assert all((ROOT / name).is_file() for name in named)
-    [words] = [shlex.split(line, comments=True) for line in shell.splitlines() if line.startswith("vlagents-ray")]
+    [words] = [
+        shlex.split(line, comments=True)
+        for line in shell.splitlines()
+        if line.startswith("vlagents-ray")
+    ]
     check_command(words, "kubernetes.md")
 
 
@@ -382,8 +439,13 @@ def test_the_manifests_server_comes_up_and_robots_with_a_key_play(tmp_path: Path
         serve_runs(cluster)
         said = robot.run([sys.executable, "-c", ROBOT, f"http://{head.name}:8000", key])
         assert said.split() == ["websocket", "scripted"]
-        health = "import sys, urllib.request as u; print(u.urlopen(sys.argv[1], timeout=5).read().decode())"
+        health = (
+            "import sys, urllib.request as u; print(u.urlopen(sys.argv[1], "
+            "timeout=5).read().decode())"
+        )
         # what KubeRay asks, and what nobody is told without a key
-        assert "success" in head.run([sys.executable, "-c", health, "http://localhost:8000/-/healthz"])
+        assert "success" in head.run(
+            [sys.executable, "-c", health, "http://localhost:8000/-/healthz"]
+        )
         with pytest.raises(HostFailed, match="401"):
             robot.run([sys.executable, "-c", health, f"http://{head.name}:8000/v1/metadata"])

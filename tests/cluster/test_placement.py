@@ -1,4 +1,6 @@
-"""Who runs where, and by which transport: a real Ray cluster of three nodes, and a robot on a host outside it."""
+"""Who runs where, and by which transport: a real Ray cluster of three nodes, and a robot on a
+host outside it.
+"""
 
 from __future__ import annotations
 
@@ -28,7 +30,9 @@ class Served:
     cluster: RayCluster
     robot: Host
 
-    def play(self, app: str, workers: int, out: Path, transport: str = "auto") -> Counter[tuple[str, str]]:
+    def play(
+        self, app: str, workers: int, out: Path, transport: str = "auto"
+    ) -> Counter[tuple[str, str]]:
         """How many of an evaluation's workers ran where, and had which transport."""
         said = self.cluster.head.run([*PLACED, "play", app, str(workers), transport, str(out)])
         found = json.loads(said.splitlines()[-1])
@@ -39,7 +43,10 @@ class Served:
 @pytest.fixture(scope="module")
 def served() -> Iterator[Served]:
     environment = {"PYTHONPATH": PYTHONPATH}
-    with hosts(4) as [head, second, third, robot], ray_cluster([head], CPUS, environment, **STORE) as cluster:
+    with (
+        hosts(4) as [head, second, third, robot],
+        ray_cluster([head], CPUS, environment, **STORE) as cluster,
+    ):
         for host, resources in ((second, {"of_one": 1, "of_two": 1}), (third, {"of_two": 1})):
             cluster.join(host, CPUS, resources=json.dumps(resources), **STORE)
         robot.environment |= environment
@@ -65,9 +72,12 @@ def test_plasma_is_there_on_the_replicas_node(served: Served, tmp_path: Path) ->
     assert served.play("one", 2, tmp_path, "plasma") == {("host2", "plasma"): 2}
 
 
-def test_workers_are_shared_over_the_nodes_of_several_replicas(served: Served, tmp_path: Path) -> None:
+def test_workers_are_shared_over_the_nodes_of_several_replicas(
+    served: Served, tmp_path: Path
+) -> None:
     wanted = {("host2", "shm"): 2, ("host3", "shm"): 2}
-    for attempt in ("1", "2", "3"):  # a replica that stands still for 0.3 s is not offered to a worker on its node
+    # A replica that stands still for 0.3 s is not offered to a worker on its node.
+    for attempt in ("1", "2", "3"):
         found = served.play("two", 4, tmp_path / attempt)
         if found == wanted:
             break

@@ -43,7 +43,11 @@ class Machines:
         for host in (first, second, robot):
             home = host.folder / "home"
             home.mkdir()
-            host.environment |= {"HOME": str(home), "PATH": ENV["PATH"], "RAY_USAGE_STATS_ENABLED": "0"}
+            host.environment |= {
+                "HOME": str(home),
+                "PATH": ENV["PATH"],
+                "RAY_USAGE_STATS_ENABLED": "0",
+            }
 
     def home(self, host: Host) -> Path:
         return Path(host.environment["HOME"])
@@ -60,10 +64,14 @@ class Machines:
 
     @contextmanager
     def serving(self, block: Block, log: Path) -> Iterator[None]:
-        """While this lasts, the block runs on the first machine, and has said that it serves; it ends by Ctrl-C."""
+        """While this lasts, the block runs on the first machine, and has said that it serves; it
+        ends by Ctrl-C.
+        """
         number = self.checkout / "server.pid"
         command = self.command(block)
-        command[-1] = f"echo $$ >{number}\n" + command[-1].replace("vlagents-ray serve", "exec vlagents-ray serve")
+        command[-1] = f"echo $$ >{number}\n" + command[-1].replace(
+            "vlagents-ray serve", "exec vlagents-ray serve"
+        )
         with log.open("w") as output:
             server = self.first.start(command, stdout=output, stderr=subprocess.STDOUT)
 
@@ -103,7 +111,8 @@ def test_the_page_makes_a_cluster_that_serves_a_robot_and_evaluates(tmp_path: Pa
         (machines.home(second) / ".ray").mkdir()
         shutil.copy(token, machines.home(second) / ".ray")
         machines.run(second, join)
-        wait_for(lambda: machines.run(first, status).count("node_") == 2)  # Ray says so every few seconds
+        # Ray says so every few seconds.
+        wait_for(lambda: machines.run(first, status).count("node_") == 2)
 
         machines.run(first, keys)
         key = (tmp_path / "arm-1.key").read_text().split()[0]
@@ -141,7 +150,9 @@ def test_a_misspelt_key_in_one_is_found() -> None:
 def test_the_settings_for_ray_start_are_those_of_a_server_of_our_own() -> None:
     variables = ["RAY_AUTH_MODE", *ROBOTS]
     show = f". {SCRIPT}; {sys.executable} -c 'import os, json; print(json.dumps(dict(os.environ)))'"
-    done = subprocess.run(["sh", "-eu", "-c", show], capture_output=True, text=True, check=True, env={})
+    done = subprocess.run(
+        ["sh", "-eu", "-c", show], capture_output=True, text=True, check=True, env={}
+    )
     said = yaml.safe_load(done.stdout)
     assert {name: said[name] for name in variables} == {"RAY_AUTH_MODE": "token", **ROBOTS}
 
@@ -152,8 +163,14 @@ def haproxy_files(home: Path, times: int = 1) -> dict[str, Path]:
     script.write_text(SCRIPT.read_text().replace("/tmp/", f"{home}/"))
     environment = {"PATH": ENV["PATH"], "PYTHONPATH": str(ROOT)}
     read = f". {script}; " * times + "env"
-    done = subprocess.run(["sh", "-euc", read], capture_output=True, text=True, check=True, env=environment)
-    said = dict(line.split("=", 1) for line in done.stdout.splitlines() if line.startswith("RAY_SERVE_HAPROXY_"))
+    done = subprocess.run(
+        ["sh", "-euc", read], capture_output=True, text=True, check=True, env=environment
+    )
+    said = dict(
+        line.split("=", 1)
+        for line in done.stdout.splitlines()
+        if line.startswith("RAY_SERVE_HAPROXY_")
+    )
     return {name: Path(value) for name, value in said.items() if value.startswith("/")}
 
 
@@ -170,7 +187,9 @@ def test_no_other_user_reaches_the_socket_that_commands_haproxy(tmp_path: Path) 
     assert {path if path == folder else path.parent for path in files.values()} == {folder}
     assert folder.stat().st_mode & 0o777 == 0o700
     assert haproxy_files(tmp_path) == files
-    longest = f"/tmp/{folder.name}/{'0' * 56}/{files['RAY_SERVE_HAPROXY_SOCKET_PATH'].name}.1234567.tmp"
+    longest = (
+        f"/tmp/{folder.name}/{'0' * 56}/{files['RAY_SERVE_HAPROXY_SOCKET_PATH'].name}.1234567.tmp"
+    )
     assert len(longest) <= 107
 
     folder.chmod(0o755)

@@ -40,17 +40,25 @@ evaluate(EvalConfig(
 
 @pytest.mark.alone
 def test_four_workers_on_two_nodes_play_nearly_four_times_as_much_as_one() -> None:
-    """Anything that all wait for would halve it; the bound leaves room for a machine that has other work to do."""
+    """Anything that all wait for would halve it; the bound leaves room for a machine that has
+    other work to do.
+    """
     plan = ScalingPlan(workers=(1, 4), rounds=1, steps=20, seconds=3.0)
     with driving(plan, nodes=2) as (driver, size, made):
         assert size == 2
         for _ in range(3):  # a machine that stands still for a second spoils a round
-            rows = {(row["app"], row["workers"]): row for row in measure_cluster(plan, size, driver, made=made)["rows"]}
+            rows = {
+                (row["app"], row["workers"]): row
+                for row in measure_cluster(plan, size, driver, made=made)["rows"]
+            }
             if rows[OWN, 4]["of_linear"] > 0.6:
                 break
         # Over before the last worker is there, as with the rounds that tell the driver's costs.
         short = PlayedEpisodes(
-            **driver.request(json.dumps(asdict(ScalingRound(4, episodes=2, steps=1, step_ms=1.0, size=32))), 120.0)
+            **driver.request(
+                json.dumps(asdict(ScalingRound(4, episodes=2, steps=1, step_ms=1.0, size=32))),
+                120.0,
+            )
         )
     assert (short.episodes, short.episodes_per_minute) == (7, None), "after the first"
     own = rows[OWN, 4]
@@ -62,12 +70,16 @@ def test_four_workers_on_two_nodes_play_nearly_four_times_as_much_as_one() -> No
     assert own["sent_bytes_per_act"] < IMAGE_BYTES / 10, "no image leaves its host"
 
 
-def test_two_drivers_on_one_cluster_play_a_part_each_and_their_results_are_merged(tmp_path: Path) -> None:
+def test_two_drivers_on_one_cluster_play_a_part_each_and_their_results_are_merged(
+    tmp_path: Path,
+) -> None:
     settings = {"address": None, "policy_ms": 5.0, "fleets": {"own": asdict(Fleet(2))}}
     with hosts(2) as both, ray_cluster(both, 4, {"PYTHONPATH": PYTHONPATH}) as cluster:
         serving = [sys.executable, "-m", "benchmarks.scaling_driver"]
         settings["address"] = cluster.address
-        with LineProcess("server", cluster.head.command([*serving, json.dumps(settings)]), our_environment()) as server:
+        with LineProcess(
+            "server", cluster.head.command([*serving, json.dumps(settings)]), our_environment()
+        ) as server:
             server.read(300)
             parts = [tmp_path / seed for seed in ("0", "6")]
             drivers = [
@@ -77,11 +89,16 @@ def test_two_drivers_on_one_cluster_play_a_part_each_and_their_results_are_merge
             assert [driver.wait(300) for driver in drivers] == [0, 0]
     merge = [sys.executable, "-c", "from vlagents_ray.cli import main; main()", "merge"]
     done = subprocess.run(
-        [*merge, *map(str, parts), "--out", str(tmp_path / "all")], capture_output=True, text=True, check=False
+        [*merge, *map(str, parts), "--out", str(tmp_path / "all")],
+        capture_output=True,
+        text=True,
+        check=False,
     )
     assert done.returncode == 0, done.stdout + done.stderr
     merged = Results.load(tmp_path / "all")
-    assert [sorted(one.result.key.seed for one in cell.episodes) for cell in merged.cells] == [list(range(12))]
+    assert [sorted(one.result.key.seed for one in cell.episodes) for cell in merged.cells] == [
+        list(range(12))
+    ]
     assert [one.result.status for one in merged.cells[0].episodes] == ["done"] * 12
     first, second = sorted(merged.runs, key=lambda run: run.started)
     assert second.started < (first.ended or 0), "they were there at the same time"

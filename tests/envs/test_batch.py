@@ -57,7 +57,8 @@ def test_a_cameras_images_are_rows_of_one_array(batch: BatchEnv) -> None:
     assert len(arrays) == 1
     assert seen[0].cameras["front"].base.shape == (3, 32, 40, 3)
     later, *_ = batch.step([act[0] for act in (actions(0), actions(1), actions(2))])
-    assert later[0].cameras["front"].base is not seen[0].cameras["front"].base  # what was given stays as it was
+    # What was given stays as it was.
+    assert later[0].cameras["front"].base is not seen[0].cameras["front"].base
 
 
 def test_an_idle_environment_stands_still_while_the_others_go_on(batch: BatchEnv) -> None:
@@ -78,7 +79,11 @@ def test_fewer_episodes_than_environments_leave_the_others_out(batch: BatchEnv) 
 def test_each_environment_has_options_of_its_own(batch: BatchEnv) -> None:
     with make_env("tabletop/lift", **SIZE) as alone:
         possible = [alone.reset(seed=seed)[1]["instructions"] for seed in SEEDS]
-    options: list[dict[str, Any] | None] = [None, {"instruction": possible[1][0]}, {"instruction": possible[2][-1]}]
+    options: list[dict[str, Any] | None] = [
+        None,
+        {"instruction": possible[1][0]},
+        {"instruction": possible[2][-1]},
+    ]
     batch.reset(seeds=SEEDS, options=options)
     assert batch.instructions[1:] == [possible[1][0], possible[2][-1]]
 

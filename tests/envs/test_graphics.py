@@ -1,4 +1,6 @@
-"""On which device a worker draws: with fakes of other machines' devices, and for real on this one's."""
+"""On which device a worker draws: with fakes of other machines' devices, and for real on this
+one's.
+"""
 
 from __future__ import annotations
 
@@ -12,7 +14,15 @@ import pytest
 from fake_gpus import TWO_GPUS, chosen, nothing_chosen
 
 from vlagents_ray.envs import graphics
-from vlagents_ray.envs.graphics import EGL_DEVICE, GPUS, EglDevice, Renderer, fitting, require_own, usable_devices
+from vlagents_ray.envs.graphics import (
+    EGL_DEVICE,
+    GPUS,
+    EglDevice,
+    Renderer,
+    fitting,
+    require_own,
+    usable_devices,
+)
 from vlagents_ray.errors import ConfigError
 
 LLVMPIPE = Renderer("llvmpipe (LLVM 15.0.6, 256 bits)", software=True, cuda=None)
@@ -55,14 +65,18 @@ def test_without_a_display_mujoco_renders_through_egl_and_in_software_on_one_cor
     assert (os.environ.get("MUJOCO_GL"), os.environ.get("LP_NUM_THREADS")) == want
 
 
-@pytest.mark.parametrize(("visible", "device"), [("1", "1"), ("GPU-8c9a", "1"), ("0,1", "1"), ("", "3"), ("-1", "3")])
+@pytest.mark.parametrize(
+    ("visible", "device"), [("1", "1"), ("GPU-8c9a", "1"), ("0,1", "1"), ("", "3"), ("-1", "3")]
+)
 def test_a_worker_draws_on_what_egl_calls_its_gpu_or_in_software(
     monkeypatch: pytest.MonkeyPatch, visible: str, device: str
 ) -> None:
     assert chosen(monkeypatch, visible) == device
 
 
-def test_a_process_that_nobody_gave_or_forbade_gpus_is_left_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_process_that_nobody_gave_or_forbade_gpus_is_left_alone(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     graphics.choose_devices()
     assert EGL_DEVICE not in os.environ
     monkeypatch.setattr(graphics, "_lavapipe", lambda: Path("/lvp_icd.json"))
@@ -70,7 +84,9 @@ def test_a_process_that_nobody_gave_or_forbade_gpus_is_left_alone(monkeypatch: p
     require_own(OTHERS)
 
 
-def test_vulkan_is_left_with_its_software_driver_where_there_is_no_gpu(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_vulkan_is_left_with_its_software_driver_where_there_is_no_gpu(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     monkeypatch.setattr(graphics, "_lavapipe", lambda: Path("/lvp_icd.json"))
     chosen(monkeypatch, "0")
     assert graphics.VULKAN_DRIVERS[0] not in os.environ
@@ -86,7 +102,9 @@ def test_what_the_user_chose_stays_and_is_no_mistake(monkeypatch: pytest.MonkeyP
     require_own(graphics.vulkan_renderer("NVIDIA H200", None))
 
 
-def test_the_nvidia_driver_that_sapien_names_by_itself_is_nobodys_wish(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_nvidia_driver_that_sapien_names_by_itself_is_nobodys_wish(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     monkeypatch.setenv(GPUS, "")
     monkeypatch.setenv(graphics.VULKAN_DRIVERS[0], "/venv/sapien/vulkan_library/nvidia_icd.json")
     with pytest.raises(ConfigError, match="given no GPU"):
@@ -102,8 +120,18 @@ def test_where_no_device_fits_none_is_named(monkeypatch: pytest.MonkeyPatch) -> 
 @pytest.mark.parametrize(
     ("visible", "good", "bad", "said"),
     [
-        ("", LLVMPIPE, [NVIDIA, OTHERS], r"given no GPU .* renders on 'NVIDIA H200.*worker: \{gpus: 0.25\}"),
-        ("3", NVIDIA, [LLVMPIPE, OTHERS], r"given the GPU 3, but its env renders on .*libnvidia-gl"),
+        (
+            "",
+            LLVMPIPE,
+            [NVIDIA, OTHERS],
+            r"given no GPU .* renders on 'NVIDIA H200.*worker: \{gpus: 0.25\}",
+        ),
+        (
+            "3",
+            NVIDIA,
+            [LLVMPIPE, OTHERS],
+            r"given the GPU 3, but its env renders on .*libnvidia-gl",
+        ),
     ],
 )
 def test_drawing_on_anything_but_what_was_given_is_an_error_with_its_cure(
@@ -117,7 +145,10 @@ def test_drawing_on_anything_but_what_was_given_is_an_error_with_its_cure(
 
 
 def test_sapiens_devices_are_read_from_its_summary() -> None:
-    assert usable_devices(SUMMARY) == [("NVIDIA H200", 0), ("llvmpipe (LLVM 15.0.6, 256 bits)", None)]
+    assert usable_devices(SUMMARY) == [
+        ("NVIDIA H200", 0),
+        ("llvmpipe (LLVM 15.0.6, 256 bits)", None),
+    ]
 
 
 DRAW = """

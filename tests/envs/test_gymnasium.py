@@ -11,7 +11,14 @@ import pytest
 from vlagents_ray import Act
 from vlagents_ray.envs import make_env
 from vlagents_ray.envs.gymnasium import Gymnasium, Pick, as_image, plain
-from vlagents_ray.errors import ConfigError, EnvFailed, InvalidAction, MissingDependency, NotReset, UnknownEnv
+from vlagents_ray.errors import (
+    ConfigError,
+    EnvFailed,
+    InvalidAction,
+    MissingDependency,
+    NotReset,
+    UnknownEnv,
+)
 from vlagents_ray.testing import ContractViolation, check_env
 
 pytestmark = pytest.mark.sim
@@ -52,7 +59,13 @@ class Arm(gymnasium.Env[dict[str, Any], np.ndarray]):
         self.count += 1
         self.qpos[:2] += 0.1 * action
         done = self.count >= 3
-        return self.observation(), np.float64(0.5), done, False, {"task": {"solved": np.bool_(done)}}
+        return (
+            self.observation(),
+            np.float64(0.5),
+            done,
+            False,
+            {"task": {"solved": np.bool_(done)}},
+        )
 
     def observation(self) -> dict[str, Any]:
         self.image[:] = self.count  # one buffer for all observations, as some simulators have
@@ -86,7 +99,10 @@ def _registered() -> Any:
         ("gymnasium/Pendulum-v1", {"width": 64, "height": 48, "remake": True}),
         ("gymnasium/MountainCarContinuous-v0", {"max_steps": 20, "unit_actions": True}),
         (PUSHT, {"max_steps": 20}),
-        ("gymnasium/VlaArm-v0", {"success": "task/solved", "gripper": "robot/qpos[3:4]", "gripper_range": (0.0, 0.04)}),
+        (
+            "gymnasium/VlaArm-v0",
+            {"success": "task/solved", "gripper": "robot/qpos[3:4]", "gripper_range": (0.0, 0.04)},
+        ),
     ],
 )
 def test_keeps_the_contract(name: str, options: dict[str, Any]) -> None:
@@ -101,7 +117,9 @@ def test_a_seed_gives_what_gymnasium_gives_for_it() -> None:
             got, _ = env.reset(seed=seed)
             assert np.array_equal(got.state["state"], expected)
             action = np.array([0.7], np.float32)
-            assert np.array_equal(env.step(Act(action))[0].state["state"], plain_env.step(action)[0])
+            assert np.array_equal(
+                env.step(Act(action))[0].state["state"], plain_env.step(action)[0]
+            )
     plain_env.close()
 
 
@@ -109,7 +127,9 @@ def test_images_and_vectors_of_the_observation_are_found() -> None:
     with make_env("gymnasium/VlaArm-v0") as env:
         assert list(env.contract.cameras or {}) == ["images/top"]
         assert list(env.contract.state or {}) == ["robot/qpos"]
-        assert (env.contract.action.low, env.contract.action.high) == (None, None), "they differ by component"
+        assert (env.contract.action.low, env.contract.action.high) == (None, None), (
+            "they differ by component"
+        )
 
 
 def test_cameras_and_states_are_renamed_cut_and_rendered() -> None:
@@ -124,7 +144,10 @@ def test_cameras_and_states_are_renamed_cut_and_rendered() -> None:
     with make_env("gymnasium/VlaArm-v0", **options) as env:
         obs, _ = env.reset(seed=1)
         assert sorted(obs.cameras) == ["front", "shown"]
-        assert {name: part.shape for name, part in obs.state.items()} == {"joints": (3,), "last": (1,)}
+        assert {name: part.shape for name, part in obs.state.items()} == {
+            "joints": (3,),
+            "last": (1,),
+        }
         assert obs.gripper == pytest.approx(0.5)
         assert env.instruction == "reach"
         assert env.contract.instruction is True
@@ -143,17 +166,23 @@ def test_unit_actions_are_scaled_to_the_box_and_clipped() -> None:
 
 
 @pytest.mark.parametrize(
-    ("options", "solved"), [({"success": "task/solved"}, True), ({"success": "terminated"}, True), ({}, False)]
+    ("options", "solved"),
+    [({"success": "task/solved"}, True), ({"success": "terminated"}, True), ({}, False)],
 )
 def test_success_comes_from_where_the_option_says(options: dict[str, str], solved: bool) -> None:
     with make_env("gymnasium/VlaArm-v0", **options) as env:
         env.reset(seed=0)
-        assert [env.step(Act(np.zeros(2, np.float32)))[-1]["success"] for _ in range(3)][-1] is solved
+        assert [env.step(Act(np.zeros(2, np.float32)))[-1]["success"] for _ in range(3)][
+            -1
+        ] is solved
 
 
 @pytest.mark.parametrize(
     ("options", "error", "message"),
-    [({"success": "solved"}, ConfigError, "'solved'"), ({"kwargs": {"broken": True}}, EnvFailed, "joint limit")],
+    [
+        ({"success": "solved"}, ConfigError, "'solved'"),
+        ({"kwargs": {"broken": True}}, EnvFailed, "joint limit"),
+    ],
 )
 def test_what_a_simulator_does_not_give_is_no_failure_of_the_policy(
     options: dict[str, Any], error: type[Exception], message: str
@@ -175,7 +204,12 @@ def test_an_env_without_step_limit_asks_for_one() -> None:
     ("task", "options", "error", "message"),
     [
         ("NoSuchEnv-v0", {}, UnknownEnv, "NoSuchEnv"),
-        ("gymnasium/VlaArm-v0", {}, UnknownEnv, "gymnasium/MODULE:ID imports.*did you mean 'VlaArm-v0'"),
+        (
+            "gymnasium/VlaArm-v0",
+            {},
+            UnknownEnv,
+            "gymnasium/MODULE:ID imports.*did you mean 'VlaArm-v0'",
+        ),
         (None, {}, UnknownEnv, "Pendulum"),
         ("VlaSwitch-v0", {}, ConfigError, "Discrete"),
         ("no_such_module/Env-v0", {}, MissingDependency, "no_such_module"),
@@ -185,7 +219,12 @@ def test_an_env_without_step_limit_asks_for_one() -> None:
         ("VlaArm-v0", {"state": {"joints": "robot[a]"}}, ConfigError, "range"),
         ("VlaArm-v0", {"cameras": {"front": "robot/qpos"}}, ConfigError, "uint8"),
         ("VlaArm-v0", {"gripper": "robot/qpos"}, ConfigError, "want one"),
-        ("VlaArm-v0", {"gripper": "robot/qpos[3:]", "gripper_range": (1.0, 1.0)}, ConfigError, "gripper_range"),
+        (
+            "VlaArm-v0",
+            {"gripper": "robot/qpos[3:]", "gripper_range": (1.0, 1.0)},
+            ConfigError,
+            "gripper_range",
+        ),
     ],
 )
 def test_a_wrong_mapping_is_named_when_the_env_is_made(
@@ -211,7 +250,12 @@ def test_a_step_before_reset_a_chunk_a_negative_seed_and_a_closed_env_are_refuse
 
 def test_what_a_reset_leaves_behind_is_found_by_the_suite_and_cured_by_remake() -> None:
     # PushT draws the last action of the previous episode into the first rendered image
-    options = {"kwargs": {"obs_type": "state"}, "cameras": {"front": "render"}, "width": 96, "height": 96}
+    options = {
+        "kwargs": {"obs_type": "state"},
+        "cameras": {"front": "render"},
+        "width": 96,
+        "height": 96,
+    }
     with pytest.raises(ContractViolation, match="first observation"):
         check_env(make_env(PUSHT, **options), step_limit=False)
     check_env(make_env(PUSHT, **options, remake=True), step_limit=False)
@@ -224,7 +268,13 @@ def test_options_of_reset_reach_the_env_and_what_the_wire_cannot_carry_is_left_o
 
 
 def test_plain_keeps_values_and_drops_objects() -> None:
-    given = {"a": np.float32(1.5), 2: (1, np.bool_(True)), "o": object(), "x": np.arange(2), "s": {"n": None, "t": "x"}}
+    given = {
+        "a": np.float32(1.5),
+        2: (1, np.bool_(True)),
+        "o": object(),
+        "x": np.arange(2),
+        "s": {"n": None, "t": "x"},
+    }
     got = plain(given)
     assert got["a"] == 1.5
     assert type(got["a"]) is float
@@ -244,7 +294,9 @@ def test_a_pick_of_a_scalar_is_a_vector_of_one() -> None:
 def test_images_are_stretched_and_there_is_no_more_info_than_the_envs() -> None:
     with Gymnasium("gym_pusht/PushT-v0", kwargs={"obs_type": "pixels_agent_pos"}) as large:
         whole = large.reset(seed=0)[0].cameras["front"]
-    with Gymnasium("gym_pusht/PushT-v0", kwargs={"obs_type": "pixels_agent_pos"}, width=32, height=32) as env:
+    with Gymnasium(
+        "gym_pusht/PushT-v0", kwargs={"obs_type": "pixels_agent_pos"}, width=32, height=32
+    ) as env:
         obs, _ = env.reset(seed=0)
         np.testing.assert_array_equal(as_image(whole, "front", (32, 32)), obs.cameras["front"])
         assert obs.info == {}

@@ -66,7 +66,11 @@ def test_each_task_gives_what_its_contract_states(task: str) -> None:
         assert set(obs.cameras) == set(contract.cameras or {}) == cameras
         assert (env.max_steps, env.instruction) == (STEP_LIMITS.get(task, 50), INSTRUCTIONS[task])
         has_gripper = task != "PushT-v1"  # its robot holds a stick
-        assert (contract.control_hz, contract.action.space, contract.gripper) == (20.0, "ee_pose", has_gripper)
+        assert (contract.control_hz, contract.action.space, contract.gripper) == (
+            20.0,
+            "ee_pose",
+            has_gripper,
+        )
         assert contract.action.dim == (7 if has_gripper else 6)
         action = np.full(contract.action.dim or 0, 0.1, dtype=np.float32)
         for _ in range(3):
@@ -84,7 +88,9 @@ def test_it_keeps_the_promises_of_an_env() -> None:
 
 @pytest.mark.parametrize("task", ["PegInsertionSide-v1", "PlugCharger-v1"])
 def test_an_episode_does_not_depend_on_what_was_played_before(task: str) -> None:
-    """PegInsertionSide draws its geometry anew; PlugCharger's contacts survive a reset without reconfiguration."""
+    """PegInsertionSide draws its geometry anew; PlugCharger's contacts survive a reset without
+    reconfiguration.
+    """
     rng = np.random.default_rng(0)
     actions = [rng.uniform(-1, 1, 7).astype(np.float32) for _ in range(12)]
     with ManiSkill(task, width=16, height=16, cameras=["base_camera"]) as env:
@@ -97,7 +103,9 @@ def test_an_episode_does_not_depend_on_what_was_played_before(task: str) -> None
 
 
 def test_images_have_the_size_asked_for_and_stand_upright() -> None:
-    """The camera looks back at the robot: what is nearer to it, at larger x, is lower; larger y is further right."""
+    """The camera looks back at the robot: what is nearer to it, at larger x, is lower; larger y
+    is further right.
+    """
     with ManiSkill("PushCube-v1", width=160, height=120) as env:
         assert env.contract.cameras == {"base_camera": CameraSpec(height=120, width=160)}
         columns = []
@@ -113,7 +121,8 @@ def test_images_have_the_size_asked_for_and_stand_upright() -> None:
             assert len(cube) > 5
             assert len(target) > 10
             assert target[:, 0].mean() > cube[:, 0].mean()
-            columns.append((obs.info["sim_state"][29], cube[:, 1].mean()))  # the cube's y in m, its column
+            # The cube's y in m, its column.
+            columns.append((obs.info["sim_state"][29], cube[:, 1].mean()))
         columns.sort()
         assert [column for _, column in columns] == sorted(column for _, column in columns)
 
@@ -139,7 +148,9 @@ def test_translations_are_along_the_bases_axes(push: ManiSkill) -> None:
 
 
 def test_a_positive_rotation_turns_the_tool_negatively(push: ManiSkill) -> None:
-    """ManiSkill scales rotations by their lower bound, -0.1 rad; `ManiSkill`'s docstring says so."""
+    """ManiSkill scales rotations by their lower bound, -0.1 rad; `ManiSkill`'s docstring says
+    so.
+    """
     start = push.reset(seed=0)[0].state["xyzrpy"]
     for _ in range(5):
         obs, *_ = push.step(command(yaw=1.0))
@@ -150,7 +161,9 @@ def test_a_positive_rotation_turns_the_tool_negatively(push: ManiSkill) -> None:
 def test_the_pose_is_in_the_robots_base_frame(push: ManiSkill) -> None:
     obs, _ = push.reset(seed=0)
     in_world = obs.info["sim_state"][18:21]  # the base stands at x = -0.615 m
-    np.testing.assert_allclose(obs.state["tquat"][:3], in_world + np.array([0.615, 0.0, 0.0]), atol=1e-5)
+    np.testing.assert_allclose(
+        obs.state["tquat"][:3], in_world + np.array([0.615, 0.0, 0.0]), atol=1e-5
+    )
     np.testing.assert_allclose(obs.state["joints"], obs.info["sim_state"][:7], atol=1e-6)
 
 
@@ -164,7 +177,12 @@ def test_only_the_cameras_asked_for_are_given_and_rendered() -> None:
 def test_other_control_modes_state_themselves() -> None:
     with ManiSkill("PushCube-v1", width=16, height=16, control_mode="pd_joint_delta_pos") as env:
         action = env.contract.action
-        assert (action.dim, action.space, action.delta, action.rotation) == (8, "joint", True, "none")
+        assert (action.dim, action.space, action.delta, action.rotation) == (
+            8,
+            "joint",
+            True,
+            "none",
+        )
         facts = env.describe()
         assert (facts["control_mode"], facts["sim_backend"]) == ("pd_joint_delta_pos", "physx_cpu")
         assert facts["render_backend"] in ("sapien_cpu", "sapien_cuda")
@@ -212,7 +230,9 @@ def test_a_task_that_cannot_be_evaluated_is_refused() -> None:
         ManiSkill("TwoRobotPickCube-v1", width=16, height=16)
 
 
-def test_missing_assets_fail_with_the_command_that_gets_them(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_missing_assets_fail_with_the_command_that_gets_them(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
     class Keyboard:
         def readline(self) -> str:
             pytest.fail("waited for an answer on stdin")
@@ -222,13 +242,16 @@ def test_missing_assets_fail_with_the_command_that_gets_them(monkeypatch: pytest
     monkeypatch.setattr(DATA_SOURCES["ycb"], "output_dir", tmp_path)
     keyboard = Keyboard()
     monkeypatch.setattr("sys.stdin", keyboard)
-    with pytest.raises(EnvFailed, match=r"ycb.*python -m mani_skill.utils.download_asset PickSingleYCB-v1"):
+    with pytest.raises(
+        EnvFailed, match=r"ycb.*python -m mani_skill.utils.download_asset PickSingleYCB-v1"
+    ):
         ManiSkill("PickSingleYCB-v1", width=16, height=16)
     assert sys.stdin is keyboard
 
 
 @pytest.mark.parametrize(
-    ("task", "words"), [("PickSingleYCB-v1", "pick single ycb"), ("OpenCabinetDrawer-v1", "open cabinet drawer")]
+    ("task", "words"),
+    [("PickSingleYCB-v1", "pick single ycb"), ("OpenCabinetDrawer-v1", "open cabinet drawer")],
 )
 def test_a_task_without_an_instruction_is_named_in_words(task: str, words: str) -> None:
     assert instruction_for(task) == words

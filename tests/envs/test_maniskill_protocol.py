@@ -32,7 +32,10 @@ def test_success_and_return_are_those_of_maniskills_own_wrapper(task: str) -> No
             rewards.append(reward)
             solved.append(info["success"])
             assert not terminated
-        modes = {name: env.describe()[name] for name in ("control_mode", "obs_mode", "sim_backend", "render_backend")}
+        modes = {
+            name: env.describe()[name]
+            for name in ("control_mode", "obs_mode", "sim_backend", "render_backend")
+        }
     from mani_skill.utils.wrappers.gymnasium import CPUGymWrapper
 
     theirs = CPUGymWrapper(
@@ -82,7 +85,9 @@ def test_a_batch_of_one_plays_what_a_single_environment_plays() -> None:
     actions = np.random.default_rng(0).uniform(-1, 1, (5, 7)).astype(np.float32)
     with (
         ManiSkill("PegInsertionSide-v1", **SMALL) as alone,
-        ManiSkillBatch("PegInsertionSide-v1", num_envs=1, sim_backend="physx_cpu", **SMALL) as batch,
+        ManiSkillBatch(
+            "PegInsertionSide-v1", num_envs=1, sim_backend="physx_cpu", **SMALL
+        ) as batch,
     ):
         assert batch.contract == alone.contract
         assert batch.max_steps == alone.max_steps
@@ -96,7 +101,9 @@ def test_a_batch_of_one_plays_what_a_single_environment_plays() -> None:
                 expected, reward, *flags, info = alone.step(Act(action))
                 [seen], rewards, *rows, infos = batch.step([Act(action)])
                 assert ([reward], [[flag] for flag in flags], [info]) == (rewards, rows, infos)
-                np.testing.assert_array_equal(seen.cameras["base_camera"], expected.cameras["base_camera"])
+                np.testing.assert_array_equal(
+                    seen.cameras["base_camera"], expected.cameras["base_camera"]
+                )
                 np.testing.assert_array_equal(seen.info["sim_state"], expected.info["sim_state"])
         assert batch.describe() == alone.describe()
 
@@ -120,7 +127,9 @@ def test_on_a_gpu_an_episode_does_not_depend_on_its_neighbours(task: str) -> Non
         assert base.shape == (4, 16, 16, 3)
         other = batch.reset(seeds=[7, 2, 8])
         assert len(other) == 3
-        np.testing.assert_allclose(other[1].info["sim_state"], first[1].info["sim_state"], atol=1e-5)
+        np.testing.assert_allclose(
+            other[1].info["sim_state"], first[1].info["sim_state"], atol=1e-5
+        )
         assert not np.allclose(other[0].info["sim_state"], first[0].info["sim_state"], atol=1e-3)
         action = Act(np.zeros(7, np.float32))
         seen, rewards, terminated, truncated, infos = batch.step([action, None, action])

@@ -18,7 +18,9 @@ quaternions = (
     .filter(lambda q: np.linalg.norm(q) > 0.1)
     .map(lambda q: q / np.linalg.norm(q))
 )
-poses = st.tuples(st.tuples(numbers, numbers, numbers).map(np.array), quaternions).map(np.concatenate)
+poses = st.tuples(st.tuples(numbers, numbers, numbers).map(np.array), quaternions).map(
+    np.concatenate
+)
 
 
 def rotation(pose: np.ndarray) -> Rotation:
@@ -32,7 +34,9 @@ def pose(turned: Rotation) -> np.ndarray:
 
 angles = st.floats(-np.pi, np.pi)
 upright = st.builds(
-    lambda yaw, sign, off, roll: pose(Rotation.from_euler("ZYX", [yaw, sign * (np.pi / 2 - off), roll])),
+    lambda yaw, sign, off, roll: pose(
+        Rotation.from_euler("ZYX", [yaw, sign * (np.pi / 2 - off), roll])
+    ),
     angles,
     st.sampled_from((-1, 1)),
     st.floats(0, 1e-3),
@@ -47,8 +51,11 @@ def check(base: np.ndarray, tool: np.ndarray) -> None:
     np.testing.assert_allclose(tquat[:3], position, atol=1e-5)
     np.testing.assert_allclose(Rotation.from_quat(tquat[3:]).as_matrix(), turned, atol=1e-5)
     np.testing.assert_allclose(xyzrpy[:3], position, atol=1e-5)
-    # near pitch = +-90 degrees the angles lose half their digits, the rotation they make up does not
-    np.testing.assert_allclose(Rotation.from_euler("xyz", xyzrpy[3:]).as_matrix(), turned, atol=2e-3)
+    # near pitch = +-90 degrees the angles lose half their digits, the rotation they make up does
+    # not
+    np.testing.assert_allclose(
+        Rotation.from_euler("xyz", xyzrpy[3:]).as_matrix(), turned, atol=2e-3
+    )
     assert tquat.dtype == xyzrpy.dtype == np.float32
     assert tquat[6] >= 0.0
 
@@ -59,7 +66,9 @@ def test_the_tools_pose_is_that_of_the_matrices(base: np.ndarray, tool: np.ndarr
 
 
 @given(upright)
-def test_a_tool_that_points_straight_up_or_down_has_angles_that_make_up_its_rotation(tool: np.ndarray) -> None:
+def test_a_tool_that_points_straight_up_or_down_has_angles_that_make_up_its_rotation(
+    tool: np.ndarray,
+) -> None:
     check(pose(Rotation.identity()), tool)
 
 
@@ -69,7 +78,13 @@ def box(low: float, high: float, dim: int) -> SimpleNamespace:
 
 def test_a_delta_pose_states_frame_rotation_and_gripper() -> None:
     spec = action_spec("pd_ee_delta_pose", box(-1.0, 1.0, 7), has_gripper=True)
-    assert (spec.dim, spec.space, spec.delta, spec.rotation, spec.frame) == (7, "ee_pose", True, "euler_xyz", "base")
+    assert (spec.dim, spec.space, spec.delta, spec.rotation, spec.frame) == (
+        7,
+        "ee_pose",
+        True,
+        "euler_xyz",
+        "base",
+    )
     assert (spec.gripper_open, spec.gripper_closed, spec.low, spec.high) == (1.0, -1.0, -1.0, 1.0)
 
 

@@ -35,7 +35,9 @@ def test_the_protocol_is_recorded_with_what_deviates_from_it(pusht: EvalEnv) -> 
     assert (protocol["name"], protocol["max_steps"], protocol["control_hz"]) == ("PushT", 300, 10.0)
     assert protocol["deviations"] == []
     with make_env(NAME, max_steps=50) as shorter:
-        assert shorter.describe()["protocol"]["deviations"] == ["max_steps: 50, the protocol says 300"]
+        assert shorter.describe()["protocol"]["deviations"] == [
+            "max_steps: 50, the protocol says 300"
+        ]
 
 
 def test_the_protocols_constants_are_the_simulators() -> None:
@@ -75,7 +77,9 @@ def test_the_expert_solves_random_beginnings_and_holding_still_does_not() -> Non
         assert (still.success_once, still.steps) == (False, 300)
 
 
-def test_a_block_that_is_not_where_the_expert_expected_it_makes_it_plan_again(pusht: EvalEnv) -> None:
+def test_a_block_that_is_not_where_the_expert_expected_it_makes_it_plan_again(
+    pusht: EvalEnv,
+) -> None:
     (before, _), (elsewhere, _) = pusht.reset(seed=0), pusht.reset(seed=1)
     interrupted, fresh = PushTExpert("pusht"), PushTExpert("pusht")
     interrupted.act(before)

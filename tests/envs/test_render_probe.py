@@ -10,7 +10,9 @@ import pytest
 from vlagents_ray.envs import graphics
 from vlagents_ray.envs.maniskill import ManiSkill
 
-needs_sapien = pytest.mark.skipif(importlib.util.find_spec("sapien") is None, reason="sapien is not installed")
+needs_sapien = pytest.mark.skipif(
+    importlib.util.find_spec("sapien") is None, reason="sapien is not installed"
+)
 
 
 @pytest.fixture(autouse=True)

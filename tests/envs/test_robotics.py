@@ -48,7 +48,11 @@ def test_moving_to_the_target_is_a_success(reach: EvalEnv) -> None:
 
 def test_staying_where_it_is_is_none(reach: EvalEnv) -> None:
     result = play(reach, NAME, Always(0.0, 0.0, 0.0, 0.0), seed=0)
-    assert (result.success_once, result.success_at_end, result.episode_return) == (False, False, -50.0)
+    assert (result.success_once, result.success_at_end, result.episode_return) == (
+        False,
+        False,
+        -50.0,
+    )
 
 
 @pytest.mark.parametrize("task", ["Reach", "Push", "Slide", "PickAndPlace"])

@@ -1,4 +1,6 @@
-"""What all simulators share, shown with one that simulates nothing; protocols, as results record them."""
+"""What all simulators share, shown with one that simulates nothing; protocols, as results record
+them.
+"""
 
 from __future__ import annotations
 
@@ -38,7 +40,10 @@ def test_what_was_played_by_the_protocol_deviates_in_nothing() -> None:
 
 def test_each_deviation_is_told_with_what_the_protocol_says() -> None:
     told = PROTOCOL.describe(max_steps=50, control_hz=20.0, ends_on_success=False)["deviations"]
-    assert told == ["max_steps: 50, the protocol says 200", "ends_on_success: False, the protocol says True"]
+    assert told == [
+        "max_steps: 50, the protocol says 200",
+        "ends_on_success: False, the protocol says True",
+    ]
 
 
 def test_a_description_travels_in_a_result() -> None:
@@ -56,7 +61,8 @@ def test_what_a_protocol_does_not_settle_cannot_deviate_from_it() -> None:
 def test_the_page_of_a_benchmark_states_its_protocol(suite: str) -> None:
     name = entries("envs")[suite].page or suite
     page = section("benchmarks", name.partition("#")[0])
-    own = page if "\n## Protocol\n" in page else section("benchmarks", name)  # several benchmarks may share a page
+    # Several benchmarks may share a page.
+    own = page if "\n## Protocol\n" in page else section("benchmarks", name)
     protocol = re.search(r"^##+ Protocol.*?\n(.*?)(?=^##|\Z)", own, re.DOTALL | re.MULTILINE)
     assert protocol is not None
     for stated in ("step", "success"):
@@ -70,7 +76,9 @@ class Shelf(SimulatorEnv):
     distributions: ClassVar = ()
     max_steps = 5
 
-    def __init__(self, *, states: int | None = None, ends_on_success: bool = True, breaks: str = "") -> None:
+    def __init__(
+        self, *, states: int | None = None, ends_on_success: bool = True, breaks: str = ""
+    ) -> None:
         super().__init__("top", width=8)
         self.init_states, self._ends_on_success = states, ends_on_success
         self._contract, self._protocol = Contract(action=ActionSpec(dim=2)), PROTOCOL
@@ -115,7 +123,11 @@ def test_success_ends_an_episode_unless_told_otherwise_and_the_limit_truncates(e
 
 def test_initial_states_go_by_the_option_or_the_seed() -> None:
     env = Shelf(states=3)
-    for seed, options, begun in ((7, None, [7, 1]), (7, {"init_state": 2}, [7, 2]), (2**32 + 3, None, [3, 1])):
+    for seed, options, begun in (
+        (7, None, [7, 1]),
+        (7, {"init_state": 2}, [7, 2]),
+        (2**32 + 3, None, [3, 1]),
+    ):
         obs, info = env.reset(seed=seed, options=options)
         assert (obs.info["begun"], info["init_state"]) == (begun, begun[1])
     for state in (3, -1, "1", True):

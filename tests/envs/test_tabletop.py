@@ -25,7 +25,9 @@ from vlagents_ray.policies.scripted import Scripted
 from vlagents_ray.testing import check_env
 
 
-def play(env: Tabletop, seed: int, *, wrong: bool = False, seen: Callable[[Obs], Obs] = lambda obs: obs) -> bool:
+def play(
+    env: Tabletop, seed: int, *, wrong: bool = False, seen: Callable[[Obs], Obs] = lambda obs: obs
+) -> bool:
     """Does the expert succeed, following the episode's instruction or another of the same scene?"""
     obs, info = env.reset(seed=seed)
     followed = env.instruction
@@ -68,7 +70,9 @@ def test_the_expert_sees_at_every_image_size(width: int, height: int) -> None:
 @pytest.mark.parametrize("subsampling", ["444", "420"])
 def test_the_expert_sees_through_jpeg(subsampling: str) -> None:
     def seen(obs: Obs) -> Obs:
-        return replace(obs, cameras={"front": decode(encode_jpeg(obs.cameras["front"], 85, subsampling))})
+        return replace(
+            obs, cameras={"front": decode(encode_jpeg(obs.cameras["front"], 85, subsampling))}
+        )
 
     env = Tabletop()
     assert np.mean([play(env, seed, seen=seen) for seed in range(many(20))]) >= 0.95
@@ -96,7 +100,11 @@ def test_an_episode_is_the_same_in_another_process_and_after_other_episodes() ->
     code = "from test_tabletop import *; print(digest_of_episode(Tabletop(), 11))"
     path = os.pathsep.join([str(Path(__file__).parent), *filter(None, sys.path)])
     elsewhere = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, check=True, env=os.environ | {"PYTHONPATH": path}
+        [sys.executable, "-c", code],
+        capture_output=True,
+        text=True,
+        check=True,
+        env=os.environ | {"PYTHONPATH": path},
     )
     env = Tabletop()
     other = digest_of_episode(env, 3)
@@ -135,7 +143,9 @@ def test_disturbances_follow_from_the_seed_and_the_expert_recovers() -> None:
     def path(disturbance: float) -> np.ndarray:
         env = Tabletop(width=64, height=64, disturbance=disturbance)
         env.reset(seed=1)
-        return np.array([env.step(Act(np.zeros(4, np.float32)))[0].state["xyzrpy"][:3] for _ in range(80)])
+        return np.array(
+            [env.step(Act(np.zeros(4, np.float32)))[0].state["xyzrpy"][:3] for _ in range(80)]
+        )
 
     assert np.array_equal(path(1.0), path(1.0))
     moved = np.abs(np.diff(path(1.0), axis=0)).max(-1) > 0
@@ -164,7 +174,9 @@ def test_what_there_is_not_is_refused() -> None:
         with pytest.raises(ConfigError, match=f"{option} is {value}, {text}"):
             Tabletop(task, **{option: value})
 
-    with pytest.raises(ConfigError, match=r"no camera \['top'\]: want some of \['front', 'wrist'\]"):
+    with pytest.raises(
+        ConfigError, match=r"no camera \['top'\]: want some of \['front', 'wrist'\]"
+    ):
         Tabletop(cameras=("top",))
 
 
@@ -172,7 +184,10 @@ def test_what_there_is_not_is_refused() -> None:
 def test_one_puck_is_the_only_one_that_is_named(task: str) -> None:
     env = Tabletop(task, pucks=1)
     _, info = env.reset(seed=0)
-    assert len({text.split(" puck ")[0] for text in [f"{text} " for text in info["instructions"]]}) == 1
+    assert (
+        len({text.split(" puck ")[0] for text in [f"{text} " for text in info["instructions"]]})
+        == 1
+    )
     assert np.mean([play(env, seed) for seed in range(many(20))]) >= 0.95
 
 
@@ -194,7 +209,9 @@ def test_the_state_of_the_objects_says_where_the_puck_is_and_where_it_is_to_be(t
         success = info["success"]
         off.append(np.linalg.norm(seen.state["puck"] - seen.state["target"]))
     assert off[0] > 0.07
-    assert off[-1] < 0.06, "within the pad, on the other puck, or somewhat higher than it had to be lifted"
+    assert off[-1] < 0.06, (
+        "within the pad, on the other puck, or somewhat higher than it had to be lifted"
+    )
 
 
 def test_a_full_action_moves_three_centimetres_and_more_is_clipped() -> None:

@@ -6,7 +6,15 @@ import math
 
 import pytest
 
-from vlagents_ray.envs.tabletop.world import PUCK_HEIGHT, PUCK_RADIUS, STEP_LIMIT, Goal, Pad, Puck, TabletopWorld
+from vlagents_ray.envs.tabletop.world import (
+    PUCK_HEIGHT,
+    PUCK_RADIUS,
+    STEP_LIMIT,
+    Goal,
+    Pad,
+    Puck,
+    TabletopWorld,
+)
 
 OPEN, CLOSED = 1.0, 0.0
 
@@ -106,7 +114,8 @@ def test_pucks_stay_on_the_table() -> None:
 
 def test_only_the_named_puck_on_the_named_pad_counts() -> None:
     scene = TabletopWorld(
-        [Puck("red", 0.2, 0.0), Puck("green", 0.0, 0.0)], [Pad("blue", 0.2, 0.0), Pad("red", -0.2, 0.0)]
+        [Puck("red", 0.2, 0.0), Puck("green", 0.0, 0.0)],
+        [Pad("blue", 0.2, 0.0), Pad("red", -0.2, 0.0)],
     )
     reached = {
         (puck, pad): Goal("pick_place", puck, pad).reached(scene)

@@ -30,7 +30,9 @@ def test_metaworld() -> None:
 @pytest.mark.vulkan
 @pytest.mark.parametrize("task", ["PickCube-v1", "StackCube-v1", "PushT-v1"])
 def test_maniskill(task: str) -> None:
-    """PickCube hides its goal from cameras, StackCube has two of them, PushT draws its reward as a picture."""
+    """PickCube hides its goal from cameras, StackCube has two of them, PushT draws its reward as
+    a picture.
+    """
     played(f"maniskill/{task}", **SMALL)
 
 

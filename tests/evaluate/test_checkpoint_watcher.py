@@ -84,7 +84,9 @@ def test_half_a_checkpoint_is_never_taken_and_a_whole_one_is(write: Write, tmp_p
 
 
 @pytest.mark.parametrize("write", KINDS)
-def test_a_trainer_that_stops_for_long_is_not_mistaken_for_one_that_is_done(write: Write, tmp_path: Path) -> None:
+def test_a_trainer_that_stops_for_long_is_not_mistaken_for_one_that_is_done(
+    write: Write, tmp_path: Path
+) -> None:
     moments = len(list(write(tmp_path / "elsewhere" / "100")))
     watcher = CheckpointWatcher(str(tmp_path / "{step}"), settle_s=1)
     for moment, _ in enumerate(write(tmp_path / "100"), 1):
@@ -92,7 +94,9 @@ def test_a_trainer_that_stops_for_long_is_not_mistaken_for_one_that_is_done(writ
         assert found == ([100] if moment == moments else [])
 
 
-def test_a_marker_says_that_it_is_done_and_no_waiting_is_needed_unless_it_is_not_whole(tmp_path: Path) -> None:
+def test_a_marker_says_that_it_is_done_and_no_waiting_is_needed_unless_it_is_not_whole(
+    tmp_path: Path,
+) -> None:
     watcher = CheckpointWatcher(str(tmp_path / "{step}"), settle_s=1e9, marker=".complete")
     list(one_file(tmp_path / "5"))
     assert watcher.scan(0) == []
@@ -106,7 +110,9 @@ def test_a_marker_says_that_it_is_done_and_no_waiting_is_needed_unless_it_is_not
     assert "its header says" in watcher.waiting()[6]
 
 
-def test_steps_are_found_in_any_part_of_the_path_with_and_without_leading_zeros(tmp_path: Path) -> None:
+def test_steps_are_found_in_any_part_of_the_path_with_and_without_leading_zeros(
+    tmp_path: Path,
+) -> None:
     for name in ("step_000100", "step_2000", "step_0300", "last", "step_x"):
         list(one_file(tmp_path / name / "model"))
     watcher = CheckpointWatcher(str(tmp_path / "step_{step}" / "model"), settle_s=0)

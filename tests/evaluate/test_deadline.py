@@ -60,7 +60,10 @@ def test_out_of_time_keeps_what_is_finished_and_resume_plays_the_rest(
         play(config(workers=0), end_at=time.time() - 1)
     assert stopped.value.summary.total.episodes == 0
     again = config(workers=0, resume=True)
-    with monkeypatch.context() as patch, pytest.raises(OutOfTime, match=r"out of time after .* --resume") as stopped:
+    with (
+        monkeypatch.context() as patch,
+        pytest.raises(OutOfTime, match=r"out of time after .* --resume") as stopped,
+    ):
         play(again, progress=SlowAfterTwo(patch), end_at=time.time() + 1000)
     assert stopped.value.summary.total.episodes == 2
     assert json.loads((config().out / "summary.json").read_text())["state"] == "out of time"

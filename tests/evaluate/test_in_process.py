@@ -35,7 +35,9 @@ def outcomes(summary: Summary) -> list[dict[str, Any]]:
     return [one.result.outcome for cell in summary.results.cells for one in cell.episodes]
 
 
-def test_its_episodes_are_those_of_workers(config: Config, tmp_path: Path, shared_ray: None) -> None:
+def test_its_episodes_are_those_of_workers(
+    config: Config, tmp_path: Path, shared_ray: None
+) -> None:
     envs = {"envs": [LINE, OTHER_LINE]}
     usual = evaluate(config(**envs, out=tmp_path / "usual"), agent_factory=ToZero)
     here = evaluate(config(**envs, workers=0), agent_factory=ToZero)
@@ -48,7 +50,9 @@ def test_it_is_one_worker_without_ray(config: Config) -> None:
     summary = evaluate(config(workers=0), agent_factory=ToZero)
     assert (summary.state, summary.total.episodes) == ("complete", 6)
     assert [worker.pid for worker in summary.results.workers] == [os.getpid()]
-    assert json.loads((summary.out / "summary.json").read_text()) == json.loads(json.dumps(summary.to_json()))
+    assert json.loads((summary.out / "summary.json").read_text()) == json.loads(
+        json.dumps(summary.to_json())
+    )
     rate = summary.total.success_once.successes / 6
     assert 0 < rate < 1
     assert f"{100 * rate:.1f} %" in (summary.out / "report.html").read_text()
@@ -83,11 +87,26 @@ def test_a_process_in_a_cluster_plays_there(monkeypatch: pytest.MonkeyPatch) -> 
 def test_a_simulator_that_does_not_repeat_itself_leaves_one_failure_without_a_video_and_a_warning(
     config: Config, caplog: pytest.LogCaptureFixture
 ) -> None:
-    settings = config(envs=[DRIFTING_LINE], env_options={"camera": [32, 32]}, episodes=12, video="failures", workers=0)
+    settings = config(
+        envs=[DRIFTING_LINE],
+        env_options={"camera": [32, 32]},
+        episodes=12,
+        video="failures",
+        workers=0,
+    )
     summary = evaluate(settings, agent_factory=lambda: ToZero(3))
-    failed = [one for cell in summary.results.cells for one in cell.episodes if not one.result.success_once]
+    failed = [
+        one
+        for cell in summary.results.cells
+        for one in cell.episodes
+        if not one.result.success_once
+    ]
     bare = [str(one.result.key) for one in failed if not one.videos]
-    warnings = [record.getMessage() for record in caplog.records if "nothing of it is recorded" in record.getMessage()]
+    warnings = [
+        record.getMessage()
+        for record in caplog.records
+        if "nothing of it is recorded" in record.getMessage()
+    ]
     assert len(bare) == len(warnings) == 1
     assert len(failed) > 1
     assert warnings[0].startswith(f"{bare[0]}: ")
@@ -99,22 +118,35 @@ def test_it_goes_on_with_what_has_no_result(config: Config) -> None:
     with pytest.raises(ConfigError, match="already has results"):
         evaluate(config(workers=0), agent_factory=ToZero)
     summary = evaluate(config(workers=0, resume=True), agent_factory=ToZero)
-    assert [one.run for cell in summary.results.cells for one in cell.episodes] == [2, 2, 1, 2, 2, 2]
+    assert [one.run for cell in summary.results.cells for one in cell.episodes] == [
+        2,
+        2,
+        1,
+        2,
+        2,
+        2,
+    ]
 
 
-def test_a_simulator_that_breaks_is_made_again_and_its_episode_repeated(config: Config, tmp_path: Path) -> None:
+def test_a_simulator_that_breaks_is_made_again_and_its_episode_repeated(
+    config: Config, tmp_path: Path
+) -> None:
     trouble = {"folder": str(tmp_path), "trouble": {"raise": [2]}}
     summary = evaluate(config(env_options=trouble, workers=0), agent_factory=ToZero)
     with closing(sqlite3.connect(summary.out / "results.db")) as db:
         assert db.execute("SELECT episode FROM episodes WHERE attempts = 2").fetchall() == [(2,)]
     assert len(summary.results.workers) == 2, "one for each simulator"
     whole = evaluate(config(out=tmp_path / "whole", workers=0), agent_factory=ToZero)
-    assert [one | {"key": 0} for one in outcomes(summary)] == [one | {"key": 0} for one in outcomes(whole)]
+    assert [one | {"key": 0} for one in outcomes(summary)] == [
+        one | {"key": 0} for one in outcomes(whole)
+    ]
 
 
 def test_suites_whose_workers_differ_have_their_turns(config: Config) -> None:
     [suite] = config(episodes=2).suites
-    other = suite.model_copy(update={"envs": [OTHER_LINE], "worker": config(cpus_per_worker=2.0).worker})
+    other = suite.model_copy(
+        update={"envs": [OTHER_LINE], "worker": config(cpus_per_worker=2.0).worker}
+    )
     both = config(workers=0).model_copy(update={"suites": [suite, other]})
     assert evaluate(both, agent_factory=ToZero).total.episodes == 4
 
@@ -128,10 +160,14 @@ def test_what_a_signal_to_the_whole_group_ends_first_costs_no_attempt(
             waiting = [job for one in self._workers for job in one.jobs]
             reports = [*super().wait(timeout_s)]
             if waiting and waiting[0].key.episode == 2:
-                threading.Timer(0.02, os.kill, (os.getpid(), signal.SIGTERM)).start()  # it arrives here, too
+                # It arrives here, too.
+                threading.Timer(0.02, os.kill, (os.getpid(), signal.SIGTERM)).start()
                 if cluster_is_lost:
                     raise ClusterLost("no head")
-                reports = [(job, Report(failure=Failure("worker", EnvFailed.code, "killed"))) for job in waiting]
+                reports = [
+                    (job, Report(failure=Failure("worker", EnvFailed.code, "killed")))
+                    for job in waiting
+                ]
             yield from reports
 
     monkeypatch.setattr(in_process, "InProcessWorkers", EndedFirst)
@@ -142,8 +178,12 @@ def test_what_a_signal_to_the_whole_group_ends_first_costs_no_attempt(
         assert db.execute("SELECT count(*) FROM attempts").fetchone() == (0,)
 
 
-def test_failures_that_come_together_wait_for_a_signal_once(config: Config, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A policy that is lost fails an episode of each environment at once, and all workers wait meanwhile."""
+def test_failures_that_come_together_wait_for_a_signal_once(
+    config: Config, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A policy that is lost fails an episode of each environment at once, and all workers wait
+    meanwhile.
+    """
     once, limits, wait = [True], [], threading.Event.wait
 
     class FailsOnce(InProcessWorkers):
@@ -153,7 +193,10 @@ def test_failures_that_come_together_wait_for_a_signal_once(config: Config, monk
         def wait(self, timeout_s: float) -> Iterator[tuple[Job, Report]]:
             reports = [*super().wait(timeout_s)]
             for job, report in reports:
-                yield job, Report(failure=Failure("policy", "unavailable", "gone")) if once[0] else report
+                yield (
+                    job,
+                    Report(failure=Failure("policy", "unavailable", "gone")) if once[0] else report,
+                )
             once[0] = once[0] and not reports
 
     def waited(event: threading.Event, timeout: float | None = None) -> bool:
@@ -202,7 +245,9 @@ def test_a_call_that_exceeds_its_limit_is_reported_with_its_line(
     monkeypatch.setattr(in_process, "_LOOK_S", 0.01)
     monkeypatch.setattr(rollout, "LONG_S", 0.01)
     evaluate(config(episodes=1, workers=0, policy_timeout_s=0.1), agent_factory=Slow)
-    [first, *_] = [record.getMessage() for record in caplog.records if "may hang" in record.getMessage()]
+    [first, *_] = [
+        record.getMessage() for record in caplog.records if "may hang" in record.getMessage()
+    ]
     assert "policy act after 0 steps has taken longer than 0.1 s" in first
     assert "time.sleep(0.5)" in first
 

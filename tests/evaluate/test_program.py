@@ -29,7 +29,10 @@ from vlagents_ray.policies.base.program import code_of_class, digest_of, files_n
 from vlagents_ray_results.merge import merge
 
 FILES = {
-    "prog_env.py": "from prog_parts.sea import CURRENT\nfrom eval_fakes import Line\nclass Sea(Line):\n    pass\n",
+    "prog_env.py": (
+        "from prog_parts.sea import CURRENT\nfrom eval_fakes import Line\nclass "
+        "Sea(Line):\n    pass\n"
+    ),
     "prog_parts/__init__.py": "",
     "prog_parts/sea.py": "from . import wind\nCURRENT = 0.03\n",
     "prog_parts/wind.py": "WIND = 1\n",
@@ -68,7 +71,12 @@ def served(own_weights: str | None) -> dict[str, Any]:
     files = files_named({"checkpoint": "w.npz", "gains": "gains.yaml"})
     weights = {"digest": own_weights or digest_of(files), "revision": None}
     program = code_of_class("prog_pilot:Pilot") | files
-    return {"policy": "prog_pilot:Pilot", "checkpoint": "w.npz", "weights": weights, "program": program}
+    return {
+        "policy": "prog_pilot:Pilot",
+        "checkpoint": "w.npz",
+        "weights": weights,
+        "program": program,
+    }
 
 
 def played(
@@ -82,7 +90,12 @@ def played(
     **changes: Any,
 ) -> EvalConfig:
     """Play the episodes of a plan that have no result, without a simulator."""
-    settings = {"envs": ["prog_env:Sea"], "episodes": episodes, "env_options": {"folder": "chart.txt"}, "policy": "own"}
+    settings = {
+        "envs": ["prog_env:Sea"],
+        "episodes": episodes,
+        "env_options": {"folder": "chart.txt"},
+        "policy": "own",
+    }
     config = flat_config(**{**settings, "out": out, **changes})
     said = served(own_weights) | (stated or {})
     with Store(config) as store:
@@ -91,9 +104,13 @@ def played(
             if str(job.key) in store.finished():
                 continue
             store.note_policy(job.cell.policy.name, said)
-            made = EnvInfo(description or {}, contract or {}, program=dict(job.cell.program), host="here")
+            made = EnvInfo(
+                description or {}, contract or {}, program=dict(job.cell.program), host="here"
+            )
             store.note_env(job.cell.place, made)
-            result = EpisodeResult(job.key, "done", True, True, steps=4, ending="truncated", checkpoint="w.npz")
+            result = EpisodeResult(
+                job.key, "done", True, True, steps=4, ending="truncated", checkpoint="w.npz"
+            )
             store.record(replace(result, weights=said["weights"]["digest"]), attempts=1)
         store.end_run("complete")
     return config
@@ -102,7 +119,9 @@ def played(
 def resumed(tmp_path: Path, change: Callable[[], Any], **options: Any) -> Results:
     played(tmp_path / "out")
     again: dict[str, Any] = change() or {}
-    return Results.load(played(tmp_path / "out", resume=True, **{"episodes": 4, **again, **options}).out)
+    return Results.load(
+        played(tmp_path / "out", resume=True, **{"episodes": 4, **again, **options}).out
+    )
 
 
 def merged(tmp_path: Path, change: Callable[[], Any], **options: Any) -> Results:
@@ -125,7 +144,9 @@ NAMED = [name for name in FILES if not name.endswith("__init__.py")]
 
 
 @pytest.mark.parametrize("way", WAYS)
-def test_unchanged_files_are_gone_on_with(work: Path, tmp_path: Path, way: Callable[..., Results]) -> None:
+def test_unchanged_files_are_gone_on_with(
+    work: Path, tmp_path: Path, way: Callable[..., Results]
+) -> None:
     found = way(tmp_path, lambda: Path("unrelated.py").write_text("1") and None)
     assert found.accepted_changes == []
     assert len({row["env_program"] for row in rows(found)}) == 1
@@ -142,13 +163,16 @@ def test_unchanged_files_are_gone_on_with(work: Path, tmp_path: Path, way: Calla
 def test_a_changed_file_is_refused_by_its_name_and_an_accepted_change_is_in_the_report(
     work: Path, tmp_path: Path, way: Callable[..., Results], name: str
 ) -> None:
-    with pytest.raises(ConfigError, match=rf"(?s){name} was .*sha256:\w+, is .*sha256:\w+.*--accept-changes"):
+    with pytest.raises(
+        ConfigError, match=rf"(?s){name} was .*sha256:\w+, is .*sha256:\w+.*--accept-changes"
+    ):
         way(tmp_path / "refused", lambda: edit(name))
     found = way(tmp_path / "accepted", lambda: edit(name), accept_changes=True)
     assert any(change.name.endswith(name) for change in found.accepted_changes)
     assert summarize(found).to_json()["accepted_changes"]
     column = "env_program" if name in ENV_FILES else "policy_program"
-    swept = way is watched and name == "w.npz"  # each step has its weights, which are in the results of its episodes
+    # Each step has its weights, which are in the results of its episodes.
+    swept = way is watched and name == "w.npz"
     assert len({row["weights" if swept else column] for row in rows(found)}) == 2
 
 
@@ -156,31 +180,49 @@ def test_a_changed_file_is_refused_by_its_name_and_an_accepted_change_is_in_the_
 def test_other_weights_of_a_class_that_names_them_are_refused(
     work: Path, tmp_path: Path, way: Callable[..., Results]
 ) -> None:
-    with pytest.raises(ConfigError, match=r"(weights|w\.npz) was .*, is mine|several weights under one name"):
+    with pytest.raises(
+        ConfigError, match=r"(weights|w\.npz) was .*, is mine|several weights under one name"
+    ):
         way(tmp_path, lambda: {"own_weights": "mine"})
 
 
-@pytest.mark.parametrize("change", [{"envs": ["eval_fakes:Line"], "env_options": {}}, {"policy": "another"}])
-def test_another_plan_is_not_added_to_results(work: Path, tmp_path: Path, change: dict[str, Any]) -> None:
-    with pytest.raises(ConfigError, match=r"own prog_env:Sea was in it.*\n.*--out.*--accept-changes"):
+@pytest.mark.parametrize(
+    "change", [{"envs": ["eval_fakes:Line"], "env_options": {}}, {"policy": "another"}]
+)
+def test_another_plan_is_not_added_to_results(
+    work: Path, tmp_path: Path, change: dict[str, Any]
+) -> None:
+    with pytest.raises(
+        ConfigError, match=r"own prog_env:Sea was in it.*\n.*--out.*--accept-changes"
+    ):
         resumed(tmp_path, lambda: change)
 
 
-def test_a_worker_that_has_other_files_is_refused_also_if_changes_are_accepted(work: Path, tmp_path: Path) -> None:
-    config = flat_config(envs=["prog_env:Sea"], out=tmp_path / "out", resume=True, accept_changes=True)
+def test_a_worker_that_has_other_files_is_refused_also_if_changes_are_accepted(
+    work: Path, tmp_path: Path
+) -> None:
+    config = flat_config(
+        envs=["prog_env:Sea"], out=tmp_path / "out", resume=True, accept_changes=True
+    )
     with Store(config) as store:
         store.begin_run(config, {})
         program = store.cells[0].program | {"prog_env.py": "sha256:0"}
-        with pytest.raises(ConfigError, match=r"(?s)worker on far has other files.*prog_env.py was .*, is sha256:0"):
+        with pytest.raises(
+            ConfigError, match=r"(?s)worker on far has other files.*prog_env.py was .*, is sha256:0"
+        ):
             store.note_env(store.cells[0].place, EnvInfo({}, {}, program=program, host="far"))
 
 
-def test_two_policies_are_not_compared_in_different_environments(work: Path, tmp_path: Path) -> None:
+def test_two_policies_are_not_compared_in_different_environments(
+    work: Path, tmp_path: Path
+) -> None:
     out = tmp_path / "out"
     played(out, policy="a")
     edit("prog_parts/sea.py")
     played(out, policy="b", resume=True, accept_changes=True)
-    with pytest.raises(ConfigError, match=r"(?s)not played in the same environment.*prog_parts/sea.py was"):
+    with pytest.raises(
+        ConfigError, match=r"(?s)not played in the same environment.*prog_parts/sea.py was"
+    ):
         compare(Results.load(out), "a", "b")
 
 
@@ -195,7 +237,9 @@ def compared(tmp_path: Path, change: Callable[[], Any], **options: Any) -> Resul
 
 
 def reported(tmp_path: Path, change: Callable[[], Any], **options: Any) -> Results:
-    """As `compared`, by the page and the JSON of `report`, which name the pairs that they do not compare."""
+    """As `compared`, by the page and the JSON of `report`, which name the pairs that they do not
+    compare.
+    """
     played(tmp_path / "a", **STATED)
     again: dict[str, Any] = change() or {}
     played(tmp_path / "b", **{**STATED, **again, "policy": "another"})
@@ -207,14 +251,18 @@ def reported(tmp_path: Path, change: Callable[[], Any], **options: Any) -> Resul
     if view.reasons:
         assert not of_json
         raise ConfigError("\n".join(view.reasons))
-    assert ("allowed" in write_report(results, tmp_path / "page.html", **options).read_text()) == bool(view.changes)
+    assert (
+        "allowed" in write_report(results, tmp_path / "page.html", **options).read_text()
+    ) == bool(view.changes)
     return replace(results, runs=(replace(results.runs[0], changes=tuple(view.changes)),))
 
 
 def resumed_as_stated(tmp_path: Path, change: Callable[[], Any], **options: Any) -> Results:
     played(tmp_path / "out", **STATED)
     again: dict[str, Any] = change() or {}
-    return Results.load(played(tmp_path / "out", resume=True, **{**STATED, "episodes": 4, **again, **options}).out)
+    return Results.load(
+        played(tmp_path / "out", resume=True, **{**STATED, "episodes": 4, **again, **options}).out
+    )
 
 
 def merged_as_stated(tmp_path: Path, change: Callable[[], Any], **options: Any) -> Results:
@@ -224,7 +272,10 @@ def merged_as_stated(tmp_path: Path, change: Callable[[], Any], **options: Any) 
     return merge(tmp_path / "c", [tmp_path / "a", tmp_path / "b"], **options).results
 
 
-STATED: dict[str, Any] = {"description": {"mujoco": "3.3.0", "assets": "a1"}, "contract": {"control_hz": 20}}
+STATED: dict[str, Any] = {
+    "description": {"mujoco": "3.3.0", "assets": "a1"},
+    "contract": {"control_hz": 20},
+}
 COMMANDS = [resumed_as_stated, merged_as_stated, compared, reported]
 # What `--resume` refuses about an environment: the change, and the name that a message has for it.
 OF_THE_ENV: dict[str, tuple[Callable[[], Any], str]] = {
@@ -238,7 +289,10 @@ OF_THE_ENV: dict[str, tuple[Callable[[], Any], str]] = {
         lambda: {"description": {"mujoco": "3.3.0"}},
         "its description 'assets' was 'a1', is None",
     ),
-    "its contract": (lambda: {"contract": {"control_hz": 10}}, "its contract 'control_hz' was 20, is 10"),
+    "its contract": (
+        lambda: {"contract": {"control_hz": 10}},
+        "its contract 'control_hz' was 20, is 10",
+    ),
 }
 
 
@@ -255,21 +309,36 @@ def test_every_command_refuses_another_environment_unless_the_change_is_accepted
 
 
 @pytest.mark.parametrize("command", COMMANDS)
-def test_no_command_refuses_the_same_environment(work: Path, tmp_path: Path, command: Callable[..., Results]) -> None:
+def test_no_command_refuses_the_same_environment(
+    work: Path, tmp_path: Path, command: Callable[..., Results]
+) -> None:
     assert command(tmp_path, lambda: None).accepted_changes == []
 
 
-# Settings that a deployment file gives a policy, and that no plan names: before, after, and the change's name.
+# Settings that a deployment file gives a policy, and that no plan names: before, after, and the
+# change's name.
 OF_THE_POLICY: dict[str, tuple[dict[str, Any], dict[str, Any], str]] = {
-    "a setting": ({"config": {"steps": 4}}, {"config": {"steps": 8}}, "its setting 'steps' was 4, is 8"),
-    "a setting more": ({"config": {}}, {"config": {"steps": 8}}, "its setting 'steps' was None, is 8"),
+    "a setting": (
+        {"config": {"steps": 4}},
+        {"config": {"steps": 8}},
+        "its setting 'steps' was 4, is 8",
+    ),
+    "a setting more": (
+        {"config": {}},
+        {"config": {"steps": 8}},
+        "its setting 'steps' was None, is 8",
+    ),
     "a wrapper": ({"wrappers": []}, {"wrappers": ["arro"]}, 'its wrappers was [], is ["arro"]'),
     "a wrapper's setting": (
         {"wrappers": [{"half": {"scale": 0.5}}]},
         {"wrappers": [{"half": {"scale": 0.9}}]},
         'its wrappers was [{"half":{"scale":0.5}}], is [{"half":{"scale":0.9}}]',
     ),
-    "the order of wrappers": ({"wrappers": ["a", "b"]}, {"wrappers": ["b", "a"]}, "its wrappers was"),
+    "the order of wrappers": (
+        {"wrappers": ["a", "b"]},
+        {"wrappers": ["b", "a"]},
+        "its wrappers was",
+    ),
 }
 
 
@@ -290,26 +359,42 @@ def test_other_settings_of_a_policy_in_its_file_are_refused_unless_they_are_acce
     with pytest.raises(ConfigError, match=rf"(?s){re.escape(message)}.*--accept-changes"):
         played(first, stated=after, episodes=4, resume=True)
     played(first, stated=after, episodes=4, resume=True, accept_changes=True)
-    assert any(message.partition(" was")[0] in str(change) for change in Results.load(first).accepted_changes)
+    assert any(
+        message.partition(" was")[0] in str(change)
+        for change in Results.load(first).accepted_changes
+    )
     played(tmp_path / "other", policy="another")
     both = combined([Results.load(first), Results.load(tmp_path / "other")])
-    with pytest.raises(ConfigError, match=r"(?s)were played with .*settings of 'own'.*as --accept-changes allowed"):
+    with pytest.raises(
+        ConfigError, match=r"(?s)were played with .*settings of 'own'.*as --accept-changes allowed"
+    ):
         compare(both, "own", "another")
 
 
-def test_settings_of_the_checkpoint_and_of_the_machine_are_no_change(work: Path, tmp_path: Path) -> None:
-    """The checkpoint has its own comparison, and a server without these fields has stated nothing."""
+def test_settings_of_the_checkpoint_and_of_the_machine_are_no_change(
+    work: Path, tmp_path: Path
+) -> None:
+    """The checkpoint has its own comparison, and a server without these fields has stated
+    nothing.
+    """
     played(tmp_path, stated={"config": {"checkpoint": "a/1", "steps": 4}})
-    played(tmp_path, stated={"config": {"checkpoint": "w.npz", "steps": 4}}, episodes=3, resume=True)
+    played(
+        tmp_path, stated={"config": {"checkpoint": "w.npz", "steps": 4}}, episodes=3, resume=True
+    )
     played(tmp_path, episodes=4, resume=True)
     assert Results.load(tmp_path).accepted_changes == []
 
 
-@pytest.mark.parametrize("identity", ["its simulator's version", "its contract", "its policy's code", "its weights"])
+@pytest.mark.parametrize(
+    "identity", ["its simulator's version", "its contract", "its policy's code", "its weights"]
+)
 def test_a_cell_in_which_a_change_was_accepted_is_not_compared_unless_that_is_accepted_again(
     work: Path, tmp_path: Path, identity: str
 ) -> None:
-    of_the_policy = {"its policy's code": lambda: edit("prog_helm.py"), "its weights": lambda: {"own_weights": "x"}}
+    of_the_policy = {
+        "its policy's code": lambda: edit("prog_helm.py"),
+        "its weights": lambda: {"own_weights": "x"},
+    }
     change = of_the_policy[identity] if identity in of_the_policy else OF_THE_ENV[identity][0]
     resumed_as_stated(tmp_path, change, accept_changes=True)
     changed_again: dict[str, Any] = {} if identity in of_the_policy else change()
@@ -342,9 +427,14 @@ def test_the_code_of_an_own_policy_is_part_of_the_program_however_it_is_given(
         if "partial" in way:
             make = functools.partial(make, chunk=1)
         config = flat_config(
-            envs=["eval_fakes:Line"], policy="own", episodes=episodes, out=tmp_path / "out", workers=0, video="none",
+            envs=["eval_fakes:Line"],
+            policy="own",
+            episodes=episodes,
+            out=tmp_path / "out",
+            workers=0,
+            video="none",
             **options,
-        )  # fmt: skip
+        )
         evaluate(config, agent_factory={"own": make} if "mapping" in way else make)
 
     run(1)
@@ -380,7 +470,9 @@ def test_installed_and_own_code_are_told_apart(work: Path) -> None:
 
 
 @pytest.mark.parametrize("env", ["gymnasium/prog_env/Sea-v0", "gymnasium/prog_env:Sea-v0"])
-def test_the_module_that_registers_an_env_of_gymnasium_is_part_of_the_program(work: Path, env: str) -> None:
+def test_the_module_that_registers_an_env_of_gymnasium_is_part_of_the_program(
+    work: Path, env: str
+) -> None:
     config = flat_config(envs=[env], episodes=1, policy="own", out=work / "out")
     assert {name for cell in cells(config) for name in cell.program} >= ENV_FILES - {"chart.txt"}
 
@@ -388,6 +480,8 @@ def test_the_module_that_registers_an_env_of_gymnasium_is_part_of_the_program(wo
 def test_a_checkpoint_is_found_at_its_step_and_the_working_folder_is_none(work: Path) -> None:
     Path("7").mkdir()
     Path("7/w.bin").write_text("7")
-    assert set(files_named({"checkpoint": "{step}", "checkpoint_step": 7})) == {"checkpoint: 7/w.bin"}
+    assert set(files_named({"checkpoint": "{step}", "checkpoint_step": 7})) == {
+        "checkpoint: 7/w.bin"
+    }
     assert files_named({"checkpoint": "{step}", "checkpoint_step": 7}, folders=False) == {}
     assert files_named({"a": ".", "b": "no such file", "c": 3, "d": {"e": ["", "\0"]}}) == {}

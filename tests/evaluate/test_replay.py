@@ -37,7 +37,11 @@ class Noisy(ToZero):
     def act(self, obs: Obs) -> Act:
         self._acts += 1
         act = super().act(obs)
-        return act if self._acts < 4 else Act(act.action + np.float32(np.random.default_rng().uniform(0.01, 0.02)))
+        return (
+            act
+            if self._acts < 4
+            else Act(act.action + np.float32(np.random.default_rng().uniform(0.01, 0.02)))
+        )
 
 
 def test_a_deterministic_policy_does_the_same_byte_for_byte(config: Config, tmp_path: Path) -> None:
@@ -59,7 +63,9 @@ def again(results: Any, name: str, out: Path, make: Callable[[], ToZero]) -> lis
     return compare(recorded, play(recorded.config(out), make, left_out=others))
 
 
-def test_a_noisy_policy_is_told_with_the_step_at_which_it_differs(config: Config, tmp_path: Path) -> None:
+def test_a_noisy_policy_is_told_with_the_step_at_which_it_differs(
+    config: Config, tmp_path: Path
+) -> None:
     results = play(config(episodes=2, record="all"), Noisy)
     first, *others = again(results, f"{LINE}#1", tmp_path / "again", Noisy)
     assert first.startswith("actions: they differ from step 3 on: [")
@@ -67,7 +73,8 @@ def test_a_noisy_policy_is_told_with_the_step_at_which_it_differs(config: Config
 
 
 @pytest.mark.parametrize(
-    ("record", "why"), [("none", r".*--record all"), ("all", r", as .*\.npz, the recorded trajectory, is gone$")]
+    ("record", "why"),
+    [("none", r".*--record all"), ("all", r", as .*\.npz, the recorded trajectory, is gone$")],
 )
 def test_without_a_trajectory_it_is_said_that_the_actions_differ(
     config: Config, tmp_path: Path, record: str, why: str
@@ -92,7 +99,9 @@ class Rounded(ToZero):
         return Act(act.action + np.float32(self._difference)) if self._acts == 3 else act
 
 
-@pytest.mark.parametrize(("difference", "is_rounding"), [(1e-6, True), (8e-6, True), (1e-3, False), (0.1, False)])
+@pytest.mark.parametrize(
+    ("difference", "is_rounding"), [(1e-6, True), (8e-6, True), (1e-3, False), (0.1, False)]
+)
 def test_rounding_is_told_from_another_action(
     config: Config, tmp_path: Path, difference: float, is_rounding: bool
 ) -> None:
@@ -130,7 +139,9 @@ class Drifting(ToZero):
 def test_rounding_may_grow_with_the_steps_but_not_begin_as_another_action(
     config: Config, tmp_path: Path, first: float, factor: float, is_rounding: bool
 ) -> None:
-    """A difference of 1e-7 at one step is 1e-5 some steps later, as each observation depends on earlier actions."""
+    """A difference of 1e-7 at one step is 1e-5 some steps later, as each observation depends on
+    earlier actions.
+    """
     recorded = find(play(config(episodes=1, record="all")), f"{LINE}#0")
     replayed = play(recorded.config(tmp_path / "again"), lambda: Drifting(first, factor))
     found = actions_difference(recorded, replayed)
@@ -150,7 +161,9 @@ def test_the_same_actions_have_no_difference_and_without_a_recording_it_is_unkno
     assert "nor whether by more than rounding" in compare(unrecorded, replayed)[0]
 
 
-def test_an_episode_is_replayed_after_a_merge_that_renamed_its_suite(config: Config, tmp_path: Path) -> None:
+def test_an_episode_is_replayed_after_a_merge_that_renamed_its_suite(
+    config: Config, tmp_path: Path
+) -> None:
     renamed = config(out=tmp_path / "b", seed=100, episodes=1)
     suite = renamed.suites[0].model_copy(update={"name": "b"})
     play(renamed.model_copy(update={"suites": [suite]}))
@@ -177,20 +190,30 @@ def test_fewer_actions_are_told_as_such(config: Config, tmp_path: Path) -> None:
     assert found[0] == "actions: 10 were recorded, now they are 6; the first 6 are the same"
 
 
-def test_a_replay_that_infrastructure_kept_from_ending_is_no_difference(config: Config, tmp_path: Path) -> None:
+def test_a_replay_that_infrastructure_kept_from_ending_is_no_difference(
+    config: Config, tmp_path: Path
+) -> None:
     recorded = find(play(config(episodes=1, record="all")), f"{LINE}#0")
     settings = recorded.config(tmp_path / "again")
     with Store(settings) as store:
         store.begin_run(settings, {})
-        store.record(EpisodeResult(recorded.episode.result.key, "infra_failed", error="it hung"), attempts=4)
+        store.record(
+            EpisodeResult(recorded.episode.result.key, "infra_failed", error="it hung"), attempts=4
+        )
     with pytest.raises(ConfigError, match=r"the replay did not end.*: it hung"):
         compare(recorded, Results.load(settings.out))
 
 
-def test_an_episode_is_found_by_its_key_and_by_env_and_number_if_it_is_the_only_one(config: Config) -> None:
+def test_an_episode_is_found_by_its_key_and_by_env_and_number_if_it_is_the_only_one(
+    config: Config,
+) -> None:
     results = play(config(envs=[LINE, OTHER_LINE], episodes=2))
     key = results.cells[1].episodes[1].result.key
-    assert find(results, str(key)).episode == find(results, f"{OTHER_LINE}#1").episode == results.cells[1].episodes[1]
+    assert (
+        find(results, str(key)).episode
+        == find(results, f"{OTHER_LINE}#1").episode
+        == results.cells[1].episodes[1]
+    )
     for name in (LINE, f"{LINE}#7", "tabletop#0", f"{LINE}#0@0"):
         with pytest.raises(ConfigError, match="has no episode"):
             find(results, name)
@@ -216,19 +239,32 @@ def test_a_key_ends_with_the_weights_that_played_it(config: Config) -> None:
     results = with_weights(play(config(episodes=2)), f"sampled-sha256:{'9f2c' * 16}")
     first, second = results.cells[0].episodes
     assert second.result.full_key == f"{second.result.key}~9f2c9f2c9f2c9f2c"
-    assert [row["key"] for row in tables.rows(results)] == [first.result.full_key, second.result.full_key]
-    assert find(results, second.result.full_key).episode == find(results, str(second.result.key)).episode == second
+    assert [row["key"] for row in tables.rows(results)] == [
+        first.result.full_key,
+        second.result.full_key,
+    ]
+    assert (
+        find(results, second.result.full_key).episode
+        == find(results, str(second.result.key)).episode
+        == second
+    )
 
 
-def test_a_replay_that_differs_says_that_the_weights_are_others(config: Config, tmp_path: Path) -> None:
+def test_a_replay_that_differs_says_that_the_weights_are_others(
+    config: Config, tmp_path: Path
+) -> None:
     results = with_weights(play(config(episodes=1)), "a")
     recorded = find(results, f"{LINE}#0")
     assert compare(recorded, with_weights(play(recorded.config(tmp_path / "same")), "b")) == []
     found = compare(recorded, with_weights(play(recorded.config(tmp_path / "other"), Noisy), "b"))
-    assert found[-1] == "weights: a played it, now it is b: another checkpoint, or other files in it"
+    assert (
+        found[-1] == "weights: a played it, now it is b: another checkpoint, or other files in it"
+    )
 
 
-def test_the_settings_are_those_of_the_run_and_of_that_cell_alone(config: Config, tmp_path: Path) -> None:
+def test_the_settings_are_those_of_the_run_and_of_that_cell_alone(
+    config: Config, tmp_path: Path
+) -> None:
     settings = config(envs=[LINE, OTHER_LINE], episodes=1, steps=[10, 20], execute=1, workers=2)
     results = play(settings)
     recorded = find(results, str(results.cells[3].episodes[0].result.key))
@@ -262,5 +298,7 @@ def test_a_policy_that_was_served_for_the_run_is_served_again_and_a_server_is_as
 
 def test_another_policy_takes_the_place_of_the_runs(config: Config, tmp_path: Path) -> None:
     recorded = find(play(config(episodes=1)), f"{LINE}#0")
-    [policy] = recorded.config(tmp_path / "again", policy={"source": "noop", "url": None, "config": {}}).policies
+    [policy] = recorded.config(
+        tmp_path / "again", policy={"source": "noop", "url": None, "config": {}}
+    ).policies
     assert (policy.source, "name" in policy.model_fields_set) == ("noop", False)

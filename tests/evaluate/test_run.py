@@ -15,7 +15,15 @@ import pytest
 from eval_fakes import CLINGING, EVERY, LINE, Silent, Teller, ToZero, wait_for
 
 from vlagents_ray.errors import ConfigError, ConnectionLost, ContractMismatch, UnknownEnv
-from vlagents_ray.evaluate import EvalConfig, EvaluationInterrupted, Progress, SuiteConfig, Summary, check, evaluate
+from vlagents_ray.evaluate import (
+    EvalConfig,
+    EvaluationInterrupted,
+    Progress,
+    SuiteConfig,
+    Summary,
+    check,
+    evaluate,
+)
 from vlagents_ray.evaluate.episode.records import EpisodeResult
 from vlagents_ray.evaluate.plan.cases import EvalCase
 from vlagents_ray.evaluate.results.store import Store
@@ -34,7 +42,8 @@ def query(config: EvalConfig, sql: str) -> list[tuple[Any, ...]]:
 def outcomes(config: EvalConfig) -> list[tuple[Any, ...]]:
     return query(
         config,
-        "SELECT env, episode, seed, status, success_once, success_at_end, steps, episode_return, instruction"
+        "SELECT env, episode, seed, status, success_once, success_at_end, steps, episode_return, "
+        "instruction"
         " FROM episodes ORDER BY env, episode",
     )
 
@@ -124,10 +133,15 @@ class TestOnACluster:
         assert summary.total.episodes == 6
         assert [row[1] for row in outcomes(config())] == list(range(6))
 
-    def test_workers_start_with_pinned_threads_and_the_users_variables(self, config: Config) -> None:
+    def test_workers_start_with_pinned_threads_and_the_users_variables(
+        self, config: Config
+    ) -> None:
         runtime_env = config().worker.runtime_env
         env_vars = {**runtime_env["env_vars"], "LP_NUM_THREADS": "5", "EXTRA": "yes"}  # type: ignore[dict-item]
-        evaluate(config(episodes=1, threads=3, runtime_env={**runtime_env, "env_vars": env_vars}), agent_factory=Teller)
+        evaluate(
+            config(episodes=1, threads=3, runtime_env={**runtime_env, "env_vars": env_vars}),
+            agent_factory=Teller,
+        )
         ((status, text),) = query(config(), "SELECT status, error FROM episodes")
         assert status == "policy_error"
         assert "{'OMP_NUM_THREADS': '3', 'LP_NUM_THREADS': '5', 'EXTRA': 'yes'}" in text
@@ -143,7 +157,9 @@ class TestOnACluster:
         base = config(workers=1, cpus_per_worker=3, place_timeout_s=120)
         suites = [
             SuiteConfig(envs=[CLINGING], episodes=2),
-            SuiteConfig(envs=[LINE], episodes=1, worker=base.worker.model_copy(update={"threads": 2})),
+            SuiteConfig(
+                envs=[LINE], episodes=1, worker=base.worker.model_copy(update={"threads": 2})
+            ),
         ]
         summary = evaluate(base.model_copy(update={"suites": suites}), agent_factory=ToZero)
         assert (summary.state, summary.total.episodes) == ("complete", 3)
@@ -171,8 +187,15 @@ def test_lost_episodes_have_no_success_and_are_played_on_resume_and_a_finished_e
 ) -> None:
     monkeypatch.setattr(rollout, "FIRST_WAIT_S", 0.001)
     summary = here(config(retries=1), functools.partial(ToZero, lost_on=4))
-    assert (summary.total.episodes, summary.total.infra_failures, summary.total.retries) == (5, 1, 1)
-    row = query(config(), "SELECT status, success_once, success_at_end, attempts FROM episodes WHERE episode = 4")
+    assert (summary.total.episodes, summary.total.infra_failures, summary.total.retries) == (
+        5,
+        1,
+        1,
+    )
+    row = query(
+        config(),
+        "SELECT status, success_once, success_at_end, attempts FROM episodes WHERE episode = 4",
+    )
     assert row == [("infra_failed", None, None, 2)]
     summary = here(config(resume=True))
     assert (summary.total.episodes, summary.total.infra_failures) == (6, 0)
@@ -182,7 +205,9 @@ def test_lost_episodes_have_no_success_and_are_played_on_resume_and_a_finished_e
     assert outcomes(config()) == before
 
 
-def test_many_lost_episodes_in_a_row_stop_the_evaluation(config: Config, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_many_lost_episodes_in_a_row_stop_the_evaluation(
+    config: Config, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(rollout, "FIRST_WAIT_S", 0.001)
     settings = config(episodes=50, retries=0, abort_after=3)
     with pytest.raises(ConnectionLost, match="3 episodes in a row lost to infrastructure"):

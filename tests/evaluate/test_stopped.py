@@ -66,7 +66,11 @@ def episodes(config: EvalConfig) -> list[tuple[int, int, int]]:
 
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGKILL, -9), (signal.SIGINT, 130)])
 def test_a_stopped_and_resumed_evaluation_has_each_episode_exactly_once(
-    config: Callable[..., EvalConfig], tmp_path: Path, ray_folder: Path, number: signal.Signals, code: int
+    config: Callable[..., EvalConfig],
+    tmp_path: Path,
+    ray_folder: Path,
+    number: signal.Signals,
+    code: int,
 ) -> None:
     options = {"folder": str(tmp_path), "trouble": {"gate": [5, 6]}}
     settings = config(episodes=9, env_options=options, env_timeout_s=100)
@@ -88,8 +92,14 @@ def test_a_stopped_and_resumed_evaluation_has_each_episode_exactly_once(
         assert json.loads((settings.out / "summary.json").read_text())["state"] == "interrupted"
 
     # Without another Ray: tests/integration/test_cli.py resumes with workers.
-    with start(config(episodes=9, env_options=options, workers=0, resume=True), ray_folder) as evaluation:
+    with start(
+        config(episodes=9, env_options=options, workers=0, resume=True), ray_folder
+    ) as evaluation:
         assert evaluation.wait(300) == 0
     assert episodes(settings) == [(1, i, 1) for i in range(5)] + [(2, i, 1) for i in range(5, 9)]
     summary = json.loads((settings.out / "summary.json").read_text())
-    assert (summary["state"], summary["totals"][0]["episodes"], summary["totals"][0]["retries"]) == ("complete", 9, 0)
+    assert (
+        summary["state"],
+        summary["totals"][0]["episodes"],
+        summary["totals"][0]["retries"],
+    ) == ("complete", 9, 0)

@@ -52,7 +52,10 @@ def listening(monkeypatch: pytest.MonkeyPatch) -> None:
     classes = {"listener": Listener, "broken": Broken}
     entries = {name: RegistryEntry(f"{__name__}:{cls.__name__}") for name, cls in classes.items()}
     entries["lacking"] = RegistryEntry(
-        f"{__name__}:Listener", needs=("no_such_tracker",), extra="lacking", distribution="lab-trackers"
+        f"{__name__}:Listener",
+        needs=("no_such_tracker",),
+        extra="lacking",
+        distribution="lab-trackers",
     )
     monkeypatch.setitem(registry._BUILT_IN, "trackers", entries)
     for kept in (Listener.begun, Listener.told, Listener.shown, Listener.finished):
@@ -67,7 +70,9 @@ def tell(config: EvalConfig) -> list[tuple[str, int | None, dict[str, float]]]:
     return list(Listener.told)
 
 
-def test_rates_return_and_steps_of_each_task_and_in_total_stand_at_the_training_step(config: Config) -> None:
+def test_rates_return_and_steps_of_each_task_and_in_total_stand_at_the_training_step(
+    config: Config,
+) -> None:
     settings = config(envs=[LINE, OTHER_LINE], episodes=4, steps=[10, 20], track=["listener"])
     results = play(settings)
     told = tell(settings)
@@ -86,7 +91,9 @@ def test_rates_return_and_steps_of_each_task_and_in_total_stand_at_the_training_
     assert Listener.finished == ["policy"]
 
 
-def test_an_unfinished_cell_is_told_by_the_run_that_completes_it_and_no_other_twice(config: Config) -> None:
+def test_an_unfinished_cell_is_told_by_the_run_that_completes_it_and_no_other_twice(
+    config: Config,
+) -> None:
     settings = config(envs=[LINE, OTHER_LINE], episodes=3, track=["listener"])
     one_env = {"suites": [settings.suites[0].model_copy(update={"envs": [LINE]})]}
     play(settings, left_out=[2])
@@ -95,14 +102,21 @@ def test_an_unfinished_cell_is_told_by_the_run_that_completes_it_and_no_other_tw
     assert [min(metrics) for _, _, metrics in tell(settings)] == [f"{LINE}/episodes"]
     assert tell(settings) == []
     play(settings.model_copy(update={"resume": True}))
-    assert [min(metrics) for _, _, metrics in tell(settings)] == [f"{OTHER_LINE}/episodes", "total/episodes"]
+    assert [min(metrics) for _, _, metrics in tell(settings)] == [
+        f"{OTHER_LINE}/episodes",
+        "total/episodes",
+    ]
     ids = {about.id for about in Listener.begun}
     assert len(ids) == 1
 
 
 def test_the_weights_of_the_server_are_in_the_settings_of_the_run(config: Config) -> None:
     settings = config(episodes=1, track=["listener"])
-    said = {"policy": "act", "checkpoint": "runs/last", "weights": {"digest": "x", "revision": None}}
+    said = {
+        "policy": "act",
+        "checkpoint": "runs/last",
+        "weights": {"digest": "x", "revision": None},
+    }
 
     class Served(ToZero):
         metadata: ClassVar = {**said, "version": "1"}
@@ -121,7 +135,11 @@ def test_a_cell_that_stopped_early_is_complete(config: Config) -> None:
 
 def test_of_the_videos_a_few_are_shown_failures_first(config: Config) -> None:
     settings = config(
-        episodes=12, video="all", env_options={"camera": [32, 32]}, track=["listener"], tracking={"videos": 3}
+        episodes=12,
+        video="all",
+        env_options={"camera": [32, 32]},
+        track=["listener"],
+        tracking={"videos": 3},
     )
     play(settings)
     tell(settings)
@@ -137,7 +155,9 @@ def test_a_tracker_that_fails_is_a_warning_and_the_others_go_on(
     play(settings)
     assert len(tell(settings)) == 2
     [record] = caplog.records
-    assert record.getMessage() == "broken: RuntimeError: no such project; nothing more is logged to it"
+    assert (
+        record.getMessage() == "broken: RuntimeError: no such project; nothing more is logged to it"
+    )
 
 
 def test_an_evaluation_tells_while_it_runs_and_at_its_end(config: Config) -> None:
@@ -157,7 +177,11 @@ def test_a_missing_package_is_an_error_before_anything_starts(config: Config) ->
             use(config(track=["lacking"]))
 
 
-def test_an_unknown_tracker_is_an_error_with_the_registered_ones_before_anything_starts(config: Config) -> None:
+def test_an_unknown_tracker_is_an_error_with_the_registered_ones_before_anything_starts(
+    config: Config,
+) -> None:
     for use in (TrackerFeed, check):
-        with pytest.raises(ConfigError, match=r"'listner' is not registered: want one of .*did you mean 'listener'"):
+        with pytest.raises(
+            ConfigError, match=r"'listner' is not registered: want one of .*did you mean 'listener'"
+        ):
             use(config(track=["listner"]))

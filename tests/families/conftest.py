@@ -1,4 +1,5 @@
-"""Tests of a model family run in the environment of that family, some with the source of its authors.
+"""Tests of a model family run in the environment of that family, some with the source of its
+authors.
 
 `make families` runs them; in other environments they are left out.
 """

@@ -6,7 +6,11 @@ import pytest
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
-    parser.addoption("--record", action="store_true", help="write the traces of tests/golden again, before all tests")
+    parser.addoption(
+        "--record",
+        action="store_true",
+        help="write the traces of tests/golden again, before all tests",
+    )
 
 
 def pytest_configure(config: pytest.Config) -> None:

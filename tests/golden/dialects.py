@@ -1,4 +1,6 @@
-"""Scenarios of other systems' protocols: what their clients send, by the codecs that ask such servers ourselves."""
+"""Scenarios of other systems' protocols: what their clients send, by the codecs that ask such
+servers ourselves.
+"""
 
 from __future__ import annotations
 
@@ -34,7 +36,12 @@ def maps() -> Iterator[Trace]:
     def infer(**more: Any) -> bytes:
         return openpi.encode(LIBERO | {"endpoint": "infer"} | more)
 
-    first, opened, at, mapped = gets(), Step("a", "opens"), ("/openpi", "/"), {"mapping": "openpi-libero"}
+    first, opened, at, mapped = (
+        gets(),
+        Step("a", "opens"),
+        ("/openpi", "/"),
+        {"mapping": "openpi-libero"},
+    )
     on = {"openpi": mapped | {"metadata": {"reset_pose": [0.5]}, "answer_reset": True}}
     seen, other = openpi.encode(LIBERO), LIBERO | {"prompt": "place it"}
     begin, again = openpi.encode({"reset": True}), openpi.encode({"endpoint": "reset"})
@@ -52,7 +59,12 @@ def maps() -> Iterator[Trace]:
     }.items():
         yield from scenario(f"openpi: {says}", at[:1], first, asks(sent), gets(), dialects=on)
     yield from scenario("openpi: not ready", at[:1], opened, dialects=on, ready=False)
-    named = asks(*(infer(session_id=name) for name in ("one", "one", "two")), again, infer(), infer(endpoint="jump"))
+    named = asks(
+        *(infer(session_id=name) for name in ("one", "one", "two")),
+        again,
+        infer(),
+        infer(endpoint="jump"),
+    )
     at, on = ("/roboarena",), {"roboarena": mapped}
     yield from scenario("roboarena: episodes, and an error", at, first, named, gets(), dialects=on)
 
@@ -67,12 +79,23 @@ def documents() -> Iterator[Trace]:
     seen = {"image": PIXELS, "instruction": "pick"}
     twice = {"encoded": openvla.encode(seen).decode()}
     lone = asks(*map(post, [seen, twice, without(seen, "image"), without(seen, "instruction")]))
-    kept = asks(post(seen, "s-1"), post(seen, "s-1"), post(seen | {"instruction": "place it"}, "s-1"))
+    kept = asks(
+        post(seen, "s-1"), post(seen, "s-1"), post(seen | {"instruction": "place it"}, "s-1")
+    )
     wrong = [seen | {"instruction": "fail"}, seen | {"image": PIXELS[0]}, b"{", b"[]", bytes(5000)]
-    yield from scenario("openvla: requests", ("http",), lone, kept, asks(*map(post, wrong)), dialects={"openvla": {}})
+    yield from scenario(
+        "openvla: requests",
+        ("http",),
+        lone,
+        kept,
+        asks(*map(post, wrong)),
+        dialects={"openvla": {}},
+    )
     chunk = {"openvla": {"chunk": True}}
     yield from scenario("openvla: a chunk", ("http",), asks(post(seen)), dialects=chunk)
-    yield from scenario("openvla: not ready", ("http",), asks(post(seen)), dialects=chunk, ready=False)
+    yield from scenario(
+        "openvla: not ready", ("http",), asks(post(seen)), dialects=chunk, ready=False
+    )
 
 
 def benchmarks() -> Iterator[Trace]:
@@ -82,7 +105,13 @@ def benchmarks() -> Iterator[Trace]:
         return masked(vla_eval.encode(vla_eval.Message(kind, payload, seq)))  # without the time
 
     def seen(seq: int, task: str = "pick", **images: Any) -> bytes:
-        return message("observation", seq, images=images or {"front": PIXELS}, task_description=task, state=JOINTS)
+        return message(
+            "observation",
+            seq,
+            images=images or {"front": PIXELS},
+            task_description=task,
+            state=JOINTS,
+        )
 
     file = {"__image__": True, "format": "png", "data": png(PIXELS)}
     no_file = file | {"data": b"GIF89a"}
@@ -91,7 +120,10 @@ def benchmarks() -> Iterator[Trace]:
         ("/vla-eval",),
         asks(message("hello", 0, protocol_version=1), message("hello", 1, protocol_version=9)),
         [Send("a", message("episode_start", 2)), asks(seen(3), seen(4), seen(5))],
-        [Send("a", message("episode_end", 6)), asks(seen(7, "place it", front=file), seen(8, "fail"))],
+        [
+            Send("a", message("episode_end", 6)),
+            asks(seen(7, "place it", front=file), seen(8, "fail")),
+        ],
         asks(message("observation", 9, images={}), message("jump", 10), RUBBISH, seen(11)),
         asks(seen(12, front=no_file), bytes(4097)),
         dialects={"vla_eval": {"observation_params": {"send_state": True}}},
@@ -106,7 +138,9 @@ def gateways() -> Iterator[Trace]:
         return gr00t.batch([one] * number, key)
 
     def get(observation: dict[str, Any], **options: Any) -> bytes:
-        return gr00t.write("get_action", {"observation": observation, "options": None}, None, **options)
+        return gr00t.write(
+            "get_action", {"observation": observation, "options": None}, None, **options
+        )
 
     def say(endpoint: str, data: Any = None) -> bytes:
         return gr00t.write(endpoint, data, None)
@@ -115,14 +149,30 @@ def gateways() -> Iterator[Trace]:
     yield from scenario(
         "gr00t: requests",
         ("gr00t",),
-        asks(say("ping"), say("get_modality_config"), get(batch()), get(batch()), say("reset", {"options": None})),
-        asks(get(batch(), packed=True), get(batch(text="place it")), get(batch(2)), say("get_action", flat)),
-        asks(say("get_modality_config"), get(batch(text="fail")), get(batch() | {"video": {}, "state": {}})),
+        asks(
+            say("ping"),
+            say("get_modality_config"),
+            get(batch()),
+            get(batch()),
+            say("reset", {"options": None}),
+        ),
+        asks(
+            get(batch(), packed=True),
+            get(batch(text="place it")),
+            get(batch(2)),
+            say("get_action", flat),
+        ),
+        asks(
+            say("get_modality_config"),
+            get(batch(text="fail")),
+            get(batch() | {"video": {}, "state": {}}),
+        ),
         asks(say("get_action", 7), say("jump"), RUBBISH, get(batch())),
         dialects={"gr00t": {}},
     )
 
-    # LeRobot's clients send pickles, which nothing here writes: its requests stay those of the file.
+    # LeRobot's clients send pickles, which nothing here writes: its requests stay those of the
+    # file.
     yield from (one.sent() for one in read("gateways") if one.name.startswith("lerobot"))
 
     def ask(method: str, *args: str) -> bytes:
@@ -132,14 +182,25 @@ def gateways() -> Iterator[Trace]:
         arm = {"cameras": {"front": PIXELS}, "joints": JOINTS, "gripper": np.array([0.5])} | changes
         return ask("act", vlagents.write_observation({"arm": arm, "language_instruction": text}))
 
-    old = '[{"cameras": {}, "camera_data_type": "raw", "gripper": 0.5, "info": {}}, "go", {"seed": 3}]'
+    old = (
+        '[{"cameras": {}, "camera_data_type": "raw", "gripper": 0.5, "info": {}}, "go", '
+        '{"seed": '
+        "3}]"
+    )
     ping = rpyc.request(8, rpyc.Handler.PING, (rpyc.VALUE, ("hi",)))
     look = rpyc.request(9, rpyc.Handler.INSPECT, (rpyc.VALUE, ()))
     yield from scenario(
         "vlagents: calls",
         ("vlagents",),
         asks(vlagents.get_root(1), ask("name"), ask("is_initialized"), ping, look),
-        asks(see(), see(), see("place it"), ask("reset", old), see("fail"), see(cameras={"front": PIXELS[0]})),
+        asks(
+            see(),
+            see(),
+            see("place it"),
+            ask("reset", old),
+            see("fail"),
+            see(cameras={"front": PIXELS[0]}),
+        ),
         asks(ask("act", "{"), ask("act"), ask("jump"), see(), b"\0\0\0\x03\0bad\n"),
         dialects={"vlagents": {}},
     )

@@ -1,4 +1,4 @@
-"""The line at which the recorded policy fails, which errors name; in its own file, so that no other edit moves it."""
+"""The line at which the recorded policy fails, which errors name; alone, so that it stays there."""
 
 from typing import NoReturn
 

@@ -1,4 +1,6 @@
-"""Connections to the endpoints, which carry bytes as they are: no encoder, no decoder and no client of this package."""
+"""Connections to the endpoints, which carry bytes as they are: no encoder, no decoder and no
+client of this package.
+"""
 
 from __future__ import annotations
 
@@ -87,7 +89,9 @@ class RpycLine(TcpLine):
 
 
 class WebSocketLine(TcpLine):
-    """Frames of a WebSocket; `more` is the first byte, if the message is no binary one in one frame."""
+    """Frames of a WebSocket; `more` is the first byte, if the message is no binary one in one
+    frame.
+    """
 
     def __init__(self, port: int, path: str) -> None:
         super().__init__(port)
@@ -96,7 +100,9 @@ class WebSocketLine(TcpLine):
 
     def send(self, data: bytes, more: list[bytes]) -> None:
         first = more[0] if more else b"\x82"
-        self._socket.sendall(first + bytes([0x80 | 127]) + struct.pack(">Q", len(data)) + bytes(4) + data)
+        self._socket.sendall(
+            first + bytes([0x80 | 127]) + struct.pack(">Q", len(data)) + bytes(4) + data
+        )
 
     def _next(self) -> Got:
         first, size = self._read(2)
@@ -106,7 +112,9 @@ class WebSocketLine(TcpLine):
 
 
 class UnixLine:
-    """Messages of a Unix socket, whose requests lie in memory: that of memory files, or what `store` keeps."""
+    """Messages of a Unix socket, whose requests lie in memory: that of memory files, or what
+    `store` keeps.
+    """
 
     def __init__(self, address: str, store: Callable[[bytes, bytes], None] | None = None) -> None:
         self._store = store
@@ -184,12 +192,16 @@ class ZmqLine:
 
 
 class GrpcLine(CallLine):
-    """Calls of gRPC's methods: the data are a method's path, `more` its message, or those of a stream."""
+    """Calls of gRPC's methods: the data are a method's path, `more` its message, or those of a
+    stream.
+    """
 
     def __init__(self, port: int) -> None:
         import grpc
 
-        self._channel = grpc.insecure_channel(f"127.0.0.1:{port}", [("grpc.use_local_subchannel_pool", 1)])
+        self._channel = grpc.insecure_channel(
+            f"127.0.0.1:{port}", [("grpc.use_local_subchannel_pool", 1)]
+        )
         self._failed = grpc.RpcError
         super().__init__(self._called)
 
@@ -197,7 +209,9 @@ class GrpcLine(CallLine):
         path = data.decode()
         try:
             if path.endswith("SendObservations"):
-                return "message", masked(self._channel.stream_unary(path)(iter(more), timeout=ANSWER_S))
+                return "message", masked(
+                    self._channel.stream_unary(path)(iter(more), timeout=ANSWER_S)
+                )
             return "message", masked(self._channel.unary_unary(path)(more[0], timeout=ANSWER_S))
         except self._failed as error:
             return error.code().name, masked(error.details().encode())

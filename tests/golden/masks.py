@@ -1,7 +1,8 @@
 """Bytes of the wire: without what varies by nature, as text for a file, and in lines for a reader.
 
-A message is masked by taking it apart, replacing values, and putting it together again. One that does not come out as
-it was, before any value is replaced, is not what its format says: it stays as it is, and so differs from its trace.
+A message is masked by taking it apart, replacing values, and putting it together again. One that
+does not come out as it was, before any value is replaced, is not what its format says: it stays as
+it is, and so differs from its trace.
 """
 
 from __future__ import annotations
@@ -15,7 +16,8 @@ from typing import Any
 import msgpack
 
 _REPLY = struct.Struct("<QHh")  # of shared memory: files that are free again, flags, core
-_ANSWER = struct.Struct("<40sqBB2xIIIddddd")  # id, step, flags, dimensions, H, D, batch size, five times in ms
+# id, step, flags, dimensions, H, D, batch size, five times in ms.
+_ANSWER = struct.Struct("<40sqBB2xIIIddddd")
 _COMPACT = 2  # of the flags
 _FRAME = struct.Struct("<4sI")
 # Of a session or a request, drawn at random; or the prefix of a request's that a gateway counts.
@@ -23,7 +25,8 @@ _ID = re.compile(rb"(?<![0-9a-f])([0-9a-f]{32}(?![0-9a-f])|[0-9a-f]{16}(?=-[0-9a
 _FRAME_MS = re.compile(rb'("\w+_ms":)-?\d+\.\d{4}(?=[,}])')
 _JSON_MS = re.compile(rb'("\w+_ms": ?)-?\d+(\.\d+)?(e-\d+)?(?=[,}])')
 _RPYC_JSON = re.compile(rb"\x0f(.{4})(\{.*\})(?=\n$)", re.DOTALL)
-_SERVERS_OWN = re.compile(rb"^(date|server): .*\r\n", re.IGNORECASE | re.MULTILINE)  # of uvicorn and websockets
+# Of uvicorn and websockets.
+_SERVERS_OWN = re.compile(rb"^(date|server): .*\r\n", re.IGNORECASE | re.MULTILINE)
 _LENGTH = re.compile(rb"(?<=\r\ncontent-length: )\d+", re.IGNORECASE)
 
 
@@ -40,7 +43,8 @@ def masked(data: bytes) -> bytes:
 def masked_local(data: bytes) -> bytes:
     """A message of the server on a Unix socket, or its head and the memory file that came with it.
 
-    Which of the client's memory files are free again varies, too: it is up to Python's garbage collector.
+    Which of the client's memory files are free again varies, too: it is up to Python's garbage
+    collector.
     """
     flags, rest = _REPLY.unpack_from(data)[1], data[_REPLY.size :]
     return _REPLY.pack(0, flags, 0) + (_without_times(rest) if flags & _COMPACT else masked(rest))
@@ -122,11 +126,17 @@ def _zeroed(value: Any, key: Any = "") -> Any:
         return [_zeroed(item) for item in value]
     if isinstance(value, str):
         return _without_ids(value.encode()).decode()
-    return 0.0 if isinstance(value, float) and (str(key).endswith("_ms") or key == "timestamp") else value
+    return (
+        0.0
+        if isinstance(value, float) and (str(key).endswith("_ms") or key == "timestamp")
+        else value
+    )
 
 
 def as_text(data: bytes) -> str:
-    """Bytes for a file: printable ASCII as it is, the others in hexadecimal within «», `07*192` for many alike."""
+    """Bytes for a file: printable ASCII as it is, the others in hexadecimal within «», `07*192`
+    for many alike.
+    """
     return re.sub(rb"[ -~]{4,}|(?:(?![ -~]{4})[\s\S])+", _run, data).decode() or "«»"
 
 

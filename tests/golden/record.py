@@ -29,7 +29,14 @@ def record() -> None:
             found: list[Trace] = []
             for scenario in scenarios():
                 one = scenario.played(scenario.endpoints[0], Path(folder))
-                same = next((other for other in found if (other.name, other.steps) == (one.name, one.steps)), None)
+                same = next(
+                    (
+                        other
+                        for other in found
+                        if (other.name, other.steps) == (one.name, one.steps)
+                    ),
+                    None,
+                )
                 if same is None:
                     found.append(one)
                 else:

@@ -1,4 +1,6 @@
-"""A server without Ray: one replica, or two that know each other, with all of its endpoints and dialects."""
+"""A server without Ray: one replica, or two that know each other, with all of its endpoints and
+dialects.
+"""
 
 from __future__ import annotations
 
@@ -19,7 +21,16 @@ from eval_fakes import wait_for
 from in_process_replicas import Replicas
 
 from tests.golden.failing import fail
-from tests.golden.lines import CallLine, GrpcLine, HttpLine, Line, RpycLine, UnixLine, WebSocketLine, ZmqLine
+from tests.golden.lines import (
+    CallLine,
+    GrpcLine,
+    HttpLine,
+    Line,
+    RpycLine,
+    UnixLine,
+    WebSocketLine,
+    ZmqLine,
+)
 from tests.golden.masks import masked
 from vlagents_ray.contract import ActionSpec, CameraSpec, Contract, StateSpec
 from vlagents_ray.interface import Act, Agent, Obs
@@ -45,7 +56,8 @@ STRICT = Contract(
     chunk=2,
     history=3,
 )
-OPEN = Contract(instruction=True, action=STRICT.action, chunk=2)  # for dialects, each of which has names of its own
+# For dialects, each of which has names of its own.
+OPEN = Contract(instruction=True, action=STRICT.action, chunk=2)
 _DRAWN_AT = 10**15  # ns, of the wall clock that the first step of an episode is drawn from
 _GATEWAYS = {"gr00t": ZmqLine, "lerobot": GrpcLine, "vlagents": RpycLine}
 
@@ -58,9 +70,10 @@ class Gate:
 
 
 class Policy(Agent):
-    """Acts by what it saw: two rows of a pixel, the sum of the state, the gripper, the length of the instruction, the
-    acts so far, the pixels of the last three observations together, and the row. `info` or the instruction asks for
-    something else."""
+    """Acts by what it saw: two rows of a pixel, the sum of the state, the gripper, the length of
+    the instruction, the
+    acts so far, the pixels of the last three observations together, and the row. `info` or the
+    instruction asks for something else."""
 
     def __init__(self, contract: Contract, gate: Gate, checkpoint: str) -> None:
         self._contract, self.gate, self.checkpoint = contract, gate, checkpoint
@@ -75,7 +88,11 @@ class Policy(Agent):
     def reset(self, obs: Obs, instruction: str | None, **kwargs: Any) -> dict[str, Any]:
         if instruction == "no reset":
             fail()
-        self.instruction, self.acts, self.seen = instruction or "", 0, deque([_pixel(obs)], maxlen=3)
+        self.instruction, self.acts, self.seen = (
+            instruction or "",
+            0,
+            deque([_pixel(obs)], maxlen=3),
+        )
         return {"instruction": instruction, "options": kwargs}
 
     def observe(self, obs: Obs) -> None:
@@ -91,7 +108,13 @@ class Policy(Agent):
         self.observe(obs)
         self.acts += 1
         state = float(sum(part.sum() for part in obs.state.values()))
-        row = [_pixel(obs), state, -1.0 if obs.gripper is None else obs.gripper, len(self.instruction), self.acts]
+        row = [
+            _pixel(obs),
+            state,
+            -1.0 if obs.gripper is None else obs.gripper,
+            len(self.instruction),
+            self.acts,
+        ]
         rows = np.array([[*row, sum(self.seen), 0.25], [*row, sum(self.seen), 0.75]], np.float32)
         answers = {
             "one row": Act(rows[0]),
@@ -108,9 +131,13 @@ def _pixel(obs: Obs) -> float:
 
 
 class Server:
-    """What a scenario talks to; its settings are `sessions`, `ready`, `replicas`, and `dialects` by name."""
+    """What a scenario talks to; its settings are `sessions`, `ready`, `replicas`, and `dialects`
+    by name.
+    """
 
-    def __init__(self, stack: contextlib.ExitStack, patch: pytest.MonkeyPatch, folder: Path, **settings: Any) -> None:
+    def __init__(
+        self, stack: contextlib.ExitStack, patch: pytest.MonkeyPatch, folder: Path, **settings: Any
+    ) -> None:
         self._stack, self._patch, self._folder = stack, patch, folder
         self._dialects: dict[str, Any] = settings.get("dialects", {})
         self._ready = settings.get("ready", True)
@@ -118,11 +145,15 @@ class Server:
         self._own: Any = None
         stack.callback(lambda: self._own and self._own.close())  # after the engine
         options = {"session_limit": settings.get("sessions", 100), "wall_clock": lambda: _DRAWN_AT}
-        self._offered = partial(Checkpoints, self._agent, {"checkpoint": "first"}, {"other": {"checkpoint": "second"}})
+        self._offered = partial(
+            Checkpoints, self._agent, {"checkpoint": "first"}, {"other": {"checkpoint": "second"}}
+        )
         self._replicas: Replicas | None = None
         gateway = self._dialects.keys() & _GATEWAYS.keys()
         if gateway or settings.get("replicas"):
-            self._replicas = Replicas([self._offered() for _ in range(settings.get("replicas", 1))], **options)
+            self._replicas = Replicas(
+                [self._offered() for _ in range(settings.get("replicas", 1))], **options
+            )
             stack.callback(self._replicas.close)
             self.engines = self._replicas.engines
         else:
@@ -134,7 +165,9 @@ class Server:
         stack.callback(self._gate.opened.set)
 
     def line(self, endpoint: str, name: str) -> Line:
-        """A new connection to the replica that the name's last digit counts from 0, or to the first."""
+        """A new connection to the replica that the name's last digit counts from 0, or to the
+        first.
+        """
         number = int(name[-1]) if name[-1].isdigit() else 0
         if endpoint in _GATEWAYS:
             return _GATEWAYS[endpoint](self._gateway_port)
@@ -150,7 +183,9 @@ class Server:
         """Something that happens to the server."""
         happens = {
             "drains": self.engines[0].drain,
-            "is acting": lambda: self._gate.acting.wait(20) or pytest.fail("the policy was not asked"),
+            "is acting": lambda: (
+                self._gate.acting.wait(20) or pytest.fail("the policy was not asked")
+            ),
             "acts on": self._gate.opened.set,
             "has no session": lambda: wait_for(lambda: not len(self.engines[0].sessions)),
         }
@@ -167,9 +202,13 @@ class Server:
         if number not in self._ports:
             self._start()
             engine = self.engines[number]
-            routes = dialect_routes(DialectArgs(**self._dialects), ReplicaContext(engine, lambda: METADATA, LIMITS))
+            routes = dialect_routes(
+                DialectArgs(**self._dialects), ReplicaContext(engine, lambda: METADATA, LIMITS)
+            )
             app = build_http_app(engine, lambda: METADATA, LIMITS, more=routes)
-            self._ports[number] = self._stack.enter_context(served(AccessMiddleware(app, None, "app")))
+            self._ports[number] = self._stack.enter_context(
+                served(AccessMiddleware(app, None, "app"))
+            )
         return self._ports[number]
 
     def _own_line(self, endpoint: str) -> Line:
@@ -187,7 +226,8 @@ class Server:
             return WebSocketLine(self._own.address.port, self._own.path)
         if endpoint == "plasma":
             return UnixLine(
-                self._own.plasma.socket, lambda message, data: PlasmaChannel.frames.update({message[:28]: data})
+                self._own.plasma.socket,
+                lambda message, data: PlasmaChannel.frames.update({message[:28]: data}),
             )
         return UnixLine(f"\0{self._own.address.socket}")
 
@@ -201,7 +241,13 @@ class Server:
         assert self._replicas is not None
         replicas, cls, port = self._replicas, dialect_class(name), free_port()
         context = GatewayContext(
-            "app", lambda _key, rank: replicas.agent(rank=rank or "robot"), LIMITS, 8, 30.0, OPEN, NoKey.OPEN
+            "app",
+            lambda _key, rank: replicas.agent(rank=rank or "robot"),
+            LIMITS,
+            8,
+            30.0,
+            OPEN,
+            NoKey.OPEN,
         )
         dialect = cls(name, cls.Config(port=port, **self._dialects[name]), context)
         dialect.serve(reserve(name, "127.0.0.1", port))

@@ -17,7 +17,9 @@ EVERYWHERE = (*FRAMES, "http", *LOCAL)
 TOGETHER = EVERYWHERE[:-1]  # plasma reads what shared memory does
 
 Message = Request | list[Request] | bytes | tuple[bytes, ...]
-"""A request, or several; a frame that no encoder writes; or all that goes out, and what travels outside of it."""
+"""A request, or several; a frame that no encoder writes; or all that goes out, and what travels
+outside of it.
+"""
 
 
 class Send(NamedTuple):
@@ -64,12 +66,19 @@ def _flat(steps: list[Steps]) -> Iterator[Send | Step]:
             yield one
 
 
-def http(method: str, path: str, body: bytes = b"", kind: str = "", session: str = "", **headers: str) -> bytes:
+def http(
+    method: str, path: str, body: bytes = b"", kind: str = "", session: str = "", **headers: str
+) -> bytes:
     """A request of HTTP."""
     named = {"host": "robot", "x-session-id": session, "x-request-id": "h-1", "content-type": kind}
     named |= {"content-length": str(len(body))} if body or method == "POST" else {}
     named |= {key.replace("_", "-"): value for key, value in headers.items()}
-    lines = [f"{method} {path} HTTP/1.1", *(f"{key}: {value}" for key, value in named.items() if value), "", ""]
+    lines = [
+        f"{method} {path} HTTP/1.1",
+        *(f"{key}: {value}" for key, value in named.items() if value),
+        "",
+        "",
+    ]
     return "\r\n".join(lines).encode() + body
 
 
@@ -92,6 +101,8 @@ def _encoder(endpoint: str, who: str) -> Callable[[Message], tuple[bytes, ...]]:
         flags, text = (0, b"") if arrays is None else (LocalAddress.COMPACT, arrays.message)
         if endpoint == "plasma":
             return PlasmaAddress.REQUEST.pack(who.encode().ljust(28, b"."), flags) + text, memory
-        return LocalAddress.REQUEST.pack(next(sent) % LocalAddress.FILES, flags, len(memory)) + text, memory
+        return LocalAddress.REQUEST.pack(
+            next(sent) % LocalAddress.FILES, flags, len(memory)
+        ) + text, memory
 
     return encode

@@ -1,4 +1,6 @@
-"""Our encoders write what they wrote when the traces were recorded, and the server answers what it answered."""
+"""Our encoders write what they wrote when the traces were recorded, and the server answers what
+it answered.
+"""
 
 from __future__ import annotations
 
@@ -19,12 +21,19 @@ def test_requests_are_those_that_were_recorded(file: str) -> None:
         assert not (said := differences(recorded[key].sent(), one.sent())), f"{key}:\n{said}"
 
 
-CASES = [(file, trace, endpoint) for file in FILES for trace in read(file) for endpoint in trace.endpoints]
+CASES = [
+    (file, trace, endpoint)
+    for file in FILES
+    for trace in read(file)
+    for endpoint in trace.endpoints
+]
 IDS = [f"{file}-{trace.name}-{endpoint}" for file, trace, endpoint in CASES]
 
 
 @pytest.mark.parametrize(("file", "trace", "endpoint"), CASES, ids=IDS)
-def test_the_server_answers_as_recorded(file: str, trace: Trace, endpoint: str, tmp_path: Path) -> None:
+def test_the_server_answers_as_recorded(
+    file: str, trace: Trace, endpoint: str, tmp_path: Path
+) -> None:
     assert not (said := differences(trace, trace.played(endpoint, tmp_path))), f"{file}:\n{said}"
 
 

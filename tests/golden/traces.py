@@ -25,8 +25,10 @@ class Step:
 
     Args:
         who: A line's name; or "server", to which something happens.
-        what: "sends", "gets", "opens" (and gets the answer to the handshake), or "leaves"; of the server, `Server.do`.
-        data: What is sent or got: the message, and what travels outside of it; `kind` says how it came.
+        what: "sends", "gets", "opens" (and gets the answer to the handshake), or "leaves"; of the
+            server, `Server.do`.
+        data: What is sent or got: the message, and what travels outside of it; `kind` says how it
+            came.
     """
 
     who: str
@@ -51,7 +53,10 @@ class Trace:
 
     def sent(self) -> Trace:
         """The same without the answers."""
-        return replace(self, steps=[one if one.what == "sends" else Step(one.who, one.what) for one in self.steps])
+        return replace(
+            self,
+            steps=[one if one.what == "sends" else Step(one.who, one.what) for one in self.steps],
+        )
 
     def played(self, endpoint: str, folder: Path) -> Trace:
         """Send the same to a new server; returns what came of it."""
@@ -88,13 +93,20 @@ def differences(recorded: Trace, played: Trace) -> str:
     for number, (before, now) in enumerate(zip(recorded.steps, played.steps, strict=False)):
         if before == now:
             continue
-        lines = list(unified_diff(before.lines(), now.lines(), "recorded", "now", n=0, lineterm=""))[2:]
-        found += [f"step {number}: {now.who} {now.what}", *(line for line in lines if line[0] in "+-")]
+        lines = list(
+            unified_diff(before.lines(), now.lines(), "recorded", "now", n=0, lineterm="")
+        )[2:]
+        found += [
+            f"step {number}: {now.who} {now.what}",
+            *(line for line in lines if line[0] in "+-"),
+        ]
     return "\n".join(found)
 
 
 def read(name: str) -> list[Trace]:
-    """The traces in a file: of each its name, a line with its endpoints and the server's settings, and its steps."""
+    """The traces in a file: of each its name, a line with its endpoints and the server's
+    settings, and its steps.
+    """
     found: list[Trace] = []
     for part in (TRACES / f"{name}.txt").read_text().split("== ")[1:]:
         title, head, *lines = part.splitlines()

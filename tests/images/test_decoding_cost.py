@@ -1,4 +1,6 @@
-"""No file costs much more than an honest one of as many pixels and bytes, nor more than its structure told."""
+"""No file costs much more than an honest one of as many pixels and bytes, nor more than its
+structure told.
+"""
 
 from __future__ import annotations
 
@@ -26,8 +28,11 @@ FACTOR = 4.0  # by which a file may be slower than honest ones; without a bound 
 ROUNDS = 3
 SLACK = 6 * 2**20  # bytes of buffers in the libraries, and of the interpreter
 
-CAMERA = np.kron(np.random.default_rng(0).integers(0, 256, (128, 128, 3), np.uint8), np.ones((8, 8, 1), np.uint8))
-NOISE = np.random.default_rng(1).integers(0, 256, (512, 256, 3), np.uint8)  # of as many bytes as a hostile file
+CAMERA = np.kron(
+    np.random.default_rng(0).integers(0, 256, (128, 128, 3), np.uint8), np.ones((8, 8, 1), np.uint8)
+)
+# Of as many bytes as a hostile file.
+NOISE = np.random.default_rng(1).integers(0, 256, (512, 256, 3), np.uint8)
 
 
 def decode_or_refuse(file: bytes) -> None:
@@ -47,14 +52,17 @@ def cpu_s(file: bytes) -> float:
 
 def saved(image: np.ndarray, kind: str, **options: object) -> bytes:
     file = io.BytesIO()
-    ImageFile.MAXBLOCK = max(ImageFile.MAXBLOCK, 2**22)  # Pillow's encoder needs room for a whole progressive file
+    # Pillow's encoder needs room for a whole progressive file.
+    ImageFile.MAXBLOCK = max(ImageFile.MAXBLOCK, 2**22)
     Image.fromarray(image).save(file, kind, **options)
     return file.getvalue()
 
 
 @pytest.fixture(scope="module")
 def honest() -> dict[str, tuple[bytes, float]]:
-    """Files of cameras, of a megapixel or of as many bytes as the hostile ones, and the CPU time of each, s."""
+    """Files of cameras, of a megapixel or of as many bytes as the hostile ones, and the CPU time
+    of each, s.
+    """
     files = {
         "JPEG": jpeg_png.encode_jpeg(CAMERA),
         "JPEG of noise": jpeg_png.encode_jpeg(NOISE, 100),
@@ -69,11 +77,15 @@ def honest() -> dict[str, tuple[bytes, float]]:
 @pytest.fixture(scope="module")
 def speed(honest: dict[str, tuple[bytes, float]]) -> float:
     """By how much this machine, at this moment, is slower than the estimates say."""
-    return max(seconds / read_structure(file, PIXELS).decoding_s for file, seconds in honest.values())
+    return max(
+        seconds / read_structure(file, PIXELS).decoding_s for file, seconds in honest.values()
+    )
 
 
 @pytest.mark.parametrize("name", FILES)
-def test_a_hostile_file_takes_no_longer_than_honest_ones(name: str, honest: dict[str, tuple[bytes, float]]) -> None:
+def test_a_hostile_file_takes_no_longer_than_honest_ones(
+    name: str, honest: dict[str, tuple[bytes, float]]
+) -> None:
     kind = name.partition(":")[0]
     of_kind = [seconds for label, (_, seconds) in honest.items() if kind in label]
     assert cpu_s(FILES[name](SIZE)) < FACTOR * sum(of_kind)
@@ -91,22 +103,31 @@ def test_decoding_takes_no_longer_than_its_estimate(name: str, speed: float) -> 
 
 
 def peak_bytes() -> int:
-    [line] = [line for line in Path("/proc/self/status").read_text().splitlines() if line.startswith("VmHWM")]
+    [line] = [
+        line
+        for line in Path("/proc/self/status").read_text().splitlines()
+        if line.startswith("VmHWM")
+    ]
     return int(line.split()[1]) * 1024
 
 
 @pytest.mark.parametrize(
     "name", [*FILES, "honest JPEG", "honest PNG", "honest PNG of others", "honest progressive JPEG"]
 )
-def test_decoding_takes_no_more_memory_than_it_reserves(name: str, honest: dict[str, tuple[bytes, float]]) -> None:
-    file = honest[name.removeprefix("honest ")][0] if name.startswith("honest") else FILES[name](SIZE)
+def test_decoding_takes_no_more_memory_than_it_reserves(
+    name: str, honest: dict[str, tuple[bytes, float]]
+) -> None:
+    file = (
+        honest[name.removeprefix("honest ")][0] if name.startswith("honest") else FILES[name](SIZE)
+    )
     try:
         structure = read_structure(file, PIXELS)
         reserved = structure.image_bytes + structure.scratch_bytes
     except (MalformedMessage, MessageTooLarge):
         reserved = 0
     try:
-        Path("/proc/self/clear_refs").write_text("5")  # the peak begins again at what is in memory now
+        # The peak begins again at what is in memory now.
+        Path("/proc/self/clear_refs").write_text("5")
     except OSError:
         pytest.skip("this system does not let a process reset its peak")
     before = peak_bytes()
@@ -145,7 +166,9 @@ def test_an_error_names_what_is_wrong(name: str, message: str) -> None:
         jpeg_png.decode(file, PIXELS)
 
 
-def test_a_client_that_rewrites_its_memory_meanwhile_changes_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_client_that_rewrites_its_memory_meanwhile_changes_nothing(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     """Over shared memory, a file may change between the check of its structure and its decoding."""
     memory = bytearray(jpeg_png.encode_jpeg(rendered()))
     original = jpeg_png.decode_file
@@ -161,10 +184,18 @@ def test_a_client_that_rewrites_its_memory_meanwhile_changes_nothing(monkeypatch
 
 
 @pytest.mark.parametrize("mode", ["1", "L", "LA", "P", "RGB", "RGBA", "I;16"])
-@pytest.mark.parametrize("options", [{}, {"optimize": True}, {"dpi": (72, 72)}, {"compress_level": 0}])
-def test_pngs_keep_their_pixels_without_their_other_chunks(mode: str, options: dict[str, object]) -> None:
+@pytest.mark.parametrize(
+    "options", [{}, {"optimize": True}, {"dpi": (72, 72)}, {"compress_level": 0}]
+)
+def test_pngs_keep_their_pixels_without_their_other_chunks(
+    mode: str, options: dict[str, object]
+) -> None:
     image = rendered()
-    picture = Image.fromarray(image[:, :, 0].astype(np.uint16) * 257) if mode == "I;16" else Image.fromarray(image)
+    picture = (
+        Image.fromarray(image[:, :, 0].astype(np.uint16) * 257)
+        if mode == "I;16"
+        else Image.fromarray(image)
+    )
     picture = picture if mode == "I;16" else picture.convert(mode)
     file = io.BytesIO()
     picture.save(file, "PNG", **options)
@@ -177,12 +208,20 @@ def test_a_palette_with_transparency_keeps_its_colours(transparent: int | bytes)
     picture = Image.fromarray(rendered()).convert("P")
     file = io.BytesIO()
     picture.save(file, "PNG", transparency=transparent)
-    np.testing.assert_array_equal(jpeg_png.decode(file.getvalue()), np.array(picture.convert("RGB")))
+    np.testing.assert_array_equal(
+        jpeg_png.decode(file.getvalue()), np.array(picture.convert("RGB"))
+    )
 
 
 @pytest.mark.parametrize(
     "options",
-    [{}, {"progressive": True}, {"optimize": True}, {"quality": 100, "subsampling": 0}, {"restart_marker_rows": 1}],
+    [
+        {},
+        {"progressive": True},
+        {"optimize": True},
+        {"quality": 100, "subsampling": 0},
+        {"restart_marker_rows": 1},
+    ],
 )
 @pytest.mark.parametrize("grey", [False, True])
 def test_jpegs_of_other_encoders_are_decoded(options: dict[str, object], grey: bool) -> None:
@@ -200,6 +239,15 @@ def test_the_files_are_what_their_names_say() -> None:
         with contextlib.suppress(MalformedMessage, MessageTooLarge):
             jpeg_png.decode(make(20_000), PIXELS)
             decoded.add(name)
-    assert {"JPEG: scans within the limit", "JPEG: restart markers", "JPEG: fill bytes"} - decoded == set()
-    assert {"PNG: interlaced", "PNG: filters of 16 bits", "PNG: one column", "PNG: one bit"} - decoded == set()
+    assert {
+        "JPEG: scans within the limit",
+        "JPEG: restart markers",
+        "JPEG: fill bytes",
+    } - decoded == set()
+    assert {
+        "PNG: interlaced",
+        "PNG: filters of 16 bits",
+        "PNG: one column",
+        "PNG: one bit",
+    } - decoded == set()
     assert hostile_images.jpeg()[:2] == b"\xff\xd8"

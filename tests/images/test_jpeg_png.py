@@ -20,14 +20,19 @@ from vlagents_ray.errors import InvalidObservation, MalformedMessage, MessageToo
 from vlagents_ray.images import jpeg_png
 from vlagents_ray.images.image_file import PNG_MAGIC, read_structure
 
-PICTURES = {"bench": observation().cameras["camera_0"], "rendered": rendered(), "photograph": photograph()}
+PICTURES = {
+    "bench": observation().cameras["camera_0"],
+    "rendered": rendered(),
+    "photograph": photograph(),
+}
 pixels = hnp.arrays(np.uint8, st.tuples(st.integers(1, 9), st.integers(1, 9), st.just(3)))
 
 
 @pytest.mark.parametrize("name", PICTURES)
 def test_a_jpeg_loses_no_more_than_by_vlagents(name: str) -> None:
     image = PICTURES[name]
-    theirs = simplejpeg.decode_jpeg(simplejpeg.encode_jpeg(image))  # both ends of vlagents 0.3: all defaults
+    # Both ends of vlagents 0.3: all defaults.
+    theirs = simplejpeg.decode_jpeg(simplejpeg.encode_jpeg(image))
     assert psnr(image, jpeg_png.decode(jpeg_png.encode_jpeg(image))) >= psnr(image, theirs)
 
 
@@ -73,7 +78,12 @@ def test_a_damaged_png_is_refused_or_harmless(data: st.DataObject) -> None:
 def test_a_png_that_declares_too_much_or_unpacks_to_more_than_that_is_refused() -> None:
     file = jpeg_png.encode_png(np.zeros((4, 4, 3), np.uint8))
     data = zlib.compress(bytes(50_000_000))
-    chunk = struct.pack(">I", len(data)) + b"IDAT" + data + struct.pack(">I", zlib.crc32(b"IDAT" + data))
+    chunk = (
+        struct.pack(">I", len(data))
+        + b"IDAT"
+        + data
+        + struct.pack(">I", zlib.crc32(b"IDAT" + data))
+    )
     with pytest.raises(MalformedMessage, match="4 rows"):
         jpeg_png.decode(file[:33] + chunk + file[-12:])
     with pytest.raises(MessageTooLarge, match="declares 8x9"):
@@ -89,7 +99,9 @@ def test_what_is_no_image_is_refused(encode: object, shape: tuple[int, ...]) -> 
 
 @pytest.mark.parametrize("in_chunks", [False, True])
 def test_a_16_bit_grey_png_is_scaled_and_not_clipped(in_chunks: bool) -> None:
-    """Pillow's own conversion makes 255 of all that is over it; of 16-bit colours it takes the upper 8 bits."""
+    """Pillow's own conversion makes 255 of all that is over it; of 16-bit colours it takes the
+    upper 8 bits.
+    """
     ramp = np.arange(0, 65536, 64, dtype=np.uint16).reshape(32, 32)
     file = io.BytesIO()
     Image.fromarray(ramp).save(file, "PNG")
@@ -98,10 +110,15 @@ def test_a_16_bit_grey_png_is_scaled_and_not_clipped(in_chunks: bool) -> None:
         header = struct.pack(">2I5B", 32, 32, 16, 0, 0, 0, 0)
         data = zlib.compress(rows)
         chunks = [(b"IHDR", header), (b"IDAT", data[:100]), (b"IDAT", data[100:]), (b"IEND", b"")]
-        parts = [struct.pack(">I", len(d)) + k + d + struct.pack(">I", zlib.crc32(k + d)) for k, d in chunks]
+        parts = [
+            struct.pack(">I", len(d)) + k + d + struct.pack(">I", zlib.crc32(k + d))
+            for k, d in chunks
+        ]
         file = io.BytesIO(PNG_MAGIC + b"".join(parts))
     image = jpeg_png.decode(file.getvalue())
-    np.testing.assert_array_equal(image, np.repeat((ramp >> 8).astype(np.uint8)[:, :, None], 3, axis=2))
+    np.testing.assert_array_equal(
+        image, np.repeat((ramp >> 8).astype(np.uint8)[:, :, None], 3, axis=2)
+    )
 
 
 def test_exif_orientation_turns_nothing() -> None:
@@ -112,4 +129,6 @@ def test_exif_orientation_turns_nothing() -> None:
     exif[0x0112] = 6  # to be turned by 90 degrees
     Image.fromarray(picture).save(plain, "JPEG")
     Image.fromarray(picture).save(marked, "JPEG", exif=exif)
-    np.testing.assert_array_equal(jpeg_png.decode(marked.getvalue()), jpeg_png.decode(plain.getvalue()))
+    np.testing.assert_array_equal(
+        jpeg_png.decode(marked.getvalue()), jpeg_png.decode(plain.getvalue())
+    )

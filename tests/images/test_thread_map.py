@@ -1,4 +1,6 @@
-"""Several images at once: the same results and errors as one by one, with few threads, and none for little work."""
+"""Several images at once: the same results and errors as one by one, with few threads, and none
+for little work.
+"""
 
 from __future__ import annotations
 
@@ -27,7 +29,9 @@ def four_cores(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture
 def no_helpers(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(thread_map, "_helpers", Mock(side_effect=AssertionError("asked for helpers")))
+    monkeypatch.setattr(
+        thread_map, "_helpers", Mock(side_effect=AssertionError("asked for helpers"))
+    )
 
 
 def helpers() -> list[threading.Thread]:
@@ -65,7 +69,10 @@ def test_large_images_are_shared_with_helpers_and_small_ones_are_not(
         files = encode_files([np.full((side, side, 3), n, np.uint8) for n in range(2)], codec)
         assert asked.called == shared
         asked.reset_mock()
-        assert [int(image[0, 0, 0]) for image in decode_files(files, Budget(DEFAULT_LIMITS))] == [0, 1]
+        assert [int(image[0, 0, 0]) for image in decode_files(files, Budget(DEFAULT_LIMITS))] == [
+            0,
+            1,
+        ]
         assert asked.called == shared
         asked.reset_mock()
 
@@ -116,7 +123,9 @@ def test_a_caller_does_not_wait_for_busy_helpers() -> None:
         at_work.release()
         go_on.wait(WAIT_S)
 
-    callers = [threading.Thread(target=thread_map.thread_map, args=(call, [0] * 4, MUCH)) for _ in range(2)]
+    callers = [
+        threading.Thread(target=thread_map.thread_map, args=(call, [0] * 4, MUCH)) for _ in range(2)
+    ]
     for caller in callers:
         caller.start()
     for _ in range(len(callers) + thread_map._MOST_HELPERS):
@@ -130,9 +139,12 @@ def test_a_caller_does_not_wait_for_busy_helpers() -> None:
 
 
 @pytest.mark.skipif(len(os.sched_getaffinity(0)) < 2, reason="there is one core")
-def test_helpers_keep_off_the_callers_core_but_not_off_all_others(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_helpers_keep_off_the_callers_core_but_not_off_all_others(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     together = threading.Barrier(1 + thread_map._MOST_HELPERS)
-    thread_map.thread_map(lambda _: together.wait(WAIT_S), [0] * together.parties, MUCH)  # starts all
+    # Starts all.
+    thread_map.thread_map(lambda _: together.wait(WAIT_S), [0] * together.parties, MUCH)
     may = os.sched_getaffinity(0)
     for core in may:
         monkeypatch.setattr(thread_map, "here", lambda core=core: core)
@@ -156,7 +168,11 @@ def test_a_fork_and_the_end_of_the_process_are_no_trouble() -> None:
         atexit.register(lambda: print(thread_map(abs, [-1, -2], 1)))  # when no thread is started any more
     """
     done = subprocess.run(
-        [sys.executable, "-W", "ignore", "-c", code], capture_output=True, text=True, timeout=60, check=True
+        [sys.executable, "-W", "ignore", "-c", code],
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=True,
     )
     assert done.stdout == "[1, 2]\n[1, 2]\n"
     assert not done.stderr

@@ -63,6 +63,8 @@ def states(app: str) -> dict[str, int]:
 
 @contextmanager
 def serving(policy: str, **args: Any) -> Iterator[Server]:
-    """A server of one policy on the Ray that test files share: for files that take the fixture `shared_ray`."""
+    """A server of one policy on the Ray that test files share: for files that take the fixture
+    `shared_ray`.
+    """
     with shared_server(deployment(policy, **args)) as server:
         yield server

@@ -27,7 +27,15 @@ from ray_processes import leaked, words
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import connect
 
-from vlagents_ray import ConfigError, ConnectionLost, Forbidden, Obs, RemoteAgent, Unauthorized, VLAgentsError
+from vlagents_ray import (
+    ConfigError,
+    ConnectionLost,
+    Forbidden,
+    Obs,
+    RemoteAgent,
+    Unauthorized,
+    VLAgentsError,
+)
 from vlagents_ray.client.credentials import KEY_VARIABLE
 from vlagents_ray.client.transports.select import TransportName
 from vlagents_ray.evaluate import evaluate
@@ -43,7 +51,15 @@ EVERYWHERE = "0.0.0.0"  # noqa: S104 - what this is about
 WAYS: tuple[TransportName, ...] = ("http", "websocket", "shm", "auto")
 
 
-LIMITS = {"pixels": 64 * 64, "cameras": 2, "state_values": 8, "depth": 3, "items": 100, "body_bytes": 2**20, "text": 50}
+LIMITS = {
+    "pixels": 64 * 64,
+    "cameras": 2,
+    "state_values": 8,
+    "depth": 3,
+    "items": 100,
+    "body_bytes": 2**20,
+    "text": 50,
+}
 TOO_MUCH = {
     "pixels": Obs(cameras={"front": np.zeros((65, 64, 3), np.uint8)}),
     "cameras": Obs(cameras={name: np.zeros((8, 8, 3), np.uint8) for name in "abc"}),
@@ -81,7 +97,9 @@ def listeners(root: psutil.Process) -> set[Listener]:
         except (psutil.NoSuchProcess, OSError):  # it has ended
             continue
         for one in sockets:
-            if one.status == psutil.CONN_LISTEN or (one.type == socket.SOCK_DGRAM and one.laddr and not one.raddr):
+            if one.status == psutil.CONN_LISTEN or (
+                one.type == socket.SOCK_DGRAM and one.laddr and not one.raddr
+            ):
                 kind = "tcp" if one.type == socket.SOCK_STREAM else "udp"
                 found.add(Listener(name, kind, one.laddr.ip, one.laddr.port))
         found |= {Listener(name, "unix", path) for path in unix}
@@ -94,7 +112,13 @@ def name_of(process: psutil.Process) -> str:
     scripts = [Path(word).name for word in said if word.endswith(".py")]
     program = Path(said[0].split()[0]).name
     # Ray's workers call themselves by what they do at the moment: "ray::Class.method".
-    return scripts[0] if scripts else program.partition(".")[0] if program.startswith("ray::") else program
+    return (
+        scripts[0]
+        if scripts
+        else program.partition(".")[0]
+        if program.startswith("ray::")
+        else program
+    )
 
 
 def unix_sockets(pid: int) -> set[str]:
@@ -143,7 +167,9 @@ class Served:
 
     def status(self, path: str, headers: dict[str, str] | None = None) -> tuple[int, bytes]:
         parts = urlsplit(self.url)
-        connection = http.client.HTTPSConnection(parts.hostname or "", parts.port, timeout=10, context=self.trust)
+        connection = http.client.HTTPSConnection(
+            parts.hostname or "", parts.port, timeout=10, context=self.trust
+        )
         with contextlib.closing(connection):
             connection.request("GET", path, headers=headers or {})
             answer = connection.getresponse()
@@ -155,10 +181,14 @@ def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
     folder = tmp_path_factory.mktemp("access")
     ca = authority(folder, "ca")
     keys = folder / "keys.json"
-    tokens = {name: new_key(keys, name) for name in ("arm", "leaver")} | {"other": new_key(keys, "other", apps=("x",))}
+    tokens = {name: new_key(keys, name) for name in ("arm", "leaver")} | {
+        "other": new_key(keys, "other", apps=("x",))
+    }
     tls = Tls(*ca.sign("server"))
     config = deployment("noop", limits=LIMITS)
-    with running_server(config, host=EVERYWHERE, num_cpus=2, keys_file=keys, tls=tls, timeout_s=120) as server:
+    with running_server(
+        config, host=EVERYWHERE, num_cpus=2, keys_file=keys, tls=tls, timeout_s=120
+    ) as server:
         yield Served(server.url, keys, tokens, ca)
 
 
@@ -178,7 +208,9 @@ def test_nobody_else_is(served: Served, way: TransportName) -> None:
             agent.reset(Obs(), "x")
 
 
-@pytest.mark.parametrize("path", ["/docs", "/v1/metadata", "/nope", "/-/routes", "/stats", "/metrics"])
+@pytest.mark.parametrize(
+    "path", ["/docs", "/v1/metadata", "/nope", "/-/routes", "/stats", "/metrics"]
+)
 def test_no_path_tells_anything_without_a_key(served: Served, path: str) -> None:
     status, body = served.status(path)
     assert status == (404 if path == "/-/routes" else 401)
@@ -187,10 +219,17 @@ def test_no_path_tells_anything_without_a_key(served: Served, path: str) -> None
 
 
 @pytest.mark.parametrize("way", ["http", "websocket", "shm", "handle", "plasma"])
-def test_every_endpoint_refuses_what_is_over_the_limits_and_goes_on(served: Served, way: TransportName) -> None:
+def test_every_endpoint_refuses_what_is_over_the_limits_and_goes_on(
+    served: Served, way: TransportName
+) -> None:
     url = "serve://noop" if way in ("handle", "plasma") else served.url
     with RemoteAgent(
-        url, transport=way, api_key=served.tokens["arm"], ca=served.ca.file, codec="raw", timeout_s=20
+        url,
+        transport=way,
+        api_key=served.tokens["arm"],
+        ca=served.ca.file,
+        codec="raw",
+        timeout_s=20,
     ) as agent:
         agent.reset(Obs(), "x")
         for limit, obs in TOO_MUCH.items():
@@ -211,8 +250,12 @@ def test_whoever_is_in_the_cluster_finds_a_way_that_needs_no_key(served: Served)
         assert agent.transport == "plasma"
 
 
-def test_a_key_is_nowhere_but_where_it_is_used(served: Served, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    """After it was used by an evaluation, by clients of every kind, and to ask what the server says of itself."""
+def test_a_key_is_nowhere_but_where_it_is_used(
+    served: Served, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """After it was used by an evaluation, by clients of every kind, and to ask what the server
+    says of itself.
+    """
     key = served.tokens["arm"]
     monkeypatch.setenv(KEY_VARIABLE, key)
     variables = {"SSL_CERT_FILE": str(served.ca.file), "PYTHONPATH": PYTHONPATH}
@@ -229,7 +272,8 @@ def test_a_key_is_nowhere_but_where_it_is_used(served: Served, monkeypatch: pyte
             agent.reset(Obs(), "x")
             agent.act(Obs())
     session = Path(ray._private.worker.global_worker.node.get_session_dir_path())
-    assert "SSL_CERT_FILE" in (session / "logs" / "runtime_env_agent.log").read_text()  # where it would be
+    # Where it would be.
+    assert "SSL_CERT_FILE" in (session / "logs" / "runtime_env_agent.log").read_text()
     assert leaked(key, [session, Path(os.environ[MARK]), tmp_path]) == []
     _, metadata = served.status("/v1/metadata", {"x-api-key": key})
     assert metadata.startswith(b"{")
@@ -243,7 +287,9 @@ def test_a_revoked_key_is_shut_out_of_every_endpoint_within_seconds(served: Serv
         for agent in agents.values():
             agent.reset(Obs(), "x")
         headers = {"x-api-key": served.tokens["leaver"]}
-        idle = stack.enter_context(connect(url, ssl=served.threaded_trust, additional_headers=headers))
+        idle = stack.enter_context(
+            connect(url, ssl=served.threaded_trust, additional_headers=headers)
+        )
         bystander = stack.enter_context(served.agent("arm"))
         bystander.reset(Obs(), "x")
         revoke(served.keys, "leaver")
@@ -273,7 +319,11 @@ def test_the_shared_memory_endpoint_wants_a_key_before_anything_else(served: Ser
 
 def test_a_replicas_own_ports_want_a_key_too(served: Served) -> None:
     """That for HTTP, and that for WebSockets, whose only path is told with the metadata."""
-    ports = {one.port for one in listeners(psutil.Process()) if one.process == REPLICA and one.host == "127.0.0.1"}
+    ports = {
+        one.port
+        for one in listeners(psutil.Process())
+        if one.process == REPLICA and one.host == "127.0.0.1"
+    }
     found = set()
     for port in ports:
         for path in ("/docs", "/v1/metadata", "/v1/stream/guess"):
@@ -284,12 +334,17 @@ def test_a_replicas_own_ports_want_a_key_too(served: Served) -> None:
     assert sorted(status for _, status in found) in ([400, 401], [401, 404])
     _, metadata = served.status("/v1/metadata", {"x-api-key": served.tokens["arm"]})
     stream = json.loads(metadata)["stream"]
-    with pytest.raises(InvalidStatus) as refused, connect(f"ws://127.0.0.1:{stream['port']}{stream['path']}"):
+    with (
+        pytest.raises(InvalidStatus) as refused,
+        connect(f"ws://127.0.0.1:{stream['port']}{stream['path']}"),
+    ):
         pytest.fail("was let in")
     assert refused.value.response.status_code == 401
 
 
-def test_a_certificate_that_is_not_to_be_trusted_is_named_with_the_cure(served: Served, tmp_path: Path) -> None:
+def test_a_certificate_that_is_not_to_be_trusted_is_named_with_the_cure(
+    served: Served, tmp_path: Path
+) -> None:
     for ca in (None, authority(tmp_path, "stranger").file):
         with pytest.raises(ConfigError, match="ca="), served.agent("arm", ca=ca) as agent:
             agent.reset(Obs(), "x")
@@ -303,7 +358,10 @@ def test_a_certificate_that_is_not_to_be_trusted_is_named_with_the_cure(served: 
 def test_an_old_way_to_encrypt_is_refused(served: Served) -> None:
     """Without forward secrecy, or in blocks whose padding tells something."""
     parts = urlsplit(served.url)
-    for ciphers, taken in (("AES256-SHA:AES128-GCM-SHA256:ECDHE-RSA-AES128-SHA", False), ("ECDHE+AESGCM", True)):
+    for ciphers, taken in (
+        ("AES256-SHA:AES128-GCM-SHA256:ECDHE-RSA-AES128-SHA", False),
+        ("ECDHE+AESGCM", True),
+    ):
         trust = served.threaded_trust
         trust.set_ciphers(ciphers)
         with socket.create_connection((parts.hostname, parts.port), 10) as raw:
@@ -328,26 +386,34 @@ def test_requests_that_never_end_are_cut_off(served: Served) -> None:
         assert not answer or b" 408 " in answer.partition(b"\r\n")[0]
 
 
-# Who may use which socket of a running server. "token": whoever has the cluster's token, which lies in a file of the
-# user who started it; "key": whoever has an API key; "user": processes of the user who started it; "machine": any
-# process of this machine, which can read numbers there, and set nothing.
+# Who may use which socket of a running server. "token": whoever has the cluster's token, which lies
+# in a file of the user who started it; "key": whoever has an API key; "user": processes of the user
+# who started it; "machine": any process of this machine, which can read numbers there, and set
+# nothing.
 REPLICA = "ray::ServeReplica:noop:Policy"
 WHO = [
     (r"haproxy", "tcp", "front", "key"),
-    (r"haproxy", "tcp", "local", "machine"),  # Serve's own port, which asks for a key; metrics; statistics
+    # Serve's own port, which asks for a key; metrics; statistics.
+    (r"haproxy", "tcp", "local", "machine"),
     (r"haproxy", "udp", "any", "nobody"),  # its log goes out there; it does not read
     (r"haproxy", "unix", r".*/vlr-[^/]*/.*/admin.*", "user"),
     (r"ray::HAProxyManager", "unix", r".*/vlr-[^/]*/.*/metrics", "user"),
-    (r"ray::HAProxyManager|ray::ServeController|ray::ProxyActor|ray::IDLE.*|driver", "tcp", "local", "token"),
+    (
+        r"ray::HAProxyManager|ray::ServeController|ray::ProxyActor|ray::IDLE.*|driver",
+        "tcp",
+        "local",
+        "token",
+    ),
     (r"gcs_server|raylet", "tcp", "local", "token"),
     (r"raylet", "unix", r".*/sockets/(raylet|plasma_store)", "user"),
     (r"ray::DashboardAgent|ray::RuntimeEnvAgent|agent\.py", "tcp", "local", "token"),
     (REPLICA, "tcp", "local", "key"),  # and its worker's own, which wants the token
     (REPLICA, "tcp", "any", "token"),  # calls between deployments: see below
     (REPLICA, "unix", r"@vlagents-ray-[0-9a-f]{32}", "key"),
-    (r"driver", "unix", r"@vlagents-ray-port-[0-9]+", "machine"),  # claims of ports, of which others read the owner
+    # Claims of ports, of which others read the owner.
+    (r"driver", "unix", r"@vlagents-ray-port-[0-9]+", "machine"),
     (REPLICA, "unix", r".*/sockets/\.?vla[0-9a-f]{8}", "user"),
-]  # fmt: skip
+]
 
 
 def who(one: Listener, front: int) -> str | None:
@@ -357,14 +423,20 @@ def who(one: Listener, front: int) -> str | None:
         if kind == "unix":
             fits = re.fullmatch(where, one.host)
         else:
-            fits = {"front": one.port == front, "local": one.is_local, "any": not one.is_local or kind == "udp"}[where]
+            fits = {
+                "front": one.port == front,
+                "local": one.is_local,
+                "any": not one.is_local or kind == "udp",
+            }[where]
         if fits:
             return allowed
     return None
 
 
 def is_private(path: Path) -> bool:
-    """Does a folder that it is in keep other users out? Its own mode does not: they could put another in its place."""
+    """Does a folder that it is in keep other users out? Its own mode does not: they could put
+    another in its place.
+    """
     return any(not stat.S_IMODE(place.stat().st_mode) & 0o077 for place in path.parents)
 
 
@@ -373,7 +445,9 @@ def test_every_socket_of_a_running_server_is_known_and_closed_to_strangers(serve
     found: dict[Listener, str | None] = {}
 
     def all_known() -> bool:
-        """A process has its name, and has closed its sockets, a moment after it was started, or ended."""
+        """A process has its name, and has closed its sockets, a moment after it was started, or
+        ended.
+        """
         found.clear()
         found.update({one: who(one, front) for one in listeners(psutil.Process())})
         return None not in found.values()

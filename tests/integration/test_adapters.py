@@ -1,4 +1,5 @@
-"""A server of two LoRA adapters over one base: sessions of both act in one pass, each as its fine-tune alone.
+"""A server of two LoRA adapters over one base: sessions of both act in one pass, each as its
+fine-tune alone.
 
 A learner pushes the values of one of them.
 """
@@ -49,10 +50,14 @@ def values(folder: Path) -> dict[str, dict[str, np.ndarray]]:
 
 
 @pytest.fixture(scope="module")
-def server(shared_ray: None, folder: Path, values: dict[str, dict[str, np.ndarray]]) -> Iterator[Server]:
+def server(
+    shared_ray: None, folder: Path, values: dict[str, dict[str, np.ndarray]]
+) -> Iterator[Server]:
     choices = {name: {"adapter": str(folder.parent / name)} for name in values}
     config = {"checkpoint": str(folder)}
-    with serving("adapted_network:Small", config=config, checkpoints={"choices": choices}) as server:
+    with serving(
+        "adapted_network:Small", config=config, checkpoints={"choices": choices}
+    ) as server:
         yield server
 
 
@@ -69,13 +74,19 @@ def test_sessions_of_two_adapters_act_in_one_batch_as_each_merged_alone(
         agent = opened.enter_context(RemoteAgent(server.url, transport=transport))
         sessions = [opened.enter_context(session) for session in agent.sessions(len(chosen))]
         infos = [
-            session.reset(at(seed), None, seed=seed, **({} if name is None else {"checkpoint": name}))
+            session.reset(
+                at(seed), None, seed=seed, **({} if name is None else {"checkpoint": name})
+            )
             for seed, (session, name) in enumerate(zip(sessions, chosen, strict=True))
         ]
         served = agent.act_batch([at(10 + seed) for seed in range(len(chosen))], sessions)
-        with pytest.raises(UnknownCheckpoint, match=r"want one of \['pour', 'stack'\] or none, for its own"):
+        with pytest.raises(
+            UnknownCheckpoint, match=r"want one of \['pour', 'stack'\] or none, for its own"
+        ):
             agent.reset(at(0), None, checkpoint="../stack")
-    assert [info["checkpoint"] for info in infos] == [str(folder.parent / (name or folder.name)) for name in chosen]
+    assert [info["checkpoint"] for info in infos] == [
+        str(folder.parent / (name or folder.name)) for name in chosen
+    ]
     assert len({info["weights"] for info in infos}) == len(chosen)
     for seed, (name, act) in enumerate(zip(chosen, served, strict=True)):
         alone = policy(folder)
@@ -84,7 +95,9 @@ def test_sessions_of_two_adapters_act_in_one_batch_as_each_merged_alone(
         alone.reset(at(seed), None, seed=seed)
         assert isinstance(act, Act)
         assert act.info["rows"] == len(chosen)
-        np.testing.assert_allclose(act.action, alone.act(at(10 + seed)).action, rtol=1e-5, atol=1e-5)
+        np.testing.assert_allclose(
+            act.action, alone.act(at(10 + seed)).action, rtol=1e-5, atol=1e-5
+        )
 
 
 def played(server: Server, **options: Any) -> tuple[bytes, dict[str, Any]]:
@@ -105,7 +118,9 @@ def test_an_adapter_that_is_pushed_over_the_network_acts_as_the_saved_one(
         with pytest.raises(InvalidWeights, match=r"unknown, want one of the policy's 16 names"):
             weights.push({f"fold/{name}": value for name, value in trained.items()}, partial=True)
         save(folder.parent / "trained", trained)
-        alone = Small.from_config({"checkpoint": str(folder), "adapters": {"stack": str(folder.parent / "trained")}})
+        alone = Small.from_config(
+            {"checkpoint": str(folder), "adapters": {"stack": str(folder.parent / "trained")}}
+        )
         alone.initialize()
         alone.reset(at(0), None, seed=0, adapter="stack")
         action, stated = played(server, checkpoint="stack")

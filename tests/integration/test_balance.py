@@ -17,7 +17,8 @@ from vlagents_ray.client.transports.select import TransportName
 from vlagents_ray.serve.launch.deployment_file import Deployment, deployment
 from vlagents_ray.serve.launch.server import Server, running_server
 
-HELD: dict[TransportName, int] = {"handle": 2, "shm": 2, "websocket": 6}  # of equal connections the oldest go first
+# Of equal connections the oldest go first.
+HELD: dict[TransportName, int] = {"handle": 2, "shm": 2, "websocket": 6}
 
 
 def deployed(replicas: int) -> Deployment:
@@ -35,11 +36,16 @@ def server() -> Iterator[Server]:
 
 
 def test_sessions_move_to_a_replica_that_joins(server: Server) -> None:
-    """Pinned ones, on every such transport, exactly where they were; so do several of one connection.
+    """Pinned ones, on every such transport, exactly where they were; so do several of one
+    connection.
 
     Then the first to go end, and the rest is uneven again.
     """
-    agents = {(way, i): RemoteAgent(url(server, way), transport=way) for way, n in HELD.items() for i in range(n)}
+    agents = {
+        (way, i): RemoteAgent(url(server, way), transport=way)
+        for way, n in HELD.items()
+        for i in range(n)
+    }
     vector = RemoteAgent(url(server, "shm"), transport="shm")
     envs = vector.sessions(2)
     pids = {key: agent.reset(obs(key[1]), f"{key}")["pid"] for key, agent in agents.items()}
@@ -107,12 +113,16 @@ def test_new_sessions_spread_evenly(server: Server, way: TransportName) -> None:
     agents = [RemoteAgent(url(server, way), transport=way) for _ in range(16)]
     for _ in range(4):
         with ThreadPoolExecutor(len(agents)) as pool:
-            held = Counter(pool.map(lambda i: agents[i].reset(obs(i), f"task {i}")["pid"], range(len(agents))))
+            held = Counter(
+                pool.map(lambda i: agents[i].reset(obs(i), f"task {i}")["pid"], range(len(agents)))
+            )
         for agent in agents:
             agent.close()
         print(f"{way}: {sorted(held.values())}")
         if len(held) == 2 and min(held.values()) >= 7:
             break
-        time.sleep(4)  # a replica that did not tell its load within 0.3 s, on a busy machine, gets no session for 3 s
+        # A replica that did not tell its load within 0.3 s, on a busy machine, gets no session for
+        # 3 s.
+        time.sleep(4)
     else:
         pytest.fail(f"{way}: {held}")

@@ -47,19 +47,47 @@ def test_every_way_is_measured_and_shared_memory_is_the_fastest_to_a_local_proce
 @pytest.mark.slow
 @pytest.mark.integration
 @pytest.mark.alone
-def test_throughput_comes_near_the_bare_policy_and_never_above_it(ray_home: Path, tmp_path: Path) -> None:
-    """Written out as a class, `noop` is a policy of unknown speed, which is measured bare; it sleeps, so that the
+def test_throughput_comes_near_the_bare_policy_and_never_above_it(
+    ray_home: Path, tmp_path: Path
+) -> None:
+    """Written out as a class, `noop` is a policy of unknown speed, which is measured bare; it
+    sleeps, so that the
     two cores of a busy machine do not matter."""
     file = tmp_path / "throughput.json"
-    policy = ["--policy", "vlagents_ray.policies.noop:Noop", "--set", "base_ms=40", "--set", "per_item_ms=5"]
-    few = ["--clients", "8", "--batch", "4", "--seconds", "0.6", "--rounds", "1", "--robot-seconds", "0.6"]
+    policy = [
+        "--policy",
+        "vlagents_ray.policies.noop:Noop",
+        "--set",
+        "base_ms=40",
+        "--set",
+        "per_item_ms=5",
+    ]
+    few = [
+        "--clients",
+        "8",
+        "--batch",
+        "4",
+        "--seconds",
+        "0.6",
+        "--rounds",
+        "1",
+        "--robot-seconds",
+        "0.6",
+    ]
     ratios = []
     for _ in range(3):  # a machine that stands still for a second spoils a measurement of 0.6 s
-        done = bench(ray_home, "throughput", *policy, *few, "--transports", "shm,handle", "--out", str(file))
+        done = bench(
+            ray_home, "throughput", *policy, *few, "--transports", "shm,handle", "--out", str(file)
+        )
         assert done.returncode == 0, done.stdout + done.stderr
         found = json.loads(file.read_text())
         assert found["ideal_actions_per_s"] == found["bare_rounds"][0]
-        ratios.append((found["bare_rounds"][0] * 0.060 / 4, *(r["of_ideal"] for r in found["transports"].values())))
+        ratios.append(
+            (
+                found["bare_rounds"][0] * 0.060 / 4,
+                *(r["of_ideal"] for r in found["transports"].values()),
+            )
+        )
         if 0.6 < ratios[-1][0] <= 1.0 and all(0.3 < of_ideal <= 1.1 for of_ideal in ratios[-1][1:]):
             break
     else:
@@ -76,7 +104,18 @@ def test_throughput_comes_near_the_bare_policy_and_never_above_it(ray_home: Path
 @pytest.mark.integration
 def test_peers_make_load_in_the_same_run(ray_home: Path, tmp_path: Path) -> None:
     file = tmp_path / "throughput.json"
-    few = ["--clients", "1,2", "--batch", "2", "--seconds", "0.5", "--rounds", "2", "--robot-seconds", "1"]
+    few = [
+        "--clients",
+        "1,2",
+        "--batch",
+        "2",
+        "--seconds",
+        "0.5",
+        "--rounds",
+        "2",
+        "--robot-seconds",
+        "1",
+    ]
     peers = ["--peers", "openpi,portal", "--peers-python", str(peers_python())]
     done = bench(ray_home, "throughput", *few, *peers, "--transports", "shm", "--out", str(file))
     assert done.returncode == 0, done.stdout + done.stderr
@@ -85,7 +124,10 @@ def test_peers_make_load_in_the_same_run(ray_home: Path, tmp_path: Path) -> None
     assert found["versions"].keys() >= {"ray", "openpi-client", "portal"}
     for row in (*found["transports"].values(), *found["peers"].values()):
         assert [point["clients"] for point in row["curve"]] == [1, 2]
-        assert all(len(point["rounds"]) == 2 and point["ci95"][0] <= point["actions_per_s"] for point in row["curve"])
+        assert all(
+            len(point["rounds"]) == 2 and point["ci95"][0] <= point["actions_per_s"]
+            for point in row["curve"]
+        )
         assert row["robot"]["calls"] > 0
     batches = {name: row["curve"][1]["mean_batch"] for name, row in found["peers"].items()}
     assert batches == {"openpi": 1.0, "portal": 2.0}

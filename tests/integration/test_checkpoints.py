@@ -37,8 +37,14 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def deployed(folder: Path, **beside: Any) -> Deployment:
     """As a file says it, with what may change while it runs beside `args`."""
     config = {"checkpoint": str(folder / "{step}"), "checkpoint_step": 1}
-    checkpoints = {"choices": {"late": {"checkpoint": str(folder / "9")}}, "steps": True, "loaded": 2}
-    document = deployment(POLICY, config=config, checkpoints=checkpoints).model_dump(exclude_unset=True)
+    checkpoints = {
+        "choices": {"late": {"checkpoint": str(folder / "9")}},
+        "steps": True,
+        "loaded": 2,
+    }
+    document = deployment(POLICY, config=config, checkpoints=checkpoints).model_dump(
+        exclude_unset=True
+    )
     if beside:
         document["applications"][0]["deployments"] = [{"name": "Policy", **beside}]
     return Deployment(**document)
@@ -46,7 +52,9 @@ def deployed(folder: Path, **beside: Any) -> Deployment:
 
 @pytest.fixture(scope="module")
 def server(shared_ray: None, folder: Path) -> Iterator[Server]:
-    """Deployed by Serve, as its file has `deployments`: only so can it change without new replicas."""
+    """Deployed by Serve, as its file has `deployments`: only so can it change without new
+    replicas.
+    """
     with shared_server(deployed(folder, num_replicas=1)) as server:
         yield server
 
@@ -83,7 +91,9 @@ def told(agent: RemoteAgent) -> list[float]:
 
 
 class Robot:
-    """Plays episodes of its own on a thread, and keeps what it got: (checkpoint of the reset, act's number, step)."""
+    """Plays episodes of its own on a thread, and keeps what it got: (checkpoint of the reset,
+    act's number, step).
+    """
 
     def __init__(self, agent: RemoteAgent, episode: int = 20, **options: Any) -> None:
         self.rows: list[tuple[str, float, int]] = []
@@ -116,7 +126,9 @@ class Robot:
 
 
 @pytest.mark.parametrize("transport", TRANSPORTS)
-def test_sessions_of_two_checkpoints_side_by_side(fresh: Server, folder: Path, transport: Any) -> None:
+def test_sessions_of_two_checkpoints_side_by_side(
+    fresh: Server, folder: Path, transport: Any
+) -> None:
     where = "serve://Stored" if transport in ("handle", "plasma") else fresh.url
     with (
         RemoteAgent(where, transport=transport) as early,
@@ -140,18 +152,30 @@ def test_metadata_says_what_may_be_chosen_and_what_is_loaded(fresh: Server, fold
 
 
 def test_a_redeploy_swaps_under_load_without_a_failed_step(fresh: Server, folder: Path) -> None:
-    """Each step of each episode is answered by the checkpoint that its reset was told, and no replica restarts."""
-    robots = [Robot(RemoteAgent(url(fresh, t).replace("Reacher", "Stored"), transport=t)) for t in TRANSPORTS]
+    """Each step of each episode is answered by the checkpoint that its reset was told, and no
+    replica restarts.
+    """
+    robots = [
+        Robot(RemoteAgent(url(fresh, t).replace("Reacher", "Stored"), transport=t))
+        for t in TRANSPORTS
+    ]
     pid = _pid(fresh)
     wait_for(lambda: all(len(robot.rows) > 100 for robot in robots))
     (folder / "2.held").touch()
     redeploy(folder, checkpoint_step=2)
     wait_for((folder / "2.begun").exists)
     counts = [len(robot.rows) for robot in robots]
-    wait_for(lambda: all(len(r.rows) > count + 100 for r, count in zip(robots, counts, strict=True)))
-    assert metadata(fresh)["checkpoints"]["swap"] == {"state": "loading", "checkpoint": str(folder / "2")}
+    wait_for(
+        lambda: all(len(r.rows) > count + 100 for r, count in zip(robots, counts, strict=True))
+    )
+    assert metadata(fresh)["checkpoints"]["swap"] == {
+        "state": "loading",
+        "checkpoint": str(folder / "2"),
+    }
     (folder / "2.held").unlink()
-    wait_for(lambda: all(r.failure is not None or (r.rows and r.rows[-1][0] == "2") for r in robots))
+    wait_for(
+        lambda: all(r.failure is not None or (r.rows and r.rows[-1][0] == "2") for r in robots)
+    )
     for robot in robots:
         rows = robot.end()
         assert {row[:2] for row in rows} == {("1", 1.0), ("2", 2.0)}
@@ -166,20 +190,26 @@ def _pid(server: Server) -> int:
         return int(agent.reset(Obs(), "x")["pid"])
 
 
-def test_a_redeploy_of_what_does_not_load_leaves_the_old_one_and_says_why(fresh: Server, folder: Path) -> None:
+def test_a_redeploy_of_what_does_not_load_leaves_the_old_one_and_says_why(
+    fresh: Server, folder: Path
+) -> None:
     robot = Robot(RemoteAgent(fresh.url))
     wait_for(lambda: len(robot.rows) > 50)
     redeploy(folder, checkpoint_step=77)
     wait_for(lambda: (metadata(fresh)["checkpoints"]["swap"] or {}).get("state") == "failed")
     assert "FileNotFoundError" in metadata(fresh)["checkpoints"]["swap"]["error"]
     redeploy(folder, checkpoint_step=1, scales=3)  # an unknown setting
-    wait_for(lambda: "ConfigError" in (metadata(fresh)["checkpoints"]["swap"] or {}).get("error", ""))
+    wait_for(
+        lambda: "ConfigError" in (metadata(fresh)["checkpoints"]["swap"] or {}).get("error", "")
+    )
     count = len(robot.rows)
     wait_for(lambda: len(robot.rows) > count + 50)
     assert {row[:2] for row in robot.end()} == {("1", 1.0)}
 
 
-def test_every_replica_swaps_and_new_ones_begin_with_what_was_swapped_to(fresh: Server, folder: Path) -> None:
+def test_every_replica_swaps_and_new_ones_begin_with_what_was_swapped_to(
+    fresh: Server, folder: Path
+) -> None:
     redeploy(folder, replicas=2, checkpoint_step=4, scale=10.0)  # any setting is swapped
 
     def numbers() -> dict[int, set[float]]:
@@ -197,22 +227,49 @@ def test_every_replica_swaps_and_new_ones_begin_with_what_was_swapped_to(fresh: 
     wait_for(lambda: list(numbers().values()) == [{5.0}] * 2)
 
 
-def test_an_evaluation_says_by_which_checkpoint(fresh: Server, folder: Path, tmp_path: Path) -> None:
-    settings = {"envs": ["eval_fakes:Line"], "policy_url": fresh.url, "episodes": 2, "video": "none"}
-    summary = evaluate(flat_config(**settings, policy_options={"checkpoint_step": 3}, out=tmp_path / "results"))
+def test_an_evaluation_says_by_which_checkpoint(
+    fresh: Server, folder: Path, tmp_path: Path
+) -> None:
+    settings = {
+        "envs": ["eval_fakes:Line"],
+        "policy_url": fresh.url,
+        "episodes": 2,
+        "video": "none",
+    }
+    summary = evaluate(
+        flat_config(**settings, policy_options={"checkpoint_step": 3}, out=tmp_path / "results")
+    )
     assert [stated(cell, "checkpoint") for cell in summary.results.cells] == [str(folder / "3")]
     assert [stated(cell, "weights") for cell in summary.results.cells] == [digest([folder / "3"])]
     assert digest([folder / "3"]) in (tmp_path / "results" / "report.html").read_text()
     assert metadata(fresh)["weights"] == {"digest": digest([folder / "1"]), "revision": None}
     assert (summary.total.episodes, summary.total.policy_errors) == (2, 0)
-    for option, error in (({"checkpoint_step": 77}, CheckpointFailed), ({"checkpoint": "lat"}, UnknownCheckpoint)):
+    for option, error in (
+        ({"checkpoint_step": 77}, CheckpointFailed),
+        ({"checkpoint": "lat"}, UnknownCheckpoint),
+    ):
         out = tmp_path / error.__name__
-        with pytest.raises(error):  # no episode is lost to it, and none counts as a failure of the policy
+        # No episode is lost to it, and none counts as a failure of the policy.
+        with pytest.raises(error):
             evaluate(flat_config(**settings, policy_options=option, out=out))
 
 
-def test_a_sweep_evaluates_each_checkpoint_on_one_server(fresh: Server, folder: Path, tmp_path: Path) -> None:
-    settings = {"envs": ["eval_fakes:Line"], "policy_url": fresh.url, "episodes": 3, "video": "none", "workers": 2}
+def test_a_sweep_evaluates_each_checkpoint_on_one_server(
+    fresh: Server, folder: Path, tmp_path: Path
+) -> None:
+    settings = {
+        "envs": ["eval_fakes:Line"],
+        "policy_url": fresh.url,
+        "episodes": 3,
+        "video": "none",
+        "workers": 2,
+    }
     summary = evaluate(flat_config(**settings, steps=[3, 4], out=tmp_path / "results"))
-    assert [(group.contender, group.episodes) for group in summary.totals] == [("policy@3", 3), ("policy@4", 3)]
-    assert [stated(cell, "checkpoint") for cell in summary.results.cells] == [str(folder / "3"), str(folder / "4")]
+    assert [(group.contender, group.episodes) for group in summary.totals] == [
+        ("policy@3", 3),
+        ("policy@4", 3),
+    ]
+    assert [stated(cell, "checkpoint") for cell in summary.results.cells] == [
+        str(folder / "3"),
+        str(folder / "4"),
+    ]

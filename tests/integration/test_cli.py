@@ -35,9 +35,14 @@ def rows(out: Path) -> list[tuple[Any, ...]]:
     if not (out / "results.db").exists():
         return []
     with closing(sqlite3.connect(out / "results.db")) as db:
-        if db.execute("SELECT count(*) FROM sqlite_master WHERE name = 'episodes'").fetchone() == (0,):
+        if db.execute("SELECT count(*) FROM sqlite_master WHERE name = 'episodes'").fetchone() == (
+            0,
+        ):
             return []
-        columns = "key, episode, seed, status, success_once, success_at_end, steps, episode_return, instruction"
+        columns = (
+            "key, episode, seed, status, success_once, success_at_end, steps, "
+            "episode_return, instruction"
+        )
         return db.execute(f"SELECT {columns} FROM episodes ORDER BY env, episode").fetchall()  # noqa: S608
 
 
@@ -61,7 +66,17 @@ def test_maniskill_is_solved_whatever_the_number_of_workers(ray_home: Path, tmp_
 
 def test_kill_dash_nine_and_resume_leave_each_episode_once(ray_home: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
-    words = ["tabletop", "--policy", "scripted", "--episodes", "60", "--workers", "2", "--video", "none"]
+    words = [
+        "tabletop",
+        "--policy",
+        "scripted",
+        "--episodes",
+        "60",
+        "--workers",
+        "2",
+        "--video",
+        "none",
+    ]
     words += ["--out", str(out)]
     with subprocess.Popen(
         [COMMAND, "eval", *words], env=os.environ | {"RAY_TMPDIR": str(ray_home)},
@@ -83,7 +98,9 @@ def test_kill_dash_nine_and_resume_leave_each_episode_once(ray_home: Path, tmp_p
     assert set(before) <= set(after)
 
 
-def test_results_without_workers_are_those_with_them_which_resume_them(ray_home: Path, tmp_path: Path) -> None:
+def test_results_without_workers_are_those_with_them_which_resume_them(
+    ray_home: Path, tmp_path: Path
+) -> None:
     """The test above resumes without workers what was begun with them."""
     words = ["tabletop", "tabletop/stack", "--policy", "scripted", "--video", "none", "--out"]
     orders = {"whole": ["0"], "resumed": ["0", "2"]}
@@ -92,7 +109,14 @@ def test_results_without_workers_are_those_with_them_which_resume_them(ray_home:
             episodes = "4" if number == len(order) - 1 else "2"
             resume = ["--resume"] * bool(number)
             done = evaluate(
-                ray_home, *words, str(tmp_path / name), "--episodes", episodes, "--workers", workers, *resume
+                ray_home,
+                *words,
+                str(tmp_path / name),
+                "--episodes",
+                episodes,
+                "--workers",
+                workers,
+                *resume,
             )
             assert done.returncode == 0, done.stdout + done.stderr
     found = {}
@@ -102,7 +126,10 @@ def test_results_without_workers_are_those_with_them_which_resume_them(ray_home:
         assert len(found[name]) == 8
     assert found["whole"] == found["resumed"]
     policies = [Results.load(tmp_path / name).policies["scripted"] for name in orders]
-    ours, theirs = ({key: one.get(key) for key in ("policy", "config", "contract", "program")} for one in policies)
+    ours, theirs = (
+        {key: one.get(key) for key in ("policy", "config", "contract", "program")}
+        for one in policies
+    )
     assert ours == theirs
 
 
@@ -124,7 +151,10 @@ def test_a_file_of_runs_is_one_evaluation_of_all(ray_home: Path, tmp_path: Path)
     done = evaluate(ray_home, str(file), cwd=tmp_path)
     assert done.returncode == 0, done.stdout + done.stderr
     summary = json.loads((tmp_path / "runs" / "nightly" / "summary.json").read_text())
-    cells = {(one["contender"], one["suite"], one["env"]): one["success_once"] for one in summary["cells"]}
+    cells = {
+        (one["contender"], one["suite"], one["env"]): one["success_once"]
+        for one in summary["cells"]
+    }
     assert summary["state"] == "complete"
     assert summary["transports"] == ["shm"]
     assert [one["episodes"] for one in cells.values()] == [4, 4, 6] * 2
@@ -142,14 +172,28 @@ def command(ray_home: Path, *words: str) -> subprocess.CompletedProcess[str]:
     )  # fmt: skip
 
 
-def test_parts_are_merged_exported_and_one_episode_is_played_again(ray_home: Path, tmp_path: Path) -> None:
+def test_parts_are_merged_exported_and_one_episode_is_played_again(
+    ray_home: Path, tmp_path: Path
+) -> None:
     parts = []
     for seed in ("0", "2"):
         parts.append(tmp_path / seed)
         done = evaluate(
-            ray_home, "tabletop", "--policy", "scripted", "--episodes", "2", "--seed", seed, "--video", "none",
-            "--record", "all", "--out", str(parts[-1]),
-        )  # fmt: skip
+            ray_home,
+            "tabletop",
+            "--policy",
+            "scripted",
+            "--episodes",
+            "2",
+            "--seed",
+            seed,
+            "--video",
+            "none",
+            "--record",
+            "all",
+            "--out",
+            str(parts[-1]),
+        )
         assert done.returncode == 0, done.stdout + done.stderr
     results = Results.load(parts[0])
     package = results.runs[0].versions["code"]["vlagents_ray"]
@@ -158,11 +202,17 @@ def test_parts_are_merged_exported_and_one_episode_is_played_again(ray_home: Pat
     merged = command(ray_home, "merge", *map(str, parts), "--out", out)
     assert merged.returncode == 0, merged.stdout + merged.stderr
     assert "4/4" in merged.stdout
-    exported = command(ray_home, "export", out, "--out", str(tmp_path / "dataset"), "--to", "lerobot")
+    exported = command(
+        ray_home, "export", out, "--out", str(tmp_path / "dataset"), "--to", "lerobot"
+    )
     assert exported.stdout.startswith("wrote 4 episodes"), exported.stdout + exported.stderr
     key = rows(tmp_path / "merged")[3][0]
     same = command(ray_home, "replay", out, key)
     assert same.returncode == 0, same.stdout + same.stderr
     assert "the same: " in same.stdout
-    other = CliRunner().invoke(app, ["replay", out, key, "--policy", "nope", "--out", str(tmp_path / "other")])
-    assert (other.exit_code, "'nope'" in other.stderr) == (2, True), "this one, and not the run's, is to be served"
+    other = CliRunner().invoke(
+        app, ["replay", out, key, "--policy", "nope", "--out", str(tmp_path / "other")]
+    )
+    assert (other.exit_code, "'nope'" in other.stderr) == (2, True), (
+        "this one, and not the run's, is to be served"
+    )

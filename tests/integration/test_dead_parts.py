@@ -1,4 +1,6 @@
-"""What dies beside a server or an evaluation: HAProxy comes back, and without Ray the command ends, all of it."""
+"""What dies beside a server or an evaluation: HAProxy comes back, and without Ray the command
+ends, all of it.
+"""
 
 from __future__ import annotations
 
@@ -49,13 +51,19 @@ def processes(log: Path, program: str = "") -> list[int]:
         with suppress(OSError):
             words = (process / "cmdline").read_bytes().split(b"\0")
             mine = f"{MINE}={log}".encode() in (process / "environ").read_bytes().split(b"\0")
-            if mine and int(process.name) != os.getpid() and Path(os.fsdecode(words[0])).name.endswith(program):
+            if (
+                mine
+                and int(process.name) != os.getpid()
+                and Path(os.fsdecode(words[0])).name.endswith(program)
+            ):
                 found.append(int(process.name))
     return found
 
 
 def gone(log: Path, started: list[psutil.Process]) -> None:
-    """Nothing that the command started runs, soon after its end. A title may hide the environment of one that does."""
+    """Nothing that the command started runs, soon after its end. A title may hide the
+    environment of one that does.
+    """
     _, left = psutil.wait_procs(started, 30)
     if left or processes(log):
         pytest.fail(f"still there: {left or processes(log)}\n{log.read_text()[-4000:]}")
@@ -74,7 +82,12 @@ def kill(log: Path, program: str) -> list[int]:
 def test_a_server_gets_haproxy_back_and_ends_without_ray_leaving_nothing(tmp_path: Path) -> None:
     log, address = tmp_path / "serve.log", free_address()
     with running(log, "serve", "noop", "--port", address.rpartition(":")[2]) as server:
-        wait_for(lambda: (healthy(address) and "serving" in log.read_text()) or server.poll() is not None, 180)
+        wait_for(
+            lambda: (
+                (healthy(address) and "serving" in log.read_text()) or server.poll() is not None
+            ),
+            180,
+        )
         assert server.poll() is None, log.read_text()
         ended = kill(log, "haproxy")  # which lets clients in
         killed = time.monotonic()
@@ -88,7 +101,8 @@ def test_a_server_gets_haproxy_back_and_ends_without_ray_leaving_nothing(tmp_pat
         gone(log, started)
         said = log.read_text()
         cause = "Ray's daemon on this machine, the raylet, has ended; start it again"
-        assert any(line.endswith(cause) for line in said.splitlines()), said  # Ray's own threads may log after it
+        # Ray's own threads may log after it.
+        assert any(line.endswith(cause) for line in said.splitlines()), said
 
 
 @pytest.mark.slow

@@ -1,4 +1,6 @@
-"""Other systems' own clients, as PyPI has them, against one batched replica: each gets its own answers."""
+"""Other systems' own clients, as PyPI has them, against one batched replica: each gets its own
+answers.
+"""
 
 from __future__ import annotations
 
@@ -22,7 +24,8 @@ from vlagents_ray_dialects.messages import openpi as openpi_codec
 CALLS = 12
 DIALECTS = {
     "openpi": {"mapping": "openpi-libero"},
-    "roboarena": {"mapping": {"preset": "roboarena", "action_gripper": {"index": 6}}},  # Mirror's rows have 7 numbers
+    # Mirror's rows have 7 numbers.
+    "roboarena": {"mapping": {"preset": "roboarena", "action_gripper": {"index": 6}}},
     "openvla": {},
     "vla_eval": {},
 }
@@ -39,7 +42,12 @@ def server(shared_ray: None, tmp_path_factory: pytest.TempPathFactory) -> Iterat
     args = {"policy": "served_agents:Mirror", "config": {"slow_s": 0.002}, "batch": {"max_size": 8}}
     names = {"root": ("/", DIALECTS), "pi": ("/pi", {"openpi": DIALECTS["openpi"]})}
     apps = [
-        {"name": name, "route_prefix": prefix, "import_path": IMPORT_PATH, "args": {**args, "dialects": dialects}}
+        {
+            "name": name,
+            "route_prefix": prefix,
+            "import_path": IMPORT_PATH,
+            "args": {**args, "dialects": dialects},
+        }
         for name, (prefix, dialects) in names.items()
     ]
     file = tmp_path_factory.mktemp("deployment") / "two.yaml"
@@ -68,7 +76,9 @@ def require_own_answers(said: list[list[Any]], client: str) -> None:
             acts = 1 if stateless or sent["task"] != previous else acts + 1
             previous = sent["task"]
             number = 0.0 if stateless else sent["number"]
-            assert [row[:4] for row in rows] == [[sent["pixel"], number, acts, float(previous.split()[-1])]]
+            assert [row[:4] for row in rows] == [
+                [sent["pixel"], number, acts, float(previous.split()[-1])]
+            ]
 
 
 NAMES = {
@@ -79,7 +89,9 @@ NAMES = {
 }
 
 
-@pytest.mark.parametrize("client", [pytest.param(client, marks=pytest.mark.program(NAMES[client])) for client in NAMES])
+@pytest.mark.parametrize(
+    "client", [pytest.param(client, marks=pytest.mark.program(NAMES[client])) for client in NAMES]
+)
 def test_the_real_clients_get_their_own_answers(server: Server, python: Path, client: str) -> None:
     said = drive(python, client, url_for(client, server), 8, CALLS)
     assert [len(one) for one in said] == [CALLS] * 8
@@ -113,7 +125,11 @@ def test_vla_eval_runs_a_benchmark_by_its_own_orchestrator(server: Server, pytho
 
 def test_pings_are_answered_while_the_policy_thinks(server: Server, tmp_path: Path) -> None:
     white = np.full((8, 8, 3), 255, np.uint8)
-    obs = {"observation/image": white, "observation/wrist_image": white, "observation/state": np.zeros(8)}
+    obs = {
+        "observation/image": white,
+        "observation/wrist_image": white,
+        "observation/state": np.zeros(8),
+    }
     with connect(websocket(server), compression=None, ping_interval=None) as socket:
         socket.recv()
         gate = tmp_path / "gate"
@@ -142,4 +158,7 @@ def test_all_of_them_at_once_beside_our_own(server: Server, python: Path) -> Non
         thread.join()
     assert failed == []
     assert httpx.get(f"{server.url}/healthz", timeout=60).status_code == 200
-    assert httpx.get(f"{server.url}/v1/metadata", timeout=60).json()["dialects"].keys() == DIALECTS.keys()
+    assert (
+        httpx.get(f"{server.url}/v1/metadata", timeout=60).json()["dialects"].keys()
+        == DIALECTS.keys()
+    )

@@ -37,7 +37,8 @@ VERSIONS = {"old": ("1.26.4", "1.15.0"), "new": (np.__version__, "1.16.0")}  # o
 class Served:
     """A cluster with four applications.
 
-    old and new run in replicas, apart in a child process without Ray, and what installed needs Ray installs.
+    old and new run in replicas, apart in a child process without Ray, and what installed needs Ray
+    installs.
     """
 
     server: Server
@@ -54,7 +55,10 @@ def served(shared_ray: None, tmp_path_factory: pytest.TempPathFactory) -> Iterat
     requirements.write_text("six==1.15.0\nnumpy==1.26.4\n")
     environments = {
         "old": {"python": str(layered(home / "old", "numpy==1.26.4", "six==1.15.0"))},
-        "new": {"python": str(layered(home / "new", "six==1.16.0")), "env_vars": {"VARIABLE": "set"}},
+        "new": {
+            "python": str(layered(home / "new", "six==1.16.0")),
+            "env_vars": {"VARIABLE": "set"},
+        },
         "apart": {
             "python": str(make_environment(requirements, home / "apart", light=True)),
             "env_vars": {"VARIABLE": "set"},
@@ -84,7 +88,9 @@ def served(shared_ray: None, tmp_path_factory: pytest.TempPathFactory) -> Iterat
 
 def observation(value: float = 0.0, **info: Any) -> Obs:
     state = {"position": np.full(1, 0.5, np.float32)}
-    return Obs({"front": np.full((64, 64, 3), 7, np.uint8)}, state=state, info={"value": value, **info})
+    return Obs(
+        {"front": np.full((64, 64, 3), 7, np.uint8)}, state=state, info={"value": value, **info}
+    )
 
 
 @ray.remote(num_cpus=0)
@@ -118,7 +124,9 @@ def test_each_policy_answers_with_its_own_versions_over_http(served: Served, app
 
 @pytest.mark.parametrize("app", ["old", "new", "apart"])
 @pytest.mark.parametrize("transport", ["plasma", "handle"])
-def test_an_env_on_the_node_with_another_numpy_drives_each(served: Served, app: str, transport: TransportName) -> None:
+def test_an_env_on_the_node_with_another_numpy_drives_each(
+    served: Served, app: str, transport: TransportName
+) -> None:
     actor = EnvActor.remote()  # type: ignore[attr-defined]
     told = ray.get(actor.drive.remote(app, transport))
     require_versions(app, told)
@@ -126,10 +134,17 @@ def test_an_env_on_the_node_with_another_numpy_drives_each(served: Served, app: 
 
 
 @pytest.mark.parametrize("app", ["old", "apart"])
-def test_an_evaluation_drives_a_policy_in_its_environment(served: Served, app: str, tmp_path: Path) -> None:
+def test_an_evaluation_drives_a_policy_in_its_environment(
+    served: Served, app: str, tmp_path: Path
+) -> None:
     before = len(served.said(app)) if served.notes[app].exists() else 0
     config = flat_config(
-        envs=[LINE], episodes=4, workers=2, out=tmp_path / "out", video="none", policy_url=served.server.apps[app]
+        envs=[LINE],
+        episodes=4,
+        workers=2,
+        out=tmp_path / "out",
+        video="none",
+        policy_url=served.server.apps[app],
     )
     summary = evaluate(config)
     assert (summary.state, summary.total.episodes) == ("complete", 4)
@@ -139,7 +154,9 @@ def test_an_evaluation_drives_a_policy_in_its_environment(served: Served, app: s
         require_versions(app, told)
 
 
-def test_a_killed_child_is_replaced_with_its_replica_and_the_session_goes_on(served: Served) -> None:
+def test_a_killed_child_is_replaced_with_its_replica_and_the_session_goes_on(
+    served: Served,
+) -> None:
     with RemoteAgent(served.server.apps["apart"], timeout_s=120) as agent:
         first = agent.reset(observation(), "a task")
         agent.act(observation())

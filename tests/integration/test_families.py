@@ -1,8 +1,9 @@
-"""Model families served from their deployment files, each in its own environment, all on one cluster.
+"""Model families served from their deployment files, each in its own environment, all on one
+cluster.
 
-The environments are those of `make families`, the checkpoints tiny random ones of each family's own code. Families
-whose code is on no package index want their source (`OPENPI_SRC`, …) and their environment (`make families
-FAMILIES=openpi`) besides.
+The environments are those of `make families`, the checkpoints tiny random ones of each family's own
+code. Families whose code is on no package index want their source (`OPENPI_SRC`, …) and their
+environment (`make families FAMILIES=openpi`) besides.
 """
 
 from __future__ import annotations
@@ -49,7 +50,14 @@ class Family:
     atol: float = 1e-4
 
 
-_CEM = {"image_size": 32, "encoder_heads": 2, "predictor_heads": 2, "samples": 12, "topk": 4, "iterations": 3}
+_CEM = {
+    "image_size": 32,
+    "encoder_heads": 2,
+    "predictor_heads": 2,
+    "samples": 12,
+    "topk": 4,
+    "iterations": 3,
+}
 FAMILIES = {
     "lerobot": Family("lerobot", "lerobot", "lerobot", ("act",), config={"state": ["xyzrpy"]}),
     "smolvla": Family("lerobot", "lerobot", "lerobot", ("smolvla",), config={"state": ["xyzrpy"]}),
@@ -66,7 +74,12 @@ FAMILIES = {
     ),
     "openvla": Family("openvla", "openvla", "openvla", source="OPENVLA_SRC"),
     "openvla_oft": Family(
-        "openvla_oft", "openvla", "openvla", ("oft",), config={"unnorm_key": "bridge_orig"}, source="OPENVLA_OFT_SRC"
+        "openvla_oft",
+        "openvla",
+        "openvla",
+        ("oft",),
+        config={"unnorm_key": "bridge_orig"},
+        source="OPENVLA_OFT_SRC",
     ),
     "octo": Family("octo", "octo", "octo", config={"batch_sizes": [1, 2]}, source="OCTO_SRC"),
     "gr00t": Family(
@@ -74,7 +87,11 @@ FAMILIES = {
         "gr00t",
         "gr00t",
         within="checkpoint",
-        config={"embodiment": "new_embodiment", "cameras": {"ego_view": "front"}, "state": ["xyzrpy"]},
+        config={
+            "embodiment": "new_embodiment",
+            "cameras": {"ego_view": "front"},
+            "state": ["xyzrpy"],
+        },
         env_vars={"GR00T_SRC": "{}/src"},  # with a small backbone
         source="GR00T_SRC",
     ),
@@ -108,7 +125,9 @@ def application(name: str, family: Family, home: Path) -> dict[str, Any]:
         stdout=subprocess.DEVNULL,
         env={**os.environ, "PYTHONPATH": str(ROOT)},
     )
-    [app] = yaml.safe_load((ROOT / "deployments" / f"{family.file}.yaml").read_text())["applications"]
+    [app] = yaml.safe_load((ROOT / "deployments" / f"{family.file}.yaml").read_text())[
+        "applications"
+    ]
     app["name"], app["route_prefix"] = name, f"/{name}"
     args = app["args"]
     args["environment"]["python"] = str(python)
@@ -126,18 +145,24 @@ def application(name: str, family: Family, home: Path) -> dict[str, Any]:
 def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
     home = tmp_path_factory.mktemp("families")
     file = home / "all.yaml"
-    file.write_text(yaml.safe_dump({"applications": [application(n, f, home) for n, f in present().items()]}))
+    file.write_text(
+        yaml.safe_dump({"applications": [application(n, f, home) for n, f in present().items()]})
+    )
     with running_server(read_deployment(str(file)), num_cpus=4) as server:
         yield server
 
 
 def each() -> list[Any]:
-    marks = {name: [pytest.mark.source(f.source)] if f.source else [] for name, f in FAMILIES.items()}
+    marks = {
+        name: [pytest.mark.source(f.source)] if f.source else [] for name, f in FAMILIES.items()
+    }
     return [pytest.param(name, marks=marks[name]) for name in FAMILIES]
 
 
 @pytest.mark.parametrize("name", each())
-def test_it_acts_the_same_through_http_and_for_an_env_actor_on_its_node(server: Server, name: str) -> None:
+def test_it_acts_the_same_through_http_and_for_an_env_actor_on_its_node(
+    server: Server, name: str
+) -> None:
     transport, by_http = play(server.apps[name], "http", 3)
     assert transport == "http"
     actor = DeskActor.remote()  # type: ignore[attr-defined]
@@ -151,7 +176,9 @@ def test_it_acts_the_same_through_http_and_for_an_env_actor_on_its_node(server: 
     assert not np.allclose(by_http[0], another[0], atol=1e-3)
 
 
-def test_families_whose_packages_contradict_are_evaluated_side_by_side(server: Server, tmp_path: Path) -> None:
+def test_families_whose_packages_contradict_are_evaluated_side_by_side(
+    server: Server, tmp_path: Path
+) -> None:
     told = [versions(family) for family in present().values()]
     assert len({found.get("transformers") for found in told}) > 1
     if set(present()) & {"openvla", "octo"}:  # which are older than numpy 2
@@ -167,11 +194,21 @@ def test_families_whose_packages_contradict_are_evaluated_side_by_side(server: S
             policy_url=server.apps[name],
         )
         summary = evaluate(config)
-        assert (summary.state, summary.total.episodes, summary.total.policy_errors) == ("complete", 2, 0)
+        assert (summary.state, summary.total.episodes, summary.total.policy_errors) == (
+            "complete",
+            2,
+            0,
+        )
 
 
 def versions(family: Family) -> dict[str, str]:
     installed = "{one.name: one.version for one in importlib.metadata.distributions()}"
     code = f"import importlib.metadata, json; print(json.dumps({installed}))"
-    found = subprocess.run([python_of(family), "-c", code], check=True, capture_output=True, text=True)
-    return {name: version for name, version in json.loads(found.stdout).items() if name in ("numpy", "transformers")}
+    found = subprocess.run(
+        [python_of(family), "-c", code], check=True, capture_output=True, text=True
+    )
+    return {
+        name: version
+        for name, version in json.loads(found.stdout).items()
+        if name in ("numpy", "transformers")
+    }

@@ -1,4 +1,5 @@
-"""Messages that are nearly right, at every endpoint of a real server: none crashes it, hangs it or makes it grow.
+"""Messages that are nearly right, at every endpoint of a real server: none crashes it, hangs it or
+makes it grow.
 
 Some hundreds at each endpoint in CI; as many as wanted by hand:
 
@@ -41,7 +42,9 @@ FRAMES = int(os.environ.get("VLAGENTS_FUZZ_FRAMES", "1400"))
 ANSWER_S = 60.0
 EVERY = 100  # messages; then a right one
 PICTURE = np.full((8, 8, 3), 9, np.uint8)
-OBS = Obs({"front": PICTURE}, 0.5, {"joints": np.ones(3, np.float32)}, {"note": "x", "list": [1, 2.5]})
+OBS = Obs(
+    {"front": PICTURE}, 0.5, {"joints": np.ones(3, np.float32)}, {"note": "x", "list": [1, 2.5]}
+)
 LIBERO = {
     "observation/image": PICTURE,
     "observation/wrist_image": PICTURE,
@@ -60,12 +63,16 @@ def server(shared_ray: None) -> Iterator[Server]:
         "openvla": {},
         "vla_eval": {},
     }
-    with serving("served_agents:Mirror", dialects=dialects, limits={"items": 1000, "body_bytes": 2**20}) as server:
+    with serving(
+        "served_agents:Mirror", dialects=dialects, limits={"items": 1000, "body_bytes": 2**20}
+    ) as server:
         yield server
 
 
 def request(op: str) -> bytes:
-    return encode_requests([Request(op, OBS, instruction="task 4" if op == "reset" else None, request_id="r")])  # type: ignore[arg-type]
+    return encode_requests(
+        [Request(op, OBS, instruction="task 4" if op == "reset" else None, request_id="r")]
+    )  # type: ignore[arg-type]
 
 
 @dataclass
@@ -92,7 +99,9 @@ def as_json(tree: dict[str, Any]) -> bytes:
 
 def as_vla_eval(tree: dict[str, Any]) -> bytes:
     fields = {"kind": "observation", "payload": {}, "seq": 3} | tree
-    return vla_eval_codec.encode(vla_eval_codec.Message(fields["kind"], fields["payload"], fields["seq"]))
+    return vla_eval_codec.encode(
+        vla_eval_codec.Message(fields["kind"], fields["payload"], fields["seq"])
+    )
 
 
 def frame_pixel(answer: bytes) -> float:
@@ -119,7 +128,10 @@ TARGETS = [
     Target(
         "roboarena",
         "/roboarena",
-        [openpi_codec.encode({"endpoint": "reset"}), openpi_codec.encode(LIBERO | {"endpoint": "infer"})],
+        [
+            openpi_codec.encode({"endpoint": "reset"}),
+            openpi_codec.encode(LIBERO | {"endpoint": "infer"}),
+        ],
         map_pixel,
         greeting=True,
         trees=[LIBERO | {"endpoint": "infer", "session_id": "a"}],
@@ -127,7 +139,10 @@ TARGETS = [
     Target(
         "openvla",
         "/act",
-        [b'{"image":%s,"instruction":"task 4","unnorm_key":null}' % openvla_codec.encode(PICTURE, twice=False)],
+        [
+            b'{"image":%s,"instruction":"task 4","unnorm_key":null}'
+            % openvla_codec.encode(PICTURE, twice=False)
+        ],
         lambda a: openvla_codec.decode(b'{"a":%s}' % a)[0]["a"][0],
         "application/json",
         trees=[{"image": PICTURE, "instruction": "task 4", "unnorm_key": "a"}],
@@ -138,7 +153,9 @@ TARGETS = [
         "/vla-eval",
         [
             FENCE,
-            vla_eval_codec.encode(vla_eval_codec.Message("episode_start", {"task": {"name": "a"}}, 2)),
+            vla_eval_codec.encode(
+                vla_eval_codec.Message("episode_start", {"task": {"name": "a"}}, 2)
+            ),
             vla_eval_codec.encode(vla_eval_codec.Message("observation", SEEN, 3)),
         ],
         lambda a: vla_eval_codec.decode(a).payload["actions"][0],
@@ -154,7 +171,9 @@ TARGETS = [
 
 
 def attack(target: Target, server: Server, frames: int, seed: int) -> None:
-    """Send so many; raises if the server hangs, tells of an internal error, or then refuses what is right."""
+    """Send so many; raises if the server hangs, tells of an internal error, or then refuses what
+    is right.
+    """
     choose = random.Random(seed)
     talk = over_http if target.content_type else over_websocket
     for begun in range(0, frames, EVERY):
@@ -219,7 +238,9 @@ def over_websocket(target: Target, server: Server, bad: list[bytes]) -> bytes:
 
 
 def wait_for_answer(target: Target, socket: ClientConnection) -> bytes | str:
-    """To the last message, or with a fence to all before it; an error in openpi's manner ends the connection."""
+    """To the last message, or with a fence to all before it; an error in openpi's manner ends
+    the connection.
+    """
     while True:
         answer = socket.recv(timeout=ANSWER_S)
         if isinstance(answer, str) and answer != "reset successful":
@@ -257,8 +278,11 @@ def test_no_message_crashes_hangs_or_bloats_the_server(server: Server) -> None:
         after = (process.memory_info().rss, process.num_threads(), process.num_fds())
         took = time.perf_counter() - begun
         print(f"\n{share * len(TARGETS)} messages, the last three quarters in {took:.0f} s")
-        print(f"replica before and after them: {before[0] / 2**20:.0f} and {after[0] / 2**20:.0f} MiB, "
-              f"{before[1]} and {after[1]} threads, {before[2]} and {after[2]} descriptors")  # fmt: skip
+        print(
+            f"replica before and after them: {before[0] / 2**20:.0f} and {after[0] / 2**20:.0f} "
+            "MiB, "
+            f"{before[1]} and {after[1]} threads, {before[2]} and {after[2]} descriptors"
+        )
         for target in TARGETS:
             print(f"{target.name}: {dict(target.seen)}")
         assert process.is_running()

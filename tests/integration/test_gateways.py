@@ -1,4 +1,6 @@
-"""The real clients of vlagents, and GR00T's and LeRobot's, on one batched replica of a real server."""
+"""The real clients of vlagents, and GR00T's and LeRobot's, on one batched replica of a real
+server.
+"""
 
 from __future__ import annotations
 
@@ -105,7 +107,13 @@ def test_the_metadata_say_where_the_gateways_listen(ports: Ports) -> None:
 
     schemes = {"gr00t": "tcp", "vlagents": "rpyc", "lerobot": "grpc"}
     wait_for(
-        lambda: told() == {name: f"{scheme}://127.0.0.1:{getattr(ports, name)}" for name, scheme in schemes.items()}
+        lambda: (
+            told()
+            == {
+                name: f"{scheme}://127.0.0.1:{getattr(ports, name)}"
+                for name, scheme in schemes.items()
+            }
+        )
     )
 
 
@@ -113,7 +121,9 @@ def test_the_metadata_say_where_the_gateways_listen(ports: Ports) -> None:
 def test_vlagents_0_3_raw_jpeg_and_shared_memory_at_once(ports: Ports) -> None:
     """Every client gets its own answers, and one's end leaves the others' memory where it is."""
     with robots(ports.vlagents, "raw", "jpeg", "shm", "shm") as fleet:
-        assert at_once(*(lambda r=robot: r.say(say="is_initialized") for robot in fleet)) == [True] * 4  # type: ignore[misc]
+        assert (
+            at_once(*(lambda r=robot: r.say(say="is_initialized") for robot in fleet)) == [True] * 4
+        )  # type: ignore[misc]
         assert fleet[0].say(say="git_status").keys() == {"vlagents_ray"}
         answers = at_once(*(lambda r=r, i=i: r.act(50 * i, calls=40) for i, r in enumerate(fleet)))  # type: ignore[misc]
         for i, acts in enumerate(answers):
@@ -135,7 +145,10 @@ def test_vlagents_0_2_resets_and_acts(ports: Ports) -> None:
             with pytest.raises(RuntimeError, match="not_reset"):
                 robot.act(10)
             wish = {"pixel": 10 + i, "joints": 0.5, "gripper": 0.25, "kwargs": {"seed": 3}}
-            assert robot.say(reset="pick it", **wish) == {"instruction": "pick it", "options": {"seed": 3}}
+            assert robot.say(reset="pick it", **wish) == {
+                "instruction": "pick it",
+                "options": {"seed": 3},
+            }
             [[rows]] = robot.act(20 + i)
             assert close_to(rows, 20 + i, 1, text=7)
 
@@ -150,14 +163,18 @@ def test_gr00t_clients_at_once_beside_vlagents(ports: Ports) -> None:
 
     def episode(pixel: int) -> list[list[float]]:
         with PolicyClient(ports.gr00t) as client:
-            return [client.get_action(observation(pixel))[0]["action"][0, 0].tolist() for _ in range(60)]
+            return [
+                client.get_action(observation(pixel))[0]["action"][0, 0].tolist() for _ in range(60)
+            ]
 
     with robots(ports.vlagents, "raw") as [robot]:
         *episodes, acts = at_once(
             *(lambda p=pixel: episode(p) for pixel in range(10, 70, 10)),  # type: ignore[misc]
             lambda: robot.act(5, calls=20),
         )
-    assert episodes == [[[pixel, 0.5, -1, 3, i + 1] for i in range(60)] for pixel in range(10, 70, 10)]
+    assert episodes == [
+        [[pixel, 0.5, -1, 3, i + 1] for i in range(60)] for pixel in range(10, 70, 10)
+    ]
     assert isinstance(acts, list), acts
     assert all(close_to(rows, 5, number + 1) for number, rows in enumerate(acts))
 

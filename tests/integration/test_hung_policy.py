@@ -1,4 +1,6 @@
-"""A policy that never returns from an act: its sessions go on elsewhere, the cause is told, and Serve replaces it."""
+"""A policy that never returns from an act: its sessions go on elsewhere, the cause is told, and
+Serve replaces it.
+"""
 
 from __future__ import annotations
 
@@ -29,16 +31,22 @@ OUTSIDE: list[TransportName] = ["shm", "websocket", "http"]
 @pytest.fixture(scope="module")
 def server(shared_ray: None) -> Iterator[Server]:
     limits = {"act_s": ACT_S, "warm_up_s": ACT_S}
-    config = deployment("served_agents:Hanging", replicas=2, limits=limits).model_dump(exclude_unset=True)
+    config = deployment("served_agents:Hanging", replicas=2, limits=limits).model_dump(
+        exclude_unset=True
+    )
     # A hung replica never drains: Serve waits for that in vain, 20 s by our default.
-    config["applications"][0]["deployments"] = [{"name": "Policy", "graceful_shutdown_timeout_s": 2}]
+    config["applications"][0]["deployments"] = [
+        {"name": "Policy", "graceful_shutdown_timeout_s": 2}
+    ]
     with shared_server(Deployment(**config)) as server:
         yield server
 
 
 def hung_calls() -> list[tuple[str, float]]:
     """What Prometheus would read of them: the op of each, and their number."""
-    return [(one.tags["op"], one.value) for one in scrape() if one.name == "vlagents_hung_calls_total"]
+    return [
+        (one.tags["op"], one.value) for one in scrape() if one.name == "vlagents_hung_calls_total"
+    ]
 
 
 def logged() -> str:
@@ -49,7 +57,11 @@ def logged() -> str:
 
 def line_of(code: str) -> int:
     """The number of the only line of the policies that holds it."""
-    [number] = [n for n, line in enumerate(Path(served_agents.__file__).read_text().splitlines(), 1) if code in line]
+    [number] = [
+        n
+        for n, line in enumerate(Path(served_agents.__file__).read_text().splitlines(), 1)
+        if code in line
+    ]
     return number
 
 
@@ -62,8 +74,12 @@ def persist(agent: RemoteAgent, left: int) -> None:
 
 
 @pytest.mark.parametrize("how", ["sleep", "lock"])
-def test_its_sessions_go_on_elsewhere_the_cause_is_told_and_it_is_replaced(how: str, server: Server) -> None:
-    """One that keeps the interpreter's lock ("lock") can say nothing itself: clients and Serve notice its silence."""
+def test_its_sessions_go_on_elsewhere_the_cause_is_told_and_it_is_replaced(
+    how: str, server: Server
+) -> None:
+    """One that keeps the interpreter's lock ("lock") can say nothing itself: clients and Serve
+    notice its silence.
+    """
     made = [RemoteAgent("serve://Hanging", transport=one, timeout_s=CALL_S) for one in INSIDE * 3]
     made += [RemoteAgent(server.url, transport=one, timeout_s=CALL_S) for one in OUTSIDE * 3]
     for agent in made:
@@ -79,7 +95,10 @@ def test_its_sessions_go_on_elsewhere_the_cause_is_told_and_it_is_replaced(how: 
     for thread in threads:
         thread.start()
     wait_for(lambda: not any(thread.is_alive() for thread in threads))
-    print(f"{how}: {len(hit)} sessions were there; the last acted elsewhere after {time.monotonic() - begun:.1f} s")
+    print(
+        f"{how}: {len(hit)} sessions were there; the last acted elsewhere after "
+        f"{time.monotonic() - begun:.1f} s"
+    )
     if how == "sleep":
         wait_for(lambda: hung_calls() == [("act", 1.0)])
         wait_for(lambda: f"has not returned from 'act' for {ACT_S}" in logged())

@@ -43,15 +43,24 @@ def outcomes(out: Path) -> dict[tuple[str, int], tuple[Any, ...]]:
     assert len({(one.key.env, one.key.episode) for one in found}) == len(found) == 2 * EPISODES
     return {
         (one.key.env, one.key.episode): (
-            one.status, one.success_once, one.success_at_end, one.first_success, one.steps, one.episode_return,
-            one.ending, one.instruction, one.actions_sha256,
+            one.status,
+            one.success_once,
+            one.success_at_end,
+            one.first_success,
+            one.steps,
+            one.episode_return,
+            one.ending,
+            one.instruction,
+            one.actions_sha256,
         )
         for one in found
-    }  # fmt: skip
+    }
 
 
 class Disaster(Progress):
-    """Kills all workers after each fifth episode, and has the evaluation interrupted after so many."""
+    """Kills all workers after each fifth episode, and has the evaluation interrupted after so
+    many.
+    """
 
     def __init__(self, interrupted_after: int | None = None) -> None:
         self.played = 0
@@ -69,18 +78,24 @@ class Disaster(Progress):
 
 
 @pytest.fixture(scope="module")
-def alone(shared_ray: None, tmp_path_factory: pytest.TempPathFactory) -> dict[tuple[str, int], tuple[Any, ...]]:
+def alone(
+    shared_ray: None, tmp_path_factory: pytest.TempPathFactory
+) -> dict[tuple[str, int], tuple[Any, ...]]:
     """By one worker, from one replica that batches nothing."""
     out = tmp_path_factory.mktemp("alone")
     with serving("served_agents:Hesitant", batch={"max_size": 1}) as server:
         evaluate(plan(out, server.url, workers=1))
     found = outcomes(out)
-    assert {row[1] for row in found.values()} == {True, False}, "both outcomes occur, or the test shows nothing"
+    assert {row[1] for row in found.values()} == {True, False}, (
+        "both outcomes occur, or the test shows nothing"
+    )
     return found
 
 
 @pytest.fixture(scope="module")
-def server(shared_ray: None, alone: dict[Any, Any], request: pytest.FixtureRequest) -> Iterator[Server]:
+def server(
+    shared_ray: None, alone: dict[Any, Any], request: pytest.FixtureRequest
+) -> Iterator[Server]:
     """With so many replicas, for all tests that want as many."""
     with serving("served_agents:Hesitant", batch={"max_size": 8}, replicas=request.param) as server:
         yield server
@@ -92,12 +107,16 @@ def test_killed_workers_and_a_resumption_change_no_result(
 ) -> None:
     with pytest.raises(EvaluationInterrupted):
         evaluate(plan(tmp_path, server.url, workers=2, retries=20), progress=Disaster(EPISODES))
-    summary = evaluate(plan(tmp_path, server.url, workers=2, retries=20, resume=True), progress=Disaster())
+    summary = evaluate(
+        plan(tmp_path, server.url, workers=2, retries=20, resume=True), progress=Disaster()
+    )
     assert summary.total.retries > 0
     assert outcomes(tmp_path) == alone
 
 
-@pytest.mark.parametrize(("server", "workers", "num_envs"), [(1, 2, 5), (2, 4, 1)], indirect=["server"])
+@pytest.mark.parametrize(
+    ("server", "workers", "num_envs"), [(1, 2, 5), (2, 4, 1)], indirect=["server"]
+)
 def test_workers_batches_replicas_and_envs_side_by_side_change_no_result(
     alone: dict[Any, Any], tmp_path: Path, server: Server, workers: int, num_envs: int
 ) -> None:

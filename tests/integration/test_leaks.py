@@ -23,10 +23,17 @@ from vlagents_ray.serve.launch.server import Server
 pytestmark = pytest.mark.integration
 
 # So many that a kilobyte or two of each shows; VLAGENTS_SESSIONS=N opens N by each transport
-SESSIONS: dict[TransportName, int] = {"shm": 2400, "websocket": 600, "http": 600, "handle": 300, "plasma": 300}
+SESSIONS: dict[TransportName, int] = {
+    "shm": 2400,
+    "websocket": 600,
+    "http": 600,
+    "handle": 300,
+    "plasma": 300,
+}
 MIB = 2**20
 ROUNDS = 4
-MOST = {"descriptors": 2, "threads": 2, "maps": 1, "own descriptors": 2, "own threads": 2}  # that may be left
+# That may be left.
+MOST = {"descriptors": 2, "threads": 2, "maps": 1, "own descriptors": 2, "own threads": 2}
 
 
 @pytest.mark.own_process
@@ -39,7 +46,9 @@ def test_sessions_opened_and_closed_leave_nothing() -> None:
 
 def open_and_close(server: Server, transport: TransportName) -> None:
     frame = Obs({"front": np.zeros((64, 64, 3), np.uint8)})
-    where = f"serve://{next(iter(server.apps))}" if transport in ("handle", "plasma") else server.url
+    where = (
+        f"serve://{next(iter(server.apps))}" if transport in ("handle", "plasma") else server.url
+    )
 
     def session(codec: CodecName = "raw", count: bool = False) -> dict[str, int]:
         with RemoteAgent(where, transport=transport, codec=codec) as agent:
@@ -48,7 +57,8 @@ def open_and_close(server: Server, transport: TransportName) -> None:
         return held
 
     number = int(os.environ.get("VLAGENTS_SESSIONS", SESSIONS[transport]))
-    for _ in range(50):  # measuring the link takes the server's memory too, and the allocator settles
+    # Measuring the link takes the server's memory too, and the allocator settles.
+    for _ in range(50):
         session("auto")
     for _ in range(number // 10):  # pools fill
         session()
@@ -66,16 +76,24 @@ def open_and_close(server: Server, transport: TransportName) -> None:
     grown: dict[str, int] = {}
 
     def settled() -> bool:
-        """Whether what the last sessions held is given back; the server's threads do that in their own time."""
+        """Whether what the last sessions held is given back; the server's threads do that in
+        their own time.
+        """
         now = session(count=True)
         grown.update({name: now[name] - before[name] for name in before})
-        grown.update({"own descriptors": me.num_fds() - mine[0], "own threads": len(unpooled_threads()) - mine[1]})
+        grown.update(
+            {
+                "own descriptors": me.num_fds() - mine[0],
+                "own threads": len(unpooled_threads()) - mine[1],
+            }
+        )
         return all(grown[name] <= limit for name, limit in MOST.items())
 
     with suppress(TimeoutError):
         wait_for(settled)
     print(f"{transport}: {number} sessions: the growth {grown}; resident: {resident}")
     assert {name: grown[name] for name, limit in MOST.items() if grown[name] > limit} == {}
-    for sizes in zip(*resident, strict=True):  # what stays of each session grows in every round, an arena in one
+    # What stays of each session grows in every round, an arena in one.
+    for sizes in zip(*resident, strict=True):
         assert min(b - a for a, b in itertools.pairwise(sizes)) < 4 * MIB / ROUNDS
         assert sizes[-1] - sizes[0] < 4 * 4 * MIB

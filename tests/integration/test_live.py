@@ -46,19 +46,27 @@ def test_a_viewer_sees_the_sessions_of_both_replicas_and_all_transports(server: 
             for replica in document["replicas"]:
                 replicas.add(replica["name"])
                 shown |= {session["id"] for session in replica["sessions"]}
-                acted |= {one["id"] for one in replica["sessions"] if one.get("last", {}).get("op") == "act"}
+                acted |= {
+                    one["id"]
+                    for one in replica["sessions"]
+                    if one.get("last", {}).get("op") == "act"
+                }
                 pictured |= {one["id"] for one in replica["sessions"] if one["pictures"]}
                 assert {one["instruction"] for one in replica["sessions"]} <= {"watch this"}
         assert all(file.startswith(b"\xff\xd8") for file in files)
 
 
-def test_a_command_of_the_page_reaches_the_session_whichever_replica_it_is_at(server: Server) -> None:
+def test_a_command_of_the_page_reaches_the_session_whichever_replica_it_is_at(
+    server: Server,
+) -> None:
     with urllib.request.urlopen(f"{server.url}/live", timeout=10) as answer:
         assert b"/v1/live" in answer.read()
     with ExitStack() as stack:
         inboxes, agents = [CommandInbox() for _ in range(4)], []
         for inbox in inboxes:
-            agents.append(stack.enter_context(RemoteAgent(server.url, transport="websocket", commands=inbox)))
+            agents.append(
+                stack.enter_context(RemoteAgent(server.url, transport="websocket", commands=inbox))
+            )
             agents[-1].reset(Obs(), "wait")
         with urllib.request.urlopen(f"{server.url}/v1/live", timeout=10) as answer:
             replicas = json.load(answer)["replicas"]

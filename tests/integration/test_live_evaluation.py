@@ -46,7 +46,16 @@ def evaluating(ray_home: Path, log: Path, *words: str) -> Iterator[LivePage]:
 def test_it_shows_cells_sessions_and_failures_while_it_runs(ray_home: Path, tmp_path: Path) -> None:
     settings = [f"folder={tmp_path}", "trouble={gate: [3]}"]  # the last episode waits for the test
     words = [word for setting in settings for word in ("--env-set", setting)]
-    policy = ["--policy", "noop", "--set", "action_dim=1", "--episodes", "4", "--out", str(tmp_path / "out")]
+    policy = [
+        "--policy",
+        "noop",
+        "--set",
+        "action_dim=1",
+        "--episodes",
+        "4",
+        "--out",
+        str(tmp_path / "out"),
+    ]
     with evaluating(ray_home, tmp_path / "log", LINE, *policy, *words) as page:
         wait_for(lambda: page.evaluation().get("done") == 3)
         document = page.document()
@@ -84,10 +93,14 @@ def test_each_checkpoint_is_evaluated_once_it_is_whole_by_one_server_and_gets_a_
     runs, out, file = tmp_path / "runs", tmp_path / "out", tmp_path / "watched.yaml"
     runs.mkdir()
     policy = {
-        "name": "mine", "source": "served_agents:Stored", "config": {"checkpoint": str(runs / "{step}" / "number")}
-    }  # fmt: skip
+        "name": "mine",
+        "source": "served_agents:Stored",
+        "config": {"checkpoint": str(runs / "{step}" / "number")},
+    }
     suites = [{"envs": [LINE], "episodes": 2}]
-    file.write_text(yaml.safe_dump({"policies": [policy], "suites": suites, "out": str(out), "video": "none"}))
+    file.write_text(
+        yaml.safe_dump({"policies": [policy], "suites": suites, "out": str(out), "video": "none"})
+    )
     written(runs, 20, "half a numb", done=False)
     words = [str(file), "--watch", str(runs), "--marker", "done", "--until", "30"]
     with evaluating(ray_home, tmp_path / "log", *words) as page:
@@ -105,4 +118,6 @@ def test_each_checkpoint_is_evaluated_once_it_is_whole_by_one_server_and_gets_a_
     ]
     assert [cell.step for cell in results.cells] == [10, 20, 30]
     assert "step 20: not yet: has no done" in (tmp_path / "log").read_text()
-    assert {one["checkpoint"] for one in results.policies.values()} == {str(runs / "10" / "number")}, "one server"
+    assert {one["checkpoint"] for one in results.policies.values()} == {
+        str(runs / "10" / "number")
+    }, "one server"

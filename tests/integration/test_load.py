@@ -15,7 +15,13 @@ from vlagents_ray import Obs, RemoteAgent
 from vlagents_ray.client.transports.select import TransportName
 
 CLIENTS, ACTS = 24, 8
-FROM_NONE = {"min_replicas": 0, "max_replicas": 2, "look_back_s": 2, "upscale_delay_s": 0.5, "downscale_delay_s": 1}
+FROM_NONE = {
+    "min_replicas": 0,
+    "max_replicas": 2,
+    "look_back_s": 2,
+    "upscale_delay_s": 0.5,
+    "downscale_delay_s": 1,
+}
 WAYS: list[TransportName] = ["shm", "websocket"]
 
 
@@ -28,11 +34,17 @@ def play(url: str, transport: TransportName, client: int) -> list[int]:
 
 @pytest.mark.slow
 def test_what_waits_while_a_batch_runs_is_the_next_batch(shared_ray: None) -> None:
-    """100 ms + 1 ms an observation, 24 clients. Serve's default of 5 requests at a time must not cap the batch."""
-    with serving("noop", config={"base_ms": 100, "per_item_ms": 1}, batch={"max_size": 16}) as server:
+    """100 ms + 1 ms an observation, 24 clients. Serve's default of 5 requests at a time must not
+    cap the batch.
+    """
+    with serving(
+        "noop", config={"base_ms": 100, "per_item_ms": 1}, batch={"max_size": 16}
+    ) as server:
         for transport in ("shm", "websocket", "http"):
             with ThreadPoolExecutor(CLIENTS) as pool:
-                sizes = list(pool.map(lambda i, t=transport: play(server.url, t, i), range(CLIENTS)))  # type: ignore[misc]
+                sizes = list(
+                    pool.map(lambda i, t=transport: play(server.url, t, i), range(CLIENTS))
+                )  # type: ignore[misc]
             flat = [size for one in sizes for size in one]
             assert len(flat) == CLIENTS * ACTS
             assert 5 < max(flat) <= 16, (transport, flat)
@@ -58,12 +70,18 @@ def replicas() -> int:
 def gone() -> bool:
     """Are even those that stop no more?"""
     (app,) = serve.status().applications.values()
-    return not any(number for deployment in app.deployments.values() for number in deployment.replica_states.values())
+    return not any(
+        number
+        for deployment in app.deployments.values()
+        for number in deployment.replica_states.values()
+    )
 
 
 @pytest.mark.slow
 def test_replicas_come_from_none_and_go_to_none_and_no_step_fails(shared_ray: None) -> None:
-    with serving("noop", config={"base_ms": 40}, batch={"max_size": 1}, autoscaling=FROM_NONE) as server:
+    with serving(
+        "noop", config={"base_ms": 40}, batch={"max_size": 1}, autoscaling=FROM_NONE
+    ) as server:
         wait_for(gone)
         stop = threading.Event()
         with ThreadPoolExecutor(4) as pool:

@@ -53,7 +53,9 @@ def test_prometheus_reads_requests_batches_and_load(server: Server) -> None:
                 agent.act(Obs())
         stranger = {"content-type": "application/json", "x-session-id": "nobody"}
         with pytest.raises(urllib.error.HTTPError, match="404"):
-            urllib.request.urlopen(urllib.request.Request(f"{server.url}/v1/act", b"{}", stranger), timeout=10)
+            urllib.request.urlopen(
+                urllib.request.Request(f"{server.url}/v1/act", b"{}", stranger), timeout=10
+            )
         ok = "vlagents_requests_total class={} code=ok op={} transport={}"
         expected = {
             ok.format("robot", "reset", "shm"): 1,
@@ -74,7 +76,9 @@ def test_prometheus_reads_requests_batches_and_load(server: Server) -> None:
         now: dict[str, float] = {}
 
         def complete() -> bool:
-            """All series together; each is exported by itself, and the load is that of the last second."""
+            """All series together; each is exported by itself, and the load is that of the last
+            second.
+            """
             now.clear()
             now.update(scraped())
             return expected.items() <= now.items() and 0 <= now["vlagents_utilisation"] < 0.5

@@ -24,7 +24,9 @@ from vlagents_ray.serve.launch.server import Server
 
 
 def deployed(replicas: int) -> Deployment:
-    """Two policies; `replicas` of the first, as `serve deploy` with another `num_replicas` would have it."""
+    """Two policies; `replicas` of the first, as `serve deploy` with another `num_replicas` would
+    have it.
+    """
     reacher = deployment("served_agents:Reacher", replicas=3).model_dump(exclude_unset=True)
     remembering = deployment("served_agents:Remembering", replicas=2).model_dump(exclude_unset=True)
     reacher["applications"][0]["deployments"] = [{"name": "Policy", "num_replicas": replicas}]
@@ -44,10 +46,14 @@ def scale(replicas: int) -> None:
 
 
 def test_sessions_go_on_when_replicas_stop(server: Server) -> None:
-    """Exactly where they were: three replicas become one under busy sessions and idle ones, on every transport."""
+    """Exactly where they were: three replicas become one under busy sessions and idle ones, on
+    every transport.
+    """
     scale(3)
     busy = {(t, i): RemoteAgent(url(server, t), transport=t) for t in TRANSPORTS for i in range(3)}
-    idle = {(t, i): RemoteAgent(url(server, t), transport=t) for t in TRANSPORTS for i in range(3, 6)}
+    idle = {
+        (t, i): RemoteAgent(url(server, t), transport=t) for t in TRANSPORTS for i in range(3, 6)
+    }
     agents = busy | idle
     counts = dict.fromkeys(agents, 0)
     pids: dict[tuple[str, int], int] = {}
@@ -135,7 +141,9 @@ def test_sessions_of_one_connection_act_in_one_message(server: Server) -> None:
     for transport in TRANSPORTS:
         with RemoteAgent(url(server, transport), transport=transport) as agent:
             envs = agent.sessions(8)
-            infos = agent.reset_batch([obs(i) for i in range(8)], [f"task {i}" for i in range(8)], envs)
+            infos = agent.reset_batch(
+                [obs(i) for i in range(8)], [f"task {i}" for i in range(8)], envs
+            )
             assert len({info["pid"] for info in infos if isinstance(info, dict)}) == 1
             for step in range(1, 4):
                 acts = agent.act_batch([obs(0, i) for i in range(8)], envs)

@@ -1,4 +1,6 @@
-"""Certificates of clients, and a cluster that Ray's own tools serve on; each wants a Ray of its own."""
+"""Certificates of clients, and a cluster that Ray's own tools serve on; each wants a Ray of its
+own.
+"""
 
 from __future__ import annotations
 
@@ -27,15 +29,27 @@ def test_a_client_without_a_certificate_is_refused_where_one_is_wanted(tmp_path:
     mine, foreign = ours.sign("robot"), strangers.sign("robot")
     config = deployment("noop")
     with running_server(
-        config, host="127.0.0.2", num_cpus=2, keys_file=tmp_path / "keys.json", tls=tls, timeout_s=120
+        config,
+        host="127.0.0.2",
+        num_cpus=2,
+        keys_file=tmp_path / "keys.json",
+        tls=tls,
+        timeout_s=120,
     ) as served:
         for way in WAYS:
-            with RemoteAgent(served.url, transport=way, api_key=token, ca=ours.file, certificate=mine) as agent:
+            with RemoteAgent(
+                served.url, transport=way, api_key=token, ca=ours.file, certificate=mine
+            ) as agent:
                 agent.reset(Obs(), "x")
                 agent.act(Obs())
             for certificate in (None, foreign):
                 agent = RemoteAgent(
-                    served.url, transport=way, api_key=token, ca=ours.file, certificate=certificate, connect_timeout_s=5
+                    served.url,
+                    transport=way,
+                    api_key=token,
+                    ca=ours.file,
+                    certificate=certificate,
+                    connect_timeout_s=5,
                 )
                 with pytest.raises(ConfigError, match="certificate="), agent:
                     agent.reset(Obs(), "x")
@@ -68,7 +82,12 @@ def test_without_haproxy_serve_asks_for_keys_and_encrypts_by_itself(
     ca = authority(tmp_path, "ca")
     token = new_key(tmp_path / "keys.json", "arm")
     tls, config = Tls(*ca.sign("server", "IP:127.0.0.2")), deployment("noop")
-    access = {"host": "127.0.0.2", "keys_file": tmp_path / "keys.json", "num_cpus": 2, "timeout_s": 120}
+    access = {
+        "host": "127.0.0.2",
+        "keys_file": tmp_path / "keys.json",
+        "num_cpus": 2,
+        "timeout_s": 120,
+    }
     with (
         pytest.raises(ConfigError, match="needs HAProxy"),
         running_server(config, tls=replace(tls, client_ca=ca.file), **access),  # type: ignore[arg-type]

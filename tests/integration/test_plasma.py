@@ -1,4 +1,6 @@
-"""Frames in plasma between env actors and a replica on their node: a real cluster with a small object store."""
+"""Frames in plasma between env actors and a replica on their node: a real cluster with a small
+object store.
+"""
 
 from __future__ import annotations
 
@@ -87,7 +89,9 @@ class EnvActor:
 def served() -> Iterator[Server]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(ray_constants, "DEFAULT_OBJECT_STORE_MAX_MEMORY_BYTES", STORE)
-        document = deployment("served_agents:Echo", limits={"body_bytes": LIMIT, "pixels": LIMIT // 3})
+        document = deployment(
+            "served_agents:Echo", limits={"body_bytes": LIMIT, "pixels": LIMIT // 3}
+        )
         with running_server(document, num_cpus=4) as server:
             yield server
 
@@ -152,22 +156,35 @@ print("Echo" in str(ray.util.list_named_actors(all_namespaces=True)))
 def test_a_ray_program_that_cannot_be_changed_joins_by_the_variables_of_the_docs(
     served: Server, tmp_path: Path
 ) -> None:
-    [line] = re.findall(r"`(RAY_ENABLE\S+=0) (RAY_AUTH_MODE=token)`", (ROOT / "docs" / "connecting.md").read_text())
+    [line] = re.findall(
+        r"`(RAY_ENABLE\S+=0) (RAY_AUTH_MODE=token)`", (ROOT / "docs" / "connecting.md").read_text()
+    )
     (tmp_path / "learner.py").write_text(UNCHANGED)
     [server] = [server for server in local_servers() if server.url == served.url]
     # Others may run here, which "auto" may find first.
     this = {"RAY_ADDRESS": server.ray_address, "RAY_AUTH_TOKEN_PATH": server.token_file}
-    ran = of_the_user(tmp_path / "learner.py", served.url, **this, **dict(one.split("=") for one in line))
+    ran = of_the_user(
+        tmp_path / "learner.py", served.url, **this, **dict(one.split("=") for one in line)
+    )
     assert ran.stdout == "True\n", ran.stderr
 
 
-def of_the_user(script: Path, *arguments: str, **variables: str) -> subprocess.CompletedProcess[str]:
+def of_the_user(
+    script: Path, *arguments: str, **variables: str
+) -> subprocess.CompletedProcess[str]:
     """Run a script without a variable of the server's process."""
-    environment = {name: value for name, value in ENV.items() if not name.startswith("RAY_") and name != MARK}
+    environment = {
+        name: value for name, value in ENV.items() if not name.startswith("RAY_") and name != MARK
+    }
     return subprocess.run(
         [sys.executable, str(script), *arguments],
-        cwd=script.parent, env=environment | variables, capture_output=True, text=True, timeout=180, check=False,
-    )  # fmt: skip
+        cwd=script.parent,
+        env=environment | variables,
+        capture_output=True,
+        text=True,
+        timeout=180,
+        check=False,
+    )
 
 
 @pytest.fixture
@@ -192,7 +209,9 @@ def objects() -> int:
     """Objects in the node's store."""
     found = re.search(
         r"(\d+) objects",
-        memory_summary(ray.get_runtime_context().gcs_address, stats_only=True).partition("Plasma memory usage")[2],
+        memory_summary(ray.get_runtime_context().gcs_address, stats_only=True).partition(
+            "Plasma memory usage"
+        )[2],
     )
     assert found is not None
     return int(found[1])
@@ -256,11 +275,12 @@ def test_connections_leave_nothing(agent: RemoteAgent) -> None:
     before = objects(), held(agent)
     for _ in range(30):
         cycle()
-    # 30 would leave 30 or more. Two: what a process makes once, when it is first needed, such as the thread that
-    # listens while a batch of several sessions is slow.
+    # 30 would leave 30 or more. Two: what a process makes once, when it is first needed, such as
+    # the thread that listens while a batch of several sessions is slow.
     wait_for(lambda: held(agent)[1] <= before[1][1] + 2)
     wait_for(lambda: held(agent)[0] <= before[1][0] + 2)
-    wait_for(lambda: objects() <= before[0] + 1)  # two at once, where one ended after the next began
+    # Two at once, where one ended after the next began.
+    wait_for(lambda: objects() <= before[0] + 1)
 
 
 def test_killed_env_actors_leave_nothing(agent: RemoteAgent) -> None:
@@ -273,13 +293,17 @@ def test_killed_env_actors_leave_nothing(agent: RemoteAgent) -> None:
             env.storm.remote()
             time.sleep(choose.uniform(0.05, 0.15))
         os.kill(pid, signal.SIGKILL)
-    wait_for(lambda: held(agent)[1] <= before[1][1] + 2)  # 12 would leave 12 or more; Ray's own come and go
+    # 12 would leave 12 or more; Ray's own come and go.
+    wait_for(lambda: held(agent)[1] <= before[1][1] + 2)
     wait_for(lambda: held(agent)[0] <= before[1][0] + 2)
-    # One is used again and again; of six killed in a storm few are killed in the microseconds of a write.
+    # One is used again and again; of six killed in a storm few are killed in the microseconds of a
+    # write.
     wait_for(lambda: objects() <= before[0] + 2 + 3)
 
 
-def test_an_env_actor_that_dies_while_it_writes_costs_its_channel_and_nothing_else(agent: RemoteAgent) -> None:
+def test_an_env_actor_that_dies_while_it_writes_costs_its_channel_and_nothing_else(
+    agent: RemoteAgent,
+) -> None:
     env = EnvActor.remote(APP, size=600)  # for a size of channel that no other test uses
     ray.get(env.open.remote())
     lost = ray.get(env.channel.remote())
@@ -292,7 +316,9 @@ def test_an_env_actor_that_dies_while_it_writes_costs_its_channel_and_nothing_el
             assert other.act(frame(pixel=pixel)).action.tolist() == [pixel]
 
 
-def test_faults_are_answered_and_harm_nobody(agent: RemoteAgent, transport: PlasmaTransport) -> None:
+def test_faults_are_answered_and_harm_nobody(
+    agent: RemoteAgent, transport: PlasmaTransport
+) -> None:
     transport.connect(30)
     transport.call([Request("reset", frame(), request_id="r")], 60)
     connection, key = transport._open(1), transport._channel.binary()
@@ -319,7 +345,9 @@ def test_what_is_too_large_is_refused_and_said(agent: RemoteAgent) -> None:
     assert agent.act(frame(pixel=9)).action.tolist() == [9]
 
 
-def test_auto_takes_plasma_where_the_socket_of_shared_memory_does_not_reach(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_auto_takes_plasma_where_the_socket_of_shared_memory_does_not_reach(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     monkeypatch.setattr("vlagents_ray.client.transports.select.reaches", lambda _: False)
     with RemoteAgent(f"serve://{APP}") as other:
         other.reset(frame(), "x")

@@ -29,7 +29,9 @@ START = observation(np.zeros(22, np.float32))
 
 
 def deployed(replicas: int) -> Deployment:
-    config = deployment(f"raptor_flights:{APP}", replicas=2, batch={"max_size": FLIGHTS}).model_dump(exclude_unset=True)
+    config = deployment(
+        f"raptor_flights:{APP}", replicas=2, batch={"max_size": FLIGHTS}
+    ).model_dump(exclude_unset=True)
     config["applications"][0]["deployments"] = [{"name": "Policy", "num_replicas": replicas}]
     return Deployment(**config)
 
@@ -58,7 +60,8 @@ def client(server: Server, transport: TransportName, **options: Any) -> RemoteAg
 
 @pytest.mark.parametrize("transport", TRANSPORTS)
 def test_each_transport_carries_the_reference(server: Server, transport: TransportName) -> None:
-    inputs, wanted = (rows[:150] for rows in reference())  # all of them in process: tests/policies/test_raptor.py
+    # All of them in process: tests/policies/test_raptor.py.
+    inputs, wanted = (rows[:150] for rows in reference())
     agents = [client(server, transport) for _ in range(2)]
     for agent in agents:
         agent.reset(START)
@@ -86,7 +89,10 @@ def test_served_flights_are_those_in_process_to_the_bit(server: Server) -> None:
     for session in (*sessions, agent):
         session.close()
     assert {timing["batch_size"] for timing in timings} == {FLIGHTS}
-    times = {name: np.median([timing[name] for timing in timings]) for name in ("inference_ms", "round_trip_ms")}
+    times = {
+        name: np.median([timing[name] for timing in timings])
+        for name in ("inference_ms", "round_trip_ms")
+    }
     print(f"{FLIGHTS} sessions in a batch over shm, median: {times}")
     np.testing.assert_array_equal(served, fly(range(FLIGHTS), together(loaded(), FLIGHTS), STEPS))
 
@@ -123,7 +129,9 @@ def test_a_killed_replica_is_an_error_where_sessions_are_not_resumed(server: Ser
 def test_flights_go_on_to_the_bit_while_a_replica_stops(server: Server) -> None:
     scale(2)
     agents = [client(server, transport) for transport in TRANSPORTS for _ in range(2)]
-    wait_for(lambda: len({agent.reset(START)["pid"] for agent in agents if agent.close() is None}) == 2)
+    wait_for(
+        lambda: len({agent.reset(START)["pid"] for agent in agents if agent.close() is None}) == 2
+    )
     scaling = threading.Thread(target=scale, args=(1,))
     steps = itertools.count()
 
@@ -141,4 +149,6 @@ def test_flights_go_on_to_the_bit_while_a_replica_stops(server: Server) -> None:
     assert states(APP) == {"RUNNING": 1}
     for agent in agents:
         agent.close()
-    np.testing.assert_array_equal(served, fly(range(len(agents)), together(loaded(), len(agents)), STEPS))
+    np.testing.assert_array_equal(
+        served, fly(range(len(agents)), together(loaded(), len(agents)), STEPS)
+    )

@@ -1,4 +1,6 @@
-"""What a server records of sessions of every transport, and what is left of it when a replica is killed."""
+"""What a server records of sessions of every transport, and what is left of it when a replica is
+killed.
+"""
 
 from __future__ import annotations
 
@@ -40,7 +42,9 @@ def server(shared_ray: None, folder: Path) -> Iterator[Server]:
 
 
 def saved(folder: Path) -> int:
-    return sum(json.loads(path.read_text())["total_episodes"] for path in folder.glob("*/meta/info.json"))
+    return sum(
+        json.loads(path.read_text())["total_episodes"] for path in folder.glob("*/meta/info.json")
+    )
 
 
 def series(key: str) -> list[float]:
@@ -76,7 +80,9 @@ def test_sessions_of_every_transport_are_recorded_and_replayed_without_error(
     assert series("vlagents_recording") == [1]
 
 
-def test_a_killed_replica_loses_its_running_episodes_and_no_others(server: Server, folder: Path) -> None:
+def test_a_killed_replica_loses_its_running_episodes_and_no_others(
+    server: Server, folder: Path
+) -> None:
     before = saved(folder)
     with RemoteAgent(server.url) as agent:
         play(agent, 1)
@@ -87,4 +93,6 @@ def test_a_killed_replica_loses_its_running_episodes_and_no_others(server: Serve
         while agent.act(seen(7)).info["pid"] == pid and time.monotonic() < until:
             time.sleep(0.1)
     wait_for(lambda: saved(folder) == before + 2, timeout_s=30)
-    assert len(list(folder.glob("*/meta/info.json"))) == 2, "the new replica has a dataset of its own"
+    assert len(list(folder.glob("*/meta/info.json"))) == 2, (
+        "the new replica has a dataset of its own"
+    )

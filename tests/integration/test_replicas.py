@@ -31,9 +31,11 @@ def opened(agents: list[RemoteAgent]) -> list[int]:
 
 
 def spread(agents: list[RemoteAgent], evenly: bool = False) -> list[int]:
-    """Reset each until they are on all three replicas, those that have replaced killed ones too; returns as `opened`.
+    """Reset each until they are on all three replicas, those that have replaced killed ones too;
+    returns as `opened`.
 
-    Sessions that are spread `evenly` stay where they are: the replicas leave such a balance as it is.
+    Sessions that are spread `evenly` stay where they are: the replicas leave such a balance as it
+    is.
     """
     pids: list[int] = []
 
@@ -52,17 +54,24 @@ def check(agents: list[RemoteAgent], pids: list[int], steps: int) -> None:
     for step in range(1, steps):
         for i, agent in enumerate(agents):
             act = agent.act(obs(0))
-            assert (act.info["pid"], act.info["instruction"], act.action[0]) == (pids[i], f"task {i}", step)
+            assert (act.info["pid"], act.info["instruction"], act.action[0]) == (
+                pids[i],
+                f"task {i}",
+                step,
+            )
 
 
 def test_http_sessions_stay_on_their_replica(server: Server) -> None:
-    agents = [RemoteAgent(server.url, transport="http") for _ in range(30)]  # hashes of so many leave no replica out
+    # Hashes of so many leave no replica out.
+    agents = [RemoteAgent(server.url, transport="http") for _ in range(30)]
     check(agents, spread(agents), 20)
     for agent in agents:
         agent.close()
 
 
-def test_a_caller_learns_on_which_nodes_the_replicas_are_and_of_no_application_nothing(server: Server) -> None:
+def test_a_caller_learns_on_which_nodes_the_replicas_are_and_of_no_application_nothing(
+    server: Server,
+) -> None:
     assert server.apps.keys() == {"Reacher"}
     nodes, here = ReplicaNodes("Reacher"), ray.get_runtime_context().get_node_id()
     wait_for(lambda: nodes.query() == {here: 3})
@@ -70,7 +79,9 @@ def test_a_caller_learns_on_which_nodes_the_replicas_are_and_of_no_application_n
 
 
 @pytest.mark.parametrize("transport", ["handle", "shm"])
-def test_a_dead_replica_ends_its_own_sessions_and_no_others(server: Server, transport: TransportName) -> None:
+def test_a_dead_replica_ends_its_own_sessions_and_no_others(
+    server: Server, transport: TransportName
+) -> None:
     agents = [RemoteAgent("serve://Reacher", transport=transport, resume=False) for _ in range(8)]
     pids = spread(agents, evenly=True)
     check(agents, pids, 5)

@@ -1,4 +1,6 @@
-"""Replicas are killed and frozen at random under sessions of every transport, and each session's history is right."""
+"""Replicas are killed and frozen at random under sessions of every transport, and each session's
+history is right.
+"""
 
 from __future__ import annotations
 
@@ -22,13 +24,14 @@ from vlagents_ray import DeadlineExceeded, Obs, PolicyUnavailable, RemoteAgent, 
 from vlagents_ray.client.transports.select import TransportName
 from vlagents_ray.serve.launch.server import Server
 
-# At the least; more, until sessions of every transport were hit. With VLAGENTS_KILLS=12 VLAGENTS_FREEZES=4 and nothing
-# else on the machine, what is promised of times is looked at, too.
+# At the least; more, until sessions of every transport were hit. With VLAGENTS_KILLS=12
+# VLAGENTS_FREEZES=4 and nothing else on the machine, what is promised of times is looked at, too.
 LEAST = {
     signal.SIGKILL: int(os.environ.get("VLAGENTS_KILLS", "1")),
     signal.SIGSTOP: int(os.environ.get("VLAGENTS_FREEZES", "1")),
 }
-WAIT_S = 60 if "VLAGENTS_KILLS" in os.environ else 240  # Serve itself notices a frozen replica after 65 s
+# Serve itself notices a frozen replica after 65 s.
+WAIT_S = 60 if "VLAGENTS_KILLS" in os.environ else 240
 TIMEOUT_S = float(os.environ.get("VLAGENTS_TIMEOUT_S", "2"))
 SEED = int(os.environ.get("VLAGENTS_SEED", "14"))
 WAYS: list[TransportName] = ["shm", "websocket", "http", "handle", "plasma"]
@@ -98,7 +101,9 @@ class Player:
         """Is there an answer to a call that began after that, or to one that it cut off?"""
         if self.broken is not None:
             raise self.broken
-        return any(call.info is not None and call.ended > moment for call in reversed(self.calls[-50:]))
+        return any(
+            call.info is not None and call.ended > moment for call in reversed(self.calls[-50:])
+        )
 
 
 @pytest.fixture(scope="module")
@@ -108,21 +113,29 @@ def ledger(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def server(shared_ray: None, ledger: Path) -> Iterator[Server]:
-    with serving("served_agents:Ledger", config={"folder": str(ledger)}, replicas=REPLICAS) as server:
+    with serving(
+        "served_agents:Ledger", config={"folder": str(ledger)}, replicas=REPLICAS
+    ) as server:
         yield server
 
 
 @pytest.mark.alone
 @pytest.mark.integration
-def test_killed_and_frozen_replicas_lose_double_cross_and_delay_no_act(server: Server, ledger: Path) -> None:
+def test_killed_and_frozen_replicas_lose_double_cross_and_delay_no_act(
+    server: Server, ledger: Path
+) -> None:
     drawn = random.Random(SEED)
     players = []
     for i in range(SESSIONS):
         transport = WAYS[i % len(WAYS)]
         where = "serve://Ledger" if transport in ("handle", "plasma") else server.url
-        players.append(Player(RemoteAgent(where, transport=transport, timeout_s=TIMEOUT_S), f"{transport}-{i}"))
+        players.append(
+            Player(RemoteAgent(where, transport=transport, timeout_s=TIMEOUT_S), f"{transport}-{i}")
+        )
     stop = threading.Event()
-    threads = [threading.Thread(target=player.play, args=(stop,), daemon=True) for player in players]
+    threads = [
+        threading.Thread(target=player.play, args=(stop,), daemon=True) for player in players
+    ]
     for thread in threads:
         thread.start()
     took: dict[signal.Signals, list[float]] = {fault: [] for fault in LEAST}
@@ -145,10 +158,14 @@ def test_killed_and_frozen_replicas_lose_double_cross_and_delay_no_act(server: S
         hit = [player for player in players if player.pid == pid]
         wait_for(lambda: all(player.acted_since(begun + 0.1) for player in players), WAIT_S)  # noqa: B023 - called here
         wait_for(lambda: all(player.pid != pid for player in hit), WAIT_S)  # noqa: B023
-        elsewhere = [next(c for c in p.calls if c.info and c.ended > begun and c.info["pid"] != pid) for p in hit]
+        elsewhere = [
+            next(c for c in p.calls if c.info and c.ended > begun and c.info["pid"] != pid)
+            for p in hit
+        ]
         took[fault].append(max(call.ended for call in elsewhere) - begun)
         print(
-            f"{fault.name}: {len(hit)} of {SESSIONS} sessions were there; the last acted after {took[fault][-1]:.2f} s"
+            f"{fault.name}: {len(hit)} of {SESSIONS} sessions were there; the last acted after "
+            f"{took[fault][-1]:.2f} s"
         )
         if fault is signal.SIGSTOP:
             time.sleep(2)  # what it held is too late now
@@ -170,8 +187,8 @@ def test_killed_and_frozen_replicas_lose_double_cross_and_delay_no_act(server: S
 def check_histories(players: list[Player], ledger: Path, frozen: dict[int, float]) -> None:
     """What the clients saw and what the replicas did, held against each other.
 
-    `frozen` are the times at which replicas were: each may have taken a batch just before, and executes it when it
-    goes on.
+    `frozen` are the times at which replicas were: each may have taken a batch just before, and
+    executes it when it goes on.
     """
     begun: dict[tuple[str, int], list[tuple[float, int]]] = {}
     for file in ledger.iterdir():
@@ -185,7 +202,9 @@ def check_histories(players: list[Player], ledger: Path, frozen: dict[int, float
         for call in player.calls:
             executed = begun.pop((call.episode, call.number), [])
             here = f"{call} after {last}, executed {executed}"
-            assert len({pid for _, pid in executed}) == len(executed), f"one replica executed it twice: {here}"
+            assert len({pid for _, pid in executed}) == len(executed), (
+                f"one replica executed it twice: {here}"
+            )
             late = [pid for at, pid in executed if at > call.ended]
             assert all(call.begun < frozen.get(pid, 0.0) for pid in late), (
                 f"executed after its caller had an answer: {here}"
@@ -194,7 +213,9 @@ def check_histories(players: list[Player], ledger: Path, frozen: dict[int, float
                 outcomes[type(call.error).__name__] += 1
                 continue
             outcomes["answered"] += 1
-            assert (call.info["episode"], call.info["number"]) == (call.episode, call.number), f"another's: {here}"
+            assert (call.info["episode"], call.info["number"]) == (call.episode, call.number), (
+                f"another's: {here}"
+            )
             assert executed, f"answered, though nobody executed it: {here}"
             if "resumed" in call.info:
                 outcomes["resumed"] += 1
@@ -202,7 +223,9 @@ def check_histories(players: list[Player], ledger: Path, frozen: dict[int, float
                 assert len(executed) == 1, f"doubled: {here}"
                 if last is not None and last.info is not None and last.episode == call.episode:
                     # what failed in between may have been executed, where its caller does not know
-                    assert 1 <= call.info["acts"] - last.info["acts"] <= call.number - last.number, f"lost: {here}"
+                    assert (
+                        1 <= call.info["acts"] - last.info["acts"] <= call.number - last.number
+                    ), f"lost: {here}"
             last = call
     print(f"{len(players)} sessions: {dict(outcomes)}")
     assert not begun, "executed, though nobody asked"

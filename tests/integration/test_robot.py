@@ -40,7 +40,8 @@ class Counter:
     def observe(self) -> Obs:
         self.tick += 1
         return Obs(
-            {"front": np.zeros((224, 224, 3), np.uint8)}, state={"tick": np.array([max(0, self.tick)], np.float32)}
+            {"front": np.zeros((224, 224, 3), np.uint8)},
+            state={"tick": np.array([max(0, self.tick)], np.float32)},
         )
 
     def apply(self, action: np.ndarray) -> None:
@@ -76,7 +77,9 @@ class Witness(Agent):
             assert act.action.tolist() == self.acts[-2].action.tolist()  # hold
         else:
             asked, row = act.action.tolist()
-            assert row == min(executed - self.executed[asked], ROWS - 1), "an action for another place"
+            assert row == min(executed - self.executed[asked], ROWS - 1), (
+                "an action for another place"
+            )
         return act
 
     def good_since(self, tick: int) -> int:
@@ -90,10 +93,14 @@ def address() -> str:
 
 
 @pytest.fixture(scope="module")
-def server(address: str, tmp_path_factory: pytest.TempPathFactory) -> Iterator[contextlib.ExitStack]:
+def server(
+    address: str, tmp_path_factory: pytest.TempPathFactory
+) -> Iterator[contextlib.ExitStack]:
     """What has the server at `address` running, and may be closed."""
     with contextlib.ExitStack() as running:
-        running.enter_context(serving("served_agents:Ticking", tmp_path_factory.mktemp("log") / "log", address))
+        running.enter_context(
+            serving("served_agents:Ticking", tmp_path_factory.mktemp("log") / "log", address)
+        )
         yield running
 
 
@@ -106,7 +113,9 @@ def witness(address: str, transport: TransportName) -> Iterator[Witness]:
 
 
 def empty_loop() -> dict[str, float]:
-    """The jitter of two seconds of a loop that does nothing, as the best that this machine can do."""
+    """The jitter of two seconds of a loop that does nothing, as the best that this machine can
+    do.
+    """
     with undisturbed():
         pacer = Pacer(HZ)
         while pacer.wait() < 2 * HZ:
@@ -163,13 +172,18 @@ def test_a_killed_replica_and_a_restarted_server_cost_safe_ticks_and_nothing_els
             until=lambda: time.monotonic() > deadline or next(script, True),
         )
         assert next(script, True), f"no resumption: {report}"
-    assert report.safe_ticks > 2 * ROWS  # both times, the server was gone for longer than a chunk lasts
+    # Both times, the server was gone for longer than a chunk lasts.
+    assert report.safe_ticks > 2 * ROWS
     assert seen.longest_s < 5.0, "a tick waited for the server, whose restart takes longer"
     assert barks
 
 
 def _disasters(
-    seen: Witness, server: contextlib.ExitStack, stack: contextlib.ExitStack, address: str, folder: Path
+    seen: Witness,
+    server: contextlib.ExitStack,
+    stack: contextlib.ExitStack,
+    address: str,
+    folder: Path,
 ) -> Iterator[bool]:
     """What happens, tick by tick, each once the robot has been driven for a while."""
     yield False

@@ -31,7 +31,10 @@ def url(server: Server, transport: TransportName) -> str:
 
 def obs(pixel: int, value: int = 0) -> Obs:
     return Obs(
-        {"front": np.full((8, 8, 3), pixel, np.uint8)}, 0.5, {"joints": np.zeros(2, np.float32)}, {"value": value}
+        {"front": np.full((8, 8, 3), pixel, np.uint8)},
+        0.5,
+        {"joints": np.zeros(2, np.float32)},
+        {"value": value},
     )
 
 
@@ -45,7 +48,10 @@ def test_two_sessions_interleaved_never_mix(server: Server, transport: Transport
         agents = {"red": red, "blue": blue}
         pixels = {"red": 10, "blue": 200}
         for name, agent in agents.items():
-            assert agent.reset(obs(pixels[name]), f"the {name} cube", seed=1)["instruction"] == f"the {name} cube"
+            assert (
+                agent.reset(obs(pixels[name]), f"the {name} cube", seed=1)["instruction"]
+                == f"the {name} cube"
+            )
             assert agent.transport == transport
         counts, sums = dict.fromkeys(agents, 0), dict.fromkeys(agents, 0)
         for _ in range(300):

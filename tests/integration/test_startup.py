@@ -65,7 +65,9 @@ def command(*words: str, start_new_session: bool = False) -> Iterator[subprocess
             process.send_signal(signal.SIGTERM)
         said, _ = process.communicate(timeout=180)
         if family:
-            assert process.returncode in (0, INTERRUPTED), f"ended with {process.returncode}:\n{said[-4000:]}"
+            assert process.returncode in (0, INTERRUPTED), (
+                f"ended with {process.returncode}:\n{said[-4000:]}"
+            )
         _, alive = psutil.wait_procs(list(family), timeout=30)
         names = [p.name() for p in alive]
         for p in alive:
@@ -74,7 +76,9 @@ def command(*words: str, start_new_session: bool = False) -> Iterator[subprocess
 
 
 @pytest.mark.parametrize("whole", [signal.SIGTERM, signal.SIGINT], ids=["service", "terminal"])
-def test_a_signal_to_every_process_of_a_server_ends_it_in_seconds_and_in_silence(whole: signal.Signals) -> None:
+def test_a_signal_to_every_process_of_a_server_ends_it_in_seconds_and_in_silence(
+    whole: signal.Signals,
+) -> None:
     """systemd sends SIGTERM to all of a service's processes; Ray's head then ends before Serve can.
 
     tests/cli/test_start_and_stop.py sends it to the command alone.
@@ -84,7 +88,8 @@ def test_a_signal_to_every_process_of_a_server_ends_it_in_seconds_and_in_silence
         assert "Ctrl-C stops\n" in iter(process.stdout.readline, "")
         family = psutil.Process(process.pid).children(recursive=True)
         for one in [psutil.Process(process.pid), *family]:
-            with suppress(ProcessLookupError, psutil.NoSuchProcess):  # some end on their own, or with those before them
+            # Some end on their own, or with those before them.
+            with suppress(ProcessLookupError, psutil.NoSuchProcess):
                 if whole == signal.SIGTERM or os.getpgid(one.pid) == process.pid:
                     one.send_signal(whole)
         begun = time.monotonic()
@@ -126,8 +131,26 @@ def test_the_port_is_closed_while_the_policy_loads_and_clients_wait_for_it(tmp_p
 def test_two_servers_on_one_machine_do_not_meet() -> None:
     ports, robots = [free_port(), free_port()], free_port()
     with (
-        command("serve", "noop", "--port", str(ports[0]), "--set", "action_dim=3", "--vlagents-port", str(robots)),
-        command("serve", "noop", "--port", str(ports[1]), "--set", "action_dim=5", "--serve-set", "batch.max_size=2"),
+        command(
+            "serve",
+            "noop",
+            "--port",
+            str(ports[0]),
+            "--set",
+            "action_dim=3",
+            "--vlagents-port",
+            str(robots),
+        ),
+        command(
+            "serve",
+            "noop",
+            "--port",
+            str(ports[1]),
+            "--set",
+            "action_dim=5",
+            "--serve-set",
+            "batch.max_size=2",
+        ),
     ):
         for port, dim in zip(ports, (3, 5), strict=True):
             with RemoteAgent(f"http://127.0.0.1:{port}", connect_timeout_s=120) as agent:
@@ -163,7 +186,10 @@ def test_serve_deploy_takes_the_same_file(tmp_path: Path) -> None:
     assert "dialects" in file.read_text()
     assert str(serve_port) in file.read_text()
     bin_dir = Path(sys.executable).parent
-    environment = os.environ | {"RAY_AUTH_MODE": "disabled", "PYTHONPATH": os.pathsep.join(sys.path)}
+    environment = os.environ | {
+        "RAY_AUTH_MODE": "disabled",
+        "PYTHONPATH": os.pathsep.join(sys.path),
+    }
     failing = tmp_path / "failing.yaml"
     failing.write_text(
         f"http_options: {{port: {serve_port}}}\napplications:\n"
@@ -181,12 +207,28 @@ def test_serve_deploy_takes_the_same_file(tmp_path: Path) -> None:
 
     with ray_folder() as home:
         ray(
-            str(bin_dir / "ray"), "start", "--head", f"--port={gcs}", f"--dashboard-port={dashboard}", "--num-cpus=2",
-            f"--temp-dir={home}", "--min-worker-port=0", "--max-worker-port=0",
-        )  # fmt: skip
-        deploy = (str(bin_dir / "serve"), "deploy", "-a", f"http://127.0.0.1:{dashboard}", str(file))
-        # The dashboard comes a while after `ray start` has ended; a try of `serve deploy` takes seconds.
-        wait_for(lambda: _answer(f"http://127.0.0.1:{dashboard}/api/serve/applications/")[0] != 0, 120)
+            str(bin_dir / "ray"),
+            "start",
+            "--head",
+            f"--port={gcs}",
+            f"--dashboard-port={dashboard}",
+            "--num-cpus=2",
+            f"--temp-dir={home}",
+            "--min-worker-port=0",
+            "--max-worker-port=0",
+        )
+        deploy = (
+            str(bin_dir / "serve"),
+            "deploy",
+            "-a",
+            f"http://127.0.0.1:{dashboard}",
+            str(file),
+        )
+        # The dashboard comes a while after `ray start` has ended; a try of `serve deploy` takes
+        # seconds.
+        wait_for(
+            lambda: _answer(f"http://127.0.0.1:{dashboard}/api/serve/applications/")[0] != 0, 120
+        )
         wait_for(lambda: ray(*deploy, check=False), 300)
         url = f"http://127.0.0.1:{serve_port}"
         wait_for(lambda: health(url) == 200)
@@ -200,14 +242,21 @@ def test_serve_deploy_takes_the_same_file(tmp_path: Path) -> None:
 
         ray(*deploy[:-1], str(failing))
         seen: list[str] = []
-        wait_for(lambda: seen.append(_status(dashboard, "broken")[0]) or seen[-1] == "DEPLOY_FAILED", 120)
+        wait_for(
+            lambda: seen.append(_status(dashboard, "broken")[0]) or seen[-1] == "DEPLOY_FAILED", 120
+        )
         assert "RUNNING" not in seen
-        assert "the policy did not load: FileNotFoundError: no checkpoint here" in _status(dashboard, "broken")[1]
+        assert (
+            "the policy did not load: FileNotFoundError: no checkpoint here"
+            in _status(dashboard, "broken")[1]
+        )
         assert _status(dashboard, "large")[0] == "DEPLOYING"
         wait_for(lambda: _status(dashboard, "nowhere")[0] == "DEPLOY_FAILED", 120)
         first, said = _status(dashboard, "nowhere")[1].strip().splitlines()
         assert first == "Deploying app 'nowhere' failed with exception:"
-        assert said.startswith("ConfigError: environment.python: no such file, got '/nowhere/bin/python'")
+        assert said.startswith(
+            "ConfigError: environment.python: no such file, got '/nowhere/bin/python'"
+        )
         for app in ("broken", "large"):
             for path in ("healthz", "v1/metadata"):
                 wait_for(lambda place=f"{url}/{app}/{path}": _answer(place)[0] == 503)  # type: ignore[misc]
@@ -217,11 +266,15 @@ def test_serve_deploy_takes_the_same_file(tmp_path: Path) -> None:
 
 def _status(dashboard: int, app: str) -> tuple[str, str]:
     """What `serve status` says of an application, and why."""
-    with urllib.request.urlopen(f"http://127.0.0.1:{dashboard}/api/serve/applications/", timeout=30) as answer:
+    with urllib.request.urlopen(
+        f"http://127.0.0.1:{dashboard}/api/serve/applications/", timeout=30
+    ) as answer:
         found = json.load(answer)["applications"].get(app)
     if found is None:
         return "", ""
-    return found["status"], " ".join([found["message"], *(d["message"] for d in found["deployments"].values())])
+    return found["status"], " ".join(
+        [found["message"], *(d["message"] for d in found["deployments"].values())]
+    )
 
 
 def _answer(url: str) -> tuple[int, Mapping[str, str]]:

@@ -31,7 +31,9 @@ class Handler(BaseHTTPRequestHandler):
     server: Collector
 
     def do_POST(self) -> None:
-        sent = ExportTraceServiceRequest.FromString(self.rfile.read(int(self.headers["Content-Length"])))
+        sent = ExportTraceServiceRequest.FromString(
+            self.rfile.read(int(self.headers["Content-Length"]))
+        )
         for resource in sent.resource_spans:
             for scope in resource.scope_spans:
                 self.server.spans += scope.spans
@@ -96,7 +98,11 @@ def test_client_and_replica_export_one_trace_of_each_request(
         served = by_id[batch.parent_span_id]
         sent = by_id[served.parent_span_id]
         assert (served.name, served.kind) == ("vlagents act", Span.SPAN_KIND_SERVER)
-        assert (sent.name, sent.kind, sent.parent_span_id) == ("vlagents act", Span.SPAN_KIND_CLIENT, b"")
+        assert (sent.name, sent.kind, sent.parent_span_id) == (
+            "vlagents act",
+            Span.SPAN_KIND_CLIENT,
+            b"",
+        )
         assert batch.trace_id == served.trace_id == sent.trace_id
         about = {one.key: one.value.string_value for one in sent.attributes}
         assert about["transport"] == transport

@@ -55,7 +55,9 @@ def test_both_replicas_act_with_a_push_on_every_transport(server: Server) -> Non
     weights = Publisher("serve://Trainable")
     version = weights.push(gain(1))
     assert weights.acknowledged(version) == 2
-    assert [acts(server, transport) for transport in TRANSPORTS for _ in range(2)] == [(1, 1.0)] * 10
+    assert [acts(server, transport) for transport in TRANSPORTS for _ in range(2)] == [
+        (1, 1.0)
+    ] * 10
     for wrong, error in ((gain(np.nan), InvalidWeights), (gain(1), UnchangedWeights)):
         with pytest.raises(error):
             weights.push(wrong)
@@ -73,7 +75,10 @@ def test_a_push_over_the_network_reaches_both_replicas(server: Server) -> None:
 
 @pytest.mark.parametrize("target", ["serve://Trainable", "URL"])
 def test_both_replicas_sleep_and_wake_with_new_weights(server: Server, target: str) -> None:
-    with Publisher(server.url if target == "URL" else target) as weights, ThreadPoolExecutor(4) as threads:
+    with (
+        Publisher(server.url if target == "URL" else target) as weights,
+        ThreadPoolExecutor(4) as threads,
+    ):
         weights.sleep()
         waiting = [threads.submit(acts, server, "http") for _ in range(4)]
         with pytest.raises(PolicyUnavailable, match="the policy sleeps"):

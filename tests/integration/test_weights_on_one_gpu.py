@@ -1,4 +1,6 @@
-"""New weights for two replicas from a learner on their GPU, or from one whose memory on the CPU takes its place."""
+"""New weights for two replicas from a learner on their GPU, or from one whose memory on the CPU
+takes its place.
+"""
 
 from __future__ import annotations
 
@@ -38,7 +40,9 @@ def test_both_replicas_act_with_what_the_learner_hands_over(
         monkeypatch.setattr(shared_values, "_MEMORY", SharedCpuMemory())
     caplog.set_level(logging.INFO, "vlagents_ray_learn")
     resources = {"num_gpus": 0.2} if device == "cuda" else {}
-    document = deployment("served_agents:OnOneGpu", config={"device": device}, replicas=2, resources=resources)
+    document = deployment(
+        "served_agents:OnOneGpu", config={"device": device}, replicas=2, resources=resources
+    )
     learner = torch.nn.Linear(500, 400, device=device).requires_grad_(False)
     with shared_server(document) as server, Publisher("serve://OnOneGpu") as weights:
 

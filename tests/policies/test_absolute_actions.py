@@ -1,4 +1,6 @@
-"""A policy with absolute actions and the same one with relative ones move an arm in the same way."""
+"""A policy with absolute actions and the same one with relative ones move an arm in the same
+way.
+"""
 
 from __future__ import annotations
 
@@ -9,7 +11,16 @@ import numpy as np
 import pytest
 from eval_fakes import wait_for
 
-from vlagents_ray import Act, ActionSpec, Agent, ChunkPlayer, ConfigError, Contract, Obs, PlayerSettings
+from vlagents_ray import (
+    Act,
+    ActionSpec,
+    Agent,
+    ChunkPlayer,
+    ConfigError,
+    Contract,
+    Obs,
+    PlayerSettings,
+)
 from vlagents_ray.contract import CameraSpec, StateSpec
 from vlagents_ray.errors import MissingState
 from vlagents_ray.interface import DELAY, DISTRIBUTION, LEFTOVER
@@ -18,7 +29,8 @@ from vlagents_ray.policies.wrapper import build_agent
 from vlagents_ray.robot.simulated import SimulatedRobot
 from vlagents_ray.testing import check_agent
 
-GOAL = np.array([1.0, -2.0, 0.5], np.float32)  # rad; the last column, a gripper's, is never relative
+# rad; the last column, a gripper's, is never relative.
+GOAL = np.array([1.0, -2.0, 0.5], np.float32)
 HORIZON, TICKS = 12, 40
 ARM = Contract(
     cameras={"front": CameraSpec(32, 32)},
@@ -28,12 +40,16 @@ ARM = Contract(
 
 
 class Reaching(Agent):
-    """Takes two fifths of the way at each row, from the measured pose or from the rows that it is given."""
+    """Takes two fifths of the way at each row, from the measured pose or from the rows that it
+    is given.
+    """
 
     shared = ("gate",)
     continues_plans = True
 
-    def __init__(self, *, relative: bool = False, gated: bool = False, action: ActionSpec | None = None) -> None:
+    def __init__(
+        self, *, relative: bool = False, gated: bool = False, action: ActionSpec | None = None
+    ) -> None:
         self.relative, self.gated = relative, gated
         self.action = action or ActionSpec(dim=3, delta=relative)
         self.gate = threading.Semaphore(0)
@@ -48,7 +64,9 @@ class Reaching(Agent):
         if self.gated and self.acts > 1:  # the first is what `reset` waits for
             assert self.gate.acquire(timeout=30)
         pose = obs.state["joints"]
-        origin = np.append(pose[:2], 0).astype(np.float32) if self.relative else np.zeros(3, np.float32)
+        origin = (
+            np.append(pose[:2], 0).astype(np.float32) if self.relative else np.zeros(3, np.float32)
+        )
         rows = [pose]
         if LEFTOVER in obs.info:
             given = obs.info[LEFTOVER] + origin
@@ -56,15 +74,22 @@ class Reaching(Agent):
         while len(rows) < HORIZON:
             rows.append(rows[-1] + 0.4 * (GOAL - rows[-1]))
         chunk = np.stack(rows) - origin
-        return Act(chunk.astype(np.float32), info={DISTRIBUTION: {"mean": chunk, "std": np.ones_like(chunk)}})
+        return Act(
+            chunk.astype(np.float32),
+            info={DISTRIBUTION: {"mean": chunk, "std": np.ones_like(chunk)}},
+        )
 
 
 def absolute(agent: Agent, **settings: Any) -> AbsoluteActions:
-    return AbsoluteActions(agent, AbsoluteActionsConfig(**{"state": ["arm"], "absolute": [-1], **settings}))
+    return AbsoluteActions(
+        agent, AbsoluteActionsConfig(**{"state": ["arm"], "absolute": [-1], **settings})
+    )
 
 
 def poses(inner: Reaching, agent: Agent, ticks_late: int, **settings: Any) -> np.ndarray:
-    """The joints at each tick, (TICKS, 3) rad, where each answer comes `ticks_late` ticks after the last one."""
+    """The joints at each tick, (TICKS, 3) rad, where each answer comes `ticks_late` ticks after
+    the last one.
+    """
     robot, found = SimulatedRobot(ARM), []
     player = ChunkPlayer(agent, PlayerSettings(**settings))
     agent.initialize()
@@ -98,11 +123,15 @@ def poses(inner: Reaching, agent: Agent, ticks_late: int, **settings: Any) -> np
         {"mode": "async", "real_time_chunking": True, "execute": 3},
     ],
 )
-def test_relative_actions_move_the_arm_as_absolute_ones_do(settings: dict[str, Any], ticks_late: int) -> None:
+def test_relative_actions_move_the_arm_as_absolute_ones_do(
+    settings: dict[str, Any], ticks_late: int
+) -> None:
     gated = settings.get("mode") == "async"
     own, relative = Reaching(gated=gated), Reaching(relative=True, gated=gated)
     wanted = poses(own, own, ticks_late, **settings)
-    np.testing.assert_allclose(poses(relative, absolute(relative), ticks_late, **settings), wanted, atol=1e-5)
+    np.testing.assert_allclose(
+        poses(relative, absolute(relative), ticks_late, **settings), wanted, atol=1e-5
+    )
     assert own.acts == relative.acts
     assert np.abs(wanted[-1] - GOAL).max() < 0.1  # it arrives
 
@@ -132,7 +161,9 @@ def test_a_session_whose_state_is_missing_fails_alone() -> None:
     agent = absolute(Reaching(relative=True))
     full = Obs(state={"joints": np.ones(3, np.float32), "arm": np.ones(2, np.float32)})
     without = Obs(state={"joints": np.ones(3, np.float32)})
-    bad, good = agent.act_batch([without, full], [absolute(Reaching(relative=True)) for _ in range(2)])
+    bad, good = agent.act_batch(
+        [without, full], [absolute(Reaching(relative=True)) for _ in range(2)]
+    )
     assert isinstance(bad, MissingState)
     assert isinstance(good, Act)
 

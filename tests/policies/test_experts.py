@@ -1,4 +1,6 @@
-"""The experts of ManiSkill's tasks: those that are installed here are solved, and what an expert lacks is named."""
+"""The experts of ManiSkill's tasks: those that are installed here are solved, and what an expert
+lacks is named.
+"""
 
 from __future__ import annotations
 
@@ -36,7 +38,9 @@ def test_the_expert_solves_the_task_and_the_cube_stays(task: str) -> None:
 
 
 def test_a_stuck_arm_gets_shorter_commands() -> None:
-    """ManiSkill's inverse kinematics fails for some long steps, and the arm then stays where it is."""
+    """ManiSkill's inverse kinematics fails for some long steps, and the arm then stays where it
+    is.
+    """
     expert = expert_class("maniskill/PushCube-v1")("maniskill/PushCube-v1")
     state = np.zeros(35, np.float32)
     state[25:28] = (0.2, 0.0, 0.0)  # the goal

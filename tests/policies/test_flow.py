@@ -1,4 +1,6 @@
-"""The random steps of flow matching: their distribution, their log-probability, and whose noise they take."""
+"""The random steps of flow matching: their distribution, their log-probability, and whose noise
+they take.
+"""
 
 from __future__ import annotations
 
@@ -11,7 +13,14 @@ from normal_steps import logprob_of_steps
 
 from vlagents_ray.policies import flow
 from vlagents_ray.policies.base import Row
-from vlagents_ray.policies.flow import RandomSteps, chain_entropy, follow, logprob_of_chain, step_mean, step_std
+from vlagents_ray.policies.flow import (
+    RandomSteps,
+    chain_entropy,
+    follow,
+    logprob_of_chain,
+    step_mean,
+    step_std,
+)
 
 torch = pytest.importorskip("torch")
 torch.set_num_threads(1)  # tensors this small are faster in one
@@ -50,7 +59,8 @@ def test_random_steps_lead_to_the_distribution_of_the_flow(level: float) -> None
     x = np.random.default_rng(0).standard_normal(20_000)
     for step in range(steps):
         time = 1.0 - step / steps
-        # of normal data: the expected noise minus the expected action, given x = time * noise + (1 - time) * action
+        # of normal data: the expected noise minus the expected action, given x = time * noise + (1
+        # - time) * action
         gain = (x - (1 - time) * mean) / (time**2 + ((1 - time) * std) ** 2)
         change = time * gain - (mean + (1 - time) * std**2 * gain)
         drawn = np.random.default_rng([1, step]).standard_normal(len(x))
@@ -77,7 +87,9 @@ def test_a_replayed_chain_has_the_log_probability_that_was_stated() -> None:
     assert list(said) == [0, 2]
     chain = torch.from_numpy(np.stack([one["replay"]["chain"] for one in said.values()]))
     again = logprob_of_chain(velocity, chain, said[0]["replay"]["noise_level"])
-    np.testing.assert_allclose(again, np.stack([one["logprob"] for one in said.values()]), atol=1e-4)
+    np.testing.assert_allclose(
+        again, np.stack([one["logprob"] for one in said.values()]), atol=1e-4
+    )
 
 
 def test_a_chain_begins_with_the_noise_and_ends_with_the_actions() -> None:
@@ -114,7 +126,9 @@ def test_neighbours_neither_change_what_is_drawn_nor_are_changed() -> None:
 
 
 def test_what_is_not_returned_has_no_part_in_the_log_probability() -> None:
-    whole, part = (stated(row(0, "logprob", "entropy"), **used)[0] for used in ({}, {"execute": 2, "dim": 1}))
+    whole, part = (
+        stated(row(0, "logprob", "entropy"), **used)[0] for used in ({}, {"execute": 2, "dim": 1})
+    )
     np.testing.assert_array_equal(part["logprob"], whole["logprob"][:2, :1])
     assert part["entropy"] == pytest.approx(whole["entropy"] / (HORIZON * DIM / 2))
 
@@ -129,6 +143,10 @@ def test_only_what_is_wanted_is_stated() -> None:
 
 
 def test_no_statement_imports_from_the_lazy_module() -> None:
-    """`torch.compile` of torch 2.11 follows no import from `transformers` itself; `require` is for code around it."""
+    """`torch.compile` of torch 2.11 follows no import from `transformers` itself; `require` is
+    for code around it.
+    """
     package = Path(flow.__file__).parent
-    assert not [file for file in package.rglob("*.py") if "from transformers import" in file.read_text()]
+    assert not [
+        file for file in package.rglob("*.py") if "from transformers import" in file.read_text()
+    ]

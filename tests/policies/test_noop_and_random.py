@@ -28,8 +28,14 @@ def batch_seconds(agent: Noop, size: int) -> float:
 @pytest.mark.parametrize(
     "agent",
     [
-        *(Noop.from_config(config) for config in ({}, {"action_dim": 4}, {"chunk": 5, "action_dim": 2})),
-        *(Random.from_config(config) for config in ({}, {"action_dim": 2, "low": 0.0, "high": 512.0}, {"chunk": 5})),
+        *(
+            Noop.from_config(config)
+            for config in ({}, {"action_dim": 4}, {"chunk": 5, "action_dim": 2})
+        ),
+        *(
+            Random.from_config(config)
+            for config in ({}, {"action_dim": 2, "low": 0.0, "high": 512.0}, {"chunk": 5})
+        ),
     ],
     ids=lambda agent: type(agent).__name__,
 )
@@ -38,9 +44,12 @@ def test_keeps_the_contract(agent: Noop | Random) -> None:
 
 
 def test_actions_are_zeros_of_the_configured_size() -> None:
-    assert np.array_equal(Noop.from_config({"action_dim": 3}).act(Obs()).action, np.zeros(3, np.float32))
     assert np.array_equal(
-        Noop.from_config({"action_dim": 3, "chunk": 2}).act(Obs()).action, np.zeros((2, 3), np.float32)
+        Noop.from_config({"action_dim": 3}).act(Obs()).action, np.zeros(3, np.float32)
+    )
+    assert np.array_equal(
+        Noop.from_config({"action_dim": 3, "chunk": 2}).act(Obs()).action,
+        np.zeros((2, 3), np.float32),
     )
 
 
@@ -102,7 +111,10 @@ def test_act_before_reset_is_refused() -> None:
 
 
 def test_samples_of_the_distribution_change_no_action() -> None:
-    plain, asked = Random(RandomConfig(chunk=2, low=-2, high=4)), Random(RandomConfig(chunk=2, low=-2, high=4))
+    plain, asked = (
+        Random(RandomConfig(chunk=2, low=-2, high=4)),
+        Random(RandomConfig(chunk=2, low=-2, high=4)),
+    )
     for agent in (plain, asked):
         agent.reset(Obs(), None, seed=5)
     for _ in range(3):

@@ -80,7 +80,9 @@ def test_the_hidden_state_moves_with_a_session(policy: Raptor, replicas: Replica
 
 
 @pytest.mark.parametrize("steps", [5, 400])
-def test_a_session_of_a_killed_replica_says_so_and_acts_as_before(steps: int, replicas: Replicas) -> None:
+def test_a_session_of_a_killed_replica_says_so_and_acts_as_before(
+    steps: int, replicas: Replicas
+) -> None:
     inputs, wanted = reference()
     with replicas.agent() as agent:
         agent.reset(START, None)
@@ -106,7 +108,9 @@ def test_the_observations_that_a_client_keeps_stand_for_the_whole_flight(policy:
         again = together(policy, flights)
         for row in seen[-kept:]:
             late = again(row)
-        errors[kept] = max(np.abs(one.action - two.action).max() for one, two in zip(acts, late, strict=True))
+        errors[kept] = max(
+            np.abs(one.action - two.action).max() for one, two in zip(acts, late, strict=True)
+        )
     print(f"largest difference of an action by the number of observations: {errors}")
     assert errors[policy.contract.history] < TOLERANCE < errors[32]
 
@@ -131,14 +135,17 @@ def test_nine_of_ten_quadrotors_come_to_the_target_and_hover(policy: Raptor) -> 
         hovered |= flying & [info["success"] for info in infos]
         flying &= ~np.array(crashed)
     assert 0.89 <= hovered.mean() <= 0.94
-    assert abs(hovered.sum() - RATES["RAPTOR"]["successes"]) <= 2  # other processors round otherwise
+    # Other processors round otherwise.
+    assert abs(hovered.sum() - RATES["RAPTOR"]["successes"]) <= 2
     assert RATES["RAPTOR"]["episodes"] == 500
 
 
 def test_a_quadrotor_flies_alone_as_it_does_among_others(policy: Raptor) -> None:
     among = fly(range(8), together(policy, 8), 500)
     for seed in range(8):
-        np.testing.assert_array_equal(fly([seed], together(policy, 1), 500)[..., 0], among[..., seed])
+        np.testing.assert_array_equal(
+            fly([seed], together(policy, 1), 500)[..., 0], among[..., seed]
+        )
 
 
 def test_a_crashed_quadrotor_stays_where_it_is_while_the_others_fly_on() -> None:
@@ -150,7 +157,9 @@ def test_a_crashed_quadrotor_stays_where_it_is_while_the_others_fly_on() -> None
 
 
 def test_a_quadrotor_obeys_gravity_and_thrust() -> None:
-    """Without thrust a quadrotor falls as a stone does; level and with the thrust of its weight it stays."""
+    """Without thrust a quadrotor falls as a stone does; level and with the thrust of its weight
+    it stays.
+    """
     flights = Quadrotors([0, 1, 2])
     body = flights.parameters
     for axis in "xyz":
@@ -163,7 +172,11 @@ def test_a_quadrotor_obeys_gravity_and_thrust() -> None:
     for _ in range(100):
         falling.step(-np.ones((4, 3)))
     np.testing.assert_allclose(falling.state[2], -9.81 / 2, rtol=1e-9)
-    a, b, c = (9.223048e-2, 1.437313e-2, 3.52526e-3 - 0.11012887 * body["mass"] * 9.81 / (4 * body["thrust"]))
+    a, b, c = (
+        9.223048e-2,
+        1.437313e-2,
+        3.52526e-3 - 0.11012887 * body["mass"] * 9.81 / (4 * body["thrust"]),
+    )
     speed = (-b + np.sqrt(b * b - 4 * a * c)) / (2 * a)
     flights.state[13:] = speed
     for _ in range(100):
@@ -182,4 +195,6 @@ def test_an_evaluation_plays_the_flights(policy: Raptor, tmp_path: Path) -> None
     [cell] = summary.results.cells
     for i, one in enumerate(cell.episodes):
         states = fly([i], together(policy, 1), one.result.steps)
-        assert one.result.success_at_end == bool((np.linalg.norm(states[-100:, :3, 0], axis=1) < 0.2).all())
+        assert one.result.success_at_end == bool(
+            (np.linalg.norm(states[-100:, :3, 0], axis=1) < 0.2).all()
+        )

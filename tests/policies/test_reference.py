@@ -23,7 +23,14 @@ from vlagents_ray.policies.adapters import WEIGHTS as ADAPTER_WEIGHTS
 from vlagents_ray.policies.base import Row
 from vlagents_ray.policies.flow import logprob_of_chain
 from vlagents_ray.policies.reference import Reference, policy
-from vlagents_ray.policies.reference.checkpoint import CONFIG, WEIGHTS, Checkpoint, Embodiment, NetworkSizes, words_of
+from vlagents_ray.policies.reference.checkpoint import (
+    CONFIG,
+    WEIGHTS,
+    Checkpoint,
+    Embodiment,
+    NetworkSizes,
+    words_of,
+)
 from vlagents_ray.testing import check_agent
 from vlagents_ray.weights.safetensors import write_values
 
@@ -35,14 +42,20 @@ network = pytest.importorskip("vlagents_ray.policies.reference.network")
 WORDS = ("put the red puck on the blue pad", "lift the blue puck", "open the drawer")
 ROBOTS = {
     "tabletop": Embodiment(
-        cameras={"scene": "front", "wrist": "wrist"}, state=["xyzrpy", "gripper"], state_mean=[0.0] * 7,
-        state_std=[0.1] * 6 + [0.0], action={"dim": 4, "space": "ee_position", "delta": True},
+        cameras={"scene": "front", "wrist": "wrist"},
+        state=["xyzrpy", "gripper"],
+        state_mean=[0.0] * 7,
+        state_std=[0.1] * 6 + [0.0],
+        action={"dim": 4, "space": "ee_position", "delta": True},
     ),
     "sawyer": Embodiment(
-        cameras={"scene": "corner2", "wrist": "gripperPOV"}, state=["xyz", "gripper"], state_mean=[0.0] * 4,
-        state_std=[0.1] * 4, action={"dim": 4, "space": "ee_position", "delta": True},
+        cameras={"scene": "corner2", "wrist": "gripperPOV"},
+        state=["xyz", "gripper"],
+        state_mean=[0.0] * 4,
+        state_std=[0.1] * 4,
+        action={"dim": 4, "space": "ee_position", "delta": True},
     ),
-}  # fmt: skip
+}
 ALL = ["logprob", "entropy", "replay"]
 LEVEL = 0.5
 BATCHED = 1e-5  # how far a batch's actions may be off those of a lone row, in float32 on a CPU
@@ -82,8 +95,12 @@ def learnt(folder: Path) -> Any:
 
 def seen(seed: int, side: tuple[int, int] = (64, 64), **info: Any) -> Obs:
     rng = np.random.default_rng(seed)
-    cameras = {name: rng.integers(0, 256, (*side, 3), dtype=np.uint8) for name in ("front", "wrist")}
-    return Obs(cameras, float(rng.random()), {"xyzrpy": rng.normal(0, 0.1, 6).astype(np.float32)}, info)
+    cameras = {
+        name: rng.integers(0, 256, (*side, 3), dtype=np.uint8) for name in ("front", "wrist")
+    }
+    return Obs(
+        cameras, float(rng.random()), {"xyzrpy": rng.normal(0, 0.1, 6).astype(np.float32)}, info
+    )
 
 
 def begun(policy: Any, seed: int, words: str = WORDS[0], **options: Any) -> Any:
@@ -106,10 +123,18 @@ def test_it_keeps_what_an_agent_promises(folder: Path) -> None:
 
 def test_each_robot_has_its_own_contract(folder: Path, loaded: Any) -> None:
     contract = loaded.contract
-    assert (set(contract.cameras), set(contract.state), contract.gripper) == ({"front", "wrist"}, {"xyzrpy"}, True)
+    assert (set(contract.cameras), set(contract.state), contract.gripper) == (
+        {"front", "wrist"},
+        {"xyzrpy"},
+        True,
+    )
     assert (contract.action.dim, contract.chunk, contract.instruction) == (4, 8, True)
     other = made(folder, embodiment="sawyer").contract
-    assert (set(other.cameras), set(other.state), other.chunk) == ({"corner2", "gripperPOV"}, {"xyz"}, 8)
+    assert (set(other.cameras), set(other.state), other.chunk) == (
+        {"corner2", "gripperPOV"},
+        {"xyz"},
+        8,
+    )
     with pytest.raises(ConfigError, match=r"got None, want one of \['sawyer', 'tabletop'\]"):
         made(folder, embodiment=None)
 
@@ -136,7 +161,10 @@ def test_images_state_words_and_their_order_all_matter(loaded: Any) -> None:
 
 
 def test_what_it_was_not_trained_with_is_refused(loaded: Any) -> None:
-    for words, said in (("lift the pink puck", "got 'pink' in"), ("puck " * 17, "got 17 words, want 1 to 16")):
+    for words, said in (
+        ("lift the pink puck", "got 'pink' in"),
+        ("puck " * 17, "got 17 words, want 1 to 16"),
+    ):
         with pytest.raises(InvalidObservation, match=said):
             begun(loaded, 0, words)
     with pytest.raises(MissingCamera, match="wrist"):
@@ -164,12 +192,18 @@ def test_frozen_rows_come_back_as_planned_and_later_ones_follow_the_plan(loaded:
     plan, free = begun(loaded, 1).act(seen(1)).action[2:], begun(loaded, 0).act(seen(0)).action
     guided = begun(loaded, 0).act(seen(0, **{LEFTOVER: plan, DELAY: 3})).action
     np.testing.assert_allclose(guided[:3], plan[:3], atol=1e-5)
-    off, without = np.abs(guided[: len(plan)] - plan).mean(1), np.abs(free[: len(plan)] - plan).mean(1)
+    off, without = (
+        np.abs(guided[: len(plan)] - plan).mean(1),
+        np.abs(free[: len(plan)] - plan).mean(1),
+    )
     assert (off[3:] < without[3:]).all()
 
 
 def test_the_log_probability_is_the_one_that_a_learner_computes(learnt: Any) -> None:
-    views, sessions = [seen(i, **{WANT: ALL, SAMPLES: 2}) for i in range(2)], [begun(learnt, i) for i in range(2)]
+    views, sessions = (
+        [seen(i, **{WANT: ALL, SAMPLES: 2}) for i in range(2)],
+        [begun(learnt, i) for i in range(2)],
+    )
     rows = []
     for session, obs in zip(sessions, views, strict=True):
         frame = session.perceive(obs)
@@ -181,7 +215,9 @@ def test_the_log_probability_is_the_one_that_a_learner_computes(learnt: Any) -> 
     with torch.no_grad():
         velocity = network.flow_velocity(learnt.model.network, inputs)
         again = logprob_of_chain(velocity, chains, LEVEL)
-        first = network.flow_velocity(learnt.model.network, {name: value[:1] for name, value in inputs.items()})
+        first = network.flow_velocity(
+            learnt.model.network, {name: value[:1] for name, value in inputs.items()}
+        )
         total = logprob_of_steps(first, said[0]["replay"]["chain"], LEVEL)
     np.testing.assert_allclose(again, np.stack([one["logprob"] for one in said]), atol=SUMMED)
     np.testing.assert_allclose(said[0]["logprob"], total, atol=SUMMED)
@@ -189,29 +225,42 @@ def test_the_log_probability_is_the_one_that_a_learner_computes(learnt: Any) -> 
 
 
 def test_the_samples_of_an_observation_are_of_one_reading_of_it(learnt: Any) -> None:
-    check_shared_readings(learnt, [seen(0, **{SAMPLES: 4, WANT: ALL}), seen(1)], begun, policy, BATCHED)
+    check_shared_readings(
+        learnt, [seen(0, **{SAMPLES: 4, WANT: ALL}), seen(1)], begun, policy, BATCHED
+    )
 
 
-def test_compiled_in_bfloat16_and_with_pushed_weights_it_stays_itself(folder: Path, loaded: Any) -> None:
+def test_compiled_in_bfloat16_and_with_pushed_weights_it_stays_itself(
+    folder: Path, loaded: Any
+) -> None:
     views = [seen(i) for i in range(3)]
     with counting_compiler() as compiler:
         compiled = made(folder, compile="require", batch_sizes=[3])
         assert compiler.rows == [3, 3]  # what is seen, and one step of the flow
         np.testing.assert_allclose(acted(compiled, views), acted(loaded, views), atol=BATCHED)
         assert compiler.calls > 0
-    np.testing.assert_allclose(acted(made(folder, dtype="bfloat16"), views), acted(loaded, views), atol=0.02)
+    np.testing.assert_allclose(
+        acted(made(folder, dtype="bfloat16"), views), acted(loaded, views), atol=0.02
+    )
     policy = made(folder)
     check_pushed_weights(policy, lambda: begun(policy, 0).act(seen(0)).action)
 
 
-def test_a_row_with_an_adapter_acts_as_the_adapter_merged(folder: Path, tmp_path: Path, loaded: Any) -> None:
+def test_a_row_with_an_adapter_acts_as_the_adapter_merged(
+    folder: Path, tmp_path: Path, loaded: Any
+) -> None:
     rng, layer = np.random.default_rng(0), "context"
     weight = loaded.model.network.state_dict()[f"{layer}.weight"]
-    low, high = (rng.normal(0, 0.1, shape).astype(np.float32) for shape in ((2, weight.shape[1]), (weight.shape[0], 2)))
+    low, high = (
+        rng.normal(0, 0.1, shape).astype(np.float32)
+        for shape in ((2, weight.shape[1]), (weight.shape[0], 2))
+    )
     own = tmp_path / "adapter"
     own.mkdir()
     settings = {"peft_type": "LORA", "r": 2, "lora_alpha": 2, "target_modules": [layer]}
-    (own / ADAPTER_CONFIG).write_text(json.dumps({**settings, "base_model_name_or_path": str(folder)}))
+    (own / ADAPTER_CONFIG).write_text(
+        json.dumps({**settings, "base_model_name_or_path": str(folder)})
+    )
     with (own / ADAPTER_WEIGHTS).open("wb") as file:
         write_values(file, {f"base_model.model.{layer}.lora_{name}.weight": value for name, value in
                             (("A", low), ("B", high))})  # fmt: skip
@@ -223,4 +272,6 @@ def test_a_row_with_an_adapter_acts_as_the_adapter_merged(folder: Path, tmp_path
     acts = [act.action for act in adapted.act_batch(views, sessions)]
     np.testing.assert_allclose(acts[0], acted(merged, views)[0], atol=BATCHED)
     np.testing.assert_allclose(acts[1], acted(loaded, views)[1], atol=BATCHED)
-    check_pushed_weights(adapted, lambda: begun(adapted, 0, adapter="own").act(seen(0)).action, "own/")
+    check_pushed_weights(
+        adapted, lambda: begun(adapted, 0, adapter="own").act(seen(0)).action, "own/"
+    )

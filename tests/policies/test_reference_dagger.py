@@ -1,4 +1,6 @@
-"""DAgger with the reference policy: corrections that an expert shows, and training on these alone."""
+"""DAgger with the reference policy: corrections that an expert shows, and training on these
+alone.
+"""
 
 from __future__ import annotations
 
@@ -20,7 +22,9 @@ CAMERAS = {"tabletop": {"scene": "front", "wrist": "wrist"}}
 
 
 def program(name: str) -> Any:
-    spec = importlib.util.spec_from_file_location(f"reference_{name}_of_dagger", REFERENCE / f"{name}.py")
+    spec = importlib.util.spec_from_file_location(
+        f"reference_{name}_of_dagger", REFERENCE / f"{name}.py"
+    )
     assert spec is not None
     assert spec.loader is not None
     module = sys.modules[spec.name] = importlib.util.module_from_spec(spec)
@@ -31,7 +35,9 @@ def program(name: str) -> Any:
 @pytest.fixture(scope="module")
 def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("data")
-    program("dagger").record(REFERENCE / "checkpoint", folder / "tabletop", episodes=6, seed=2_000_000)
+    program("dagger").record(
+        REFERENCE / "checkpoint", folder / "tabletop", episodes=6, seed=2_000_000
+    )
     return folder
 
 
@@ -63,6 +69,8 @@ def test_training_goes_on_from_the_checkpoint_with_the_experts_frames_alone(
         led += [step.intervention for step in dataset.steps(session.episodes[0], Names(), None)]
     assert np.array_equal(frames.place, np.flatnonzero(led))
     old = train.read_network(before.sizes, start).state_dict()
-    new = train.fit(checkpoint, frames, 2, 0, tmp_path / "state.pt", rate=1e-4, start=start).state_dict()
+    new = train.fit(
+        checkpoint, frames, 2, 0, tmp_path / "state.pt", rate=1e-4, start=start
+    ).state_dict()
     moved = max(float((new[name] - value).abs().max()) for name, value in old.items())
     assert 0 < moved < 1e-3

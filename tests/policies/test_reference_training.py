@@ -1,4 +1,6 @@
-"""The training of the reference policy, from demonstrations that are recorded and exported by the usual commands."""
+"""The training of the reference policy, from demonstrations that are recorded and exported by
+the usual commands.
+"""
 
 from __future__ import annotations
 
@@ -39,14 +41,21 @@ def train() -> Any:
 
 @pytest.fixture(scope="module")
 def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Two episodes of each task and strength of disturbance, as in the folder's plan of demonstrations."""
+    """Two episodes of each task and strength of disturbance, as in the folder's plan of
+    demonstrations.
+    """
     folder = tmp_path_factory.mktemp("data")
     plan = yaml.safe_load((ROOT / "reference/demonstrations/tabletop.yaml").read_text())
     plan["suites"] = [suite | {"episodes": 2} for suite in plan["suites"]]
     plan["policies"] = [{"name": "expert"}]
     evaluate(EvalConfig(**plan | {"out": folder / "runs", "workers": 0}), agent_factory=Scripted)
     objects = ["puck", "target"]
-    to_lerobot(Results.load(folder / "runs"), folder / "tabletop", successes=True, environment_state=objects)
+    to_lerobot(
+        Results.load(folder / "runs"),
+        folder / "tabletop",
+        successes=True,
+        environment_state=objects,
+    )
     return folder
 
 
@@ -93,12 +102,19 @@ def test_a_training_that_was_cut_off_and_a_second_one_end_with_the_same_weights(
     assert not torch.equal(other.queries, whole.queries)
 
 
-def test_what_was_trained_is_served(train: Any, data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_was_trained_is_served(
+    train: Any, data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     from vlagents_ray.policies.reference import Reference
 
     monkeypatch.setattr(train, "BATCH", 16)
     checkpoint, frames = train.read(data, CAMERAS, tmp_path / "images")
-    train.save(checkpoint, train.fit(checkpoint, frames, 2, 0, tmp_path / "state.pt"), tmp_path / "checkpoint", {})
+    train.save(
+        checkpoint,
+        train.fit(checkpoint, frames, 2, 0, tmp_path / "state.pt"),
+        tmp_path / "checkpoint",
+        {},
+    )
     policy = Reference.from_config({"checkpoint": str(tmp_path / "checkpoint"), "execute": 4})
     policy.initialize()
     env = Tabletop("stack", width=64, height=64, cameras=("front", "wrist"))

@@ -34,7 +34,9 @@ def test_they_are_small_enough_for_a_repository() -> None:
 
 @pytest.fixture
 def one_thread() -> Iterator[None]:
-    """Lets torch compute with one thread: batches of one are too small to share, and other tests run beside."""
+    """Lets torch compute with one thread: batches of one are too small to share, and other tests
+    run beside.
+    """
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     yield
@@ -46,9 +48,14 @@ def one_thread() -> Iterator[None]:
 def test_they_succeed_as_often_as_their_card_says(env: str, tmp_path: Path) -> None:
     solved, episodes = RATES["tabletop"][env]
     options: dict[str, Any] = {"cameras": ["front", "wrist"], "width": 64, "height": 64}
-    suite = SuiteConfig(envs=[env], env_options=options, episodes=EPISODES, seeds=[10_000])  # seeds of no evaluation
+    # Seeds of no evaluation.
+    suite = SuiteConfig(envs=[env], env_options=options, episodes=EPISODES, seeds=[10_000])
     plan = EvalConfig(
-        policies=[{"name": "reference", "execute": 4}], suites=[suite], out=tmp_path, video="none", workers=0
+        policies=[{"name": "reference", "execute": 4}],
+        suites=[suite],
+        out=tmp_path,
+        video="none",
+        workers=0,
     )
     config = {"checkpoint": str(CHECKPOINT), "embodiment": "tabletop"}
     found = evaluate(plan, agent_factory=lambda: Reference.from_config(config)).total

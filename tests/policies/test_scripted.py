@@ -34,7 +34,9 @@ def tabletop_views() -> tuple[list[Obs], list[str]]:
 
 def test_keeps_the_contract() -> None:
     views, instructions = tabletop_views()
-    check_agent(Scripted(), obs=views, instructions=instructions, reset_kwargs={"env": "tabletop"}, steps=10)
+    check_agent(
+        Scripted(), obs=views, instructions=instructions, reset_kwargs={"env": "tabletop"}, steps=10
+    )
 
 
 def test_the_env_of_reset_comes_before_the_task_of_the_config() -> None:
@@ -79,7 +81,9 @@ def test_a_failed_reset_keeps_no_expert() -> None:
         agent.act(views[0])
 
 
-@pytest.mark.parametrize("text", ["", "lift the orange puck", "open the drawer", "put the red puck on the blue puck"])
+@pytest.mark.parametrize(
+    "text", ["", "lift the orange puck", "open the drawer", "put the red puck on the blue puck"]
+)
 def test_an_instruction_that_it_does_not_understand_is_refused(text: str) -> None:
     views, _ = tabletop_views()
     with pytest.raises(InvalidObservation, match="want one like"):

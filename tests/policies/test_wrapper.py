@@ -11,7 +11,13 @@ from pydantic import BaseModel
 
 from vlagents_ray import Act, Agent, Obs
 from vlagents_ray.contract import ActionSpec, Contract
-from vlagents_ray.errors import ConfigError, InvalidObservation, NotTrainable, PolicyFailed, UnknownPolicy
+from vlagents_ray.errors import (
+    ConfigError,
+    InvalidObservation,
+    NotTrainable,
+    PolicyFailed,
+    UnknownPolicy,
+)
 from vlagents_ray.policies.wrapper import Wrapper, build_agent
 from vlagents_ray.serve.models.agent_copies import AgentCopies
 from vlagents_ray.testing import check_agent
@@ -59,14 +65,18 @@ class Dim(Wrapper):
         assert isinstance(first, Obs)
         return first
 
-    def change_batch(self, obs: Sequence[Obs], sessions: Sequence[Wrapper]) -> list[Obs | Exception]:
+    def change_batch(
+        self, obs: Sequence[Obs], sessions: Sequence[Wrapper]
+    ) -> list[Obs | Exception]:
         return [self._dim(one, session) for one, session in zip(obs, sessions, strict=True)]  # type: ignore[arg-type]
 
     def _dim(self, obs: Obs, session: Dim) -> Obs | Exception:
         if "front" not in obs.cameras:
             return InvalidObservation("no front camera")
         session.count += 1
-        return Obs(cameras={"front": obs.cameras["front"] - np.uint8(self.config.by + session.count)})
+        return Obs(
+            cameras={"front": obs.cameras["front"] - np.uint8(self.config.by + session.count)}
+        )
 
 
 BRIGHT, DIM = f"{__name__}:Bright", f"{__name__}:Dim"

@@ -1,4 +1,6 @@
-"""These tests follow what package indexes have today: `make programs` runs them each night, and no other command."""
+"""These tests follow what package indexes have today: `make programs` runs them each night, and
+no other command.
+"""
 
 from __future__ import annotations
 

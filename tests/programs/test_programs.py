@@ -1,4 +1,5 @@
-"""Programs that others wrote, as PyPI has them, each in an environment of its own, act with a policy of ours.
+"""Programs that others wrote, as PyPI has them, each in an environment of its own, act with a
+policy of ours.
 
 The list is in `tests/support/programs.py`. The server is a replica's endpoints in this process.
 """
@@ -28,7 +29,12 @@ from vlagents_ray.protocol.messages import DEFAULT_LIMITS
 from vlagents_ray.registry import dialect_class
 from vlagents_ray.serve.access.api_keys import NoKey
 from vlagents_ray.serve.config.dialects import DialectArgs
-from vlagents_ray.serve.dialects.base import GatewayContext, ReplicaContext, RouteDialect, dialect_routes
+from vlagents_ray.serve.dialects.base import (
+    GatewayContext,
+    ReplicaContext,
+    RouteDialect,
+    dialect_routes,
+)
 from vlagents_ray.serve.endpoints.access_middleware import AccessMiddleware
 from vlagents_ray.serve.endpoints.http import build_http_app
 from vlagents_ray.serve.ports import free_port, reserve
@@ -37,21 +43,26 @@ ROWS = 4
 
 
 def chunk(acts: int, dim: int) -> np.ndarray:
-    """The rows of the act of that number: numbers in [0, 1] that no two rows share, exact in float32."""
+    """The rows of the act of that number: numbers in [0, 1] that no two rows share, exact in
+    float32.
+    """
     return (np.arange(ROWS * dim, dtype=np.float32).reshape(ROWS, dim) + 64 * (acts - 1)) / 1024
 
 
 class Witness(Agent):
     """A policy that notes what it sees; its gripper is 1 when open."""
 
-    seen: ClassVar[list[tuple[Obs, str | None, int]]] = []  # by all sessions: with the instruction and the act's number
+    # By all sessions: with the instruction and the act's number.
+    seen: ClassVar[list[tuple[Obs, str | None, int]]] = []
 
     def __init__(self, dim: int) -> None:
         self.dim = dim
 
     @property
     def contract(self) -> Contract:
-        return Contract(action=ActionSpec(dim=self.dim, gripper_open=1.0, gripper_closed=0.0), chunk=ROWS)
+        return Contract(
+            action=ActionSpec(dim=self.dim, gripper_open=1.0, gripper_closed=0.0), chunk=ROWS
+        )
 
     def reset(self, obs: Obs, instruction: str | None, **kwargs: object) -> dict[str, object]:
         self.instruction, self.acts = instruction, 0
@@ -74,7 +85,9 @@ def serving(dim: int, dialects: Mapping[str, Any]) -> Iterator[int]:
         [(name, settings)] = dialects.items()
         cls = dialect_class(name)
         if issubclass(cls, RouteDialect):
-            routes = dialect_routes(DialectArgs(**dialects), ReplicaContext(engine, lambda: METADATA, DEFAULT_LIMITS))
+            routes = dialect_routes(
+                DialectArgs(**dialects), ReplicaContext(engine, lambda: METADATA, DEFAULT_LIMITS)
+            )
             inside = build_http_app(engine, lambda: METADATA, DEFAULT_LIMITS, more=routes)
             yield stack.enter_context(served(AccessMiddleware(inside, None, "app")))
             return
@@ -87,7 +100,12 @@ def serving(dim: int, dialects: Mapping[str, Any]) -> Iterator[int]:
 
 
 @pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=pytest.mark.program(name)) for name, one in PROGRAMS.items() if one.client]
+    "name",
+    [
+        pytest.param(name, marks=pytest.mark.program(name))
+        for name, one in PROGRAMS.items()
+        if one.client
+    ],
 )
 def test_it_executes_the_policys_actions(name: str) -> None:
     program = PROGRAMS[name]
@@ -98,13 +116,16 @@ def test_it_executes_the_policys_actions(name: str) -> None:
     assert len(executed) == clients.STEPS
     assert len(seen) == clients.STEPS // program.used
     stateless = "openvla" in program.dialects
-    assert [acts for _, _, acts in seen] == ([1] * len(seen) if stateless else list(range(1, len(seen) + 1)))
+    assert [acts for _, _, acts in seen] == (
+        [1] * len(seen) if stateless else list(range(1, len(seen) + 1))
+    )
     for number, (obs, instruction, _) in enumerate(seen):
         assert instruction == clients.TASK
         assert sorted(obs.cameras) == sorted(said["cameras"])
         for image in obs.cameras.values():
             middle = image[image.shape[0] // 2, image.shape[1] // 2].astype(int)
-            assert np.abs(middle - clients.picture(number * program.used)[0, 0]).max() <= 1  # one sends JPEG's pixels
+            # One sends JPEG's pixels.
+            assert np.abs(middle - clients.picture(number * program.used)[0, 0]).max() <= 1
         assert bool(obs.state) == bool(said["state"])
         for key, part in said["state"].items():
             np.testing.assert_array_equal(obs.state[key], np.float32(part))
@@ -119,7 +140,14 @@ def run_example(name: str, *options: str, **variables: str) -> str:
     folder = Path(os.environ["OPENPI_SRC"]) / "examples" / name
     theirs = ["--requirement", str(folder / "requirements.txt"), *program.requirements]
     command = [str(environment(name, theirs, program.python)), str(folder / "main.py"), *options]
-    done = subprocess.run(command, env=os.environ | variables, capture_output=True, text=True, timeout=500, check=False)
+    done = subprocess.run(
+        command,
+        env=os.environ | variables,
+        capture_output=True,
+        text=True,
+        timeout=500,
+        check=False,
+    )
     assert done.returncode == 0, done.stderr
     acts = [acts for _, _, acts in Witness.seen]
     assert acts == list(range(1, len(acts) + 1))  # one session
@@ -132,7 +160,9 @@ def run_example(name: str, *options: str, **variables: str) -> str:
 
 @pytest.mark.source("OPENPI_SRC")
 @pytest.mark.program("openpi examples/simple_client")
-@pytest.mark.parametrize(("env", "preset", "dim"), [("DROID", "openpi-droid", 8), ("ALOHA_SIM", "openpi-aloha", 14)])
+@pytest.mark.parametrize(
+    ("env", "preset", "dim"), [("DROID", "openpi-droid", 8), ("ALOHA_SIM", "openpi-aloha", 14)]
+)
 def test_openpis_simple_client_measures_the_server(env: str, preset: str, dim: int) -> None:
     with serving(dim, {"openpi": {"mapping": preset}}) as port:
         options = ("--host", "127.0.0.1", "--port", str(port), "--env", env, "--num-steps", "5")
@@ -144,7 +174,14 @@ def test_openpis_simple_client_measures_the_server(env: str, preset: str, dim: i
 @pytest.mark.program("openpi examples/aloha_sim")
 def test_openpis_aloha_example_plays_an_episode(tmp_path: Path) -> None:
     with serving(14, {"openpi": {"mapping": "openpi-aloha"}}) as port:
-        options = ("--args.host", "127.0.0.1", "--args.port", str(port), "--args.action-horizon", str(ROWS))
+        options = (
+            "--args.host",
+            "127.0.0.1",
+            "--args.port",
+            str(port),
+            "--args.action-horizon",
+            str(ROWS),
+        )
         run_example("aloha_sim", *options, "--args.out-dir", str(tmp_path), MUJOCO_GL="egl")
     assert len(Witness.seen) == 300 // ROWS
     assert [video.suffix for video in tmp_path.iterdir()] == [".mp4"]

@@ -54,7 +54,9 @@ arrays = hnp.arrays(
     dtype=st.sampled_from([np.dtype(t) for t in ("?", "u1", "i2", "i4", "i8", "f2", "f4", "f8")]),
     shape=hnp.array_shapes(min_dims=0, max_dims=3, max_side=5),
 )
-leaves = st.none() | st.booleans() | st.integers(-(2**53), 2**53) | st.floats() | st.text(max_size=10)
+leaves = (
+    st.none() | st.booleans() | st.integers(-(2**53), 2**53) | st.floats() | st.text(max_size=10)
+)
 infos = st.dictionaries(
     names,
     st.recursive(
@@ -67,7 +69,9 @@ infos = st.dictionaries(
 observations = st.builds(
     Obs,
     cameras=st.dictionaries(
-        names, hnp.arrays(np.uint8, st.tuples(st.integers(1, 9), st.integers(1, 9), st.just(3))), max_size=3
+        names,
+        hnp.arrays(np.uint8, st.tuples(st.integers(1, 9), st.integers(1, 9), st.just(3))),
+        max_size=3,
     ),
     gripper=st.none() | st.floats(0, 1),
     state=st.dictionaries(names, hnp.arrays(np.float32, st.integers(0, 9)), max_size=3),
@@ -91,7 +95,12 @@ def same(a: object, b: object) -> bool:
 def test_a_request_comes_back_as_it_was(obs: Obs, instruction: str | None, kwargs: dict) -> None:
     sent = Request("reset", obs, instruction, kwargs, request_id="r1", deadline_ms=20.0)
     got = decode_request(encode_requests([sent], RAW))
-    assert (got.op, got.instruction, got.request_id, got.deadline_ms) == ("reset", instruction, "r1", 20.0)
+    assert (got.op, got.instruction, got.request_id, got.deadline_ms) == (
+        "reset",
+        instruction,
+        "r1",
+        20.0,
+    )
     assert got.obs is not None
     for part in ("cameras", "gripper", "state", "info"):
         assert same(getattr(obs, part), getattr(got.obs, part)), part
@@ -100,7 +109,9 @@ def test_a_request_comes_back_as_it_was(obs: Obs, instruction: str | None, kwarg
 
 @given(hnp.arrays(np.float32, hnp.array_shapes(min_dims=1, max_dims=2)), st.booleans(), infos)
 def test_a_reply_comes_back_as_it_was(action: np.ndarray, done: bool, info: dict) -> None:
-    got = decode_replies(encode_replies([Reply("r1", Act(action, done, info), timing={"queue_ms": 0.5})]))[0]
+    got = decode_replies(
+        encode_replies([Reply("r1", Act(action, done, info), timing={"queue_ms": 0.5})])
+    )[0]
     assert same(action, got.act.action)
     assert (got.request_id, got.act.done, got.timing) == ("r1", done, {"queue_ms": 0.5})
     assert same(info, got.act.info)
@@ -122,7 +133,9 @@ def test_a_step_is_text_since_some_parsers_round_it() -> None:
         encode_replies([Reply("r1", info={}, step=step)]),
     ):
         assert json.loads(frame[8 : 8 + struct.unpack("<I", frame[4:8])[0]])["step"] == str(step)
-        assert (decode_request(frame) if b'"op"' in frame else decode_replies(frame)[0]).step == step
+        assert (
+            decode_request(frame) if b'"op"' in frame else decode_replies(frame)[0]
+        ).step == step
     assert decode_request(b"".join(pack({"op": "act", "obs": {}, "step": "3"}, []))).step == 3
     for wrong in (3, "x", "-1", "1.5", "\u00b2", "1" * 99, 2.0, -1, True, []):
         with pytest.raises(MalformedMessage, match="step"):
@@ -144,7 +157,9 @@ def test_half_of_a_surrogate_pair_is_malformed() -> None:
 
 
 def test_an_error_comes_back_as_its_own_class() -> None:
-    got = decode_replies(encode_replies([Reply("r1", error=MissingCamera("wrist", have=["front"]))]))[0]
+    got = decode_replies(
+        encode_replies([Reply("r1", error=MissingCamera("wrist", have=["front"]))])
+    )[0]
     assert type(got.error) is MissingCamera
     assert "wrist" in str(got.error)
 
@@ -186,7 +201,9 @@ def test_a_damaged_frame_is_refused_or_harmless_and_a_truncated_one_malformed() 
     choose, refused, sent = random.Random(0), 0, many(5000)
     for _ in range(sent):
         try:
-            [answer, *_] = read_requests(mutated(choose, choose.choice(frames)), Budget(DEFAULT_LIMITS))
+            [answer, *_] = read_requests(
+                mutated(choose, choose.choice(frames)), Budget(DEFAULT_LIMITS)
+            )
         except VLAgentsError:
             refused += 1  # by name; anything else fails the test
             continue
@@ -209,11 +226,31 @@ def _frame(header: dict, *blobs: bytes) -> bytes:
         ({"op": "fly", "obs": {}}, (), MalformedMessage),
         ({"op": "act", "obs": {}, "extra": 1}, (), MalformedMessage),
         ({"op": "act", "obs": {"camera": {}}}, (), MalformedMessage),
-        ({"op": "act", "obs": {"cameras": {"a": {"$": ["nd", 0, "|O", [1]]}}}}, (b"x",), MalformedMessage),
-        ({"op": "act", "obs": {"cameras": {"a": {"$": ["nd", 0, "|u1", [2, 2, 3]]}}}}, (b"x" * 11,), MalformedMessage),
-        ({"op": "act", "obs": {"cameras": {"a": {"$": ["nd", 0, "|u1", [3, 4]]}}}}, (b"x" * 12,), InvalidObservation),
-        ({"op": "act", "obs": {"cameras": {"a": {"$": ["nd", 7, "|u1", [1]]}}}}, (b"x",), MalformedMessage),
-        ({"op": "act", "obs": {"cameras": {"a": {"$": ["img", 0]}}}}, (b"not an image",), MalformedMessage),
+        (
+            {"op": "act", "obs": {"cameras": {"a": {"$": ["nd", 0, "|O", [1]]}}}},
+            (b"x",),
+            MalformedMessage,
+        ),
+        (
+            {"op": "act", "obs": {"cameras": {"a": {"$": ["nd", 0, "|u1", [2, 2, 3]]}}}},
+            (b"x" * 11,),
+            MalformedMessage,
+        ),
+        (
+            {"op": "act", "obs": {"cameras": {"a": {"$": ["nd", 0, "|u1", [3, 4]]}}}},
+            (b"x" * 12,),
+            InvalidObservation,
+        ),
+        (
+            {"op": "act", "obs": {"cameras": {"a": {"$": ["nd", 7, "|u1", [1]]}}}},
+            (b"x",),
+            MalformedMessage,
+        ),
+        (
+            {"op": "act", "obs": {"cameras": {"a": {"$": ["img", 0]}}}},
+            (b"not an image",),
+            MalformedMessage,
+        ),
         ({"op": "act", "obs": {"state": {"joints": ["a"]}}}, (), InvalidObservation),
         ({"op": "act", "obs": {"state": {"joints": [[1.0]]}}}, (), InvalidObservation),
         ({"op": "act", "obs": {"state": {"joints": 1}}}, (), InvalidObservation),
@@ -227,19 +264,25 @@ def _frame(header: dict, *blobs: bytes) -> bytes:
         ({"op": "reset", "obs": {}, "instruction": "x" * 100_000}, (), MessageTooLarge),
     ],
 )
-def test_each_fault_has_its_error(header: dict, blobs: tuple[bytes, ...], error: type[Exception]) -> None:
+def test_each_fault_has_its_error(
+    header: dict, blobs: tuple[bytes, ...], error: type[Exception]
+) -> None:
     with pytest.raises(error):
         decode_request(_frame(header, *blobs))
 
 
-@pytest.mark.parametrize("act", [3, {}, {"action": {"$": ["nd", 0, "<f4", [1]]}}, {"action": 1, "done": 1, "info": {}}])
+@pytest.mark.parametrize(
+    "act", [3, {}, {"action": {"$": ["nd", 0, "<f4", [1]]}}, {"action": 1, "done": 1, "info": {}}]
+)
 def test_a_broken_reply_is_malformed(act: object) -> None:
     with pytest.raises(MalformedMessage):
         decode_replies(_frame({"act": act}, b"1234"))[0]
 
 
 def test_pixels_are_limited_before_memory_is_taken() -> None:
-    jpeg = bytearray(encode_requests([Request("act", Obs({"a": np.zeros((8, 8, 3), np.uint8)}))], JPEG))
+    jpeg = bytearray(
+        encode_requests([Request("act", Obs({"a": np.zeros((8, 8, 3), np.uint8)}))], JPEG)
+    )
     at = jpeg.index(b"\xff\xc0")  # start of frame: length, precision, height, width
     jpeg[at + 5 : at + 9] = struct.pack(">HH", 60_000, 60_000)
     with pytest.raises(MessageTooLarge, match="60000x60000"):
@@ -257,7 +300,9 @@ IMAGE_NODE, BYTES_NODE = {"$": ["img", 0]}, {"$": ["bin", 1]}
         [{"op": "act", "obs": {"info": {"a": [BYTES_NODE] * 1500}}}],
     ],
 )
-def test_a_small_file_that_is_named_again_and_again_does_not_become_much_memory(requests: list[dict]) -> None:
+def test_a_small_file_that_is_named_again_and_again_does_not_become_much_memory(
+    requests: list[dict],
+) -> None:
     limits = Limits(body_bytes=100_000, pixels=256 * 256, cameras=2, decoded_bytes=10_000_000)
     file = encode_jpeg(np.zeros((256, 256, 3), np.uint8))
     frame = b"".join(pack({"requests": requests}, [file, bytes(50_000)]))
@@ -273,7 +318,9 @@ def test_a_small_file_that_is_named_again_and_again_does_not_become_much_memory(
 
 def test_images_of_as_many_requests_as_a_frame_may_hold_are_decoded() -> None:
     seen = [Obs({"front": np.zeros((224, 224, 3), np.uint8)})] * DEFAULT_LIMITS.requests
-    answers = read_requests(encode_requests([Request("act", obs) for obs in seen], JPEG), Budget(DEFAULT_LIMITS))
+    answers = read_requests(
+        encode_requests([Request("act", obs) for obs in seen], JPEG), Budget(DEFAULT_LIMITS)
+    )
     assert all(isinstance(answer, Request) for answer in answers)
 
 
@@ -311,7 +358,12 @@ def test_requests_that_share_a_frame_come_back_in_order(seen: list[Obs]) -> None
     assert len(got) == len(sent)
     for i, (one, obs) in enumerate(zip(got, seen, strict=True)):
         assert isinstance(one, Request)
-        assert (one.session, one.rank, one.step, one.request_id) == (f"s{i}", "simulation", i, f"r{i}")
+        assert (one.session, one.rank, one.step, one.request_id) == (
+            f"s{i}",
+            "simulation",
+            i,
+            f"r{i}",
+        )
         assert same(obs.cameras, one.obs.cameras)
         assert same(obs.info, one.obs.info)
 
@@ -325,7 +377,11 @@ def test_a_wrong_request_in_a_frame_is_answered_alone() -> None:
 
 
 def test_replies_that_share_a_frame_come_back_in_order() -> None:
-    sent = [Reply("a", Act(np.ones(3)), step=4), Reply("b", error=MissingCamera("wrist", have=[])), Reply("c", info={})]
+    sent = [
+        Reply("a", Act(np.ones(3)), step=4),
+        Reply("b", error=MissingCamera("wrist", have=[])),
+        Reply("c", info={}),
+    ]
     sent[0].draining = True
     got = decode_replies(encode_replies(sent))
     assert [reply.request_id for reply in got] == ["a", "b", "c"]
@@ -344,7 +400,8 @@ def test_replies_that_share_a_frame_come_back_in_order() -> None:
         ({"history": {"a": 1}}, MalformedMessage),
         ({"history": [{}] * 300}, MessageTooLarge),
         *(
-            ({"op": of_a_replica}, MalformedMessage) for of_a_replica in ("observe", "export", "adopt")
+            ({"op": of_a_replica}, MalformedMessage)
+            for of_a_replica in ("observe", "export", "adopt")
         ),  # two carry pickles
     ],
 )
@@ -362,10 +419,14 @@ def test_a_frame_of_requests_is_a_list(requests: object) -> None:
         read_requests(b"".join(pack({"requests": [{}] * 5}, [])), Budget(Limits(requests=4)))
 
 
-@pytest.mark.parametrize("name", ["a b", "a\nERROR forged", "a\x1b[2K", "é", "a\u2028b", "\x7f", "\0"])
+@pytest.mark.parametrize(
+    "name", ["a b", "a\nERROR forged", "a\x1b[2K", "é", "a\u2028b", "\x7f", "\0"]
+)
 @pytest.mark.parametrize("field", ["request_id", "session"])
 def test_names_forge_no_line_in_a_log(field: str, name: str) -> None:
-    [reply] = read_requests(encode_requests([Request("close", **{field: name})]), Budget(DEFAULT_LIMITS))
+    [reply] = read_requests(
+        encode_requests([Request("close", **{field: name})]), Budget(DEFAULT_LIMITS)
+    )
     assert isinstance(reply, Reply)
     assert isinstance(reply.error, MalformedMessage)
     assert reply.request_id == ""

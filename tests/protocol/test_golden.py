@@ -1,4 +1,6 @@
-"""The golden files of the protocol are what the codec of this package writes and reads, and its schema's examples."""
+"""The golden files of the protocol are what the codec of this package writes and reads, and its
+schema's examples.
+"""
 
 from __future__ import annotations
 
@@ -19,7 +21,12 @@ from vlagents_ray.errors import MalformedMessage
 from vlagents_ray.images.jpeg_png import decode
 from vlagents_ray.interface import Act, Agent, Obs
 from vlagents_ray.protocol.frame_layout import pack, unpack
-from vlagents_ray.protocol.frames import CONTENT_TYPE, decode_replies, encode_replies, encode_requests
+from vlagents_ray.protocol.frames import (
+    CONTENT_TYPE,
+    decode_replies,
+    encode_replies,
+    encode_requests,
+)
 from vlagents_ray.protocol.messages import (
     DEFAULT_LIMITS,
     PROTOCOL_VERSION,
@@ -37,19 +44,25 @@ SCHEMA = json.loads((golden.ROOT / "clients" / "schema" / "v1.json").read_text()
 
 
 def of(*kinds: str) -> Any:
-    return pytest.mark.parametrize("frame", [pytest.param(one, id=one.name) for one in FRAMES if one.kind in kinds])
+    return pytest.mark.parametrize(
+        "frame", [pytest.param(one, id=one.name) for one in FRAMES if one.kind in kinds]
+    )
 
 
 def require_valid(document: Any, name: str) -> None:
     """Raise unless the document is one of that name in the schema."""
-    jsonschema.Draft202012Validator({"$ref": f"#/$defs/{name}", "$defs": SCHEMA["$defs"]}).validate(document)
+    jsonschema.Draft202012Validator({"$ref": f"#/$defs/{name}", "$defs": SCHEMA["$defs"]}).validate(
+        document
+    )
 
 
 def plain(means: Any) -> Any:
     """A meaning in which an image file is its pixels, as the reader of requests gives them."""
     if isinstance(means, dict) and means.get("$") == "image":
         pixels = means.get("pixels")
-        return pixels if pixels is not None else golden.meaning(decode(golden.JPEG_FILE.read_bytes()))
+        return (
+            pixels if pixels is not None else golden.meaning(decode(golden.JPEG_FILE.read_bytes()))
+        )
     if isinstance(means, dict):
         return {key: plain(value) for key, value in means.items()}
     return [plain(value) for value in means] if isinstance(means, list) else means
@@ -57,7 +70,11 @@ def plain(means: Any) -> Any:
 
 def test_the_files_are_what_the_command_writes(tmp_path: Path) -> None:
     golden.write(tmp_path)
-    written = {file.relative_to(tmp_path): file.read_bytes() for file in tmp_path.rglob("*") if file.is_file()}
+    written = {
+        file.relative_to(tmp_path): file.read_bytes()
+        for file in tmp_path.rglob("*")
+        if file.is_file()
+    }
     others = {"README.md", golden.JPEG_FILE.name}
     kept = {
         file.relative_to(golden.GOLDEN): file.read_bytes()
@@ -79,7 +96,8 @@ def test_the_codec_reads_what_a_request_says_and_writes_its_bytes(frame: golden.
 @of("replies")
 def test_the_codec_reads_what_a_reply_says_and_writes_its_bytes(frame: golden.Golden) -> None:
     replies = decode_replies(frame.data)
-    said = json.loads(json.dumps(frame.meaning).replace('"melted"', '"internal"'))  # as an unknown code is read
+    # As an unknown code is read.
+    said = json.loads(json.dumps(frame.meaning).replace('"melted"', '"internal"'))
     assert [golden.of_reply(reply) for reply in replies] == said
     if frame.by_codec:
         assert encode_replies(replies) == frame.data
@@ -105,7 +123,9 @@ def test_a_probe_is_one_and_its_answer_counts_it() -> None:
 
 @pytest.mark.parametrize("name", golden.documents())
 def test_a_document_is_one_of_the_schema(name: str) -> None:
-    require_valid(golden.documents()[name], "_".join(name.split("_")[: 1 + (not name.startswith("problem"))]))
+    require_valid(
+        golden.documents()[name], "_".join(name.split("_")[: 1 + (not name.startswith("problem"))])
+    )
 
 
 @pytest.mark.parametrize(
@@ -120,7 +140,10 @@ def test_a_document_is_one_of_the_schema(name: str) -> None:
         ("requests_header", {"op": "close", "unknown": 1, "blobs": []}),
         ("requests_header", {"requests": [], "blobs": []}),
         ("replies_header", {"request_id": "", "blobs": []}),
-        ("replies_header", {"request_id": "", "info": {"x": {"$": ["nd", 0, "|O8", []]}}, "blobs": []}),
+        (
+            "replies_header",
+            {"request_id": "", "info": {"x": {"$": ["nd", 0, "|O8", []]}}, "blobs": []},
+        ),
     ],
 )
 def test_the_schema_refuses_what_the_protocol_does_not_allow(name: str, document: Any) -> None:
@@ -162,8 +185,14 @@ class Chunks(Agent):
 def client() -> Iterator[TestClient]:
     engine = Engine(Chunks())
     engine.start()
-    metadata = {"protocol": PROTOCOL_VERSION, "contract": Chunks().contract.to_json(), "stream": None}
-    with TestClient(AccessMiddleware(build_http_app(engine, lambda: metadata, DEFAULT_LIMITS), None, "app")) as client:
+    metadata = {
+        "protocol": PROTOCOL_VERSION,
+        "contract": Chunks().contract.to_json(),
+        "stream": None,
+    }
+    with TestClient(
+        AccessMiddleware(build_http_app(engine, lambda: metadata, DEFAULT_LIMITS), None, "app")
+    ) as client:
         yield client
     engine.close()
 
@@ -173,7 +202,11 @@ def test_what_the_schema_refuses_the_server_refuses_too_in_json_and_in_frames(
     document: dict[str, Any], client: TestClient
 ) -> None:
     of_obs = {key: value for key, value in document.items() if key in ("state", "gripper")}
-    header = {"op": "act", "obs": of_obs, **{key: value for key, value in document.items() if key not in of_obs}}
+    header = {
+        "op": "act",
+        "obs": of_obs,
+        **{key: value for key, value in document.items() if key not in of_obs},
+    }
     client.post("/v1/reset", json={}, headers={"x-session-id": "robot-1"})
     for name, said, kind in (
         ("act_request", document, "application/json"),
@@ -184,7 +217,9 @@ def test_what_the_schema_refuses_the_server_refuses_too_in_json_and_in_frames(
         content = b"".join(pack(header, [])) if kind == CONTENT_TYPE else json.dumps(said).encode()
         headers = {"x-session-id": "robot-1", "content-type": kind}
         answer = client.post("/v1/act", content=content, headers=headers)
-        assert answer.json()["code"] in ("malformed", "invalid_observation", "too_large"), answer.text
+        assert answer.json()["code"] in ("malformed", "invalid_observation", "too_large"), (
+            answer.text
+        )
 
 
 def test_what_a_server_answers_is_what_the_schema_says(client: TestClient) -> None:
@@ -202,9 +237,13 @@ def test_what_a_server_answers_is_what_the_schema_says(client: TestClient) -> No
     answer = client.post("/v1/act", content=form, headers=session | kind)
     require_valid(answer.json(), "act_answer")
     assert answer.json()["info"]["pixels"] == {"front": golden.PIXELS.tolist()}
-    require_valid(client.post("/v1/act", json={"info": {"fail": 1}}, headers=session).json(), "problem")
+    require_valid(
+        client.post("/v1/act", json={"info": {"fail": 1}}, headers=session).json(), "problem"
+    )
     frame = {"content-type": CONTENT_TYPE, "accept": CONTENT_TYPE}
-    answer = client.post("/v1/act", content=encode_requests([Request("act", Obs())]), headers=session | frame)
+    answer = client.post(
+        "/v1/act", content=encode_requests([Request("act", Obs())]), headers=session | frame
+    )
     require_valid(unpack(answer.content, DEFAULT_LIMITS)[0], "replies_header")
     require_valid(client.post("/v1/close", headers=session).json(), "close_answer")
     with client.websocket_connect("/v1/stream") as stream:

@@ -1,4 +1,6 @@
-"""An answer of a hostile server costs a robot's computer little memory; tests/clients has the other languages."""
+"""An answer of a hostile server costs a robot's computer little memory; tests/clients has the
+other languages.
+"""
 
 from __future__ import annotations
 
@@ -32,5 +34,7 @@ print(peak_mb() - before)
 def test_no_answer_fills_the_memory_of_a_robots_computer(tmp_path: Path) -> None:
     for number, answer in enumerate(ANSWERS.values()):
         (tmp_path / f"{number}").write_bytes(answer)
-    done = subprocess.run([sys.executable, "-c", READ, tmp_path], check=False, capture_output=True, text=True)
+    done = subprocess.run(
+        [sys.executable, "-c", READ, tmp_path], check=False, capture_output=True, text=True
+    )
     assert float(done.stdout) < ADDED_MB, done.stderr

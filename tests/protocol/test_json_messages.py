@@ -9,7 +9,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from vlagents_ray.errors import InvalidInput, InvalidObservation, MalformedMessage, MessageTooLarge, NotReset
+from vlagents_ray.errors import (
+    InvalidInput,
+    InvalidObservation,
+    MalformedMessage,
+    MessageTooLarge,
+    NotReset,
+)
 from vlagents_ray.images.jpeg_png import encode_jpeg
 from vlagents_ray.interface import Act
 from vlagents_ray.protocol.json_messages import problem, reply_to_json, request_from_parts
@@ -19,7 +25,9 @@ from vlagents_ray.protocol.values import from_text, to_text
 IMAGE = np.full((16, 16, 3), 200, np.uint8)
 
 
-@pytest.mark.parametrize(("values", "reason"), [(300_000, "values in its JSON"), (1_000_000, "bytes of JSON")])
+@pytest.mark.parametrize(
+    ("values", "reason"), [(300_000, "values in its JSON"), (1_000_000, "bytes of JSON")]
+)
 def test_a_long_document_is_refused_unread(values: int, reason: str) -> None:
     document = b'{"info":{"a":[' + b"[]," * values + b"1]}}"
     with pytest.raises(MessageTooLarge, match=reason):
@@ -34,7 +42,9 @@ def test_a_request_is_read_from_json_and_images() -> None:
         "info": {"a": [1]},
         "kwargs": {"seed": 3},
     }
-    request = request_from_parts("reset", json.dumps(document), {"front": encode_jpeg(IMAGE)}, Budget(DEFAULT_LIMITS))
+    request = request_from_parts(
+        "reset", json.dumps(document), {"front": encode_jpeg(IMAGE)}, Budget(DEFAULT_LIMITS)
+    )
     assert request.instruction == "push"
     assert request.kwargs == {"seed": 3}
     assert request.obs.gripper == 1.0
@@ -68,23 +78,49 @@ def test_each_fault_has_its_error(text: str | bytes, images: dict, error: type[E
 
 
 def test_a_reply_becomes_plain_json() -> None:
-    info = {"array": np.arange(2), "bytes": b"abc", "scalar": np.float32(0.5), "deep": [{"x": np.zeros(1)}]}
-    document = json.loads(json.dumps(reply_to_json(Reply("r", Act(np.zeros((2, 3), np.float32), True, info)))))
+    info = {
+        "array": np.arange(2),
+        "bytes": b"abc",
+        "scalar": np.float32(0.5),
+        "deep": [{"x": np.zeros(1)}],
+    }
+    document = json.loads(
+        json.dumps(reply_to_json(Reply("r", Act(np.zeros((2, 3), np.float32), True, info))))
+    )
     assert document["action"] == [[0, 0, 0], [0, 0, 0]]
     assert document["done"] is True
-    assert document["info"] == {"array": [0, 1], "bytes": "YWJj", "scalar": 0.5, "deep": [{"x": [0.0]}]}
+    assert document["info"] == {
+        "array": [0, 1],
+        "bytes": "YWJj",
+        "scalar": 0.5,
+        "deep": [{"x": [0.0]}],
+    }
 
 
 def test_a_number_that_json_does_not_have_becomes_none() -> None:
     nan, inf = float("nan"), float("inf")
-    info = {"loss": nan, "scalar": np.float32(inf), "list": [1.0, -inf], "array": np.array([[1, nan], [inf, 2]])}
+    info = {
+        "loss": nan,
+        "scalar": np.float32(inf),
+        "list": [1.0, -inf],
+        "array": np.array([[1, nan], [inf, 2]]),
+    }
     document = reply_to_json(Reply("r", Act(np.zeros(3, np.float32), info=info)))
-    assert document["info"] == {"loss": None, "scalar": None, "list": [1, None], "array": [[1, None], [None, 2]]}
+    assert document["info"] == {
+        "loss": None,
+        "scalar": None,
+        "list": [1, None],
+        "array": [[1, None], [None, 2]],
+    }
 
 
 def test_a_problem_names_its_stable_code() -> None:
     document = problem(NotReset("reset first"), "r7")
-    assert (document["status"], document["code"], document["request_id"]) == (409, "not_reset", "r7")
+    assert (document["status"], document["code"], document["request_id"]) == (
+        409,
+        "not_reset",
+        "r7",
+    )
 
 
 def read(text: str) -> Any:
@@ -94,16 +130,33 @@ def read(text: str) -> Any:
 def test_a_text_has_the_same_values() -> None:
     array = np.arange(6, dtype=np.float32).reshape(2, 3)
     found = read(
-        to_text({"seed": 7, "why": "späť", "none": None, "list": [1.5, True], "raw": b"\x00\xff", "array": array})
+        to_text(
+            {
+                "seed": 7,
+                "why": "späť",
+                "none": None,
+                "list": [1.5, True],
+                "raw": b"\x00\xff",
+                "array": array,
+            }
+        )
     )
     assert found["array"].dtype == np.float32
     np.testing.assert_array_equal(found.pop("array"), array)
-    assert found == {"seed": 7, "why": "späť", "none": None, "list": [1.5, True], "raw": b"\x00\xff"}
+    assert found == {
+        "seed": 7,
+        "why": "späť",
+        "none": None,
+        "list": [1.5, True],
+        "raw": b"\x00\xff",
+    }
     assert math.isnan(read(to_text({"x": math.nan}))["x"])
 
 
 def test_numbers_and_words_stay_readable() -> None:
-    assert json.loads(to_text({"seed": 7, "task": "stack"})) == {"value": {"seed": 7, "task": "stack"}}
+    assert json.loads(to_text({"seed": 7, "task": "stack"})) == {
+        "value": {"seed": 7, "task": "stack"}
+    }
 
 
 @pytest.mark.parametrize(

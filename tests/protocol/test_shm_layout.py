@@ -51,9 +51,19 @@ def placed(written: Written) -> np.ndarray:
 
 
 @given(st.lists(observations, min_size=1, max_size=4), st.none() | st.integers(0, 2**40))
-def test_acts_come_back_as_they_were_also_when_their_layout_is_known(seen: list[Obs], step: int | None) -> None:
+def test_acts_come_back_as_they_were_also_when_their_layout_is_known(
+    seen: list[Obs], step: int | None
+) -> None:
     sent = [
-        Request("act", obs, session=f"s{i}", rank="simulation", step=step, request_id=f"r{i}", deadline_ms=5.0 + i)
+        Request(
+            "act",
+            obs,
+            session=f"s{i}",
+            rank="simulation",
+            step=step,
+            request_id=f"r{i}",
+            deadline_ms=5.0 + i,
+        )
         for i, obs in enumerate(seen)
     ]
     writer, reader = ShmWriter(), ShmReader(Limits())
@@ -91,10 +101,15 @@ def test_a_session_may_change_what_it_sees_even_within_a_message() -> None:
 
 @pytest.mark.parametrize(
     "change",
-    [{"rank": "simulation"}, {"session": "other"}, {"obs": Obs({"hand": np.zeros((4, 4, 3), np.uint8)})},
-     {"obs": Obs({"front": np.zeros((4, 4, 3), np.uint8)}, state={"joints": np.zeros(7)})}, {"obs": Obs()}],
+    [
+        {"rank": "simulation"},
+        {"session": "other"},
+        {"obs": Obs({"hand": np.zeros((4, 4, 3), np.uint8)})},
+        {"obs": Obs({"front": np.zeros((4, 4, 3), np.uint8)}, state={"joints": np.zeros(7)})},
+        {"obs": Obs()},
+    ],
     ids=["rank", "session", "name", "more", "less"],
-)  # fmt: skip
+)
 def test_what_is_not_like_the_last_act_has_a_layout_of_its_own(change: dict[str, Any]) -> None:
     writer, reader = ShmWriter(), ShmReader(Limits())
     for request in (seeing(4), replace(seeing(4), **change)):
@@ -102,7 +117,10 @@ def test_what_is_not_like_the_last_act_has_a_layout_of_its_own(change: dict[str,
         assert len(written.message) > COUNT.size + ITEM.size
         [read] = reader.read(memoryview(written.message), placed(written))
         assert (read.session, read.rank) == (request.session, request.rank)
-        assert (list(read.obs.cameras), list(read.obs.state)) == (list(request.obs.cameras), list(request.obs.state))
+        assert (list(read.obs.cameras), list(read.obs.state)) == (
+            list(request.obs.cameras),
+            list(request.obs.state),
+        )
 
 
 def test_nothing_of_a_message_that_travels_as_a_frame_is_taken_for_known() -> None:
@@ -167,7 +185,11 @@ def test_layouts_are_checked(layout: object) -> None:
 
 @given(
     st.lists(
-        st.tuples(hnp.arrays(np.float32, hnp.array_shapes(min_dims=1, max_dims=2)), st.booleans(), st.booleans()),
+        st.tuples(
+            hnp.arrays(np.float32, hnp.array_shapes(min_dims=1, max_dims=2)),
+            st.booleans(),
+            st.booleans(),
+        ),
         min_size=1,
         max_size=3,
     )
@@ -175,15 +197,23 @@ def test_layouts_are_checked(layout: object) -> None:
 def test_answers_come_back_as_they_were(given_: list[tuple[np.ndarray, bool, bool]]) -> None:
     timing = {"queue_ms": 0.1, "inference_ms": 2.0, "decode_ms": 0.3, "batch_size": 3}
     replies = [
-        Reply(f"r{i}", Act(action, done), step=i, timing=dict(timing)) for i, (action, done, _) in enumerate(given_)
+        Reply(f"r{i}", Act(action, done), step=i, timing=dict(timing))
+        for i, (action, done, _) in enumerate(given_)
     ]
     for reply, (_, _, draining) in zip(replies, given_, strict=True):
         reply.draining = draining
     data = write_answers(replies, arrived=0.0)
-    for i, (got, (action, done, draining)) in enumerate(zip(read_answers(memoryview(data)), given_, strict=True)):
+    for i, (got, (action, done, draining)) in enumerate(
+        zip(read_answers(memoryview(data)), given_, strict=True)
+    ):
         assert got.act.action.tobytes() == action.tobytes()
         assert got.act.action.shape == action.shape
-        assert (got.request_id, got.act.done, got.draining, got.step) == (f"r{i}", done, draining, i)
+        assert (got.request_id, got.act.done, got.draining, got.step) == (
+            f"r{i}",
+            done,
+            draining,
+            i,
+        )
         assert got.timing == replies[i].timing
         assert got.timing.keys() >= {"encode_ms", "total_ms"}
 
@@ -192,9 +222,13 @@ def test_an_answer_names_the_weights_that_computed_it_without_a_frame() -> None:
     timing = {"queue_ms": 0.1, "inference_ms": 2.0, "decode_ms": 0.3, "batch_size": 3}
     named = [{"policy": {"version": 2**40, "fingerprint": "0123456789abcdef"}}]
     named += [{"policy": {"version": 0, "fingerprint": ""}}]
-    replies = [Reply("r", Act(np.zeros(3, np.float32), info=info), step=1, timing=timing) for info in named]
+    replies = [
+        Reply("r", Act(np.zeros(3, np.float32), info=info), step=1, timing=timing) for info in named
+    ]
     data = write_answers(replies, arrived=0.0)
-    assert [reply.act.info for reply in read_answers(memoryview(data)) if reply.act is not None] == named
+    assert [
+        reply.act.info for reply in read_answers(memoryview(data)) if reply.act is not None
+    ] == named
 
 
 @pytest.mark.parametrize(
@@ -232,10 +266,11 @@ def test_names_forge_no_line_in_a_log() -> None:
 
 
 class WritersAndReaders(RuleBasedStateMachine):
-    """One connection with four layouts at most, whose messages may be lost or refused on either side.
+    """One connection with four layouts at most, whose messages may be lost or refused on either
+    side.
 
-    As in `ShmTransport`, a client whose message was not sent, or was refused before it was read, begins its layouts
-    again, while the server remembers those that it has read.
+    As in `ShmTransport`, a client whose message was not sent, or was refused before it was read,
+    begins its layouts again, while the server remembers those that it has read.
     """
 
     def __init__(self) -> None:
@@ -246,11 +281,18 @@ class WritersAndReaders(RuleBasedStateMachine):
     def reconnect(self) -> None:
         self.writer, self.reader = ShmWriter(), ShmReader(Limits(requests=8))
 
-    def written(self, sides: list[int], sessions: list[int]) -> tuple[list[Request], Written | None]:
-        requests = [seeing(side, f"s{session}") for side, session in zip(sides, sessions, strict=False)]
+    def written(
+        self, sides: list[int], sessions: list[int]
+    ) -> tuple[list[Request], Written | None]:
+        requests = [
+            seeing(side, f"s{session}") for side, session in zip(sides, sessions, strict=False)
+        ]
         return requests, self.writer.write(requests)
 
-    @rule(sides=st.lists(st.integers(1, 3), min_size=1, max_size=3), sessions=st.lists(st.integers(0, 4), min_size=3))
+    @rule(
+        sides=st.lists(st.integers(1, 3), min_size=1, max_size=3),
+        sessions=st.lists(st.integers(0, 4), min_size=3),
+    )
     def act(self, sides: list[int], sessions: list[int]) -> None:
         requests, written = self.written(sides, sessions)
         if written is None:
@@ -261,7 +303,10 @@ class WritersAndReaders(RuleBasedStateMachine):
             np.testing.assert_array_equal(got.obs.cameras["front"], sent.obs.cameras["front"])
         assert len(self.reader._known) <= 4
 
-    @rule(sides=st.lists(st.integers(1, 3), min_size=1, max_size=3), sessions=st.lists(st.integers(0, 4), min_size=3))
+    @rule(
+        sides=st.lists(st.integers(1, 3), min_size=1, max_size=3),
+        sessions=st.lists(st.integers(0, 4), min_size=3),
+    )
     def send_in_vain(self, sides: list[int], sessions: list[int]) -> None:
         """Over the rate, or not sent in time."""
         self.written(sides, sessions)
@@ -269,7 +314,9 @@ class WritersAndReaders(RuleBasedStateMachine):
 
     @rule(side=st.integers(1, 3), session=st.integers(0, 4))
     def be_refused_behind_the_layout(self, side: int, session: int) -> None:
-        """The second act of a message is wrong: the layout of the first has been read, and the client starts over."""
+        """The second act of a message is wrong: the layout of the first has been read, and the
+        client starts over.
+        """
         _, written = self.written([side], [session])
         if written is None:
             return
@@ -290,7 +337,9 @@ def few_layouts(request: pytest.FixtureRequest) -> Iterator[None]:
 
 
 def test_a_writer_and_a_reader_agree_on_layouts_whatever_was_lost_or_refused() -> None:
-    run_state_machine_as_test(WritersAndReaders, settings=settings(max_examples=many(60), deadline=None))
+    run_state_machine_as_test(
+        WritersAndReaders, settings=settings(max_examples=many(60), deadline=None)
+    )
 
 
 def test_a_reader_takes_no_layout_beyond_the_limit_and_no_message_of_too_many_acts() -> None:

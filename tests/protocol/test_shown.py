@@ -1,4 +1,6 @@
-"""Texts of errors that show a value of the network: their length and time do not depend on the value."""
+"""Texts of errors that show a value of the network: their length and time do not depend on the
+value.
+"""
 
 from __future__ import annotations
 
@@ -26,7 +28,13 @@ ERRORS = ("error", "full", "problem")  # names of exceptions, whose texts are bo
 
 ARRAY = np.random.default_rng(0).random(1000)
 VALUES = st.recursive(
-    st.none() | st.booleans() | st.integers() | st.floats() | st.text() | st.binary() | st.just(ARRAY),
+    st.none()
+    | st.booleans()
+    | st.integers()
+    | st.floats()
+    | st.text()
+    | st.binary()
+    | st.just(ARRAY),
     lambda inner: st.lists(inner) | st.dictionaries(st.text(), inner) | st.tuples(inner, inner),
 )
 
@@ -80,14 +88,19 @@ def test_a_small_value_is_written_as_it_is(value: object, text: str) -> None:
 
 
 def _cut_after_it_was_written(path: Path) -> Iterator[int]:
-    """Lines with `str(x)[:n]`, `repr(x)[:n]` or `{x!r:.n}`, which write all of a value, and cut the text then."""
+    """Lines with `str(x)[:n]`, `repr(x)[:n]` or `{x!r:.n}`, which write all of a value, and cut
+    the text then.
+    """
     for node in ast.walk(ast.parse(path.read_text())):
         if (
             isinstance(node, ast.FormattedValue)
             and node.conversion != -1
             and isinstance(node.format_spec, ast.JoinedStr)
         ):
-            if any(isinstance(one, ast.Constant) and str(one.value).startswith(".") for one in node.format_spec.values):
+            if any(
+                isinstance(one, ast.Constant) and str(one.value).startswith(".")
+                for one in node.format_spec.values
+            ):
                 yield node.lineno
         elif (
             isinstance(node, ast.Subscript)
@@ -105,5 +118,7 @@ def test_no_value_of_the_network_is_written_before_it_is_cut(tmp_path: Path) -> 
     files = [file for folder in FROM_THE_NETWORK for file in folder.rglob("*.py")]
     assert [f"{file}:{line}" for file in files for line in _cut_after_it_was_written(file)] == []
     wrong = tmp_path / "wrong.py"
-    wrong.write_text('str(x)[:40]\nf"{x!r:.80}"\nrepr(x)[:3]\nf"{str(a.b)[:4]!r}"\nstr(error)[:80]\nf"{x:.3f}"\n')
+    wrong.write_text(
+        'str(x)[:40]\nf"{x!r:.80}"\nrepr(x)[:3]\nf"{str(a.b)[:4]!r}"\nstr(error)[:80]\nf"{x:.3f}"\n'
+    )
     assert sorted(_cut_after_it_was_written(wrong)) == [1, 2, 3, 4]

@@ -1,4 +1,6 @@
-"""Our reader of WebSocket frames against that of `websockets`: the same events, answers and refusals, for any bytes."""
+"""Our reader of WebSocket frames against that of `websockets`: the same events, answers and
+refusals, for any bytes.
+"""
 
 from __future__ import annotations
 
@@ -20,7 +22,9 @@ from vlagents_ray.protocol.websocket_frames import ReceiveBuffer, frame_head
 
 LIMIT = 100_000
 MASK = b"\x01\x80\x00\xff"
-SIZES = st.integers(0, 3000) | st.sampled_from([125, 126, 1023, 1024, 1025, 2**16 - 1, 2**16, 100_000])
+SIZES = st.integers(0, 3000) | st.sampled_from(
+    [125, 126, 1023, 1024, 1025, 2**16 - 1, 2**16, 100_000]
+)
 
 
 def connected(*, is_server: bool = True) -> tuple[Protocol, ReceiveBuffer]:
@@ -32,7 +36,11 @@ def connected(*, is_server: bool = True) -> tuple[Protocol, ReceiveBuffer]:
 
 
 def opened(*, is_server: bool) -> Protocol:
-    protocol = ServerProtocol(max_size=LIMIT) if is_server else ClientProtocol(parse_uri("ws://a/"), max_size=LIMIT)
+    protocol = (
+        ServerProtocol(max_size=LIMIT)
+        if is_server
+        else ClientProtocol(parse_uri("ws://a/"), max_size=LIMIT)
+    )
     protocol.state = State.OPEN
     protocol.parser = Protocol.parse(protocol)  # the one so far reads a handshake
     next(protocol.parser)
@@ -41,13 +49,26 @@ def opened(*, is_server: bool) -> Protocol:
 
 def outcome(protocol: Protocol) -> tuple[object, ...]:
     """Return everything that is seen of a protocol after it has received bytes."""
-    events = [(one.opcode, bytes(one.data), one.fin) for one in protocol.events_received() if isinstance(one, Frame)]
+    events = [
+        (one.opcode, bytes(one.data), one.fin)
+        for one in protocol.events_received()
+        if isinstance(one, Frame)
+    ]
     error = repr(protocol.parser_exc)
-    return events, protocol.data_to_send(), protocol.state, protocol.close_rcvd, protocol.close_sent, error
+    return (
+        events,
+        protocol.data_to_send(),
+        protocol.state,
+        protocol.close_rcvd,
+        protocol.close_sent,
+        error,
+    )
 
 
 def serialized(head: int, data: bytes, *, mask: bytes, length: int = 0) -> bytes:
-    """Return a frame with any first byte; its length takes at least `length` bytes after the second one."""
+    """Return a frame with any first byte; its length takes at least `length` bytes after the
+    second one.
+    """
     size = len(data)
     bit = 0x80 * bool(mask)
     if size < 126 and not length:
@@ -60,9 +81,14 @@ def serialized(head: int, data: bytes, *, mask: bytes, length: int = 0) -> bytes
 
 
 BINARY, PART, LAST, PING, PONG, CLOSE = 0x82, 0x02, 0x80, 0x89, 0x8A, 0x88
-HEADS = st.sampled_from([*[BINARY] * 8, PART, LAST, 0x00, 0x81, PING, PONG, CLOSE]) | st.integers(0, 255)
-DATA = st.binary(max_size=130) | st.sampled_from([b"\x03\xe8bye", 1025, 70_000, LIMIT, LIMIT + 1])  # or so many zeros
-FRAMES = st.tuples(HEADS, DATA, st.sampled_from([True] * 9 + [False]), st.sampled_from([0] * 8 + [2, 8]))
+HEADS = st.sampled_from([*[BINARY] * 8, PART, LAST, 0x00, 0x81, PING, PONG, CLOSE]) | st.integers(
+    0, 255
+)
+# Or so many zeros.
+DATA = st.binary(max_size=130) | st.sampled_from([b"\x03\xe8bye", 1025, 70_000, LIMIT, LIMIT + 1])
+FRAMES = st.tuples(
+    HEADS, DATA, st.sampled_from([True] * 9 + [False]), st.sampled_from([0] * 8 + [2, 8])
+)
 NO_MASK = bytes(4)  # our client's, which changes nothing
 
 
@@ -74,11 +100,22 @@ NO_MASK = bytes(4)  # our client's, which changes nothing
     st.lists(st.integers(1, 300), max_size=6),
     st.sampled_from([MASK, NO_MASK]),
 )
-@example(True, [(PART, b"a", True, 0), (BINARY, b"b", True, 0)], b"", [], MASK)  # a message within another one
+# A message within another one.
+@example(True, [(PART, b"a", True, 0), (BINARY, b"b", True, 0)], b"", [], MASK)
 @example(
-    False, [(PART, b"a", True, 0), (PING, b"", True, 0), (LAST, b"b", True, 0), (BINARY, b"c", True, 0)], b"", [], MASK
+    False,
+    [(PART, b"a", True, 0), (PING, b"", True, 0), (LAST, b"b", True, 0), (BINARY, b"c", True, 0)],
+    b"",
+    [],
+    MASK,
 )
-@example(True, [(BINARY, b"a", True, 0), (CLOSE, b"\x03\xe8", True, 0), (BINARY, b"b", True, 0)], b"", [], MASK)
+@example(
+    True,
+    [(BINARY, b"a", True, 0), (CLOSE, b"\x03\xe8", True, 0), (BINARY, b"b", True, 0)],
+    b"",
+    [],
+    MASK,
+)
 @example(True, [(BINARY, b"not masked", False, 0)], b"", [], MASK)
 @example(False, [(BINARY, b"masked", False, 0)], b"", [], MASK)
 @example(True, [], b"\x82\x01a1234", [], MASK)  # as long as a masked frame
@@ -86,7 +123,11 @@ NO_MASK = bytes(4)  # our client's, which changes nothing
 @example(True, [(0xC2, b"compressed", True, 0)], b"", [], MASK)
 @example(True, [(BINARY, b"a long length", True, 8)], b"", [], MASK)
 def test_any_bytes_have_the_same_effect_as_on_the_parser_of_websockets(
-    is_server: bool, sent: list[tuple[int, bytes | int, bool, int]], garbage: bytes, sizes: list[int], mask: bytes
+    is_server: bool,
+    sent: list[tuple[int, bytes | int, bool, int]],
+    garbage: bytes,
+    sizes: list[int],
+    mask: bytes,
 ) -> None:
     pieces = [
         serialized(head, bytes(data), mask=mask if right is is_server else b"", length=size)
@@ -107,7 +148,9 @@ def test_any_bytes_have_the_same_effect_as_on_the_parser_of_websockets(
 
 
 def cut(pieces: Iterable[bytes], sizes: list[int]) -> Iterable[memoryview]:
-    """Yield the pieces, or parts of them that end at multiples of one of `sizes`, in memory that each reuses."""
+    """Yield the pieces, or parts of them that end at multiples of one of `sizes`, in memory that
+    each reuses.
+    """
     memory = memoryview(bytearray(2**20))
     for number, piece in enumerate(pieces):
         step = sizes[number % len(sizes)] if sizes and number % 2 else max(1, len(piece))
@@ -119,8 +162,14 @@ def cut(pieces: Iterable[bytes], sizes: list[int]) -> Iterable[memoryview]:
 
 @pytest.mark.parametrize("mask", [frames.apply_mask, utils.apply_mask], ids=["in C", "in Python"])
 @settings(max_examples=many(40))
-@given(st.lists(SIZES, min_size=1, max_size=5), st.lists(st.integers(1, 5000), min_size=1, max_size=20), st.randoms())
-def test_the_pieces_of_a_stream_make_no_difference(mask, sizes: list[int], pieces: list[int], random) -> None:
+@given(
+    st.lists(SIZES, min_size=1, max_size=5),
+    st.lists(st.integers(1, 5000), min_size=1, max_size=20),
+    st.randoms(),
+)
+def test_the_pieces_of_a_stream_make_no_difference(
+    mask, sizes: list[int], pieces: list[int], random
+) -> None:
     sent = [random.randbytes(size) for size in sizes]
     stream = b"".join(Frame(Opcode.BINARY, message).serialize(mask=True) for message in sent)
     protocol, received = connected()
@@ -129,7 +178,9 @@ def test_the_pieces_of_a_stream_make_no_difference(mask, sizes: list[int], piece
         patched.setattr(frames, "apply_mask", mask)
         for part in cut([b"", stream], pieces):
             received.parse(part)
-            messages += [event.data for event in protocol.events_received() if isinstance(event, Frame)]
+            messages += [
+                event.data for event in protocol.events_received() if isinstance(event, Frame)
+            ]
     assert messages == sent
     assert received.size == 0
 
@@ -140,7 +191,9 @@ def test_the_rest_of_a_frame_is_not_taken_for_a_frame() -> None:
     received.parse(memoryview(bytes([0x82, 0x80 | len(message), 0, 0, 0, 0])))
     assert received.size == 0  # the parser has read the head
     received.parse(memoryview(message))
-    assert [event.data for event in protocol.events_received() if isinstance(event, Frame)] == [message]
+    assert [event.data for event in protocol.events_received() if isinstance(event, Frame)] == [
+        message
+    ]
 
 
 def test_the_end_within_a_message_is_noticed() -> None:

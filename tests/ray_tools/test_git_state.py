@@ -15,7 +15,9 @@ from vlagents_ray.ray_tools.git_state import code_in, code_of
 
 @pytest.fixture
 def repository(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """One commit with a module in it, importable; the cache of what the process has seen is empty."""
+    """One commit with a module in it, importable; the cache of what the process has seen is
+    empty.
+    """
     folder = tmp_path / "repository"
     folder.mkdir()
     (folder / "grasping.py").write_text("SPEED = 1\n")
@@ -29,14 +31,24 @@ def repository(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def git(folder: Path, *words: str) -> str:
-    who = {f"GIT_{role}_{what}": "someone" for role in ("AUTHOR", "COMMITTER") for what in ("NAME", "EMAIL")}
+    who = {
+        f"GIT_{role}_{what}": "someone"
+        for role in ("AUTHOR", "COMMITTER")
+        for what in ("NAME", "EMAIL")
+    }
     command = ["git", "-C", folder, *words]
-    return subprocess.run(command, capture_output=True, text=True, check=True, env=os.environ | who).stdout.strip()
+    return subprocess.run(
+        command, capture_output=True, text=True, check=True, env=os.environ | who
+    ).stdout.strip()
 
 
 def test_a_clean_checkout_is_its_commit(repository: Path) -> None:
     found = code_of("grasping:Grasping")
-    assert found.to_json() == {"commit": git(repository, "rev-parse", "HEAD"), "dirty": False, "diff_sha256": None}
+    assert found.to_json() == {
+        "commit": git(repository, "rev-parse", "HEAD"),
+        "dirty": False,
+        "diff_sha256": None,
+    }
 
 
 def test_what_differs_from_the_commit_is_kept_with_its_digest(repository: Path) -> None:
@@ -48,7 +60,9 @@ def test_what_differs_from_the_commit_is_kept_with_its_digest(repository: Path) 
     assert found.diff_sha256 == hashlib.sha256(found.diff).hexdigest()
 
 
-def test_an_installed_module_inside_a_repository_is_not_taken_for_its_code(repository: Path) -> None:
+def test_an_installed_module_inside_a_repository_is_not_taken_for_its_code(
+    repository: Path,
+) -> None:
     (repository / "installed.py").write_text("")
     assert code_of("installed") is None
 

@@ -18,7 +18,9 @@ from vlagents_ray.ray_tools.private import node_of_this_process
 
 @pytest.fixture
 def silent(monkeypatch: pytest.MonkeyPatch) -> Iterator[socket.socket]:
-    """In place of the head's socket: bound, so that nobody else gets its port, and answering once it listens."""
+    """In place of the head's socket: bound, so that nobody else gets its port, and answering
+    once it listens.
+    """
     with socket.socket() as bound:
         bound.bind(("127.0.0.1", 0))
         context = SimpleNamespace(gcs_address=f"127.0.0.1:{bound.getsockname()[1]}")
@@ -39,7 +41,9 @@ def test_a_head_that_is_silent_for_a_while_is_waited_for(
 
 
 @pytest.mark.usefixtures("silent")
-def test_one_that_stays_silent_is_given_up_before_ray_ends_this_process(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_one_that_stays_silent_is_given_up_before_ray_ends_this_process(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     monkeypatch.setenv("RAY_gcs_rpc_server_reconnect_timeout_s", "0.000001")
     watched = HeadMonitor("go on with --resume")
     with pytest.raises(ClusterLost, match=r"127\.0\.0\.1:\d+, has not answered.*--resume"):
@@ -61,7 +65,9 @@ def node(silent: socket.socket, monkeypatch: pytest.MonkeyPatch, tmp_path: Path)
     return node
 
 
-def test_the_end_of_the_daemon_here_is_noticed_though_the_head_answers(node: SimpleNamespace) -> None:
+def test_the_end_of_the_daemon_here_is_noticed_though_the_head_answers(
+    node: SimpleNamespace,
+) -> None:
     with socket.socket(socket.AF_UNIX) as daemon:
         daemon.bind(node.raylet_socket_name)
         daemon.listen()
@@ -86,7 +92,9 @@ def test_a_head_that_this_process_started_is_not_waited_for(
         own.answers()
 
 
-def test_a_process_that_is_still_being_connected_has_no_node_yet(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_process_that_is_still_being_connected_has_no_node_yet(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     """Ray has its record before, and starts a second Ray for whoever asks it for anything then."""
     worker = SimpleNamespace(node="a node", connected=False)
     monkeypatch.setattr("ray._private.worker.global_worker", worker)

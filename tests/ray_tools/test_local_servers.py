@@ -20,7 +20,9 @@ from vlagents_ray.ray_tools.session import LocalServer, announce, local_servers
 
 @pytest.fixture(autouse=True)
 def alone(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
-    """Of the processes of this machine those alone are looked at whose Ray is in this test's folder."""
+    """Of the processes of this machine those alone are looked at whose Ray is in this test's
+    folder.
+    """
     found = Path.glob
 
     def ours(self: Path, pattern: str) -> Iterator[Path]:
@@ -40,26 +42,40 @@ def environ(process: Path) -> bytes:
 
 @contextlib.contextmanager
 def raylet(folder: Path, ray_address: str, **environment: str) -> Iterator[None]:
-    """Run a process that looks like the daemon of the Ray cluster whose private folder is `folder`."""
+    """Run a process that looks like the daemon of the Ray cluster whose private folder is
+    `folder`.
+    """
     folder.mkdir(exist_ok=True)
-    words = ["/ray/raylet", "-c", "read forever", "raylet", f"--gcs-address={ray_address}", "--node_id=1"]
+    words = [
+        "/ray/raylet",
+        "-c",
+        "read forever",
+        "raylet",
+        f"--gcs-address={ray_address}",
+        "--node_id=1",
+    ]
     with subprocess.Popen(
         words, executable="/bin/sh", env={MARK: str(folder)} | environment, stdin=subprocess.PIPE
     ) as process:
         try:
-            wait_for(Path(f"/proc/{process.pid}/cmdline").read_bytes)  # which the kernel sets after Popen has returned
+            # Which the kernel sets after Popen has returned.
+            wait_for(Path(f"/proc/{process.pid}/cmdline").read_bytes)
             yield
         finally:
             process.kill()
 
 
-def ready(monkeypatch: pytest.MonkeyPatch, folder: Path, url: str, app: str, ray_address: str) -> None:
+def ready(
+    monkeypatch: pytest.MonkeyPatch, folder: Path, url: str, app: str, ray_address: str
+) -> None:
     monkeypatch.setenv(MARK, str(folder))
     announce(url, {app: f"{url}/{app}"}, ray_address)
 
 
 def test_without_a_server_joining_ends_at_once_with_the_cure() -> None:
-    with pytest.raises(ConfigError, match=r"no server of this user is ready .* `vlagents-ray serve POLICY`"):
+    with pytest.raises(
+        ConfigError, match=r"no server of this user is ready .* `vlagents-ray serve POLICY`"
+    ):
         join()
 
 
@@ -70,7 +86,11 @@ def test_a_server_that_is_starting_is_not_there_yet_and_one_that_was_killed_no_m
         assert local_servers() == []
         ready(monkeypatch, alone / "a", "http://127.0.0.1:8000", "noop", "127.0.0.1:1")
         [server] = local_servers()
-        assert (server.url, server.apps, server.ray_address) == ("http://127.0.0.1:8000", ("noop",), "127.0.0.1:1")
+        assert (server.url, server.apps, server.ray_address) == (
+            "http://127.0.0.1:8000",
+            ("noop",),
+            "127.0.0.1:1",
+        )
     assert local_servers() == []
     with raylet(alone / "a", "127.0.0.1:2"):  # of another Ray
         assert local_servers() == []
@@ -83,17 +103,32 @@ def test_of_several_servers_one_is_named_by_its_url_or_its_application(
         ready(monkeypatch, alone / "a", "http://127.0.0.1:8000", "noop", "127.0.0.1:1")
         ready(monkeypatch, alone / "b", "http://127.0.0.1:8001", "pi0", "127.0.0.1:2")
         assert [one.apps for one in local_servers()] == [("noop",), ("pi0",)]
-        with pytest.raises(ConfigError, match=r"got 2 servers .*8000 \(noop\), .*8001 \(pi0\); say which"):
+        with pytest.raises(
+            ConfigError, match=r"got 2 servers .*8000 \(noop\), .*8001 \(pi0\); say which"
+        ):
             join()
-        with pytest.raises(ConfigError, match=r"got 'act', want the URL or an application .*8000 \(noop\)"):
+        with pytest.raises(
+            ConfigError, match=r"got 'act', want the URL or an application .*8000 \(noop\)"
+        ):
             join("act")
-        monkeypatch.setenv("RAY_AUTH_MODE", "disabled")  # so that it says which one it found, and goes no further
-        for name in ("pi0", "http://127.0.0.1:8001", "http://127.0.0.1:8001/", "http://localhost:8001"):
-            with pytest.raises(ConfigError, match=r"RAY_AUTH_MODE=disabled: the Ray of http://127\.0\.0\.1:8001 needs"):
+        # So that it says which one it found, and goes no further.
+        monkeypatch.setenv("RAY_AUTH_MODE", "disabled")
+        for name in (
+            "pi0",
+            "http://127.0.0.1:8001",
+            "http://127.0.0.1:8001/",
+            "http://localhost:8001",
+        ):
+            with pytest.raises(
+                ConfigError,
+                match=r"RAY_AUTH_MODE=disabled: the Ray of http://127\.0\.0\.1:8001 needs",
+            ):
                 join(name)
 
 
-def test_a_program_with_another_token_joins_with_that_of_the_server(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_program_with_another_token_joins_with_that_of_the_server(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     ray = pytest.importorskip("ray")
     found: dict[str, str] = {}
     monkeypatch.setattr(os, "environ", os.environ | {"RAY_AUTH_TOKEN": "mine"})

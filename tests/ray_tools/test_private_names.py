@@ -16,6 +16,9 @@ def test_ray_has_the_private_names_that_are_used(place: str) -> None:
 
 
 def test_a_name_that_is_gone_is_noticed() -> None:
-    assert ray_names.missing("ray._private.worker.no_such_name.more") == "ray._private.worker.no_such_name"
+    assert (
+        ray_names.missing("ray._private.worker.no_such_name.more")
+        == "ray._private.worker.no_such_name"
+    )
     assert ray_names.missing("ray._private.no_such_module.name") == "ray._private.no_such_module"
     assert ray_names.missing("ray.serve._private.common.RequestMetadata.no_such_field") is not None

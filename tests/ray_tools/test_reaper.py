@@ -48,11 +48,16 @@ def test_the_reaper_needs_no_package_that_only_its_driver_finds(tmp_path: Path) 
 
 
 @pytest.mark.parametrize("end", ["killed", "without Ray", "orderly"])
-def test_a_driver_that_was_killed_or_has_lost_ray_takes_its_cluster_along(tmp_path: Path, end: str) -> None:
+def test_a_driver_that_was_killed_or_has_lost_ray_takes_its_cluster_along(
+    tmp_path: Path, end: str
+) -> None:
     folder = tmp_path / "cluster"
     folder.mkdir()
     with subprocess.Popen(
-        [sys.executable, "-c", DRIVER, str(folder), end], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+        [sys.executable, "-c", DRIVER, str(folder), end],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
     ) as driver:
         assert driver.stdin is not None
         child, proxy, agent = map(int, driver.stdout.readline().split())

@@ -1,4 +1,6 @@
-"""Ray writes runtime environments where every user of the machine can read them: no secret may be in one."""
+"""Ray writes runtime environments where every user of the machine can read them: no secret may
+be in one.
+"""
 
 from __future__ import annotations
 
@@ -27,20 +29,39 @@ from vlagents_ray.serve.launch.deployment_file import deployment, together
     ],
 )
 def test_variables_that_are_named_like_secrets_are_refused_with_the_cure(name: str) -> None:
-    with pytest.raises(ConfigError, match=f"'{name}'.*in the environment in which Ray is started") as refused:
+    with pytest.raises(
+        ConfigError, match=f"'{name}'.*in the environment in which Ray is started"
+    ) as refused:
         require_no_secrets({"env_vars": {name: "hush"}})
     assert "hush" not in str(refused.value)
 
 
 @pytest.mark.parametrize(
-    "name", ["TOKENIZERS_PARALLELISM", "HF_TOKEN_PATH", "MAX_TOKENS", "MONKEY", "PYTHONPATH", "CUDA_VISIBLE_DEVICES"]
+    "name",
+    [
+        "TOKENIZERS_PARALLELISM",
+        "HF_TOKEN_PATH",
+        "MAX_TOKENS",
+        "MONKEY",
+        "PYTHONPATH",
+        "CUDA_VISIBLE_DEVICES",
+    ],
 )
 def test_others_are_not(name: str) -> None:
-    require_no_secrets({"env_vars": {name: "x"}, "pip": ["a @ https://x/a.whl", "--index-url https://u:${TOKEN}@x"]})
+    require_no_secrets(
+        {
+            "env_vars": {name: "x"},
+            "pip": ["a @ https://x/a.whl", "--index-url https://u:${TOKEN}@x"],
+        }
+    )
 
 
 @pytest.mark.parametrize(
-    "runtime_env", [{"working_dir": "https://u:hush@x/a.zip"}, {"pip": {"packages": ["--index-url=https://u:hush@x"]}}]
+    "runtime_env",
+    [
+        {"working_dir": "https://u:hush@x/a.zip"},
+        {"pip": {"packages": ["--index-url=https://u:hush@x"]}},
+    ],
 )
 def test_a_password_in_a_url_is_refused_wherever_it_stands(runtime_env: dict[str, Any]) -> None:
     with pytest.raises(ConfigError, match="netrc") as refused:

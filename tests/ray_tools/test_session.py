@@ -24,7 +24,8 @@ from vlagents_ray.evaluate.workers.cluster import ray_cluster
 from vlagents_ray.ray_tools import session as joining
 from vlagents_ray.ray_tools.session import joined, ray_folder
 
-# A start-up file of Python's that holds one of Ray's helpers back for longer than Ray's daemon waits for it.
+# A start-up file of Python's that holds one of Ray's helpers back for longer than Ray's daemon
+# waits for it.
 SLOW = """
 import os, time
 from pathlib import Path
@@ -38,9 +39,13 @@ if "dashboard/agent.py" in Path("/proc/self/cmdline").read_text():
 
 
 @pytest.mark.parametrize(
-    "error", [ConnectionError("nobody there"), ray.exceptions.AuthenticationError("another token")], ids=repr
+    "error",
+    [ConnectionError("nobody there"), ray.exceptions.AuthenticationError("another token")],
+    ids=repr,
 )
-def test_a_cluster_that_cannot_be_joined_is_a_wrong_setting(error: Exception, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_cluster_that_cannot_be_joined_is_a_wrong_setting(
+    error: Exception, monkeypatch: pytest.MonkeyPatch
+) -> None:
     def refuse(**_options: object) -> None:
         raise error
 
@@ -53,12 +58,16 @@ def test_a_cluster_that_cannot_be_joined_is_a_wrong_setting(error: Exception, mo
             pytest.fail("joined it")
 
 
-@pytest.mark.parametrize(("here", "own"), [("127.0.0.1:1", True), ("127.0.0.1:2", False), (None, False)])
+@pytest.mark.parametrize(
+    ("here", "own"), [("127.0.0.1:1", True), ("127.0.0.1:2", False), (None, False)]
+)
 def test_a_cluster_that_was_lost_is_not_taken_for_the_one_that_this_process_joined_later(
     monkeypatch: pytest.MonkeyPatch, here: str | None, own: bool
 ) -> None:
     monkeypatch.setattr(joining, "_started", [SimpleNamespace(gcs_address="127.0.0.1:1")])
-    monkeypatch.setattr(joining.private, "node_of_this_process", lambda: here and SimpleNamespace(gcs_address=here))
+    monkeypatch.setattr(
+        joining.private, "node_of_this_process", lambda: here and SimpleNamespace(gcs_address=here)
+    )
     assert joining.started_here() is own
 
 
@@ -101,7 +110,8 @@ def test_a_machine_that_is_slow_to_start_ray_gets_another_attempt(
     with joined("local", num_cpus=1):
         assert ray.get(ray.put(5)) == 5
         assert len(ray.nodes()) == 1
-    assert asked.read_text() in ("xx", "xxx")  # the third where the machine is as slow as that by itself
+    # The third where the machine is as slow as that by itself.
+    assert asked.read_text() in ("xx", "xxx")
     assert "attempt 2 of 3" in caplog.text
     assert re.search("Ray's daemon: .*Timed out waiting for file .*agent", caplog.text)
     _, left = psutil.wait_procs(set(psutil.Process().children(recursive=True)) - before, 30)
@@ -111,7 +121,11 @@ def test_a_machine_that_is_slow_to_start_ray_gets_another_attempt(
 @pytest.mark.parametrize(
     ("error", "said", "attempts"),
     [
-        (Exception("it timed out"), r"did not start .* in 3 attempts: it timed out\. .* Logs: /", 3),
+        (
+            Exception("it timed out"),
+            r"did not start .* in 3 attempts: it timed out\. .* Logs: /",
+            3,
+        ),
         (ValueError("no"), "^no$", 1),
     ],
     ids=["time", "option"],
@@ -177,7 +191,9 @@ def session() -> Path:
 def test_a_ray_of_ones_own_is_in_a_folder_that_no_other_user_enters_and_leaves_nothing(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Its own folders are everybody's to write to: whose sockets and logs are in them would be a matter of luck."""
+    """Its own folders are everybody's to write to: whose sockets and logs are in them would be a
+    matter of luck.
+    """
     with ray_folder_of_test() as place:
         place.chmod(0o755)
         monkeypatch.setenv("RAY_TMPDIR", str(place / "new"))
@@ -205,7 +221,8 @@ def test_a_folder_whose_name_is_too_long_for_sockets_is_replaced(
     assert not folder.exists()
 
 
-# Starts two clusters after each other, and lists what other accounts of the machine could read of their tokens.
+# Starts two clusters after each other, and lists what other accounts of the machine could read of
+# their tokens.
 OPEN_HOME = """
 import os, stat, sys
 from pathlib import Path
@@ -236,14 +253,20 @@ print("closed to others")
 
 
 @pytest.mark.ray
-def test_the_token_of_a_started_cluster_is_its_own_and_closed_to_other_accounts(tmp_path: Path) -> None:
-    """Whoever reads the token runs code as this user, and a home folder that others may enter is usual."""
+def test_the_token_of_a_started_cluster_is_its_own_and_closed_to_other_accounts(
+    tmp_path: Path,
+) -> None:
+    """Whoever reads the token runs code as this user, and a home folder that others may enter is
+    usual.
+    """
     with tempfile.TemporaryDirectory() as folder:  # short, for the names of Ray's sockets
         Path(folder).chmod(0o755)
         home, files = Path(folder, "home"), Path(folder, "t")
         for place in (home, files):
             place.mkdir(mode=0o755)
-        environment = {name: value for name, value in os.environ.items() if not name.startswith("RAY_AUTH")}
+        environment = {
+            name: value for name, value in os.environ.items() if not name.startswith("RAY_AUTH")
+        }
         environment |= {"HOME": str(home), "TMPDIR": str(files), "RAY_TMPDIR": str(files)}
         script = tmp_path / "open_home.py"
         script.write_text(OPEN_HOME)

@@ -1,4 +1,6 @@
-"""Stops, pauses, take-overs and commands from afar in any order: the robot moves only when it is allowed to."""
+"""Stops, pauses, take-overs and commands from afar in any order: the robot moves only when it is
+allowed to.
+"""
 
 from __future__ import annotations
 
@@ -13,7 +15,13 @@ import pytest
 from eval_fakes import SimulatedTime
 from hypothesis import settings
 from hypothesis import strategies as st
-from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, rule, run_state_machine_as_test
+from hypothesis.stateful import (
+    RuleBasedStateMachine,
+    initialize,
+    invariant,
+    rule,
+    run_state_machine_as_test,
+)
 from in_process_replicas import Replicas
 from many import many
 
@@ -53,7 +61,9 @@ def event(**drawn: Any) -> Callable[[Callable[..., None]], Any]:
 
 
 class Machine(RuleBasedStateMachine):
-    """A control loop that makes a tick when a rule says so, and a model of what may move the robot."""
+    """A control loop that makes a tick when a rule says so, and a model of what may move the
+    robot.
+    """
 
     def __init__(self) -> None:
         super().__init__()
@@ -64,18 +74,23 @@ class Machine(RuleBasedStateMachine):
         self.info: dict[str, Any] = {}
         self.from_afar: list[dict[str, str]] = []
         self.passed: list[bytes] = []
-        self.humans = 0  # applied actions of a run that are the human's, and not safe ones in their place
+        # Applied actions of a run that are the human's, and not safe ones in their place.
+        self.humans = 0
         self.wrong: list[str] = []
         self.thread: threading.Thread | None = None
         self.ready, self.go = threading.Semaphore(0), threading.Semaphore(0)
         self.ending = False
         self._open = contextlib.ExitStack()
         self._open.enter_context(patch("vlagents_ray.robot.pacing.time", SimulatedTime()))
-        self._open.enter_context(patch("vlagents_ray.robot.loop.undisturbed", lambda **_: contextlib.nullcontext([])))
+        self._open.enter_context(
+            patch("vlagents_ray.robot.loop.undisturbed", lambda **_: contextlib.nullcontext([]))
+        )
 
     @initialize(
         simulated=st.booleans(),
-        options=st.sampled_from([{"mode": "open_loop"}, {"mode": "open_loop", "execute": 1}, {"mode": "ensemble"}]),
+        options=st.sampled_from(
+            [{"mode": "open_loop"}, {"mode": "open_loop", "execute": 1}, {"mode": "ensemble"}]
+        ),
         played=st.booleans(),
     )
     def build(self, *, simulated: bool, options: dict[str, Any], played: bool) -> None:
@@ -95,7 +110,10 @@ class Machine(RuleBasedStateMachine):
             def act(self, obs: Obs) -> Act:
                 self.acts += 1
                 row = np.full(2, 0.001 * (self.acts % 300), np.float32)
-                act = Act(np.tile(row, (3, 1)) if played else row, info=dict(machine.info) if played else {})
+                act = Act(
+                    np.tile(row, (3, 1)) if played else row,
+                    info=dict(machine.info) if played else {},
+                )
                 if machine.wild and played:
                     act.action[:] = WILD
                 if machine.from_afar:
@@ -124,7 +142,10 @@ class Machine(RuleBasedStateMachine):
         self.agent: Agent = Policy()
         if played:
             self.agent = ChunkPlayer(
-                Policy(), PlayerSettings(safe="hold", **options), override=Leader(), check=self.guard
+                Policy(),
+                PlayerSettings(safe="hold", **options),
+                override=Leader(),
+                check=self.guard,
             )
             self.watchdog.share(self.agent.control)
         self.control = self.watchdog.control
@@ -145,7 +166,8 @@ class Machine(RuleBasedStateMachine):
         """Compare an action with the model."""
         value = float(action[0])
         humans = value == HUMANS
-        accepted = self.engaged and not self.wild  # the guard refuses a wild one, and a safe one takes its place
+        # The guard refuses a wild one, and a safe one takes its place.
+        accepted = self.engaged and not self.wild
         self.humans += accepted
         if self.commanded_stop or self.barked:
             self.wrong.append(f"{value} after a stop without a restart")
@@ -185,9 +207,13 @@ class Machine(RuleBasedStateMachine):
             )
             interventions = report.interventions
             if interventions != self.humans:
-                self.wrong.append(f"{interventions} interventions, of which {self.humans} are the human's")
+                self.wrong.append(
+                    f"{interventions} interventions, of which {self.humans} are the human's"
+                )
         except InvalidAction:
-            pass  # a wild action before the first one, as there is nothing to hold: the run ends with a stop
+            # A wild action before the first one, as there is nothing to hold: the run ends with a
+            # stop.
+            pass
         except RuntimeError as error:
             if str(error) != "a sensor":
                 self.wrong.append(repr(error))
@@ -237,7 +263,9 @@ class Machine(RuleBasedStateMachine):
     @event(source=st.sampled_from(["server", "camera", "trip", "own program"]))
     def stop_at_the_robot(self, source: str) -> None:
         if source in ("trip", "own program"):
-            (self.watchdog.trip if source == "trip" else self.control.stop)("a person is in the way")
+            (self.watchdog.trip if source == "trip" else self.control.stop)(
+                "a person is in the way"
+            )
             self.commanded_stop = True
             return
         self.control.stop(f"{source}: silent", silent=source)
@@ -297,7 +325,18 @@ class Machine(RuleBasedStateMachine):
 
     @event(
         do=st.sampled_from(
-            ["pause", "stop", "stop", "success", "failure", "resume", "instruct", "restart", "begin", "move"]
+            [
+                "pause",
+                "stop",
+                "stop",
+                "success",
+                "failure",
+                "resume",
+                "instruct",
+                "restart",
+                "begin",
+                "move",
+            ]
         )
     )
     def command_from_afar(self, do: str) -> None:
@@ -322,7 +361,9 @@ class Machine(RuleBasedStateMachine):
 
 
 def test_nothing_moves_after_a_stop_or_in_a_pause_or_past_the_guard_in_any_order() -> None:
-    run_state_machine_as_test(Machine, settings=settings(max_examples=many(200), stateful_step_count=50, deadline=None))
+    run_state_machine_as_test(
+        Machine, settings=settings(max_examples=many(200), stateful_step_count=50, deadline=None)
+    )
 
 
 class Loop(Agent):
@@ -352,7 +393,17 @@ def test_no_answer_of_a_server_has_a_name_of_the_loop() -> None:
 @pytest.mark.parametrize("name", OF_THE_LOOP)
 def test_an_answer_with_a_name_of_the_loop_changes_nothing(name: str) -> None:
     seen = []
-    for value in (None, True, "fine", float("nan"), -1e9, 10**6, np.full(2, 9.0, np.float32), [1], {"row": 1}):
+    for value in (
+        None,
+        True,
+        "fine",
+        float("nan"),
+        -1e9,
+        10**6,
+        np.full(2, 9.0, np.float32),
+        [1],
+        {"row": 1},
+    ):
         for info in ({}, {name: value, "other": 1}):
             with ChunkPlayer(Loop(info)) as player:
                 player.initialize()

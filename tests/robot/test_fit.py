@@ -25,17 +25,25 @@ NAMES = ("pan", "lift", "gripper")
 @pytest.mark.parametrize(
     "content",
     [
-        {"observation.state": {"min": LOW, "max": HIGH, "mean": LOW}, "action": {"min": LOW, "max": HIGH}},
+        {
+            "observation.state": {"min": LOW, "max": HIGH, "mean": LOW},
+            "action": {"min": LOW, "max": HIGH},
+        },
         {"norm_stats": {"state": {"q01": LOW, "q99": HIGH}, "actions": {"q01": LOW, "q99": HIGH}}},
         {
             "so101": {
-                part: {"arm": {"min": LOW[:2], "max": HIGH[:2]}, "gripper": {"min": LOW[2:], "max": HIGH[2:]}}
+                part: {
+                    "arm": {"min": LOW[:2], "max": HIGH[:2]},
+                    "gripper": {"min": LOW[2:], "max": HIGH[2:]},
+                }
                 for part in ("state", "action")
             }
         },
     ],
 )
-def test_the_statistics_of_three_libraries_are_read(tmp_path: Path, content: dict[str, object]) -> None:
+def test_the_statistics_of_three_libraries_are_read(
+    tmp_path: Path, content: dict[str, object]
+) -> None:
     (tmp_path / "stats.json").write_text(json.dumps(content))
     found = Trained.read(tmp_path / "stats.json")
     for part in (found.state, found.action):
@@ -54,12 +62,20 @@ def test_a_file_without_ranges_is_refused(tmp_path: Path, text: str) -> None:
     ("state", "said"),
     [
         ([0.5, -1.0, 0.5], None),
-        ([57.0, -1.0, 0.5], r"state\[0\] \(pan\): got 57, was trained from -1 to 1; degrees for radians\?"),
-        ([-1.9, -1.0, 0.5], r"state\[0\] \(pan\): got -1.9, .*fit number \[1\] \(lift\): another order\?"),
+        (
+            [57.0, -1.0, 0.5],
+            r"state\[0\] \(pan\): got 57, was trained from -1 to 1; degrees for radians\?",
+        ),
+        (
+            [-1.9, -1.0, 0.5],
+            r"state\[0\] \(pan\): got -1.9, .*fit number \[1\] \(lift\): another order\?",
+        ),
         ([0.5, -1.0], "got 2 numbers, was trained with 3"),
     ],
 )
-def test_a_state_outside_of_the_training_is_found_with_its_number(state: list[float], said: str | None) -> None:
+def test_a_state_outside_of_the_training_is_found_with_its_number(
+    state: list[float], said: str | None
+) -> None:
     found = TRAINED.misfits(np.array(state), None, None, NAMES)
     if said is None:
         assert found == []
@@ -86,9 +102,15 @@ def test_an_accepted_misfit_is_logged(caplog: pytest.LogCaptureFixture) -> None:
 
 def test_the_first_chunk_is_drawn_beside_the_training_and_the_limits() -> None:
     chunk = np.array([[0.0, 0.1, 1.0], [0.3, 0.2, 0.9]])
-    header, *lines = TRAINED.drawn(chunk, Limits(low=(-1.5, -2.5, 0.0), high=(1.5, 1.0, 1.0)), NAMES)
+    header, *lines = TRAINED.drawn(
+        chunk, Limits(low=(-1.5, -2.5, 0.0), high=(1.5, 1.0, 1.0)), NAMES
+    )
     assert header.split()[-3:] == ["chunk", "training", "limits"]
-    assert [line.split("|")[0].strip() for line in lines] == ["[0] (pan)", "[1] (lift)", "[2] (gripper)"]
+    assert [line.split("|")[0].strip() for line in lines] == [
+        "[0] (pan)",
+        "[1] (lift)",
+        "[2] (gripper)",
+    ]
     assert lines[0].split("|")[1:] == [
         ".....----------####-------......",
         "             0 … 0.3              -1 … 1          -1.5 … 1.5",
@@ -105,12 +127,16 @@ def test_joints_in_another_order_than_that_of_the_limits_are_found_by_name() -> 
     assert first == "joints: number 0 is 'pan' of the arm and 'lift' of its limits; use one order"
     assert "number 1 is 'lift'" in second
     assert Trained().misfits(None, None, Limits(joints=("pan.pos", "lift.pos")), NAMES) == []
-    assert Trained().misfits(None, None, Limits(joints=("joint1", "joint2")), NAMES) == [], "other names say nothing"
+    assert Trained().misfits(None, None, Limits(joints=("joint1", "joint2")), NAMES) == [], (
+        "other names say nothing"
+    )
 
 
 def test_joints_in_another_order_than_that_of_the_policy_are_found_by_name() -> None:
     policy = Contract(action=ActionSpec(dim=3, names=("lift.pos", "pan.pos", "gripper.pos")))
-    with pytest.raises(ContractMismatch, match="number 0 is 'lift' of the policy and 'pan' of the env") as caught:
+    with pytest.raises(
+        ContractMismatch, match="number 0 is 'lift' of the policy and 'pan' of the env"
+    ) as caught:
         require_match(policy, contract_of(Standing(0, 0)))
     assert str(caught.value).count("- action.names: number") == 2
     require_match(Contract(action=ActionSpec(names=NAMES)), contract_of(Standing(0, 0)))
@@ -159,7 +185,9 @@ RANGES = {"min": LOW, "max": HIGH}
 
 
 def test_the_command_compares_the_arm_in_the_order_of_the_contract(tmp_path: Path) -> None:
-    (tmp_path / "stats.json").write_text(json.dumps({"observation.state": RANGES, "action": RANGES}))
+    (tmp_path / "stats.json").write_text(
+        json.dumps({"observation.state": RANGES, "action": RANGES})
+    )
     given = ["http://gpu-box:8000", "--trained-on", str(tmp_path / "stats.json")]
     said: list[str] = []
     _require_fit(parse(given), Still(), Standing(0, 0), None, said.append)
@@ -169,8 +197,13 @@ def test_the_command_compares_the_arm_in_the_order_of_the_contract(tmp_path: Pat
     _require_fit(parse([*given, "--accept-misfit"]), Still(), Standing(57, 0), None, said.append)
 
 
-def test_the_statistics_are_those_of_the_server_unless_a_file_is_named(caplog: pytest.LogCaptureFixture) -> None:
-    stated = {"parts": ["gripper", "joints"], "observation.state": {"min": [0, -1, -2], "max": [1, 1, 0.5]}}
+def test_the_statistics_are_those_of_the_server_unless_a_file_is_named(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    stated = {
+        "parts": ["gripper", "joints"],
+        "observation.state": {"min": [0, -1, -2], "max": [1, 1, 0.5]},
+    }
     agent, said = Still(stated), list[str]()
     words = ["http://gpu-box:8000", "--robot", "test_fit:Standing"]
     with caplog.at_level(logging.INFO):

@@ -1,4 +1,6 @@
-"""No producer of commands changes a gripper on its own: each of them, for both kinds of actions, one arm and two."""
+"""No producer of commands changes a gripper on its own: each of them, for both kinds of actions,
+one arm and two.
+"""
 
 from __future__ import annotations
 
@@ -8,7 +10,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from vlagents_ray import Act, ActionSpec, Agent, ChunkPlayer, ConfigError, Contract, Obs, PlayerSettings
+from vlagents_ray import (
+    Act,
+    ActionSpec,
+    Agent,
+    ChunkPlayer,
+    ConfigError,
+    Contract,
+    Obs,
+    PlayerSettings,
+)
 from vlagents_ray.chunking.fallback import SafeAction, neutral
 from vlagents_ray.errors import PolicyUnavailable
 from vlagents_ray.interface import SAFE
@@ -27,7 +38,14 @@ KINDS = [
 def spec_of(delta: bool, arms: int) -> ActionSpec:
     """Return actions of three joints and a gripper for each arm."""
     names = tuple(f"arm{i}" for i in range(arms)) if arms > 1 else None
-    return ActionSpec(dim=4 * arms, space="joint", delta=delta, gripper_open=OPEN, gripper_closed=CLOSED, arms=names)
+    return ActionSpec(
+        dim=4 * arms,
+        space="joint",
+        delta=delta,
+        gripper_open=OPEN,
+        gripper_closed=CLOSED,
+        arms=names,
+    )
 
 
 def limits_of(arms: int, gripper: float) -> Limits:
@@ -45,10 +63,14 @@ def test_the_columns_are_the_last_of_each_arms_part() -> None:
     assert spec_of(True, 2).delta_columns(8) == [0, 1, 2, 4, 5, 6]
     assert spec_of(False, 2).delta_columns(8) == []
     assert ActionSpec(delta=True).gripper_columns(7) == []
-    assert ActionSpec(gripper_closed=0.0).gripper_columns(7) == [6], "also if only one of its ends is stated"
+    assert ActionSpec(gripper_closed=0.0).gripper_columns(7) == [6], (
+        "also if only one of its ends is stated"
+    )
 
 
-UNEQUAL = ActionSpec(dim=15, delta=True, gripper_open=1.0, gripper_closed=0.0, arms=("left", "right"))
+UNEQUAL = ActionSpec(
+    dim=15, delta=True, gripper_open=1.0, gripper_closed=0.0, arms=("left", "right")
+)
 
 
 @pytest.mark.parametrize(
@@ -67,7 +89,9 @@ def test_arms_that_do_not_share_the_numbers_equally_are_an_error_of_each_user(us
 
 
 @pytest.mark.parametrize(("delta", "arms"), KINDS)
-def test_a_safe_action_keeps_each_gripper_and_the_neutral_one_opens_all(delta: bool, arms: int) -> None:
+def test_a_safe_action_keeps_each_gripper_and_the_neutral_one_opens_all(
+    delta: bool, arms: int
+) -> None:
     spec = spec_of(delta, arms)
     columns = spec.gripper_columns(4 * arms)
     last = np.random.default_rng(0).uniform(-1, 1, 4 * arms).astype(np.float32)
@@ -96,7 +120,9 @@ class Grasping(Agent):
         if not spec.relative:
             rows = obs.state["joints"] + np.cumsum(rows, axis=0)
         for row in rows:
-            target = np.where(self._random.random(len(self._gripper)) < 0.1, -self._gripper, self._gripper)
+            target = np.where(
+                self._random.random(len(self._gripper)) < 0.1, -self._gripper, self._gripper
+            )
             change = np.clip(target - self._gripper, -self._change, self._change)
             self._gripper = np.clip(self._gripper + change, CLOSED, OPEN)
             row[spec.gripper_columns(dim)] = self._gripper
@@ -107,7 +133,9 @@ class Grasping(Agent):
 @pytest.mark.parametrize(("delta", "arms"), KINDS)
 @pytest.mark.parametrize("mode", ["open_loop", "async"])
 @pytest.mark.parametrize("seed", range(3))
-def test_a_grippers_command_is_the_last_one_or_the_policys(delta: bool, arms: int, mode: str, seed: int) -> None:
+def test_a_grippers_command_is_the_last_one_or_the_policys(
+    delta: bool, arms: int, mode: str, seed: int
+) -> None:
     """Ease-in, hold, lost answers, pauses and stops change no gripper that has no limits."""
     spec = spec_of(delta, arms)
     columns = spec.gripper_columns(4 * arms)
@@ -129,7 +157,8 @@ def test_a_grippers_command_is_the_last_one_or_the_policys(delta: bool, arms: in
             elif event == "stop" and last is not None:
                 player.act(Obs(state={"joints": joints}))  # is not executed
                 player.interrupt()
-                joints = joints + np.float32(0.2) * np.isin(np.arange(len(joints)), columns)  # the fingers give way
+                # The fingers give way.
+                joints = joints + np.float32(0.2) * np.isin(np.arange(len(joints)), columns)
             act = player.act(Obs(state={"joints": joints}))
             player.control.resume()
             held += SAFE in act.info
@@ -147,7 +176,9 @@ def test_a_grippers_command_is_the_last_one_or_the_policys(delta: bool, arms: in
 
 
 @pytest.mark.parametrize(("delta", "arms"), KINDS)
-def test_a_gripper_with_limits_goes_from_the_last_command_to_the_policys_and_not_back(delta: bool, arms: int) -> None:
+def test_a_gripper_with_limits_goes_from_the_last_command_to_the_policys_and_not_back(
+    delta: bool, arms: int
+) -> None:
     spec = spec_of(delta, arms)
     columns = spec.gripper_columns(4 * arms)
 
@@ -192,7 +223,9 @@ def test_the_way_to_rest_keeps_the_grippers(arms: int) -> None:
 
 
 @pytest.mark.parametrize(("delta", "arms"), KINDS)
-def test_a_simulated_robot_has_its_grippers_where_they_were_commanded(delta: bool, arms: int) -> None:
+def test_a_simulated_robot_has_its_grippers_where_they_were_commanded(
+    delta: bool, arms: int
+) -> None:
     spec = spec_of(delta, arms)
     columns = spec.gripper_columns(4 * arms)
 
@@ -239,7 +272,9 @@ def test_arms_whose_openings_are_unknown_stand_until_the_first_action_that_is_ac
 
 @pytest.mark.parametrize("broken", [np.nan, np.inf, -np.inf])
 @pytest.mark.parametrize("column", [4, 6, 7], ids=["a joint", "another joint", "the gripper"])
-def test_a_number_of_the_second_arm_that_is_not_finite_moves_neither_arm(broken: float, column: int) -> None:
+def test_a_number_of_the_second_arm_that_is_not_finite_moves_neither_arm(
+    broken: float, column: int
+) -> None:
     spec = spec_of(True, 2)
 
     class Breaking(Agent):
@@ -255,7 +290,9 @@ def test_a_number_of_the_second_arm_that_is_not_finite_moves_neither_arm(broken:
             return Act(rows)
 
     policy = Breaking()
-    with ChunkPlayer(policy, PlayerSettings(deadline_s=30.0), check=Guard(policy.contract)) as player:
+    with ChunkPlayer(
+        policy, PlayerSettings(deadline_s=30.0), check=Guard(policy.contract)
+    ) as player:
         player.initialize()
         player.reset(Obs())
         acts = [player.act(Obs()) for _ in range(12)]

@@ -29,7 +29,9 @@ GUARD = Guard(Contract(action=ActionSpec(dim=3, low=-1.0, high=1.0)))
         (row(0, 1.01, 0), r"action\[1\]: got 1.01, above the limit 1"),
     ],
 )
-def test_an_action_that_breaks_the_contract_is_refused_by_its_number(action: np.ndarray, said: str) -> None:
+def test_an_action_that_breaks_the_contract_is_refused_by_its_number(
+    action: np.ndarray, said: str
+) -> None:
     with pytest.raises(InvalidAction, match=said):
         GUARD(action)
 

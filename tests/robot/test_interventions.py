@@ -1,4 +1,6 @@
-"""Interventions in the control loop: how long they take to begin, what the robot gets, and what is recorded."""
+"""Interventions in the control loop: how long they take to begin, what the robot gets, and what
+is recorded.
+"""
 
 from __future__ import annotations
 
@@ -49,7 +51,11 @@ class Arm(SimulatedRobot):
         self.commanded: list[np.ndarray] = []
 
     def observe(self) -> Obs:
-        return Obs(state={"joints": (self.commanded[-1] if self.commanded else np.zeros(2)).astype(np.float32)})
+        return Obs(
+            state={
+                "joints": (self.commanded[-1] if self.commanded else np.zeros(2)).astype(np.float32)
+            }
+        )
 
     def apply(self, action: np.ndarray) -> None:
         self.commanded.append(action)
@@ -85,8 +91,13 @@ def test_a_correction_of_a_second_is_recorded_from_its_first_tick_with_both_acti
         wait_for(lambda: player._asker is None or not player._asker.busy, every_s=0.001)
         return False
 
-    with recorder, ChunkPlayer(Going(), PlayerSettings(**options), override=leader, check=guard) as player:
-        report = run_loop(arm, player, hz=HZ, seconds=3.0, instruction="go", recorder=recorder, until=answered)
+    with (
+        recorder,
+        ChunkPlayer(Going(), PlayerSettings(**options), override=leader, check=guard) as player,
+    ):
+        report = run_loop(
+            arm, player, hz=HZ, seconds=3.0, instruction="go", recorder=recorder, until=answered
+        )
     seen = rows(tmp_path)
     led = [tick for tick, human in zip(seen["tick"], seen["intervention"], strict=True) if human]
     assert 49 <= len(led) <= 51
@@ -99,7 +110,9 @@ def test_a_correction_of_a_second_is_recorded_from_its_first_tick_with_both_acti
     assert human == pytest.approx(np.array(leader.given))
     assert all(seen["policy_known"][first : first + len(led)])
     assert (policy > human).all(), "it wants to go the other way"
-    others = [i for i in range(len(seen["tick"])) if not seen["intervention"][i] and not seen["safe"][i]]
+    others = [
+        i for i in range(len(seen["tick"])) if not seen["intervention"][i] and not seen["safe"][i]
+    ]
     assert [seen["policy_action"][i] for i in others] == [seen["action"][i] for i in others]
     steps = np.abs(np.diff(np.stack([np.zeros(2), *arm.commanded]), axis=0))
     assert steps.max() <= MAX_STEP + 1e-6, "at the release, too"
@@ -121,7 +134,9 @@ def test_pauses_are_counted_apart_from_ticks_that_the_policy_missed(clock: Simul
 
 
 def test_a_silent_server_stops_no_robot_that_a_human_moves() -> None:
-    """A silent policy gives safe actions; a human's count as signs of life of whoever moves the robot."""
+    """A silent policy gives safe actions; a human's count as signs of life of whoever moves the
+    robot.
+    """
     gate = threading.Event()
 
     class Hanging(Going):
@@ -152,7 +167,12 @@ def test_a_silent_server_stops_no_robot_that_a_human_moves() -> None:
 def add(recorder: Recorder, label: Any = None) -> None:
     with recorder.episode("stack"):
         recorder.add(Obs(state={"joints": np.zeros(2, np.float32)}), np.ones(2, np.float32), tick=0)
-        recorder.add(Obs(state={"joints": np.zeros(2, np.float32)}), np.ones(2, np.float32), tick=1, intervention=True)
+        recorder.add(
+            Obs(state={"joints": np.zeros(2, np.float32)}),
+            np.ones(2, np.float32),
+            tick=1,
+            intervention=True,
+        )
         if label is not None:
             recorder.label(label)
 
@@ -163,9 +183,15 @@ def test_episodes_have_a_label_and_discarded_ones_are_dropped(tmp_path: Path) ->
             add(recorder, label)
         with pytest.raises(ConfigError, match="want one of"):
             recorder.label("good")  # type: ignore[arg-type]
-    about = [pq.read_table(path).to_pylist()[0] for path in sorted(tmp_path.glob("meta/episodes/*/*.parquet"))]
+    about = [
+        pq.read_table(path).to_pylist()[0]
+        for path in sorted(tmp_path.glob("meta/episodes/*/*.parquet"))
+    ]
     assert [one["label"] for one in about] == ["success", "failure", "none"]
-    outcomes = [[rows(tmp_path, episode)[f"next.{name}"] for name in ("reward", "success")] for episode in range(3)]
+    outcomes = [
+        [rows(tmp_path, episode)[f"next.{name}"] for name in ("reward", "success")]
+        for episode in range(3)
+    ]
     assert outcomes == [[[0, 1], [False, True]], *[[[0, 0], [False, False]]] * 2]
     assert all(rows(tmp_path, episode)["next.done"] == [False, True] for episode in range(3))
     assert json.loads((tmp_path / "meta/info.json").read_text())["total_episodes"] == 3
@@ -192,10 +218,16 @@ def test_a_dataset_goes_on_with_its_own_columns(tmp_path: Path) -> None:
     assert "intervention" not in rows(tmp_path / "old", 1)
 
 
-def test_a_recorder_without_a_place_for_interventions_is_refused_before_anything_moves(tmp_path: Path) -> None:
+def test_a_recorder_without_a_place_for_interventions_is_refused_before_anything_moves(
+    tmp_path: Path,
+) -> None:
     arm = Arm()
     player = ChunkPlayer(Going(), override=ScriptedLeader(back))
-    with Recorder(tmp_path, HZ) as recorder, player, pytest.raises(ConfigError, match="interventions=True"):
+    with (
+        Recorder(tmp_path, HZ) as recorder,
+        player,
+        pytest.raises(ConfigError, match="interventions=True"),
+    ):
         run_loop(arm, player, hz=HZ, seconds=1.0, recorder=recorder)
     assert arm.commanded == []
 
@@ -223,7 +255,9 @@ def test_a_recorded_frame_is_the_policys_or_an_operators_or_a_safe_one(
 
     leader = ScriptedLeader(led, lambda: 5 <= leader.polls < 35)
     guard = Guard(Still.contract, low=-1.0, high=1.0)
-    player = ChunkPlayer(Still(), PlayerSettings(mode, deadline_s=0.5), override=leader, check=guard)
+    player = ChunkPlayer(
+        Still(), PlayerSettings(mode, deadline_s=0.5), override=leader, check=guard
+    )
     with player, Recorder(tmp_path, 200, interventions=True) as recorder:
         report = run_loop(arm, player, hz=200.0, recorder=recorder, until=lambda: leader.polls > 45)
     seen = rows(tmp_path)

@@ -1,4 +1,6 @@
-"""Limits of speed, acceleration and jerk, where they come from, and the slow ways from and to rest."""
+"""Limits of speed, acceleration and jerk, where they come from, and the slow ways from and to
+rest.
+"""
 
 from __future__ import annotations
 
@@ -9,7 +11,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from vlagents_ray import Act, ActionSpec, Agent, ChunkPlayer, ConfigError, Contract, Obs, PlayerSettings
+from vlagents_ray import (
+    Act,
+    ActionSpec,
+    Agent,
+    ChunkPlayer,
+    ConfigError,
+    Contract,
+    Obs,
+    PlayerSettings,
+)
 from vlagents_ray.chunking.control import Control
 from vlagents_ray.errors import InvalidAction
 from vlagents_ray.robot import Guard, Limits, run_loop
@@ -46,10 +57,12 @@ def run(checked: Guard, *positions: float) -> None:
 
 def test_speeding_up_is_limited_and_braking_is_not() -> None:
     limits = Limits(velocity=1.0, acceleration=10.0)
-    run(guard(limits), 0, 0.0039, 0.0078, 0.0078, 0.0039)  # braking, and away in the other direction from rest
+    # braking, and away in the other direction from rest.
+    run(guard(limits), 0, 0.0039, 0.0078, 0.0078, 0.0039)
     for positions, said, cause in (
         ((0, 0.0041), "acceleration 10.25, want 10 at most", "dynamics"),
-        ((0, 0.0030, 0.0060, 0.0030), "acceleration -15, want 10", "dynamics"),  # turns round at once
+        # Turns round at once.
+        ((0, 0.0030, 0.0060, 0.0030), "acceleration -15, want 10", "dynamics"),
         ((0, 0.021), "velocity 1.05, want 1 at most", "max_step"),
     ):
         with pytest.raises(InvalidAction, match=said) as refused:
@@ -68,7 +81,9 @@ def test_holding_always_passes() -> None:
 
 
 def test_the_limits_of_relative_actions_are_of_the_actions_themselves() -> None:
-    checked = Guard(Contract(action=ActionSpec(dim=1, delta=True)), limits=LIMITS, hz=HZ, soft_start_s=0)
+    checked = Guard(
+        Contract(action=ActionSpec(dim=1, delta=True)), limits=LIMITS, hz=HZ, soft_start_s=0
+    )
     checked(row(0.003), row(0))
     with pytest.raises(InvalidAction, match=r"velocity 1\.5"):
         checked(row(0.03), row(0.003))
@@ -127,14 +142,22 @@ class Line(Agent):
 
 
 def driven(arm: Arm, agent: Agent, limits: Limits, **options: float) -> np.ndarray:
-    checked = Guard(agent.contract, limits=limits, hz=200, measure=lambda obs: obs.state["joints"], soft_start_s=0)
+    checked = Guard(
+        agent.contract,
+        limits=limits,
+        hz=200,
+        measure=lambda obs: obs.state["joints"],
+        soft_start_s=0,
+    )
     with ChunkPlayer(agent, PlayerSettings(deadline_s=5.0), check=checked) as player:
         report = run_loop(arm, player, hz=200, seconds=2, **options)
     assert report.safe == {}
     return np.array(arm.path)[:, 0].astype(np.float64)
 
 
-def test_the_first_action_is_eased_in_from_the_measured_pose_and_the_plan_follows_with_rising_speed() -> None:
+def test_the_first_action_is_eased_in_from_the_measured_pose_and_the_plan_follows_with_rising_speed() -> (
+    None
+):
     limits = Limits(velocity=4.0, acceleration=80.0, jerk=16000.0)
     path = driven(Arm(), Line(begin=0.3), limits)
     steps, rows = np.diff(path), 0.3 + 0.01 * np.arange(1, 201)
@@ -189,7 +212,9 @@ def test_a_file_of_limits_is_read_with_its_urdf(tmp_path: Path) -> None:
     assert limits.low == (-1.5, -1.0)
     checked = guard(limits)
     checked(row(1.4, 0.1))
-    with pytest.raises(InvalidAction, match=r"tip would be at z = -0\.152 m, below the workspace's 0\.05 m"):
+    with pytest.raises(
+        InvalidAction, match=r"tip would be at z = -0\.152 m, below the workspace's 0\.05 m"
+    ):
         checked(row(0, -1.0))
     with pytest.raises(InvalidAction, match=r"above the limit 1\.5"):
         checked(row(1.6, 0))
@@ -198,7 +223,14 @@ def test_a_file_of_limits_is_read_with_its_urdf(tmp_path: Path) -> None:
 def test_the_tip_is_where_the_chain_of_transforms_puts_it(tmp_path: Path) -> None:
     (tmp_path / "arm.urdf").write_text(URDF)
     (tmp_path / "arm.json").write_text(
-        json.dumps({"joints": ["lift", "pan"], "urdf": "arm.urdf", "tip": "tip", "workspace_low": [-1, -1, -1]})
+        json.dumps(
+            {
+                "joints": ["lift", "pan"],
+                "urdf": "arm.urdf",
+                "tip": "tip",
+                "workspace_low": [-1, -1, -1],
+            }
+        )
     )
     chain = Limits.read(tmp_path / "arm.json").chain
     assert chain is not None
@@ -232,7 +264,8 @@ def test_a_dataset_gives_the_limits_of_its_demonstrations(tmp_path: Path) -> Non
 
     time_s = np.arange(300) / 30
     episodes = [
-        np.stack([(1 - np.cos(time_s + phase)) ** 2 / 4, np.zeros(300)], 1).astype(np.float32) for phase in (0.0, 2.0)
+        np.stack([(1 - np.cos(time_s + phase)) ** 2 / 4, np.zeros(300)], 1).astype(np.float32)
+        for phase in (0.0, 2.0)
     ]
     (tmp_path / "meta").mkdir()
     features = {"action": {"dtype": "float32", "shape": [2], "names": ["a.pos", "b.pos"]}}
@@ -242,7 +275,8 @@ def test_a_dataset_gives_the_limits_of_its_demonstrations(tmp_path: Path) -> Non
     pq.write_table(pa.table(columns), tmp_path / "data/chunk-000/file-000.parquet")
     limits = Limits.read(tmp_path)
     assert limits.joints == ("a.pos", "b.pos")
-    assert limits.velocity == pytest.approx((1.3, math.inf), rel=0.01)  # twice that of the path, without a jump between
+    # Twice that of the path, without a jump between.
+    assert limits.velocity == pytest.approx((1.3, math.inf), rel=0.01)
     assert limits.acceleration == pytest.approx((2.0, math.inf), rel=0.01)
     assert limits.low == pytest.approx((-0.1, 0), abs=0.01)
     last = None

@@ -1,4 +1,6 @@
-"""Every plan within half of the limits is executed within a bounded time, from wherever the arm stands before it."""
+"""Every plan within half of the limits is executed within a bounded time, from wherever the arm
+stands before it.
+"""
 
 from __future__ import annotations
 
@@ -18,12 +20,20 @@ RUNS = 25  # a test; four seeds make 100
 
 
 class Swinging(Agent):
-    """A plan of one joint, a sine at a share of the strictest limit; row k of it is the same in each answer."""
+    """A plan of one joint, a sine at a share of the strictest limit; row k of it is the same in
+    each answer.
+    """
 
     contract: Contract | None = None
 
     def __init__(
-        self, random: np.random.Generator, hz: float, share: float, *, delta: bool, chunk: int | None = None
+        self,
+        random: np.random.Generator,
+        hz: float,
+        share: float,
+        *,
+        delta: bool,
+        chunk: int | None = None,
     ) -> None:
         self.contract = Contract(action=ActionSpec(dim=1, space="joint", delta=delta))
         self._chunk = chunk or int(2 * RUN_S * hz)
@@ -54,7 +64,8 @@ def executed(
     delta: bool,
     chunk: int | None = None,
 ) -> tuple[float, int]:
-    """Return the share of a run's ticks that were rows of the plan, and the number of refused actions.
+    """Return the share of a run's ticks that were rows of the plan, and the number of refused
+    actions.
 
     With chunks of a stated length, each answer comes within a tick.
     """
@@ -69,7 +80,9 @@ def executed(
         measure=None if delta else (lambda obs: obs.state["joints"]),
         soft_start_s=soft_start_s,
     )
-    settings = PlayerSettings(mode, deadline_s=30.0, safe=np.zeros(1, np.float32) if delta else "hold")
+    settings = PlayerSettings(
+        mode, deadline_s=30.0, safe=np.zeros(1, np.float32) if delta else "hold"
+    )
     ticks, refused = int(RUN_S * hz), 0
     with ChunkPlayer(policy, settings, check=guard) as player:
         player.initialize()
@@ -84,14 +97,20 @@ def executed(
                 time.sleep(0)
             act = player.act(observed())
             refused += act.info.get("safe_cause") in ("dynamics", "max_step", "limits")
-            assert SAFE not in act.info or act.info["safe_cause"] in ("dynamics", "max_step", "waiting")
+            assert SAFE not in act.info or act.info["safe_cause"] in (
+                "dynamics",
+                "max_step",
+                "waiting",
+            )
             pose = np.float32(pose + act.action[0]) if delta else act.action[0]
         return player._plan.executed / ticks, refused
 
 
 @pytest.mark.parametrize("delta", [False, True], ids=["absolute", "relative"])
 @pytest.mark.parametrize(
-    ("share", "soft_start_s"), [(0.5, 0.0), (0.25, 120.0)], ids=["half of the limits", "half in the soft start"]
+    ("share", "soft_start_s"),
+    [(0.5, 0.0), (0.25, 120.0)],
+    ids=["half of the limits", "half in the soft start"],
 )
 @pytest.mark.parametrize("seed", range(4))
 def test_a_plan_within_half_of_the_limits_is_executed(
@@ -116,7 +135,8 @@ def test_answers_during_the_ease_in_do_not_keep_the_robot_from_moving(delta: boo
 @pytest.mark.parametrize(
     ("mode", "chunk", "at_least"),
     [
-        # The shorter the chunks, the lower the speed at which the ramp can end exactly at each last row.
+        # The shorter the chunks, the lower the speed at which the ramp can end exactly at each last
+        # row.
         ("open_loop", 1, 0.15),
         ("open_loop", 2, 0.25),
         ("open_loop", 3, 0.3),

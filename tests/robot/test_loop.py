@@ -13,7 +13,17 @@ from typing import Any
 import numpy as np
 import pytest
 
-from vlagents_ray import Act, ActionSpec, Agent, CameraSpec, ConfigError, Contract, Obs, PolicyFailed, StateSpec
+from vlagents_ray import (
+    Act,
+    ActionSpec,
+    Agent,
+    CameraSpec,
+    ConfigError,
+    Contract,
+    Obs,
+    PolicyFailed,
+    StateSpec,
+)
 from vlagents_ray.chunking.player import ChunkPlayer, PlayerSettings
 from vlagents_ray.errors import InvalidAction
 from vlagents_ray.robot import Guard, Watchdog, run_loop
@@ -28,7 +38,9 @@ class Going(Agent):
 
     contract = Contract(action=ActionSpec(dim=2, delta=False, low=-1.0, high=1.0))
 
-    def __init__(self, *, wrong_at: int | None = None, done_at: int | None = None, slow_at: int | None = None) -> None:
+    def __init__(
+        self, *, wrong_at: int | None = None, done_at: int | None = None, slow_at: int | None = None
+    ) -> None:
         self.wrong_at, self.done_at, self.slow_at = wrong_at, done_at, slow_at
         self.instruction: str | None = None
         self.tick = 0
@@ -47,7 +59,9 @@ class Going(Agent):
 
 
 def set_limit(watchdog: Watchdog, name: str, silent_s: float) -> None:
-    """Of a watchdog that runs. A busy machine keeps a loop from a short one's sign of life until it is wanted."""
+    """Of a watchdog that runs. A busy machine keeps a loop from a short one's sign of life until
+    it is wanted.
+    """
     with watchdog._changed:
         watchdog._limits[name] = silent_s
         watchdog._changed.notify_all()
@@ -141,7 +155,9 @@ def test_the_process_is_left_as_it_was(*, frozen: bool) -> None:
         with undisturbed() as done:
             assert not gc.isenabled()
             assert done
-            assert len(gc.get_objects()) < len(heap), "a collection within the loop would go through all of them"
+            assert len(gc.get_objects()) < len(heap), (
+                "a collection within the loop would go through all of them"
+            )
         after = settings()
         assert (after[0], *after[2:]) == (before[0], *before[2:])
         assert (gc.get_freeze_count() >= before[1]) if frozen else (gc.get_freeze_count() == 0)
@@ -169,7 +185,9 @@ def test_a_robot_is_driven_for_as_long_as_was_said_and_then_stopped() -> None:
 
 
 @pytest.mark.parametrize(("slow_at", "ticks", "missed"), [(5, 60, 4), (9, 10, 0)])
-def test_a_slow_tick_costs_the_ticks_until_the_end_that_it_covers(slow_at: int, ticks: int, missed: int) -> None:
+def test_a_slow_tick_costs_the_ticks_until_the_end_that_it_covers(
+    slow_at: int, ticks: int, missed: int
+) -> None:
     report = run_loop(Watched(Going.contract), Going(slow_at=slow_at), hz=HZ, seconds=ticks / HZ)
     assert report.jitter["missed"] >= missed  # the next one begins late, but in its time
     assert report.jitter["ticks"] + report.jitter["missed"] == ticks
@@ -214,7 +232,9 @@ def test_an_error_stops_the_robot_before_an_action_of_it(
 
 def test_with_a_player_the_loop_goes_on_with_a_safe_action() -> None:
     robot = Watched(Going.contract)
-    player = ChunkPlayer(Going(wrong_at=3), PlayerSettings(deadline_s=30.0), check=Guard(Going.contract))
+    player = ChunkPlayer(
+        Going(wrong_at=3), PlayerSettings(deadline_s=30.0), check=Guard(Going.contract)
+    )
     report = run_loop(robot, player, hz=HZ, until=lambda: len(robot.commanded) >= 6)
     player.close()
     assert robot.commanded == [0, 0.01, 0.02, 0.02, 0.04, 0.05]
@@ -226,7 +246,9 @@ def test_the_loop_has_no_other_guard_than_its_player() -> None:
         contract = Contract(action=ActionSpec(dim=2, delta=False))
 
     robot, guard = Watched(Bounded.contract), Guard(high=0.025)
-    player = ChunkPlayer(Bounded(), PlayerSettings(deadline_s=30.0, safe=np.full(2, 9.0)), check=guard)
+    player = ChunkPlayer(
+        Bounded(), PlayerSettings(deadline_s=30.0, safe=np.full(2, 9.0)), check=guard
+    )
     report = run_loop(robot, player, hz=HZ, until=lambda: len(robot.commanded) >= 6)
     assert robot.commanded == [0, 0.01, 0.02, 0.02, 0.02, 0.02]  # neither what is planned nor the 9
     assert report.safe_ticks == 3
@@ -275,7 +297,11 @@ def test_a_robot_that_the_watchdog_stopped_stays_so_until_the_server_is_heard_ag
 
     watchdog = Watchdog(bark, {"server": 60.0})
     report = run_loop(
-        robot, agent, hz=HZ, until=lambda: bool(at_bark) and agent.tick > at_bark[0] + 30, watchdog=watchdog
+        robot,
+        agent,
+        hz=HZ,
+        until=lambda: bool(at_bark) and agent.tick > at_bark[0] + 30,
+        watchdog=watchdog,
     )
     ticks = [round(100 * value) for value in robot.commanded]
     applied = [tick for tick in ticks if at_bark[0] + 1 < tick < at_bark[0] + 19]
@@ -307,7 +333,8 @@ class Silenced(Going):
 
 
 @pytest.mark.parametrize(
-    ("kind", "restart"), [(Hardware, None), (Hardware, "manual"), (Hardware, "auto"), (Watched, None)]
+    ("kind", "restart"),
+    [(Hardware, None), (Hardware, "manual"), (Hardware, "auto"), (Watched, None)],
 )
 def test_after_a_protective_stop_only_a_simulation_moves_by_itself_unless_it_is_told(
     kind: type[Watched], restart: Any
@@ -346,7 +373,8 @@ def test_after_a_protective_stop_only_a_simulation_moves_by_itself_unless_it_is_
     else:
         assert again >= told[1][1] - 1
         assert report.safe["stopped"] >= 20
-    assert agent.interrupts >= again - barked_at[0] - 3  # nothing of what it returned meanwhile was executed
+    # Nothing of what it returned meanwhile was executed.
+    assert agent.interrupts >= again - barked_at[0] - 3
     assert len(watchdog.barks) == 1
 
 
@@ -375,7 +403,9 @@ def test_a_report_counts_refused_actions_by_cause_whatever_their_numbers(
             return Act(np.full(2, value, np.float32))
 
     agent = Jumping()
-    with ChunkPlayer(agent, PlayerSettings(deadline_s=30.0), check=Guard(Going.contract, **limits)) as player:
+    with ChunkPlayer(
+        agent, PlayerSettings(deadline_s=30.0), check=Guard(Going.contract, **limits)
+    ) as player:
         report = run_loop(Watched(Going.contract), player, hz=200, until=lambda: agent.tick > 12)
     assert set(report.safe) == {cause}
     assert report.safe[cause] == report.safe_ticks >= 10
@@ -400,7 +430,9 @@ def test_waiting_for_the_next_chunk_is_counted_apart_from_safe_actions() -> None
     assert "waiting for an answer" in str(report.mostly_safe)
 
 
-def test_before_the_first_action_and_after_a_stop_the_loops_guard_measures_where_the_robot_stands() -> None:
+def test_before_the_first_action_and_after_a_stop_the_loops_guard_measures_where_the_robot_stands() -> (
+    None
+):
     guard = Guard(Going.contract, max_step=0.05, measure=lambda obs: obs.state["joints"])
     robot = Watched(Going.contract)
     run_loop(robot, Going(), hz=HZ, until=lambda: len(robot.commanded) >= 3, guard=guard)
@@ -440,7 +472,9 @@ def test_before_the_first_action_no_safe_one_is_commanded() -> None:
     assert (report.safe, report.reasons) == ({"other": 4}, {"other": "waiting"})
 
 
-def test_a_loop_that_runs_for_days_keeps_no_more_than_it_needs(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_loop_that_runs_for_days_keeps_no_more_than_it_needs(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     monkeypatch.setattr("vlagents_ray.robot.pacing.KEPT_TICKS", 10)
     monkeypatch.setattr("vlagents_ray.robot.loop._COLLECT_S", 0.05)
     living: weakref.WeakSet[Failure] = weakref.WeakSet()
@@ -497,7 +531,10 @@ def test_the_simulated_robot_gives_what_a_contract_asks_for() -> None:
     robot = SimulatedRobot(contract)
     first = robot.observe()
     assert first.cameras["left"].shape == (48, 64, 3)
-    assert {name: part.shape for name, part in first.state.items()} == {"joints": (3,), "pose": (6,)}
+    assert {name: part.shape for name, part in first.state.items()} == {
+        "joints": (3,),
+        "pose": (6,),
+    }
     for _ in range(20):
         robot.apply(np.array([0.1, 0, 0, 0.05], np.float32))
         last = robot.observe()

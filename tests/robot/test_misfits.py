@@ -1,4 +1,6 @@
-"""Every entry point that moves an arm compares policy and arm before the first motion: misfits by entry points."""
+"""Every entry point that moves an arm compares policy and arm before the first motion: misfits
+by entry points.
+"""
 
 from __future__ import annotations
 
@@ -46,15 +48,27 @@ def action(**changes: Any) -> dict[str, Any]:
 
 STATED = {"observation.state": RANGE, "action": RANGE}
 MISFITS: dict[str, tuple[Case, str]] = {
-    "unit": (Case(RIGHT | {"state": {"joints": StateSpec(2, "deg")}}), "needs 'deg', the env gives 'rad'"),
+    "unit": (
+        Case(RIGHT | {"state": {"joints": StateSpec(2, "deg")}}),
+        "needs 'deg', the env gives 'rad'",
+    ),
     "relative actions": (Case(action(delta=True)), "action.delta: the policy gives True"),
     "order of joints": (Case(action(names=("lift", "pan"))), "number 0 is 'lift' of the policy"),
-    "number of joints": (Case(RIGHT | {"state": {"joints": StateSpec(3, "rad")}}), "needs 3 numbers"),
+    "number of joints": (
+        Case(RIGHT | {"state": {"joints": StateSpec(3, "rad")}}),
+        "needs 3 numbers",
+    ),
     "dimension of actions": (Case(action(dim=7, names=None)), "action.dim: the policy gives 7"),
     "a missing camera": (Case(RIGHT | {"state": {"elbow": StateSpec(1)}}), "state 'elbow'"),
-    "a state outside of the training": (Case(statistics=STATED, pose=(57.0, 0.5)), "degrees for radians"),
+    "a state outside of the training": (
+        Case(statistics=STATED, pose=(57.0, 0.5)),
+        "degrees for radians",
+    ),
     "another order by the training": (Case(statistics=STATED, pose=(0.9, 0.5)), "another order"),
-    "a chunk outside of the training": (Case(statistics=STATED, rows=(0.0, 9.0)), r"first chunk\[1\]"),
+    "a chunk outside of the training": (
+        Case(statistics=STATED, rows=(0.0, 9.0)),
+        r"first chunk\[1\]",
+    ),
 }
 FITS = Case(statistics=STATED)
 
@@ -110,7 +124,12 @@ def by_run_loop_of_single_rows(case: Case, tmp_path: Path) -> None:
 
 
 def by_an_asynchronous_player(case: Case, tmp_path: Path) -> None:
-    run_loop(Arm(), ChunkPlayer(Policy(case), PlayerSettings("async", deadline_s=0.5)), hz=200, seconds=0.02)
+    run_loop(
+        Arm(),
+        ChunkPlayer(Policy(case), PlayerSettings("async", deadline_s=0.5)),
+        hz=200,
+        seconds=0.02,
+    )
 
 
 def by_the_command(case: Case, tmp_path: Path) -> None:
@@ -168,14 +187,18 @@ def test_a_misfit_is_found_before_the_first_motion(
 
 
 @pytest.mark.parametrize("entry", ENTRIES)
-def test_a_policy_that_fits_moves_the_arm(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, entry: Entry) -> None:
+def test_a_policy_that_fits_moves_the_arm(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, entry: Entry
+) -> None:
     monkeypatch.setattr(Arm, "pose", FITS.pose)
     entry(FITS, tmp_path)
     assert Arm.applied > 0
 
 
 @pytest.mark.parametrize("entry", ENTRIES)
-def test_no_entry_point_moves_an_arm_that_holds(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, entry: Entry) -> None:
+def test_no_entry_point_moves_an_arm_that_holds(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, entry: Entry
+) -> None:
     monkeypatch.setattr(Arm, "pose", FITS.pose)
     monkeypatch.setattr(Arm, "holds", "the wrist camera hangs", raising=False)
     entry(FITS, tmp_path)

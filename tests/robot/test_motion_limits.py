@@ -1,4 +1,6 @@
-"""Limits of motion for both kinds of actions, one arm and two: no accepted sequence exceeds them, from the first on."""
+"""Limits of motion for both kinds of actions, one arm and two: no accepted sequence exceeds
+them, from the first on.
+"""
 
 from __future__ import annotations
 
@@ -10,7 +12,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from vlagents_ray import Act, ActionSpec, Agent, ChunkPlayer, ConfigError, Contract, Obs, PlayerSettings
+from vlagents_ray import (
+    Act,
+    ActionSpec,
+    Agent,
+    ChunkPlayer,
+    ConfigError,
+    Contract,
+    Obs,
+    PlayerSettings,
+)
 from vlagents_ray.datasets.writer import Dataset
 from vlagents_ray.errors import InvalidAction
 from vlagents_ray.interface import SAFE
@@ -31,7 +42,9 @@ def spec_of(delta: bool, arms: int | None) -> ActionSpec:
     """Return actions of two joints and a gripper for each arm."""
     names = None if arms is None else tuple(f"arm{i}" for i in range(arms))
     dim = 3 * (arms or 1)
-    return ActionSpec(dim=dim, space="joint", delta=delta, gripper_open=1.0, gripper_closed=0.0, arms=names)
+    return ActionSpec(
+        dim=dim, space="joint", delta=delta, gripper_open=1.0, gripper_closed=0.0, arms=names
+    )
 
 
 def path_of(spec: ActionSpec, actions: list[np.ndarray]) -> np.ndarray:
@@ -47,11 +60,15 @@ def path_of(spec: ActionSpec, actions: list[np.ndarray]) -> np.ndarray:
 def require_within(path: np.ndarray, limits: Limits, hz: float = HZ) -> None:
     """Raise if a path speeds up beyond the limits; braking is always allowed."""
     speeds = np.diff(path, axis=0)
-    for before, now, change_before in zip(speeds[1:-1], speeds[2:], np.diff(speeds, axis=0)[:-1], strict=True):
+    for before, now, change_before in zip(
+        speeds[1:-1], speeds[2:], np.diff(speeds, axis=0)[:-1], strict=True
+    ):
         change = now - before
         brakes = (np.abs(now) <= np.abs(before)) & (now * before >= 0)
         assert (np.abs(now) * hz <= np.asarray(limits.velocity) * 1.001 + 1e-4).all()
-        assert (brakes | (np.abs(change) * hz**2 <= np.asarray(limits.acceleration) * 1.001 + 1e-2)).all()
+        assert (
+            brakes | (np.abs(change) * hz**2 <= np.asarray(limits.acceleration) * 1.001 + 1e-2)
+        ).all()
         # A tick at rest ends the deceleration before it.
         rested = ~before.any()
         jerk = np.abs(change if rested else change - change_before) * hz**3
@@ -129,18 +146,24 @@ def test_no_command_of_a_player_exceeds_the_limits_from_the_first_one_and_after_
     if step * HZ <= SPEED:
         assert moved == 200, "a plan within the limits is executed"
     else:
-        assert player._plan.executed < 5, "of a plan beyond the limits, only the slow way to its first row is"
+        assert player._plan.executed < 5, (
+            "of a plan beyond the limits, only the slow way to its first row is"
+        )
 
 
 @pytest.mark.parametrize("delta", [False, True])
 @pytest.mark.parametrize("limit", [0.05, 0.1, 0.3, 5.0])
 @pytest.mark.parametrize("position", [0.0, 0.7, 3.1, 90.0, 179.0])
-def test_a_step_of_exactly_the_limit_is_inside_in_float32(delta: bool, limit: float, position: float) -> None:
+def test_a_step_of_exactly_the_limit_is_inside_in_float32(
+    delta: bool, limit: float, position: float
+) -> None:
     contract = Contract(action=ActionSpec(dim=1, delta=delta))
     guards = {
         "max_step": Guard(contract, max_step=limit),
         "velocity": Guard(contract, limits=Limits(velocity=limit * HZ), hz=HZ, soft_start_s=0),
-        "acceleration": Guard(contract, limits=Limits(acceleration=limit * HZ**2), hz=HZ, soft_start_s=0),
+        "acceleration": Guard(
+            contract, limits=Limits(acceleration=limit * HZ**2), hz=HZ, soft_start_s=0
+        ),
         "jerk": Guard(contract, limits=Limits(jerk=limit * HZ**3), hz=HZ, soft_start_s=0),
     }
     for offset in np.linspace(0, 1, 200):
@@ -189,8 +212,14 @@ EFFECTS: dict[str, tuple[dict[str, object], list[list[float]]]] = {
     "unit": ({"urdf": "arm.urdf", "unit": "deg"}, [[60.0]]),
     "joints": ({"urdf": "arm.urdf", "joints": ["pan"]}, [[1.1]]),
     "tip": ({"urdf": "arm.urdf", "tip": "hand", "workspace_low": [0.1, 0, 0]}, [[0]]),
-    "workspace_low": ({"urdf": "arm.urdf", "tip": "hand", "workspace_low": [None, None, 0.1]}, [[0]]),
-    "workspace_high": ({"urdf": "arm.urdf", "tip": "hand", "workspace_high": [None, -0.1, None]}, [[0]]),
+    "workspace_low": (
+        {"urdf": "arm.urdf", "tip": "hand", "workspace_low": [None, None, 0.1]},
+        [[0]],
+    ),
+    "workspace_high": (
+        {"urdf": "arm.urdf", "tip": "hand", "workspace_high": [None, -0.1, None]},
+        [[0]],
+    ),
 }
 
 
@@ -202,13 +231,16 @@ def written(folder: Path, document: dict[str, object]) -> Path:
 
 def test_the_table_of_effects_has_each_key_of_a_file() -> None:
     named = {field.name for field in fields(Limits)} - {"chain"} | {"urdf", "tip"}
-    assert {*EFFECTS, "first", "rest"} == named  # these two are not of a sequence of actions; see the tests of each
+    # These two are not of a sequence of actions; see the tests of each.
+    assert {*EFFECTS, "first", "rest"} == named
 
 
 @pytest.mark.parametrize("key", EFFECTS)
 def test_each_key_of_a_file_refuses_an_absolute_action(tmp_path: Path, key: str) -> None:
     document, actions = EFFECTS[key]
-    guard = Guard(Contract(action=ActionSpec(dim=1, delta=False)), limits=written(tmp_path, document), hz=HZ)
+    guard = Guard(
+        Contract(action=ActionSpec(dim=1, delta=False)), limits=written(tmp_path, document), hz=HZ
+    )
 
     def run() -> None:
         last = None
@@ -220,7 +252,9 @@ def test_each_key_of_a_file_refuses_an_absolute_action(tmp_path: Path, key: str)
 
 
 @pytest.mark.parametrize("key", [*EFFECTS, "first", "rest"])
-def test_each_key_of_a_file_refuses_a_relative_action_or_is_an_error(tmp_path: Path, key: str) -> None:
+def test_each_key_of_a_file_refuses_a_relative_action_or_is_an_error(
+    tmp_path: Path, key: str
+) -> None:
     document = {"first": {"first": 0.1}, "rest": {"rest": [0.1]}}.get(key) or EFFECTS[key][0]
     path = written(tmp_path, document)
     contract = Contract(action=ActionSpec(dim=1, delta=True))
@@ -245,7 +279,10 @@ def test_bounds_of_a_gripper_have_an_effect_for_relative_actions_as_well() -> No
 @pytest.mark.parametrize(
     ("document", "said"),
     [
-        *(({key: float("nan")}, key) for key in ("low", "high", "velocity", "acceleration", "jerk", "first")),
+        *(
+            ({key: float("nan")}, key)
+            for key in ("low", "high", "velocity", "acceleration", "jerk", "first")
+        ),
         *(({key: [1.0, float("nan")]}, key) for key in ("low", "high", "velocity", "rest")),
         ({"velocity": -1.0}, "velocity: expected numbers of 0 or more"),
         ({"velocity": True}, "velocity: expected numbers"),
@@ -254,8 +291,14 @@ def test_bounds_of_a_gripper_have_an_effect_for_relative_actions_as_well() -> No
         ({"joints": "pan"}, "joints: expected a list"),
         ({"urdf": "arm.urdf", "tip": "hand"}, "tip, urdf and workspace"),
         ({"workspace_low": [0, 0, 0]}, "tip, urdf and workspace"),
-        ({"urdf": "arm.urdf", "tip": "hand", "workspace_low": [0, 0]}, "workspace_low: expected x, y and z"),
-        ({"urdf": "arm.urdf", "tip": "hand", "workspace_low": [0, 0, float("nan")]}, "workspace_low"),
+        (
+            {"urdf": "arm.urdf", "tip": "hand", "workspace_low": [0, 0]},
+            "workspace_low: expected x, y and z",
+        ),
+        (
+            {"urdf": "arm.urdf", "tip": "hand", "workspace_low": [0, 0, float("nan")]},
+            "workspace_low",
+        ),
     ],
     ids=str,
 )
@@ -276,7 +319,9 @@ def test_a_number_or_key_of_a_file_that_would_have_no_effect_is_an_error(
     ],
     ids=str,
 )
-def test_limits_that_do_not_fit_the_actions_are_an_error_before_the_first_one(limits: Limits, said: str) -> None:
+def test_limits_that_do_not_fit_the_actions_are_an_error_before_the_first_one(
+    limits: Limits, said: str
+) -> None:
     with pytest.raises(ConfigError, match=said):
         Guard(Contract(action=spec_of(delta=False, arms=None)), limits=limits, hz=HZ)
 
@@ -303,7 +348,9 @@ def demonstrations(spec: ActionSpec, seed: int) -> list[np.ndarray]:
     for _ in range(3):
         time_s = np.arange(int(random.integers(300, 600))) / HZ
         periods_s = random.uniform(2, 6, spec.dim or 1)
-        actions = np.sin(np.pi * time_s[:, None] / periods_s) ** 3 * random.uniform(0.2, 1.0, spec.dim or 1)
+        actions = np.sin(np.pi * time_s[:, None] / periods_s) ** 3 * random.uniform(
+            0.2, 1.0, spec.dim or 1
+        )
         deltas = spec.delta_columns(spec.dim or 1)
         moved = np.diff(actions, axis=0, prepend=0.0)
         actions[:, deltas] = moved[:, deltas]
@@ -360,7 +407,9 @@ def test_a_dataset_with_one_number_an_action_has_limits(tmp_path: Path, delta: b
         last = guard(action, last)
 
 
-def test_constant_deltas_from_the_first_frame_on_have_limits_that_accept_them(tmp_path: Path) -> None:
+def test_constant_deltas_from_the_first_frame_on_have_limits_that_accept_them(
+    tmp_path: Path,
+) -> None:
     spec = ActionSpec(dim=2, space="ee_position", delta=True)
     rows = np.tile(np.array([0.01, 0.005], np.float32), (600, 1))
     guard = Guard(Contract(action=spec), limits=recorded(tmp_path / "demos", spec, [rows]), hz=HZ)

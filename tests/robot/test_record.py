@@ -1,4 +1,6 @@
-"""Recordings in LeRobot's format: what was seen and done, whatever becomes of the disk or the process."""
+"""Recordings in LeRobot's format: what was seen and done, whatever becomes of the disk or the
+process.
+"""
 
 from __future__ import annotations
 
@@ -32,7 +34,10 @@ VIDEO = "videos/observation.images.front/chunk-000"
 
 def obs(i: int, side: int = SIDE) -> Obs:
     state = {"joints": np.array([i, -i], np.float32), "left/force": np.array([0.5])}
-    cameras = {"front": np.full((side, side, 3), 10 * i % 256, np.uint8), "left/wrist": np.zeros((33, 47, 3), np.uint8)}
+    cameras = {
+        "front": np.full((side, side, 3), 10 * i % 256, np.uint8),
+        "left/wrist": np.zeros((33, 47, 3), np.uint8),
+    }
     return Obs(cameras, 0.25, state, {"captured_at": 1e9 + i / FPS})
 
 
@@ -55,22 +60,32 @@ def test_two_cameras_never_share_a_video(tmp_path: Path) -> None:
         with Recorder(tmp_path, FPS) as recorder, recorder.episode("look"):
             for i in range(4):
                 views = {"left/wrist": 0, "left_wrist": 200, "front": 100}
-                cameras = {name: np.full((SIDE, SIDE, 3), value, np.uint8) for name, value in views.items()}
+                cameras = {
+                    name: np.full((SIDE, SIDE, 3), value, np.uint8) for name, value in views.items()
+                }
                 recorder.add(Obs(cameras), action(i), tick=i)
     seen = {}
     for path in tmp_path.rglob("file-001.mp4"):
         with av.open(str(path)) as video:
-            frames = [round(float(frame.to_ndarray(format="rgb24").mean()), -1) for frame in video.decode(video=0)]
+            frames = [
+                round(float(frame.to_ndarray(format="rgb24").mean()), -1)
+                for frame in video.decode(video=0)
+            ]
         seen[path.parent.parent.name.rpartition(".")[2]] = frames
     assert seen == {"left_wrist": [200] * 4, "left_wrist_2": [0] * 4, "front": [100] * 4}
 
 
-def test_a_policy_that_is_trained_on_it_learns_what_its_state_and_cameras_are(tmp_path: Path) -> None:
+def test_a_policy_that_is_trained_on_it_learns_what_its_state_and_cameras_are(
+    tmp_path: Path,
+) -> None:
     for _ in range(2):  # the second time the dataset is opened again
         record(tmp_path, 3)
     about = DatasetContract.from_json(info(tmp_path)[INFO])
     assert about.state == ("joints", "left/force", "gripper")
-    assert about.cameras == {"observation.images.front": "front", "observation.images.left_wrist": "left/wrist"}
+    assert about.cameras == {
+        "observation.images.front": "front",
+        "observation.images.left_wrist": "left/wrist",
+    }
     assert about.contract == Contract(
         cameras={"front": CameraSpec(SIDE, SIDE), "left/wrist": CameraSpec(33, 47)},
         state={"joints": StateSpec(2), "left/force": StateSpec(1)},
@@ -84,7 +99,10 @@ def test_a_policy_that_is_trained_on_it_learns_what_its_state_and_cameras_are(tm
 
 
 def test_the_gripper_is_that_of_the_observation(tmp_path: Path) -> None:
-    seen = Obs(gripper=0.5, state={"gripper": np.array([0.04], np.float32), "joints": np.zeros(2, np.float32)})
+    seen = Obs(
+        gripper=0.5,
+        state={"gripper": np.array([0.04], np.float32), "joints": np.zeros(2, np.float32)},
+    )
     with Recorder(tmp_path, FPS) as recorder, recorder.episode("grasp"):
         recorder.add(seen, action(0), tick=0)
     rows = pq.read_table(tmp_path / "data/chunk-000/file-000.parquet").to_pydict()
@@ -106,9 +124,19 @@ def test_an_episode_holds_what_was_seen_and_done(tmp_path: Path) -> None:
     assert [round(float(frame.mean()) / 10) for frame in frames] == list(range(12))
     about = info(tmp_path)
     assert about["codebase_version"] == "v3.0"
-    assert (about["total_episodes"], about["total_frames"], about["total_tasks"], about["fps"]) == (1, 12, 1, FPS)
+    assert (about["total_episodes"], about["total_frames"], about["total_tasks"], about["fps"]) == (
+        1,
+        12,
+        1,
+        FPS,
+    )
     features = about["features"]
-    assert features["observation.state"]["names"] == ["joints_0", "joints_1", "left/force_0", "gripper"]
+    assert features["observation.state"]["names"] == [
+        "joints_0",
+        "joints_1",
+        "left/force_0",
+        "gripper",
+    ]
     assert features["observation.images.left_wrist"]["shape"] == [34, 48, 3]  # made even
     assert not (tmp_path / "unfinished").exists() or not any((tmp_path / "unfinished").iterdir())
 
@@ -117,10 +145,17 @@ def test_a_dataset_goes_on_with_the_next_episode(tmp_path: Path) -> None:
     record(tmp_path, 5)
     record(tmp_path, 7, "unstack the cups")
     record(tmp_path, 3)
-    rows = [pq.read_table(tmp_path / f"data/chunk-000/file-{i:03d}.parquet").to_pydict() for i in range(3)]
+    rows = [
+        pq.read_table(tmp_path / f"data/chunk-000/file-{i:03d}.parquet").to_pydict()
+        for i in range(3)
+    ]
     assert [row["episode_index"][0] for row in rows] == [0, 1, 2]
     assert [row["task_index"][0] for row in rows] == [0, 1, 0]
-    assert [row["index"] for row in rows] == [list(range(5)), list(range(5, 12)), list(range(12, 15))]
+    assert [row["index"] for row in rows] == [
+        list(range(5)),
+        list(range(5, 12)),
+        list(range(12, 15)),
+    ]
     episode = pq.read_table(tmp_path / "meta/episodes/chunk-000/file-001.parquet").to_pylist()[0]
     assert episode["tasks"] == ["unstack the cups"]
     assert (episode["dataset_from_index"], episode["dataset_to_index"]) == (5, 12)
@@ -132,7 +167,12 @@ def test_statistics_are_those_of_all_frames(tmp_path: Path) -> None:
     record(tmp_path, 9)
     told = json.loads((tmp_path / "meta/stats.json").read_text())
     values = np.stack([action(i) for i in [*range(5), *range(9)]])
-    for name, expected in (("mean", values.mean(0)), ("std", values.std(0)), ("max", values.max(0)), ("count", [14])):
+    for name, expected in (
+        ("mean", values.mean(0)),
+        ("std", values.std(0)),
+        ("max", values.max(0)),
+        ("count", [14]),
+    ):
         assert told["action"][name] == pytest.approx(expected), name
     seen = np.array([10 * i for i in [*range(5), *range(9)]]) / 255
     image = {name: np.ravel(value) for name, value in told["observation.images.front"].items()}
@@ -141,7 +181,9 @@ def test_statistics_are_those_of_all_frames(tmp_path: Path) -> None:
     assert (image["min"][0], image["max"][0]) == pytest.approx((0, 80 / 255))
 
 
-def test_adding_never_waits_and_what_is_dropped_is_counted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_adding_never_waits_and_what_is_dropped_is_counted(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     going, gate = threading.Event(), threading.Event()
     begin = Dataset.begin
 
@@ -157,7 +199,12 @@ def test_adding_never_waits_and_what_is_dropped_is_counted(tmp_path: Path, monke
             recorder.add(obs(i), action(i), tick=i)
         assert recorder.dropped == 6
         gate.set()
-    assert pq.read_table(tmp_path / "data/chunk-000/file-000.parquet")["tick"].to_pylist() == [0, 1, 2, 3]
+    assert pq.read_table(tmp_path / "data/chunk-000/file-000.parquet")["tick"].to_pylist() == [
+        0,
+        1,
+        2,
+        3,
+    ]
 
 
 def test_a_frame_is_recorded_as_it_was_when_it_was_added(tmp_path: Path) -> None:
@@ -185,7 +232,8 @@ def test_a_full_disk_costs_its_episode_and_no_later_one(tmp_path: Path) -> None:
     noise = np.random.default_rng(0)
     recorder = Recorder(tmp_path, FPS, frames=1000)
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (50_000, limits[1]))  # a file that grows longer cannot be written
+    # A file that grows longer cannot be written.
+    resource.setrlimit(resource.RLIMIT_FSIZE, (50_000, limits[1]))
     try:
         with recorder.episode("stack"):
             for i in range(100):
@@ -219,13 +267,18 @@ for episode in range(3):
                     time.sleep(60)
             time.sleep(0.01)
 """
-    with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True) as process:
+    with subprocess.Popen(
+        [sys.executable, "-c", code], stdout=subprocess.PIPE, text=True
+    ) as process:
         assert process.stdout is not None
         assert process.stdout.readline() == "recording\n"
         os.kill(process.pid, signal.SIGKILL)
     assert info(tmp_path)["total_episodes"] == 2
     assert len(list(tmp_path.glob("data/*/*.parquet"))) == 2
-    strays = [tmp_path / f"{part}/file-002.{end}" for part, end in (("data/chunk-000", "parquet"), (VIDEO, "mp4"))]
+    strays = [
+        tmp_path / f"{part}/file-002.{end}"
+        for part, end in (("data/chunk-000", "parquet"), (VIDEO, "mp4"))
+    ]
     for stray in strays:
         stray.write_bytes(b"whole, but of an episode that was not counted")
     assert Dataset(tmp_path, FPS).episodes == 2
@@ -251,11 +304,16 @@ def test_a_kill_at_any_moment_of_a_save_leaves_nothing_of_its_episode(
     with monkeypatch.context() as patched:
         patched.setattr(Dataset, "_move", moved)
         record(root, 9, "unstack the cups")
-    assert killed[-1].joinpath("meta/stats.json").read_bytes() != killed[0].joinpath("meta/stats.json").read_bytes()
+    assert (
+        killed[-1].joinpath("meta/stats.json").read_bytes()
+        != killed[0].joinpath("meta/stats.json").read_bytes()
+    )
     for left in killed:
         record(left, 7, "stack the plates")
         for name in ("meta/info.json", "meta/stats.json"):
-            assert json.loads((left / name).read_text()) == json.loads((expected / name).read_text()), (left, name)
+            assert json.loads((left / name).read_text()) == json.loads(
+                (expected / name).read_text()
+            ), (left, name)
         for name in ("meta/tasks.parquet", "data/chunk-000/file-001.parquet"):
             assert pq.read_table(left / name) == pq.read_table(expected / name), (left, name)
 

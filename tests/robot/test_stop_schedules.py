@@ -1,4 +1,6 @@
-"""No command begins after a stop on another thread, however the threads of the loop and of the stop take turns."""
+"""No command begins after a stop on another thread, however the threads of the loop and of the
+stop take turns.
+"""
 
 from __future__ import annotations
 
@@ -127,9 +129,11 @@ class Run:
             assert not self.stopper.is_alive()
 
     def require_stopped(self, restart: Restart) -> None:
-        """Require that the watchdog's stop is followed by no command, or by none of the plan of before.
+        """Require that the watchdog's stop is followed by no command, or by none of the plan of
+        before.
 
-        The loop may see the stop before the watchdog's thread calls its own, but only after the last command.
+        The loop may see the stop before the watchdog's thread calls its own, but only after the
+        last command.
         """
         calls_before = self.arm.trace[: self.arm.trace.index("dog")]
         last_command = max(i for i, call in enumerate(calls_before) if call == "apply")
@@ -156,7 +160,9 @@ def tracer_of(codes: set[CodeType], happens: Callable[[FrameType], None]) -> Tra
 
 def loop_codes() -> set[CodeType]:
     methods = [getattr(loop._Run, name) for name in vars(loop._Run)]
-    return {method.__code__ for method in methods if callable(method) and hasattr(method, "__code__")}
+    return {
+        method.__code__ for method in methods if callable(method) and hasattr(method, "__code__")
+    }
 
 
 def wait_until(holds: Callable[[], bool]) -> None:
@@ -174,12 +180,16 @@ def patient(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.parametrize("restart", ["manual", "auto"])
 @pytest.mark.parametrize("source", ["trip", "silence"])
-def test_no_command_follows_a_stop_at_any_line_of_the_loop(patient: None, source: str, restart: Restart) -> None:
+def test_no_command_follows_a_stop_at_any_line_of_the_loop(
+    patient: None, source: str, restart: Restart
+) -> None:
     for point in itertools.count():
         run = Run()
         lines = itertools.count()
 
-        def happens(frame: FrameType, run: Run = run, lines: Any = lines, point: int = point) -> None:
+        def happens(
+            frame: FrameType, run: Run = run, lines: Any = lines, point: int = point
+        ) -> None:
             if run.arm.observations != EVENT_AT or run.stopper is not None or next(lines) < point:
                 return
             run.stop_on_a_thread(source)
@@ -201,12 +211,16 @@ def test_no_command_follows_a_stop_at_any_line_of_the_loop(patient: None, source
 
 @pytest.mark.parametrize("restart", ["manual", "auto"])
 @pytest.mark.parametrize("source", ["trip", "silence"])
-def test_no_command_follows_a_stop_whose_thread_waits_at_any_line(patient: None, source: str, restart: Restart) -> None:
+def test_no_command_follows_a_stop_whose_thread_waits_at_any_line(
+    patient: None, source: str, restart: Restart
+) -> None:
     for point in itertools.count():
         run = Run()
         lines = itertools.count()
 
-        def happens(frame: FrameType, run: Run = run, lines: Any = lines, point: int = point) -> None:
+        def happens(
+            frame: FrameType, run: Run = run, lines: Any = lines, point: int = point
+        ) -> None:
             control = run.dog.control
             locks = (control._lock, control._commanding, run.dog._changed)
             if next(lines) != point or any(lock._is_owned() for lock in locks):  # type: ignore[attr-defined]

@@ -1,4 +1,6 @@
-"""After any stop nothing is applied: a property of the trace of calls, for each source of stops and each setting."""
+"""After any stop nothing is applied: a property of the trace of calls, for each source of stops
+and each setting.
+"""
 
 from __future__ import annotations
 
@@ -21,7 +23,13 @@ from vlagents_ray.client.commands import COMMAND, CommandInbox
 from vlagents_ray.contract import ActionSpec, Contract
 from vlagents_ray.errors import PolicyFailed
 from vlagents_ray.evaluate import EvalConfig
-from vlagents_ray.evaluate.robot import Operator, PageOperator, Verdict, VisibleTrial, evaluate_on_robot
+from vlagents_ray.evaluate.robot import (
+    Operator,
+    PageOperator,
+    Verdict,
+    VisibleTrial,
+    evaluate_on_robot,
+)
 from vlagents_ray.interface import Act, Agent, Obs
 from vlagents_ray.robot import Guard, Limits, Watchdog, run_loop
 from vlagents_ray.robot.record import Recorder
@@ -34,7 +42,9 @@ WAY_TO_REST = -0.05  # targets below it are on the way to the rest pose; the pol
 
 
 class Arm:
-    """A robot that writes the trace of its commands, and lets something happen at a moment of it."""
+    """A robot that writes the trace of its commands, and lets something happen at a moment of
+    it.
+    """
 
     def __init__(self) -> None:
         self.trace: list[str] = []
@@ -126,10 +136,16 @@ IN_OBSERVE: dict[str, Callable[[Run], Callable[[], None]]] = {
     "a stop from afar": lambda run: lambda: run.command("stop"),
     "a pause from afar": lambda run: lambda: run.command("pause"),
     "a mark from afar": lambda run: lambda: run.command("success"),
-    "the watchdog, by hand": lambda run: lambda: on_a_thread(lambda: run.dog.trip("a person is in the way")),
+    "the watchdog, by hand": lambda run: (
+        lambda: on_a_thread(lambda: run.dog.trip("a person is in the way"))
+    ),
     "the watchdog, by a silence": lambda run: lambda: silence(run),
-    "a stop on another thread": lambda run: lambda: on_a_thread(lambda: run.dog.control.stop("by a program")),
-    "the robot's own reason": lambda run: lambda: setattr(run.arm, "holds", "the wrist camera hangs"),
+    "a stop on another thread": lambda run: (
+        lambda: on_a_thread(lambda: run.dog.control.stop("by a program"))
+    ),
+    "the robot's own reason": lambda run: (
+        lambda: setattr(run.arm, "holds", "the wrist camera hangs")
+    ),
     "Ctrl-C": lambda _: lambda: signal.raise_signal(signal.SIGINT),
     "SIGTERM of the command": lambda _: raises(SystemExit(143)),
     "an error of a sensor": lambda _: raises(OSError("the camera is unplugged")),
@@ -175,7 +191,9 @@ def test_nothing_is_applied_after_a_stop(
     arm, policy = Arm(), Policy(relative=relative)
     leader = ScriptedLeader(np.full(2, 0.001, np.float32), lambda: True) if led else None
     guard = Guard(policy.contract, limits=MOTION if relative else REST, hz=HZ, soft_start_s=0.0)
-    player = ChunkPlayer(policy, PlayerSettings(mode, deadline_s=0.0 if led else None), check=guard, override=leader)
+    player = ChunkPlayer(
+        policy, PlayerSettings(mode, deadline_s=0.0 if led else None), check=guard, override=leader
+    )
     run = Run(arm, policy, Watchdog(lambda _: arm.stop(), {"loop": 0.3}))
     if moment == "driven":
         arm.moment = lambda: arm.observations >= EVENT_AT and "apply" in arm.trace
@@ -199,7 +217,15 @@ def test_nothing_is_applied_after_a_stop(
         if recorded:
             recorder = stack.enter_context(Recorder(tmp_path / "data", HZ, interventions=led))
         with suppress(KeyboardInterrupt, SystemExit, OSError, RuntimeError, PolicyFailed):
-            run_loop(arm, player, hz=HZ, seconds=0.1, watchdog=run.dog, commands=run.inbox, recorder=recorder)
+            run_loop(
+                arm,
+                player,
+                hz=HZ,
+                seconds=0.1,
+                watchdog=run.dog,
+                commands=run.inbox,
+                recorder=recorder,
+            )
     require_still(arm)
 
 
@@ -255,7 +281,9 @@ def blind_trial(tmp_path: Path, arm: Arm, person: Operator, policy: Policy, mode
 
 
 @pytest.mark.parametrize("mode", ["open_loop", "async"])
-@pytest.mark.parametrize(("moment", "relative"), [("driven", False), ("driven", True), ("on the way to rest", False)])
+@pytest.mark.parametrize(
+    ("moment", "relative"), [("driven", False), ("driven", True), ("on the way to rest", False)]
+)
 @pytest.mark.parametrize("source", ["the button", "a closed page", "the robot's own reason"])
 def test_nothing_is_applied_after_a_stop_of_a_blind_trial(
     tmp_path: Path, source: str, moment: str, mode: Mode, *, relative: bool
@@ -295,7 +323,9 @@ def test_a_trial_counts_no_step_of_the_way_to_rest(tmp_path: Path) -> None:
 
 
 class Numbered(Agent):
-    """Chunks of three rows from the present pose on; the second column is the number of the chunk."""
+    """Chunks of three rows from the present pose on; the second column is the number of the
+    chunk.
+    """
 
     def __init__(self, arm: Arm) -> None:
         self._arm = arm
@@ -316,7 +346,9 @@ class Numbered(Agent):
 
 @pytest.mark.parametrize("mode", ["open_loop", "async"])
 @pytest.mark.parametrize("chunk", [1, 2, 3])
-def test_a_stop_in_the_tick_in_which_a_chunk_begins_drops_that_chunk(mode: Mode, chunk: int) -> None:
+def test_a_stop_in_the_tick_in_which_a_chunk_begins_drops_that_chunk(
+    mode: Mode, chunk: int
+) -> None:
     arm = Arm()
     applied: list[float] = []
     apply = arm.apply
@@ -354,7 +386,14 @@ def test_a_stop_of_one_robot_leaves_the_loop_of_another_running() -> None:
 
     def drive(number: int) -> None:
         with ChunkPlayer(Policy(relative=True), PlayerSettings("async")) as player:
-            run_loop(arms[number], player, hz=HZ, watchdog=dogs[number], restart="manual", until=ends[number])
+            run_loop(
+                arms[number],
+                player,
+                hz=HZ,
+                watchdog=dogs[number],
+                restart="manual",
+                until=ends[number],
+            )
 
     ended = threading.Event()
     ends = [ended.is_set, over]
@@ -390,7 +429,9 @@ def test_after_a_lost_leader_and_a_stop_a_restart_alone_moves_nothing() -> None:
         elif arm.observations == EVENT_AT + 6:
             assert dog.restart()
         elif arm.observations == EVENT_AT + 9:
-            assert "apply" not in arm.trace[arm.trace.index("stop") :], "the pause of the lost leader lasts"
+            assert "apply" not in arm.trace[arm.trace.index("stop") :], (
+                "the pause of the lost leader lasts"
+            )
             lost.clear()
             leader.wants = lambda: False
             dog.control.resume()

@@ -54,7 +54,8 @@ class Commanding(Agent):
 
 
 def applied(arm: Arm) -> list[int]:
-    return [tick - 1 for tick, did in arm.did if did == "apply"]  # the first observation is that of the reset
+    # The first observation is that of the reset.
+    return [tick - 1 for tick, did in arm.did if did == "apply"]
 
 
 def test_a_paused_robot_stands_still_until_it_resumes_at_the_robot() -> None:
@@ -66,7 +67,11 @@ def test_a_paused_robot_stands_still_until_it_resumes_at_the_robot() -> None:
         return arm.ticks > 20
 
     report = run_loop(
-        arm, Commanding(inbox, {5: "pause", 8: "resume", 9: "instruct"}), hz=200, commands=inbox, until=over
+        arm,
+        Commanding(inbox, {5: "pause", 8: "resume", 9: "instruct"}),
+        hz=200,
+        commands=inbox,
+        until=over,
     )
     assert not set(range(5, 12)) & set(applied(arm))
     assert {4, 12} <= set(applied(arm))
@@ -76,7 +81,9 @@ def test_a_paused_robot_stands_still_until_it_resumes_at_the_robot() -> None:
 @pytest.mark.parametrize("label", ["success", "failure"])
 def test_a_mark_ends_the_loop_before_another_action(label: str) -> None:
     arm, inbox = Arm(simulated=True), CommandInbox()
-    report = run_loop(arm, Commanding(inbox, {6: label}), hz=200, commands=inbox, until=lambda: arm.ticks > 20)
+    report = run_loop(
+        arm, Commanding(inbox, {6: label}), hz=200, commands=inbox, until=lambda: arm.ticks > 20
+    )
     assert report.outcome == label
     assert applied(arm)[-1] == 5
     assert arm.did[-1][1] == "stop"
@@ -84,12 +91,18 @@ def test_a_mark_ends_the_loop_before_another_action(label: str) -> None:
 
 @pytest.mark.parametrize("simulated", [False, True])
 @pytest.mark.parametrize("watched", [False, True])
-def test_a_stop_from_the_page_is_over_when_a_person_restarts(*, simulated: bool, watched: bool) -> None:
+def test_a_stop_from_the_page_is_over_when_a_person_restarts(
+    *, simulated: bool, watched: bool
+) -> None:
     dog = Watchdog(lambda _: None, {"loop": 10.0}) if watched else None
     arm, inbox = Arm(simulated=simulated), CommandInbox()
     agent = Commanding(inbox, {5: "stop", 8: "resume", 9: "instruct", 12: "success"})
     report = run_loop(arm, agent, hz=200, commands=inbox, watchdog=dog)
-    assert (report.outcome, report.barks, applied(arm)) == ("success", ["the live page"], [1, 2, 3, 4])
+    assert (report.outcome, report.barks, applied(arm)) == (
+        "success",
+        ["the live page"],
+        [1, 2, 3, 4],
+    )
     again = Arm(simulated=simulated)
 
     def over() -> bool:
@@ -116,7 +129,14 @@ def test_a_protective_stop_outlives_the_run(stop: str) -> None:
     dog._limits["camera"] = 60.0
     for _ in range(2):
         before = len(applied(arm))
-        run_loop(arm, Commanding(inbox, {}), hz=200, watchdog=dog, seconds=0.05, instruction="fold the cloth")
+        run_loop(
+            arm,
+            Commanding(inbox, {}),
+            hz=200,
+            watchdog=dog,
+            seconds=0.05,
+            instruction="fold the cloth",
+        )
         assert len(applied(arm)) == before
     assert dog.restart() is (stop == "trip")
     dog.heard("camera")
@@ -128,12 +148,16 @@ def test_a_protective_stop_outlives_the_run(stop: str) -> None:
 
 def test_a_loop_without_commands_is_as_before() -> None:
     arm = Arm(simulated=True)
-    report = run_loop(arm, Commanding(CommandInbox(), {3: "stop"}), hz=200, until=lambda: len(applied(arm)) > 8)
+    report = run_loop(
+        arm, Commanding(CommandInbox(), {3: "stop"}), hz=200, until=lambda: len(applied(arm)) > 8
+    )
     assert report.safe == {}
     assert len(applied(arm)) == 9
 
 
-def test_a_human_takes_over_in_a_pause_from_the_page_and_the_mark_labels_the_episode(tmp_path: Path) -> None:
+def test_a_human_takes_over_in_a_pause_from_the_page_and_the_mark_labels_the_episode(
+    tmp_path: Path,
+) -> None:
     class Standing(Commanding):
         contract = Contract(action=ActionSpec(dim=2, delta=False))
 
@@ -148,7 +172,9 @@ def test_a_human_takes_over_in_a_pause_from_the_page_and_the_mark_labels_the_epi
         return False
 
     with player, Recorder(tmp_path, 200, interventions=True) as recorder:
-        report = run_loop(arm, player, hz=200.0, seconds=60.0, commands=inbox, recorder=recorder, until=state)
+        report = run_loop(
+            arm, player, hz=200.0, seconds=60.0, commands=inbox, recorder=recorder, until=state
+        )
     changes = [state for state, before in zip(states[1:], states, strict=False) if state != before]
     assert changes == ["paused", "human", "autonomous", "paused"]
     assert (report.interventions, report.outcome) == (4, "success")
@@ -179,7 +205,9 @@ def test_a_pause_that_ends_between_the_players_decision_and_the_loops_moves_noth
 
 @pytest.mark.parametrize("delta", [False, True])
 @pytest.mark.parametrize("arms", [None, ("left", "right")])
-def test_a_simulated_robot_stops_where_it_is_and_keeps_its_grasp(delta: bool, arms: tuple[str, ...] | None) -> None:
+def test_a_simulated_robot_stops_where_it_is_and_keeps_its_grasp(
+    delta: bool, arms: tuple[str, ...] | None
+) -> None:
     dim = 3 * len(arms or ("",))
     spec = ActionSpec(dim=dim, delta=delta, gripper_open=1.0, gripper_closed=0.0, arms=arms)
     robot = SimulatedRobot(Contract(action=spec))

@@ -1,4 +1,6 @@
-"""Robots around other robots: each wrapper has all attributes of the inner robot, by one mechanism."""
+"""Robots around other robots: each wrapper has all attributes of the inner robot, by one
+mechanism.
+"""
 
 from __future__ import annotations
 
@@ -56,7 +58,9 @@ class Arm:
 @pytest.mark.parametrize("wrapper", WRAPPERS)
 @pytest.mark.parametrize("depth", [1, 2])
 @pytest.mark.parametrize("name", OPTIONAL)
-def test_a_wrapper_has_each_attribute_of_its_robot_now(wrapper: type[RobotWrapper], depth: int, name: str) -> None:
+def test_a_wrapper_has_each_attribute_of_its_robot_now(
+    wrapper: type[RobotWrapper], depth: int, name: str
+) -> None:
     arm = Arm()
     wrapped = wrapper(arm)
     for _ in range(depth - 1):
@@ -85,7 +89,9 @@ def test_a_wrapper_calls_its_robot_and_can_be_copied(wrapper: type[RobotWrapper]
 
 
 @pytest.mark.parametrize("wrapper", WRAPPERS)
-def test_the_watchdog_of_a_wrapped_robot_also_watches_the_robots_own_sources(wrapper: type[RobotWrapper]) -> None:
+def test_the_watchdog_of_a_wrapped_robot_also_watches_the_robots_own_sources(
+    wrapper: type[RobotWrapper],
+) -> None:
     arm = Arm()
     arm.silent_s = {"/joint_states": 0.01}  # type: ignore[attr-defined]
     arm.watchdog = None  # type: ignore[attr-defined]
@@ -109,13 +115,27 @@ def wraps_a_robot(node: ast.ClassDef) -> bool:
     """Return whether a class with the methods of a robot is made from a robot."""
     methods = {one.name: one for one in node.body if isinstance(one, ast.FunctionDef)}
     made = methods.get("__init__")
-    takes = [] if made is None else [one.annotation for one in made.args.args if one.annotation is not None]
-    return "apply" in methods and "stop" in methods and any(ast.unparse(one) == "Robot" for one in takes)
+    takes = (
+        []
+        if made is None
+        else [one.annotation for one in made.args.args if one.annotation is not None]
+    )
+    return (
+        "apply" in methods
+        and "stop" in methods
+        and any(ast.unparse(one) == "Robot" for one in takes)
+    )
 
 
 def test_every_class_around_a_robot_derives_from_the_one_wrapper() -> None:
     bases = {node.name: [ast.unparse(base) for base in node.bases] for _, node in classes()}
     around = [name for name, above in bases.items() if "RobotWrapper" in above]
-    assert sorted(around) == sorted(one.__name__ for one in WRAPPERS if one is not RobotWrapper), "add it to WRAPPERS"
-    others = [f"{path}: {node.name}" for path, node in classes() if wraps_a_robot(node) and node.name not in around]
+    assert sorted(around) == sorted(one.__name__ for one in WRAPPERS if one is not RobotWrapper), (
+        "add it to WRAPPERS"
+    )
+    others = [
+        f"{path}: {node.name}"
+        for path, node in classes()
+        if wraps_a_robot(node) and node.name not in around
+    ]
     assert others == ["vlagents_ray/robot/wrapper.py: RobotWrapper"]

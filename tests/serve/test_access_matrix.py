@@ -1,4 +1,6 @@
-"""docs/keys.md is true: each cell of its table, tried on a replica with API keys and all its ways in."""
+"""docs/keys.md is true: each cell of its table, tried on a replica with API keys and all its
+ways in.
+"""
 
 from __future__ import annotations
 
@@ -50,7 +52,9 @@ def replica(tmp_path_factory: pytest.TempPathFactory) -> Iterator[KeyedReplica]:
         yield one
 
 
-@pytest.mark.parametrize("cell", CELLS, ids=lambda cell: f"{cell.way}, {cell.when}, {cell.credential}")
+@pytest.mark.parametrize(
+    "cell", CELLS, ids=lambda cell: f"{cell.way}, {cell.when}, {cell.credential}"
+)
 def test_what_the_table_says_is_so(replica: KeyedReplica, cell: Cell) -> None:
     visitor = replica.visitor(cell.credential)
     said = WAYS[cell.way](visitor, cell.when)
@@ -69,15 +73,21 @@ def test_the_table_names_every_way_in(replica: KeyedReplica) -> None:
     assert {cell.way for cell in CELLS} == set(WAYS)
     assert len(CELLS) % CREDENTIALS == 0
     assert len({(cell.way, cell.when, cell.credential) for cell in CELLS}) == len(CELLS) >= 300
-    connected = {way for way in WAYS if way.startswith("`WS") or way in ("own port", "shared memory")}
+    connected = {
+        way for way in WAYS if way.startswith("`WS") or way in ("own port", "shared memory")
+    }
     for way in connected:
         assert {cell.when for cell in CELLS if cell.way == way} == {"before", "with", "after"}
     routes = {getattr(route, "path", "") for route in _routes(replica)}
     named = {way.strip("`").partition(" ")[2] for way in WAYS if way.startswith("`")}
     new = routes - {"/openapi.json"} - named - {f"/v1/{op}" for op in OPS}
-    assert not new, "WAYS of tests/support/api_key_replica.py tries them, docs/keys.md has their cells"
+    assert not new, (
+        "WAYS of tests/support/api_key_replica.py tries them, docs/keys.md has their cells"
+    )
     with_ports = {"gr00t", "vlagents", "lerobot"}
-    assert set(names("dialects")) == {*ALL, *with_ports}, "`keyed_replica` serves a new one, WAYS tries it"
+    assert set(names("dialects")) == {*ALL, *with_ports}, (
+        "`keyed_replica` serves a new one, WAYS tries it"
+    )
 
 
 def _routes(replica: KeyedReplica) -> list[object]:

@@ -1,4 +1,6 @@
-"""Who is let in at a replica's own ports, before which nothing is read, and when a connection has to end."""
+"""Who is let in at a replica's own ports, before which nothing is read, and when a connection
+has to end.
+"""
 
 from __future__ import annotations
 
@@ -51,7 +53,8 @@ from vlagents_ray.serve.engine.sender import Sender
 from vlagents_ray.serve.requests import Message
 
 BASE = urlsplit("http://127.0.0.1")
-SLOW_S, IDLE_S = 0.4, 3.0  # where a test is about those; others hold though this process stands still
+# Where a test is about those; others hold though this process stands still.
+SLOW_S, IDLE_S = 0.4, 3.0
 
 
 class Seen(list[str | None]):
@@ -138,7 +141,11 @@ def keyed() -> Iterator[Replica]:
 
 def handshake(path: str, *headers: str) -> bytes:
     lines = [f"GET {path} HTTP/1.1", "Host: 127.0.0.1", "Upgrade: websocket", "Connection: Upgrade"]
-    lines += [f"Sec-WebSocket-Key: {base64.b64encode(os.urandom(16)).decode()}", "Sec-WebSocket-Version: 13", *headers]
+    lines += [
+        f"Sec-WebSocket-Key: {base64.b64encode(os.urandom(16)).decode()}",
+        "Sec-WebSocket-Version: 13",
+        *headers,
+    ]
     return "\r\n".join([*lines, "", ""]).encode()
 
 
@@ -148,7 +155,9 @@ def frame(payload: bytes) -> bytes:
     return head + mask + bytes(byte ^ mask[i % 4] for i, byte in enumerate(payload))
 
 
-RESET = frame(encode_requests([Request("reset", Obs(), "move to the human", session="arm/robot-1")]))
+RESET = frame(
+    encode_requests([Request("reset", Obs(), "move to the human", session="arm/robot-1")])
+)
 
 
 def answer(port: int, *segments: bytes) -> bytes:
@@ -190,7 +199,10 @@ def test_what_comes_with_a_refused_handshake_is_not_read(
 
 def test_a_page_of_another_site_has_nothing_read_either() -> None:
     with replica(keyed=False) as opened:
-        said = answer(opened.own.address.port, handshake(opened.own.path, "Origin: https://evil.example") + RESET)
+        said = answer(
+            opened.own.address.port,
+            handshake(opened.own.path, "Origin: https://evil.example") + RESET,
+        )
         assert said.startswith(b"HTTP/1.1 403")
         assert opened.policy.seen == []
 
@@ -211,8 +223,13 @@ def test_who_forgets_to_say_whose_requests_they_are_fails(keyed: Replica) -> Non
         Sender(keyed.engine, "http")  # type: ignore[call-arg]
     with pytest.raises(TypeError, match="want a Caller"):
         Sender(keyed.engine, "http", caller=None)  # type: ignore[arg-type]
-    unguarded = TestClient(build_http_app(keyed.engine, dict, Limits()), raise_server_exceptions=False)
-    assert unguarded.post("/v1/reset", json={"obs": {}}, headers={"x-session-id": "a"}).status_code == 500
+    unguarded = TestClient(
+        build_http_app(keyed.engine, dict, Limits()), raise_server_exceptions=False
+    )
+    assert (
+        unguarded.post("/v1/reset", json={"obs": {}}, headers={"x-session-id": "a"}).status_code
+        == 500
+    )
     assert keyed.policy.seen == []
 
 
@@ -223,7 +240,12 @@ def listen_to_the_end(client: Stream) -> None:
 
 def half(payload: int) -> bytes:
     """A frame's header and a part of what it announces."""
-    return bytes([0x82, 0x80 | 127]) + struct.pack(">Q", payload) + b"\0\0\0\0" + b"\0" * (payload // 2)
+    return (
+        bytes([0x82, 0x80 | 127])
+        + struct.pack(">Q", payload)
+        + b"\0\0\0\0"
+        + b"\0" * (payload // 2)
+    )
 
 
 def test_half_a_message_is_not_waited_for() -> None:
@@ -240,8 +262,12 @@ def test_half_a_message_is_not_waited_for() -> None:
 NO_HANDSHAKE = [RESET, b"GET / HTTP/1.1\r\n" + RESET, b"\r\n\r\n" + RESET, b"\0" * 40_000]
 
 
-@pytest.mark.parametrize("first", [b"", b"GET / HTTP/1.1\r\nHost: x\r\n", *NO_HANDSHAKE], ids=range(6))
-def test_what_comes_without_a_handshake_is_cut_off_and_not_read(keyed: Replica, first: bytes, monkeypatch) -> None:
+@pytest.mark.parametrize(
+    "first", [b"", b"GET / HTTP/1.1\r\nHost: x\r\n", *NO_HANDSHAKE], ids=range(6)
+)
+def test_what_comes_without_a_handshake_is_cut_off_and_not_read(
+    keyed: Replica, first: bytes, monkeypatch
+) -> None:
     monkeypatch.setattr(websocket, "_HANDSHAKE_S", 0.2)
     silent = [socket.create_connection(("127.0.0.1", keyed.own.address.port)) for _ in range(20)]
     for each in silent:
@@ -256,7 +282,10 @@ def test_what_comes_without_a_handshake_is_cut_off_and_not_read(keyed: Replica, 
 
 def test_a_silent_connection_ends_and_none_that_is_used_or_that_the_policy_keeps_waiting() -> None:
     """It is the server that does not read while the policy is busy."""
-    with replica(slow_s=SLOW_S, idle_s=IDLE_S) as quiet, replica(slow_s=SLOW_S, idle_s=IDLE_S) as busy:
+    with (
+        replica(slow_s=SLOW_S, idle_s=IDLE_S) as quiet,
+        replica(slow_s=SLOW_S, idle_s=IDLE_S) as busy,
+    ):
         token = busy.known.add("arm")
         other, waiting = busy.stream(token), busy.stream(token)
         for client in (other, waiting):
@@ -265,7 +294,9 @@ def test_a_silent_connection_ends_and_none_that_is_used_or_that_the_policy_keeps
         busy.policy.hold.clear()
         other.send(encode_requests([Request("act", Obs())]), 5)
         assert busy.policy.acting.wait(5)
-        waiting._socket.sendall(frame(encode_requests([Request("act", Obs(info={"much": bytes(20_000)}))])))
+        waiting._socket.sendall(
+            frame(encode_requests([Request("act", Obs(info={"much": bytes(20_000)}))]))
+        )
         token = quiet.known.add("arm")
         silent, used = quiet.stream(token), quiet.stream(token)
         begun = time.monotonic()
@@ -285,7 +316,9 @@ def test_a_silent_connection_ends_and_none_that_is_used_or_that_the_policy_keeps
     ("change", "said"),
     [({"revoked": True}, "revoked"), ({"expires": 1.0}, "expired"), ({"apps": ["x"]}, "not for")],
 )
-def test_connections_end_with_their_key_and_no_others(keyed: Replica, change: dict[str, object], said: str) -> None:
+def test_connections_end_with_their_key_and_no_others(
+    keyed: Replica, change: dict[str, object], said: str
+) -> None:
     token, other = keyed.known.add("arm"), keyed.known.add("lab")
     own, near = keyed.stream(token), keyed.shm(token)
     bystander, beside = keyed.stream(other), keyed.shm(other)
@@ -326,9 +359,14 @@ def test_a_key_has_no_more_connections_than_sessions(keyed: Replica, way: str) -
         else:
             third = keyed.shm(token)
             for _ in range(3):
-                assert isinstance(third.call([Request("reset", Obs(), request_id="r")], 5)[0].error, TooManyRequests)
+                assert isinstance(
+                    third.call([Request("reset", Obs(), request_id="r")], 5)[0].error,
+                    TooManyRequests,
+                )
             keyed.known.change("arm", sessions=3)
-            wait_for(lambda: third.call([Request("reset", Obs(), request_id="s")], 5)[0].error is None)  # noqa: B023
+            wait_for(
+                lambda: third.call([Request("reset", Obs(), request_id="s")], 5)[0].error is None  # noqa: B023
+            )
             keyed.known.change("arm", sessions=2)
             third.close()
             wait_for(lambda: len(keyed.local._clients) == 1)
@@ -355,7 +393,9 @@ def test_a_local_client_shows_its_key_soon(keyed: Replica, monkeypatch: pytest.M
     assert keyed.policy.seen == []
 
 
-def test_the_proxied_port_counts_a_keys_connections_too(keyed: Replica, serving: Callable[..., str]) -> None:
+def test_the_proxied_port_counts_a_keys_connections_too(
+    keyed: Replica, serving: Callable[..., str]
+) -> None:
     token = keyed.known.add("arm", sessions=1)
     url = serving(keyed.engine, keyed.known.keys)
     with (
@@ -375,7 +415,9 @@ def serving() -> Iterator[Callable[..., str]]:
     with contextlib.ExitStack() as stack:
 
         def start(engine: Engine, keys: api_keys.Keys) -> str:
-            port = stack.enter_context(served(AccessMiddleware(build_http_app(engine, dict, Limits()), keys, "app")))
+            port = stack.enter_context(
+                served(AccessMiddleware(build_http_app(engine, dict, Limits()), keys, "app"))
+            )
             return f"ws://127.0.0.1:{port}/v1/stream"
 
         yield start
@@ -391,9 +433,16 @@ def test_a_full_replica_turns_away_before_it_accepts_and_says_why(keyed: Replica
     assert len(held) == 8
 
 
-def test_a_client_goes_through_the_proxy_where_the_replicas_own_port_is_full(keyed: Replica) -> None:
+def test_a_client_goes_through_the_proxy_where_the_replicas_own_port_is_full(
+    keyed: Replica,
+) -> None:
     token = keyed.known.add("arm")
-    about = {"policy": "p", "version": "0", "protocol": PROTOCOL_VERSION, "stream": asdict(keyed.own.address)}
+    about = {
+        "policy": "p",
+        "version": "0",
+        "protocol": PROTOCOL_VERSION,
+        "stream": asdict(keyed.own.address),
+    }
     inside = build_http_app(keyed.engine, lambda: about, Limits())
     with served(AccessMiddleware(inside, keyed.known.keys, "app")) as port:
 
@@ -412,7 +461,9 @@ def test_a_client_goes_through_the_proxy_where_the_replicas_own_port_is_full(key
             assert len(keyed.own._clients) == 8
 
 
-def test_a_full_replica_closes_a_proxied_websocket_with_its_reason(keyed: Replica, serving: Callable[..., str]) -> None:
+def test_a_full_replica_closes_a_proxied_websocket_with_its_reason(
+    keyed: Replica, serving: Callable[..., str]
+) -> None:
     token = keyed.known.add("arm")
     for number in range(8):
         keyed.engine.sessions.open(f"lab/{number}")
@@ -492,11 +543,15 @@ def frame_of(data: bytes) -> bytes:
     return frame_head(len(data), bytes(4)) + data
 
 
-@pytest.mark.parametrize(("owner", "name"), FAULTS, ids=lambda value: getattr(value, "__name__", value))
+@pytest.mark.parametrize(
+    ("owner", "name"), FAULTS, ids=lambda value: getattr(value, "__name__", value)
+)
 def test_an_unexpected_error_anywhere_ends_that_connection_and_nothing_else(
     keyed: Replica, owner: type, name: str, monkeypatch: pytest.MonkeyPatch, no_records: None
 ) -> None:
-    """It is raised in callbacks of sockets, of timers, and of the threads that decode and answer."""
+    """It is raised in callbacks of sockets, of timers, and of the threads that decode and
+    answer.
+    """
     keyed.known.add("arm", rate=4)
     bystander = keyed.shm(keyed.known.add("lab"))
     assert bystander.call([Request("reset", Obs())], 5)[0].error is None
@@ -517,18 +572,28 @@ def test_an_unexpected_error_anywhere_ends_that_connection_and_nothing_else(
     with monkeypatch.context() as patch:
         patch.setattr(owner, name, fail)
         for _attempt in range(3):
-            with socket.create_connection(("127.0.0.1", port)) as client, contextlib.suppress(OSError):
-                client.sendall(handshake(keyed.own.path, "Authorization: Bearer vlr_arm") + messages)
+            with (
+                socket.create_connection(("127.0.0.1", port)) as client,
+                contextlib.suppress(OSError),
+            ):
+                client.sendall(
+                    handshake(keyed.own.path, "Authorization: Bearer vlr_arm") + messages
+                )
                 client.settimeout(0.3)
                 while client.recv(65536):
                     pass
             near = ShmTransport(keyed.local.address, Credentials("vlr_arm"))
             with contextlib.suppress(VLAgentsError, OSError):  # whatever this client is answered
                 near.connect(1)
-                near.call([Request("reset", Obs({"front": np.zeros((1100, 1100, 3), np.uint8)}))], 0.3)
+                near.call(
+                    [Request("reset", Obs({"front": np.zeros((1100, 1100, 3), np.uint8)}))], 0.3
+                )
             near.close()
         assert raised.wait(10)
-    assert bystander.call([Request("reset", Obs())], 5)[0].error is None or name in ("release", "overdue")
+    assert bystander.call([Request("reset", Obs())], 5)[0].error is None or name in (
+        "release",
+        "overdue",
+    )
     wait_for(lambda: not keyed.own._clients and len(keyed.local._clients) <= 1, 20)
     gc.collect()
     wait_for(lambda: keyed.engine.admission.held == 0, 20)

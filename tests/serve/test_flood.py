@@ -1,4 +1,6 @@
-"""A key of rate 1 sends the largest messages that it may, as fast as they are taken: robots do not notice."""
+"""A key of rate 1 sends the largest messages that it may, as fast as they are taken: robots do
+not notice.
+"""
 
 from __future__ import annotations
 
@@ -30,13 +32,17 @@ from vlagents_ray_dialects.messages import lerobot
 pytestmark = [pytest.mark.alone, pytest.mark.slow, pytest.mark.integration]
 
 SECONDS = 1.5  # 100 acts
-# Of each row of the table. p99 needs a quiet machine and 10 s or more; the rows are printed by `pytest -s`.
+# Of each row of the table. p99 needs a quiet machine and 10 s or more; the rows are printed by
+# `pytest -s`.
 ROW_SECONDS = float(os.environ.get("VLAGENTS_FLOOD_SECONDS", "1.5"))
-MEMORY_MB = 150  # what eight connections of one key may take: for each, a part of a message and what uvicorn copies
-# Of one address's observations without an end: its share of what is in flight, 128 MB, and gRPC's buffers and heaps.
+# What eight connections of one key may take: for each, a part of a message and what uvicorn copies.
+MEMORY_MB = 150
+# Of one address's observations without an end: its share of what is in flight, 128 MB, and gRPC's
+# buffers and heaps.
 UPLOADS_MEMORY_MB = 256
 ATTEMPTS = 3  # a machine that does something else meanwhile misleads
-NOISE_MS = 5.0  # of p90 on a machine with two cores, of which the flooding process takes one while it begins
+# Of p90 on a machine with two cores, of which the flooding process takes one while it begins.
+NOISE_MS = 5.0
 CASES = [
     *((way, "images", 1) for way in flood.WAYS),
     *((way, "header", connections) for way in flood.FRAMES for connections in (8, 32)),
@@ -77,7 +83,12 @@ def robot(where: flood.Where) -> Iterator[ShmTransport]:
 
 @pytest.mark.parametrize(("way", "part", "connections"), CASES)
 def test_a_robots_act_takes_less_than_twice_as_long(
-    where: flood.Where, robot: ShmTransport, attackers: Popen[str], way: str, part: str, connections: int
+    where: flood.Where,
+    robot: ShmTransport,
+    attackers: Popen[str],
+    way: str,
+    part: str,
+    connections: int,
 ) -> None:
     """The median, and p90 against that of the same robot alone in the same attempt.
 
@@ -98,7 +109,11 @@ def test_a_robots_act_takes_less_than_twice_as_long(
 
 def resources(server: int) -> tuple[float, int]:
     """The memory of a process, MB, and the number of its sockets."""
-    [memory] = [line for line in Path(f"/proc/{server}/status").read_text().splitlines() if line.startswith("VmRSS")]
+    [memory] = [
+        line
+        for line in Path(f"/proc/{server}/status").read_text().splitlines()
+        if line.startswith("VmRSS")
+    ]
     files = []
     for file in Path(f"/proc/{server}/fd").iterdir():
         with contextlib.suppress(OSError):  # closed meanwhile
@@ -106,15 +121,23 @@ def resources(server: int) -> tuple[float, int]:
     return int(memory.split()[1]) / 1024, sum(file.startswith("socket:") for file in files)
 
 
-# uvicorn's port is behind HAProxy, which forwards no connection without complete headers, and bounds their number
-# (`HTTP_TABLE`, and `launch/test_haproxy.py`).
+# uvicorn's port is behind HAProxy, which forwards no connection without complete headers, and
+# bounds their number (`HTTP_TABLE`, and `launch/test_haproxy.py`).
 OF_HAPROXY = ("nothing", "half a handshake", "closed at once")
 TABLE = [
     *(("own port", behaviour) for behaviour in flood.BEHAVIOURS),
-    *(("WS /v1/stream", behaviour) for behaviour in flood.BEHAVIOURS if behaviour not in OF_HAPROXY),
+    *(
+        ("WS /v1/stream", behaviour)
+        for behaviour in flood.BEHAVIOURS
+        if behaviour not in OF_HAPROXY
+    ),
     *(("shared memory", behaviour) for behaviour in flood.NEAR),
     *((flood.PLASMA, behaviour) for behaviour in flood.NEAR_PLASMA),
-    *((page, behaviour) for page in flood.PAGES for behaviour in (*flood.BEHAVIOURS, *flood.OF_VIEWERS)),
+    *(
+        (page, behaviour)
+        for page in flood.PAGES
+        for behaviour in (*flood.BEHAVIOURS, *flood.OF_VIEWERS)
+    ),
     *(
         (way, behaviour)
         for way in flood.WEBSOCKETS
@@ -153,7 +176,9 @@ def robots(
 
     def show() -> None:
         # From another address than the flood: each may hold 32 connections.
-        connection = HTTPConnection("127.0.0.1", page["port"], timeout=60, source_address=("127.0.0.2", 0))
+        connection = HTTPConnection(
+            "127.0.0.1", page["port"], timeout=60, source_address=("127.0.0.2", 0)
+        )
         with contextlib.closing(connection):
             connection.request("GET", "/live", headers={"authorization": "Bearer robot"})
             answer = connection.getresponse()
@@ -161,7 +186,9 @@ def robots(
             assert answer.read()
 
     with (
-        flood.http_robot(where) if where["proxied"] else contextlib.nullcontext(act) as act_over_http,
+        flood.http_robot(where)
+        if where["proxied"]
+        else contextlib.nullcontext(act) as act_over_http,
         PolicyClient(ports["gr00t"], "robot") as of_gr00t,
         socket.create_connection(("127.0.0.1", ports["vlagents"]), timeout=60) as of_vlagents,
         grpc.insecure_channel(f"127.0.0.1:{ports['lerobot']}") as of_lerobot,
@@ -184,20 +211,30 @@ def robots(
 
 @pytest.fixture(scope="module")
 def alone_ms() -> dict[str, list[float]]:
-    """The times of each robot alone, sorted: of the first row, and of those that are measured again."""
+    """The times of each robot alone, sorted: of the first row, and of those that are measured
+    again.
+    """
     return {}
 
 
-# A client without a key has a rate for each connection, of 150 requests a second, and none for its address, which may
-# be that of many robots; docs/other_clients.md has a rule for a firewall.
-OF_MANY_CLIENTS = pytest.mark.xfail(strict=False, reason="eight clients without a key send 1,200 requests a second")
+# A client without a key has a rate for each connection, of 150 requests a second, and none for its
+# address, which may be that of many robots; docs/other_clients.md has a rule for a firewall.
+OF_MANY_CLIENTS = pytest.mark.xfail(
+    strict=False, reason="eight clients without a key send 1,200 requests a second"
+)
 GATEWAY_TABLE = [
-    pytest.param(way, name, marks=[OF_MANY_CLIENTS] if (way, name) == ("lerobot", "requests") else [])
+    pytest.param(
+        way, name, marks=[OF_MANY_CLIENTS] if (way, name) == ("lerobot", "requests") else []
+    )
     for way, behaviours in flood.GATEWAYS.items()
     for name in behaviours
 ]
 HTTP_TABLE = [
-    pytest.param(way, name, marks=pytest.mark.skipif(haproxy_binary() is None, reason="HAProxy is not installed"))
+    pytest.param(
+        way,
+        name,
+        marks=pytest.mark.skipif(haproxy_binary() is None, reason="HAProxy is not installed"),
+    )
     for way in flood.HTTP
     for name in flood.HTTP_BEHAVIOURS
 ]
@@ -231,7 +268,9 @@ def test_no_behaviour_of_a_connection_delays_a_robot_or_leaves_anything(
         where = page
     call()
     memory, sockets = resources(where["pid"])
-    name = "replica" if way in (*flood.WAYS, flood.PLASMA) else "HAProxy" if way in flood.HTTP else way
+    name = (
+        "replica" if way in (*flood.WAYS, flood.PLASMA) else "HAProxy" if way in flood.HTTP else way
+    )
     for attempt in range(ATTEMPTS):
         if attempt or name not in alone_ms:
             await_calm(where["pid"])  # an attempt before this one may have left much to do
@@ -242,7 +281,9 @@ def test_no_behaviour_of_a_connection_delays_a_robot_or_leaves_anything(
                 await_calm(where["pid"])  # 400 MB arrive at first
             beside = flood.times_ms(call, ROW_SECONDS)
             held = resources(where["pid"])[0] - memory
-        p50, p90, p99 = ((flood.percentile(alone, n), flood.percentile(beside, n)) for n in (50, 90, 99))
+        p50, p90, p99 = (
+            (flood.percentile(alone, n), flood.percentile(beside, n)) for n in (50, 90, 99)
+        )
         is_calm = p50[1] < 2 * p50[0] and p90[1] < 2 * max(p90[0], NOISE_MS)
         if is_calm or attempt == ATTEMPTS - 1:
             break
@@ -250,7 +291,8 @@ def test_no_behaviour_of_a_connection_delays_a_robot_or_leaves_anything(
     wait_for(lambda: resources(where["pid"])[1] <= sockets, 30)
     ended_s = time.monotonic() - begun
     row = (
-        f"p50 {p50[0]:.2f} -> {p50[1]:.2f} ms, p90 {p90[0]:.2f} -> {p90[1]:.2f} ms, p99 {p99[0]:.2f} -> {p99[1]:.2f} ms"
+        f"p50 {p50[0]:.2f} -> {p50[1]:.2f} ms, p90 {p90[0]:.2f} -> {p90[1]:.2f} ms, p99 "
+        f"{p99[0]:.2f} -> {p99[1]:.2f} ms"
     )
     row += f", memory +{held:.0f} MB, connections gone after {ended_s:.1f} s"
     record_property("row", row)
@@ -267,16 +309,26 @@ def test_no_websocket_is_compressed(where: flood.Where, way: str) -> None:
 
 
 def test_a_message_that_does_not_arrive_ends_its_connection(where: flood.Where) -> None:
-    """All ways and behaviours at once, as each lasts for as long as the server waits for a message."""
-    cases = list(itertools.product(flood.WEBSOCKETS, ["half a head", "half a message", flood.DRIPPED]))
+    """All ways and behaviours at once, as each lasts for as long as the server waits for a
+    message.
+    """
+    cases = list(
+        itertools.product(flood.WEBSOCKETS, ["half a head", "half a message", flood.DRIPPED])
+    )
 
     def seconds_until_the_end(way: str, behaviour: str) -> float:
         begun = time.monotonic()
         with contextlib.suppress(OSError):
-            flood.misbehave(flood.WEBSOCKETS[way], behaviour, where, "robot", begun + 10 * flood.SLOW_S)
+            flood.misbehave(
+                flood.WEBSOCKETS[way], behaviour, where, "robot", begun + 10 * flood.SLOW_S
+            )
         return time.monotonic() - begun
 
     with ThreadPoolExecutor(len(cases)) as connections:
         waited = list(connections.map(lambda case: seconds_until_the_end(*case), cases))
-    late = {case: seconds for case, seconds in zip(cases, waited, strict=True) if seconds >= 5 * flood.SLOW_S}
+    late = {
+        case: seconds
+        for case, seconds in zip(cases, waited, strict=True)
+        if seconds >= 5 * flood.SLOW_S
+    }
     assert not late

@@ -1,10 +1,13 @@
-"""Bytes from clients that nobody has let in, at every port of a keyed replica: none crashes it, makes it grow, or acts.
+"""Bytes from clients that nobody has let in, at every port of a keyed replica: none crashes it,
+makes it grow, or acts.
 
-What is fuzzed are the states of each protocol before authentication: handshakes that are nearly right, whole requests
-before, with and after refused ones, in segments cut anywhere. `tests/integration/test_fuzz.py` does so after it. Some
-thousands in CI; as many as wanted by hand, all of them from one seed:
+What is fuzzed are the states of each protocol before authentication: handshakes that are nearly
+right, whole requests before, with and after refused ones, in segments cut anywhere.
+`tests/integration/test_fuzz.py` does so after it. Some thousands in CI; as many as wanted by hand,
+all of them from one seed:
 
-    VLAGENTS_FUZZ_SEQUENCES=1000000 VLAGENTS_FUZZ_SEED=1 pytest tests/serve/test_fuzz_before_keys.py -s --timeout 7200
+    VLAGENTS_FUZZ_SEQUENCES=1000000 VLAGENTS_FUZZ_SEED=1 pytest tests/serve/test_fuzz_before_keys.py
+    -s --timeout 7200
 """
 
 from __future__ import annotations
@@ -49,7 +52,9 @@ ANSWER_S = 20.0
 GROWTH = 64 * 2**20  # bytes, whatever the number of sequences
 KEYS = (None, "vlr_wrong", "vlr_leaver", "vlr_elsewhere", "vlr_", "\xe9", "x" * 5000)
 PICTURE = np.full((8, 8, 3), 9, np.uint8)
-RESET = encode_requests([Request("reset", Obs({"front": PICTURE}), "move to the human", session="robot-1")])
+RESET = encode_requests(
+    [Request("reset", Obs({"front": PICTURE}), "move to the human", session="robot-1")]
+)
 ACT = encode_requests([Request("act", Obs({"front": PICTURE}), session="robot-1")])
 FORM = b'--b\r\nContent-Disposition: form-data; name="obs"\r\n\r\n{}\r\n--b--'
 Sequence = list[bytes]
@@ -57,7 +62,9 @@ Sequence = list[bytes]
 
 @dataclass
 class Target:
-    """A port, what comes close to a right message there, and the way in that a client with a key takes."""
+    """A port, what comes close to a right message there, and the way in that a client with a key
+    takes.
+    """
 
     name: str
     way: str
@@ -87,7 +94,14 @@ def sequence(target: Target, replica: KeyedReplica, choose: random.Random) -> Se
 
 def headers(choose: random.Random) -> bytes:
     key = choose.choice(KEYS)
-    shown = choose.choice(("Authorization: Bearer ", "authorization: Api-Key ", "x-api-key: ", "Authorization: Basic "))
+    shown = choose.choice(
+        (
+            "Authorization: Bearer ",
+            "authorization: Api-Key ",
+            "x-api-key: ",
+            "Authorization: Basic ",
+        )
+    )
     return b"" if key is None else f"{shown}{key}\r\n".encode("latin-1")
 
 
@@ -111,12 +125,15 @@ def frames(choose: random.Random) -> Sequence:
         b"VLA?" * 3,
     ]
     return [
-        frame(choose.choice(some), choose.choice((2, 2, 2, 0, 1, 8, 9, 10, 3))) for _ in range(choose.randint(0, 3))
+        frame(choose.choice(some), choose.choice((2, 2, 2, 0, 1, 8, 9, 10, 3)))
+        for _ in range(choose.randint(0, 3))
     ]
 
 
 def at_own_port(replica: KeyedReplica, choose: random.Random) -> Sequence:
-    path = choose.choice((replica.own.path, replica.own.path, "/", "/v1/stream", replica.own.path[:-1]))
+    path = choose.choice(
+        (replica.own.path, replica.own.path, "/", "/v1/stream", replica.own.path[:-1])
+    )
     return [handshake(choose, path), *frames(choose)]
 
 
@@ -124,7 +141,9 @@ def at_http(_replica: KeyedReplica, choose: random.Random) -> Sequence:
     if choose.random() < 0.4:
         path = choose.choice(("/v1/stream", "/", "/openpi", "/roboarena", "/vla-eval", "/nope"))
         return [handshake(choose, path), *frames(choose)]
-    path = choose.choice(("/v1/reset", "/v1/act", "/v1/close", "/act", "/docs", "/v1/metadata", "/healthz/"))
+    path = choose.choice(
+        ("/v1/reset", "/v1/act", "/v1/close", "/act", "/docs", "/v1/metadata", "/healthz/")
+    )
     kind, content = choose.choice(
         (
             ("application/json", b'{"instruction": "move to the human"}'),
@@ -136,11 +155,18 @@ def at_http(_replica: KeyedReplica, choose: random.Random) -> Sequence:
             ),
         )
     )
-    length = f"Content-Length: {len(content)}\r\n" if choose.random() < 0.7 else "Transfer-Encoding: chunked\r\n"
+    length = (
+        f"Content-Length: {len(content)}\r\n"
+        if choose.random() < 0.7
+        else "Transfer-Encoding: chunked\r\n"
+    )
     if "chunked" in length:
         content = f"{len(content):x}\r\n".encode() + content + b"\r\n0\r\n\r\n"
     method = choose.choice(("POST", "POST", "GET", "PUT", "OPTIONS"))
-    head = f"{method} {path} HTTP/1.1\r\nHost: x\r\nx-session-id: robot-1\r\nContent-Type: {kind}\r\n{length}"
+    head = (
+        f"{method} {path} HTTP/1.1\r\nHost: x\r\nx-session-id: robot-1\r\nContent-Type: "
+        f"{kind}\r\n{length}"
+    )
     return [head.encode() + headers(choose) + b"\r\n", content] * choose.randint(1, 2)
 
 
@@ -151,9 +177,15 @@ def at_shm(_replica: KeyedReplica, choose: random.Random) -> Sequence:
 
 
 def at_gr00t(_replica: KeyedReplica, choose: random.Random) -> Sequence:
-    observation = {"video": {"ego": PICTURE[None, None]}, "language": {"task": [["move to the human"]]}}
+    observation = {
+        "video": {"ego": PICTURE[None, None]},
+        "language": {"task": [["move to the human"]]},
+    }
     data = choose.choice(({"observation": observation, "options": None}, observation, {}, None))
-    said = {"endpoint": choose.choice(("get_action", "reset", "ping", "get_modality_config", "kill")), "data": data}
+    said = {
+        "endpoint": choose.choice(("get_action", "reset", "ping", "get_modality_config", "kill")),
+        "data": data,
+    }
     if (key := choose.choice(KEYS)) is not None:
         said = {"api_token": key} | said if choose.random() < 0.5 else said | {"api_token": key}
     return [msgpack.packb(said, default=gr00t_encode)]
@@ -173,8 +205,20 @@ def at_vlagents(_replica: KeyedReplica, choose: random.Random) -> Sequence:
     getroot = request(1, Handler.GETROOT, (TUPLE, ()))
     getattr_ = request(2, Handler.GETATTR, (TUPLE, ((LOCAL, ROOT), (VALUE, "act"))))
     half = document(1, "move to the human").encode()[: choose.randint(0, 100)].decode()
-    calls = [call("act", half), call("reset", half), call("name"), call("git_status"), call("act"), call("kill", "x")]
-    return [getroot, getattr_, *choose.sample(calls, 2), rpyc.HEADER.pack(choose.randrange(2**32), 0)]
+    calls = [
+        call("act", half),
+        call("reset", half),
+        call("name"),
+        call("git_status"),
+        call("act"),
+        call("kill", "x"),
+    ]
+    return [
+        getroot,
+        getattr_,
+        *choose.sample(calls, 2),
+        rpyc.HEADER.pack(choose.randrange(2**32), 0),
+    ]
 
 
 # How.
@@ -184,11 +228,14 @@ def over_tcp(
     port: Callable[[KeyedReplica], int], *, hangs_up: bool = True
 ) -> Callable[[KeyedReplica, random.Random, Sequence], str]:
     def send(replica: KeyedReplica, choose: random.Random, segments: Sequence) -> str:
-        """Until the server hangs up, which it does once it has read all of it; ZMQ may wait for more."""
+        """Until the server hangs up, which it does once it has read all of it; ZMQ may wait for
+        more.
+        """
         said = b""
         with socket.socket() as connection:
             connection.settimeout(ANSWER_S if hangs_up else 0.5)
-            connection.bind((f"127.0.0.{choose.randint(2, 250)}", 0))  # one address has few ports a minute
+            # One address has few ports a minute.
+            connection.bind((f"127.0.0.{choose.randint(2, 250)}", 0))
             connection.connect(("127.0.0.1", port(replica)))
             gone = (ConnectionError,) if hangs_up else (ConnectionError, TimeoutError)
             with contextlib.suppress(*gone):  # it did not wait for the rest
@@ -198,7 +245,13 @@ def over_tcp(
                     connection.shutdown(socket.SHUT_WR)
                 while more := connection.recv(65536):
                     said += more
-        return said[:12].decode("latin-1") if said.startswith(b"HTTP") else "something" if said else "nothing"
+        return (
+            said[:12].decode("latin-1")
+            if said.startswith(b"HTTP")
+            else "something"
+            if said
+            else "nothing"
+        )
 
     return send
 
@@ -228,7 +281,9 @@ _OF_THREAD = threading.local()
 
 
 def over_zmq(replica: KeyedReplica, _choose: random.Random, segments: Sequence) -> str:
-    """One message, in as many parts as there are segments; a connection is closed after 64 without a key."""
+    """One message, in as many parts as there are segments; a connection is closed after 64
+    without a key.
+    """
     if not hasattr(_OF_THREAD, "context"):
         _OF_THREAD.context = zmq.Context()
     if (_OF_THREAD.__dict__.setdefault("sent", 0)) % 50 == 0:
@@ -256,7 +311,10 @@ TARGETS = [
         over_tcp(lambda replica: replica.gr00t[True], hangs_up=False),
     ),
     Target(
-        "vlagents", "vlagents' gateway, `without_key: true`", at_vlagents, over_tcp(lambda replica: replica.vlagents)
+        "vlagents",
+        "vlagents' gateway, `without_key: true`",
+        at_vlagents,
+        over_tcp(lambda replica: replica.vlagents),
     ),
 ]
 
@@ -295,7 +353,12 @@ def test_nothing_that_comes_before_a_key_crashes_bloats_or_acts(
 
     def attack_all(number: int, seed: int) -> None:
         with ThreadPoolExecutor(len(TARGETS)) as pool:
-            list(pool.map(lambda each: attack(each[1], replica, number, seed + each[0]), enumerate(TARGETS)))
+            list(
+                pool.map(
+                    lambda each: attack(each[1], replica, number, seed + each[0]),
+                    enumerate(TARGETS),
+                )
+            )
 
     attack_all(share // 4, 100 * SEED)
     at_rest(replica)
@@ -305,13 +368,18 @@ def test_nothing_that_comes_before_a_key_crashes_bloats_or_acts(
     took_s = time.perf_counter() - begun
     at_rest(replica)
     after = held()
-    print(f"\n{share * len(TARGETS)} sequences, the last three quarters in {took_s:.0f} s; before and after those: "
-          f"{before[0] / 2**20:.0f} and {after[0] / 2**20:.0f} MiB, {before[1]} and {after[1]} threads, "
+    print(f"\n{share * len(TARGETS)} sequences, the last three quarters in {took_s:.0f} s; before "
+          "and after those: "
+          f"{before[0] / 2**20:.0f} and {after[0] / 2**20:.0f} MiB, {before[1]} and {after[1]} "
+          "threads, "
           f"{before[2]} and {after[2]} descriptors")  # fmt: skip
     for target in TARGETS:
         print(f"{target.name}: {dict(target.said.most_common(8))}")
-    assert [mark for mark in replica.policy.done if not mark.startswith("mark of ")] == []  # of clients with a key
-    assert [record.getMessage() for record in caplog.records if record.levelno >= logging.ERROR] == []
+    # Of clients with a key.
+    assert [mark for mark in replica.policy.done if not mark.startswith("mark of ")] == []
+    assert [
+        record.getMessage() for record in caplog.records if record.levelno >= logging.ERROR
+    ] == []
     assert after[0] - before[0] < GROWTH
     assert after[1] - before[1] < 10
     assert after[2] - before[2] < 20
@@ -320,5 +388,7 @@ def test_nothing_that_comes_before_a_key_crashes_bloats_or_acts(
 def at_rest(replica: KeyedReplica) -> None:
     """Nobody is connected any more."""
     wait_for(lambda: not replica.own._clients and not replica.local._clients)
-    wait_for(lambda: not any(thread.name.startswith("vlagents 127") for thread in threading.enumerate()))
+    wait_for(
+        lambda: not any(thread.name.startswith("vlagents 127") for thread in threading.enumerate())
+    )
     wait_for(lambda: not replica.known.keys._held)

@@ -1,4 +1,6 @@
-"""What a replica holds for requests that wait for its policy is what it counts as in flight, at each endpoint."""
+"""What a replica holds for requests that wait for its policy is what it counts as in flight, at
+each endpoint.
+"""
 
 from __future__ import annotations
 
@@ -73,7 +75,10 @@ def replica() -> Iterator[Replica]:
     limits = Limits(in_flight_bytes=IN_FLIGHT)
     policy = Gate()
     engine = Engine(policy, in_flight_bytes=IN_FLIGHT)
-    own, near = WebSocketServer(engine, limits, "127.0.0.1", None, NoKey.OPEN), ShmServer(engine, limits, NoKey.OPEN)
+    own, near = (
+        WebSocketServer(engine, limits, "127.0.0.1", None, NoKey.OPEN),
+        ShmServer(engine, limits, NoKey.OPEN),
+    )
     own.open(), near.open()
     engine.start()
     yield Replica(policy, engine, own, near)
@@ -88,24 +93,34 @@ def replica() -> Iterator[Replica]:
 def allocated() -> int:
     """Bytes of this process alone, without shared pages."""
     gc.collect()
-    [line] = [line for line in Path("/proc/self/status").read_text().splitlines() if line.startswith("RssAnon")]
+    [line] = [
+        line
+        for line in Path("/proc/self/status").read_text().splitlines()
+        if line.startswith("RssAnon")
+    ]
     return int(line.split()[1]) * 1024
 
 
 def many_acts(session: str) -> bytes:
     act = f'{{"op":"act","session":"{session}","obs":{{}}}}'
-    return b"".join(frame_layout.assemble(f'{{"requests":[{",".join([act] * ACTS)}],"blobs":[]}}', []))
+    return b"".join(
+        frame_layout.assemble(f'{{"requests":[{",".join([act] * ACTS)}],"blobs":[]}}', [])
+    )
 
 
 def hold_policy(replica: Replica) -> ShmTransport:
-    """A client whose act keeps the policy busy, after acts of two sessions, so that another thread reads."""
+    """A client whose act keeps the policy busy, after acts of two sessions, so that another
+    thread reads.
+    """
     client = ShmTransport(replica.near.address)
     client.connect(5)
     for name in "ab":
         assert client.call([Request("reset", SMALL, session=name)], 10)[0].error is None
     for _ in range(8):
         client.call([Request("act", SMALL, session=name, request_id=name) for name in "ab"], 10)
-    written = encode_requests([Request("act", Obs(state={"wait": np.zeros(1, np.float32)}), session="a")])
+    written = encode_requests(
+        [Request("act", Obs(state={"wait": np.zeros(1, np.float32)}), session="a")]
+    )
     send_in_file(client, 0, written)
     assert replica.policy.entered.wait(10)
     return client
@@ -134,7 +149,10 @@ Flood = Callable[[Replica, ShmTransport], contextlib.AbstractContextManager[None
 @contextlib.contextmanager
 def over_own_port(replica: Replica, _: ShmTransport) -> Iterator[None]:
     message = many_acts("b")
-    streams = [Stream(urlsplit("http://127.0.0.1"), replica.own.address.port, replica.own.path, 5) for _ in range(2)]
+    streams = [
+        Stream(urlsplit("http://127.0.0.1"), replica.own.address.port, replica.own.path, 5)
+        for _ in range(2)
+    ]
     for stream in streams:
         stream.send(encode_requests([Request("reset", SMALL, session="b")]), 5)
         stream._socket.setblocking(True)
@@ -167,7 +185,9 @@ def over_shared_memory(_replica: Replica, client: ShmTransport) -> Iterator[None
     """Frames of small acts, in memory of the client."""
     frame = many_acts("b")
     head = LocalAddress.REQUEST.pack(1, 0, len(frame))
-    _send_all(client, ((head, memory_file(FILE, frame) if number == 0 else None) for number in range(120)))
+    _send_all(
+        client, ((head, memory_file(FILE, frame) if number == 0 else None) for number in range(120))
+    )
     yield
 
 
@@ -184,13 +204,17 @@ def _compact(acts: int) -> bytes:
 def in_compact_form(_replica: Replica, client: ShmTransport) -> Iterator[None]:
     head = LocalAddress.REQUEST.pack(1, LocalAddress.COMPACT, FILE)
     message = head + _compact(ACTS)
-    _send_all(client, ((message, memory_file(FILE) if number == 0 else None) for number in range(120)))
+    _send_all(
+        client, ((message, memory_file(FILE) if number == 0 else None) for number in range(120))
+    )
     yield
 
 
 @contextlib.contextmanager
 def with_copies(_replica: Replica, client: ShmTransport) -> Iterator[None]:
-    """From the ninth view on, each act copies its whole memory file, although it needs 12 bytes of it."""
+    """From the ninth view on, each act copies its whole memory file, although it needs 12 bytes
+    of it.
+    """
 
     def messages() -> Iterator[tuple[bytes, int | None]]:
         for number in range(120):
@@ -211,12 +235,18 @@ FLOODS: dict[str, Flood] = {
 
 
 @pytest.mark.parametrize("name", FLOODS)
-def test_requests_that_wait_take_no_more_memory_than_they_count(replica: Replica, name: str) -> None:
+def test_requests_that_wait_take_no_more_memory_than_they_count(
+    replica: Replica, name: str
+) -> None:
     client = hold_policy(replica)
     admission = replica.engine.admission
     before = allocated()
     with FLOODS[name](replica, client):
-        wait_for(lambda: admission.held > IN_FLIGHT / 4 or replica.engine.queue.depth() > MOST_UNANSWERED / 2)
+        wait_for(
+            lambda: (
+                admission.held > IN_FLIGHT / 4 or replica.engine.queue.depth() > MOST_UNANSWERED / 2
+            )
+        )
         time.sleep(0.5)  # for as much more as the server takes
         assert admission.held <= IN_FLIGHT
         assert admission.held >= REQUEST_BYTES * replica.engine.queue.depth()
@@ -229,7 +259,9 @@ def test_a_local_client_that_reads_no_answers_is_not_read_for_ever(replica: Repl
     client = hold_policy(replica)
     [connection] = replica.near._clients
     head = LocalAddress.REQUEST.pack(1, LocalAddress.COMPACT, FILE)
-    messages = ((head + _compact(1), memory_file(FILE) if number == 0 else None) for number in range(2000))
+    messages = (
+        (head + _compact(1), memory_file(FILE) if number == 0 else None) for number in range(2000)
+    )
     _send_all(client, messages)
     wait_for(lambda: not connection._polled)
     assert connection._unanswered == MOST_UNANSWERED
@@ -248,7 +280,9 @@ def test_an_act_in_compact_form_is_refused_while_there_is_no_room(replica: Repli
     admission = replica.engine.admission
     size = IN_FLIGHT - REQUEST_BYTES  # the last message may not be dropped yet
     admission.hold(size, True, 0)
-    [reply] = client.call([Request("act", SMALL, request_id=str(number)) for number in range(2)], 10)[:1]
+    [reply] = client.call(
+        [Request("act", SMALL, request_id=str(number)) for number in range(2)], 10
+    )[:1]
     assert reply.error is not None
     assert reply.error.code == "overloaded"
     admission.release(size)

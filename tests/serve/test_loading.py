@@ -1,4 +1,6 @@
-"""When Serve calls a replica running: when its policy has loaded, not before, and not if it did not."""
+"""When Serve calls a replica running: when its policy has loaded, not before, and not if it did
+not.
+"""
 
 from __future__ import annotations
 
@@ -70,11 +72,15 @@ def test_a_replica_runs_when_its_policy_has_loaded() -> None:
     assert asyncio.run(start()) == [False, True]
 
 
-@pytest.mark.parametrize(("cause", "shown"), [(MissingDependency("no jax"), False), (KeyError("jax"), True)])
+@pytest.mark.parametrize(
+    ("cause", "shown"), [(MissingDependency("no jax"), False), (KeyError("jax"), True)]
+)
 def test_only_the_traceback_of_a_policys_own_bug_is_shown(
     cause: Exception, shown: bool, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """`serve status` shows what is raised here with its traceback, after which the cause is hard to find."""
+    """`serve status` shows what is raised here with its traceback, after which the cause is hard
+    to find.
+    """
 
     def fail() -> None:
         raise PolicyFailed("the policy did not load: no jax") from cause
@@ -91,11 +97,16 @@ def test_only_the_traceback_of_a_policys_own_bug_is_shown(
 @pytest.mark.parametrize(
     ("args", "said"),
     [
-        ({"environment": {"python": "/nowhere/.venv-pi/bin/python"}}, "ConfigError: environment.python: no such file"),
+        (
+            {"environment": {"python": "/nowhere/.venv-pi/bin/python"}},
+            "ConfigError: environment.python: no such file",
+        ),
         ({"batch": {"max_sise": 3}}, "batch.max_sise"),
     ],
 )
-def test_serve_status_shows_one_sentence_if_an_application_cannot_be_built(args: dict[str, Any], said: str) -> None:
+def test_serve_status_shows_one_sentence_if_an_application_cannot_be_built(
+    args: dict[str, Any], said: str
+) -> None:
     """Serve shows the text of its own exceptions, and of any other a traceback of forty lines."""
     builder = import_attr(IMPORT_PATH)
     with pytest.raises(RayServeException) as failed:
@@ -107,10 +118,14 @@ def test_serve_status_shows_one_sentence_if_an_application_cannot_be_built(args:
 
 
 @pytest.mark.parametrize("act_s", [3.0, 60.0, 600.0])
-def test_serve_leaves_a_replica_that_does_not_answer_as_much_time_as_a_call_may_take(act_s: float) -> None:
+def test_serve_leaves_a_replica_that_does_not_answer_as_much_time_as_a_call_may_take(
+    act_s: float,
+) -> None:
     """Its policy may hold the interpreter's lock: Serve's checks are all that limits that."""
     policy = application(ServerArgs(policy="noop", limits={"act_s": act_s}))._bound_deployment
-    assert policy._deployment_config.max_constructor_retry_count == 1, "it gives up after the first failed start"
+    assert policy._deployment_config.max_constructor_retry_count == 1, (
+        "it gives up after the first failed start"
+    )
     silent_s = 3 * policy._deployment_config.health_check_timeout_s
     assert act_s <= silent_s <= max(15.0, act_s)
 
@@ -137,7 +152,9 @@ def test_a_replica_warns_of_keys_that_come_unencrypted_unless_tls_ends_elsewhere
 
 
 @pytest.mark.parametrize("method", PEER_METHODS)
-def test_what_other_replicas_call_reaches_the_part_that_has_it(monkeypatch: pytest.MonkeyPatch, method: str) -> None:
+def test_what_other_replicas_call_reaches_the_part_that_has_it(
+    monkeypatch: pytest.MonkeyPatch, method: str
+) -> None:
     asked = PEER_METHODS[method]
     parts = {part: SimpleNamespace() for part in (HeldSessions, WeightUpdates, Rebalancer)}
 
@@ -165,7 +182,11 @@ def test_other_replicas_call_a_part_by_its_name() -> None:
 
     one = object.__new__(Bare)
     vars(one).update(_parts=Parts())
-    assert asyncio.run(one.call_part("counter", "count", 1, "two")) == ("counter", "count", (1, "two"))
+    assert asyncio.run(one.call_part("counter", "count", 1, "two")) == (
+        "counter",
+        "count",
+        (1, "two"),
+    )
 
 
 def test_a_replica_answers_what_waits_before_its_ways_in_and_its_parts_close() -> None:
@@ -182,7 +203,9 @@ def test_a_replica_answers_what_waits_before_its_ways_in_and_its_parts_close() -
         vars(one).update(
             _tasks=[asyncio.ensure_future(asyncio.sleep(60))],
             _engine=part("engine", draining=True),
-            _migrator=SimpleNamespace(hand_over=lambda: ended("sessions"), close=lambda: ended("migrator")),
+            _migrator=SimpleNamespace(
+                hand_over=lambda: ended("sessions"), close=lambda: ended("migrator")
+            ),
             **{f"_{name}": part(name) for name in ("parts", "metrics", "local", "stream")},
             _plasma=None,
         )

@@ -24,7 +24,9 @@ THIS = f"{__name__}:Trembling"
 
 
 class Trembling(Agent):
-    """Goes to zero in steps of a length, which tremble; its own count of acts must be that of one episode."""
+    """Goes to zero in steps of a length, which tremble; its own count of acts must be that of
+    one episode.
+    """
 
     def __init__(self, length: float = 1.0) -> None:
         self.length, self.acts = length, 0
@@ -33,7 +35,9 @@ class Trembling(Agent):
     def contract(self) -> Contract:
         return Contract(state={"position": StateSpec(1)}, action=ActionSpec(dim=1))
 
-    def reset(self, obs: Obs, instruction: str | None, *, seed: int | None = None, **kwargs: Any) -> dict[str, Any]:
+    def reset(
+        self, obs: Obs, instruction: str | None, *, seed: int | None = None, **kwargs: Any
+    ) -> dict[str, Any]:
         self.noise = np.random.default_rng(seed)
         return {}
 
@@ -58,14 +62,23 @@ def outcomes(summary: Summary) -> list[dict[str, Any]]:
 
 
 @pytest.mark.parametrize("num_envs", [1, 3])
-def test_its_episodes_are_those_of_a_replica(num_envs: int, replica: Replicas, tmp_path: Path) -> None:
+def test_its_episodes_are_those_of_a_replica(
+    num_envs: int, replica: Replicas, tmp_path: Path
+) -> None:
     args = ServerArgs(policy=THIS)
     found = []
     for name, make in {
         "here": partial(LocalPolicy, args, {"length": 0.8}),
         "there": partial(replica.agent, rank="simulation", resume=False),
     }.items():
-        plan = flat_config(envs=[LINE], episodes=12, num_envs=num_envs, workers=0, video="none", out=tmp_path / name)
+        plan = flat_config(
+            envs=[LINE],
+            episodes=12,
+            num_envs=num_envs,
+            workers=0,
+            video="none",
+            out=tmp_path / name,
+        )
         found.append(evaluate(plan, agent_factory=make))
     here, there = map(outcomes, found)
     assert here == there

@@ -1,4 +1,6 @@
-"""What a message may cost is asked before it is paid: by the key's rate, by memory, and on which thread."""
+"""What a message may cost is asked before it is paid: by the key's rate, by memory, and on which
+thread.
+"""
 
 from __future__ import annotations
 
@@ -80,7 +82,12 @@ from vlagents_ray.serve.access.api_keys import NoKey
 from vlagents_ray.serve.dialects.base import GatewayContext
 from vlagents_ray.serve.endpoints.shm import ShmServer, UnixConnection
 from vlagents_ray.serve.endpoints.websocket import WebSocketServer
-from vlagents_ray.serve.engine.admission import Admission, ArrivingBytes, MessageAdmission, NeedsDecodingThread
+from vlagents_ray.serve.engine.admission import (
+    Admission,
+    ArrivingBytes,
+    MessageAdmission,
+    NeedsDecodingThread,
+)
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.engine.sender import REFUSALS
 from vlagents_ray.wire import json_numpy
@@ -101,7 +108,9 @@ SEEN = {"cameras": {"front": {"$": ["img", 0]}}}
 
 
 def frame(*requests: dict[str, Any], files: list[bytes] | None = None) -> bytes:
-    return b"".join(frame_layout.pack({"requests": list(requests)}, [JPEG] if files is None else list(files)))
+    return b"".join(
+        frame_layout.pack({"requests": list(requests)}, [JPEG] if files is None else list(files))
+    )
 
 
 def reset(**more: Any) -> dict[str, Any]:
@@ -109,7 +118,9 @@ def reset(**more: Any) -> dict[str, Any]:
 
 
 def message_admission(
-    most: int = 10**9, limits: Limits = DEFAULT_LIMITS, admit: Callable[[object], bool] = lambda _: True
+    most: int = 10**9,
+    limits: Limits = DEFAULT_LIMITS,
+    admit: Callable[[object], bool] = lambda _: True,
 ) -> MessageAdmission:
     return MessageAdmission(Admission(most), limits, admit)
 
@@ -125,7 +136,9 @@ def replica(tmp_path_factory: pytest.TempPathFactory) -> Iterator[KeyedReplica]:
 
 @pytest.fixture
 def decoded(monkeypatch: pytest.MonkeyPatch) -> list[str]:
-    """The decoders that were called, and the parsers outside of the test's own thread, in which its clients run."""
+    """The decoders that were called, and the parsers outside of the test's own thread, in which
+    its clients run.
+    """
     by: list[str] = []
     for module, name in (
         (jpeg_png, "decode_file"),
@@ -142,7 +155,13 @@ def decoded(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     ):
         original = getattr(module, name)
 
-        def noted(*args: Any, original: Any = original, module: Any = module, name: str = name, **options: Any) -> Any:
+        def noted(
+            *args: Any,
+            original: Any = original,
+            module: Any = module,
+            name: str = name,
+            **options: Any,
+        ) -> Any:
             if module is jpeg_png or threading.current_thread() is not threading.main_thread():
                 by.append(name)
             return original(*args, **options)
@@ -155,7 +174,11 @@ def _post(path: str, kind: str, content: bytes) -> Callable[[Visitor, str], str]
     def attempt(visitor: Visitor, _when: str) -> str:
         visitor.become()
         connection = http.client.HTTPConnection("127.0.0.1", visitor.replica.port, timeout=10)
-        headers = {"authorization": f"Bearer {visitor.shown}", "content-type": kind, "x-session-id": "robot-1"}
+        headers = {
+            "authorization": f"Bearer {visitor.shown}",
+            "content-type": kind,
+            "x-session-id": "robot-1",
+        }
         connection.request("POST", path, content, headers)
         answer = connection.getresponse()
         if answer.status == 429:
@@ -188,12 +211,15 @@ NO_KEY = {
 
 
 FORM = (
-    b'--X\r\nContent-Disposition: form-data; name="obs"\r\n\r\n{}\r\n--X\r\nContent-Disposition: form-data; '
+    b'--X\r\nContent-Disposition: form-data; name="obs"\r\n\r\n{}\r\n--X\r\nContent-Disposition: '
+    b"form-data; "
     b'name="cameras.front"; filename="a"\r\n\r\n' + JPEG + b"\r\n--X--\r\n"
 )
 ACT = "`POST /v1/act`"  # for which the others reset a session first
 # Each way in by which something to decode comes, for a key; docs/keys.md has them all.
-CARRY = {way: attempt for way, attempt in WAYS.items() if way not in NOTHING_TO_DECODE | NO_KEY | {ACT}} | {
+CARRY = {
+    way: attempt for way, attempt in WAYS.items() if way not in NOTHING_TO_DECODE | NO_KEY | {ACT}
+} | {
     f"{op}, {kind.partition(';')[0]}": _post(f"/v1/{op}", kind, content)
     for op in ("reset", "act")
     for kind, content in (
@@ -208,8 +234,11 @@ def test_a_refused_body_that_is_long_is_not_read(replica: KeyedReplica) -> None:
     visitor = replica.visitor("over its rate")
     visitor.become()
     with socket.create_connection(("127.0.0.1", replica.port), timeout=10) as connection:
-        head = f"POST /v1/act HTTP/1.1\r\nhost: localhost\r\nauthorization: Bearer {visitor.token}\r\n"
-        connection.sendall(f"{head}content-length: 60000000\r\n\r\n".encode())  # none of it is here yet
+        head = (
+            f"POST /v1/act HTTP/1.1\r\nhost: localhost\r\nauthorization: Bearer {visitor.token}\r\n"
+        )
+        # None of it is here yet.
+        connection.sendall(f"{head}content-length: 60000000\r\n\r\n".encode())
         answer = b""
         while more := connection.recv(65536):  # until it is closed
             answer += more
@@ -223,11 +252,14 @@ def test_no_other_way_in_is_left_out() -> None:
 
 
 @pytest.mark.parametrize("way", CARRY)
-def test_nothing_of_a_key_over_its_rate_is_decoded(replica: KeyedReplica, decoded: list[str], way: str) -> None:
+def test_nothing_of_a_key_over_its_rate_is_decoded(
+    replica: KeyedReplica, decoded: list[str], way: str
+) -> None:
     attempt, when = CARRY[way], "with" if "gateway" in way else "after"
     assert attempt(replica.visitor("over its rate"), when) == "429"
     assert decoded == []
-    assert attempt(replica.visitor("right"), when) in ("done", "200", "409", "404")  # an act before a reset
+    # An act before a reset.
+    assert attempt(replica.visitor("right"), when) in ("done", "200", "409", "404")
     assert decoded != []
 
 
@@ -235,7 +267,9 @@ def test_nothing_of_a_key_over_its_rate_is_decoded(replica: KeyedReplica, decode
 def test_a_probe_through_a_websocket_counts_for_the_rate(replica: KeyedReplica, path: str) -> None:
     probe = bytes_probe(100)
     send = over_websocket(
-        path, lambda _: probe, lambda got: "done" if is_probe_answer(got, probe) else _read_reply(got)
+        path,
+        lambda _: probe,
+        lambda got: "done" if is_probe_answer(got, probe) else _read_reply(got),
     )
     assert send(replica.visitor("right"), "after") == "done"
     assert send(replica.visitor("over its rate"), "after") == "429"
@@ -264,14 +298,19 @@ def test_nothing_that_serves_decodes_without_an_admission() -> None:
     served = list((package / "serve").rglob("*.py"))
     assert package / "serve/engine/admission.py" in served
     for file in served:
-        assert "Budget(" not in file.read_text().replace("class MessageAdmission(Budget):", ""), file
-    # Files that the policy has seen are decoded again, one save at a time, by `vlagents_ray_live.ring`.
+        assert "Budget(" not in file.read_text().replace("class MessageAdmission(Budget):", ""), (
+            file
+        )
+    # Files that the policy has seen are decoded again, one save at a time, by
+    # `vlagents_ray_live.ring`.
     for file in {*served, *(package / "protocol").glob("*.py")}:
         assert "jpeg_png" not in file.read_text(), file
 
 
 def test_closing_is_free_and_decodes_nothing(decoded: list[str]) -> None:
-    [answer] = read_requests(frame({"op": "close", "obs": SEEN, "history": [SEEN]}), Budget(DEFAULT_LIMITS))
+    [answer] = read_requests(
+        frame({"op": "close", "obs": SEEN, "history": [SEEN]}), Budget(DEFAULT_LIMITS)
+    )
     assert isinstance(answer, Request)
     assert answer.obs is None
     assert answer.history == []
@@ -282,9 +321,13 @@ def test_closing_is_free_and_decodes_nothing(decoded: list[str]) -> None:
 
 
 def test_each_image_is_decoded_once_however_often_it_is_named(decoded: list[str]) -> None:
-    both = {"cameras": {"a": {"$": ["img", 0]}, "b": {"$": ["img", 1]}}, "info": {"again": {"$": ["img", 0]}}}
+    both = {
+        "cameras": {"a": {"$": ["img", 0]}, "b": {"$": ["img", 1]}},
+        "info": {"again": {"$": ["img", 0]}},
+    }
     answers = read_requests(
-        frame(*[{"op": "reset", "obs": both, "history": [both] * 5}] * 3, files=[JPEG, PNG]), message_admission()
+        frame(*[{"op": "reset", "obs": both, "history": [both] * 5}] * 3, files=[JPEG, PNG]),
+        message_admission(),
     )
     assert all(isinstance(answer, Request) for answer in answers)
     assert decoded == ["decode_file"] * 2
@@ -294,7 +337,10 @@ def test_what_a_request_names_is_counted_each_time_and_taken_once() -> None:
     limits = Limits(decoded_bytes=4 * DECODED)
     held = Admission(10**9)
     message = MessageAdmission(held, limits, lambda _: True)
-    good, bad = {"op": "reset", "obs": SEEN, "history": [SEEN] * 3}, {"op": "reset", "obs": SEEN, "history": [SEEN] * 4}
+    good, bad = (
+        {"op": "reset", "obs": SEEN, "history": [SEEN] * 3},
+        {"op": "reset", "obs": SEEN, "history": [SEEN] * 4},
+    )
     first, second, third = read_requests(frame(good, bad, good), message)
     assert isinstance(first, Request)
     assert isinstance(second, Reply)
@@ -306,7 +352,10 @@ def test_what_a_request_names_is_counted_each_time_and_taken_once() -> None:
     assert held.held == 0
 
     def named(times: int) -> dict[str, Any]:
-        return {"op": "reset", "obs": {"info": {str(n): {"$": ["nd", 0, "|u1", [1000]]} for n in range(times)}}}
+        return {
+            "op": "reset",
+            "obs": {"info": {str(n): {"$": ["nd", 0, "|u1", [1000]]} for n in range(times)}},
+        }
 
     arrays = frame(named(4), named(5), files=[bytes(1000)])
     good_one, bad_one = read_requests(arrays, Budget(Limits(decoded_bytes=4000)))
@@ -332,7 +381,12 @@ def test_4k_cameras_pass_by_default() -> None:
 
 def test_a_png_that_changes_its_mind_about_its_size_is_refused() -> None:
     def chunk(kind: bytes, data: bytes) -> bytes:
-        return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(data, zlib.crc32(kind)))
+        return (
+            struct.pack(">I", len(data))
+            + kind
+            + data
+            + struct.pack(">I", zlib.crc32(data, zlib.crc32(kind)))
+        )
 
     def header(side: int) -> bytes:
         return chunk(b"IHDR", struct.pack(">2I5B", side, side, 8, 2, 0, 0, 0))
@@ -362,7 +416,8 @@ def test_robots_have_a_share_of_the_memory_for_themselves() -> None:
     del simulations[0]  # answered, or dropped
     assert message("robot")[1] is None
     assert isinstance(message("simulation")[1], Overloaded)  # what robots have taken is theirs
-    small = MessageAdmission(Admission(DECODED), DEFAULT_LIMITS, lambda _: True)  # into which it will never fit
+    # Into which it will never fit.
+    small = MessageAdmission(Admission(DECODED), DEFAULT_LIMITS, lambda _: True)
     [answer] = read_requests(frame(reset(rank="simulation")), small)
     assert isinstance(answer, Reply)
     assert isinstance(answer.error, MessageTooLarge), "it is not told to wait"
@@ -467,12 +522,19 @@ def _connected(own: WebSocketServer) -> Stream:
 
 
 def act(file: bytes, name: str, **more: Any) -> bytes:
-    return b"".join(frame_layout.pack({"op": "act", "obs": SEEN, "request_id": name, **more}, [file]))
+    return b"".join(
+        frame_layout.pack({"op": "act", "obs": SEEN, "request_id": name, **more}, [file])
+    )
 
 
-@pytest.mark.parametrize(("rank", "threads"), [("simulation", "decode-others"), ("robot", "decode-robots")])
+@pytest.mark.parametrize(
+    ("rank", "threads"), [("simulation", "decode-others"), ("robot", "decode-robots")]
+)
 def test_a_robot_is_answered_while_anothers_image_is_decoded_and_order_is_kept(
-    endpoints: tuple[WebSocketServer, ShmServer], held_up: tuple[threading.Event, list[str]], rank: str, threads: str
+    endpoints: tuple[WebSocketServer, ShmServer],
+    held_up: tuple[threading.Event, list[str]],
+    rank: str,
+    threads: str,
 ) -> None:
     go_on, decoders = held_up
     own, near = endpoints
@@ -537,7 +599,9 @@ def test_a_frame_in_shared_memory_is_decoded_beside_the_policy_too(
     large = frame_layout.pack(reset(), [LARGE])
     monkeypatch.setattr("vlagents_ray.client.transports.shm.request_parts", lambda *_: large)
     answers: list[Reply] = []
-    asking = threading.Thread(target=lambda: answers.extend(local.call([Request("reset", Obs())], 30)))
+    asking = threading.Thread(
+        target=lambda: answers.extend(local.call([Request("reset", Obs())], 30))
+    )
     asking.start()
     wait_for(lambda: decoders != [])
     robot.send(act(JPEG, "robot"), 10)
@@ -564,7 +628,9 @@ def test_a_client_that_leaves_while_its_image_is_decoded_leaves_nothing(
     assert len(own.engine.sessions) == 0
 
 
-def test_an_event_loop_goes_on_while_a_message_is_decoded(held_up: tuple[threading.Event, list[str]]) -> None:
+def test_an_event_loop_goes_on_while_a_message_is_decoded(
+    held_up: tuple[threading.Event, list[str]],
+) -> None:
     go_on, decoders = held_up
 
     async def run() -> Decoded:
@@ -603,7 +669,11 @@ def test_simulations_images_are_decoded_one_by_one(monkeypatch: pytest.MonkeyPat
     two = {"cameras": {"a": {"$": ["img", 0]}, "b": {"$": ["img", 1]}}}
     message = message_admission(admit=lambda _: False)
     data = frame(reset(obs=two), files=[LARGE, LARGE])
-    assert not message.decode_on_thread(lambda budget: decode_requests(data, budget)).result(30).refused
+    assert (
+        not message.decode_on_thread(lambda budget: decode_requests(data, budget))
+        .result(30)
+        .refused
+    )
 
 
 # Over the rate.
@@ -619,7 +689,8 @@ def test_local_clients_over_their_rate_wait_without_threads_and_leave_nothing_be
     start, receive = threading.Thread.start, UnixConnection._receive
 
     def noted(thread: threading.Thread) -> None:
-        if threading.current_thread().name.startswith("policy") and thread.name != "keys":  # which reads the key file
+        # Which reads the key file.
+        if threading.current_thread().name.startswith("policy") and thread.name != "keys":
             started.append(thread.name)
         start(thread)
 
@@ -631,7 +702,11 @@ def test_local_clients_over_their_rate_wait_without_threads_and_leave_nothing_be
     monkeypatch.setattr(UnixConnection, "_receive", counted)
 
     def held() -> list[UnixConnection]:
-        return [one for one in list(replica.local._clients) if getattr(one.caller, "name", "") == visitor.name]
+        return [
+            one
+            for one in list(replica.local._clients)
+            if getattr(one.caller, "name", "") == visitor.name
+        ]
 
     message = frame(reset())
     descriptor = os.memfd_create("message", os.MFD_ALLOW_SEALING)
@@ -677,14 +752,20 @@ def _keyed_stream(replica: KeyedReplica, token: str, path: str = "own") -> Strea
     """A WebSocket at the replica's own port, or at a path of its HTTP port."""
     own = replica.own.address
     port, path = (own.port, own.path) if path == "own" else (replica.port, path)
-    return Stream(urlsplit("http://127.0.0.1"), port, path, 10, {"authorization": f"Bearer {token}"})
+    return Stream(
+        urlsplit("http://127.0.0.1"), port, path, 10, {"authorization": f"Bearer {token}"}
+    )
 
 
 def _part(client: Stream, size: int) -> int:
-    """Send all but the last byte of a message of that size, as far as the server reads it; return the bytes left."""
+    """Send all but the last byte of a message of that size, as far as the server reads it;
+    return the bytes left.
+    """
     connection = client._socket
     connection.setblocking(False)
-    data = memoryview(bytes([0x82, 0x80 | 127]) + struct.pack(">Q", size) + bytes(4) + bytes(size - 1))
+    data = memoryview(
+        bytes([0x82, 0x80 | 127]) + struct.pack(">Q", size) + bytes(4) + bytes(size - 1)
+    )
     connection.settimeout(0.5)
     with contextlib.suppress(OSError):  # the server reads no more
         while data:
@@ -699,7 +780,9 @@ def test_parts_of_messages_of_a_key_are_bounded_by_its_rate(replica: KeyedReplic
     clients = [_keyed_stream(replica, visitor.token) for _ in range(5)]
     for client in clients:
         _part(client, STREAM_BYTES)
-    mine = [one for one in list(replica.own._clients) if getattr(one.caller, "name", "") == visitor.name]
+    mine = [
+        one for one in list(replica.own._clients) if getattr(one.caller, "name", "") == visitor.name
+    ]
     begun = [one for one in mine if one._received.size > 2**20 + 100]
     assert len(begun) <= 4  # one a second, of those that took half a second each
     assert replica.engine.admission.held <= len(begun) * STREAM_BYTES + 8 * 2**20
@@ -709,7 +792,9 @@ def test_parts_of_messages_of_a_key_are_bounded_by_its_rate(replica: KeyedReplic
     wait_for(lambda: replica.engine.admission.held == 0)
 
 
-def test_a_connection_ends_after_some_refusals_in_a_row(replica: KeyedReplica, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_connection_ends_after_some_refusals_in_a_row(
+    replica: KeyedReplica, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(api_keys, "_THROTTLED_S", (0.02, 0.02))
     visitor = replica.visitor("right")
     client = _keyed_stream(replica, visitor.token)
@@ -757,34 +842,47 @@ def test_the_messages_of_a_key_over_its_rate_stay_unread_at_uvicorns_websockets(
         caller.admit()
     assert _part(client, STREAM_BYTES) > STREAM_BYTES / 4, "the kernel's buffers hold 10 MB"
     client.close()
-    wait_for(lambda: visitor.name not in replica.known.keys._held)  # what they hold is read, which takes memory
+    # What they hold is read, which takes memory.
+    wait_for(lambda: visitor.name not in replica.known.keys._held)
 
 
 def test_an_act_in_compact_form_is_read_again_after_a_refusal(replica: KeyedReplica) -> None:
-    """The layout of its arrays came with the first message, which was refused before it was parsed."""
+    """The layout of its arrays came with the first message, which was refused before it was
+    parsed.
+    """
     visitor = replica.visitor("right")
     transport = ShmTransport(replica.local.address, Credentials(visitor.token))
     transport.connect(10)
     assert transport.call([Request("reset", OBS)], 10)[0].error is None
     replica.known.change(visitor.name, rate=1e-6)
     replica.known.keys.check(visitor.token, "app").admit()
-    assert isinstance(transport.call([Request("act", OBS, request_id="a")], 10)[0].error, TooManyRequests)
+    assert isinstance(
+        transport.call([Request("act", OBS, request_id="a")], 10)[0].error, TooManyRequests
+    )
     replica.known.change(visitor.name, rate=None)
     [reply] = transport.call([Request("act", OBS, request_id="b")], 10)
     assert reply.error is None, reply.error
     transport.close()
 
 
-def test_parts_of_messages_before_a_key_are_bounded_at_groots_gateway(monkeypatch: pytest.MonkeyPatch) -> None:
-    """12 connections with 24 MiB of a message each take no more than the 64 MiB of one message, and a part more."""
+def test_parts_of_messages_before_a_key_are_bounded_at_groots_gateway(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """12 connections with 24 MiB of a message each take no more than the 64 MiB of one message,
+    and a part more.
+    """
     monkeypatch.setattr(gr00t, "_STRANGER_S", 3.0)
     monkeypatch.setattr(gr00t, "_MESSAGE_S", 3.0)
-    context = GatewayContext("app", _no_replica, DEFAULT_LIMITS, 8, 30.0, None, lambda _: NoKey.OPEN)
+    context = GatewayContext(
+        "app", _no_replica, DEFAULT_LIMITS, 8, 30.0, None, lambda _: NoKey.OPEN
+    )
     dialect = gr00t.GR00TDialect("gr00t", gr00t.GR00TDialectConfig(), context)
     listener = socket.create_server(("127.0.0.1", 0))
     port = listener.getsockname()[1]
     dialect.serve(listener)
-    greeting = b"\xff" + bytes(8) + b"\x7f" + b"\x03\x01" + b"NULL".ljust(20, b"\0") + b"\0" + bytes(31)
+    greeting = (
+        b"\xff" + bytes(8) + b"\x7f" + b"\x03\x01" + b"NULL".ljust(20, b"\0") + b"\0" + bytes(31)
+    )
     greeted = b"\x05READY" + b"\x0bSocket-Type" + struct.pack(">I", 6) + b"DEALER"
     before, held, part = _rss(), [], bytes(24 * 2**20)
     for _ in range(12):
@@ -794,7 +892,9 @@ def test_parts_of_messages_before_a_key_are_bounded_at_groots_gateway(monkeypatc
         got = 0
         while got < 64:
             got += len(connection.recv(64 - got))
-        connection.sendall(b"\x04" + bytes([len(greeted)]) + greeted + b"\x02" + struct.pack(">Q", 2 * len(part)))
+        connection.sendall(
+            b"\x04" + bytes([len(greeted)]) + greeted + b"\x02" + struct.pack(">Q", 2 * len(part))
+        )
         with contextlib.suppress(OSError):  # it is cut off meanwhile
             connection.sendall(part)
     assert _rss() - before < DEFAULT_LIMITS.body_bytes + len(part) + SLACK
@@ -820,7 +920,11 @@ def test_a_request_at_groots_gateway_counts_as_in_flight_for_its_key() -> None:
     listener = socket.create_server(("127.0.0.1", 0))
     port = listener.getsockname()[1]
     dialect.serve(listener)
-    seen = {"video": {"ego": np.zeros((1, 1, 500, 800, 3), np.uint8)}, "state": {}, "language": {"task": [["go"]]}}
+    seen = {
+        "video": {"ego": np.zeros((1, 1, 500, 800, 3), np.uint8)},
+        "state": {},
+        "language": {"task": [["go"]]},
+    }
 
     def error_of(token: str, observation: dict[str, Any]) -> str:
         with PolicyClient(port, token) as client, pytest.raises(RuntimeError) as refused:

@@ -19,7 +19,8 @@ from vlagents_ray_live.live_page import page_server
 from vlagents_ray_live.live_view import Fleet
 
 PACKAGE = Path(vlagents_ray.__file__).parent
-SERVES = {"evaluate/robot/operator.py", "serve/endpoints/http_messages.py"}  # all modules that send HTML
+# All modules that send HTML.
+SERVES = {"evaluate/robot/operator.py", "serve/endpoints/http_messages.py"}
 
 
 @contextmanager
@@ -49,7 +50,10 @@ PAGES = {
 
 
 def directives(policy: str) -> dict[str, str]:
-    return {name: sources for name, _, sources in (one.strip().partition(" ") for one in policy.split(";"))}
+    return {
+        name: sources
+        for name, _, sources in (one.strip().partition(" ") for one in policy.split(";"))
+    }
 
 
 def digest(text: str) -> str:
@@ -83,8 +87,12 @@ def test_no_other_module_sends_html() -> None:
 
 def test_pages_that_are_files_load_nothing_from_elsewhere() -> None:
     """A browser reads `frame-ancestors` in headers alone, which a file has not."""
-    templates = [path for path in PACKAGE.rglob("*.j2") if "<!doctype html>" in path.read_text().lower()]
+    templates = [
+        path for path in PACKAGE.rglob("*.j2") if "<!doctype html>" in path.read_text().lower()
+    ]
     for path in templates:
-        [policy] = re.findall(r'<meta http-equiv="Content-Security-Policy" content="(.*?)">', path.read_text())
+        [policy] = re.findall(
+            r'<meta http-equiv="Content-Security-Policy" content="(.*?)">', path.read_text()
+        )
         assert directives(policy)["default-src"] == "'none'", path
         assert "http" not in policy, path

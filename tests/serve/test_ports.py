@@ -28,7 +28,9 @@ def claims(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
 
 
 def free_range(length: int) -> tuple[int, int]:
-    """Ports next to each other that nobody has, below those that the kernel gives to connections."""
+    """Ports next to each other that nobody has, below those that the kernel gives to
+    connections.
+    """
     for first in range(10_000, 20_000, length):
         if all(is_free(EVERYWHERE, port) for port in range(first, first + length)):
             return first, first + length
@@ -73,7 +75,9 @@ def test_two_processes_are_given_different_ports(monkeypatch: pytest.MonkeyPatch
         f"import sys; from vlagents_ray.serve import ports; ports._PORTS = {few}\n"
         "print(*(ports.free_port() for _ in range(5)), flush=True); sys.stdin.read()"
     )
-    with subprocess.Popen([sys.executable, "-c", draw], stdin=subprocess.PIPE, stdout=subprocess.PIPE) as other:
+    with subprocess.Popen(
+        [sys.executable, "-c", draw], stdin=subprocess.PIPE, stdout=subprocess.PIPE
+    ) as other:
         assert other.stdin is not None
         theirs = set(map(int, other.stdout.readline().split()))
         monkeypatch.setattr(ports, "_PORTS", few)
@@ -84,17 +88,24 @@ def test_two_processes_are_given_different_ports(monkeypatch: pytest.MonkeyPatch
 
 
 @pytest.mark.usefixtures("claims")
-@pytest.mark.skipif(os.getuid() != 0, reason="another account is needed, which only root can act as")
+@pytest.mark.skipif(
+    os.getuid() != 0, reason="another account is needed, which only root can act as"
+)
 @pytest.mark.parametrize("listens", ["", "s.listen(0);"], ids=["bound", "listening"])
-def test_another_account_cannot_claim_all_ports(listens: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_another_account_cannot_claim_all_ports(
+    listens: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     few = free_range(12)
     squat = (
         "import os, socket, sys; os.setgroups([]); os.setgid(65534); os.setuid(65534); held = []\n"
         f"for port in range(*{few}):\n"
-        f"    s = socket.socket(socket.AF_UNIX); s.bind(f'\\0vlagents-ray-port-{{port}}'); {listens} held.append(s)\n"
+        f"    s = socket.socket(socket.AF_UNIX); s.bind(f'\\0vlagents-ray-port-{{port}}'); "
+        f"{listens} held.append(s)\n"
         "print('bound', flush=True); sys.stdin.read()"
     )
-    with subprocess.Popen([sys.executable, "-c", squat], stdin=subprocess.PIPE, stdout=subprocess.PIPE) as other:
+    with subprocess.Popen(
+        [sys.executable, "-c", squat], stdin=subprocess.PIPE, stdout=subprocess.PIPE
+    ) as other:
         assert other.stdin is not None
         assert other.stdout.readline() == b"bound\n"
         monkeypatch.setattr(ports, "_PORTS", few)
@@ -119,6 +130,8 @@ def test_haproxy_starts_with_its_statistics_on_loopback(tmp_path: Path) -> None:
     program = ingress_environment(tmp_path, "/bin/cat")["RAY_SERVE_HAPROXY_BINARY_PATH"]
     settings = tmp_path / "haproxy.cfg"
     settings.write_text("  bind *:9000\n    bind :9001\n    bind 192.0.2.7:9002\n")
-    shown = subprocess.run([program, "--", "-f", settings], capture_output=True, text=True, check=False).stdout
+    shown = subprocess.run(
+        [program, "--", "-f", settings], capture_output=True, text=True, check=False
+    ).stdout
     assert shown == "  bind 127.0.0.1:9000\n    bind 127.0.0.1:9001\n    bind 192.0.2.7:9002\n"
     assert ingress_environment(tmp_path, "/bin/cat")["RAY_SERVE_HAPROXY_BINARY_PATH"] == program

@@ -1,4 +1,6 @@
-"""Each preset with what its client sends, as its own code builds it: all of it arrives, or the client is told."""
+"""Each preset with what its client sends, as its own code builds it: all of it arrives, or the
+client is told.
+"""
 
 from __future__ import annotations
 
@@ -44,7 +46,12 @@ def chw(size: int = 32) -> np.ndarray:
 LIBERO_STATE = np.array([-0.05, 0.03, 0.91, 3.1, 0.02, -0.1, 0.0388, -0.0388])
 _LIBERO = {"xyz_axis_angle": 6, "gripper_qpos": 2}
 _ALOHA = {"left/joints": 6, "left/gripper": 1, "right/joints": 6, "right/gripper": 1}
-_OFT = {"full_image": image(), "state": LIBERO_STATE, "instruction": TASK, "unnorm_key": "libero_spatial"}
+_OFT = {
+    "full_image": image(),
+    "state": LIBERO_STATE,
+    "instruction": TASK,
+    "unnorm_key": "libero_spatial",
+}
 
 SENT = [
     Sent(
@@ -86,7 +93,12 @@ SENT = [
         "openpi, examples/simple_client/main.py",
         {
             "state": np.ones((14,)),
-            "images": {"cam_high": chw(), "cam_low": chw(), "cam_left_wrist": chw(), "cam_right_wrist": chw()},
+            "images": {
+                "cam_high": chw(),
+                "cam_low": chw(),
+                "cam_left_wrist": chw(),
+                "cam_right_wrist": chw(),
+            },
             "prompt": TASK,
         },
         ("front", "left_wrist", "right_wrist"),
@@ -128,7 +140,8 @@ SENT = [
     Sent(
         "openvla-oft-aloha",
         "openvla-oft, experiments/robot/aloha/run_aloha_eval.py",
-        _OFT | {"left_wrist_image": image(), "right_wrist_image": image(), "state": np.arange(14.0)},
+        _OFT
+        | {"left_wrist_image": image(), "right_wrist_image": image(), "state": np.arange(14.0)},
         ("front", "left_wrist", "right_wrist"),
         _ALOHA,
     ),
@@ -137,7 +150,10 @@ SENT = [
         "Isaac-GR00T N1.6, its SO-100 adapter",
         {
             "video": {"front": image()[None, None], "wrist": image()[None, None]},
-            "state": {"single_arm": np.zeros((1, 1, 5), np.float32), "gripper": np.zeros((1, 1, 1), np.float32)},
+            "state": {
+                "single_arm": np.zeros((1, 1, 5), np.float32),
+                "gripper": np.zeros((1, 1, 1), np.float32),
+            },
             "language": {"annotation.human.task_description": [[TASK]]},
         },
         ("front", "wrist"),
@@ -201,7 +217,8 @@ SENT = [
     ),
     Sent(
         "lerobot",
-        "LeRobot 0.4.4, async_inference/robot_client.py with an SO-100, by the names of its features",
+        "LeRobot 0.4.4, async_inference/robot_client.py with an SO-100, by the names of its "
+        "features",
         {
             "observation.state": np.zeros(6, np.float32),
             "observation.images.front": image(),
@@ -217,7 +234,9 @@ each = pytest.mark.parametrize("sent", SENT, ids=lambda sent: f"{sent.preset}: {
 
 
 def arrive(sent: Sent, change: Callable[[str], str] = str) -> tuple[Obs, str | None]:
-    """What the mapping makes of it, GR00T's on the way that its gateway goes; `change` renames the client's keys."""
+    """What the mapping makes of it, GR00T's on the way that its gateway goes; `change` renames
+    the client's keys.
+    """
     mapping = presets()[sent.preset]
     if not sent.preset.startswith("gr00t"):
         return mapping.obs(renamed(sent.observation, change))
@@ -226,7 +245,10 @@ def arrive(sent: Sent, change: Callable[[str], str] = str) -> tuple[Obs, str | N
 
 
 def renamed(nested: dict[str, Any], change: Callable[[str], str]) -> dict[str, Any]:
-    return {change(key): renamed(one, change) if isinstance(one, dict) else one for key, one in nested.items()}
+    return {
+        change(key): renamed(one, change) if isinstance(one, dict) else one
+        for key, one in nested.items()
+    }
 
 
 def test_every_preset_is_tried_with_its_clients_observation() -> None:
@@ -250,12 +272,19 @@ def test_an_observation_under_other_names_is_refused_and_never_empty(sent: Sent)
     """All of it, its cameras alone, or its state alone."""
     mapping = presets()[sent.preset]
     states = [one for entries in mapping.state.values() for one in entries]
-    for entries in ([], *([mapping.cameras.values()] if sent.cameras else []), *([states] if sent.state else [])):
+    for entries in (
+        [],
+        *([mapping.cameras.values()] if sent.cameras else []),
+        *([states] if sent.state else []),
+    ):
         known = {part for one in entries for part in one.key.split("|")}
         theirs = known | {part.partition("/")[0].partition(".")[0] for part in known}
         renames = {False: str, True: "their_{}".format}
         with pytest.raises(InvalidObservation, match="their_"):
-            arrive(sent, lambda key: renames[not theirs or any(matches(key, one) for one in theirs)](key))  # noqa: B023
+            arrive(
+                sent,
+                lambda key: renames[not theirs or any(matches(key, one) for one in theirs)](key),  # noqa: B023
+            )
 
 
 def test_of_two_names_of_one_state_the_first_counts() -> None:
@@ -265,7 +294,10 @@ def test_of_two_names_of_one_state_the_first_counts() -> None:
 
 def test_a_state_is_taken_from_a_key_that_holds_numbers_and_not_a_map_of_them() -> None:
     """vla-eval's RoboCasa365 sends a map, which wants a mapping of its own."""
-    theirs = {"images": {"front": np.zeros((8, 8, 3), np.uint8)}, "state": {"state.gripper_qpos": np.zeros(2)}}
+    theirs = {
+        "images": {"front": np.zeros((8, 8, 3), np.uint8)},
+        "state": {"state.gripper_qpos": np.zeros(2)},
+    }
     with pytest.raises(InvalidObservation, match=r"state/state\.gripper_qpos.*mapping\.state"):
         presets()["vla-eval"].obs(theirs)
 
@@ -291,14 +323,22 @@ def test_arrays_that_cannot_be_a_state_and_those_that_are_read_as_info_are_not_m
         KeyMapping.from_json(mapping.to_json() | {"info": {}}).obs(theirs)
 
 
-OPENPI = [sent for sent in SENT if sent.preset in ("openpi-libero", "openpi-droid", "openpi-aloha", "roboarena")]
+OPENPI = [
+    sent
+    for sent in SENT
+    if sent.preset in ("openpi-libero", "openpi-droid", "openpi-aloha", "roboarena")
+]
 
 
 @pytest.mark.parametrize("sent", OPENPI, ids=lambda sent: sent.preset)
 @pytest.mark.parametrize("dtype", [np.float32, np.float64, np.uint8])
 @pytest.mark.parametrize("first", [True, False])
-def test_openpis_images_come_as_its_own_server_takes_them(sent: Sent, dtype: type, first: bool) -> None:
-    """`_parse_image` of openpi's policies: floats in [0, 1] times 255, rounded down; three channels first turned."""
+def test_openpis_images_come_as_its_own_server_takes_them(
+    sent: Sent, dtype: type, first: bool
+) -> None:
+    """`_parse_image` of openpi's policies: floats in [0, 1] times 255, rounded down; three
+    channels first turned.
+    """
 
     def theirs(value: Any) -> Any:
         if isinstance(value, dict):
@@ -355,13 +395,22 @@ def test_an_alpha_channel_is_left_out() -> None:
 
 @pytest.mark.parametrize("number", [np.array([3]), np.array([[3]])])
 def test_a_number_in_place_of_an_instruction_has_its_text(number: np.ndarray) -> None:
-    fields = {"state": {"joints": "state"}, "instruction": "prompt|task_id", "instructions": {"3": "turn on the radio"}}
+    fields = {
+        "state": {"joints": "state"},
+        "instruction": "prompt|task_id",
+        "instructions": {"3": "turn on the radio"},
+    }
     mapping = KeyMapping.from_json(fields)
     theirs = {"state": np.zeros(7), "task_id": number}
     assert mapping.obs(theirs)[1] == "turn on the radio"
     needed = Contract(instruction=True)
-    with pytest.raises(InvalidObservation, match=r"got 4, want one of \['3'\]; add its text to mapping.instructions"):
+    with pytest.raises(
+        InvalidObservation,
+        match=r"got 4, want one of \['3'\]; add its text to mapping.instructions",
+    ):
         mapping.obs(theirs | {"task_id": number + 1}, contract=needed)
     with pytest.raises(InvalidObservation, match="want text"):
         mapping.obs(theirs | {"task_id": np.array([0.5])})
-    assert mapping.obs(theirs | {"task_id": number + 1})[1] is None, "a policy without an instruction needs no texts"
+    assert mapping.obs(theirs | {"task_id": number + 1})[1] is None, (
+        "a policy without an instruction needs no texts"
+    )

@@ -44,7 +44,10 @@ class Stateful(Agent):
         self.buffer[0] += value
         self.nested["a"][0]["b"].add(value)
         self.tensor += value
-        return Act(np.array([len(self.history), self.buffer[0], self.scale(value)]), info={"random": self.rng.random()})
+        return Act(
+            np.array([len(self.history), self.buffer[0], self.scale(value)]),
+            info={"random": self.rng.random()},
+        )
 
 
 def copies(agent: Agent) -> Any:
@@ -191,7 +194,9 @@ def test_a_connection_ends_its_own_sessions_only() -> None:
     assert table.ids() == ["b", "c"]
 
 
-def test_an_episode_begins_above_all_earlier_steps_of_its_session_though_the_clock_is_behind() -> None:
+def test_an_episode_begins_above_all_earlier_steps_of_its_session_though_the_clock_is_behind() -> (
+    None
+):
     table: SessionTable[object] = SessionTable(limit=10, idle_s=60, clock=lambda: 0)
     earlier = 2**40
     table.enter(Session("a", steps=earlier))  # from a replica whose clock is ahead

@@ -1,4 +1,6 @@
-"""What a client gets when its server stops, and what becomes of its acts when it leaves, at each endpoint."""
+"""What a client gets when its server stops, and what becomes of its acts when it leaves, at each
+endpoint.
+"""
 
 from __future__ import annotations
 
@@ -51,7 +53,11 @@ class Scene:
     @property
     def acts(self) -> list[int]:
         """The acts that the policy has executed for the client since its first one."""
-        return [brightness for brightness in self.server.policy.acted if brightness == BRIGHTNESS.get(self.situation)]
+        return [
+            brightness
+            for brightness in self.server.policy.acted
+            if brightness == BRIGHTNESS.get(self.situation)
+        ]
 
 
 @contextlib.contextmanager
@@ -96,9 +102,14 @@ def test_a_server_that_stops_leaves_no_client_waiting(name: str, situation: str)
 
 
 @pytest.mark.parametrize("sends_more", [False, True], ids=["only reads", "sends half a message"])
-@pytest.mark.parametrize("name", ["own port", "GR00T", "vlagents"])  # LeRobot's clients take 4 MB: test_http2_front.py
-def test_an_answer_that_is_written_before_a_stop_arrives_at_a_slow_client(name: str, sends_more: bool) -> None:
-    """Also if the client has sent what is never read, for which the kernel resets a connection that is closed."""
+# LeRobot's clients take 4 MB: test_http2_front.py.
+@pytest.mark.parametrize("name", ["own port", "GR00T", "vlagents"])
+def test_an_answer_that_is_written_before_a_stop_arrives_at_a_slow_client(
+    name: str, sends_more: bool
+) -> None:
+    """Also if the client has sent what is never read, for which the kernel resets a connection
+    that is closed.
+    """
     with contextlib.ExitStack() as stack:
         server = StoppableServer(stack)
         relay = server.relay(name)
@@ -140,13 +151,19 @@ def test_an_answer_over_shared_memory_arrives_though_a_later_message_is_never_re
 
 
 @pytest.mark.parametrize(("name", "situation"), EACH)
-def test_no_act_is_executed_for_a_client_that_left_before_it_began(name: str, situation: str) -> None:
-    """A gateway notices only after an act that its client has left; that client's acts end with its session."""
+def test_no_act_is_executed_for_a_client_that_left_before_it_began(
+    name: str, situation: str
+) -> None:
+    """A gateway notices only after an act that its client has left; that client's acts end with
+    its session.
+    """
     with scene(name, situation) as at:
         of_client = [request for request in at.server.queued if request.session_id not in OTHERS]
         at.client.leave()
         if situation == "waiting" and name not in GATEWAYS:
-            wait_for(lambda: all(request.over or request.origin.ended for request in of_client), BOUND_S)
+            wait_for(
+                lambda: all(request.over or request.origin.ended for request in of_client), BOUND_S
+            )
         at.server.policy.gate.set()
         for op in ("reset", "act"):
             at.server.ask(OTHERS[1], op)
@@ -158,7 +175,9 @@ def test_no_act_is_executed_for_a_client_that_left_before_it_began(name: str, si
 
 
 def test_the_table_has_each_endpoint() -> None:
-    ports = {name for name in names("dialects") if not issubclass(dialect_class(name), RouteDialect)}
+    ports = {
+        name for name in names("dialects") if not issubclass(dialect_class(name), RouteDialect)
+    }
     assert ports == {name.lower() for name in GATEWAYS}
     paths = {
         path

@@ -23,9 +23,10 @@ class Violation(AssertionError):
 class Robot:
     """One session, for a few episodes. With `steps` it sends back the step of the last answer.
 
-    Without `steps` and with `gives_up` it sends no deadline, and begins its next episode when an answer does not come:
-    over HTTP after longer than a message between replicas takes, or over a connection at once. Either way it closes the
-    connection, to connect again elsewhere, and each act belongs to the episode in which it was sent.
+    Without `steps` and with `gives_up` it sends no deadline, and begins its next episode when an
+    answer does not come: over HTTP after longer than a message between replicas takes, or over a
+    connection at once. Either way it closes the connection, to connect again elsewhere, and each
+    act belongs to the episode in which it was sent.
     """
 
     def __init__(self, world: World, number: int) -> None:
@@ -39,7 +40,8 @@ class Robot:
         # A fault may hold an HTTP request back until later ones have been executed elsewhere.
         self.strict = self.link is not None or (self.gives_up and not world.plan.rough)
         self.history: list[str] = []
-        self.refused: list[str] = []  # acts whose answer says that they were not executed, and never will be
+        # Acts whose answer says that they were not executed, and never will be.
+        self.refused: list[str] = []
         self.done: list[str] = []  # acts that were answered with an action
         self.over = False
         self.uncertain: set[str] = set()  # acts and resets of which it does not know what became
@@ -66,7 +68,8 @@ class Robot:
                 self.uncertain.add(instruction)
             self._reconnect(reply)
             await asyncio.sleep(0.1)
-        if self.gives_up:  # an answer to a reset does not wait for the slowest of messages to the other replicas
+        # An answer to a reset does not wait for the slowest of messages to the other replicas.
+        if self.gives_up:
             await asyncio.sleep(max(0.0, self.world.plan.latest_s - session_migration._OTHERS_S))
         acted: list[str] = []  # that it was told of
         for _ in range(draw.randint(2, 6)):
@@ -89,17 +92,22 @@ class Robot:
             else:
                 if not self.world.plan.rough and not self._excuses():
                     raise Violation(
-                        f"{name}: {outcome} ({reply and reply.error}), though nothing was lost: a session was"
+                        f"{name}: {outcome} ({reply and reply.error}), though nothing was lost: a "
+                        "session was"
                     )
                 return
 
     def _excuses(self) -> set[str]:
-        """Requests that may come late and end its episode: over connections that it has closed, only resets."""
+        """Requests that may come late and end its episode: over connections that it has closed,
+        only resets.
+        """
         return {name for name in self.uncertain if self.link is None or "/" in name}
 
     def _reconnect(self, reply: Reply | None) -> None:
         """Elsewhere, if the connection is silent, or its replica stops."""
-        if self.link is not None and (reply is None or reply.draining or code(reply) == "unavailable"):
+        if self.link is not None and (
+            reply is None or reply.draining or code(reply) == "unavailable"
+        ):
             self.link.end()
             self.link = self.world.connect()
 
@@ -108,12 +116,17 @@ class Robot:
         if not obeyed.startswith(self.name + "/"):
             raise Violation(f"{expected[-1]}: crossed with another session, it obeys {obeyed}")
         if not (self.steps or self.strict) and (self.uncertain or self.world.plan.rough):
-            return  # what it gave up may come late, and what a fault left behind may be met: steps are for that
+            # What it gave up may come late, and what a fault left behind may be met: steps are for
+            # that.
+            return
         if obeyed != instruction:
-            raise Violation(f"{expected[-1]}: of an older episode, it obeys {obeyed}, not {instruction}")
+            raise Violation(
+                f"{expected[-1]}: of an older episode, it obeys {obeyed}, not {instruction}"
+            )
         if [one for one in ids if one not in self.uncertain] != expected:
             raise Violation(
-                f"{expected[-1]}: acts were lost or doubled: {ids}, want {expected} and some of {self.uncertain}"
+                f"{expected[-1]}: acts were lost or doubled: {ids}, want {expected} and some of "
+                f"{self.uncertain}"
             )
 
     async def _ask(self, op: str, instruction: str, name: str | None) -> Reply | None:
@@ -143,7 +156,9 @@ class Robot:
             answer.cancel()
         if reply is not None and reply.step is not None and reply.error is None:
             self._step = reply.step
-        self.history.append(f"{self.world.clock.now:8.3f} {op} {name or instruction}: {code(reply)}")
+        self.history.append(
+            f"{self.world.clock.now:8.3f} {op} {name or instruction}: {code(reply)}"
+        )
         return reply
 
 
@@ -161,10 +176,14 @@ def play(world: World) -> list[Robot]:
         names = [name for name, _, _ in world.log.acts]
         executed = set(names)
         if len(executed) < len(names):
-            raise Violation(f"executed twice: {sorted(name for name in executed if names.count(name) > 1)}")
+            raise Violation(
+                f"executed twice: {sorted(name for name in executed if names.count(name) > 1)}"
+            )
         for robot in robots:
             if late := executed.intersection(robot.refused):
-                raise Violation(f"executed, though answered with that they never would be: {sorted(late)}")
+                raise Violation(
+                    f"executed, though answered with that they never would be: {sorted(late)}"
+                )
             if unheard := set(robot.done) - executed:
                 raise Violation(f"answered, but never executed: {sorted(unheard)}")
         for name, obeyed, sent_in in world.log.acts:

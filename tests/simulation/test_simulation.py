@@ -1,7 +1,7 @@
 """Histories of sessions under faults, each drawn from a seed, and played in a few milliseconds.
 
-VLAGENTS_SIMULATION_SEED=1234 pytest tests/simulation -s     replays a seed that failed, and prints its history
-VLAGENTS_SIMULATION_SEEDS=100000 pytest tests/simulation     more of them than 2,000
+VLAGENTS_SIMULATION_SEED=1234 pytest tests/simulation -s     replays a seed that failed, and prints
+its history VLAGENTS_SIMULATION_SEEDS=100000 pytest tests/simulation     more of them than 2,000
 """
 
 from __future__ import annotations
@@ -22,7 +22,8 @@ from vlagents_ray.serve.requests import PendingRequest
 from vlagents_ray.serve.scaling import session_migration
 from vlagents_ray.serve.sessions import Session
 
-SEEDS = int(os.environ.get("VLAGENTS_SIMULATION_SEEDS", "2000"))  # it finds each bug below within so many
+# It finds each bug below within so many.
+SEEDS = int(os.environ.get("VLAGENTS_SIMULATION_SEEDS", "2000"))
 SEED = os.environ.get("VLAGENTS_SIMULATION_SEED")
 
 
@@ -115,7 +116,9 @@ def export_at_once(replica: Replica) -> None:
 
 
 def deadlines_begin_anew(replica: Replica) -> None:
-    """Counts the deadline anew once the session was fetched, and asks nobody whether it was answered."""
+    """Counts the deadline anew once the session was fetched, and asks nobody whether it was
+    answered.
+    """
     engine = replica.engine
 
     def seek(pending: PendingRequest, error: VLAgentsError) -> bool:
@@ -125,7 +128,11 @@ def deadlines_begin_anew(replica: Replica) -> None:
             except VLAgentsError as again:
                 pending.fail(again)
 
-        if pending.request.op != "act" or not isinstance(error, UnknownSession) or engine.finder is None:
+        if (
+            pending.request.op != "act"
+            or not isinstance(error, UnknownSession)
+            or engine.finder is None
+        ):
             return False
         if not engine.finder.fetch(pending.session_id, retry):
             pending.fail(PolicyUnavailable("the replica is stopping"))

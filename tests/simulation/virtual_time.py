@@ -1,4 +1,6 @@
-"""Event loops under one virtual clock: what is due next runs next, at once, in an order that the seed decides."""
+"""Event loops under one virtual clock: what is due next runs next, at once, in an order that the
+seed decides.
+"""
 
 from __future__ import annotations
 
@@ -59,10 +61,14 @@ class Loop(asyncio.AbstractEventLoop):
 
     call_soon_threadsafe = call_soon
 
-    def call_later(self, delay: float, callback: Any, *args: Any, context: Any = None) -> asyncio.TimerHandle:
+    def call_later(
+        self, delay: float, callback: Any, *args: Any, context: Any = None
+    ) -> asyncio.TimerHandle:
         return self.call_at(self._clock.now + delay, callback, *args, context=context)
 
-    def call_at(self, when: float, callback: Any, *args: Any, context: Any = None) -> asyncio.TimerHandle:
+    def call_at(
+        self, when: float, callback: Any, *args: Any, context: Any = None
+    ) -> asyncio.TimerHandle:
         handle = asyncio.TimerHandle(when, callback, args, self, context)
         self._clock.add(when, handle, self)
         return handle

@@ -1,9 +1,10 @@
-"""Replicas, a network and clients in one thread under a virtual clock, and the faults that a seed has for them.
+"""Replicas, a network and clients in one thread under a virtual clock, and the faults that a seed
+has for them.
 
-The queue, the sessions, the engine, the moves between replicas and `Sender` are the real ones. What a replica's
-thread, its event loop and Ray's calls between replicas do is played here: a batch takes a time that is drawn, a message
-is late, comes twice or out of order, or waits until a partition heals; a replica stops, is killed or frozen; clocks are
-set.
+The queue, the sessions, the engine, the moves between replicas and `Sender` are the real ones. What
+a replica's thread, its event loop and Ray's calls between replicas do is played here: a batch takes
+a time that is drawn, a message is late, comes twice or out of order, or waits until a partition
+heals; a replica stops, is killed or frozen; clocks are set.
 """
 
 from __future__ import annotations
@@ -32,7 +33,9 @@ _EPOCH_NS = 1_700_000_000 * 10**9
 
 
 class Log:
-    """What the policy did: the ids of the acts, in order, with what the session obeyed, and what the client meant."""
+    """What the policy did: the ids of the acts, in order, with what the session obeyed, and what
+    the client meant.
+    """
 
     def __init__(self) -> None:
         self.acts: list[tuple[str, str, str | None]] = []
@@ -60,7 +63,9 @@ _ACTION = np.zeros(1, np.float32)
 
 
 class _NoFiles:
-    """In place of what the queue's thread waits on: has the replica take its turn when something waits."""
+    """In place of what the queue's thread waits on: has the replica take its turn when something
+    waits.
+    """
 
     def __init__(self, wake: Callable[[], None]) -> None:
         self.wake = wake
@@ -101,7 +106,9 @@ class Replica:
         return not self.loop.ended
 
     async def _others(self) -> Sequence[Peer]:
-        return [_Peer(self, other) for other in self.world.replicas if other is not self and other.alive]
+        return [
+            _Peer(self, other) for other in self.world.replicas if other is not self and other.alive
+        ]
 
     def _wake(self) -> None:
         self.loop.call_soon(self._turn)
@@ -115,7 +122,9 @@ class Replica:
         if batch:
             self._busy = True
             draw = self.world.draw
-            self.loop.call_later(self.slowness * draw.random() ** 4 + 0.001, self._finish, Taken(batch, []))
+            self.loop.call_later(
+                self.slowness * draw.random() ** 4 + 0.001, self._finish, Taken(batch, [])
+            )
         elif self.engine.queue.depth():
             self._wake()
 
@@ -127,7 +136,8 @@ class Replica:
     def receive(
         self, request: Request, session_id: str, answer: Callable[[list[Reply]], None], timed: bool
     ) -> Callable[[], Any]:
-        """A client's request: `timed` as over HTTP, else as over a connection, where only the queue knows deadlines.
+        """A client's request: `timed` as over HTTP, else as over a connection, where only the queue
+        knows deadlines.
 
         Returns what the end of its connection does.
         """
@@ -141,7 +151,9 @@ class Replica:
 
 
 class Link:
-    """A client's connection to one replica: what is sent arrives in order, and last that it has ended."""
+    """A client's connection to one replica: what is sent arrives in order, and last that it has
+    ended.
+    """
 
     def __init__(self, world: World, replica: Replica) -> None:
         self.replica = replica
@@ -181,7 +193,9 @@ class _Peer(Peer):
                 world.transport(other, me, partial(_settle, answer, None, PeerEnded(other.name)))
                 return
             task = other.loop.create_task(getattr(other.migrator.held, method.__name__)(*args))
-            task.add_done_callback(lambda done: world.transport(other, me, partial(_settle, answer, done.result())))
+            task.add_done_callback(
+                lambda done: world.transport(other, me, partial(_settle, answer, done.result()))
+            )
 
         world.transport(me, other, deliver)
         if world.draw.random() < world.plan.twice:
@@ -207,14 +221,20 @@ class Plan:
 
     def __init__(self, draw: random.Random) -> None:
         self.rough = draw.random() < 0.4  # with faults that may end a session
-        self.slowness = draw.choice([(0.02,), (0.02, 4.0), (0.02, 30.0)])  # s that a batch may take, of a replica
+        # S that a batch may take, of a replica.
+        self.slowness = draw.choice([(0.02,), (0.02, 4.0), (0.02, 30.0)])
         self.late = draw.choice([0.0, 0.1, 0.3])  # share of messages
         self.latest_s = draw.choice([0.2, 1.0])
         self.twice = draw.choice([0.0, 0.2])
         self.replicas = draw.choice([2, 2, 3])
-        self.stray = draw.choice([0.0, 0.2])  # share of requests that the load balancer sends elsewhere
-        names = ["drain", "drain", "clock"] + (["kill", "freeze", "partition"] if self.rough else [])
-        self.faults = [(draw.uniform(0.0, 6.0), draw.choice(names)) for _ in range(draw.randint(1, 3))]
+        # Share of requests that the load balancer sends elsewhere.
+        self.stray = draw.choice([0.0, 0.2])
+        names = ["drain", "drain", "clock"] + (
+            ["kill", "freeze", "partition"] if self.rough else []
+        )
+        self.faults = [
+            (draw.uniform(0.0, 6.0), draw.choice(names)) for _ in range(draw.randint(1, 3))
+        ]
 
 
 class World:
@@ -244,8 +264,12 @@ class World:
             return self.draw.random() * self.plan.latest_s
         return 0.0005 + 0.004 * self.draw.random()
 
-    def transport(self, source: Replica | None, target: Replica | None, deliver: Callable[[], None]) -> None:
-        """Carry a message. What leaves a replica that is cut off, or is for one, waits until it is not."""
+    def transport(
+        self, source: Replica | None, target: Replica | None, deliver: Callable[[], None]
+    ) -> None:
+        """Carry a message. What leaves a replica that is cut off, or is for one, waits until it
+        is not.
+        """
         if source is not None and not source.alive:
             return
         when = self.arrival(source, target)
@@ -253,7 +277,9 @@ class World:
 
     def connect(self) -> Link:
         """A client's connection to any replica that accepts one."""
-        ready = [replica for replica in self.replicas if replica.alive and not replica.draining] or self.replicas
+        ready = [
+            replica for replica in self.replicas if replica.alive and not replica.draining
+        ] or self.replicas
         return Link(self, self.draw.choice(ready))
 
     def arrival(self, source: Replica | None, target: Replica | None) -> float:
@@ -269,14 +295,18 @@ class World:
 
         def look() -> None:
             if not other.alive:  # what it said before may still come
-                me.loop.call_later(2 * self.plan.latest_s, _settle, answer, None, PeerEnded(other.name))
+                me.loop.call_later(
+                    2 * self.plan.latest_s, _settle, answer, None, PeerEnded(other.name)
+                )
             elif not answer.done():
                 me.loop.call_later(0.5, look)
 
         me.loop.call_later(0.5, look)
 
     def route(self, session_id: str, steady: bool) -> Replica:
-        """Where the load balancer sends a request: by its session, and now and then elsewhere unless `steady`."""
+        """Where the load balancer sends a request: by its session, and now and then elsewhere
+        unless `steady`.
+        """
         ready = [one for one in self.replicas if one.alive and not one.draining] or self.replicas
         if not steady and self.draw.random() < self.plan.stray:
             return self.draw.choice(ready)
@@ -312,9 +342,19 @@ class World:
         replica.loop.create_task(stop())
 
     def send(
-        self, op: Op, session_id: str, obs: Obs, *, link: Link | None, steady: bool, timed: bool, **fields: Any
+        self,
+        op: Op,
+        session_id: str,
+        obs: Obs,
+        *,
+        link: Link | None,
+        steady: bool,
+        timed: bool,
+        **fields: Any,
     ) -> asyncio.Future[Reply]:
-        """A client's request; its answer may never come. A client that cancels the answer closes its connection."""
+        """A client's request; its answer may never come. A client that cancels the answer closes
+        its connection.
+        """
         answer: asyncio.Future[Reply] = self.outside.create_future()
         replica = self.route(session_id, steady) if link is None else link.replica
 
@@ -324,7 +364,9 @@ class World:
         def deliver() -> None:
             if replica.alive:
                 end = replica.receive(Request(op, obs, **fields), session_id, answered, timed)
-                answer.add_done_callback(lambda done: self.transport(None, replica, end) if done.cancelled() else None)
+                answer.add_done_callback(
+                    lambda done: self.transport(None, replica, end) if done.cancelled() else None
+                )
 
         if link is None:
             self.transport(None, replica, deliver)

@@ -1,6 +1,8 @@
-"""A small network whose layers LoRA adapters change, as a policy; a deployment names it `adapted_network:Small`.
+"""A small network whose layers LoRA adapters change, as a policy; a deployment names it
+`adapted_network:Small`.
 
-Adapters are written as PEFT saves them, with random values, and merged into a network for comparison.
+Adapters are written as PEFT saves them, with random values, and merged into a network for
+comparison.
 """
 
 from __future__ import annotations
@@ -23,7 +25,9 @@ LAYERS = ("see", "look", "head.0", "head.2")
 
 
 class Small(ModelPolicy):
-    """A network that sees two views of a state at once, as numbers and as images, and adds noise."""
+    """A network that sees two views of a state at once, as numbers and as images, and adds
+    noise.
+    """
 
     Config = ModelConfig
     adaptable = True
@@ -39,8 +43,14 @@ class Small(ModelPolicy):
 
         find_checkpoint(self.config.checkpoint)
         torch.manual_seed(0)
-        head = torch.nn.Sequential(torch.nn.Linear(8, 8), torch.nn.Tanh(), torch.nn.Linear(8, HORIZON * DIM))
-        parts = {"see": torch.nn.Linear(DIM, 8), "look": torch.nn.Conv2d(3, 8, 2, stride=2, padding=1), "head": head}
+        head = torch.nn.Sequential(
+            torch.nn.Linear(8, 8), torch.nn.Tanh(), torch.nn.Linear(8, HORIZON * DIM)
+        )
+        parts = {
+            "see": torch.nn.Linear(DIM, 8),
+            "look": torch.nn.Conv2d(3, 8, 2, stride=2, padding=1),
+            "head": head,
+        }
         return torch.nn.ModuleDict({**parts, "attention": torch.nn.MultiheadAttention(8, 2)})
 
     def perceive(self, obs: Obs) -> np.ndarray:
@@ -54,7 +64,8 @@ class Small(ModelPolicy):
         states = torch.from_numpy(np.stack([rows[i].frames[-1] for i in firsts]))
         with torch.inference_mode():
             with self.adapters.rows([rows[i].adapter for i in firsts]):
-                views = torch.stack([states, -states], 1).flatten(0, 1)  # two entries for each observation
+                # Two entries for each observation.
+                views = torch.stack([states, -states], 1).flatten(0, 1)
                 image = torch.cat([views, -views, views**2], 1).view(-1, 3, 2, 2)
                 both = self.model["see"](views) + self.model["look"](image).mean((2, 3))
                 seen = torch.tanh(both).unflatten(0, (len(firsts), VIEWS)).mean(1)[owners]
@@ -72,7 +83,9 @@ def base(tmp_path: Path) -> Path:
 
 
 def pairs(network: Any, layers: Sequence[str], rank: int, seed: int = 0) -> dict[str, np.ndarray]:
-    """A and B of these layers of a torch module, by PEFT's names; they change results by as much as the layers do."""
+    """A and B of these layers of a torch module, by PEFT's names; they change results by as much
+    as the layers do.
+    """
     rng, modules, found = np.random.default_rng(seed), dict(network.named_modules()), {}
     for layer in layers:
         outputs, *inputs = modules[layer].weight.shape  # of a convolution: with the kernel
@@ -87,8 +100,19 @@ def save(folder: Path, values: Mapping[str, np.ndarray], **config: Any) -> Path:
     """An adapter of that folder, with lora_alpha 2 r unless the config says something else."""
     folder.mkdir(parents=True, exist_ok=True)
     rank = len(next(value for name, value in values.items() if ".lora_A." in name))
-    usual = {"peft_type": "LORA", "r": rank, "lora_alpha": 2 * rank, "target_modules": ["any"], "bias": "none"}
-    unset = {"base_model_name_or_path": None, "use_dora": False, "modules_to_save": None, "init_lora_weights": True}
+    usual = {
+        "peft_type": "LORA",
+        "r": rank,
+        "lora_alpha": 2 * rank,
+        "target_modules": ["any"],
+        "bias": "none",
+    }
+    unset = {
+        "base_model_name_or_path": None,
+        "use_dora": False,
+        "modules_to_save": None,
+        "init_lora_weights": True,
+    }
     (folder / "adapter_config.json").write_text(json.dumps({**usual, **unset, **config}))
     data = header_of(values) + b"".join(parts_of(values))
     (folder / "adapter_model.safetensors").write_bytes(data)

@@ -1,4 +1,6 @@
-"""A replica with API keys in this process, and the outcome of a request to each of its endpoints, as one word."""
+"""A replica with API keys in this process, and the outcome of a request to each of its
+endpoints, as one word.
+"""
 
 from __future__ import annotations
 
@@ -139,7 +141,8 @@ class Visitor:
         self.replica.known.change(self.name, **changes[self.credential])
         for keys in (self.replica.known.keys, self.replica.at_gateway):
             if self.credential == "over its rate":
-                with contextlib.suppress(TooManyRequests):  # the end of a refused WebSocket has been charged to it
+                # The end of a refused WebSocket has been charged to it.
+                with contextlib.suppress(TooManyRequests):
                     keys.check(self.token, "app").admit()
             if self.credential == "over its sessions":
                 keys.hold(self.name, 1, None)
@@ -150,9 +153,12 @@ class Visitor:
 class KeyedReplica:
     """An engine, and everything that stands before it."""
 
-    def __init__(self, stack: contextlib.ExitStack, patch: pytest.MonkeyPatch, folder: Path) -> None:
+    def __init__(
+        self, stack: contextlib.ExitStack, patch: pytest.MonkeyPatch, folder: Path
+    ) -> None:
         patch.setattr(api_keys, "_CHECK_S", 0.0)
-        patch.setattr(api_keys, "_WAIT_S", 60.0)  # of a busy machine: each test changes keys, and needs them changed
+        # Of a busy machine: each test changes keys, and needs them changed.
+        patch.setattr(api_keys, "_WAIT_S", 60.0)
         patch.setattr(access_middleware, "_TICK_S", 0.02)
         patch.setattr(periodic.each_half_second, "_period_s", 0.02)
         self.known = ChangingKeys()
@@ -168,7 +174,9 @@ class KeyedReplica:
         for each in (self.own, self.local, self.plasma):
             each.open()
         self.engine.start()
-        routes = dialect_routes(DialectArgs(**ALL), ReplicaContext(self.engine, lambda: METADATA, LIMITS))
+        routes = dialect_routes(
+            DialectArgs(**ALL), ReplicaContext(self.engine, lambda: METADATA, LIMITS)
+        )
         metadata = METADATA | {"policy_version": None, "weights": None}
         parts = open_parts(PartArgs(), PartContext(self.engine, "this", "here", lambda: metadata))
         stack.callback(parts.close)
@@ -176,11 +184,17 @@ class KeyedReplica:
         inside = build_http_app(self.engine, lambda: METADATA, LIMITS, more=[*routes, *others])
         self.routes = inside.routes
         with_access = AccessMiddleware(
-            inside, self.known.keys, "app", admission=self.engine.admission, public=parts.pages(inside.routes)
+            inside,
+            self.known.keys,
+            "app",
+            admission=self.engine.admission,
+            public=parts.pages(inside.routes),
         )
         self.port = stack.enter_context(served(FrontMiddleware(with_access)))
         check = partial(self.at_gateway.check, app="app")
-        self.gr00t = {near: self._on_own_port(stack, "gr00t", near, check) for near in (True, False)}
+        self.gr00t = {
+            near: self._on_own_port(stack, "gr00t", near, check) for near in (True, False)
+        }
         self.vlagents = self._on_own_port(stack, "vlagents", False, check, without_key=True)
         self.lerobot = self._on_own_port(stack, "lerobot", False, check, without_key=True)
         stack.callback(self._close)
@@ -200,7 +214,11 @@ class KeyedReplica:
         def watched(*tickets: Any) -> None:
             for ticket in tickets:
                 obs = ticket.request.obs
-                mark = ticket.request.instruction or (obs is not None and obs.info.get("mark")) or ticket.session_id
+                mark = (
+                    ticket.request.instruction
+                    or (obs is not None and obs.info.get("mark"))
+                    or ticket.session_id
+                )
                 self.ranks[str(mark)] = ticket.rank.name
             put(*tickets)
 
@@ -209,13 +227,21 @@ class KeyedReplica:
     def _agent(self, near: bool, key: str | None, rank: RankName | None) -> RemoteAgent:
         agent = RemoteAgent("http://127.0.0.1:9", rank=rank or "robot")
         engines = SimpleNamespace(
-            engines=[self.engine], dead=set(), frozen=set(), prefer=0, lose_reply=False, stopping=False, frames=[]
+            engines=[self.engine],
+            dead=set(),
+            frozen=set(),
+            prefer=0,
+            lose_reply=False,
+            stopping=False,
+            frames=[],
         )
         way = _Near(self.local.address, Credentials(key or "")) if near else InProcess(engines)  # type: ignore[arg-type]
         agent._connection = Connection(agent.url, lambda: way, CodecChoice("raw"), 5.0, 5.0)  # type: ignore[arg-type]
         return agent
 
-    def _on_own_port(self, stack: contextlib.ExitStack, name: str, near: bool, check: Any, **settings: Any) -> int:
+    def _on_own_port(
+        self, stack: contextlib.ExitStack, name: str, near: bool, check: Any, **settings: Any
+    ) -> int:
         """Serve a dialect of the gateway; returns its port."""
         cls, port = dialect_class(name), free_port()
         context = GatewayContext("app", partial(self._agent, near), LIMITS, 100, 2.0, None, check)
@@ -240,7 +266,9 @@ def plasma_server(engine: Engine, limits: Limits, patch: pytest.MonkeyPatch, fol
     node = SimpleNamespace(plasma_store_socket_name=str(folder / "plasma_store"))
     with pytest.MonkeyPatch.context() as for_now:
         for_now.setattr(ray._private.worker.global_worker, "node", node, raising=False)
-        for_now.setattr(ray, "get_runtime_context", lambda: SimpleNamespace(get_node_id=lambda: "node"))
+        for_now.setattr(
+            ray, "get_runtime_context", lambda: SimpleNamespace(get_node_id=lambda: "node")
+        )
         server = PlasmaServer(engine, limits)
     patch.setattr(server.pool, "claim", PlasmaChannel)
     patch.setattr(server.pool, "release", lambda _channel: None)
@@ -270,7 +298,9 @@ def keyed_replica(folder: Path) -> Iterator[KeyedReplica]:
 
 
 Way = Callable[[Visitor, str], str]
-"""Tries a request before, with or after the credential; returns what was answered: a status, "done" or "ended"."""
+"""Tries a request before, with or after the credential; returns what was answered: a status,
+"done" or "ended".
+"""
 
 
 def over_http(method: str, path: str, **options: Any) -> Way:
@@ -278,8 +308,14 @@ def over_http(method: str, path: str, **options: Any) -> Way:
 
     def attempt(visitor: Visitor, _when: str) -> str:
         def ask(method: str, path: str, document: dict[str, Any] | None, token: str | None) -> int:
-            connection = http.client.HTTPConnection("127.0.0.1", visitor.replica.port, timeout=ANSWER_S)
-            headers = {"x-session-id": "robot-1", "content-type": "application/json"} if path != "/act" else {}
+            connection = http.client.HTTPConnection(
+                "127.0.0.1", visitor.replica.port, timeout=ANSWER_S
+            )
+            headers = (
+                {"x-session-id": "robot-1", "content-type": "application/json"}
+                if path != "/act"
+                else {}
+            )
             headers |= {} if token is None else {"authorization": f"Bearer {token}"}
             with contextlib.closing(connection):
                 content = json.dumps(document).encode()
@@ -300,8 +336,12 @@ def over_http(method: str, path: str, **options: Any) -> Way:
     return attempt
 
 
-def over_websocket(path: str, message: Callable[[str], bytes], read: Callable[[bytes | str], str | None]) -> Way:
-    """A WebSocket: `message` asks for what the mark says, `read` gives what a message says of it, if anything."""
+def over_websocket(
+    path: str, message: Callable[[str], bytes], read: Callable[[bytes | str], str | None]
+) -> Way:
+    """A WebSocket: `message` asks for what the mark says, `read` gives what a message says of
+    it, if anything.
+    """
 
     def attempt(visitor: Visitor, when: str) -> str:
         replica = visitor.replica
@@ -330,7 +370,8 @@ def over_websocket(path: str, message: Callable[[str], bytes], read: Callable[[b
                 protocol.receive_data(_some(connection))
             if when == "with":
                 if protocol.state is State.OPEN and not path.startswith("own"):
-                    connection.sendall(asked)  # uvicorn drops what comes in one segment with a handshake
+                    # Uvicorn drops what comes in one segment with a handshake.
+                    connection.sendall(asked)
                 return _answer(protocol, connection, read)
             said = "" if protocol.handshake_exc is None else _answer(protocol, connection, read)
             if not refused:
@@ -372,12 +413,16 @@ def _until_ended(protocol: ClientProtocol, connection: socket.socket) -> None:
         connection.sendall(b"".join(protocol.data_to_send()))
 
 
-def _answer(protocol: ClientProtocol, connection: socket.socket, read: Callable[[bytes | str], str | None]) -> str:
+def _answer(
+    protocol: ClientProtocol, connection: socket.socket, read: Callable[[bytes | str], str | None]
+) -> str:
     while True:
         for event in protocol.events_received():
             if isinstance(event, Frame) and event.opcode in (Opcode.BINARY, Opcode.TEXT):
                 data = bytes(event.data)
-                if (said := read(data.decode() if event.opcode is Opcode.TEXT else data)) is not None:
+                if (
+                    said := read(data.decode() if event.opcode is Opcode.TEXT else data)
+                ) is not None:
                     return said
             elif isinstance(event, Frame) and event.opcode is Opcode.CLOSE:
                 return status_of(Close.parse(bytes(event.data)).reason)
@@ -431,7 +476,11 @@ def over_shm(visitor: Visitor, when: str) -> str:
         if when == "after":
             if not refused:
                 local = visitor.replica.local
-                wait_for(lambda: any(getattr(c.caller, "name", "") == visitor.name for c in list(local._clients)))
+                wait_for(
+                    lambda: any(
+                        getattr(c.caller, "name", "") == visitor.name for c in list(local._clients)
+                    )
+                )
             visitor.become()
         try:
             [reply] = transport.call([Request("reset", Obs(), visitor.mark)], ANSWER_S)
@@ -462,7 +511,9 @@ def over_handle(visitor: Visitor, _when: str) -> str:
 
     visitor.become()
     frame = encode_requests([Request("reset", Obs(), visitor.mark)])
-    [reply] = decode_replies(asyncio.run(answer_frame(visitor.replica.engine, LIMITS, visitor.name, frame)))
+    [reply] = decode_replies(
+        asyncio.run(answer_frame(visitor.replica.engine, LIMITS, visitor.name, frame))
+    )
     return "done" if reply.error is None else str(reply.error.status)
 
 
@@ -601,9 +652,13 @@ WAYS: dict[str, Way] = {
     "`GET /v1/weights`": over_http("GET", "/v1/weights"),
     "`GET /v1/weights`, scope `weights`": _with_scope("weights", over_http("GET", "/v1/weights")),
     "`POST /v1/weights/{step}`": over_http("POST", "/v1/weights/wake"),
-    "`POST /v1/weights/{step}`, scope `weights`": _with_scope("weights", over_http("POST", "/v1/weights/wake")),
+    "`POST /v1/weights/{step}`, scope `weights`": _with_scope(
+        "weights", over_http("POST", "/v1/weights/wake")
+    ),
     "`WS /v1/weights`": over_websocket("/v1/weights", _weights, _read_pushed),
-    "`WS /v1/weights`, scope `weights`": _with_scope("weights", over_websocket("/v1/weights", _weights, _read_pushed)),
+    "`WS /v1/weights`, scope `weights`": _with_scope(
+        "weights", over_websocket("/v1/weights", _weights, _read_pushed)
+    ),
     "`GET /live`": over_http("GET", "/live"),
     "`GET /v1/live`": over_http("GET", "/v1/live"),
     "`GET /v1/live`, scope `watch`": _with_scope("watch", over_http("GET", "/v1/live")),
@@ -612,7 +667,9 @@ WAYS: dict[str, Way] = {
         "operate", over_http("POST", "/v1/live/command", document=_press, session=True)
     ),
     "`WS /v1/live`": over_websocket("/v1/live", _watch, _read_seen),
-    "`WS /v1/live`, scope `watch`": _with_scope("watch", over_websocket("/v1/live", _watch, _read_seen)),
+    "`WS /v1/live`, scope `watch`": _with_scope(
+        "watch", over_websocket("/v1/live", _watch, _read_seen)
+    ),
     "own port": over_websocket("own", _stream_message, _read_reply),
     "own port, another path": over_websocket("own/x", _stream_message, _read_reply),
     "shared memory": over_shm,

@@ -39,7 +39,9 @@ def served(app: ASGIApp) -> Iterator[int]:
 
 
 @contextlib.contextmanager
-def policy_server(agent: Agent, asked: Counter[str] | None = None, **metadata: Any) -> Iterator[int]:
+def policy_server(
+    agent: Agent, asked: Counter[str] | None = None, **metadata: Any
+) -> Iterator[int]:
     """The port of a server of a policy, without Ray; `asked` counts the paths of its requests."""
     engine = Engine(agent)
     engine.start()

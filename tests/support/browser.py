@@ -14,7 +14,9 @@ from typing import Any
 
 from websockets.sync.client import ClientConnection, connect
 
-CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+CHROMIUM = next(
+    filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None
+)
 _WAIT_S = 60
 
 
@@ -41,9 +43,20 @@ class Page:
                 return message["result"]
 
     def open(self, path: Path | str, *, width: int, scheme: str, height: int = 900) -> None:
-        """Load a file or an address, in a window of this size, for a reader who prefers this colour scheme."""
-        self.call("Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=1, mobile=False)
-        self.call("Emulation.setEmulatedMedia", features=[{"name": "prefers-color-scheme", "value": scheme}])
+        """Load a file or an address, in a window of this size, for a reader who prefers this
+        colour scheme.
+        """
+        self.call(
+            "Emulation.setDeviceMetricsOverride",
+            width=width,
+            height=height,
+            deviceScaleFactor=1,
+            mobile=False,
+        )
+        self.call(
+            "Emulation.setEmulatedMedia",
+            features=[{"name": "prefers-color-scheme", "value": scheme}],
+        )
         self.call("Page.navigate", url=path if isinstance(path, str) else path.as_uri())
         while True:
             message = json.loads(self._socket.recv(_WAIT_S))
@@ -52,14 +65,20 @@ class Page:
                 return
 
     def value(self, expression: str) -> Any:
-        """What an expression of JavaScript is there, once it has settled; None if it is undefined."""
-        found = self.call("Runtime.evaluate", expression=expression, returnByValue=True, awaitPromise=True)
+        """What an expression of JavaScript is there, once it has settled; None if it is
+        undefined.
+        """
+        found = self.call(
+            "Runtime.evaluate", expression=expression, returnByValue=True, awaitPromise=True
+        )
         assert "exceptionDetails" not in found, found
         return found["result"].get("value")
 
     def pdf(self) -> bytes:
         """The page as it is printed, on A4."""
-        return base64.b64decode(self.call("Page.printToPDF", preferCSSPageSize=True, printBackground=True)["data"])
+        return base64.b64decode(
+            self.call("Page.printToPDF", preferCSSPageSize=True, printBackground=True)["data"]
+        )
 
     def _note(self, message: dict[str, Any]) -> None:
         method, params = message.get("method"), message.get("params", {})
@@ -81,7 +100,10 @@ def browser(profile: Path) -> Iterator[Page]:
         f"--user-data-dir={profile}",
     ]
     process = subprocess.Popen(
-        [CHROMIUM, *switches, "about:blank"], stderr=subprocess.PIPE, text=True, env=os.environ | {"HOME": str(profile)}
+        [CHROMIUM, *switches, "about:blank"],
+        stderr=subprocess.PIPE,
+        text=True,
+        env=os.environ | {"HOME": str(profile)},
     )
     assert process.stderr is not None
     try:

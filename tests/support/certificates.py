@@ -21,14 +21,41 @@ class Authority:
 
     def sign(self, whom: str, addresses: str = "IP:127.0.0.1") -> tuple[Path, Path]:
         """A certificate and its key."""
-        certificate, key = self.folder / f"{self.name}-{whom}.pem", self.folder / f"{self.name}-{whom}.key"
+        certificate, key = (
+            self.folder / f"{self.name}-{whom}.pem",
+            self.folder / f"{self.name}-{whom}.key",
+        )
         request, extensions = certificate.with_suffix(".csr"), certificate.with_suffix(".ext")
         extensions.write_text(f"subjectAltName={addresses}\n")
-        _openssl("req", "-newkey", *_CURVE, "-nodes", "-subj", f"/CN={whom}", "-keyout", key, "-out", request)
         _openssl(
-            "x509", "-req", "-in", request, "-CA", self.file, "-CAkey", self.file.with_suffix(".key"),
-            "-CAcreateserial", "-days", "2", "-extfile", extensions, "-out", certificate,
-        )  # fmt: skip
+            "req",
+            "-newkey",
+            *_CURVE,
+            "-nodes",
+            "-subj",
+            f"/CN={whom}",
+            "-keyout",
+            key,
+            "-out",
+            request,
+        )
+        _openssl(
+            "x509",
+            "-req",
+            "-in",
+            request,
+            "-CA",
+            self.file,
+            "-CAkey",
+            self.file.with_suffix(".key"),
+            "-CAcreateserial",
+            "-days",
+            "2",
+            "-extfile",
+            extensions,
+            "-out",
+            certificate,
+        )
         return certificate, key
 
 

@@ -1,4 +1,6 @@
-"""Servers for the tests of clients in other languages, over a policy of their own in this process, without Ray."""
+"""Servers for the tests of clients in other languages, over a policy of their own in this
+process, without Ray.
+"""
 
 from __future__ import annotations
 
@@ -27,8 +29,9 @@ ROWS = 4
 class Told(Agent):
     """Acts with what it was told, so that a client can say whether all of it arrived.
 
-    Each of the ROWS rows of its chunk has: the acts of the episode so far, the row's number, the gripper, the mean of
-    the camera `front`, and the first number of the state `joints`; -1 for what is missing.
+    Each of the ROWS rows of its chunk has: the acts of the episode so far, the row's number, the
+    gripper, the mean of the camera `front`, and the first number of the state `joints`; -1 for what
+    is missing.
     """
 
     @property
@@ -59,7 +62,8 @@ class Told(Agent):
 def client_servers() -> Iterator[dict[str, str]]:
     """Yield the variables that the tests of a client read.
 
-    VLAGENTS_TEST_URL: a server whose replica has a port of its own; VLAGENTS_TEST_PROXIED_URL: the same policy without
+    VLAGENTS_TEST_URL: a server whose replica has a port of its own; VLAGENTS_TEST_PROXIED_URL: the
+        same policy without
     that port; VLAGENTS_TEST_KEYED_URL: the same behind API keys, of which VLAGENTS_TEST_KEY is one.
     """
     engine = Engine(Told())
@@ -68,11 +72,18 @@ def client_servers() -> Iterator[dict[str, str]]:
     engine.start()
     keys = ChangingKeys()
     contract = Told().contract.to_json()
-    metadata: dict[str, Any] = {"policy": "told", "protocol": PROTOCOL_VERSION, "contract": contract, "stream": None}
+    metadata: dict[str, Any] = {
+        "policy": "told",
+        "protocol": PROTOCOL_VERSION,
+        "contract": contract,
+        "stream": None,
+    }
 
     def app(stream: Any, known: Any) -> AccessMiddleware:
         return AccessMiddleware(
-            build_http_app(engine, lambda: metadata | {"stream": stream}, DEFAULT_LIMITS), known, "app"
+            build_http_app(engine, lambda: metadata | {"stream": stream}, DEFAULT_LIMITS),
+            known,
+            "app",
         )
 
     with contextlib.ExitStack() as stack:
@@ -83,5 +94,8 @@ def client_servers() -> Iterator[dict[str, str]]:
             "VLAGENTS_TEST_PROXIED_URL": app(None, None),
             "VLAGENTS_TEST_KEYED_URL": app(None, keys.keys),
         }
-        urls = {name: f"http://127.0.0.1:{stack.enter_context(served(each))}" for name, each in ports.items()}
+        urls = {
+            name: f"http://127.0.0.1:{stack.enter_context(served(each))}"
+            for name, each in ports.items()
+        }
         yield urls | {"VLAGENTS_TEST_KEY": keys.add("robot")}

@@ -1,4 +1,6 @@
-"""A backend of torch.compile that runs what Dynamo traced: it counts the programs that it makes, and can spoil some."""
+"""A backend of torch.compile that runs what Dynamo traced: it counts the programs that it makes,
+and can spoil some.
+"""
 
 from __future__ import annotations
 
@@ -17,11 +19,14 @@ class CountingCompiler:
 
     def __init__(self) -> None:
         self.rows: list[int] = []  # of each program
-        self.change: dict[int, Callable[[Any], Any]] = {}  # of the results of programs, by their rows
+        # Of the results of programs, by their rows.
+        self.change: dict[int, Callable[[Any], Any]] = {}
         self.calls = 0  # of programs
 
     def __call__(self, graph: Any, examples: Sequence[Any]) -> Callable[..., Any]:
-        rows = next(len(one) for one in examples if not isinstance(one, torch.nn.Parameter) and one.ndim)
+        rows = next(
+            len(one) for one in examples if not isinstance(one, torch.nn.Parameter) and one.ndim
+        )
         self.rows.append(rows)
 
         def program(*inputs: Any) -> Any:

@@ -12,7 +12,10 @@ from types import TracebackType
 from typing import Any
 
 CLIENT = Path(__file__).parents[2] / "clients" / "cpp"
-_NEEDED = "#if !__has_include(<nlohmann/json.hpp>) || !__has_include(<jpeglib.h>)\n#error missing\n#endif\n"
+_NEEDED = (
+    "#if !__has_include(<nlohmann/json.hpp>) || !__has_include(<jpeglib.h>)\n#error "
+    "missing\n#endif\n"
+)
 _BUILD_S = 300
 _ANSWER_S = 60
 
@@ -40,9 +43,13 @@ def _includes() -> list[str]:
 
 
 def build(folder: Path) -> Path:
-    """Install the client below `folder`, and build its test programs as a user's project does; returns their folder."""
+    """Install the client below `folder`, and build its test programs as a user's project does;
+    returns their folder.
+    """
     installed, programs = folder / "installed", folder / "programs"
-    prefixes = os.pathsep.join(filter(None, [str(installed), os.environ.get("CMAKE_PREFIX_PATH", "")]))
+    prefixes = os.pathsep.join(
+        filter(None, [str(installed), os.environ.get("CMAKE_PREFIX_PATH", "")])
+    )
     for command in (
         ["cmake", "-S", CLIENT, "-B", folder / "client", "-DVLAGENTS_RAY_EXAMPLES=OFF"],
         ["cmake", "--install", folder / "client", "--prefix", installed],
@@ -50,9 +57,13 @@ def build(folder: Path) -> Path:
         ["cmake", "--build", programs, "--parallel", "2"],
     ):
         done = subprocess.run(
-            command, env=os.environ | {"CMAKE_PREFIX_PATH": prefixes}, capture_output=True, text=True,
-            timeout=_BUILD_S, check=False,
-        )  # fmt: skip
+            command,
+            env=os.environ | {"CMAKE_PREFIX_PATH": prefixes},
+            capture_output=True,
+            text=True,
+            timeout=_BUILD_S,
+            check=False,
+        )
         assert done.returncode == 0, f"{command}: {done.stdout[-2000:]}{done.stderr[-4000:]}"
     return programs
 
@@ -70,12 +81,18 @@ class CppError(Exception):
 
 
 class CppClient:
-    """The client. Each method of the driver is a call with its arguments (clients/cpp/tests/driver.cpp)."""
+    """The client. Each method of the driver is a call with its arguments
+    (clients/cpp/tests/driver.cpp).
+    """
 
     def __init__(self, programs: Path, url: str = "", **options: Any) -> None:
         """Start it, and with a `url` make a `Client`, with `ahead` also a `ChunkPlayer`."""
         self._process = subprocess.Popen(
-            [programs / "driver"], stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+            [programs / "driver"],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
         )
         if url:
             self.call("connect", url=url, **options)
@@ -113,7 +130,12 @@ class CppClient:
     def __enter__(self) -> CppClient:
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        at: TracebackType | None,
+    ) -> None:
         _, said = self._process.communicate(timeout=_ANSWER_S)  # it ends with its input
         if kind is None:
             assert (self._process.returncode, said) == (0, "")

@@ -1,4 +1,6 @@
-"""All dialects of the server's own port over one engine, and those with a port of their own over others."""
+"""All dialects of the server's own port over one engine, and those with a port of their own over
+others.
+"""
 
 from __future__ import annotations
 
@@ -45,7 +47,11 @@ def open_dialect(replicas: Replicas) -> Iterator[OpenPort]:
         return replicas.agent(rank=rank or "robot")
 
     def open_port(
-        name: str, sessions: int = 8, idle_s: float = 30.0, check: Any = NoKey.OPEN, **settings: object
+        name: str,
+        sessions: int = 8,
+        idle_s: float = 30.0,
+        check: Any = NoKey.OPEN,
+        **settings: object,
     ) -> int:
         cls = dialect_class(name)
         config = cls.Config(port=free_port(), **settings)

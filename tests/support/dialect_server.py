@@ -46,7 +46,9 @@ def serving(
 
 def client_of(engine: Engine, dialects: dict[str, Any], keys: Keys | None = None) -> TestClient:
     """A client of the dialects over an engine."""
-    routes = dialect_routes(DialectArgs(**dialects), ReplicaContext(engine, lambda: METADATA, LIMITS))
+    routes = dialect_routes(
+        DialectArgs(**dialects), ReplicaContext(engine, lambda: METADATA, LIMITS)
+    )
     inside = build_http_app(engine, lambda: METADATA, LIMITS, more=routes)
     return TestClient(AccessMiddleware(inside, keys, "app"))
 
@@ -67,7 +69,11 @@ def call(socket: Any, data: bytes) -> Any:
 
 
 def body(pixel: int, instruction: str = "task 1", **more: Any) -> dict[str, Any]:
-    return {"image": json.loads(openvla_codec.encode(image(pixel), twice=False)), "instruction": instruction, **more}
+    return {
+        "image": json.loads(openvla_codec.encode(image(pixel), twice=False)),
+        "instruction": instruction,
+        **more,
+    }
 
 
 def send(socket: Any, kind: Any, payload: dict[str, Any], seq: int) -> None:

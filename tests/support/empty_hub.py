@@ -9,7 +9,9 @@ import pytest
 
 
 def empty_hub(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, str | None]]:
-    """Replace the hub's package; return the repositories and commits that are asked for, as they come."""
+    """Replace the hub's package; return the repositories and commits that are asked for, as they
+    come.
+    """
     asked: list[tuple[str, str | None]] = []
 
     def download(name: str, revision: str | None) -> str:

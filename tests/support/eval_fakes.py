@@ -26,14 +26,15 @@ DRIFTING_LINE = "eval_fakes:DriftingLine"
 CLINGING = "eval_fakes:Clinging"
 EVERY = -1  # seed
 HURRY = "VLAGENTS_RAY_TEST_HURRY"  # variable, see `Unhurried`
-PYTHONPATH = f"{Path(__file__).parent}:{Path(__file__).parents[2]}"  # with which other processes find this module
+# With which other processes find this module.
+PYTHONPATH = f"{Path(__file__).parent}:{Path(__file__).parents[2]}"
 
 
 class Line(EvalEnv):
     """A point on a line is to be brought to 0 within 10 steps; from far away it cannot be.
 
-    `trouble` maps a kind to the seeds in whose fourth step it happens, once for each seed: a file in
-    `folder` remembers. Kinds: "raise", "exit", "hang" (asleep), "freeze" (asleep, holding the
+    `trouble` maps a kind to the seeds in whose fourth step it happens, once for each seed: a file
+    in `folder` remembers. Kinds: "raise", "exit", "hang" (asleep), "freeze" (asleep, holding the
     interpreter), and "gate", which waits for the file `folder/open`.
     """
 
@@ -67,7 +68,9 @@ class Line(EvalEnv):
     def instruction(self) -> str:
         return f"bring {self._position:.3f} to zero"
 
-    def reset(self, *, seed: int, options: Mapping[str, Any] | None = None) -> tuple[Obs, dict[str, Any]]:
+    def reset(
+        self, *, seed: int, options: Mapping[str, Any] | None = None
+    ) -> tuple[Obs, dict[str, Any]]:
         self._seed, self._steps = seed, 0
         self._position = float(np.random.default_rng(seed).uniform(2.0, 12.0))
         return self._look(), {}
@@ -80,7 +83,13 @@ class Line(EvalEnv):
                     self._misbehave(kind)
         self._position += float(np.clip(act.action[0], -1.0, 1.0))
         success = abs(self._position) < 0.5
-        return self._look(), -abs(self._position), False, self._steps == self.max_steps, {"success": success}
+        return (
+            self._look(),
+            -abs(self._position),
+            False,
+            self._steps == self.max_steps,
+            {"success": success},
+        )
 
     def describe(self) -> dict[str, Any]:
         return {"simulator": "line", "version": 1}
@@ -91,7 +100,9 @@ class Line(EvalEnv):
     def _look(self) -> Obs:
         cameras = {}
         if self._camera:
-            cameras["front"] = np.full((*self._camera, 3), (20 * self._steps, 200 - 20 * self._steps, 60), np.uint8)
+            cameras["front"] = np.full(
+                (*self._camera, 3), (20 * self._steps, 200 - 20 * self._steps, 60), np.uint8
+            )
         state = np.full(self._state_dim, self._position, np.float32)
         return Obs(cameras=cameras, state={"position": state})
 
@@ -159,7 +170,9 @@ class DriftingLine(SparingLine):
         super().__init__(**options)
         self._resets = 0
 
-    def reset(self, *, seed: int, options: Mapping[str, Any] | None = None) -> tuple[Obs, dict[str, Any]]:
+    def reset(
+        self, *, seed: int, options: Mapping[str, Any] | None = None
+    ) -> tuple[Obs, dict[str, Any]]:
         obs, info = super().reset(seed=seed, options=options)
         self._resets += 1
         self._position += 0.01 * self._resets
@@ -169,7 +182,9 @@ class DriftingLine(SparingLine):
 class ToZero(Agent):
     """Steps to zero with some noise of its own; `chunk` rows at a time."""
 
-    def __init__(self, chunk: int = 1, state_dim: int | None = None, lost_on: int | None = None) -> None:
+    def __init__(
+        self, chunk: int = 1, state_dim: int | None = None, lost_on: int | None = None
+    ) -> None:
         self._chunk = chunk
         self._state_dim = state_dim
         self._lost_on = lost_on  # the seed in whose acts the connection breaks
@@ -196,7 +211,8 @@ class ToZero(Agent):
 class Unhurried(ToZero):
     """Chunks of a second for a robot at 50 Hz.
 
-    Each takes its time, so that an evaluation lasts until there is the file that the variable `HURRY` names.
+    Each takes its time, so that an evaluation lasts until there is the file that the variable
+    `HURRY` names.
     """
 
     def __init__(self, takes_s: float = 0.05) -> None:
@@ -224,13 +240,21 @@ class Teller(ToZero):
     """Fails by telling what its process was started with."""
 
     def act(self, obs: Obs) -> Act:
-        raise PolicyFailed(str({name: os.environ.get(name) for name in ("OMP_NUM_THREADS", "LP_NUM_THREADS", "EXTRA")}))
+        raise PolicyFailed(
+            str(
+                {
+                    name: os.environ.get(name)
+                    for name in ("OMP_NUM_THREADS", "LP_NUM_THREADS", "EXTRA")
+                }
+            )
+        )
 
 
 def wait_for(true: Any, timeout_s: float = 120.0, every_s: float = 0.02) -> None:
     """Poll until `true()`; `TimeoutError` if it never is.
 
-    What takes long to find out, such as whether a process has ended, is asked less often: what is waited for wants CPU.
+    What takes long to find out, such as whether a process has ended, is asked less often: what is
+    waited for wants CPU.
     """
     deadline = (begun := time.monotonic()) + timeout_s
     while not true():

@@ -22,7 +22,13 @@ def config(tmp_path: Path) -> Callable[..., EvalConfig]:
     """Settings of a small evaluation of `Line` in a folder of this test's own."""
 
     def make(**changes: Any) -> EvalConfig:
-        settings = {"envs": [LINE], "episodes": 6, "workers": 2, "out": tmp_path / "out", "video": "none"}
+        settings = {
+            "envs": [LINE],
+            "episodes": 6,
+            "workers": 2,
+            "out": tmp_path / "out",
+            "video": "none",
+        }
         return flat_config(**settings | {"env_timeout_s": 5, "runtime_env": WORKER_PATH} | changes)
 
     return make
@@ -30,7 +36,9 @@ def config(tmp_path: Path) -> Callable[..., EvalConfig]:
 
 @pytest.fixture(scope="module", autouse=True)
 def commits_reach_the_disk() -> Iterator[None]:
-    """They do not, which takes 5 to 25 ms each; a module that is about it overrides this fixture."""
+    """They do not, which takes 5 to 25 ms each; a module that is about it overrides this
+    fixture.
+    """
     opened = Store._open
 
     def without_waiting(store: Store, config: EvalConfig) -> sqlite3.Connection:

@@ -10,14 +10,23 @@ from vlagents_ray.evaluate.episode.records import EpisodeResult
 from vlagents_ray.evaluate.plan.jobs import plan
 from vlagents_ray.evaluate.results.store import Store
 
-SETTINGS = {"envs": [LINE, OTHER_LINE], "episodes": 3, "env_options": {"camera": [32, 32]}, "record": "failures"}
+SETTINGS = {
+    "envs": [LINE, OTHER_LINE],
+    "episodes": 3,
+    "env_options": {"camera": [32, 32]},
+    "record": "failures",
+}
 
 
 def with_a_lost_episode(settings: EvalConfig) -> Results:
-    """Play two episodes in each of two envs by `SETTINGS`, and record one that infrastructure failed."""
+    """Play two episodes in each of two envs by `SETTINGS`, and record one that infrastructure
+    failed.
+    """
     play(settings, left_out=[2])
     with Store(settings.model_copy(update={"resume": True})) as store:
         store.begin_run(settings, {})
         key = next(job.key for job in plan(store.cells) if job.key.episode == 2)
-        store.record(EpisodeResult(key, "infra_failed", error='env_failed: it hung, "again"'), attempts=4)
+        store.record(
+            EpisodeResult(key, "infra_failed", error='env_failed: it hung, "again"'), attempts=4
+        )
     return Results.load(settings.out)

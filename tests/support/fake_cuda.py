@@ -1,14 +1,16 @@
-"""A CUDA of two devices on a CPU: streams, graphs and errors as torch has them, for tests without a GPU.
+"""A CUDA of two devices on a CPU: streams, graphs and errors as torch has them, for tests without a
+GPU.
 
-A tensor of `FakeCuda.tensor` computes on the CPU and says that it is on a GPU. While a graph is captured, the
-operations of its stream are recorded, and their results are then overwritten, as a capture computes nothing; a replay
-computes them again from the same tensors. The rules are CUDA's, or stricter:
+A tensor of `FakeCuda.tensor` computes on the CPU and says that it is on a GPU. While a graph is
+captured, the operations of its stream are recorded, and their results are then overwritten, as a
+capture computes nothing; a replay computes them again from the same tensors. The rules are CUDA's,
+or stricter:
 
 - A capture fails, on both threads, if another thread waits for its device or makes a tensor there.
 - An operation on another stream or device than the captured one runs at once and is not recorded.
 - `torch.cuda.graph` has one stream for all captures of a process, on the device of the first.
-- With `install_copies`, a copy from pinned memory on a stream other than the default one is made only when a stream
-  waits for an event after it; until then its destination has garbage.
+- With `install_copies`, a copy from pinned memory on a stream other than the default one is made
+  only when a stream waits for an event after it; until then its destination has garbage.
 - The graphs of a memory pool share memory: a replay overwrites the results of all others.
 - A GPU's time is the number of replayed operations, in milliseconds.
 - After `fail`, every call fails. A tensor of more than `most_rows` rows does not fit into memory.
@@ -32,7 +34,8 @@ from torch.overrides import TorchFunctionMode
 from torch.utils._pytree import tree_leaves, tree_map
 
 _EMPTY = (
-    "The CUDA Graph is empty. This usually means that the graph was attempted to be captured on wrong device or stream."
+    "The CUDA Graph is empty. This usually means that the graph was attempted to be captured "
+    "on wrong device or stream."
 )
 _GARBAGE = 55  # in memory that a capture has not written
 
@@ -51,7 +54,8 @@ class FakeCuda:
         self.replays: list[Capture] = []  # the graph of each replay
         self.reserved = [0, 0]  # bytes of the graphs on each device
         self.memory = Memory()
-        self.transfers: list[tuple[Stream, int]] = []  # streams and bytes of copies between GPU and host
+        # Streams and bytes of copies between GPU and host.
+        self.transfers: list[tuple[Stream, int]] = []
         self._local = threading.local()
         self._default = [Stream(self, index) for index in range(2)]
         self._capture_stream: Stream | None = None
@@ -72,8 +76,13 @@ class FakeCuda:
             "Event": lambda **_: Event(self),
             "graph_pool_handle": object,
             "memory_allocated": lambda _=None: self.memory.allocated,
-            "memory_reserved": lambda device=None: self.memory.allocated + self.reserved[self._index(device)],
-            "mem_get_info": lambda _=None: (self.memory.total - self.memory.allocated, self.memory.total),
+            "memory_reserved": lambda device=None: (
+                self.memory.allocated + self.reserved[self._index(device)]
+            ),
+            "mem_get_info": lambda _=None: (
+                self.memory.total - self.memory.allocated,
+                self.memory.total,
+            ),
             "graph": self._graph,
         }.items():
             patch.setattr(torch.cuda, name, value)
@@ -81,21 +90,32 @@ class FakeCuda:
         patch.setattr(torch.Tensor, "pin_memory", lambda self: self)
 
     def install_copies(self, patch: pytest.MonkeyPatch) -> None:
-        """Replace pinned memory and the copies from it; one that would wait for its stream is an error."""
+        """Replace pinned memory and the copies from it; one that would wait for its stream is an
+        error.
+        """
         empty, pin, to, pinned = torch.empty, torch.Tensor.clone, torch.Tensor.to, set[int]()
 
         def hold(tensor: torch.Tensor, held: bool = True) -> torch.Tensor:
             if held:
                 pinned.add(tensor.data_ptr())
-                self.pinned.append(tensor)  # its memory stays in use, so that the address means it alone
+                # Its memory stays in use, so that the address means it alone.
+                self.pinned.append(tensor)
             return tensor
 
-        def copy(tensor: torch.Tensor, *args: Any, non_blocking: bool = False, **kwargs: Any) -> Any:
+        def copy(
+            tensor: torch.Tensor, *args: Any, non_blocking: bool = False, **kwargs: Any
+        ) -> Any:
             device = args[0] if args else None
-            if isinstance(tensor, GpuTensor) or not isinstance(device, torch.device) or device.type != "cuda":
+            if (
+                isinstance(tensor, GpuTensor)
+                or not isinstance(device, torch.device)
+                or device.type != "cuda"
+            ):
                 return to(tensor, *args, non_blocking=non_blocking, **kwargs)
             if not non_blocking or tensor.data_ptr() not in pinned:
-                raise AssertionError("the copy waits for its stream: want pinned memory, and non_blocking")
+                raise AssertionError(
+                    "the copy waits for its stream: want pinned memory, and non_blocking"
+                )
             made = self.tensor(torch.full_like(tensor, _GARBAGE), self._index(device))
             stream = self.current_stream(device)
             stream.pending.append(lambda: made.values.copy_(tensor))
@@ -104,7 +124,9 @@ class FakeCuda:
             return made
 
         patch.setattr(
-            torch, "empty", lambda *size, pin_memory=False, **kwargs: hold(empty(*size, **kwargs), pin_memory)
+            torch,
+            "empty",
+            lambda *size, pin_memory=False, **kwargs: hold(empty(*size, **kwargs), pin_memory),
         )
         patch.setattr(torch.Tensor, "pin_memory", lambda tensor: hold(pin(tensor)))
         patch.setattr(torch.Tensor, "to", copy)
@@ -133,8 +155,13 @@ class FakeCuda:
         if capture is None or capture.thread != threading.get_ident():
             self._require(index)
         result = call()
-        if any(isinstance(one, torch.Tensor) and one.ndim and len(one) > self.most_rows for one in tree_leaves(result)):
-            raise torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 2.00 GiB. GPU 0 has 1.00 GiB free")
+        if any(
+            isinstance(one, torch.Tensor) and one.ndim and len(one) > self.most_rows
+            for one in tree_leaves(result)
+        ):
+            raise torch.OutOfMemoryError(
+                "CUDA out of memory. Tried to allocate 2.00 GiB. GPU 0 has 1.00 GiB free"
+            )
         if capture is not None and capture.stream is self.current_stream(index):
             capture.calls.append((call, result, inputs))
         return result
@@ -144,7 +171,9 @@ class FakeCuda:
             raise torch.AcceleratorError(self.failure, 710)
         if (capture := self.capture) is not None and capture.stream.index == index:
             capture.broken = True
-            raise torch.AcceleratorError("CUDA error: operation not permitted when stream is capturing", 900)
+            raise torch.AcceleratorError(
+                "CUDA error: operation not permitted when stream is capturing", 900
+            )
 
     def _streams(self) -> dict[int, Stream]:
         streams: dict[int, Stream] = self._local.__dict__.setdefault("streams", {})
@@ -178,7 +207,11 @@ class FakeCuda:
 
     @contextmanager
     def _graph(
-        self, capture: Capture, pool: Any = None, stream: Stream | None = None, capture_error_mode: str = "global"
+        self,
+        capture: Capture,
+        pool: Any = None,
+        stream: Stream | None = None,
+        capture_error_mode: str = "global",
     ) -> Iterator[None]:
         self.captures.append(capture)
         capture.pool = pool
@@ -227,11 +260,14 @@ class Memory:
 
 @dataclass(eq=False)
 class Stream:
-    """A stream of one GPU, on which operations other than the copies of `install_copies` run at once."""
+    """A stream of one GPU, on which operations other than the copies of `install_copies` run at
+    once.
+    """
 
     cuda: FakeCuda
     index: int
-    pending: list[Callable[[], object]] = field(default_factory=list)  # copies that no stream has waited for
+    # Copies that no stream has waited for.
+    pending: list[Callable[[], object]] = field(default_factory=list)
 
     def record_event(self) -> Event:
         """Return an event after all copies so far."""
@@ -254,7 +290,9 @@ class Stream:
 
     def synchronize(self) -> None:
         """Wait for the stream, which is an error if it is captured."""
-        if self.cuda.failure or (self.cuda.capture is not None and self.cuda.capture.stream is self):
+        if self.cuda.failure or (
+            self.cuda.capture is not None and self.cuda.capture.stream is self
+        ):
             self.cuda._require(self.index)
 
 
@@ -267,10 +305,14 @@ class Event:
     stream: Stream | None = None  # the first one
 
     def record(self, stream: Stream | None = None) -> None:
-        """Note the time, and the stream, always of the same GPU, on which nothing but copies is ever outstanding."""
+        """Note the time, and the stream, always of the same GPU, on which nothing but copies is
+        ever outstanding.
+        """
         stream = stream or self.cuda.current_stream()
         stream.synchronize()
-        assert self.stream is None or self.stream.index == stream.index, "Event device does not match the stream's"
+        assert self.stream is None or self.stream.index == stream.index, (
+            "Event device does not match the stream's"
+        )
         self.ms, self.stream = self.cuda.clock_ms, stream
 
     def query(self) -> bool:
@@ -292,16 +334,21 @@ class Capture:
     """A `torch.cuda.CUDAGraph`."""
 
     cuda: FakeCuda
-    calls: list[tuple[Callable[[], Any], Any, list[Any]]] = field(default_factory=list)  # with result and arguments
+    # With result and arguments.
+    calls: list[tuple[Callable[[], Any], Any, list[Any]]] = field(default_factory=list)
     broken: bool = False
     thread: int = 0
     stream: Any = None
     pool: Any = None
 
     def end(self) -> None:
-        """Raise if the capture was ended by another thread; overwrite all results, as none was computed."""
+        """Raise if the capture was ended by another thread; overwrite all results, as none was
+        computed.
+        """
         if self.broken:
-            raise torch.AcceleratorError("CUDA error: operation failed due to a previous error during capture", 901)
+            raise torch.AcceleratorError(
+                "CUDA error: operation failed due to a previous error during capture", 901
+            )
         if not self.calls:
             warnings.warn(_EMPTY, stacklevel=2)
         self.cuda.reserved[self.stream.index] += sum(result.nbytes for result in self._results())
@@ -323,7 +370,9 @@ class Capture:
 
     @torch.inference_mode()  # in which the tensors may have been made
     def replay(self) -> None:
-        """Compute all results again, in their memory, and overwrite those of other graphs in its pool."""
+        """Compute all results again, in their memory, and overwrite those of other graphs in its
+        pool.
+        """
         self.cuda._require(self.stream.index)
         for other in self.cuda.captures:
             if other.pool is not None and other.pool is self.pool and other is not self:
@@ -364,7 +413,11 @@ class GpuTensor(torch.Tensor):
     @staticmethod
     def __new__(cls: Any, values: torch.Tensor, cuda: FakeCuda, index: int) -> GpuTensor:
         made: GpuTensor = torch.Tensor._make_wrapper_subclass(
-            cls, values.shape, strides=values.stride(), storage_offset=values.storage_offset(), dtype=values.dtype
+            cls,
+            values.shape,
+            strides=values.stride(),
+            storage_offset=values.storage_offset(),
+            dtype=values.dtype,
         )
         made.values, made.cuda_of, made.index = values, cuda, index
         made.streams = []
@@ -401,7 +454,9 @@ class GpuTensor(torch.Tensor):
         result = cuda.run(index, lambda: op(*args, **kwargs), inputs)
         wrappers = {id(one.values): one for one in own}  # of what an operation in place returns
 
-        on_host = {id(one) for one in tree_leaves((args, kwargs)) if isinstance(one, torch.Tensor)} - {*map(id, inputs)}
+        on_host = {
+            id(one) for one in tree_leaves((args, kwargs)) if isinstance(one, torch.Tensor)
+        } - {*map(id, inputs)}
 
         def wrapped(one: Any) -> Any:
             if not isinstance(one, torch.Tensor) or id(one) in on_host:

@@ -20,7 +20,14 @@ TWO_GPUS = [
 
 @pytest.fixture
 def nothing_chosen(monkeypatch: pytest.MonkeyPatch) -> None:
-    for name in (GPUS, EGL_DEVICE, "MUJOCO_GL", "DISPLAY", "LP_NUM_THREADS", *graphics.VULKAN_DRIVERS):
+    for name in (
+        GPUS,
+        EGL_DEVICE,
+        "MUJOCO_GL",
+        "DISPLAY",
+        "LP_NUM_THREADS",
+        *graphics.VULKAN_DRIVERS,
+    ):
         monkeypatch.setenv(name, "")  # so that what the test sets is undone
         monkeypatch.delenv(name)
     monkeypatch.setattr(graphics, "devices", lambda: TWO_GPUS)

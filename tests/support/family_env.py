@@ -31,30 +31,51 @@ class Desk(EvalEnv):
     @property
     def contract(self) -> Contract:
         cameras = dict.fromkeys(("front", "wrist", "top"), CameraSpec(SIDE, SIDE))
-        return Contract(cameras, {name: StateSpec(dim) for name, dim in STATES.items()}, gripper=True, instruction=True)
+        return Contract(
+            cameras,
+            {name: StateSpec(dim) for name, dim in STATES.items()},
+            gripper=True,
+            instruction=True,
+        )
 
     @property
     def instruction(self) -> str:
         return "pick up the cube"
 
-    def reset(self, *, seed: int, options: Mapping[str, Any] | None = None) -> tuple[Obs, dict[str, Any]]:
+    def reset(
+        self, *, seed: int, options: Mapping[str, Any] | None = None
+    ) -> tuple[Obs, dict[str, Any]]:
         self._rng, self._steps = np.random.default_rng(seed), 0
         return self._look(), {}
 
     def step(self, act: Act) -> tuple[Obs, float, bool, bool, dict[str, Any]]:
         self._steps += 1
-        return self._look(), 0.0, False, self._steps == self.max_steps, {"success": self._steps == 2}
+        return (
+            self._look(),
+            0.0,
+            False,
+            self._steps == self.max_steps,
+            {"success": self._steps == 2},
+        )
 
     def close(self) -> None:
         self._steps = 0
 
     def _look(self) -> Obs:
-        cameras = {name: self._rng.integers(0, 256, (SIDE, SIDE, 3), np.uint8) for name in self.contract.cameras or {}}
-        state = {name: self._rng.uniform(-0.1, 0.1, dim).astype(np.float32) for name, dim in STATES.items()}
+        cameras = {
+            name: self._rng.integers(0, 256, (SIDE, SIDE, 3), np.uint8)
+            for name in self.contract.cameras or {}
+        }
+        state = {
+            name: self._rng.uniform(-0.1, 0.1, dim).astype(np.float32)
+            for name, dim in STATES.items()
+        }
         return Obs(cameras, 0.5, state, {GOAL_IMAGE: cameras["front"]})
 
 
-def play(url: str, transport: TransportName, seed: int, steps: int = 3) -> tuple[str, list[np.ndarray]]:
+def play(
+    url: str, transport: TransportName, seed: int, steps: int = 3
+) -> tuple[str, list[np.ndarray]]:
     """The transport that carried it, and the actions of an episode's beginning."""
     with Desk() as env, RemoteAgent(url, transport=transport, codec="raw", timeout_s=120) as agent:
         obs, _ = env.reset(seed=seed)

@@ -7,8 +7,12 @@ from pathlib import Path
 
 from vlagents_ray.registry import entries
 
-# folder -> the packages without which its tests cannot be imported; the authors' source may come from a checkout
-_NEEDS = {name: entry.needs[bool(entry.checkouts) :] for name, entry in (entries("policies") | entries("envs")).items()}
+# folder -> the packages without which its tests cannot be imported; the authors' source may come
+# from a checkout
+_NEEDS = {
+    name: entry.needs[bool(entry.checkouts) :]
+    for name, entry in (entries("policies") | entries("envs")).items()
+}
 _NEEDS |= {
     "arro": ("transformers", "torch"),
     "ros": ("rclpy",),
@@ -17,6 +21,8 @@ _NEEDS |= {
 
 
 def not_here(families: Path) -> list[str]:
-    """Return the names of the folders in `families` whose tests cannot be imported in this environment."""
+    """Return the names of the folders in `families` whose tests cannot be imported in this
+    environment.
+    """
     folders = {test.parent.name for test in families.glob("*/test_*.py")}
     return [folder for folder in folders if not all(map(importlib.util.find_spec, _NEEDS[folder]))]

@@ -12,10 +12,24 @@ READ_ONLY = "mount --bind '{folder}' '{folder}' && mount -o remount,ro,bind '{fo
 _HERE = Path(__file__).parent
 
 
-def python_on(mount: str, folder: Path, code: str, *words: str, **options: str) -> subprocess.CompletedProcess[str]:
-    """Run `code` (`sys.argv[1]` is the folder, `words` follow) where `mount` was done to it. Needs root."""
+def python_on(
+    mount: str, folder: Path, code: str, *words: str, **options: str
+) -> subprocess.CompletedProcess[str]:
+    """Run `code` (`sys.argv[1]` is the folder, `words` follow) where `mount` was done to it.
+    Needs root.
+    """
     mounted = mount.format(folder=folder, **options)
-    command = ["unshare", "--mount", "sh", "-c", f'{mounted} && exec "$@"', "sh", sys.executable, "-c", code]
+    command = [
+        "unshare",
+        "--mount",
+        "sh",
+        "-c",
+        f'{mounted} && exec "$@"',
+        "sh",
+        sys.executable,
+        "-c",
+        code,
+    ]
     path = os.pathsep.join((str(_HERE), str(_HERE.parents[1])))
     return subprocess.run(
         [*command, str(folder), *words],

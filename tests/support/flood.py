@@ -1,6 +1,7 @@
 """A keyed replica in a process of its own, and one that floods it.
 
-`flood.py serve`, `flood.py haproxy PORT`, `flood.py gateways`, `flood.py page`, and `flood.py attacks`.
+`flood.py serve`, `flood.py haproxy PORT`, `flood.py gateways`, `flood.py page`, and `flood.py
+attacks`.
 """
 
 from __future__ import annotations
@@ -114,7 +115,9 @@ def serve() -> None:
         _serve_replica(engine, keys, own, near, plasma)
 
 
-def _serve_replica(engine: Engine, keys: Keys, own: WebSocketServer, near: ShmServer, plasma: PlasmaServer) -> None:
+def _serve_replica(
+    engine: Engine, keys: Keys, own: WebSocketServer, near: ShmServer, plasma: PlasmaServer
+) -> None:
     limits = Limits()
     for endpoint in (own, near, plasma):
         endpoint.open()
@@ -159,10 +162,13 @@ def _haproxy(replica: int) -> Iterator[int]:
 
 
 def serve_haproxy(replica: int) -> None:
-    """Run HAProxy with the settings that Serve writes, in front of a replica's port; print its own port as JSON."""
+    """Run HAProxy with the settings that Serve writes, in front of a replica's port; print its
+    own port as JSON.
+    """
     with tempfile.TemporaryDirectory(dir="/tmp") as name:
         folder, port = Path(name), free_port()
-        os.environ.update(ingress_environment(folder, str(haproxy_binary())))  # Serve reads it when it is imported
+        # Serve reads it when it is imported.
+        os.environ.update(ingress_environment(folder, str(haproxy_binary())))
         from ray.serve._private.haproxy import (
             BackendConfig,
             HAProxyApi,
@@ -175,11 +181,15 @@ def serve_haproxy(replica: int) -> None:
         replicas = [ServerConfig("SERVE_REPLICA_app-Policy-1", "127.0.0.1", replica)]
         backend = BackendConfig("http-app", "/", servers=replicas, app_name="app")
         config = HAProxyConfig(
-            http_options=HTTPOptions(host="127.0.0.1", port=port), has_received_routes=True, has_received_servers=True
+            http_options=HTTPOptions(host="127.0.0.1", port=port),
+            has_received_routes=True,
+            has_received_servers=True,
         )
         api = HAProxyApi(config, {"app": backend})
         api._generate_config_file_internal()
-        with subprocess.Popen([get_haproxy_binary(), "-db", "-f", api.config_file_path, "-dR"]) as proxy:
+        with subprocess.Popen(
+            [get_haproxy_binary(), "-db", "-f", api.config_file_path, "-dR"]
+        ) as proxy:
             wait_for(lambda: _is_healthy(port), 30)
             print(json.dumps({"port": port}), flush=True)
             sys.stdin.read()
@@ -207,7 +217,11 @@ def serve_gateways() -> None:
     limits = Limits()
     gr00t._MESSAGE_S = vlagents._FRAME_S = lerobot_dialect._UPLOAD_S = SLOW_S
     dialects, ports = [], {}
-    for name, check in (("gr00t", partial(keys.check, app="app")), ("vlagents", NoKey.OPEN), ("lerobot", NoKey.OPEN)):
+    for name, check in (
+        ("gr00t", partial(keys.check, app="app")),
+        ("vlagents", NoKey.OPEN),
+        ("lerobot", NoKey.OPEN),
+    ):
         admission = Admission(GATEWAYS_IN_FLIGHT)
         context = GatewayContext("app", _no_replica, limits, 100, 600.0, None, check, admission)
         cls = dialect_class(name)
@@ -240,7 +254,9 @@ def _jpeg() -> bytes:
 
 def _frame(op: str = "reset") -> bytes:
     seen = [{"cameras": {"front": {"$": ["img", i]}}} for i in range(IMAGES)]
-    return b"".join(frame_layout.pack({"op": op, "obs": seen[0], "history": seen[1:]}, [_jpeg()] * IMAGES))
+    return b"".join(
+        frame_layout.pack({"op": op, "obs": seen[0], "history": seen[1:]}, [_jpeg()] * IMAGES)
+    )
 
 
 def _header() -> bytes:
@@ -253,7 +269,9 @@ def _allowed_header() -> bytes:
     """The longest header with the most values that a server parses."""
     text = "\\u00e9" * 140_000
     numbers = ",".join(["1"] * (frame_layout.VALUES - 20))
-    return _assembled(f'{{"op":"act","obs":{{"info":{{"t":"{text}","x":[{numbers}]}}}},"blobs":[]}}')
+    return _assembled(
+        f'{{"op":"act","obs":{{"info":{{"t":"{text}","x":[{numbers}]}}}},"blobs":[]}}'
+    )
 
 
 def _names() -> bytes:
@@ -283,7 +301,9 @@ def _raw_frame() -> bytes:
 def _hostile(name: str) -> bytes:
     """A small image whose decoding would take seconds, or as long as its structure may."""
     seen = {"cameras": {"front": {"$": ["img", 0]}}}
-    return b"".join(frame_layout.pack({"op": "reset", "obs": seen}, [hostile_images.FILES[name](200_000)]))
+    return b"".join(
+        frame_layout.pack({"op": "reset", "obs": seen}, [hostile_images.FILES[name](200_000)])
+    )
 
 
 def _probe() -> bytes:
@@ -313,7 +333,9 @@ def _form() -> bytes:
 
 
 def _of_openvla() -> bytes:
-    return json_numpy.dumps({"image": np.zeros((HEIGHT, WIDTH, 3), np.uint8), "instruction": "x"}).encode()
+    return json_numpy.dumps(
+        {"image": np.zeros((HEIGHT, WIDTH, 3), np.uint8), "instruction": "x"}
+    ).encode()
 
 
 Where = dict[str, Any]
@@ -334,13 +356,17 @@ def address_of(path: str, where: Where) -> tuple[int, str]:
 @contextlib.contextmanager
 def connected(path: str, where: Where) -> Iterator[socket.socket]:
     """A connection before its handshake."""
-    with socket.create_connection(("127.0.0.1", address_of(path, where)[0]), timeout=5) as connection:
+    with socket.create_connection(
+        ("127.0.0.1", address_of(path, where)[0]), timeout=5
+    ) as connection:
         yield connection
 
 
 @contextlib.contextmanager
 def opened(path: str, where: Where, key: str) -> Iterator[tuple[socket.socket, bytes]]:
-    """A WebSocket, which offers compression, and the answer to its handshake; `OSError` if it is refused."""
+    """A WebSocket, which offers compression, and the answer to its handshake; `OSError` if it is
+    refused.
+    """
     port, place = address_of(path, where)
     with connected(path, where) as connection:
         protocol = ClientProtocol(
@@ -362,7 +388,8 @@ def opened(path: str, where: Where, key: str) -> Iterator[tuple[socket.socket, b
 
 def _websocket(path: str) -> Attack:
     def attack(message: bytes, where: Where, key: str, end: float) -> None:
-        head = bytes([0x82, 0x80 | 127]) + struct.pack(">Q", len(message)) + bytes(4)  # a mask of zeros
+        # A mask of zeros.
+        head = bytes([0x82, 0x80 | 127]) + struct.pack(">Q", len(message)) + bytes(4)
         with opened(path, where, key) as (connection, _):
             threading.Thread(target=_drain, args=(connection,), daemon=True).start()
             while (left_s := end - time.monotonic()) > 0:
@@ -376,7 +403,8 @@ def _websocket(path: str) -> Attack:
 def _post(path: str, kind: str) -> Attack:
     def attack(content: bytes, where: Where, key: str, end: float) -> None:
         head = (
-            f"POST {path} HTTP/1.1\r\nhost: localhost\r\nauthorization: Bearer {key}\r\nx-session-id: s\r\n"
+            f"POST {path} HTTP/1.1\r\nhost: localhost\r\nauthorization: Bearer "
+            f"{key}\r\nx-session-id: s\r\n"
             f"content-type: {kind}\r\ncontent-length: {len(content)}\r\n\r\n"
         ).encode()
         with socket.create_connection(("127.0.0.1", where["port"]), timeout=5) as connection:
@@ -406,7 +434,8 @@ def _shared_memory(message: bytes, where: Where, key: str, end: float) -> None:
         threading.Thread(target=_drain, args=(connection,), daemon=True).start()
         head = LocalAddress.REQUEST.pack(0, 0, len(message))
         socket.send_fds(connection, [head], [descriptor])
-        while time.monotonic() < end:  # blocking, as poll() calls such a socket writable while its peer reads nothing
+        # blocking, as poll() calls such a socket writable while its peer reads nothing.
+        while time.monotonic() < end:
             connection.send(head)
 
 
@@ -437,8 +466,11 @@ PARTS: dict[str, Callable[[], bytes]] = {
     "chunks": partial(_hostile, "PNG: empty chunks"),
     "rows of no columns": partial(_hostile, "PNG: no columns"),
 }
-"""The largest message in each part of the grammar of a frame; "images" is the largest that each way takes."""
-FRAMES = ("own port", "WS /v1/stream", "POST /v1/reset, frame", "shared memory")  # the ways that take a frame
+"""The largest message in each part of the grammar of a frame; "images" is the largest that each
+way takes.
+"""
+# The ways that take a frame.
+FRAMES = ("own port", "WS /v1/stream", "POST /v1/reset, frame", "shared memory")
 
 
 def _masked(first: int, payload: bytes = b"") -> bytes:
@@ -459,7 +491,10 @@ PART_OF_A_MESSAGE = frame_head(15 * 2**20, bytes(4)) + bytes(2 * 2**20)
 BEFORE_A_KEY: dict[str, tuple[bytes, bool]] = {
     "nothing": (b"", True),
     "half a handshake": (HANDSHAKE, True),
-    "a refused handshake": (HANDSHAKE + b"Connection: Upgrade\r\n" + b"a: b\r\n" * 2000 + b"\r\n", False),
+    "a refused handshake": (
+        HANDSHAKE + b"Connection: Upgrade\r\n" + b"a: b\r\n" * 2000 + b"\r\n",
+        False,
+    ),
     "closed at once": (b"", False),
 }
 # What it sends with a key: once, and then it waits; or repeatedly.
@@ -477,13 +512,17 @@ REPEATED: dict[str, Callable[[], bytes]] = {
 }
 DRIPPED = "a message byte by byte"
 BEHAVIOURS = [*BEFORE_A_KEY, *ONCE, DRIPPED, *REPEATED]
-WEBSOCKETS = {way: way.removeprefix("WS ") for way in WAYS if way.startswith("WS ") and "probes" not in way}
+WEBSOCKETS = {
+    way: way.removeprefix("WS ") for way in WAYS if way.startswith("WS ") and "probes" not in way
+}
 WEBSOCKETS["own port"] = "own"
 
 
 PAGES = {"page of an evaluation": "/v1/live"}
 # What only a viewer of a page sends.
-OF_VIEWERS: dict[str, Callable[[], bytes]] = {"requests of viewers": lambda: _masked(0x81, b'{"shown": []}')}
+OF_VIEWERS: dict[str, Callable[[], bytes]] = {
+    "requests of viewers": lambda: _masked(0x81, b'{"shown": []}')
+}
 
 
 def misbehave(path: str, behaviour: str, where: Where, key: str, end: float) -> None:
@@ -518,7 +557,10 @@ def misbehave(path: str, behaviour: str, where: Where, key: str, end: float) -> 
 
 
 # Routes behind HAProxy: the replica's own, and a dialect's.
-HTTP = {"HAProxy, POST /v1/act": ("/v1/act", CONTENT_TYPE), "HAProxy, POST /act": ("/act", "application/json")}
+HTTP = {
+    "HAProxy, POST /v1/act": ("/v1/act", CONTENT_TYPE),
+    "HAProxy, POST /act": ("/act", "application/json"),
+}
 
 
 def _request(way: str, key: str, *fields: str) -> bytes:
@@ -557,8 +599,12 @@ HTTP_BEHAVIOURS = {
     "nothing": HttpBehaviour(lambda _way, _key: b""),
     "closed at once": HttpBehaviour(lambda _way, _key: b"", waits=False),
     "half a head": HttpBehaviour(lambda way, key: _request(way, key)[:-2]),
-    "a head byte by byte": HttpBehaviour(lambda way, key: _request(way, key)[:-2], lambda _way, _key: b"a", 0.05),
-    "a head that is too long": HttpBehaviour(lambda way, key: _request(way, key, *[_HEADER_FIELD] * 100)),
+    "a head byte by byte": HttpBehaviour(
+        lambda way, key: _request(way, key)[:-2], lambda _way, _key: b"a", 0.05
+    ),
+    "a head that is too long": HttpBehaviour(
+        lambda way, key: _request(way, key, *[_HEADER_FIELD] * 100)
+    ),
     "requests without a key": HttpBehaviour(
         lambda _way, _key: b"", lambda way, _key: _with_content(way, "wrong", b"x") * 100, 0.01
     ),
@@ -566,23 +612,33 @@ HTTP_BEHAVIOURS = {
         lambda way, _key: _request(way, "wrong", _LARGE), lambda _way, _key: bytes(2**18)
     ),
     "half a message": HttpBehaviour(lambda way, key: _request(way, key, _LARGE) + bytes(2 * 2**20)),
-    DRIPPED: HttpBehaviour(lambda way, key: _request(way, key, _LARGE), lambda _way, _key: b"x", 0.05),
-    "chunks without an end": HttpBehaviour(
-        lambda way, key: _request(way, key, "transfer-encoding: chunked"), lambda _way, _key: b"1\r\nx\r\n" * 1000
+    DRIPPED: HttpBehaviour(
+        lambda way, key: _request(way, key, _LARGE), lambda _way, _key: b"x", 0.05
     ),
-    "small requests": HttpBehaviour(lambda _way, _key: b"", lambda way, key: _with_content(way, key, b"x") * 100, 0.01),
-    "small requests by reconnects": HttpBehaviour(lambda way, key: _with_content(way, key, b"x"), waits=False),
+    "chunks without an end": HttpBehaviour(
+        lambda way, key: _request(way, key, "transfer-encoding: chunked"),
+        lambda _way, _key: b"1\r\nx\r\n" * 1000,
+    ),
+    "small requests": HttpBehaviour(
+        lambda _way, _key: b"", lambda way, key: _with_content(way, key, b"x") * 100, 0.01
+    ),
+    "small requests by reconnects": HttpBehaviour(
+        lambda way, key: _with_content(way, key, b"x"), waits=False
+    ),
     "a continuation that is awaited": HttpBehaviour(
         lambda way, key: _request(way, key, _LARGE, "expect: 100-continue")
     ),
     "a refused upgrade": HttpBehaviour(
-        lambda way, key: _request(way, key, "connection: upgrade", "upgrade: websocket"), waits=False
+        lambda way, key: _request(way, key, "connection: upgrade", "upgrade: websocket"),
+        waits=False,
     ),
 }
 
 
 def misbehave_over_http(way: str, name: str, where: Where, end: float) -> None:
-    """Behave in that way over one connection to HAProxy, until it ends the connection, or until the `end`."""
+    """Behave in that way over one connection to HAProxy, until it ends the connection, or until
+    the `end`.
+    """
     behaviour, key = HTTP_BEHAVIOURS[name], key_of(way)
     with socket.create_connection(("127.0.0.1", where["proxied"]), timeout=5) as connection:
         connection.settimeout(max(0.01, end - time.monotonic()))
@@ -602,11 +658,18 @@ def misbehave_over_http(way: str, name: str, where: Where, end: float) -> None:
 @contextlib.contextmanager
 def http_robot(where: Where) -> Iterator[Callable[[], None]]:
     """An act of a robot over HTTP through HAProxy, in a session of its own."""
-    headers = {"authorization": "Bearer robot", "content-type": CONTENT_TYPE, "x-session-id": "robot"}
-    with contextlib.closing(HTTPConnection("127.0.0.1", where["proxied"], timeout=60)) as connection:
+    headers = {
+        "authorization": "Bearer robot",
+        "content-type": CONTENT_TYPE,
+        "x-session-id": "robot",
+    }
+    with contextlib.closing(
+        HTTPConnection("127.0.0.1", where["proxied"], timeout=60)
+    ) as connection:
 
         def send(op: Op) -> None:
-            # As clients with a pool of connections do: HAProxy ends one that is idle, as between two rows.
+            # As clients with a pool of connections do: HAProxy ends one that is idle, as between
+            # two rows.
             if connection.sock is not None and select.select([connection.sock], [], [], 0)[0]:
                 connection.close()
             connection.request("POST", f"/v1/{op}", encode_requests([Request(op, OBS)]), headers)
@@ -620,7 +683,9 @@ def http_robot(where: Where) -> Iterator[Callable[[], None]]:
 
 @dataclass(frozen=True)
 class Behaviour:
-    """What a client of a gateway sends over a connection: once, then a part again and again, or byte by byte."""
+    """What a client of a gateway sends over a connection: once, then a part again and again, or
+    byte by byte.
+    """
 
     once: Callable[[str], bytes]  # the first bytes, with a key
     repeated: bytes | Callable[[int], bytes] = b""  # a function gets the number of the repetition
@@ -635,7 +700,9 @@ def _zmtp(content: bytes = b"") -> bytes:
 
 
 def _gr00t(key: str, **more: Any) -> bytes:
-    return zmtp.write_message([b"", gr00t_wire.pack({"endpoint": "ping", "api_token": key, **more})])
+    return zmtp.write_message(
+        [b"", gr00t_wire.pack({"endpoint": "ping", "api_token": key, **more})]
+    )
 
 
 _HALF = b"\x02" + struct.pack(">Q", 60 * 2**20) + bytes(50 * 2**20)
@@ -647,11 +714,15 @@ _OBSERVE = "SendObservations"
 
 
 def _http2_frame(kind: int, flags: int, stream: int, payload: bytes = b"") -> bytes:
-    return len(payload).to_bytes(3, "big") + bytes([kind, flags]) + stream.to_bytes(4, "big") + payload
+    return (
+        len(payload).to_bytes(3, "big") + bytes([kind, flags]) + stream.to_bytes(4, "big") + payload
+    )
 
 
 def _grpc_head(stream: int, method: str, *, is_complete: bool = True) -> bytes:
-    """The HEADERS of a request, each as a literal without an index; without its end, another frame must follow."""
+    """The HEADERS of a request, each as a literal without an index; without its end, another
+    frame must follow.
+    """
     headers = {
         ":method": "POST",
         ":scheme": "http",
@@ -673,11 +744,15 @@ def _ready(stream: int) -> bytes:
 
 def _readies(repetition: int) -> bytes:
     """Fifty complete requests, each on its own stream."""
-    return b"".join(_ready(stream) for stream in range(100 * repetition + 1, 100 * repetition + 101, 2))
+    return b"".join(
+        _ready(stream) for stream in range(100 * repetition + 1, 100 * repetition + 101, 2)
+    )
 
 
 def _part_of_an_observation(repetition: int) -> bytes:
-    """Nothing at first, while `Ready` is answered; then 9 kB of a message of 1 MiB; then nothing."""
+    """Nothing at first, while `Ready` is answered; then 9 kB of a message of 1 MiB; then
+    nothing.
+    """
     if repetition != 1:
         return b""
     return _grpc_head(3, _OBSERVE) + _http2_frame(0, 0, 3, _GRPC_HALF + bytes(9000))
@@ -691,7 +766,10 @@ def _bytes_of_an_observation(repetition: int) -> bytes:
 def _cancelled(repetition: int) -> bytes:
     """Fifty requests that are cancelled at once."""
     streams = range(100 * repetition + 1, 100 * repetition + 101, 2)
-    return b"".join(_grpc_head(stream, _READY) + _http2_frame(3, 0, stream, bytes(3) + b"\x08") for stream in streams)
+    return b"".join(
+        _grpc_head(stream, _READY) + _http2_frame(3, 0, stream, bytes(3) + b"\x08")
+        for stream in streams
+    )
 
 
 _GRPC_HALF = b"\0" + struct.pack(">I", 2**20)  # the head of a message of 1 MiB
@@ -708,15 +786,21 @@ GATEWAYS: dict[str, dict[str, Behaviour]] = {
     "gr00t": {
         **_OF_ANY,
         "half a handshake": Behaviour(lambda _: zmtp.GREETING[:40]),
-        "a refused handshake": Behaviour(lambda _: b"\xff" + bytes(8) + b"\x7f\x01\x05\x00\x00", waits=False),
+        "a refused handshake": Behaviour(
+            lambda _: b"\xff" + bytes(8) + b"\x7f\x01\x05\x00\x00", waits=False
+        ),
         "half a message": Behaviour(lambda _: _zmtp(_HALF)),
         "one part of many": Behaviour(lambda _: _zmtp(), _EMPTY_PARTS),
-        "parts of a message": Behaviour(lambda _: _zmtp(), b"\x03" + struct.pack(">Q", 2**20) + bytes(2**20)),
+        "parts of a message": Behaviour(
+            lambda _: _zmtp(), b"\x03" + struct.pack(">Q", 2**20) + bytes(2**20)
+        ),
         "pings": Behaviour(lambda _: _zmtp(), _ZMQ_PING * 1000),
         "messages with a wrong key": Behaviour(lambda _: _zmtp(), _gr00t("wrong") * 10),
         "empty messages": Behaviour(lambda _: _zmtp(), bytes(2) * 1000),
         "half a message, with a key": Behaviour(lambda key: _zmtp(_gr00t(key) + _HALF)),
-        "a message byte by byte, with a key": Behaviour(lambda key: _zmtp(_gr00t(key) + _HALF[:9]), b"x", 0.05),
+        "a message byte by byte, with a key": Behaviour(
+            lambda key: _zmtp(_gr00t(key) + _HALF[:9]), b"x", 0.05
+        ),
         "one part of many, with a key": Behaviour(lambda key: _zmtp(_gr00t(key)), _EMPTY_PARTS),
         "a key over its rate": Behaviour(lambda key: _zmtp(_gr00t(key)), b"key"),
     },
@@ -737,28 +821,40 @@ GATEWAYS: dict[str, dict[str, Behaviour]] = {
         "requests": Behaviour(lambda _: _HTTP2, _readies),
         "requests by reconnects": Behaviour(lambda _: _HTTP2 + _readies(0), waits=False),
         "cancelled requests": Behaviour(lambda _: _HTTP2, _cancelled),
-        "cancelled requests by reconnects": Behaviour(lambda _: _HTTP2 + _cancelled(0), waits=False),
+        "cancelled requests by reconnects": Behaviour(
+            lambda _: _HTTP2 + _cancelled(0), waits=False
+        ),
         "half a head": Behaviour(lambda _: _HTTP2 + _grpc_head(1, _READY, is_complete=False)),
         "half a message": Behaviour(lambda _: _HTTP2 + _ready(1), _part_of_an_observation, 0.05),
-        "a message byte by byte": Behaviour(lambda _: _HTTP2 + _ready(1), _bytes_of_an_observation, 0.05),
+        "a message byte by byte": Behaviour(
+            lambda _: _HTTP2 + _ready(1), _bytes_of_an_observation, 0.05
+        ),
         UPLOADS: Behaviour(lambda _: b""),
     },
 }
 
 
 def _upload_without_end(where: Where, end: float) -> None:
-    """Send the parts of the largest observation, but the last, as gRPC's flow control takes them."""
+    """Send the parts of the largest observation, but the last, as gRPC's flow control takes
+    them.
+    """
 
     def parts() -> Iterator[bytes]:
         for _ in range(16):
-            yield b"\x08\x02\x12" + b"\x80\x80\x80\x01" + bytes(2**21)  # 2 MiB of data, in the middle
+            # 2 MiB of data, in the middle.
+            yield b"\x08\x02\x12" + b"\x80\x80\x80\x01" + bytes(2**21)
         time.sleep(max(0.0, end - time.monotonic()))
 
     address = f"127.0.0.1:{where['gateways']['lerobot']}"
     options = [("grpc.use_local_subchannel_pool", 1)]  # a connection for each channel
-    with grpc.insecure_channel(address, options=options) as channel, contextlib.suppress(grpc.RpcError):
+    with (
+        grpc.insecure_channel(address, options=options) as channel,
+        contextlib.suppress(grpc.RpcError),
+    ):
         channel.unary_unary(f"/{lerobot.SERVICE}/{_READY}")(b"", timeout=10)
-        channel.stream_unary(f"/{lerobot.SERVICE}/{_OBSERVE}")(parts(), timeout=max(0.1, end - time.monotonic()))
+        channel.stream_unary(f"/{lerobot.SERVICE}/{_OBSERVE}")(
+            parts(), timeout=max(0.1, end - time.monotonic())
+        )
 
 
 def misbehave_at_gateway(way: str, name: str, where: Where, end: float) -> None:
@@ -767,7 +863,9 @@ def misbehave_at_gateway(way: str, name: str, where: Where, end: float) -> None:
         _upload_without_end(where, end)
         return
     behaviour, key = GATEWAYS[way][name], key_of(way)
-    repeated = _gr00t(key, data=bytes(4 * 2**20)) if behaviour.repeated == b"key" else behaviour.repeated
+    repeated = (
+        _gr00t(key, data=bytes(4 * 2**20)) if behaviour.repeated == b"key" else behaviour.repeated
+    )
     with socket.create_connection(("127.0.0.1", where["gateways"][way]), timeout=5) as connection:
         connection.settimeout(max(0.01, end - time.monotonic()))
         connection.sendall(behaviour.once(key))
@@ -783,7 +881,8 @@ def misbehave_at_gateway(way: str, name: str, where: Where, end: float) -> None:
 
 
 _MEMORY = LocalAddress.REQUEST
-# What a process of this user sends to the socket of the shared memory: before a key, or after it, and whether again.
+# What a process of this user sends to the socket of the shared memory: before a key, or after it,
+# and whether again.
 NEAR: dict[str, tuple[bool, bytes, bool]] = {
     "nothing": (False, b"", False),
     "closed at once": (False, b"", False),
@@ -811,7 +910,9 @@ _MANY = 60  # connections of each thread
 
 
 def misbehave_near(way: str, behaviour: str, where: Where, end: float) -> None:
-    """Behave in that way at the socket of shared memory or plasma, until the server ends it, or until the `end`."""
+    """Behave in that way at the socket of shared memory or plasma, until the server ends it, or
+    until the `end`.
+    """
     address = where["plasma"] if way == PLASMA else "\0" + where["local"]["socket"]
     shows_key, message, repeats = (NEAR_PLASMA if way == PLASMA else NEAR)[behaviour]
     with contextlib.ExitStack() as stack:
@@ -832,7 +933,9 @@ def misbehave_near(way: str, behaviour: str, where: Where, end: float) -> None:
 
 
 def attack(way: str, part: str, where: Where, connections: int, seconds: float) -> None:
-    """Send the largest messages, or misbehave, for so long, as fast as bytes are taken, whatever is answered."""
+    """Send the largest messages, or misbehave, for so long, as fast as bytes are taken, whatever
+    is answered.
+    """
     make, send = WAYS.get(way, (bytes, _shared_memory))
     end = time.monotonic() + seconds
     of_way = way in GATEWAYS or way in HTTP or way == PLASMA
@@ -867,7 +970,11 @@ def attack(way: str, part: str, where: Where, connections: int, seconds: float) 
 @contextlib.contextmanager
 def child(*args: str) -> Iterator[subprocess.Popen[str]]:
     """This file as a process, which has printed its first line to `stdout`."""
-    folders = [str(Path(__file__).parents[2]), str(Path(__file__).parent), os.environ.get("PYTHONPATH", "")]
+    folders = [
+        str(Path(__file__).parents[2]),
+        str(Path(__file__).parent),
+        os.environ.get("PYTHONPATH", ""),
+    ]
     process = subprocess.Popen(
         [sys.executable, __file__, *args],
         env={**os.environ, "PYTHONPATH": os.pathsep.join(folders)},
@@ -905,7 +1012,12 @@ def serve_attacks() -> None:
 
 @contextlib.contextmanager
 def attacking(
-    attackers: subprocess.Popen[str], way: str, part: str, where: Where, connections: int, seconds: float = 60.0
+    attackers: subprocess.Popen[str],
+    way: str,
+    part: str,
+    where: Where,
+    connections: int,
+    seconds: float = 60.0,
 ) -> Iterator[None]:
     """Attack for the length of the context, by the process that `serve_attacks` runs in."""
     assert attackers.stdin is not None

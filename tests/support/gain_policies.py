@@ -33,7 +33,9 @@ class Gain(Agent):
 
 
 class Doubled(Gain):
-    """Computes its actions from twice its parameter, which it computes once for each version, in place."""
+    """Computes its actions from twice its parameter, which it computes once for each version, in
+    place.
+    """
 
     def initialize(self) -> None:
         super().initialize()
@@ -100,4 +102,6 @@ def in_child(policy: str = "Gain", **config: Any) -> Any:
 
     here, policy = Path(__file__).parent, policy if ":" in policy else f"gain_policies:{policy}"
     paths = os.pathsep.join([str(here), str(here.parents[1])])
-    return ChildAgent(Child(sys.executable, Settings(policy, config, 16, "1"), {"PYTHONPATH": paths}))
+    return ChildAgent(
+        Child(sys.executable, Settings(policy, config, 16, "1"), {"PYTHONPATH": paths})
+    )

@@ -1,7 +1,8 @@
-"""The golden files of the protocol, for clients in any language: `python tests/support/golden.py` writes them all.
+"""The golden files of the protocol, for clients in any language: `python tests/support/golden.py`
+writes them all.
 
-They lie in clients/golden, whose README.md says what each contains. tests/protocol/test_golden.py holds the codec of
-this package to each frame's bytes, and to the meaning that is written beside it.
+They lie in clients/golden, whose README.md says what each contains. tests/protocol/test_golden.py
+holds the codec of this package to each frame's bytes, and to the meaning that is written beside it.
 """
 
 from __future__ import annotations
@@ -57,24 +58,35 @@ class Golden:
 
 
 def png(pixels: np.ndarray) -> bytes:
-    """A PNG file whose pixels are not compressed, so that every version of zlib writes the same bytes."""
+    """A PNG file whose pixels are not compressed, so that every version of zlib writes the same
+    bytes.
+    """
 
     def chunk(kind: bytes, data: bytes) -> bytes:
-        return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+        return (
+            struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+        )
 
     height, width, _ = pixels.shape
     rows = b"".join(b"\0" + row.tobytes() for row in pixels)
     stored = b"\x78\x01\x01" + struct.pack("<HH", len(rows), len(rows) ^ 0xFFFF) + rows
     stored += struct.pack(">I", zlib.adler32(rows))
     header = struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)
-    return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + chunk(b"IDAT", stored) + chunk(b"IEND", b"")
+    return (
+        b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + chunk(b"IDAT", stored) + chunk(b"IEND", b"")
+    )
 
 
 def meaning(value: Any) -> Any:
     """A value as JSON without blobs; an object with the key `$` names what JSON does not have."""
     if isinstance(value, np.ndarray):
         kind = value.dtype.newbyteorder("<").str
-        return {"$": "array", "dtype": kind, "shape": list(value.shape), "values": meaning(value.ravel().tolist())}
+        return {
+            "$": "array",
+            "dtype": kind,
+            "shape": list(value.shape),
+            "values": meaning(value.ravel().tolist()),
+        }
     if isinstance(value, float) and not math.isfinite(value):
         return {"$": "float", "value": str(value)}
     if isinstance(value, bytes):
@@ -101,7 +113,15 @@ def of_request(request: Request) -> dict[str, Any]:
     default = Request(request.op)
     said = {
         name: value
-        for name in ("instruction", "kwargs", "contract", "session", "rank", "request_id", "deadline_ms")
+        for name in (
+            "instruction",
+            "kwargs",
+            "contract",
+            "session",
+            "rank",
+            "request_id",
+            "deadline_ms",
+        )
         if (value := getattr(request, name)) != getattr(default, name)
     }
     found = {"op": request.op, **meaning(said)}
@@ -120,7 +140,11 @@ def of_reply(reply: Reply) -> dict[str, Any]:
     if reply.error is not None:
         found["error"] = describe_error(reply.error)
     if reply.act is not None:
-        found["act"] = {"action": meaning(reply.act.action), "done": reply.act.done, "info": meaning(reply.act.info)}
+        found["act"] = {
+            "action": meaning(reply.act.action),
+            "done": reply.act.done,
+            "info": meaning(reply.act.info),
+        }
     if reply.info is not None:
         found["info"] = meaning(reply.info)
     if reply.step is not None:
@@ -139,8 +163,18 @@ def frames() -> list[Golden]:
 
 def _requests() -> list[Golden]:
     plain = Obs({"front": PIXELS}, 1.0, {"joints": JOINTS})
-    reset = Request("reset", plain, "push the cube", {"seed": 3}, request_id="r-1", session="robot-1")
-    act = Request("act", plain, request_id="a-1", session="robot-1", rank="simulation", step=STEP, deadline_ms=1500.0)
+    reset = Request(
+        "reset", plain, "push the cube", {"seed": 3}, request_id="r-1", session="robot-1"
+    )
+    act = Request(
+        "act",
+        plain,
+        request_id="a-1",
+        session="robot-1",
+        rank="simulation",
+        step=STEP,
+        deadline_ms=1500.0,
+    )
     kinds = ("|b1", "|i1", "<i2", "<i4", "<i8", "|u1", "<u2", "<u4", "<u8", "<f2", "<f4", "<f8")
     info = {
         "nothing": None,
@@ -167,36 +201,80 @@ def _requests() -> list[Golden]:
         "act": ("an act with a step over 2**53, a deadline and the class of simulations", [act]),
         "act_shortest": ("an act without cameras or state", [Request("act", Obs())]),
         "close": ("a close", [Request("close", session="robot-1", request_id="c-1")]),
-        "values": ("every value that `info` may hold", [Request("act", Obs(info=info), request_id="v")]),
+        "values": (
+            "every value that `info` may hold",
+            [Request("act", Obs(info=info), request_id="v")],
+        ),
         "reset_contract": (
             "a reset with a contract and two earlier observations",
-            [Request("reset", Obs(state={"joints": JOINTS}), "", contract=contract, history=[earlier, Obs()])],
+            [
+                Request(
+                    "reset",
+                    Obs(state={"joints": JOINTS}),
+                    "",
+                    contract=contract,
+                    history=[earlier, Obs()],
+                )
+            ],
         ),
         "several_requests": ("acts of two sessions in one frame", several),
     }
     written = [
-        Golden(name, "requests", says, encode_requests(requests), [of_request(one) for one in requests], by_codec=True)
+        Golden(
+            name,
+            "requests",
+            says,
+            encode_requests(requests),
+            [of_request(one) for one in requests],
+            by_codec=True,
+        )
         for name, (says, requests) in say.items()
     ]
-    return [*written, _with_file("png", png(PIXELS), PIXELS), _with_file("jpeg", JPEG_FILE.read_bytes(), None)]
+    return [
+        *written,
+        _with_file("png", png(PIXELS), PIXELS),
+        _with_file("jpeg", JPEG_FILE.read_bytes(), None),
+    ]
 
 
 def _with_file(format_: str, file: bytes, pixels: np.ndarray | None) -> Golden:
-    obs: dict[str, Any] = {"cameras": {"front": {"$": ["img", 0]}}, "gripper": None, "state": {"joints": [0.5, -1]}}
-    camera: dict[str, Any] = {"$": "image", "format": format_, "base64": base64.b64encode(file).decode()}
+    obs: dict[str, Any] = {
+        "cameras": {"front": {"$": ["img", 0]}},
+        "gripper": None,
+        "state": {"joints": [0.5, -1]},
+    }
+    camera: dict[str, Any] = {
+        "$": "image",
+        "format": format_,
+        "base64": base64.b64encode(file).decode(),
+    }
     if pixels is not None:
         camera["pixels"] = meaning(pixels)
     joints = meaning(np.array([0.5, -1.0], np.float32))
-    means = {"op": "act", "request_id": format_, "obs": {"cameras": {"front": camera}, "gripper": None}}
+    means = {
+        "op": "act",
+        "request_id": format_,
+        "obs": {"cameras": {"front": camera}, "gripper": None},
+    }
     means["obs"] |= {"state": {"joints": joints}, "info": {}}  # type: ignore[operator]
     says = f"an act with a {format_.upper()} file, and a state as a list of numbers"
     return _packed(
-        f"act_{format_}", "requests", says, {"op": "act", "obs": obs, "request_id": format_}, [file], [means]
+        f"act_{format_}",
+        "requests",
+        says,
+        {"op": "act", "obs": obs, "request_id": format_},
+        [file],
+        [means],
     )
 
 
 def _packed(
-    name: str, kind: str, says: str, header: dict[str, Any], blobs: Sequence[bytes] = (), means: Any = None
+    name: str,
+    kind: str,
+    says: str,
+    header: dict[str, Any],
+    blobs: Sequence[bytes] = (),
+    means: Any = None,
 ) -> Golden:
     return Golden(name, kind, says, b"".join(pack(header, list(blobs))), means)
 
@@ -205,23 +283,49 @@ def _replies() -> list[Golden]:
     busy = Overloaded("the replica has no memory left; send it again later")
     busy.retry_after_s = 0.25
     unknown = UnknownSession("session 'robot-1': expired, closed, or never reset; reset it")
-    odd = {"loss": math.nan, "distribution": {"std": np.array([0.5, np.inf], np.float32)}, "raw": b"\x00\xff"}
+    odd = {
+        "loss": math.nan,
+        "distribution": {"std": np.array([0.5, np.inf], np.float32)},
+        "raw": b"\x00\xff",
+    }
     say: dict[str, tuple[str, list[Reply]]] = {
-        "reset_reply": ("the answer to a reset", [Reply("r-1", info={"seed": 3}, step=STEP, timing=TIMING)]),
-        "act_reply": ("a chunk", [Reply("a-1", Act(CHUNK, info=WEIGHTS), step=STEP + 1, timing=TIMING)]),
+        "reset_reply": (
+            "the answer to a reset",
+            [Reply("r-1", info={"seed": 3}, step=STEP, timing=TIMING)],
+        ),
+        "act_reply": (
+            "a chunk",
+            [Reply("a-1", Act(CHUNK, info=WEIGHTS), step=STEP + 1, timing=TIMING)],
+        ),
         "act_reply_one": ("one action, the last", [Reply("", Act(CHUNK[0], done=True))]),
-        "act_reply_info": ("an action with an info of all sorts", [Reply("i", Act(CHUNK[0], info=odd))]),
+        "act_reply_info": (
+            "an action with an info of all sorts",
+            [Reply("i", Act(CHUNK[0], info=odd))],
+        ),
         "close_reply": ("the answer to a close", [Reply("c-1", info={})]),
-        "draining": ("an answer of a replica that stops", [Reply("a-2", Act(CHUNK[0]), step=STEP + 2, draining=True)]),
+        "draining": (
+            "an answer of a replica that stops",
+            [Reply("a-2", Act(CHUNK[0]), step=STEP + 2, draining=True)],
+        ),
         "error": ("an error", [Reply("a-1", error=unknown)]),
         "error_retry": ("an error with a time to wait", [Reply("a-1", error=busy)]),
         "several_replies": (
             "the answers to two requests in one frame, the second of which failed",
-            [Reply("0", Act(CHUNK[0]), step=7), Reply("1", error=NotReset("act before reset; call reset first"))],
+            [
+                Reply("0", Act(CHUNK[0]), step=7),
+                Reply("1", error=NotReset("act before reset; call reset first")),
+            ],
         ),
     }
     return [
-        Golden(name, "replies", says, encode_replies(replies), [of_reply(one) for one in replies], by_codec=True)
+        Golden(
+            name,
+            "replies",
+            says,
+            encode_replies(replies),
+            [of_reply(one) for one in replies],
+            by_codec=True,
+        )
         for name, (says, replies) in say.items()
     ]
 
@@ -259,9 +363,18 @@ def _from_the_future() -> list[Golden]:
 def _malformed() -> list[Golden]:
     good = encode_replies([Reply("a-1", Act(CHUNK), step=1)])
     length = struct.unpack_from("<I", good, 4)[0]
-    far = {"request_id": "", "act": {"action": {"$": ["nd", 1, "<f4", [7]]}, "done": False, "info": {}}}
-    short = {"request_id": "", "act": {"action": {"$": ["nd", 0, "<f4", [2]]}, "done": False, "info": {}}}
-    objects = {"request_id": "", "act": {"action": {"$": ["nd", 0, "|O8", [1]]}, "done": False, "info": {}}}
+    far = {
+        "request_id": "",
+        "act": {"action": {"$": ["nd", 1, "<f4", [7]]}, "done": False, "info": {}},
+    }
+    short = {
+        "request_id": "",
+        "act": {"action": {"$": ["nd", 0, "<f4", [2]]}, "done": False, "info": {}},
+    }
+    objects = {
+        "request_id": "",
+        "act": {"action": {"$": ["nd", 0, "|O8", [1]]}, "done": False, "info": {}},
+    }
 
     def of(header: bytes) -> bytes:
         return b"VLA\x01" + struct.pack("<I", len(header)) + header
@@ -272,7 +385,10 @@ def _malformed() -> list[Golden]:
         "bad_magic": ("another format", b"VLB" + good[3:]),
         "bad_version": ("version 2, which this side does not speak", good[:3] + b"\x02" + good[4:]),
         "bad_header_short": ("it ends inside its header", good[: 8 + length - 3]),
-        "bad_header_long": ("the length of its header is 4 GiB", good[:4] + b"\xff\xff\xff\xff" + good[8:]),
+        "bad_header_long": (
+            "the length of its header is 4 GiB",
+            good[:4] + b"\xff\xff\xff\xff" + good[8:],
+        ),
         "bad_header": ("its header is not JSON", of(b'{"blobs": [}')),
         "bad_header_list": ("its header is no object", of(b"[]")),
         "bad_no_blobs": ("its header has no `blobs`", of(b'{"request_id":""}')),
@@ -306,21 +422,32 @@ def _probes() -> list[Golden]:
 
 
 def documents() -> dict[str, Any]:
-    """The JSON documents of HTTP, by name; clients/schema/v1.json has the schema of each, by the first word."""
+    """The JSON documents of HTTP, by name; clients/schema/v1.json has the schema of each, by the
+    first word.
+    """
     error = UnknownSession("session 'robot-1': expired, closed, or never reset; reset it")
     return {
         "reset_request": {"instruction": "push the cube", "gripper": 1.0, "kwargs": {"seed": 3}},
-        "act_request": {"gripper": 1.0, "state": {"joints": JOINTS.tolist()}, "info": {}, "deadline_ms": 1500},
+        "act_request": {
+            "gripper": 1.0,
+            "state": {"joints": JOINTS.tolist()},
+            "info": {},
+            "deadline_ms": 1500,
+        },
         "act_request_shortest": {},
         "reset_answer": reply_to_json(Reply("r-1", info={"seed": 3}, timing=TIMING)),
         "act_answer": reply_to_json(Reply("a-1", Act(CHUNK[0], info=WEIGHTS), timing=TIMING)),
         "act_answer_chunk": reply_to_json(
-            Reply("a-1", Act(CHUNK, done=True, info={"loss": math.nan, "raw": b"\0"}), timing=TIMING)
+            Reply(
+                "a-1", Act(CHUNK, done=True, info={"loss": math.nan, "raw": b"\0"}), timing=TIMING
+            )
         ),
         "close_answer": reply_to_json(Reply("c-1", info={}, timing=TIMING)),
         "problem": problem(error, "a-1"),
         "problem_overloaded": problem(Overloaded("no memory left; send it again later"), "a-1"),
-        "problem_internal": problem(VLAgentsError("internal error; the server's log has the details"), "a-1"),
+        "problem_internal": problem(
+            VLAgentsError("internal error; the server's log has the details"), "a-1"
+        ),
     }
 
 

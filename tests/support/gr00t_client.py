@@ -1,4 +1,5 @@
-"""A client as GR00T's own `PolicyClient` is (gr00t/policy/server_client.py): a REQ socket, msgpack, .npy files.
+"""A client as GR00T's own `PolicyClient` is (gr00t/policy/server_client.py): a REQ socket, msgpack,
+.npy files.
 
 GR00T is not on PyPI; this follows its code, and its answers are decoded by numpy's own reader.
 """
@@ -25,7 +26,13 @@ def encode(value: Any) -> Any:
 def encode_packed(value: Any) -> Any:
     """As msgpack_numpy does, which GR00T's newest client uses."""
     if isinstance(value, np.ndarray):
-        return {b"nd": True, b"type": value.dtype.str, b"kind": b"", b"shape": value.shape, b"data": value.tobytes()}
+        return {
+            b"nd": True,
+            b"type": value.dtype.str,
+            b"kind": b"",
+            b"shape": value.shape,
+            b"data": value.tobytes(),
+        }
     return value
 
 
@@ -91,7 +98,9 @@ class PolicyClient:
 
     def get_action(self, observation: dict, options: dict | None = None) -> tuple[dict, dict]:
         """N1.6 and newer."""
-        return tuple(self.call_endpoint("get_action", {"observation": observation, "options": options}))
+        return tuple(
+            self.call_endpoint("get_action", {"observation": observation, "options": options})
+        )
 
     def get_action_n15(self, observation: dict) -> dict:
         """N1.5."""

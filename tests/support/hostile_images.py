@@ -19,8 +19,8 @@ def _bits(text: str) -> bytes:
     return int(text, 2).to_bytes(len(text) // 8, "big").replace(b"\xff", b"\xff\0")
 
 
-# One quantisation table; codes "0" for a DC difference of 0, "0" for a run of 16384 to 32767 blocks without AC
-# coefficients, and "10" for the end of a block.
+# One quantisation table; codes "0" for a DC difference of 0, "0" for a run of 16384 to 32767 blocks
+# without AC coefficients, and "10" for the end of a block.
 TABLES = (
     segment(0xDB, b"\0" + b"\1" * 64)
     + segment(0xC4, b"\x00" + bytes([1] + [0] * 15) + b"\0")
@@ -42,7 +42,9 @@ def jpeg(*parts: bytes, height: int = 1024, width: int = 1024, marker: int = 0xC
     """A JPEG of grey pixels, all zero, with more segments or scans behind the first scan."""
     data = _bits("0" * (BLOCKS if marker == 0xC2 else 0) or "010" * BLOCKS)
     first = scan(0, 0 if marker == 0xC2 else 63, data)
-    return b"\xff\xd8" + TABLES + frame(marker, height, width) + first + b"".join(parts) + b"\xff\xd9"
+    return (
+        b"\xff\xd8" + TABLES + frame(marker, height, width) + first + b"".join(parts) + b"\xff\xd9"
+    )
 
 
 EMPTY_SCAN = scan(1, 63, _bits("0" + format(BLOCKS - 2**14, "014b")))
@@ -57,7 +59,9 @@ def _restarts(interval: int, extra: bytes) -> bytes:
     pieces = []
     for number in range(BLOCKS // interval):
         pieces.append(_bits("010" * interval) + bytes((0xFF, 0xD0 | number % 8)) + extra)
-    head = b"\xff\xd8" + TABLES + segment(0xDD, struct.pack(">H", interval)) + frame(0xC0, 1024, 1024)
+    head = (
+        b"\xff\xd8" + TABLES + segment(0xDD, struct.pack(">H", interval)) + frame(0xC0, 1024, 1024)
+    )
     return head + scan(0, 63, b"".join(pieces)[: -2 - len(extra)]) + b"\xff\xd9"
 
 
@@ -73,12 +77,16 @@ JPEGS: dict[str, Callable[[int], bytes]] = {
     "scans": lambda size: jpeg(EMPTY_SCAN * (size // len(EMPTY_SCAN))),
     "scans within the limit": lambda _: jpeg(EMPTY_SCAN * 98),
     "scans without data": lambda size: jpeg(scan(1, 63, b"") * (size // 10)),
-    "arithmetic coding": lambda _: jpeg(scan(1, 63, b"") * 50, marker=0xC2).replace(b"\xff\xc2", b"\xff\xca"),
+    "arithmetic coding": lambda _: jpeg(scan(1, 63, b"") * 50, marker=0xC2).replace(
+        b"\xff\xc2", b"\xff\xca"
+    ),
     "comments first": lambda size: _before_scan(segment(0xFE, b"") * (size // 4)),
     "comments behind a scan": lambda size: jpeg(segment(0xFE, b"") * (size // 4)),
     "tables": lambda size: _before_scan(TABLES * (size // len(TABLES))),
     "tables behind a scan": lambda size: jpeg(TABLES * (size // len(TABLES))),
-    "profiles": lambda size: _before_scan(segment(0xE2, b"ICC_PROFILE\0\1\1" + bytes(60_000)) * (size // 60_000)),
+    "profiles": lambda size: _before_scan(
+        segment(0xE2, b"ICC_PROFILE\0\1\1" + bytes(60_000)) * (size // 60_000)
+    ),
     "fill bytes": lambda size: _before_scan(b"\xff" * size),
     "restart markers": lambda _: _restarts(1, b""),
     "restart markers, twice": lambda _: _restarts(1, b"\xff\xd0" * 20),
@@ -93,7 +101,12 @@ JPEGS: dict[str, Callable[[int], bytes]] = {
 
 
 def chunk(name: bytes, data: bytes) -> bytes:
-    return struct.pack(">I", len(data)) + name + data + struct.pack(">I", zlib.crc32(data, zlib.crc32(name)))
+    return (
+        struct.pack(">I", len(data))
+        + name
+        + data
+        + struct.pack(">I", zlib.crc32(data, zlib.crc32(name)))
+    )
 
 
 def png(
@@ -126,24 +139,42 @@ PNGS: dict[str, Callable[[int], bytes]] = {
     "empty data": lambda size: png(chunk(b"IDAT", b"") * (size // 12)),
     "palettes": lambda size: png(chunk(b"PLTE", bytes(3)) * (size // 15)),
     "profiles": lambda size: png(chunk(b"iCCP", b"a\0\0" + _deflated(2**20 - 1)) * (size // 1100)),
-    "packed text": lambda size: png(chunk(b"zTXt", b"k\0\0" + _deflated(2**20 - 1)) * (size // 1100)),
+    "packed text": lambda size: png(
+        chunk(b"zTXt", b"k\0\0" + _deflated(2**20 - 1)) * (size // 1100)
+    ),
     "text": lambda size: png(*(chunk(b"tEXt", b"k%d\0v" % n) for n in range(size // 20))),
-    "animation": lambda size: png(chunk(b"acTL", struct.pack(">2I", size // 38, 0)) + chunk(b"fcTL", bytes(26))),
+    "animation": lambda size: png(
+        chunk(b"acTL", struct.pack(">2I", size // 38, 0)) + chunk(b"fcTL", bytes(26))
+    ),
     "short chunk behind the data": lambda _: png(after=chunk(b"gAMA", b"")),
-    "no columns": lambda size: png(width=0, height=100 * size, data=chunk(b"IDAT", _deflated(100 * size))),
-    "no rows": lambda size: png(width=100 * size, height=0, data=chunk(b"IDAT", _deflated(100 * size))),
+    "no columns": lambda size: png(
+        width=0, height=100 * size, data=chunk(b"IDAT", _deflated(100 * size))
+    ),
+    "no rows": lambda size: png(
+        width=100 * size, height=0, data=chunk(b"IDAT", _deflated(100 * size))
+    ),
     "more data than pixels": lambda size: png(data=chunk(b"IDAT", _deflated(100 * size))),
     "one column": lambda _: png(height=2**20, width=1),
-    "one column, another filter": lambda _: png(height=2**20, width=1, rows=_filtered(b"\2\4", 2**20, 3)),
+    "one column, another filter": lambda _: png(
+        height=2**20, width=1, rows=_filtered(b"\2\4", 2**20, 3)
+    ),
     "one row": lambda _: png(height=1, width=2**20),
     "filters": lambda _: png(height=1024, width=1024, rows=_filtered(b"\4", 1024, 3072)),
     "filters of 16 bits": lambda _: png(
         height=1024, width=1024, form=(16, 6, 0, 0, 0), rows=_filtered(b"\1\2\3\4", 1024, 8192)
     ),
-    "interlaced": lambda _: png(height=1024, width=1024, form=(8, 2, 0, 0, 1), rows=bytes(3 * 2**20 + 4096)),
-    "interlaced column": lambda _: png(height=2**20, width=1, form=(8, 2, 0, 0, 1), rows=bytes(4 * 2**20)),
+    "interlaced": lambda _: png(
+        height=1024, width=1024, form=(8, 2, 0, 0, 1), rows=bytes(3 * 2**20 + 4096)
+    ),
+    "interlaced column": lambda _: png(
+        height=2**20, width=1, form=(8, 2, 0, 0, 1), rows=bytes(4 * 2**20)
+    ),
     "one bit": lambda _: png(height=1024, width=1024, form=(1, 0, 0, 0, 0), rows=bytes(1024 * 129)),
-    "the form of ours, another filter": lambda _: png(height=1024, width=1024, rows=_filtered(b"\2\2\2\4", 1024, 3072)),
+    "the form of ours, another filter": lambda _: png(
+        height=1024, width=1024, rows=_filtered(b"\2\2\2\4", 1024, 3072)
+    ),
 }
 
-FILES = {f"JPEG: {name}": make for name, make in JPEGS.items()} | {f"PNG: {name}": make for name, make in PNGS.items()}
+FILES = {f"JPEG: {name}": make for name, make in JPEGS.items()} | {
+    f"PNG: {name}": make for name, make in PNGS.items()
+}

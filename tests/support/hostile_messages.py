@@ -1,4 +1,6 @@
-"""Valid messages with small mutations, and answers of a server that is after the memory of a robot's computer."""
+"""Valid messages with small mutations, and answers of a server that is after the memory of a
+robot's computer.
+"""
 
 from __future__ import annotations
 
@@ -10,10 +12,34 @@ import numpy as np
 from vlagents_ray.protocol.frame_layout import pack
 
 _JUNK: list[Any] = [
-    *(None, True, -1, 2**63 - 1, 1e308, float("nan"), float("inf"), "", "x" * 1000, "task", "reset", "\ud7ff"),
+    *(
+        None,
+        True,
+        -1,
+        2**63 - 1,
+        1e308,
+        float("nan"),
+        float("inf"),
+        "",
+        "x" * 1000,
+        "task",
+        "reset",
+        "\ud7ff",
+    ),
     *([], {}, [[[]]], [None], {"a": {"a": {}}}, ["0"] * 8, [0.5] * 8, [1] * 5000),
-    *(np.zeros(0), np.zeros(8), np.full(8, np.nan), np.full(14, np.inf), np.zeros((1, 1, 1, 8)), np.float32(3)),
-    *(np.zeros((4, 4, 3), np.uint8), np.zeros((3, 4, 4), np.uint8), np.zeros((1, 0, 4, 4, 3), np.uint8)),
+    *(
+        np.zeros(0),
+        np.zeros(8),
+        np.full(8, np.nan),
+        np.full(14, np.inf),
+        np.zeros((1, 1, 1, 8)),
+        np.float32(3),
+    ),
+    *(
+        np.zeros((4, 4, 3), np.uint8),
+        np.zeros((3, 4, 4), np.uint8),
+        np.zeros((1, 0, 4, 4, 3), np.uint8),
+    ),
     *(
         np.zeros((2, 4, 4, 3), np.uint8),
         np.zeros((4, 4, 4), np.uint8),
@@ -22,7 +48,8 @@ _JUNK: list[Any] = [
     ),
 ]
 _NAMES = ["", "x", "endpoint", "encoded", "__ndarray__", "__image__", "__numpy__"]
-_LENGTHS = b"\x00\x7f\x80\x90\xc1\xc4\xc6\xc7\xd9\xdb\xdc\xdd\xde\xdf\xff"  # msgpack's own, and extremes
+# msgpack's own, and extremes.
+_LENGTHS = b"\x00\x7f\x80\x90\xc1\xc4\xc6\xc7\xd9\xdb\xdc\xdd\xde\xdf\xff"
 
 
 def mutated(choose: random.Random, frame: bytes) -> bytes:
@@ -32,7 +59,11 @@ def mutated(choose: random.Random, frame: bytes) -> bytes:
         if not data:
             return bytes(choose.randbytes(choose.randint(0, 40)))
         # Faults in the beginning and among the keys do more harm than those in pixels.
-        at = choose.randrange(min(len(data), 160)) if choose.random() < 0.5 else choose.randrange(len(data))
+        at = (
+            choose.randrange(min(len(data), 160))
+            if choose.random() < 0.5
+            else choose.randrange(len(data))
+        )
         kind = choose.randrange(7)
         if kind == 0:
             data[at] ^= 1 << choose.randrange(8)
@@ -54,11 +85,17 @@ def mutated(choose: random.Random, frame: bytes) -> bytes:
 
 
 def changed(choose: random.Random, tree: dict[str, Any]) -> dict[str, Any]:
-    """A copy of `tree` in which one or two values are others, gone, under another key or where they do not belong."""
+    """A copy of `tree` in which one or two values are others, gone, under another key or where
+    they do not belong.
+    """
     copy = _copy(tree)
     for _ in range(choose.randint(1, 2)):
         node = copy
-        while node and choose.random() < 0.6 and (inside := [v for v in node.values() if isinstance(v, dict) and v]):
+        while (
+            node
+            and choose.random() < 0.6
+            and (inside := [v for v in node.values() if isinstance(v, dict) and v])
+        ):
             node = choose.choice(inside)
         if not node:
             continue
@@ -69,9 +106,11 @@ def changed(choose: random.Random, tree: dict[str, Any]) -> dict[str, Any]:
         elif kind == 3:
             del node[key]
         else:
-            node[choose.choice(["", "x", "endpoint", "__ndarray__", "__image__", "__numpy__", key + "/"])] = node.pop(
-                key
-            )
+            node[
+                choose.choice(
+                    ["", "x", "endpoint", "__ndarray__", "__image__", "__numpy__", key + "/"]
+                )
+            ] = node.pop(key)
     return copy
 
 
@@ -80,7 +119,8 @@ def _copy(value: Any) -> Any:
 
 
 # A few bytes that name much.
-ADDED_MB = 400  # most memory that reading one of them may take: three times what a client copies at most
+# Most memory that reading one of them may take: three times what a client copies at most.
+ADDED_MB = 400
 
 
 def _act(info: dict[str, Any], blobs: list[bytes], shape: tuple[int, ...] = (1,)) -> bytes:

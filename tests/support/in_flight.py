@@ -24,7 +24,9 @@ def pending(session_id: str, request: Request, done: Done, **fields: Any) -> Pen
 
 
 def checked(engine: Engine, session_id: str, request: Request, done: Done) -> PendingRequest:
-    """A request that the engine has checked, which raises its errors, and that is not queued yet."""
+    """A request that the engine has checked, which raises its errors, and that is not queued
+    yet.
+    """
     one = pending(session_id, request, done)
     engine.check(one)
     return one
@@ -49,7 +51,9 @@ def answered(engine: Engine, session_id: str, request: Request) -> Reply:
     return asked(engine, session_id, request).get(timeout=30)
 
 
-def send(sender: Sender, requests: Sequence[Request], done: Callable[[list[Reply]], Any]) -> list[PendingRequest]:
+def send(
+    sender: Sender, requests: Sequence[Request], done: Callable[[list[Reply]], Any]
+) -> list[PendingRequest]:
     """Send the requests of a message; `done` gets all replies."""
     message, decoded = sender.message(), Decoded(list(requests), {})
     message.decoded(decoded)

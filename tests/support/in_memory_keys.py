@@ -10,7 +10,9 @@ from vlagents_ray.serve.access.api_keys import Keys
 
 
 class ChangingKeys:
-    """`keys` sees a change when it reads them again, at every request if `api_keys._CHECK_S` is 0."""
+    """`keys` sees a change when it reads them again, at every request if `api_keys._CHECK_S` is
+    0.
+    """
 
     def __init__(self) -> None:
         self._entries: dict[str, dict[str, Any]] = {}
@@ -19,7 +21,9 @@ class ChangingKeys:
 
     def another(self) -> Keys:
         """The same keys, as another process has them."""
-        return Keys(lambda: json.dumps({"keys": list(self._entries.values())}), lambda: self._version)
+        return Keys(
+            lambda: json.dumps({"keys": list(self._entries.values())}), lambda: self._version
+        )
 
     def add(self, name: str, **allowed: Any) -> str:
         """A key of that name; returns what its holder shows."""

@@ -43,7 +43,9 @@ def run_episode(
     """
     observer, batch = EpisodeObserver(), SequentialBatch([env])
     observer.add_action = executed  # type: ignore[method-assign]
-    [outcome] = run_episodes(batch, agent, [agent], [key], **settings, observers=[observer], images=images)
+    [outcome] = run_episodes(
+        batch, agent, [agent], [key], **settings, observers=[observer], images=images
+    )
     if isinstance(outcome, VLAgentsError):
         raise outcome
     if isinstance(outcome, Diverged):
@@ -51,8 +53,12 @@ def run_episode(
     return outcome
 
 
-def play(env: EvalEnv, name: str, agent: Agent | str, *, seed: int = 0, **options: Any) -> EpisodeResult:
-    """The episode of `seed` and the reset's `options`, played by an agent or by an expert, "module:Class"."""
+def play(
+    env: EvalEnv, name: str, agent: Agent | str, *, seed: int = 0, **options: Any
+) -> EpisodeResult:
+    """The episode of `seed` and the reset's `options`, played by an agent or by an expert,
+    "module:Class".
+    """
     if isinstance(agent, str):
         agent = Scripted.from_config({"expert": agent})
     key = EpisodeKey(name, episode=0, seed=seed, settings="")

@@ -16,7 +16,9 @@ from vlagents_ray.evaluate.workers.rollout import Rollout
 from vlagents_ray.interface import Agent
 
 
-def play(config: EvalConfig, make: Callable[[], Agent] = ToZero, *, left_out: Iterable[int] = ()) -> Results:
+def play(
+    config: EvalConfig, make: Callable[[], Agent] = ToZero, *, left_out: Iterable[int] = ()
+) -> Results:
     """Play the plan, apart from the episodes of those numbers, one after another."""
     worker = Rollout(config, lambda _policy: make())
     with Store(config) as store:
@@ -33,25 +35,49 @@ def play(config: EvalConfig, make: Callable[[], Agent] = ToZero, *, left_out: It
                 store.note_env(job.cell.place, report.env)
             if report.worker is not None:
                 store.note_worker(report.worker)
-            store.record(report.result, job.attempt, *save(config.out, job.cell, report.result, report.artifacts))
+            store.record(
+                report.result,
+                job.attempt,
+                *save(config.out, job.cell, report.result, report.artifacts),
+            )
         store.end_run("complete")
     worker.close()
     return Results.load(config.out)
 
 
 _POLICY = {
-    "policy": "name", "policy_url": "url", "policy_config": "config", "policy_options": "options",
-    "checkpoint": "checkpoint", "steps": "steps", "execute": "execute", "codec": "codec", "transport": "transport",
-}  # fmt: skip
-_SUITE = {name: name for name in ("envs", "env_options", "reset_options", "episodes", "seeds", "num_envs")}
-_WORKER = {"cpus_per_worker": "cpus", "gpus_per_worker": "gpus", "threads": "threads", "runtime_env": "runtime_env"}
+    "policy": "name",
+    "policy_url": "url",
+    "policy_config": "config",
+    "policy_options": "options",
+    "checkpoint": "checkpoint",
+    "steps": "steps",
+    "execute": "execute",
+    "codec": "codec",
+    "transport": "transport",
+}
+_SUITE = {
+    name: name for name in ("envs", "env_options", "reset_options", "episodes", "seeds", "num_envs")
+}
+_WORKER = {
+    "cpus_per_worker": "cpus",
+    "gpus_per_worker": "gpus",
+    "threads": "threads",
+    "runtime_env": "runtime_env",
+}
 
 
 def flat_config(**settings: Any) -> EvalConfig:
-    """An evaluation of one policy in one suite, from settings side by side; `seed` is the only seed."""
+    """An evaluation of one policy in one suite, from settings side by side; `seed` is the only
+    seed.
+    """
     if "seed" in settings:
         settings = settings | {"seeds": [settings["seed"]]}
         del settings["seed"]
-    policy, suite, worker = ({one[k]: v for k, v in settings.items() if k in one} for one in (_POLICY, _SUITE, _WORKER))
+    policy, suite, worker = (
+        {one[k]: v for k, v in settings.items() if k in one} for one in (_POLICY, _SUITE, _WORKER)
+    )
     rest = {k: v for k, v in settings.items() if k not in _POLICY | _SUITE | _WORKER}
-    return EvalConfig.model_validate({"policies": [policy], "suites": [suite], "worker": worker, **rest})
+    return EvalConfig.model_validate(
+        {"policies": [policy], "suites": [suite], "worker": worker, **rest}
+    )

@@ -38,7 +38,9 @@ from vlagents_ray.serve.scaling.session_migration import Peer, PeerEnded, Sessio
 
 
 class Replicas:
-    """Engines of one policy that know each other; requests go to the first that lives and does not stop."""
+    """Engines of one policy that know each other; requests go to the first that lives and does
+    not stop.
+    """
 
     def __init__(self, agents: Sequence[Agent | Checkpoints], **options: Any) -> None:
         self.dead: set[int] = set()
@@ -51,10 +53,12 @@ class Replicas:
         self._thread = threading.Thread(target=self._loop.run_forever)
         self._thread.start()
         self.migrators = [
-            SessionMigrator(str(number), partial(self._others, number), self._loop) for number in range(len(agents))
+            SessionMigrator(str(number), partial(self._others, number), self._loop)
+            for number in range(len(agents))
         ]
         self.engines = [
-            Engine(agent, finder=finder, **options) for agent, finder in zip(agents, self.migrators, strict=True)
+            Engine(agent, finder=finder, **options)
+            for agent, finder in zip(agents, self.migrators, strict=True)
         ]
         for migrator, engine in zip(self.migrators, self.engines, strict=True):
             migrator.start(engine)
@@ -106,12 +110,17 @@ class InProcess:
         """To the preferred replica, or the first that is there."""
         if self._replicas.stopping:
             raise UnknownApp("no application at this path")
-        numbered = sorted(enumerate(self._replicas.engines), key=lambda one: one[0] != self._replicas.prefer)
+        numbered = sorted(
+            enumerate(self._replicas.engines), key=lambda one: one[0] != self._replicas.prefer
+        )
         for number, engine in numbered:
             if number not in self._replicas.dead | self._replicas.frozen and not engine.draining:
                 self._number, self._sender = number, Sender(engine, "in process", caller=NoKey.OPEN)
                 contract = engine.contract
-                return {"protocol": PROTOCOL_VERSION, "contract": contract.to_json() if contract else None}
+                return {
+                    "protocol": PROTOCOL_VERSION,
+                    "contract": contract.to_json() if contract else None,
+                }
         raise PolicyUnavailable("no replica lives")
 
     def call(self, requests: Sequence[Request], timeout_s: float) -> list[Reply]:
@@ -128,7 +137,11 @@ class InProcess:
         answers: queue.SimpleQueue[bytes] = queue.SimpleQueue()
         frame = encode_requests(requests)
         decoded = decode_requests(frame, Budget(DEFAULT_LIMITS))
-        self._sender.send(self._sender.message(), decoded, lambda message: answers.put(encode_replies(message.replies)))
+        self._sender.send(
+            self._sender.message(),
+            decoded,
+            lambda message: answers.put(encode_replies(message.replies)),
+        )
         try:
             answer = answers.get(timeout=timeout_s)
         except queue.Empty:
@@ -166,7 +179,9 @@ def export(engine: Engine, session_id: str) -> dict[str, Any] | None:
     copied = answered(engine, session_id, Request("export"))
     if copied.info is None:
         return None
-    released = answered(engine, session_id, Request("release", kwargs={"version": version_of(copied.info)}))
+    released = answered(
+        engine, session_id, Request("release", kwargs={"version": version_of(copied.info)})
+    )
     assert released.info == {"released": True}
     return copied.info
 

@@ -11,7 +11,9 @@ _EVENT = "/jax/core/compile/backend_compile_duration"
 
 @contextmanager
 def jax_compiles() -> Iterator[list[str]]:
-    """Return a list that grows by an entry for each program that JAX compiles within the context."""
+    """Return a list that grows by an entry for each program that JAX compiles within the
+    context.
+    """
     import jax
 
     found: list[str] = []
@@ -24,6 +26,7 @@ def jax_compiles() -> Iterator[list[str]]:
     try:
         yield found
     finally:
-        from jax._src.monitoring import _unregister_event_duration_listener_by_callback  # there is no public one
+        # There is no public one.
+        from jax._src.monitoring import _unregister_event_duration_listener_by_callback
 
         _unregister_event_duration_listener_by_callback(note)

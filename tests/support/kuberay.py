@@ -1,9 +1,9 @@
 """Kubernetes manifests against their schemas, without Kubernetes.
 
-Core kinds, and the pods inside KubeRay's, have the schemas that the package kubernetes-validate brings. KubeRay's own
-are on no package index; what is here names the keys that our manifests use, read from the custom resource definitions
-of KubeRay 1.6.2 and 1.7.0, and knows no others: a misspelt key is an error; the same holds for the kind
-of Prometheus' operator.
+Core kinds, and the pods inside KubeRay's, have the schemas that the package kubernetes-validate
+brings. KubeRay's own are on no package index; what is here names the keys that our manifests use,
+read from the custom resource definitions of KubeRay 1.6.2 and 1.7.0, and knows no others: a
+misspelt key is an error; the same holds for the kind of Prometheus' operator.
 """
 
 from __future__ import annotations
@@ -87,7 +87,8 @@ class WorkerGroup(HeadGroup):
     def _ordered(self) -> WorkerGroup:
         if not self.min_replicas <= self.replicas <= self.max_replicas:
             raise ValueError(
-                f"{self.group_name}: {self.min_replicas} <= {self.replicas} <= {self.max_replicas} is not so"
+                f"{self.group_name}: {self.min_replicas} <= {self.replicas} <= {self.max_replicas} "
+                "is not so"
             )
         return self
 
@@ -128,7 +129,8 @@ class JobSpec(_Closed):
 
 
 class Metadata(_Closed):
-    name: str = Field(max_length=47, pattern=r"[a-z]([-a-z0-9]*[a-z0-9])?")  # KubeRay makes longer ones of it
+    # KubeRay makes longer ones of it.
+    name: str = Field(max_length=47, pattern=r"[a-z]([-a-z0-9]*[a-z0-9])?")
 
 
 class RayService(_Closed):
@@ -210,7 +212,11 @@ def serve_runs(cluster: RayCluster) -> None:
 
     def runs() -> bool:
         states = json.loads(cluster.python(STATUS).splitlines()[-1])
-        failed = {name: state for name, state in states.items() if state[0] in ("DEPLOY_FAILED", "UNHEALTHY")}
+        failed = {
+            name: state
+            for name, state in states.items()
+            if state[0] in ("DEPLOY_FAILED", "UNHEALTHY")
+        }
         assert not failed, failed
         return bool(states) and all(state == "RUNNING" for state, _ in states.values())
 

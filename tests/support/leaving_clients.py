@@ -1,4 +1,6 @@
-"""A replica and its gateways in this process, and a client of each endpoint that acts, sends half a message, leaves."""
+"""A replica and its gateways in this process, and a client of each endpoint that acts, sends
+half a message, leaves.
+"""
 
 from __future__ import annotations
 
@@ -46,7 +48,12 @@ from vlagents_ray.protocol.messages import Limits, RankName, Reply, Request
 from vlagents_ray.registry import dialect_class
 from vlagents_ray.serve.access.api_keys import NoKey
 from vlagents_ray.serve.config.dialects import DialectArgs
-from vlagents_ray.serve.dialects.base import GatewayContext, PortDialect, ReplicaContext, dialect_routes
+from vlagents_ray.serve.dialects.base import (
+    GatewayContext,
+    PortDialect,
+    ReplicaContext,
+    dialect_routes,
+)
 from vlagents_ray.serve.endpoints.access_middleware import AccessMiddleware, Shutdown
 from vlagents_ray.serve.endpoints.front import FrontMiddleware
 from vlagents_ray.serve.endpoints.http import build_http_app
@@ -57,7 +64,8 @@ from vlagents_ray.serve.ports import free_port, reserve
 from vlagents_ray_dialects.messages import vla_eval as vla_eval_codec
 
 BOUND_S = 5.0  # nothing waits for longer
-LARGE = 240  # for a picture of this brightness the policy returns 8 MB, more than the kernel's buffers hold
+# For a picture of this brightness the policy returns 8 MB, more than the kernel's buffers hold.
+LARGE = 240
 HELD = 250  # the policy acts on pictures from this brightness on when its gate opens
 OTHERS = ("another", "a third")  # sessions of other clients
 SLOW_S = 0.02  # of each act, so that another thread reads the connections while the policy acts
@@ -153,9 +161,13 @@ class StoppableServer:
         self.engine.start()
         self.shutdown = Shutdown()
         self.requests = 0  # of HTTP, and WebSockets, that are under way
-        routes = dialect_routes(DialectArgs(**ALL), ReplicaContext(self.engine, lambda: METADATA, LIMITS))
+        routes = dialect_routes(
+            DialectArgs(**ALL), ReplicaContext(self.engine, lambda: METADATA, LIMITS)
+        )
         inside = build_http_app(self.engine, lambda: METADATA, LIMITS, more=routes)
-        guarded = AccessMiddleware(inside, None, "app", admission=self.engine.admission, shutdown=self.shutdown)
+        guarded = AccessMiddleware(
+            inside, None, "app", admission=self.engine.admission, shutdown=self.shutdown
+        )
         self.port = stack.enter_context(served(FrontMiddleware(self._as_in_serve(guarded))))
         self.gateways: dict[str, PortDialect] = {}
         self.ports = {name: self._gateway(name) for name in ("gr00t", "vlagents", "lerobot")}
@@ -183,13 +195,19 @@ class StoppableServer:
         return replies
 
     def is_stopping(self) -> bool:
-        """Whether all parts of the server have begun to stop that can begin before the policy's gate opens."""
+        """Whether all parts of the server have begun to stop that can begin before the policy's
+        gate opens.
+        """
         gateways = self.gateways.values()
-        closing = all((getattr(one, "_stopping", None) or one._closing).is_set() for one in gateways)  # type: ignore[attr-defined]
+        closing = all(
+            (getattr(one, "_stopping", None) or one._closing).is_set() for one in gateways
+        )  # type: ignore[attr-defined]
         return closing and (self.requests > 0 or self.engine.queue._closed)
 
     def stop(self) -> None:
-        """Stop the replica as Serve and `PolicyReplica` do: first what keeps Serve from ending it."""
+        """Stop the replica as Serve and `PolicyReplica` do: first what keeps Serve from ending
+        it.
+        """
         if self._stopped:
             return
         self._stopped = True
@@ -215,10 +233,14 @@ class StoppableServer:
 
     def is_listening(self) -> bool:
         """Whether the own port of the replica or of a dialect accepts connections."""
-        return self.own._listener.fileno() >= 0 or any(dialect.alive() for dialect in self.gateways.values())
+        return self.own._listener.fileno() >= 0 or any(
+            dialect.alive() for dialect in self.gateways.values()
+        )
 
     def _as_in_serve(self, app: ASGIApp) -> ASGIApp:
-        """Count the requests that are under way; cancel one of HTTP when its client leaves, as Serve does."""
+        """Count the requests that are under way; cancel one of HTTP when its client leaves, as
+        Serve does.
+        """
 
         async def run(scope: Scope, receive: Receive, send: Send) -> None:
             import asyncio
@@ -260,7 +282,13 @@ class StoppableServer:
     def _agent(self, _key: str | None, rank: RankName | None) -> RemoteAgent:
         agent = RemoteAgent("http://127.0.0.1:9", rank=rank or "robot")
         engines: Any = SimpleNamespace(
-            engines=[self.engine], dead=set(), frozen=set(), prefer=0, lose_reply=False, stopping=False, frames=[]
+            engines=[self.engine],
+            dead=set(),
+            frozen=set(),
+            prefer=0,
+            lose_reply=False,
+            stopping=False,
+            frames=[],
         )
         transport = InProcess(engines)
         agent._connection = Connection(agent.url, lambda: transport, CodecChoice("raw"), 5.0, 5.0)
@@ -289,7 +317,9 @@ class LeavingClient(abc.ABC):
 
     @abc.abstractmethod
     def end(self) -> str:
-        """Wait until the server has ended the connection; returns the close code and its reason, if it has them."""
+        """Wait until the server has ended the connection; returns the close code and its reason,
+        if it has them.
+        """
 
     @abc.abstractmethod
     def leave(self) -> None:
@@ -340,14 +370,20 @@ class WebSocketClient(LeavingClient):
             while True:
                 self._socket.recv(BOUND_S)
         except ConnectionClosed as closed:
-            return "no close code" if closed.rcvd is None else f"{closed.rcvd.code} {closed.rcvd.reason}"
+            return (
+                "no close code"
+                if closed.rcvd is None
+                else f"{closed.rcvd.code} {closed.rcvd.reason}"
+            )
 
     def leave(self) -> None:
         self._socket.socket.shutdown(socket.SHUT_RDWR)
 
 
 class HttpClient(LeavingClient):
-    def __init__(self, server: StoppableServer, path: str, document: Callable[[int], bytes], kind: str) -> None:
+    def __init__(
+        self, server: StoppableServer, path: str, document: Callable[[int], bytes], kind: str
+    ) -> None:
         super().__init__(server)
         self._path, self._document = path, document
         self._headers = {"x-session-id": "robot-1", "content-type": kind}
@@ -432,7 +468,9 @@ class ShmClient(ThreadedClient):
 class Gr00tClient(LeavingClient):
     def __init__(self, server: StoppableServer) -> None:
         super().__init__(server)
-        self._client = server.stack.enter_context(PolicyClient(server.ports["gr00t"], timeout_ms=int(BOUND_S * 1e3)))
+        self._client = server.stack.enter_context(
+            PolicyClient(server.ports["gr00t"], timeout_ms=int(BOUND_S * 1e3))
+        )
         self.send(2)
         assert self.answer() == ACTED
 
@@ -443,15 +481,23 @@ class Gr00tClient(LeavingClient):
             "language": {"task": [["a task"]]},
         }
         data = {"observation": observation, "options": None}
-        self._client.socket.send(msgpack.packb({"endpoint": "get_action", "data": data}, default=encode))
+        self._client.socket.send(
+            msgpack.packb({"endpoint": "get_action", "data": data}, default=encode)
+        )
 
     def answer(self) -> str:
         reply = msgpack.unpackb(self._client.socket.recv())
-        return str(reply["error"]).partition(":")[0] if isinstance(reply, dict) and "error" in reply else ACTED
+        return (
+            str(reply["error"]).partition(":")[0]
+            if isinstance(reply, dict) and "error" in reply
+            else ACTED
+        )
 
     def send_half(self) -> None:
         address = "127.0.0.1", self.server.ports["gr00t"]
-        self._half = self.server.stack.enter_context(socket.create_connection(address, timeout=BOUND_S))
+        self._half = self.server.stack.enter_context(
+            socket.create_connection(address, timeout=BOUND_S)
+        )
         self._half.sendall(b"\xff\0\0\0\0\0\0\0\1\x7f")  # the first part of ZeroMQ's greeting
 
     def end(self) -> str:
@@ -561,7 +607,9 @@ def _read_map(data: bytes | str) -> str:
 
 
 def _see(brightness: int) -> bytes:
-    return vla_eval_codec.encode(vla_eval_codec.Message("observation", seen(brightness), brightness))
+    return vla_eval_codec.encode(
+        vla_eval_codec.Message("observation", seen(brightness), brightness)
+    )
 
 
 def _read_vla_eval(data: bytes | str) -> str:
@@ -574,12 +622,18 @@ def _arena(brightness: int) -> bytes:
 
 
 Connect = Callable[[StoppableServer], LeavingClient]
-_opened = partial(WebSocketClient, message=partial(_frame, "act"), read=_read_frame, opening=_frame("reset", 2))
+_opened = partial(
+    WebSocketClient, message=partial(_frame, "act"), read=_read_frame, opening=_frame("reset", 2)
+)
 CLIENTS: dict[str, Connect] = {
     "own port": partial(_opened, path="own"),
     "WS /v1/stream": partial(_opened, path="/v1/stream"),
-    "WS /openpi": partial(WebSocketClient, path="/openpi", message=libero, read=_read_map, greets=True),
-    "WS /roboarena": partial(WebSocketClient, path="/roboarena", message=_arena, read=_read_map, greets=True),
+    "WS /openpi": partial(
+        WebSocketClient, path="/openpi", message=libero, read=_read_map, greets=True
+    ),
+    "WS /roboarena": partial(
+        WebSocketClient, path="/roboarena", message=_arena, read=_read_map, greets=True
+    ),
     "WS /vla-eval": partial(WebSocketClient, path="/vla-eval", message=_see, read=_read_vla_eval),
     "POST /v1/act": partial(
         HttpClient,

@@ -1,4 +1,6 @@
-"""The messages of LeRobot's asynchronous inference: look-alikes of its classes, with the same pickles."""
+"""The messages of LeRobot's asynchronous inference: look-alikes of its classes, with the same
+pickles.
+"""
 
 from __future__ import annotations
 
@@ -16,8 +18,16 @@ import numpy as np
 
 HELPERS = "lerobot.async_inference.helpers"
 FEATURES: dict[str, Any] = {
-    "observation.state": {"dtype": "float32", "shape": (2,), "names": ["shoulder.pos", "gripper.pos"]},
-    "observation.images.front": {"dtype": "image", "shape": (8, 8, 3), "names": ["height", "width", "channels"]},
+    "observation.state": {
+        "dtype": "float32",
+        "shape": (2,),
+        "names": ["shoulder.pos", "gripper.pos"],
+    },
+    "observation.images.front": {
+        "dtype": "image",
+        "shape": (8, 8, 3),
+        "names": ["height", "width", "channels"],
+    },
 }
 
 
@@ -53,7 +63,9 @@ for _one in MESSAGES:
 
 @contextmanager
 def _importable() -> Iterator[None]:
-    """Let Python's pickler find the classes under LeRobot's names, whether it is installed or not."""
+    """Let Python's pickler find the classes under LeRobot's names, whether it is installed or
+    not.
+    """
     folders = HELPERS.split(".")
     names = [".".join(folders[: n + 1]) for n in range(len(folders))]
     before = {name: sys.modules.get(name) for name in names}
@@ -94,12 +106,21 @@ def actions_of(data: bytes) -> list[TimedAction]:
 
 def setup(**changes: Any) -> RemotePolicyConfig:
     stated: dict[str, Any] = {"lerobot_features": FEATURES, "actions_per_chunk": 10, **changes}
-    return RemotePolicyConfig(stated.pop("policy_type", "act"), stated.pop("checkpoint", "me/act"), **stated)
+    return RemotePolicyConfig(
+        stated.pop("policy_type", "act"), stated.pop("checkpoint", "me/act"), **stated
+    )
 
 
-def robot_saw(timestep: int, pixel: int = 0, task: str = "abc", must_go: bool = False, **more: Any) -> TimedObservation:
+def robot_saw(
+    timestep: int, pixel: int = 0, task: str = "abc", must_go: bool = False, **more: Any
+) -> TimedObservation:
     """An observation of a robot with `FEATURES`."""
-    values = {"shoulder.pos": 0.5, "gripper.pos": 0.25, "front": np.full((8, 8, 3), pixel, np.uint8), "task": task}
+    values = {
+        "shoulder.pos": 0.5,
+        "gripper.pos": 0.25,
+        "front": np.full((8, 8, 3), pixel, np.uint8),
+        "task": task,
+    }
     return TimedObservation(1000.0 + timestep, timestep, values | more, must_go)
 
 
@@ -128,11 +149,15 @@ class AsyncClient:
     """A client of LeRobot's service over gRPC, without its threads and its robot."""
 
     def __init__(self, port: int, **options: Any) -> None:
-        # A channel of its own for each: gRPC shares the connections of channels with the same options.
-        self.channel = grpc.insecure_channel(f"127.0.0.1:{port}", [("grpc.use_local_subchannel_pool", 1)], **options)
+        # A channel of its own for each: gRPC shares the connections of channels with the same
+        # options.
+        self.channel = grpc.insecure_channel(
+            f"127.0.0.1:{port}", [("grpc.use_local_subchannel_pool", 1)], **options
+        )
         unary, stream = self.channel.unary_unary, self.channel.stream_unary
         self.ready, self.instruct, self.get = (
-            unary(f"/transport.AsyncInference/{name}") for name in ("Ready", "SendPolicyInstructions", "GetActions")
+            unary(f"/transport.AsyncInference/{name}")
+            for name in ("Ready", "SendPolicyInstructions", "GetActions")
         )
         self.send_parts = stream("/transport.AsyncInference/SendObservations")
 

@@ -1,6 +1,8 @@
-"""A simulated robot as LeRobot finds it, `--robot.type=mirror`: it is at once where an action sends it.
+"""A simulated robot as LeRobot finds it, `--robot.type=mirror`: it is at once where an action sends
+it.
 
-With `--teleop.type=mirror`, its operator corrects the policy now and then, by the keys of LeRobot's own loop.
+With `--teleop.type=mirror`, its operator corrects the policy now and then, by the keys of LeRobot's
+own loop.
 """
 
 import json
@@ -26,7 +28,9 @@ def moved_to(move: int) -> list[float]:
 
 
 class Operator:
-    """Who pauses the robot after some actions of the policy, moves it, and gives it back; waits for what happens."""
+    """Who pauses the robot after some actions of the policy, moves it, and gives it back; waits
+    for what happens.
+    """
 
     def __init__(self) -> None:
         self.does, self.watched, self.moves = "watches", 0, 0
@@ -64,7 +68,8 @@ _operator = Operator()
 @dataclass
 class MirrorRobotConfig(RobotConfig):
     camera: str = CAMERA
-    log: str = ""  # file with a line of JSON for each action: what it was seen to be, and where it is sent
+    # File with a line of JSON for each action: what it was seen to be, and where it is sent.
+    log: str = ""
     actions: int = 0  # Ctrl-C after so many
 
 
@@ -98,7 +103,9 @@ class MirrorRobot(Robot):
         if self.config.log:
             numbers = {"state": list(before.values()), "action": list(self.positions.values())}
             with Path(self.config.log).open("a") as log:
-                log.write(json.dumps({"image": self.images, "moves": _operator.moves, **numbers}) + "\n")
+                log.write(
+                    json.dumps({"image": self.images, "moves": _operator.moves, **numbers}) + "\n"
+                )
         _operator.sees(self.positions)
         if self.actions == self.config.actions:
             os.kill(os.getpid(), signal.SIGINT)

@@ -24,7 +24,13 @@ from vlagents_ray.serve.endpoints.access_middleware import AccessMiddleware
 from vlagents_ray.serve.endpoints.http import build_http_app
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.ports import free_port
-from vlagents_ray.serve.replica.part import OtherReplica, PartContext, ReplicaParts, no_siblings, open_parts
+from vlagents_ray.serve.replica.part import (
+    OtherReplica,
+    PartContext,
+    ReplicaParts,
+    no_siblings,
+    open_parts,
+)
 from vlagents_ray_live.live_view import Fleet, ReplicaView
 from vlagents_ray_live.part import LivePart
 from vlagents_ray_live.ring import LiveConfig
@@ -35,7 +41,10 @@ METADATA = {
     "policy": "noop",
     "checkpoint": "org/model@4f0c",
     "weights": {"digest": "sampled-sha256:9f2c", "revision": None},
-    "policy_version": {"newest": {"version": 3, "fingerprint": "ab"}, "pinned": {"version": 0, "fingerprint": "cd"}},
+    "policy_version": {
+        "newest": {"version": 3, "fingerprint": "ab"},
+        "pinned": {"version": 0, "fingerprint": "cd"},
+    },
     "version": "0",
     "protocol": PROTOCOL_VERSION,
     "local": None,
@@ -62,7 +71,10 @@ class LivePage:
 
     def document(self) -> dict[str, Any]:
         """What it shows; {} while it is not there."""
-        with suppress(urllib.error.URLError, ConnectionError), urllib.request.urlopen(f"{self.url}/v1/live") as answer:
+        with (
+            suppress(urllib.error.URLError, ConnectionError),
+            urllib.request.urlopen(f"{self.url}/v1/live") as answer,
+        ):
             found: dict[str, Any] = json.load(answer)
             return found
         return {}
@@ -73,7 +85,11 @@ class LivePage:
 
     def steps(self) -> list[int]:
         """Those in its learning curve."""
-        return [point["step"] for curve in self.evaluation().get("curves", []) for point in curve["points"]]
+        return [
+            point["step"]
+            for curve in self.evaluation().get("curves", [])
+            for point in curve["points"]
+        ]
 
     def text(self) -> bytes:
         with urllib.request.urlopen(f"{self.url}/live") as answer:
@@ -106,7 +122,9 @@ def live_server(
     insecure: bool = False,
     settings: LiveConfig | None = None,
 ) -> Iterator[LiveServer]:
-    """A replica of `agent`, by default `noop`, with the parts that are on by default, until the end of the context."""
+    """A replica of `agent`, by default `noop`, with the parts that are on by default, until the
+    end of the context.
+    """
     engine = Engine(agent or Noop.from_config({}))
     engine.start()
     context = PartContext(
@@ -123,7 +141,9 @@ def live_server(
     with ExitStack() as stack:
         stack.callback(parts.close)
         stack.callback(engine.close)
-        port = stack.enter_context(served(AccessMiddleware(inside, keys, "app", public=parts.pages(inside.routes))))
+        port = stack.enter_context(
+            served(AccessMiddleware(inside, keys, "app", public=parts.pages(inside.routes)))
+        )
         yield LiveServer(engine, live.view, live.fleet, port)
 
 

@@ -1,4 +1,5 @@
-"""How many examples a test draws that draws many: all of them, or a fifth in `make check`, whose profile is `quick`.
+"""How many examples a test draws that draws many: all of them, or a fifth in `make check`, whose
+profile is `quick`.
 
 No profile limits the time of an example: on a busy machine that would be an absolute time.
 """
@@ -7,7 +8,9 @@ from __future__ import annotations
 
 from hypothesis import HealthCheck, settings
 
-_BUSY = settings(settings.get_profile("default"), deadline=None, suppress_health_check=[HealthCheck.too_slow])
+_BUSY = settings(
+    settings.get_profile("default"), deadline=None, suppress_health_check=[HealthCheck.too_slow]
+)
 _WHOLE = _BUSY.max_examples
 settings.register_profile("default", _BUSY)
 settings.register_profile("quick", _BUSY, max_examples=_WHOLE // 5)

@@ -1,4 +1,6 @@
-"""Policies whose chunks are a known function of what they got, so that a test can say what LeRobot should do."""
+"""Policies whose chunks are a known function of what they got, so that a test can say what
+LeRobot should do.
+"""
 
 from __future__ import annotations
 
@@ -38,7 +40,8 @@ def mirrored(state: np.ndarray, colour: int, acts: int, instruction: str) -> np.
     """
     shoulder, elbow, gripper = (float(number) for number in state)
     rows = [
-        [elbow + row, len(instruction) - shoulder / 2 + acts / 8, (gripper + colour / 255) / 2] for row in range(ROWS)
+        [elbow + row, len(instruction) - shoulder / 2 + acts / 8, (gripper + colour / 255) / 2]
+        for row in range(ROWS)
     ]
     return np.array(rows, np.float32)
 
@@ -61,15 +64,20 @@ class MirrorPolicy(Agent):
 
 
 class CountingPolicy(Agent):
-    """A policy with real-time chunking, whose rows (n, n, n) go on counting in `COUNT` from the plan, else from 1."""
+    """A policy with real-time chunking, whose rows (n, n, n) go on counting in `COUNT` from the
+    plan, else from 1.
+    """
 
     contract = replace(CONTRACT, chunk=40)
     continues_plans = True
-    plans: ClassVar[list[tuple[np.ndarray, int]]] = []  # rows, (H, 3), and the delay of each act with a plan
+    # rows, (H, 3), and the delay of each act with a plan.
+    plans: ClassVar[list[tuple[np.ndarray, int]]] = []
 
     def act(self, obs: Obs) -> Act:
         plan = obs.info.get(LEFTOVER, np.zeros((0, 3), np.float32))
         if len(plan):
             self.plans.append((plan, obs.info[DELAY]))
         first = plan[0, 0] / COUNT if len(plan) else 1
-        return Act(np.repeat(np.arange(first, first + 40, dtype=np.float32)[:, None] * COUNT, 3, axis=1))
+        return Act(
+            np.repeat(np.arange(first, first + 40, dtype=np.float32)[:, None] * COUNT, 3, axis=1)
+        )

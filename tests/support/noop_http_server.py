@@ -28,7 +28,9 @@ def main(host: str) -> None:
     with socket.socket() as listening:
         listening.bind((host, 0))
         print(listening.getsockname()[1], flush=True)
-        uvicorn.Server(uvicorn.Config(app, log_level="warning", ws_max_size=16 * 2**20)).run(sockets=[listening])
+        uvicorn.Server(uvicorn.Config(app, log_level="warning", ws_max_size=16 * 2**20)).run(
+            sockets=[listening]
+        )
     engine.close()
 
 

@@ -1,4 +1,6 @@
-"""The log-probability of a flow's random steps, as the papers write it (Flow-GRPO, πRL), for comparison with ours."""
+"""The log-probability of a flow's random steps, as the papers write it (Flow-GRPO, πRL), for
+comparison with ours.
+"""
 
 from __future__ import annotations
 
@@ -9,14 +11,19 @@ import numpy as np
 
 
 def logprob_of_steps(velocity: Callable[[Any, float], Any], chain: np.ndarray, level: float) -> Any:
-    """That of each number of a chain (K + 1, H, D), summed over the steps; `velocity` is of (1, H, D)."""
+    """That of each number of a chain (K + 1, H, D), summed over the steps; `velocity` is of (1,
+    H, D).
+    """
     import torch
 
     states = torch.from_numpy(chain)
     times = np.linspace(1, 0, len(chain))
     total = torch.zeros(states.shape[1:], dtype=torch.float64)
     for before, after, t, s in zip(states, states[1:], times, times[1:], strict=False):
-        v, sigma = velocity(before[None], float(t))[0], level * (t / (1 - (t if t < 1 else s))) ** 0.5
+        v, sigma = (
+            velocity(before[None], float(t))[0],
+            level * (t / (1 - (t if t < 1 else s))) ** 0.5,
+        )
         clean, noise = before - t * v, before + (1 - t) * v  # as the model estimates both
         mean = (1 - s) * clean + (s - sigma**2 * (t - s) / (2 * t)) * noise
         total += torch.distributions.Normal(mean, sigma * (t - s) ** 0.5).log_prob(after)

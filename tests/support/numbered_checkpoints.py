@@ -1,4 +1,6 @@
-"""A policy whose checkpoint is a number, and a library that counts how often each checkpoint is loaded."""
+"""A policy whose checkpoint is a number, and a library that counts how often each checkpoint is
+loaded.
+"""
 
 from __future__ import annotations
 
@@ -89,11 +91,17 @@ class Library:
         while self.begun.get(timeout=10) != name:
             pass
 
-    def engine(self, *, choices: Sequence[str] = (), steps: bool = False, loaded: int = 2, **options: Any) -> Engine:
-        """A running one whose own checkpoint is "a/1"; `choices` are such as "b/2", by their first letter."""
+    def engine(
+        self, *, choices: Sequence[str] = (), steps: bool = False, loaded: int = 2, **options: Any
+    ) -> Engine:
+        """A running one whose own checkpoint is "a/1"; `choices` are such as "b/2", by their
+        first letter.
+        """
         config = {"checkpoint": "a/{step}", "checkpoint_step": 1}
         named = {choice[0]: {"checkpoint": choice} for choice in choices}
-        engine = Engine(Checkpoints(self.make, config, named, steps=steps, loaded=loaded), **options)
+        engine = Engine(
+            Checkpoints(self.make, config, named, steps=steps, loaded=loaded), **options
+        )
         engine.start()
         return engine
 

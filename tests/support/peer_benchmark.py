@@ -1,4 +1,6 @@
-"""A benchmark for vla-eval, written as its documentation asks; imported with the peers' Python only."""
+"""A benchmark for vla-eval, written as its documentation asks; imported with the peers' Python
+only.
+"""
 
 from __future__ import annotations
 
@@ -11,7 +13,9 @@ STEPS = 7
 
 
 class Pictures(StepBenchmark):
-    """Each step shows another picture; an episode succeeds if every action names the one that it answers."""
+    """Each step shows another picture; an episode succeeds if every action names the one that it
+    answers.
+    """
 
     def get_tasks(self) -> list[dict[str, Any]]:
         return [{"name": "task 3"}]
@@ -28,7 +32,11 @@ class Pictures(StepBenchmark):
 
     def make_obs(self, raw_obs: int, task: dict[str, Any]) -> dict[str, Any]:
         picture = np.full((64, 64, 3), raw_obs, np.uint8)
-        return {"images": {"front": picture}, "task_description": task["name"], "state": np.zeros(7)}
+        return {
+            "images": {"front": picture},
+            "task_description": task["name"],
+            "state": np.zeros(7),
+        }
 
     def get_step_result(self, step_result: StepResult) -> dict[str, Any]:
         return {"success": self.right == STEPS}

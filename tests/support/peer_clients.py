@@ -1,7 +1,9 @@
-"""Other systems' own clients, several at once: `peer_clients.py CLIENT URL CLIENTS CALLS`, with the peers' Python.
+"""Other systems' own clients, several at once: `peer_clients.py CLIENT URL CLIENTS CALLS`, with the
+peers' Python.
 
-Each sends observations that say whose they are, under two instructions in turn, and prints what it was answered: for
-each client a list of [what it sent, the rows it got], as JSON in the last line. It imports nothing of ours.
+Each sends observations that say whose they are, under two instructions in turn, and prints what it
+was answered: for each client a list of [what it sent, the rows it got], as JSON in the last line.
+It imports nothing of ours.
 """
 
 from __future__ import annotations
@@ -20,7 +22,10 @@ def observations(client: int, calls: int) -> list[dict[str, Any]]:
     """Pixel, a number in the state, and an instruction that changes once."""
     tasks = [f"task {client + 100 * (call >= calls // 2)}" for call in range(calls)]
     pixels = [(client * 16 + call) % 255 for call in range(calls)]  # 255 is slow
-    return [{"pixel": p, "number": float(client + 1), "task": t} for p, t in zip(pixels, tasks, strict=True)]
+    return [
+        {"pixel": p, "number": float(client + 1), "task": t}
+        for p, t in zip(pixels, tasks, strict=True)
+    ]
 
 
 def image(pixel: int) -> np.ndarray:
@@ -34,7 +39,9 @@ def openpi(url: str, client: int, calls: int) -> list[Any]:
     from openpi_client.websocket_client_policy import WebsocketClientPolicy
 
     host, _, port = url.removeprefix("ws://").partition(":")
-    policy = WebsocketClientPolicy(host, int(port)) if port.isdigit() else WebsocketClientPolicy(url)
+    policy = (
+        WebsocketClientPolicy(host, int(port)) if port.isdigit() else WebsocketClientPolicy(url)
+    )
     if not policy.get_server_metadata():
         raise RuntimeError("no metadata")
     said = []
@@ -61,7 +68,9 @@ def openpi(url: str, client: int, calls: int) -> list[Any]:
 
 
 def roboarena(url: str, client: int, calls: int) -> list[Any]:
-    """RoboArena's client, which is openpi's with an `endpoint` in each request, and is not on PyPI."""
+    """RoboArena's client, which is openpi's with an `endpoint` in each request, and is not on
+    PyPI.
+    """
     from openpi_client.websocket_client_policy import WebsocketClientPolicy
 
     policy = WebsocketClientPolicy(url)
@@ -101,7 +110,9 @@ def openpi_error(url: str, client: int, calls: int) -> list[Any]:
 
 
 def openpi_keyed(url: str, client: int, calls: int) -> Any:
-    """The fragment of the URL is the API key, which this client sends by itself. What it gets, or why nothing."""
+    """The fragment of the URL is the API key, which this client sends by itself. What it gets,
+    or why nothing.
+    """
     from openpi_client.websocket_client_policy import WebsocketClientPolicy
     from websockets.exceptions import InvalidStatus
 
@@ -113,21 +124,31 @@ def openpi_keyed(url: str, client: int, calls: int) -> Any:
         "prompt": "abc",
     }
     try:
-        return WebsocketClientPolicy(address, api_key=key or None).infer(element)["actions"].tolist()
+        return (
+            WebsocketClientPolicy(address, api_key=key or None).infer(element)["actions"].tolist()
+        )
     except InvalidStatus as error:
         return error.response.status_code
 
 
 def openvla(url: str, client: int, calls: int) -> list[Any]:
-    """requests and json-numpy, as OpenVLA documents it: plain, and in every second call encoded twice."""
+    """requests and json-numpy, as OpenVLA documents it: plain, and in every second call encoded
+    twice.
+    """
     import json_numpy
     import requests
 
     said = []
     for number, one in enumerate(observations(client, calls)):
-        payload = {"image": image(one["pixel"]), "instruction": one["task"], "unnorm_key": "bridge_orig"}
+        payload = {
+            "image": image(one["pixel"]),
+            "instruction": one["task"],
+            "unnorm_key": "bridge_orig",
+        }
         if number % 2:
-            answer = requests.post(f"{url}/act", json={"encoded": json_numpy.dumps(payload)}, timeout=60).json()
+            answer = requests.post(
+                f"{url}/act", json={"encoded": json_numpy.dumps(payload)}, timeout=60
+            ).json()
             action = json_numpy.loads(answer)
         else:
             answer = requests.post(f"{url}/act", data=json_numpy.dumps(payload), timeout=60)
@@ -176,14 +197,22 @@ def vla_eval(url: str, client: int, calls: int, codec: str = "png") -> list[Any]
 
 
 def vla_eval_run(url: str, client: int, calls: int) -> list[Any]:
-    """A run of vla-eval, its orchestrator and all: `calls` episodes of `peer_benchmark.Pictures`."""
+    """A run of vla-eval, its orchestrator and all: `calls` episodes of
+    `peer_benchmark.Pictures`.
+    """
     from vla_eval.orchestrator import Orchestrator
 
     with tempfile.TemporaryDirectory() as folder:
         config = {
             "server": {"url": url},
             "output_dir": folder,
-            "benchmarks": [{"benchmark": "peer_benchmark:Pictures", "episodes_per_task": calls, "max_steps": 100}],
+            "benchmarks": [
+                {
+                    "benchmark": "peer_benchmark:Pictures",
+                    "episodes_per_task": calls,
+                    "max_steps": 100,
+                }
+            ],
         }
         return asyncio.run(Orchestrator(config, no_save=True).run())
 

@@ -1,7 +1,8 @@
-"""Python environments with other systems' clients from PyPI, some of whose requirements conflict with ours.
+"""Python environments with other systems' clients from PyPI, some of whose requirements conflict
+with ours.
 
-They are `.venv-peers` and `.venv-peers-torch` of this checkout, those that the benchmark uses, and `.venv-peers-NAME`
-of single programs; each is created at first use.
+They are `.venv-peers` and `.venv-peers-torch` of this checkout, those that the benchmark uses, and
+`.venv-peers-NAME` of single programs; each is created at first use.
 """
 
 from __future__ import annotations
@@ -21,7 +22,9 @@ CLIENTS = Path(__file__).with_name("peer_clients.py")
 
 
 def peers_python(environment: str = "") -> Path:
-    """The Python of the first environment, or of the second if it is `TORCH`, with the pinned packages in it."""
+    """The Python of the first environment, or of the second if it is `TORCH`, with the pinned
+    packages in it.
+    """
     requirements = TORCH_REQUIREMENTS if environment == TORCH else REQUIREMENTS
     return _made(environment, requirements.read_text(), lambda folder: set_up(folder, requirements))
 
@@ -44,16 +47,24 @@ def _made(end: str, wanted: str, make: Callable[[Path], object]) -> Path:
     return python_in(folder)
 
 
-def drive(python: Path, client: str, *words: object, script: Path = CLIENTS, timeout_s: float = 120) -> Any:
-    """What a client of `peer_clients.py`, or of another script, has to say at its end; its error is this process's."""
+def drive(
+    python: Path, client: str, *words: object, script: Path = CLIENTS, timeout_s: float = 120
+) -> Any:
+    """What a client of `peer_clients.py`, or of another script, has to say at its end; its error
+    is this process's.
+    """
     command = [str(python), str(script), client, *map(str, words)]
     done = subprocess.run(command, check=False, capture_output=True, text=True, timeout=timeout_s)
-    assert done.returncode == 0, f"{client} ended with {done.returncode}:\n{done.stdout[-2000:]}\n{done.stderr[-4000:]}"
+    assert done.returncode == 0, (
+        f"{client} ended with {done.returncode}:\n{done.stdout[-2000:]}\n{done.stderr[-4000:]}"
+    )
     return json.loads(done.stdout.splitlines()[-1])
 
 
 def package(requirement: str) -> Path:
-    """A folder for PYTHONPATH with that version of a package, alone: what it needs is the environment's."""
+    """A folder for PYTHONPATH with that version of a package, alone: what it needs is the
+    environment's.
+    """
     folder = FOLDER / requirement.replace("==", "-")
     done = folder / ".installed"
     if not done.exists():

@@ -1,4 +1,6 @@
-"""Commands that tests of placement run on each host: a server of two applications, an evaluation, a robot."""
+"""Commands that tests of placement run on each host: a server of two applications, an
+evaluation, a robot.
+"""
 
 from __future__ import annotations
 
@@ -15,7 +17,8 @@ from vlagents_ray import RemoteAgent
 from vlagents_ray.interface import Obs
 
 PORT = 8000
-RESOURCE = {"one": "of_one", "two": "of_two"}  # by application: what each of its replicas takes one of
+# By application: what each of its replicas takes one of.
+RESOURCE = {"one": "of_one", "two": "of_two"}
 REPLICAS = {"one": 1, "two": 2}
 
 
@@ -26,7 +29,9 @@ class Meeting(Line):
         super().__init__()
         self._folder, self._expected, self._met = Path(folder), expected, False
 
-    def reset(self, *, seed: int, options: Mapping[str, Any] | None = None) -> tuple[Obs, dict[str, Any]]:
+    def reset(
+        self, *, seed: int, options: Mapping[str, Any] | None = None
+    ) -> tuple[Obs, dict[str, Any]]:
         if not self._met:
             self._met = True
             (self._folder / str(seed)).touch()
@@ -41,7 +46,9 @@ def serve() -> None:
 
     both = together(
         {
-            app: deployment("eval_fakes:ToZero", replicas=number, resources={"custom": {RESOURCE[app]: 1}})
+            app: deployment(
+                "eval_fakes:ToZero", replicas=number, resources={"custom": {RESOURCE[app]: 1}}
+            )
             for app, number in REPLICAS.items()
         }
     )
@@ -59,7 +66,8 @@ def play(app: str, workers: str, transport: str, out: str) -> None:
     from vlagents_ray.evaluate.results.reader import Results
 
     ray.init("auto", log_to_driver=False)
-    # Workers of the evaluation before that are still ending hold their node's CPUs: new ones would go elsewhere.
+    # Workers of the evaluation before that are still ending hold their node's CPUs: new ones would
+    # go elsewhere.
     wait_for(lambda: ray.available_resources().get("CPU") == ray.cluster_resources()["CPU"])
     met = Path(out, "met")
     met.mkdir(parents=True)
@@ -87,8 +95,12 @@ def play(app: str, workers: str, transport: str, out: str) -> None:
 
 
 def robot(url: str) -> None:
-    """Ten acts by each transport that reaches another machine; prints which was chosen, and which were used."""
-    obs = Obs({"front": np.zeros((224, 224, 3), np.uint8)}, state={"position": np.ones(1, np.float32)})
+    """Ten acts by each transport that reaches another machine; prints which was chosen, and
+    which were used.
+    """
+    obs = Obs(
+        {"front": np.zeros((224, 224, 3), np.uint8)}, state={"position": np.ones(1, np.float32)}
+    )
     used = []
     for transport in ("auto", "http"):
         with RemoteAgent(url, transport=transport) as agent:  # type: ignore[arg-type]

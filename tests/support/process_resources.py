@@ -1,11 +1,12 @@
-"""The processes that run tests: what one holds, and which tests may run at the same time in those of pytest-xdist.
+"""The processes that run tests: what one holds, and which tests may run at the same time in those
+of pytest-xdist.
 
-The tests that ran in this process before may have left connections, such as Ray's, which come and go at any time: a
-test that counts what its process holds is marked `own_process`.
+The tests that ran in this process before may have left connections, such as Ray's, which come and
+go at any time: a test that counts what its process holds is marked `own_process`.
 
-A test that is marked `alone` runs while no other test does. Each test takes two file locks. All tests share the second
-one, except one marked `alone`, which takes it exclusively. The first lock is held while a test waits for the second, so
-that tests run in the order they arrive.
+A test that is marked `alone` runs while no other test does. Each test takes two file locks. All
+tests share the second one, except one marked `alone`, which takes it exclusively. The first lock is
+held while a test waits for the second, so that tests run in the order they arrive.
 """
 
 from __future__ import annotations
@@ -32,7 +33,8 @@ def descriptors() -> set[str]:
     """Open files and sockets; a descriptor whose number is used again counts as another one."""
     found = set()
     for number in os.listdir("/proc/self/fd"):
-        with contextlib.suppress(FileNotFoundError):  # the descriptor of this listing, and those closed meanwhile
+        # The descriptor of this listing, and those closed meanwhile.
+        with contextlib.suppress(FileNotFoundError):
             found.add(f"{number}: {os.readlink(f'/proc/self/fd/{number}')}")
     return found
 
@@ -56,7 +58,13 @@ def pytest_pyfunc_call(pyfuncitem: pytest.Function) -> bool | None:
     options = ["-q", "-p", "no:xdist", "-p", "no:cacheprovider", f"--hypothesis-profile={profile}"]
     environment = {key: value for key, value in os.environ.items() if not key.startswith("PYTEST_")}
     done = subprocess.run(
-        [sys.executable, "-m", "pytest", *options, f"{pyfuncitem.path}::{pyfuncitem.nodeid.partition('::')[2]}"],
+        [
+            sys.executable,
+            "-m",
+            "pytest",
+            *options,
+            f"{pyfuncitem.path}::{pyfuncitem.nodeid.partition('::')[2]}",
+        ],
         check=False,
         cwd=pyfuncitem.config.rootpath,
         env=environment | {_INSIDE: "1"},
@@ -92,7 +100,8 @@ def _locks(name: str) -> Path:
 
 
 def own_ray_folder() -> Path | None:
-    """Make a folder for the Ray clusters of this process, so that they do not find those of other processes.
+    """Make a folder for the Ray clusters of this process, so that they do not find those of other
+    processes.
 
     None where one process runs all tests. The caller removes the folder.
     """

@@ -1,8 +1,9 @@
-"""Programs that others wrote, as their users start them: `program_clients.py PROGRAM PORT`, with the program's Python.
+"""Programs that others wrote, as their users start them: `program_clients.py PROGRAM PORT`, with
+the program's Python.
 
-Each function acts with one program on constant pictures, and prints as JSON what its robot executed and what a policy
-should have seen, in our terms: "executed" rows, "state" by name, "gripper" (1 is open) and "cameras". It imports
-nothing of ours.
+Each function acts with one program on constant pictures, and prints as JSON what its robot executed
+and what a policy should have seen, in our terms: "executed" rows, "state" by name, "gripper" (1 is
+open) and "cameras". It imports nothing of ours.
 """
 
 from __future__ import annotations
@@ -31,10 +32,16 @@ def numbers(dim: int) -> np.ndarray:
 
 def said(executed: Any, cameras: Sequence[str], gripper: float | None = None, **state: Any) -> Said:
     plain = {name: np.asarray(part).tolist() for name, part in state.items()}
-    return {"executed": np.asarray(executed).tolist(), "cameras": list(cameras), "gripper": gripper, "state": plain}
+    return {
+        "executed": np.asarray(executed).tolist(),
+        "cameras": list(cameras),
+        "gripper": gripper,
+        "state": plain,
+    }
 
 
-# Inspect Robots: its evaluation, with the policy of a plug-in and an embodiment that follows the plug-in's own spaces.
+# Inspect Robots: its evaluation, with the policy of a plug-in and an embodiment that follows the
+# plug-in's own spaces.
 
 
 def _inspect_robots(policy: Any) -> np.ndarray:
@@ -44,11 +51,15 @@ def _inspect_robots(policy: Any) -> np.ndarray:
     executed: list[np.ndarray] = []
 
     class Pictures(ir.EmbodimentBase):
-        info = ir.EmbodimentInfo("pictures", policy.info.action_space, policy.info.observation_space, is_simulated=True)
+        info = ir.EmbodimentInfo(
+            "pictures", policy.info.action_space, policy.info.observation_space, is_simulated=True
+        )
 
         def look(self) -> Any:
             space = self.info.observation_space
-            cameras = {one.name: picture(len(executed), one.height, one.width) for one in space.cameras}
+            cameras = {
+                one.name: picture(len(executed), one.height, one.width) for one in space.cameras
+            }
             fields = () if space.state is None else space.state.fields
             return ir.Observation(cameras, {one.key: numbers(one.shape[0]) for one in fields}, TASK)
 
@@ -58,7 +69,9 @@ def _inspect_robots(policy: Any) -> np.ndarray:
         def step(self, action: Any) -> Any:
             executed.append(np.asarray(action.data))
             over = len(executed) == STEPS
-            return ir.StepResult(self.look(), terminated=over, termination_reason="success" if over else None)
+            return ir.StepResult(
+                self.look(), terminated=over, termination_reason="success" if over else None
+            )
 
     task = ir.Task("look", [ir.Scene("one", TASK)], "success_at_end", max_steps=STEPS + 1)
     with tempfile.TemporaryDirectory() as folder:
@@ -95,7 +108,9 @@ def widowx_openvla(port: int) -> Said:
 def agibot_openpi(port: int) -> Said:
     from inspect_robots_agibot_a2.policy import OpenpiPolicy
 
-    return said(_inspect_robots(OpenpiPolicy(port=port)), ["front", "left", "right"], joints=numbers(16))
+    return said(
+        _inspect_robots(OpenpiPolicy(port=port)), ["front", "left", "right"], joints=numbers(16)
+    )
 
 
 def agibot_go1(port: int) -> Said:
@@ -125,7 +140,9 @@ def unitree_g1(port: int) -> Said:
 
 
 def strands_robots(port: int) -> Said:
-    """Its policy for servers of Cosmos 3, which speak openpi's protocol, with the actions under another name."""
+    """Its policy for servers of Cosmos 3, which speak openpi's protocol, with the actions under
+    another name.
+    """
     from strands_robots.policies import create_policy
 
     policy = create_policy("cosmos3", host="127.0.0.1", port=port)
@@ -133,17 +150,22 @@ def strands_robots(port: int) -> Said:
     columns = [*(f"joint_{i}" for i in range(7)), "gripper"]
 
     def act(step: int) -> list[list[float]]:
-        seen = {f"observation/{view}": picture(step) for view in views} | {"observation.state": numbers(8)}
+        seen = {f"observation/{view}": picture(step) for view in views} | {
+            "observation.state": numbers(8)
+        }
         return [[row[name] for name in columns] for row in policy.get_actions_sync(seen, TASK)]
 
     state = numbers(8)
     rows = np.asarray(_acts(act))
-    rows[:, 7] = 1 - rows[:, 7]  # DROID's gripper is 1 when closed, as is the robot's of this program
+    # DROID's gripper is 1 when closed, as is the robot's of this program.
+    rows[:, 7] = 1 - rows[:, 7]
     return said(rows, ["front", "wrist"], 1 - state[7], joints=state[:7])
 
 
 def strands_robots_sim(port: int) -> Said:
-    """Its client of GR00T N1.5; its LIBERO robot makes the gripper -1 or 1, so that column is left out."""
+    """Its client of GR00T N1.5; its LIBERO robot makes the gripper -1 or 1, so that column is
+    left out.
+    """
     import asyncio
 
     from strands_robots_sim.policies.groot import Gr00tPolicy
@@ -157,11 +179,15 @@ def strands_robots_sim(port: int) -> Said:
         rows = asyncio.run(policy.get_actions(seen | pose, TASK))
         return [row["action"][:6] for row in rows]
 
-    return said(_acts(act), ["image", "wrist_image"], x=position[:1], y=position[1:2], z=position[2:])
+    return said(
+        _acts(act), ["image", "wrist_image"], x=position[:1], y=position[1:2], z=position[2:]
+    )
 
 
 def positronic(port: int) -> Said:
-    """Its client of RoboArena's protocol, with the observations of its DROID codec, which number cameras from 1."""
+    """Its client of RoboArena's protocol, with the observations of its DROID codec, which number
+    cameras from 1.
+    """
     from positronic.offboard.roboarena import RoboarenaClient
 
     client = RoboarenaClient("127.0.0.1", port)
@@ -171,8 +197,14 @@ def positronic(port: int) -> Said:
     state = numbers(8)
 
     def act(step: int) -> Any:
-        seen = {"observation/exterior_image_1_left": picture(step), "observation/wrist_image_left": picture(step)}
-        seen |= {"observation/joint_position": state[:7], "observation/gripper_position": 1 - state[7:]}
+        seen = {
+            "observation/exterior_image_1_left": picture(step),
+            "observation/wrist_image_left": picture(step),
+        }
+        seen |= {
+            "observation/joint_position": state[:7],
+            "observation/gripper_position": 1 - state[7:],
+        }
         return client.infer({**seen, "prompt": TASK})["actions"]
 
     rows = np.array(_acts(act))
@@ -183,7 +215,9 @@ def positronic(port: int) -> Said:
 
 
 def provael(port: int) -> Said:
-    """Its policy for openpi's servers, which executes the first row of each chunk, without a gripper's convention."""
+    """Its policy for openpi's servers, which executes the first row of each chunk, without a
+    gripper's convention.
+    """
     from provael.policies.openpi_adapter import OpenPiAdapter
 
     policy = OpenPiAdapter(host="127.0.0.1", port=port)
@@ -194,7 +228,9 @@ def provael(port: int) -> Said:
         seen = {"image": picture(step), "wrist_image": picture(step), "state": state}
         return [np.asarray(policy.act(seen, TASK))[:6]]
 
-    return said(_acts(act), ["front", "wrist"], 0.5, xyz_axis_angle=state[:6], gripper_qpos=state[6:])
+    return said(
+        _acts(act), ["front", "wrist"], 0.5, xyz_axis_angle=state[:6], gripper_qpos=state[6:]
+    )
 
 
 def _acts(act: Callable[[int], Any]) -> list[Any]:

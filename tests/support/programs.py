@@ -1,7 +1,9 @@
-"""Programs that others wrote, and what became of their tests; `tables` writes them into docs/programs.md.
+"""Programs that others wrote, and what became of their tests; `tables` writes them into
+docs/programs.md.
 
-A test that runs one is marked `@pytest.mark.program(NAME)`, NAME being one of `PROGRAMS`. `pytest --verified` notes the
-outcomes with the versions in `programs.json`, and `make programs` does all of it.
+A test that runs one is marked `@pytest.mark.program(NAME)`, NAME being one of `PROGRAMS`. `pytest
+--verified` notes the outcomes with the versions in `programs.json`, and `make programs` does all of
+it.
 """
 
 from __future__ import annotations
@@ -20,15 +22,16 @@ from verified import ROOT, installed_version
 
 NOTED = ROOT / "tests" / "programs.json"
 PYPI = "PyPI"
-BESIDE = {"stable-baselines3": "STABLE_BASELINES3_SRC", "torchrl": "TORCHRL_SRC"}  # folders beside the torch of .venv
+# Folders beside the torch of .venv.
+BESIDE = {"stable-baselines3": "STABLE_BASELINES3_SRC", "torchrl": "TORCHRL_SRC"}
 
 
 @dataclass(frozen=True)
 class Program:
     """A program of others.
 
-    One with `requirements` has an environment with these, and is a function of `program_clients.py` that acts with it
-    on a server with `dialects`.
+    One with `requirements` has an environment with these, and is a function of `program_clients.py`
+    that acts with it on a server with `dialects`.
     """
 
     packages: tuple[str, ...]  # whose versions matter; or the variable of a checkout
@@ -64,48 +67,81 @@ _GO1 = {
     "state": {"joints": "state"},
     "instruction": "instruction",
 }
-_YAM = {"cameras": _CAMERAS, "state": {"joints": "state"}, "instruction": "instruction", "action": {"actions": {}}}
+_YAM = {
+    "cameras": _CAMERAS,
+    "state": {"joints": "state"},
+    "instruction": "instruction",
+    "action": {"actions": {}},
+}
 _G1 = {
     "left_arm": {"stop": 7},
     "left_hand": {"start": 7, "stop": 8},
     "right_arm": {"start": 8, "stop": 15},
     "right_hand": {"start": 15},
 }
-_POSE = {name: {"start": i, "stop": i + 1} for i, name in enumerate(("x", "y", "z", "roll", "pitch", "yaw", "gripper"))}
+_POSE = {
+    name: {"start": i, "stop": i + 1}
+    for i, name in enumerate(("x", "y", "z", "roll", "pitch", "yaw", "gripper"))
+}
 
 PROGRAMS = {
-    "openpi-client": Program(("openpi-client",), "openpi", said="0.1.2 also needs `typing_extensions`"),
+    "openpi-client": Program(
+        ("openpi-client",), "openpi", said="0.1.2 also needs `typing_extensions`"
+    ),
     "openpi examples/simple_client": Program(
-        ("OPENPI_SRC", "openpi-client"), "openpi", "GitHub", "a preset for each `--env`; only applications at the root",
+        ("OPENPI_SRC", "openpi-client"),
+        "openpi",
+        "GitHub",
+        "a preset for each `--env`; only applications at the root",
         requirements=_OPENPI,
     ),
-    "openpi examples/aloha_sim": Program(("OPENPI_SRC", "openpi-client"), "openpi", "GitHub", requirements=_OPENPI),
+    "openpi examples/aloha_sim": Program(
+        ("OPENPI_SRC", "openpi-client"), "openpi", "GitHub", requirements=_OPENPI
+    ),
     "RoboArena's messages": Program(
-        ("openpi-client",), "roboarena", said="openpi's client with RoboArena's requests; theirs is on no index"
+        ("openpi-client",),
+        "roboarena",
+        said="openpi's client with RoboArena's requests; theirs is on no index",
     ),
     "OpenVLA's `requests` and json-numpy": Program(("json-numpy",), "openvla"),
     "vla-eval": Program(("vla-eval",), "vla_eval", said="`server.url` ends in `/vla-eval`"),
-    "vlagents": Program(("vlagents",), "vlagents", said="a port; `model` is the application's name"),
+    "vlagents": Program(
+        ("vlagents",), "vlagents", said="a port; `model` is the application's name"
+    ),
     "LeRobot asynchronous inference": Program(("lerobot",), "lerobot", said="a port"),
     "LeRobot lerobot-record": Program(
-        ("lerobot",), "plug-in", said="without a teleoperator: `--dataset.reset_time_s=0`; 0.6 takes no policy"
+        ("lerobot",),
+        "plug-in",
+        said="without a teleoperator: `--dataset.reset_time_s=0`; 0.6 takes no policy",
     ),
-    "LeRobot lerobot-eval": Program(("lerobot",), "plug-in", said="0.6: `--eval.use_async_envs=false`"),
-    "LeRobot lerobot-rollout with RTC": Program(("lerobot",), "plug-in", said="0.6; a policy with real-time chunking"),
+    "LeRobot lerobot-eval": Program(
+        ("lerobot",), "plug-in", said="0.6: `--eval.use_async_envs=false`"
+    ),
+    "LeRobot lerobot-rollout with RTC": Program(
+        ("lerobot",), "plug-in", said="0.6; a policy with real-time chunking"
+    ),
     "Gymnasium's checkers": Program(("gymnasium",), "`as_vector_env`"),
     "Stable-Baselines3": Program(
-        ("stable-baselines3",), "`as_vector_env`", said="the adapter of `docs/evaluation/stable_baselines.py`"
+        ("stable-baselines3",),
+        "`as_vector_env`",
+        said="the adapter of `docs/evaluation/stable_baselines.py`",
     ),
     "TorchRL": Program(
         ("torchrl",), "`as_vector_env`", said='`GymWrapper(as_vector_env(…, autoreset="disabled"))`'
     ),
     "inspect-robots-franka": Program(
-        ("inspect-robots-franka", "inspect-robots", "openpi-client"), "openpi", client="franka", dim=8,
+        ("inspect-robots-franka", "inspect-robots", "openpi-client"),
+        "openpi",
+        client="franka",
+        dim=8,
         said="for positions: `actions_are_velocity=False`",
-        requirements=_adapter("franka", "0.1.0", *_OPENPI), dialects={"openpi": {"mapping": "openpi-droid"}},
+        requirements=_adapter("franka", "0.1.0", *_OPENPI),
+        dialects={"openpi": {"mapping": "openpi-droid"}},
     ),
     "inspect-robots-widowx openpi": Program(
-        ("inspect-robots-widowx", "inspect-robots", "openpi-client"), "openpi", client="widowx_openpi",
+        ("inspect-robots-widowx", "inspect-robots", "openpi-client"),
+        "openpi",
+        client="widowx_openpi",
         requirements=_adapter("widowx", "0.1.0", *_OPENPI),
         dialects={
             "openpi": {
@@ -118,67 +154,125 @@ PROGRAMS = {
         },
     ),
     "inspect-robots-widowx openvla": Program(
-        ("inspect-robots-widowx", "inspect-robots"), "openvla", client="widowx_openvla", used=1,
-        requirements=_adapter("widowx", "0.1.0", *_OPENPI), dialects={"openvla": {}},
+        ("inspect-robots-widowx", "inspect-robots"),
+        "openvla",
+        client="widowx_openvla",
+        used=1,
+        requirements=_adapter("widowx", "0.1.0", *_OPENPI),
+        dialects={"openvla": {}},
     ),
     "inspect-robots-agibot-a2 openpi": Program(
-        ("inspect-robots-agibot-a2", "inspect-robots", "openpi-client"), "openpi", client="agibot_openpi", dim=16,
-        requirements=_adapter("agibot-a2", "0.1.0", *_OPENPI), dialects={"openpi": {"mapping": _A2}},
+        ("inspect-robots-agibot-a2", "inspect-robots", "openpi-client"),
+        "openpi",
+        client="agibot_openpi",
+        dim=16,
+        requirements=_adapter("agibot-a2", "0.1.0", *_OPENPI),
+        dialects={"openpi": {"mapping": _A2}},
     ),
     "inspect-robots-agibot-a2 GO-1": Program(
-        ("inspect-robots-agibot-a2", "inspect-robots"), "openvla", client="agibot_go1", dim=16,
+        ("inspect-robots-agibot-a2", "inspect-robots"),
+        "openvla",
+        client="agibot_go1",
+        dim=16,
         requirements=_adapter("agibot-a2", "0.1.0", *_OPENPI),
         dialects={"openvla": {"chunk": True, "plain": True, "mapping": _GO1}},
     ),
     "inspect-robots-yam (MolmoAct2)": Program(
-        ("inspect-robots-yam", "inspect-robots"), "openvla", client="yam", dim=14,
-        requirements=_adapter("yam", "0.37.0"), dialects={"openvla": {"chunk": True, "mapping": _YAM}},
+        ("inspect-robots-yam", "inspect-robots"),
+        "openvla",
+        client="yam",
+        dim=14,
+        requirements=_adapter("yam", "0.37.0"),
+        dialects={"openvla": {"chunk": True, "mapping": _YAM}},
     ),
     "inspect-robots-unitree-g1": Program(
-        ("inspect-robots-unitree-g1", "inspect-robots"), "gr00t", client="unitree_g1", dim=16,
+        ("inspect-robots-unitree-g1", "inspect-robots"),
+        "gr00t",
+        client="unitree_g1",
+        dim=16,
         requirements=_adapter("unitree-g1", "0.1.1", "msgpack", "msgpack-numpy", "pyzmq"),
         dialects={"gr00t": {"mapping": {"preset": "gr00t", "action": _G1}}},
     ),
     "strands-robots Cosmos 3": Program(
-        ("strands-robots",), "openpi", client="strands_robots", dim=8, python="3.12",
+        ("strands-robots",),
+        "openpi",
+        client="strands_robots",
+        dim=8,
+        python="3.12",
         requirements=("strands-robots[cosmos3-service]==0.5.3",),
         dialects={"openpi": {"mapping": {"preset": "openpi-droid", "action": {"action": {}}}}},
     ),
     "strands-robots-sim GR00T N1.5": Program(
-        ("strands-robots-sim",), "gr00t", client="strands_robots_sim",
-        requirements=("strands-robots-sim==0.1.1", "msgpack", "pyzmq", "numpy"), options=("--no-deps",),
+        ("strands-robots-sim",),
+        "gr00t",
+        client="strands_robots_sim",
+        requirements=("strands-robots-sim==0.1.1", "msgpack", "pyzmq", "numpy"),
+        options=("--no-deps",),
         dialects={"gr00t": {"mapping": {"preset": "gr00t-n1.5", "action": _POSE}}},
     ),
     "positronic RoboArena": Program(
-        ("positronic", "positronic-wire"), "roboarena", client="positronic", dim=8,
-        said="numbers cameras from 1", options=("--no-deps",),
+        ("positronic", "positronic-wire"),
+        "roboarena",
+        client="positronic",
+        dim=8,
+        said="numbers cameras from 1",
+        options=("--no-deps",),
         requirements=(
-            "positronic==0.4.1", "positronic-wire==0.12.0", "positronic-model-server==0.3.1",
-            "positronic-eval-vocabulary==0.6.0", "boto3", "botocore", "jmespath", "msgpack", "msgpack-numpy", "numpy",
-            "opentelemetry-api", "pillow", "pos3", "python-dateutil", "pyyaml", "s3transfer", "six", "tqdm",
-            "typing-extensions", "urllib3", "websockets",
+            "positronic==0.4.1",
+            "positronic-wire==0.12.0",
+            "positronic-model-server==0.3.1",
+            "positronic-eval-vocabulary==0.6.0",
+            "boto3",
+            "botocore",
+            "jmespath",
+            "msgpack",
+            "msgpack-numpy",
+            "numpy",
+            "opentelemetry-api",
+            "pillow",
+            "pos3",
+            "python-dateutil",
+            "pyyaml",
+            "s3transfer",
+            "six",
+            "tqdm",
+            "typing-extensions",
+            "urllib3",
+            "websockets",
         ),
         dialects={"roboarena": {"mapping": "openpi-droid"}},
     ),
     "provael": Program(
-        ("provael", "openpi-client"), "openpi", client="provael", python="3.12", used=1,
+        ("provael", "openpi-client"),
+        "openpi",
+        client="provael",
+        python="3.12",
+        used=1,
         said="executes the first row of each chunk",
-        requirements=("provael[openpi]==0.46.0", *_OPENPI), dialects={"openpi": {"mapping": "openpi-libero"}},
+        requirements=("provael[openpi]==0.46.0", *_OPENPI),
+        dialects={"openpi": {"mapping": "openpi-libero"}},
     ),
-}  # fmt: skip
-# Programs with a protocol of their own: what they speak, and the size of a dialect, estimated by those that there are.
+}
+# Programs with a protocol of their own: what they speak, and the size of a dialect, estimated by
+# those that there are.
 OTHERS = {
-    "positronic 0.4.1, `RemotePolicy`": "sessions over WebSocket and gRPC (`/api/v1/session`): about 350 lines",
+    "positronic 0.4.1, `RemotePolicy`": (
+        "sessions over WebSocket and gRPC (`/api/v1/session`): about 350 lines"
+    ),
     "inspect-robots-xpolicylab 0.1.0": "XPolicyLab's frames: about 250 lines",
     "strands-robots 0.5.3, `RemotePolicy`": "JSON over WebSocket: about 250 lines",
-    "atoms-robot 0.1.0": "`POST /v1/act` with JPEG in base64, at a path of this project: about 100 lines, and a port",
+    "atoms-robot 0.1.0": (
+        "`POST /v1/act` with JPEG in base64, at a path of this project: about 100 lines, and a port"
+    ),
     "roboeval 0.1.1": "HTTP with a handshake that states formats of actions: about 150 lines",
     "agi-diy 0.5.12": "leases of a hosted service with accounts: no dialect",
 }
 
 
 class RunPrograms:
-    """A pytest plugin that notes the outcomes of the tests marked `program`, by program and version."""
+    """A pytest plugin that notes the outcomes of the tests marked `program`, by program and
+    version.
+    """
 
     def __init__(self) -> None:
         self._outcomes: dict[str, Counter[str]] = {}
@@ -198,14 +292,22 @@ class RunPrograms:
         for name, outcomes in self._outcomes.items():
             if outcomes.keys() != {"skipped"}:
                 program = PROGRAMS[name]
-                noted.setdefault(name, {})[_python(program)] = {"versions": versions(program), **outcomes}
+                noted.setdefault(name, {})[_python(program)] = {
+                    "versions": versions(program),
+                    **outcomes,
+                }
         if self._outcomes:
-            NOTED.write_text(json.dumps({name: noted[name] for name in PROGRAMS if name in noted}, indent=2) + "\n")
+            NOTED.write_text(
+                json.dumps({name: noted[name] for name in PROGRAMS if name in noted}, indent=2)
+                + "\n"
+            )
 
 
 def notes() -> dict[str, dict[str, dict[str, Any]]]:
     """What is noted of each program, by its Python."""
-    found: dict[str, dict[str, dict[str, Any]]] = json.loads(NOTED.read_text()) if NOTED.is_file() else {}
+    found: dict[str, dict[str, dict[str, Any]]] = (
+        json.loads(NOTED.read_text()) if NOTED.is_file() else {}
+    )
     return found
 
 
@@ -213,12 +315,17 @@ def versions(program: Program) -> str:
     """The versions of a program's packages, as the table shows them."""
     pinned = _pins(program)
     found = {name: pinned.get(name) or _installed(name) for name in program.packages}
-    return ", ".join(f"{name.removesuffix('_SRC').lower()} {number}" for name, number in found.items())
+    return ", ".join(
+        f"{name.removesuffix('_SRC').lower()} {number}" for name, number in found.items()
+    )
 
 
 def _pins(program: Program) -> dict[str, str]:
     """The versions that a program's environment has, or that of the peers' clients, by package."""
-    wanted = list(program.requirements) or (ROOT / "benchmarks/peers/requirements.txt").read_text().splitlines()
+    wanted = (
+        list(program.requirements)
+        or (ROOT / "benchmarks/peers/requirements.txt").read_text().splitlines()
+    )
     pins = (line.partition("==") for line in wanted)
     return {name.partition("[")[0]: number for name, equal, number in pins if equal}
 
@@ -235,12 +342,23 @@ def _python(program: Program) -> str:
 
 def ran() -> Iterator[str]:
     """Yield the rows of the table of programs, one for each Python in which one was tried."""
-    yield from ("| program | versions | from | connects to | tests | advice |", "|---|---|---|---|---|---|")
+    yield from (
+        "| program | versions | from | connects to | tests | advice |",
+        "|---|---|---|---|---|---|",
+    )
     noted = notes()
     for name, program in PROGRAMS.items():
         for one in noted.get(name, {"": {}}).values():
-            outcomes = ", ".join(f"{one[what]} {what}" for what in ("passed", "failed", "skipped") if what in one)
-            cells = (name, one.get("versions", ""), program.source, program.connects, outcomes or "not run")
+            outcomes = ", ".join(
+                f"{one[what]} {what}" for what in ("passed", "failed", "skipped") if what in one
+            )
+            cells = (
+                name,
+                one.get("versions", ""),
+                program.source,
+                program.connects,
+                outcomes or "not run",
+            )
             yield f"| {' | '.join((*cells, program.said))} |"
 
 
@@ -252,7 +370,9 @@ def settings() -> Iterator[str]:
     for name, program in PROGRAMS.items():
         if program.dialects:
             yield f"# {name}"
-            yield yaml.safe_dump(dict(program.dialects), sort_keys=False, default_flow_style=None, width=110).rstrip()
+            yield yaml.safe_dump(
+                dict(program.dialects), sort_keys=False, default_flow_style=None, width=110
+            ).rstrip()
     yield "```"
 
 

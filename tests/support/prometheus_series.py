@@ -18,7 +18,9 @@ class Scraped(NamedTuple):
 
     def key(self, *tags: str) -> str:
         """The name, and those of `tags` that it has, sorted."""
-        return " ".join([self.name, *(f"{tag}={self.tags[tag]}" for tag in sorted(tags) if tag in self.tags)])
+        return " ".join(
+            [self.name, *(f"{tag}={self.tags[tag]}" for tag in sorted(tags) if tag in self.tags)]
+        )
 
 
 def scrape() -> list[Scraped]:
@@ -28,4 +30,7 @@ def scrape() -> list[Scraped]:
     with urllib.request.urlopen(url, timeout=10) as answer:
         text = answer.read().decode()
     lines = re.findall(r"^ray_(vlagents_\w+)\{(.*)\} (\S+)$", text, re.MULTILINE)
-    return [Scraped(name, dict(re.findall(r'(\w+)="([^"]*)"', tags)), float(value)) for name, tags, value in lines]
+    return [
+        Scraped(name, dict(re.findall(r'(\w+)="([^"]*)"', tags)), float(value))
+        for name, tags, value in lines
+    ]

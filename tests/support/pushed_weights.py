@@ -1,4 +1,6 @@
-"""Whether a loaded policy acts with weights that are pushed, and as before with those that it had."""
+"""Whether a loaded policy acts with weights that are pushed, and as before with those that it
+had.
+"""
 
 from __future__ import annotations
 
@@ -34,7 +36,13 @@ def check_pushed_weights(agent: Agent, act: Callable[[], np.ndarray], part: str 
         weights.use(weights.newest)
         return act()
 
-    other = push(1, {name: value * _FACTOR if "float" in str(value.dtype) else value for name, value in loaded.items()})
+    other = push(
+        1,
+        {
+            name: value * _FACTOR if "float" in str(value.dtype) else value
+            for name, value in loaded.items()
+        },
+    )
     assert other.shape == before.shape
     assert not np.allclose(other, before)
     np.testing.assert_array_equal(push(2, loaded), before)

@@ -1,4 +1,6 @@
-"""Policies for separate Python environments; before they are loaded they need only numpy and this package."""
+"""Policies for separate Python environments; before they are loaded they need only numpy and
+this package.
+"""
 
 from __future__ import annotations
 
@@ -21,9 +23,11 @@ ALIVE: weakref.WeakSet[Telling] = weakref.WeakSet()  # sessions that this proces
 
 
 class Telling(Agent):
-    """Brings `eval_fakes.Line` to zero, and says in every `info` what it runs on and how many acts it has behind it.
+    """Brings `eval_fakes.Line` to zero, and says in every `info` what it runs on and how many acts
+    it has behind it.
 
-    `needs` is imported when it is loaded; what it says at each reset is also a line of the file `notes`.
+    `needs` is imported when it is loaded; what it says at each reset is also a line of the file
+    `notes`.
     """
 
     contract = Contract(action=ActionSpec(dim=1))
@@ -45,7 +49,9 @@ class Telling(Agent):
         if self.notes is not None:
             with Path(self.notes).open("a") as file:
                 file.write(json.dumps(self.told()) + "\n")
-        return self.told() | ({"weights": f"with {kwargs['adapter']}"} if "adapter" in kwargs else {})
+        return self.told() | (
+            {"weights": f"with {kwargs['adapter']}"} if "adapter" in kwargs else {}
+        )
 
     def observe(self, obs: Obs) -> None:
         self.seen.append(float(obs.info["value"]))
@@ -75,11 +81,20 @@ class Telling(Agent):
         except importlib.metadata.PackageNotFoundError:
             ray = None
         return {
-            "python": platform.python_version(), "numpy": np.__version__, "ray": ray, self.needs: self.version,
-            "prefix": sys.prefix, "pid": os.getpid(), "parent": os.getppid(), "variable": os.environ.get("VARIABLE"),
-            "gpus": os.environ.get("CUDA_VISIBLE_DEVICES"), "instruction": self.instruction, "acts": self.acts,
-            "seen": list(self.seen), "alive": len(ALIVE),
-        }  # fmt: skip
+            "python": platform.python_version(),
+            "numpy": np.__version__,
+            "ray": ray,
+            self.needs: self.version,
+            "prefix": sys.prefix,
+            "pid": os.getpid(),
+            "parent": os.getppid(),
+            "variable": os.environ.get("VARIABLE"),
+            "gpus": os.environ.get("CUDA_VISIBLE_DEVICES"),
+            "instruction": self.instruction,
+            "acts": self.acts,
+            "seen": list(self.seen),
+            "alive": len(ALIVE),
+        }
 
 
 class Compiling(Telling):

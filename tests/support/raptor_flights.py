@@ -1,4 +1,6 @@
-"""RAPTOR of examples/raptor: the reference that its authors ship with the weights, and flights with a policy."""
+"""RAPTOR of examples/raptor: the reference that its authors ship with the weights, and flights
+with a policy.
+"""
 
 from __future__ import annotations
 
@@ -18,14 +20,18 @@ Acts = Callable[[Sequence[Obs]], Sequence[Act]]
 
 
 class LocatedRaptor(Raptor):
-    """States its process at each reset and act, for tests that kill it: a session may have moved since its reset."""
+    """States its process at each reset and act, for tests that kill it: a session may have moved
+    since its reset.
+    """
 
     def reset(self, obs: Obs, instruction: str | None, **kwargs: Any) -> dict[str, Any]:
         super().reset(obs, instruction, **kwargs)
         return {"pid": os.getpid()}
 
     def act_batch(self, obs: Sequence[Obs], sessions: Sequence[Any]) -> list[Act]:
-        return [Act(act.action, info={"pid": os.getpid()}) for act in super().act_batch(obs, sessions)]
+        return [
+            Act(act.action, info={"pid": os.getpid()}) for act in super().act_batch(obs, sessions)
+        ]
 
 
 def reference() -> tuple[np.ndarray, np.ndarray]:
@@ -50,7 +56,9 @@ def loaded() -> Raptor:
 
 
 def fly(seeds: Sequence[int], acts: Acts, steps: int) -> np.ndarray:
-    """Fly from the start of each seed; the states of the quadrotors after each step, (steps, 17, flights)."""
+    """Fly from the start of each seed; the states of the quadrotors after each step, (steps, 17,
+    flights).
+    """
     batch = HoverBatch(len(seeds))
     obs = batch.reset(seeds=seeds)
     states = []

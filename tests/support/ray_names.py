@@ -1,4 +1,5 @@
-"""The names of Ray that this package uses though they are not public, and whether the installed Ray has them.
+"""The names of Ray that this package uses though they are not public, and whether the installed Ray
+has them.
 
 `python tests/support/ray_names.py` lists them, and fails if one is missing.
 """
@@ -12,7 +13,8 @@ from pathlib import Path
 from types import ModuleType
 
 PACKAGE = Path(__file__).parents[2] / "vlagents_ray"
-PLACES = ("ray_tools/private.py", "serve/scaling/router.py")  # tests/test_layout.py holds that nothing else uses any
+# tests/test_layout.py holds that nothing else uses any.
+PLACES = ("ray_tools/private.py", "serve/scaling/router.py")
 
 
 def used(file: Path) -> set[str]:
@@ -23,14 +25,22 @@ def used(file: Path) -> set[str]:
         if isinstance(node, ast.ImportFrom) and (node.module or "").split(".")[0] == "ray":
             known |= {one.asname or one.name: f"{node.module}.{one.name}" for one in node.names}
         elif isinstance(node, ast.Import):
-            known |= {one.asname: one.name for one in node.names if one.asname and one.name.startswith("ray.")}
+            known |= {
+                one.asname: one.name
+                for one in node.names
+                if one.asname and one.name.startswith("ray.")
+            }
     found = {name for name in known.values() if _is_private(name)}
     for node in ast.walk(tree):
         if isinstance(node, ast.Attribute):
             root, *parts = ast.unparse(node).split(".")
             if root in known and all(part.isidentifier() for part in parts):
                 found.add(".".join([known[root], *parts]))
-    return {name for name in found if _is_private(name) and not any(other.startswith(f"{name}.") for other in found)}
+    return {
+        name
+        for name in found
+        if _is_private(name) and not any(other.startswith(f"{name}.") for other in found)
+    }
 
 
 def _is_private(name: str) -> bool:

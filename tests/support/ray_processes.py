@@ -1,7 +1,8 @@
 """Processes of servers and of Ray.
 
 Those of a Ray that has a folder of its own (RAY_TMPDIR, --temp-dir) are known by it. `serving` runs
-`vlagents-ray serve` as users do; `leaked` searches the places where other processes can read a secret.
+`vlagents-ray serve` as users do; `leaked` searches the places where other processes can read a
+secret.
 """
 
 from __future__ import annotations
@@ -38,7 +39,9 @@ def words(process: psutil.Process) -> list[str]:
 
 @contextmanager
 def ray_folder() -> Iterator[Path]:
-    """A folder for a Ray of one's own, which is ended with it; short, because the names of sockets are limited."""
+    """A folder for a Ray of one's own, which is ended with it; short, because the names of
+    sockets are limited.
+    """
     folder = Path(tempfile.mkdtemp(prefix="r"))
     try:
         yield folder
@@ -48,7 +51,9 @@ def ray_folder() -> Iterator[Path]:
 
 
 def processes(folder: Path, named: str = "") -> list[int]:
-    """The processes of the Ray whose files are in `folder`, or those of them that are `named` so."""
+    """The processes of the Ray whose files are in `folder`, or those of them that are `named`
+    so.
+    """
     found = []
     for process in Path("/proc").glob("[0-9]*"):
         try:
@@ -57,14 +62,17 @@ def processes(folder: Path, named: str = "") -> list[int]:
             ours = ours or (is_titled(process) and has_open_files(process, str(folder)))
         except OSError:  # it has ended, or is not ours
             continue
-        program = command.partition(b"\0")[0]  # what follows may be what setproctitle left of the environment
+        # What follows may be what setproctitle left of the environment.
+        program = command.partition(b"\0")[0]
         if ours and named.encode() in program:
             found.append(int(process.name))
     return found
 
 
 def wait_for_end(folder: Path, *named: str) -> None:
-    """Until no process of that Ray that is `named` so is left; says which are if they do not end."""
+    """Until no process of that Ray that is `named` so is left; says which are if they do not
+    end.
+    """
     try:
         wait_for(lambda: not any(processes(folder, name) for name in named))
     except TimeoutError as error:
@@ -75,7 +83,9 @@ def wait_for_end(folder: Path, *named: str) -> None:
 def _said(pid: int) -> str:
     try:
         command = (Path("/proc") / str(pid) / "cmdline").read_bytes().replace(b"\0", b" ")
-        state = (Path("/proc") / str(pid) / "status").read_text().partition("State:")[2].split("\n")[0]
+        state = (
+            (Path("/proc") / str(pid) / "status").read_text().partition("State:")[2].split("\n")[0]
+        )
     except OSError:
         return "just ended"
     return f"{command[:200].decode(errors='replace')} ({state.strip()})"
@@ -101,7 +111,8 @@ def free_address() -> str:
 def serving(
     policy: str, log: Path, address: str | None = None, *options: str, cwd: Path | None = None
 ) -> Iterator[str]:
-    """A server for the length of the context, on a free port unless one is given; yields "host:port" once healthy.
+    """A server for the length of the context, on a free port unless one is given; yields
+    "host:port" once healthy.
 
     With a `cwd` it is as a reader types it there: what tests add to PYTHONPATH is not in it.
     """
@@ -121,7 +132,9 @@ def serving(
         deadline = time.monotonic() + START_S
         while not healthy(address):
             assert server.poll() is None, f"{shlex.join(command)} ended:\n{log.read_text()}"
-            assert time.monotonic() < deadline, f"{shlex.join(command)} is not healthy:\n{log.read_text()}"
+            assert time.monotonic() < deadline, (
+                f"{shlex.join(command)} is not healthy:\n{log.read_text()}"
+            )
             time.sleep(0.2)
         yield address
     finally:
@@ -144,11 +157,16 @@ def healthy(address: str) -> bool:
 
 
 def leaked(secret: str, folders: Iterable[Path]) -> list[str]:
-    """The files below `folders` that hold it, and processes but this one, by their command lines and environments."""
+    """The files below `folders` that hold it, and processes but this one, by their command lines
+    and environments.
+    """
     sought = secret.encode()
     files = [file for folder in folders for file in folder.rglob("*") if file.is_file()]
     for process in Path("/proc").glob("[0-9]*"):
-        files += [process / "cmdline", *([process / "environ"] if int(process.name) != os.getpid() else [])]
+        files += [
+            process / "cmdline",
+            *([process / "environ"] if int(process.name) != os.getpid() else []),
+        ]
     found = []
     for file in files:
         try:

@@ -1,19 +1,21 @@
-"""Reading, running and checking the fenced blocks of a Markdown text, its commands, and the files of examples/.
+"""Reading, running and checking the fenced blocks of a Markdown text, its commands, and the files
+of examples/.
 
-An HTML comment straight above a block says how it is tested. `<!-- test: serve scripted -->` runs it
-with a server of that policy in place of http://gpu-box:8000 or http://localhost:8000, `<!-- test -->` or no
-comment without one; ` with peers` at the end of either runs it with the Python that has other systems'
-clients, and ` with ray` says of a block of docs/ that it starts Ray.
+An HTML comment straight above a block says how it is tested. `<!-- test: serve scripted -->` runs
+it with a server of that policy in place of http://gpu-box:8000 or http://localhost:8000, `<!-- test
+-->` or no comment without one; ` with peers` at the end of either runs it with the Python that has
+other systems' clients, and ` with ray` says of a block of docs/ that it starts Ray.
 Further lines of such a comment are code that is run before the block:
 
     <!-- test: serve scripted
     obs = Obs(gripper=1.0) -->
 
-`<!-- file: NAME -->` says that the reader saves the block, of whatever language, under that name; the blocks
-after it on the page find the file.
+`<!-- file: NAME -->` says that the reader saves the block, of whatever language, under that name;
+the blocks after it on the page find the file.
 
 `<!-- not run: REASON -->` says why a block is not run; its commands must at least exist, and
-`vlagents-ray`'s must know their options. Where blocks run, an `sbatch` takes every job and runs none.
+`vlagents-ray`'s must know their options. Where blocks run, an `sbatch` takes every job and runs
+none.
 """
 
 from __future__ import annotations
@@ -40,8 +42,13 @@ ROOT = Path(__file__).parents[2]
 DOCUMENTED_HOST = "gpu-box:8000"
 ON_THIS_MACHINE = "localhost:8000"
 PYTHON, SHELL = {"python"}, {"bash", "sh", "console"}
-# As a reader has it, without PYTHONPATH; but if that names this checkout, another one may be what is installed.
-_HERE = {"PYTHONPATH": str(ROOT)} if str(ROOT) in os.environ.get("PYTHONPATH", "").split(os.pathsep) else {}
+# As a reader has it, without PYTHONPATH; but if that names this checkout, another one may be what
+# is installed.
+_HERE = (
+    {"PYTHONPATH": str(ROOT)}
+    if str(ROOT) in os.environ.get("PYTHONPATH", "").split(os.pathsep)
+    else {}
+)
 _READERS = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"} | _HERE
 _BIN = Path(__file__).parent / "bin"  # commands that a reader has, and this machine may not
 ENV = _READERS | {
@@ -55,7 +62,9 @@ RUN_S = 300
 
 @dataclass(frozen=True)
 class Block:
-    """One fenced block. `source` has its code, and its comment's, at the lines of the README where they stand."""
+    """One fenced block. `source` has its code, and its comment's, at the lines of the README
+    where they stand.
+    """
 
     language: str
     line: int
@@ -71,7 +80,9 @@ class Block:
 
 
 def blocks(text: str) -> list[Block]:
-    """The Python and shell blocks of a Markdown text. Raises `ValueError` for an unknown or unfinished one."""
+    """The Python and shell blocks of a Markdown text. Raises `ValueError` for an unknown or
+    unfinished one.
+    """
     found: list[Block] = []
     fence: re.Match[str] | None = None
     comment: list[tuple[int, str]] | None = None
@@ -80,7 +91,9 @@ def blocks(text: str) -> list[Block]:
     for number, line in enumerate(text.splitlines(), 1):
         if fence is not None:
             if line.strip() == "```":
-                if fence["language"] in PYTHON | SHELL or (above and above[0][1].lstrip().startswith("<!-- file:")):
+                if fence["language"] in PYTHON | SHELL or (
+                    above and above[0][1].lstrip().startswith("<!-- file:")
+                ):
                     found.append(_block(fence["language"], above, code))
                 fence, above, code = None, [], []
             else:
@@ -113,7 +126,8 @@ def _block(language: str, above: list[tuple[int, str]], code: list[tuple[int, st
         server, peers, ray = match[1], match[2] is not None, match[3] is not None
     else:
         raise ValueError(
-            f"line {above[0][0]}: {mark!r}, want 'test', 'test: serve POLICY' ('with peers', 'with ray'), "
+            f"line {above[0][0]}: {mark!r}, want 'test', 'test: serve POLICY' ('with peers', 'with "
+            "ray'), "
             f"'file: NAME' or 'not run: REASON'"
         )
     if language == "console":  # what begins with a prompt was typed, the rest is output
@@ -125,7 +139,9 @@ def _block(language: str, above: list[tuple[int, str]], code: list[tuple[int, st
 
 
 def checkout(folder: Path) -> None:
-    """Put into `folder` what pages name as paths in a checkout, with two episodes of each env in `evaluations`."""
+    """Put into `folder` what pages name as paths in a checkout, with two episodes of each env in
+    `evaluations`.
+    """
     for name in ("cluster", "deployments", "evaluations", "examples", "reference"):
         shutil.copytree(ROOT / name, folder / name)
     for file in (folder / "evaluations").glob("*.yaml"):
@@ -145,16 +161,33 @@ def run(block: Block, cwd: Path, host: str = DOCUMENTED_HOST, *, page: str = "RE
     env = ENV | {"PATH": f"{_BIN}{os.pathsep}{ENV['PATH']}", "HOME": str(cwd)}
     script.write_text(source)
     python = str(peers_python()) if block.peers else sys.executable
-    command = [python, str(script)] if block.language in PYTHON else ["bash", "-eu", "-o", "pipefail", script]
-    done = subprocess.run(
-        command, check=False, cwd=cwd, env=env, stdin=subprocess.DEVNULL, capture_output=True, text=True, timeout=RUN_S
+    command = (
+        [python, str(script)]
+        if block.language in PYTHON
+        else ["bash", "-eu", "-o", "pipefail", script]
     )
-    assert done.returncode == 0, f"{page} {block}: exit status {done.returncode}\n{done.stdout}\n{done.stderr}"
+    done = subprocess.run(
+        command,
+        check=False,
+        cwd=cwd,
+        env=env,
+        stdin=subprocess.DEVNULL,
+        capture_output=True,
+        text=True,
+        timeout=RUN_S,
+    )
+    assert done.returncode == 0, (
+        f"{page} {block}: exit status {done.returncode}\n{done.stdout}\n{done.stderr}"
+    )
 
 
 def check_commands(block: Block) -> None:
-    """Every command of a shell block that is not run is there, and takes the options that are shown."""
-    parsed = subprocess.run(["bash", "-n"], input=block.source, check=False, capture_output=True, text=True)
+    """Every command of a shell block that is not run is there, and takes the options that are
+    shown.
+    """
+    parsed = subprocess.run(
+        ["bash", "-n"], input=block.source, check=False, capture_output=True, text=True
+    )
     assert parsed.returncode == 0, f"README {block}: {parsed.stderr}"
     for line in block.source.replace("\\\n", " ").splitlines():
         words = shlex.split(line, comments=True)
@@ -173,14 +206,19 @@ def check_command(words: list[str], where: str) -> None:
     else:
         command = ["bash", "-c", f"type {shlex.quote(name)}"]
     done = subprocess.run(command, check=False, capture_output=True, text=True, env=ENV, timeout=60)
-    if name == "vlagents-ray" and re.search(r"Usage:.*COMMAND", done.stdout):  # a command of commands, as `bench` is
+    # A command of commands, as `bench` is.
+    if name == "vlagents-ray" and re.search(r"Usage:.*COMMAND", done.stdout):
         command = [name, *arguments[:2], "--help"]
-        done = subprocess.run(command, check=False, capture_output=True, text=True, env=ENV, timeout=60)
+        done = subprocess.run(
+            command, check=False, capture_output=True, text=True, env=ENV, timeout=60
+        )
     assert done.returncode == 0, f"{where}\n{done.stdout}{done.stderr}"
     if name == "vlagents-ray":
         known = set(re.findall(r"--[\w-]+", done.stdout))
         shown = {word.partition("=")[0] for word in arguments if word.startswith("--")}
-        assert shown - known == set(), f"{where}: {sorted(shown - known)} are not among {sorted(known)}"
+        assert shown - known == set(), (
+            f"{where}: {sorted(shown - known)} are not among {sorted(known)}"
+        )
 
 
 DOCS = ROOT / "docs"
@@ -190,9 +228,15 @@ PAGES = sorted([ROOT / "README.md", ROOT / "SECURITY.md", *DOCS.rglob("*.md")])
 
 
 def commands(text: str) -> list[tuple[str, bool]]:
-    """The commands of `vlagents-ray` in a page, and whether one stands in a block, whole, and not in a sentence."""
+    """The commands of `vlagents-ray` in a page, and whether one stands in a block, whole, and
+    not in a sentence.
+    """
     blocks = re.findall(r"```(?:bash|sh|console)\n(.*?)```", text, re.DOTALL)
-    lines = [line.strip().removeprefix("$ ") for block in blocks for line in block.replace("\\\n", " ").splitlines()]
+    lines = [
+        line.strip().removeprefix("$ ")
+        for block in blocks
+        for line in block.replace("\\\n", " ").splitlines()
+    ]
     typed = [line for line in lines if re.match(r"(\w+=\S+ )*vlagents-ray ", line)]
     prose = re.sub(r"```.*?```", "", text, flags=re.DOTALL)
     mentioned = [" ".join(one.split()) for one in re.findall(r"`(vlagents-ray [^`]*)`", prose)]
@@ -205,7 +249,12 @@ def options_of(line: str) -> set[str]:
     words = words[words.index("vlagents-ray") + 1 :]
     if words[:1] == ["robot"]:
         parsers = [robot.command_parser()[0], check_parser()]
-        return {option for parser in parsers for action in parser._actions for option in action.option_strings}
+        return {
+            option
+            for parser in parsers
+            for action in parser._actions
+            for option in action.option_strings
+        }
     command = COMMAND
     while words and words[0] in getattr(command, "commands", {}):
         command = command.commands[words.pop(0)]
@@ -214,7 +263,9 @@ def options_of(line: str) -> set[str]:
 
 
 def read_as_typed(line: str, *, whole: bool) -> None:
-    """Raise what the command would say of its words before it does anything; of a mention some may be left out."""
+    """Raise what the command would say of its words before it does anything; of a mention some
+    may be left out.
+    """
     if not whole:
         line = re.sub(r"[\[\]…]", "", line)  # what is optional, and what is anything
     words = re.split(r" (?:\d?>|\||&)", line)[0]  # what the shell reads
@@ -223,23 +274,34 @@ def read_as_typed(line: str, *, whole: bool) -> None:
     command = COMMAND
     try:
         while hasattr(command, "resolve_command") and arguments:
-            _, command, arguments = command.resolve_command(command.context_class(command), arguments)
+            _, command, arguments = command.resolve_command(
+                command.context_class(command), arguments
+            )
         command.make_context(line, arguments)
     except Exception as error:
-        left_out = type(error).__name__ in ("MissingParameter", "NoArgsIsHelpError") or "requires an argument" in str(
-            error
-        )
+        left_out = type(error).__name__ in (
+            "MissingParameter",
+            "NoArgsIsHelpError",
+        ) or "requires an argument" in str(error)
         if whole or not left_out:
-            raise ValueError(f"{line}: {getattr(error, 'format_message', error.__str__)()}") from error
+            raise ValueError(
+                f"{line}: {getattr(error, 'format_message', error.__str__)()}"
+            ) from error
 
 
 EXAMPLES = ROOT / "examples"
 
 
 def code_of(notebook: Path, server: str | None = None) -> Block:
-    """The cells of a notebook in their order, as one block of Python; raises `ValueError` if it has outputs."""
-    cells = [cell for cell in json.loads(notebook.read_text())["cells"] if cell["cell_type"] == "code"]
+    """The cells of a notebook in their order, as one block of Python; raises `ValueError` if it
+    has outputs.
+    """
+    cells = [
+        cell for cell in json.loads(notebook.read_text())["cells"] if cell["cell_type"] == "code"
+    ]
     if kept := [cell["id"] for cell in cells if cell["outputs"] or cell["execution_count"]]:
         raise ValueError(f"{notebook.name}: got outputs in {kept}, want none; clear them")
-    code = "\n".join("".join(cell["source"]) for cell in cells).replace("localhost:8000", DOCUMENTED_HOST)
+    code = "\n".join("".join(cell["source"]) for cell in cells).replace(
+        "localhost:8000", DOCUMENTED_HOST
+    )
     return Block("python", 1, code, server)

@@ -1,4 +1,6 @@
-"""Folders of results as an evaluation writes them, without running episodes: for tests of their readers."""
+"""Folders of results as an evaluation writes them, without running episodes: for tests of their
+readers.
+"""
 
 from __future__ import annotations
 
@@ -21,15 +23,29 @@ from vlagents_ray.evaluate.results.store import Store
 from vlagents_ray.interface import Obs
 
 HOSTILE = "</script><img src=x onerror=alert(1)>\"'&"
-TIMING = {"decode_ms": 0.2, "queue_ms": 1.0, "inference_ms": 20.0, "encode_ms": 0.1, "wire_ms": 2.0, "total_ms": 21.5}
+TIMING = {
+    "decode_ms": 0.2,
+    "queue_ms": 1.0,
+    "inference_ms": 20.0,
+    "encode_ms": 0.1,
+    "wire_ms": 2.0,
+    "total_ms": 21.5,
+}
 
-Outcome = Callable[[EvalCase, int], int | None]  # (cell, seed) -> the step that solved it, None for never
+# (cell, seed) -> the step that solved it, None for never.
+Outcome = Callable[[EvalCase, int], int | None]
 
 
-def runs(out: Path, *, episodes: int = 12, steps: list[int] | None = None, **changes: Any) -> EvalConfig:
+def runs(
+    out: Path, *, episodes: int = 12, steps: list[int] | None = None, **changes: Any
+) -> EvalConfig:
     """Settings of two policies, one of them a sweep, in two suites."""
     policies = [
-        {"name": "learner", "url": "http://localhost:1", "steps": [1000, 2000] if steps is None else steps},
+        {
+            "name": "learner",
+            "url": "http://localhost:1",
+            "steps": [1000, 2000] if steps is None else steps,
+        },
         {"name": "base", "url": "http://localhost:2"},
     ]
     suites = [
@@ -47,9 +63,14 @@ def better_later(cell: EvalCase, seed: int) -> int | None:
 
 
 def record(
-    config: EvalConfig, outcome: Outcome = better_later, *, videos: bool = False, troubles: bool = False
+    config: EvalConfig,
+    outcome: Outcome = better_later,
+    *,
+    videos: bool = False,
+    troubles: bool = False,
 ) -> Results:
-    """Record every episode of `config`; with `troubles`, one error of a policy and one lost episode.
+    """Record every episode of `config`; with `troubles`, one error of a policy and one lost
+    episode.
 
     `videos` are of those that failed, or of all if `config.video` says so.
     """
@@ -60,29 +81,51 @@ def record(
         for job in jobs:
             result = _result(job, outcome(job.cell, job.key.seed))
             paths = save_videos(
-                config.out, job.cell, result, _video() if videos and (shown or not result.success_once) else {}
+                config.out,
+                job.cell,
+                result,
+                _video() if videos and (shown or not result.success_once) else {},
             )
             if troubles and job in (jobs[0], jobs[1]):
                 _trouble(store, job, lost=job == jobs[1])
             else:
                 store.record(result, 1, paths)
         for place in {cell.place for cell in store.cells}:
-            described = {"simulator": "line", "protocol": {"init_states": 50, "settle_steps": 10, "word": HOSTILE}}
+            described = {
+                "simulator": "line",
+                "protocol": {"init_states": 50, "settle_steps": 10, "word": HOSTILE},
+            }
             store.note_env(place, EnvInfo(described, {"action": {"dim": 1}}))
         for policy in config.policies:
             store.note_policy(policy.name, {"policy": policy.name, "checkpoint": None})
             for pid in (1, 1, 2):
-                store.note_worker(WorkerInfo("gpu-box", None, pid, policy.name, "handle", f"llvmpipe {HOSTILE}"))
+                store.note_worker(
+                    WorkerInfo("gpu-box", None, pid, policy.name, "handle", f"llvmpipe {HOSTILE}")
+                )
         store.end_run("complete")
     return Results.load(config.out)
 
 
 def _result(job: Job, solved: int | None) -> EpisodeResult:
     return EpisodeResult(
-        job.key, "done", solved is not None, solved is not None, solved, steps=80, episode_return=float(solved is None),
-        ending="truncated", instruction=f"go {HOSTILE}", seconds=2.0, reset_ms=5.0, env_step_ms=1.5, acts=80,
-        policy_ms=23.4, policy_p95_ms=30.0, timing_ms=TIMING, transport="http",
-    )  # fmt: skip
+        job.key,
+        "done",
+        solved is not None,
+        solved is not None,
+        solved,
+        steps=80,
+        episode_return=float(solved is None),
+        ending="truncated",
+        instruction=f"go {HOSTILE}",
+        seconds=2.0,
+        reset_ms=5.0,
+        env_step_ms=1.5,
+        acts=80,
+        policy_ms=23.4,
+        policy_p95_ms=30.0,
+        timing_ms=TIMING,
+        transport="http",
+    )
 
 
 def _trouble(store: Store, job: Job, *, lost: bool) -> None:
@@ -91,7 +134,10 @@ def _trouble(store: Store, job: Job, *, lost: bool) -> None:
     if lost:
         store.record(EpisodeResult(job.key, "infra_failed", error="hung"), 4)
     else:
-        store.record(EpisodeResult(job.key, "policy_error", False, False, error=f"policy_failed: {HOSTILE}"), 2)
+        store.record(
+            EpisodeResult(job.key, "policy_error", False, False, error=f"policy_failed: {HOSTILE}"),
+            2,
+        )
 
 
 def _video() -> dict[str, bytes]:

@@ -69,7 +69,9 @@ class Robot:
         [reply] = replies.result(10)
         return reply
 
-    def play(self, acts: int, seed: int = 0, first: int = 0, instruction: str = "stack the cups") -> list[np.ndarray]:
+    def play(
+        self, acts: int, seed: int = 0, first: int = 0, instruction: str = "stack the cups"
+    ) -> list[np.ndarray]:
         """Begin an episode, and return the chunks of so many acts."""
         reset = self.ask(Request("reset", seen(first), instruction, {"seed": seed}))
         assert reply_of(reset).error is None

@@ -1,6 +1,8 @@
-"""What uv resolves of pyproject.toml and the plug-ins' requirements: the table of docs/install.md, the images' locks.
+"""What uv resolves of pyproject.toml and the plug-ins' requirements: the table of docs/install.md,
+the images' locks.
 
-`python tests/support/resolved.py extras` writes the table again, `… locks` the locks, over the network.
+`python tests/support/resolved.py extras` writes the table again, `… locks` the locks, over the
+network.
 """
 
 from __future__ import annotations
@@ -31,7 +33,8 @@ PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 _PLUGIN_FILES = sorted(ROOT.glob("plugins/vlagents_ray_*/pyproject.toml"))
 PLUGINS = [tomllib.loads(file.read_text())["project"] for file in _PLUGIN_FILES]
 OF_DEVELOPMENT = {"all", "check", "docs", "dev"}  # for Python 3.11 alone; "all" brings plug-ins
-# Extras of the plug-ins, with what their distribution needs. No two distributions have an extra of the same name.
+# Extras of the plug-ins, with what their distribution needs. No two distributions have an extra of
+# the same name.
 OF_PLUGINS: dict[str, list[str]] = {
     extra: [*project["dependencies"], *requirements]
     for project in PLUGINS
@@ -46,7 +49,9 @@ BEGIN, END = "<!-- resolved {} -->", "<!-- /resolved -->"
 
 
 def direct(extra: str | None) -> list[str]:
-    """The requirements of an extra with those of the extras that it names, and of the install without one."""
+    """The requirements of an extra with those of the extras that it names, and of the install
+    without one.
+    """
     found = list(PROJECT["dependencies"]) if extra is None else direct(None)
     for text in EXTRAS[extra] if extra else []:
         wanted = Requirement(text)
@@ -65,27 +70,43 @@ def lines(file: Path) -> list[str]:
 
 
 def overrides(requirements: Sequence[str]) -> list[str]:
-    """The lines of torch.txt but for packages of which the requirements pin a version, as for another CUDA."""
+    """The lines of torch.txt but for packages of which the requirements pin a version, as for
+    another CUDA.
+    """
     wanted = map(Requirement, requirements)
     pinned = {one.name for one in wanted if any(part.operator == "==" for part in one.specifier)}
     return [text for text in lines(TORCH) if Requirement(text).name not in pinned]
 
 
 def resolve(requirements: Sequence[str], python: str, *words: str) -> list[dict[str, Any]]:
-    """The packages, as in a `pylock.toml`: of each its `name`, `version`, and the `wheels` that fit the platform.
+    """The packages, as in a `pylock.toml`: of each its `name`, `version`, and the `wheels` that fit
+    the platform.
 
     Raises:
         LookupError: Nothing fits.
         RuntimeError: uv failed otherwise, as without a network.
     """
-    command = [sys.executable, "-m", "uv", "pip", "compile", "--quiet", "--no-config", "--format", "pylock.toml"]
-    command += ["--no-python-downloads"]  # it would look for that Python, which resolving does not need
+    command = [
+        sys.executable,
+        "-m",
+        "uv",
+        "pip",
+        "compile",
+        "--quiet",
+        "--no-config",
+        "--format",
+        "pylock.toml",
+    ]
+    # It would look for that Python, which resolving does not need.
+    command += ["--no-python-downloads"]
     command += ["--python-version", python, "--python-platform", PLATFORM, *words]
     with tempfile.NamedTemporaryFile("w", suffix=".txt") as file:
         file.write("\n".join(overrides(requirements)))
         file.flush()
         command += ["--override", file.name, "-"]
-        done = subprocess.run(command, input="\n".join(requirements), capture_output=True, text=True, check=False)
+        done = subprocess.run(
+            command, input="\n".join(requirements), capture_output=True, text=True, check=False
+        )
     if done.returncode != 0:
         raise (LookupError if "No solution found" in done.stderr else RuntimeError)(done.stderr)
     return list(tomllib.loads(done.stdout)["packages"])
@@ -106,7 +127,9 @@ def digest() -> str:
 
 
 def cell(extra: str | None, python: str) -> tuple[str, list[str]]:
-    """How many packages come, and which of them have to be compiled, where no versions with wheels alone fit."""
+    """How many packages come, and which of them have to be compiled, where no versions with
+    wheels alone fit.
+    """
     found, built = "no", list[str]()
     for words in ([], ["--no-build"]):
         with suppress(LookupError):
@@ -119,7 +142,9 @@ def cell(extra: str | None, python: str) -> tuple[str, list[str]]:
 
 
 def table(only: Sequence[str], old: dict[str, str]) -> str:
-    """All rows, of which those that `only` names are resolved, or all if it is empty; `old` has the others."""
+    """All rows, of which those that `only` names are resolved, or all if it is empty; `old` has
+    the others.
+    """
     with ThreadPoolExecutor(8) as pool:
         cells = {
             extra or "none": [pool.submit(cell, extra, python) for python in PYTHONS]
@@ -134,7 +159,9 @@ def table(only: Sequence[str], old: dict[str, str]) -> str:
             found.append(old[name])
             continue
         counts, built = zip(*(one.result() for one in cells[name]), strict=True)
-        found.append(row(f"`{extra}`" if extra else name, *counts, ", ".join(sorted(set().union(*built)))))
+        found.append(
+            row(f"`{extra}`" if extra else name, *counts, ", ".join(sorted(set().union(*built))))
+        )
     return "\n".join(found)
 
 
@@ -166,7 +193,9 @@ def families() -> list[Path]:
 
 
 def simulators() -> list[str]:
-    """The extras of simulators that have an image: all but SIMPLER, which is in the image of ManiSkill."""
+    """The extras of simulators that have an image: all but SIMPLER, which is in the image of
+    ManiSkill.
+    """
     of_core = [extra for extra in EXTRAS if f"{PROJECT['name']}[sim]" in EXTRAS[extra]]
     of_plugins = []
     for extra, requirements in OF_PLUGINS.items():
@@ -182,7 +211,10 @@ def locks() -> dict[str, tuple[str, list[str]]]:
     found = {f"server-{extra}": (SERVER_PYTHON, direct(extra)) for extra in servers}
     for file in families():
         python = re.match(r"# python: (\S+)", file.read_text())
-        found[f"family-{file.stem}"] = (python[1] if python else SERVER_PYTHON, [*direct("serve"), *lines(file)])
+        found[f"family-{file.stem}"] = (
+            python[1] if python else SERVER_PYTHON,
+            [*direct("serve"), *lines(file)],
+        )
     return found
 
 
@@ -200,7 +232,9 @@ def lock(name: str) -> str:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("what", choices=["extras", "locks"])
-    parser.add_argument("only", nargs="*", metavar="NAME", help="an extra or a lock; all without one")
+    parser.add_argument(
+        "only", nargs="*", metavar="NAME", help="an extra or a lock; all without one"
+    )
     arguments = parser.parse_args()
     if arguments.what == "extras":
         found = f"{BEGIN.format(digest())}\n{table(arguments.only, rows(PAGE.read_text()))}\n{END}"

@@ -30,7 +30,9 @@ _CONTRACT = Contract(
 
 
 class Arm(SimulatedRobot):
-    """A simulated arm that `--robot robot_trials:Arm` names. Before the action `fails_at`, from 0, it fails once."""
+    """A simulated arm that `--robot robot_trials:Arm` names. Before the action `fails_at`, from
+    0, it fails once.
+    """
 
     def __init__(self, fails_at: int | None = None) -> None:
         super().__init__(_CONTRACT)
@@ -49,14 +51,20 @@ class Arm(SimulatedRobot):
 
 
 class Reaching(Agent):
-    """Absolute targets; policies differ in where they go, and say their names wherever a policy can."""
+    """Absolute targets; policies differ in where they go, and say their names wherever a policy
+    can.
+    """
 
     contract = _CONTRACT
 
     def __init__(self, name: str, checkpoint: str | None = None) -> None:
         self.name = name
         self.acts = 0
-        self.metadata = {"policy": name, "checkpoint": checkpoint or CHECKPOINTS[name], "url": URLS[name]}
+        self.metadata = {
+            "policy": name,
+            "checkpoint": checkpoint or CHECKPOINTS[name],
+            "url": URLS[name],
+        }
 
     def reset(self, obs: Obs, instruction: str | None = None, **kwargs: Any) -> dict[str, Any]:
         return {"checkpoint": self.metadata["checkpoint"], "weights": f"digest-of-{self.name}"}
@@ -64,12 +72,21 @@ class Reaching(Agent):
     def act(self, obs: Obs) -> Act:
         target = 0.1 + 0.2 * NAMES.index(self.name)
         about = {"version": 0, "fingerprint": f"fingerprint-of-{self.name}"}
-        return Act(np.full((4, 2), target, np.float32), info={"policy": about, "timing": {"round_trip_ms": 3.0}})
+        return Act(
+            np.full((4, 2), target, np.float32),
+            info={"policy": about, "timing": {"round_trip_ms": 3.0}},
+        )
 
 
 def plan(out: Path, **changes: Any) -> EvalConfig:
     """Two policies, two tasks, short trials."""
-    robot = {"arm": "robot_trials:Arm", "hz": 200, "key": "a key of the plan", "tasks": tasks(), "mode": "open_loop"}
+    robot = {
+        "arm": "robot_trials:Arm",
+        "hz": 200,
+        "key": "a key of the plan",
+        "tasks": tasks(),
+        "mode": "open_loop",
+    }
     suite = {"envs": ["cups", "drawer"], "episodes": 2, "seeds": [3]}
     settings = {
         "policies": [{"name": name, "url": URLS[name]} for name in NAMES],
@@ -82,7 +99,12 @@ def plan(out: Path, **changes: Any) -> EvalConfig:
 
 def tasks(max_steps: int = 4) -> dict[str, dict[str, Any]]:
     rubric = {"the cup is grasped": 1, "the cup is on the plate": 3}
-    cups = {"instruction": "put the cup on the plate", "setup": "cup on the mark", "max_steps": 6, "rubric": rubric}
+    cups = {
+        "instruction": "put the cup on the plate",
+        "setup": "cup on the mark",
+        "max_steps": 6,
+        "rubric": rubric,
+    }
     return {"cups": cups, "drawer": {"instruction": "open the drawer", "max_steps": max_steps}}
 
 
@@ -104,7 +126,9 @@ class Evaluation:
     def __init__(self, config: EvalConfig, operator: Operator, arm: Arm) -> None:
         self.summary: Summary | None = None
         self.error: BaseException | None = None
-        self._play = lambda: evaluate_on_robot(config, operator, robot=arm, agent_factory=Policies())
+        self._play = lambda: evaluate_on_robot(
+            config, operator, robot=arm, agent_factory=Policies()
+        )
         self._thread = threading.Thread(target=self._run)
         self._thread.start()
 
@@ -120,9 +144,13 @@ class Evaluation:
 
 
 class ScriptedPerson(TerminalOperator):
-    """A person at the terminal who types what `answer` returns for each question; `printed` is what they read."""
+    """A person at the terminal who types what `answer` returns for each question; `printed` is
+    what they read.
+    """
 
-    def __init__(self, answer: Callable[[str], str], before: Callable[[], None] = lambda: None) -> None:
+    def __init__(
+        self, answer: Callable[[str], str], before: Callable[[], None] = lambda: None
+    ) -> None:
         self.printed: list[str] = []
         self._answer = answer
         self._before = before
@@ -148,7 +176,9 @@ def typed(lines: Sequence[str]) -> Callable[[str], str]:
 
 
 def judged(verdicts: str) -> Callable[[str], str]:
-    """Ready at once; these verdicts, a letter each, one after the other and then from the beginning."""
+    """Ready at once; these verdicts, a letter each, one after the other and then from the
+    beginning.
+    """
     letters = itertools.cycle(verdicts)
 
     def answer(question: str) -> str:

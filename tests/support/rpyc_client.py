@@ -69,7 +69,9 @@ class Client:
             raise RuntimeError(content[1][0])
         [one] = json.loads(content[1])["acts"][0].values()
         action = one["action"]
-        return np.frombuffer(json_numpy.decode_base64(action["__numpy__"], "action"), action["dtype"]).tolist()
+        return np.frombuffer(
+            json_numpy.decode_base64(action["__numpy__"], "action"), action["dtype"]
+        ).tolist()
 
     def close(self) -> None:
         self.file.close()

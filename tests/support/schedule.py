@@ -1,7 +1,8 @@
 """What a process of pytest-xdist takes at once, and which of it begins first.
 
-Whatever takes longest begins first, so that the processes end at about the same time. `seconds.json` has the seconds of
-each file that takes long, by tier; a run with VLAGENTS_TEST_SECONDS=tests/support/seconds.json records its own there.
+Whatever takes longest begins first, so that the processes end at about the same time.
+`seconds.json` has the seconds of each file that takes long, by tier; a run with
+VLAGENTS_TEST_SECONDS=tests/support/seconds.json records its own there.
 """
 
 from __future__ import annotations
@@ -18,7 +19,8 @@ import pytest
 
 _SECONDS = Path(__file__).parent / "seconds.json"
 _LEAST_S = 8.0  # of a file that is recorded
-_CLUSTERS = "tests/cluster/"  # of several hosts each: one at a time, as two of them starve each other of CPU
+# Of several hosts each: one at a time, as two of them starve each other of CPU.
+_CLUSTERS = "tests/cluster/"
 
 
 def unit(nodeid: str) -> str:
@@ -46,7 +48,9 @@ def in_order(nodeids: Sequence[str]) -> dict[str, str]:
 
 @pytest.hookimpl(optionalhook=True)
 def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
-    """Where `--dist loadfile` asks for files, send units; what of one runs alone, later than the rest, is apart."""
+    """Where `--dist loadfile` asks for files, send units; what of one runs alone, later than the
+    rest, is apart.
+    """
     if config.option.dist != "loadfile":
         return None
     from xdist.scheduler import LoadFileScheduling
@@ -73,6 +77,10 @@ def pytest_terminal_summary(terminalreporter: Any, config: pytest.Config) -> Non
             took[report.nodeid.partition("::")[0]] += report.duration
     file = Path(name)
     known = json.loads(file.read_text()) if file.exists() else {}
-    others = {test: s for test, s in known.get(config.option.markexpr, {}).items() if test not in took}
-    known[config.option.markexpr] = others | {test: round(s, 1) for test, s in took.items() if s >= _LEAST_S}
+    others = {
+        test: s for test, s in known.get(config.option.markexpr, {}).items() if test not in took
+    }
+    known[config.option.markexpr] = others | {
+        test: round(s, 1) for test, s in took.items() if s >= _LEAST_S
+    }
     file.write_text(json.dumps(known, indent=1, sort_keys=True) + "\n")

@@ -10,7 +10,9 @@ from vlagents_ray import Obs
 
 
 class HoldingLeader:
-    """Has a robot of two joints all the time, and holds it; made without arguments, as commands make a leader."""
+    """Has a robot of two joints all the time, and holds it; made without arguments, as commands
+    make a leader.
+    """
 
     def engaged(self) -> bool:
         return True
@@ -23,7 +25,9 @@ class ScriptedLeader:
     """Wants the robot while `wants` is set or true, and commands what `command` says or returns."""
 
     def __init__(
-        self, command: np.ndarray | Callable[[Obs], np.ndarray], wants: Callable[[], bool] = lambda: False
+        self,
+        command: np.ndarray | Callable[[Obs], np.ndarray],
+        wants: Callable[[], bool] = lambda: False,
     ) -> None:
         self.command = command
         self.wants = wants

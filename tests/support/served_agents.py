@@ -25,7 +25,9 @@ from vlagents_ray.policies.scripted import Scripted
 
 
 class Reacher(Agent):
-    """Written as in the paper, without a thought for sessions: state in attributes, some of them mutable."""
+    """Written as in the paper, without a thought for sessions: state in attributes, some of them
+    mutable.
+    """
 
     def __init__(self, scale: float = 1.0) -> None:
         self.scale = scale
@@ -62,7 +64,9 @@ class Trainable(Agent):
 
 
 class OnOneGpu(Agent):
-    """A torch policy that has a GPU in common with its learner; or, on the CPU, memory in the place of that GPU's."""
+    """A torch policy that has a GPU in common with its learner; or, on the CPU, memory in the
+    place of that GPU's.
+    """
 
     trainable = "layer"
 
@@ -100,7 +104,9 @@ class Remembering(Agent):
 
 
 class Ledger(Agent):
-    """Writes down each act as its batch begins, in a file of its process: of which episode, for which observation."""
+    """Writes down each act as its batch begins, in a file of its process: of which episode, for
+    which observation.
+    """
 
     def __init__(self, folder: str) -> None:
         self.folder = folder
@@ -119,12 +125,19 @@ class Ledger(Agent):
     def act(self, obs: Obs) -> Act:
         time.sleep(0.002)
         self.acts += 1
-        info = {"episode": self.episode, "number": obs.info["number"], "acts": self.acts, "pid": os.getpid()}
+        info = {
+            "episode": self.episode,
+            "number": obs.info["number"],
+            "acts": self.acts,
+            "pid": os.getpid(),
+        }
         return Act(np.zeros(7, np.float32), info=info)
 
 
 class Hanging(Agent):
-    """Never returns from an act when told so: it waits ("sleep"), or keeps the interpreter's lock besides ("lock")."""
+    """Never returns from an act when told so: it waits ("sleep"), or keeps the interpreter's
+    lock besides ("lock").
+    """
 
     def reset(self, obs: Obs, instruction: str | None, **kwargs: object) -> dict:
         self.acts = 0
@@ -165,7 +178,9 @@ class Broken(Agent):
 
 
 class Accountant(Agent):
-    """If it is to count, says what its process holds: descriptors, threads, mappings of clients' memory, bytes."""
+    """If it is to count, says what its process holds: descriptors, threads, mappings of clients'
+    memory, bytes.
+    """
 
     def reset(self, obs: Obs, instruction: str | None, **kwargs: object) -> dict:
         if not kwargs.get("count"):
@@ -185,7 +200,9 @@ class Accountant(Agent):
 
 
 class Echo(Agent):
-    """Answers with what it was sent, and with what its process holds; if a `gate` is named, when that file exists."""
+    """Answers with what it was sent, and with what its process holds; if a `gate` is named, when
+    that file exists.
+    """
 
     def reset(self, obs: Obs, instruction: str | None, **kwargs: object) -> dict:
         self.instruction = instruction
@@ -201,22 +218,30 @@ class Echo(Agent):
             "threads": threading.active_count(),
             "descriptors": len(os.listdir("/proc/self/fd")),
         }
-        return Act(np.array([float(image[-1, -1, -1]) for image in obs.cameras.values()]), info=info)
+        return Act(
+            np.array([float(image[-1, -1, -1]) for image in obs.cameras.values()]), info=info
+        )
 
 
 class Ticking(Agent):
     """Rows that name the observation that they answer and their own number, after 0.2 s."""
 
-    contract = Contract(state={"tick": StateSpec(1)}, action=ActionSpec(dim=2, delta=False), chunk=50)
+    contract = Contract(
+        state={"tick": StateSpec(1)}, action=ActionSpec(dim=2, delta=False), chunk=50
+    )
 
     def act(self, obs: Obs) -> Act:
         time.sleep(0.2)
         rows = np.arange(50.0)
-        return Act(np.stack([np.full(50, obs.state["tick"][0]), rows], 1).astype(np.float32), info={"pid": os.getpid()})
+        return Act(
+            np.stack([np.full(50, obs.state["tick"][0]), rows], 1).astype(np.float32),
+            info={"pid": os.getpid()},
+        )
 
 
 class Witness(Agent):
-    """An action that tells what was seen: a pixel of the first camera, the first state, the gripper, the length of the
+    """An action that tells what was seen: a pixel of the first camera, the first state, the
+    gripper, the length of the
     instruction, and which act of its session it is. Two rows, the second with the next number."""
 
     def reset(self, obs: Obs, instruction: str | None, **kwargs: object) -> dict:
@@ -228,25 +253,38 @@ class Witness(Agent):
         self.acts += 1
         image = next(iter(obs.cameras.values()), np.zeros((1, 1, 3), np.uint8))
         joints = next(iter(obs.state.values()), np.zeros(1))
-        seen = [image[0, -1, 0], joints[0], -1.0 if obs.gripper is None else obs.gripper, len(self.instruction)]
+        seen = [
+            image[0, -1, 0],
+            joints[0],
+            -1.0 if obs.gripper is None else obs.gripper,
+            len(self.instruction),
+        ]
         info = {"cameras": sorted(obs.cameras), "state": sorted(obs.state), "pid": os.getpid()}
         return Act(np.array([[*seen, self.acts], [*seen, self.acts + 1]], np.float32), info=info)
 
 
 class Mirror(Agent):
-    """Says whose observation it was: a pixel, the first state's sum, acts so far, the instruction's number.
+    """Says whose observation it was: a pixel, the first state's sum, acts so far, the instruction's
+    number.
 
-    A white picture takes it two seconds, or, if the instruction begins with a path, until that file exists.
+    A white picture takes it two seconds, or, if the instruction begins with a path, until that file
+    exists.
     """
 
-    contract = Contract(instruction=True, action=ActionSpec(dim=7, gripper_open=1.0, gripper_closed=0.0))
+    contract = Contract(
+        instruction=True, action=ActionSpec(dim=7, gripper_open=1.0, gripper_closed=0.0)
+    )
 
     def __init__(self, chunk: int = 1, slow_s: float = 0.0) -> None:
         self.chunk = chunk
         self.slow_s = slow_s
 
     def reset(self, obs: Obs, instruction: str | None, **kwargs: object) -> dict:
-        self.gate, self.number, self.acts = Path(instruction.split()[0]), float(instruction.split()[-1]), 0
+        self.gate, self.number, self.acts = (
+            Path(instruction.split()[0]),
+            float(instruction.split()[-1]),
+            0,
+        )
         return {"pid": os.getpid()}
 
     def act(self, obs: Obs) -> Act:
@@ -260,7 +298,15 @@ class Mirror(Agent):
             time.sleep(2.0 if white else self.slow_s)
         self.acts += 1
         total = float(next(iter(obs.state.values())).sum()) if obs.state else 0.0
-        row = [pixel, total, self.acts, self.number, 0.0, 0.0, 0.0 if obs.gripper is None else obs.gripper]
+        row = [
+            pixel,
+            total,
+            self.acts,
+            self.number,
+            0.0,
+            0.0,
+            0.0 if obs.gripper is None else obs.gripper,
+        ]
         rows = np.tile(np.array(row, np.float32), (self.chunk, 1))
         rows[:, 4] = np.arange(self.chunk)
         return Act(rows)
@@ -270,7 +316,9 @@ class Stored(Agent):
     """Its checkpoint is a file with a number, which its actions tell. Loads while there is no
     file "….held" beside it, and leaves "….begun" and "….closed"."""
 
-    def __init__(self, checkpoint: str, checkpoint_step: int | None = None, scale: float = 1.0) -> None:
+    def __init__(
+        self, checkpoint: str, checkpoint_step: int | None = None, scale: float = 1.0
+    ) -> None:
         self.path = checkpoint.replace("{step}", str(checkpoint_step))
         self.scale = scale
 
@@ -294,7 +342,9 @@ class Stored(Agent):
 
 
 class Stochastic(ToZero):
-    """Says on demand how likely its actions were, and always which weights chose them: the version in a file."""
+    """Says on demand how likely its actions were, and always which weights chose them: the
+    version in a file.
+    """
 
     def __init__(self, version: str) -> None:
         super().__init__()
@@ -306,14 +356,19 @@ class Stochastic(ToZero):
 
     def act(self, obs: Obs) -> Act:
         act, position = super().act(obs), float(obs.state["position"][0])
-        said = {"logprob": float(-0.5 * ((act.action[0, 0] + position) / 0.1) ** 2), "value": -abs(position)}
+        said = {
+            "logprob": float(-0.5 * ((act.action[0, 0] + position) / 0.1) ** 2),
+            "value": -abs(position),
+        }
         act.info["policy"] = {"version": int(self._version.read_text()), "fingerprint": "of a test"}
         act.info["behaviour"] = {name: said[name] for name in obs.info.get("want", ())}
         return act
 
 
 class Hesitant(Scripted):
-    """The expert, who now and then stays where it is, each session when its own dice say: some run out of time."""
+    """The expert, who now and then stays where it is, each session when its own dice say: some
+    run out of time.
+    """
 
     def reset(self, obs: Obs, instruction: str | None, **kwargs: Any) -> dict[str, Any]:
         self.rng = np.random.default_rng(kwargs["seed"])

@@ -1,7 +1,9 @@
-"""Shared memory of the CPU in place of a GPU's: torch's files of it have the lifetime of CUDA's handles.
+"""Shared memory of the CPU in place of a GPU's: torch's files of it have the lifetime of CUDA's
+handles.
 
-Readers are counted as torch 2.13 counts those of a GPU's memory (torch/csrc/CudaIPCTypes.cpp and StorageSharing.cpp):
-in a shared file with a header of 64 bytes, in unsigned numbers, and with a limbo for memory that was freed before.
+Readers are counted as torch 2.13 counts those of a GPU's memory (torch/csrc/CudaIPCTypes.cpp and
+StorageSharing.cpp): in a shared file with a header of 64 bytes, in unsigned numbers, and with a
+limbo for memory that was freed before.
 """
 
 from __future__ import annotations
@@ -29,7 +31,8 @@ class ReaderCounts:
     """Torch's counts of the readers of memory that this process has sent."""
 
     def __init__(self) -> None:
-        # Readers keep files of counts open by their names, so that no name is ever used again, as torch's are not.
+        # Readers keep files of counts open by their names, so that no name is ever used again, as
+        # torch's are not.
         self.name = f"/readers_{os.getpid()}_{next(_FILES)}"
         self.next = 0
         self.limbo: list[tuple[int, Any]] = []  # slots, and their storages
@@ -87,7 +90,11 @@ class SharedCpuMemory:
 
     def gpu(self, value: Any) -> str:
         torch = sys.modules.get("torch")
-        return self.uuid if torch is not None and isinstance(value, torch.Tensor) and value.numel() else ""
+        return (
+            self.uuid
+            if torch is not None and isinstance(value, torch.Tensor) and value.numel()
+            else ""
+        )
 
     def readable(self, gpu: str) -> tuple[str, ...]:
         return gpu, *self.peers
@@ -97,12 +104,15 @@ class SharedCpuMemory:
 
     @contextmanager
     def handed_over(self, storage: Any) -> Iterator[StorageHandle]:
-        manager, file, size = storage._share_filename_cpu_()  # moves the values there, so that writes are seen by all
+        # Moves the values there, so that writes are seen by all.
+        manager, file, size = storage._share_filename_cpu_()
         slot = self.counts.share()
         self.handles += 1
         try:
             with counted_reads(self.counts.name.encode(), slot):
-                yield StorageHandle(file, size, 0, manager + b"\0" + self.counts.name.encode(), slot)
+                yield StorageHandle(
+                    file, size, 0, manager + b"\0" + self.counts.name.encode(), slot
+                )
         finally:
             self.handles -= 1
             self.counts.delete(slot, storage)
@@ -116,7 +126,9 @@ class SharedCpuMemory:
         if gpu not in self.readable(self.uuid):
             raise RuntimeError("this process does not use that GPU")
         manager, _, name = handle.counters.partition(b"\0")
-        storage = torch.UntypedStorage._new_shared_filename_cpu(manager, handle.allocation, handle.size)
+        storage = torch.UntypedStorage._new_shared_filename_cpu(
+            manager, handle.allocation, handle.size
+        )
         weakref.finalize(storage, ReaderCounts.release, name.decode(), handle.counter)
         return storage
 

@@ -1,9 +1,11 @@
-"""The one Ray of this test process, and one Serve on it, where test files deploy their policies one after the other.
+"""The one Ray of this test process, and one Serve on it, where test files deploy their policies one
+after the other.
 
-A file that needs a Ray, but not its own, takes the fixture `shared_ray`. Ray starts when the first such file needs
-it, and ends before the first test of a file without the fixture, which may start a Ray of its own. The order of the
-files in tests/conftest.py makes that happen once. Only tests of launching, of crashes and of settings of Ray itself
-start their own; so do tests of commands that start one, as they would inherit the environment of the shared one.
+A file that needs a Ray, but not its own, takes the fixture `shared_ray`. Ray starts when the first
+such file needs it, and ends before the first test of a file without the fixture, which may start a
+Ray of its own. The order of the files in tests/conftest.py makes that happen once. Only tests of
+launching, of crashes and of settings of Ray itself start their own; so do tests of commands that
+start one, as they would inherit the environment of the shared one.
 """
 
 from __future__ import annotations
@@ -21,7 +23,8 @@ from vlagents_ray.serve.ports import LOOPBACK, free_port, keep
 
 FIXTURE = "shared_ray"
 _CPUS = 4  # only an account: replicas, and workers of evaluations
-_READY_S = 400.0  # for a policy to be ready, with packages that Ray installs; CI may have a fraction of two cores
+# For a policy to be ready, with packages that Ray installs; CI may have a fraction of two cores.
+_READY_S = 400.0
 # Policies that tests serve: their own, and those of an example with several files.
 _POLICIES = (Path(__file__).parent, Path(__file__).parents[2] / "examples" / "raptor")
 
@@ -39,7 +42,8 @@ def start() -> None:
     _port = free_port()
     with contextlib.ExitStack() as stack:
         patch = stack.enter_context(pytest.MonkeyPatch.context())
-        patch.setenv("RAY_metrics_report_interval_ms", "2000")  # instead of 10 s, for which tests would wait
+        # Instead of 10 s, for which tests would wait.
+        patch.setenv("RAY_metrics_report_interval_ms", "2000")
         patch.setenv("PYTHONPATH", os.pathsep.join(map(str, _POLICIES)), prepend=os.pathsep)
         stack.enter_context(own_ray(LOOPBACK, _port, num_cpus=_CPUS))
         _running = stack.pop_all()
@@ -62,7 +66,8 @@ def stop() -> None:
 
 @contextlib.contextmanager
 def shared_server(config: Any) -> Iterator[Any]:
-    """Serve a deployment on the shared Ray for the length of the context, as `running_server` does on one of its own.
+    """Serve a deployment on the shared Ray for the length of the context, as `running_server` does
+    on one of its own.
 
     Args:
         config: A `Deployment`.

@@ -20,14 +20,20 @@ def check_shared_readings(
     module: ModuleType,
     atol: float,
 ) -> None:
-    """Require of a policy that its acts are those without `shared_frames` of its module, which runs afterwards."""
+    """Require of a policy that its acts are those without `shared_frames` of its module, which
+    runs afterwards.
+    """
     shared = policy.act_batch(views, [begun(policy, number) for number in range(len(views))])
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(module, "shared_frames", lambda rows: (list(range(len(rows))), list(range(len(rows)))))
+        patch.setattr(
+            module, "shared_frames", lambda rows: (list(range(len(rows))), list(range(len(rows))))
+        )
         each = policy.act_batch(views, [begun(policy, number) for number in range(len(views))])
     for one, other in zip(shared, each, strict=True):
         assert isinstance(one, Act)
         assert isinstance(other, Act)
         np.testing.assert_allclose(one.action, other.action, atol=atol)
         if DISTRIBUTION in one.info:
-            np.testing.assert_allclose(*(act.info[DISTRIBUTION]["samples"] for act in (one, other)), atol=atol)
+            np.testing.assert_allclose(
+                *(act.info[DISTRIBUTION]["samples"] for act in (one, other)), atol=atol
+            )

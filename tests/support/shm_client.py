@@ -32,12 +32,20 @@ class Keeper(Agent):
         action = [float(image[0, 0, 0]) for image in self.seen[-4:]]
         if not obs.info:
             return Act(np.array(action))
-        return Act(np.array(action), info={"instruction": self.instruction, "big": bytes(obs.info.get("reply", 0))})
+        return Act(
+            np.array(action),
+            info={"instruction": self.instruction, "big": bytes(obs.info.get("reply", 0))},
+        )
 
 
 def request(op: Any, pixel: int = 0, size: int = 64, **info: Any) -> Request:
     obs = Obs({"front": np.full((size, size, 3), pixel, np.uint8)}, info=info)
-    return Request(op, obs, instruction=f"task {pixel}" if op == "reset" else None, request_id=os.urandom(8).hex())
+    return Request(
+        op,
+        obs,
+        instruction=f"task {pixel}" if op == "reset" else None,
+        request_id=os.urandom(8).hex(),
+    )
 
 
 def call(transport: ShmTransport, one: Request, timeout_s: float) -> Reply:

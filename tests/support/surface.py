@@ -1,6 +1,8 @@
-"""What users write down, and so what must not change unnoticed: names, settings, paths, series, columns, options.
+"""What users write down, and so what must not change unnoticed: names, settings, paths, series,
+columns, options.
 
-`python tests/support/surface.py` writes tests/surface.txt again, whose changes are seen in a review.
+`python tests/support/surface.py` writes tests/surface.txt again, whose changes are seen in a
+review.
 """
 
 from __future__ import annotations
@@ -55,7 +57,9 @@ def surface() -> str:
         "Command line: vlagents-ray robot": robot_options(),
         "Environment variables": variables(),
     }
-    return "\n".join(f"# {title}\n" + "".join(f"{line}\n" for line in lines) for title, lines in sections.items())
+    return "\n".join(
+        f"# {title}\n" + "".join(f"{line}\n" for line in lines) for title, lines in sections.items()
+    )
 
 
 def python_names() -> Iterator[str]:
@@ -63,7 +67,9 @@ def python_names() -> Iterator[str]:
         module = importlib.import_module(name)
         for one in sorted(module.__all__):
             value = getattr(module, one)
-            if not (inspect.isclass(value) or inspect.isfunction(value)) or hasattr(value, "model_fields"):
+            if not (inspect.isclass(value) or inspect.isfunction(value)) or hasattr(
+                value, "model_fields"
+            ):
                 yield f"{name}.{one}"  # settings have a section of their own
                 continue
             yield f"{name}.{one}{_arguments(value)}"
@@ -95,14 +101,20 @@ def _arguments(value: Any) -> str:
 def _argument(one: inspect.Parameter) -> str:
     mark = {one.VAR_POSITIONAL: "*", one.VAR_KEYWORD: "**"}.get(one.kind, "")
     only = "keyword " if one.kind is one.KEYWORD_ONLY else ""
-    return f"{only}{mark}{one.name}" + ("" if one.default is one.empty else f"={_shown(one.default)}")
+    return f"{only}{mark}{one.name}" + (
+        "" if one.default is one.empty else f"={_shown(one.default)}"
+    )
 
 
 def _shown(value: Any) -> str:
     """A default, without what differs from one run or machine to the next."""
     if inspect.isclass(value) or inspect.isroutine(value):
         return str(value.__qualname__)
-    text = re.sub(r" at 0x[0-9a-f]+", "", repr(value)).replace(str(Path.home()), "~").replace(str(ROOT), ".")
+    text = (
+        re.sub(r" at 0x[0-9a-f]+", "", repr(value))
+        .replace(str(Path.home()), "~")
+        .replace(str(ROOT), ".")
+    )
     return " ".join(text.split())
 
 
@@ -110,13 +122,25 @@ def error_codes() -> Iterator[str]:
     errors = importlib.import_module("vlagents_ray.errors")
     found = {one for one in vars(errors).values() if inspect.isclass(one) and hasattr(one, "code")}
     yield from sorted(
-        f"{one.code}: {one.__name__}({', '.join(base.__name__ for base in one.__bases__)})" for one in found
+        f"{one.code}: {one.__name__}({', '.join(base.__name__ for base in one.__bases__)})"
+        for one in found
     )
 
 
 def registered() -> Iterator[str]:
     registry = importlib.import_module("vlagents_ray.registry")
-    kinds = ("policies", "wrappers", "envs", "dialects", "robots", "leaders", "replica", "pages", "exports", "trackers")
+    kinds = (
+        "policies",
+        "wrappers",
+        "envs",
+        "dialects",
+        "robots",
+        "leaders",
+        "replica",
+        "pages",
+        "exports",
+        "trackers",
+    )
     for kind in kinds:
         yield f"{kind}: {', '.join(sorted(registry.names(kind)))}"
 
@@ -147,7 +171,11 @@ def _fields(model: Any, before: tuple[type, ...] = ()) -> Iterator[str]:
         inner = [] if field.annotation in before else list(_models(field.annotation))
         if field.is_required():
             yield f"{name} (required)"
-        elif not inner or field.default is None or field.get_default(call_default_factory=True) in ([], {}):
+        elif (
+            not inner
+            or field.default is None
+            or field.get_default(call_default_factory=True) in ([], {})
+        ):
             yield f"{name} = {_shown(field.get_default(call_default_factory=True))}"
         for one in inner:
             if one not in before:
@@ -175,14 +203,22 @@ def paths() -> Iterator[str]:
 
 def series() -> list[str]:
     """By the calls that make them, since Ray's own series cannot be listed."""
-    files = (*ROOT.glob("vlagents_ray/serve/**/*.py"), *ROOT.glob("plugins/*/vlagents_ray_*/**/*.py"))
-    texts = [text for text in (file.read_text() for file in files) if "make = partial(series, " in text]
+    files = (
+        *ROOT.glob("vlagents_ray/serve/**/*.py"),
+        *ROOT.glob("plugins/*/vlagents_ray_*/**/*.py"),
+    )
+    texts = [
+        text for text in (file.read_text() for file in files) if "make = partial(series, " in text
+    ]
     found = []
     for call in (node for text in texts for node in ast.walk(ast.parse(text))):
         if isinstance(call, ast.Call) and getattr(call.func, "id", "") == "make":
             kind, name, _, *tags = call.args
             words = [ast.literal_eval(tag) for tag in tags]
-            found.append(f"ray_vlagents_{ast.literal_eval(name)} {ast.unparse(kind).lower()} [{', '.join(words)}]")
+            found.append(
+                f"ray_vlagents_{ast.literal_eval(name)} {ast.unparse(kind).lower()} "
+                f"[{', '.join(words)}]"
+            )
     return sorted(found)
 
 
@@ -196,7 +232,9 @@ def database() -> Iterator[str]:
     module = importlib.import_module("vlagents_ray.evaluate.results.database")
     yield f"version: {module.VERSION}"
     connection.executescript(module.SCHEMA)
-    for (name,) in connection.execute("SELECT name FROM sqlite_master WHERE type = 'table' ORDER BY name").fetchall():
+    for (name,) in connection.execute(
+        "SELECT name FROM sqlite_master WHERE type = 'table' ORDER BY name"
+    ).fetchall():
         found = connection.execute(f"PRAGMA table_info({name})").fetchall()
         yield f"{name}: {', '.join(f'{column[1]} {column[2]}' for column in found)}"
 
@@ -216,7 +254,11 @@ def _commands(command: Any, name: str) -> Iterator[str]:
         if one.name in ("help", "install_completion", "show_completion"):
             continue
         option = one.param_type_name == "option"
-        what = " / ".join(sorted((*one.opts, *one.secondary_opts))) if option else str(one.name).upper()
+        what = (
+            " / ".join(sorted((*one.opts, *one.secondary_opts)))
+            if option
+            else str(one.name).upper()
+        )
         default = "(required)" if one.required else f"= {_shown(one.default)}"
         yield f"{name} {what} {default}"
     for inside in sorted(inner):
@@ -242,7 +284,9 @@ def variables() -> list[str]:
 def lines_that_differ(before: str, after: str) -> Iterable[str]:
     """What was removed, with -, and what was added, with +."""
     old, new = before.splitlines(), after.splitlines()
-    return [f"- {line}" for line in old if line not in set(new)] + [f"+ {line}" for line in new if line not in set(old)]
+    return [f"- {line}" for line in old if line not in set(new)] + [
+        f"+ {line}" for line in new if line not in set(old)
+    ]
 
 
 if __name__ == "__main__":

@@ -1,9 +1,10 @@
-"""The tables of README and docs/ about policies and environments: `python tests/support/tables.py` writes them.
+"""The tables of README and docs/ about policies and environments: `python tests/support/tables.py`
+writes them.
 
 It also writes examples/plugin, by the skeleton of `vlagents-ray new plugin`, and published.json.
 
-They are made from the registry and from what tests have verified, and lie between `<!-- table: NAME -->` and
-`<!-- /table -->`. So are the pages in the navigation of mkdocs.yml.
+They are made from the registry and from what tests have verified, and lie between `<!-- table: NAME
+-->` and `<!-- /table -->`. So are the pages in the navigation of mkdocs.yml.
 """
 
 from __future__ import annotations
@@ -24,9 +25,12 @@ from vlagents_ray.registry import CORE, RegistryEntry, entries
 ROOT = Path(__file__).parents[2]
 PUBLISHED = ROOT / "vlagents_ray" / "published.json"
 PLUGIN, PLUGIN_NAME = ROOT / "examples" / "plugin", "homing"
-RATES = json.loads((ROOT / "tests/rates.json").read_text())  # which the tests that it names find again
-LEARNT = json.loads((ROOT / "reference/checkpoint/rates.json").read_text())  # of the reference policy, by simulator
-WAYS = json.loads((ROOT / "reference/success.json").read_text())["ways"]  # of serving it, by `benchmarks.success`
+# Which the tests that it names find again.
+RATES = json.loads((ROOT / "tests/rates.json").read_text())
+# Of the reference policy, by simulator.
+LEARNT = json.loads((ROOT / "reference/checkpoint/rates.json").read_text())
+# Of serving it, by `benchmarks.success`.
+WAYS = json.loads((ROOT / "reference/success.json").read_text())["ways"]
 
 
 def _listed(adapters: dict[str, RegistryEntry]) -> Iterator[tuple[str, RegistryEntry]]:
@@ -44,12 +48,16 @@ def _code(words: Iterable[str]) -> str:
 
 
 def folder_of(entry: RegistryEntry) -> str:
-    """Return the folder that pip installs in a checkout, of the distribution that registers an entry."""
+    """Return the folder that pip installs in a checkout, of the distribution that registers an
+    entry.
+    """
     return "." if entry.distribution == CORE else f"plugins/{entry.distribution.replace('-', '_')}"
 
 
 def published() -> str:
-    """Return the text of published.json: the distribution of each name that this repository's plug-ins register."""
+    """Return the text of published.json: the distribution of each name that this repository's
+    plug-ins register.
+    """
     kinds: dict[str, dict[str, str]] = {}
     for file in sorted(ROOT.glob("plugins/*/pyproject.toml")):
         project = tomllib.loads(file.read_text())["project"]
@@ -60,8 +68,13 @@ def published() -> str:
 
 
 def example_plugin() -> dict[Path, str]:
-    """Return the text of each file of examples/plugin, which is what `vlagents-ray new plugin homing` writes."""
-    return {PLUGIN / path.relative_to(PLUGIN_NAME): text for path, text in render(PLUGIN_NAME, "plugin").items()}
+    """Return the text of each file of examples/plugin, which is what `vlagents-ray new plugin
+    homing` writes.
+    """
+    return {
+        PLUGIN / path.relative_to(PLUGIN_NAME): text
+        for path, text in render(PLUGIN_NAME, "plugin").items()
+    }
 
 
 def page_of(name: str, one: RegistryEntry) -> str:
@@ -70,7 +83,9 @@ def page_of(name: str, one: RegistryEntry) -> str:
 
 
 def section(folder: str, page: str) -> str:
-    """Return the text of a page of docs/, given as `page` or, for one section of it, as `page#anchor`."""
+    """Return the text of a page of docs/, given as `page` or, for one section of it, as
+    `page#anchor`.
+    """
     name, _, anchor = page.partition("#")
     text = (ROOT / "docs" / folder / f"{name}.md").read_text()
     if not anchor:
@@ -102,7 +117,11 @@ def verified(name: str, family: str = "") -> str:
     if "successes" in rate:
         return f"✓ {share(rate['successes'], rate['episodes'])} % of {rate['episodes']}"
     parity = {test for test, what in marked(family) if what == "parity"} if family else set()
-    cases = [one["tests"].get(test, {}).get("passed", 0) for one in notes(family) for test in parity] if parity else []
+    cases = (
+        [one["tests"].get(test, {}).get("passed", 0) for one in notes(family) for test in parity]
+        if parity
+        else []
+    )
     return "◇" if any(cases) or rate.get("equal") else "○"
 
 
@@ -112,7 +131,10 @@ def policies(folder: str = "") -> Iterator[str]:
     for name, one in _listed(entries("policies")):
         source = f"a checkout, {_code(one.checkouts)}" if one.checkouts else "PyPI"
         said = verified(name, name if name in RUN_WITH else page_of(name, one))
-        yield f"| {_link(name, f'`{name}`', one, folder)} | {one.about} | {one.wants or source} | {said} |"
+        yield (
+            f"| {_link(name, f'`{name}`', one, folder)} | {one.about} | {one.wants or source} | "
+            f"{said} |"
+        )
 
 
 def simulated(name: str) -> str:
@@ -131,7 +153,10 @@ def environments(folder: str = "") -> Iterator[str]:
         packages = [f"`'{folder_of(one)}[{one.extra}]'`"] if one.extra else []
         packages += [f"`env make {name}`" for name in one.requirements]
         wants = "; ".join(filter(None, (" or ".join(packages), one.wants)))
-        yield f"| {_link(name, f'`{name}{one.tasks}`', one, folder)} | {one.about} | {wants} | {simulated(name)} |"
+        yield (
+            f"| {_link(name, f'`{name}{one.tasks}`', one, folder)} | {one.about} | {wants} | "
+            f"{simulated(name)} |"
+        )
 
 
 def rates() -> Iterator[str]:
@@ -146,13 +171,18 @@ def ways() -> Iterator[str]:
     """Yield the rows of the ways of serving the reference policy."""
     yield from ("| way | success, % | difference | p | equal |", "|---|---|---|---|---|")
     for row in WAYS:
-        off, low, high = (f"{100 * value:+.1f}" for value in (row["difference"], *row["difference_95"]))
+        off, low, high = (
+            f"{100 * value:+.1f}" for value in (row["difference"], *row["difference_95"])
+        )
         equal = "all" if row["equal"] == row["episodes"] else row["equal"]
         rate = share(row["solved"], row["episodes"], 1)
         yield f"| {row['way']} | {rate} | {off} [{low}, {high}] | {row['p_holm']:.2g} | {equal} |"
 
 
-_RAPTOR = f"a recurrent policy for quadrotors by its authors' weights, in 58 lines | PyPI | {verified('RAPTOR')}"
+_RAPTOR = (
+    "a recurrent policy for quadrotors by its authors' weights, in 58 lines | PyPI | "
+    f"{verified('RAPTOR')}"
+)
 _OWN_POLICY = "a class with `initialize`, `reset` and `act` | `vlagents-ray new policy NAME` | "
 TABLES: dict[str, dict[str, list[str]]] = {
     "README.md": {
@@ -164,19 +194,30 @@ TABLES: dict[str, dict[str, list[str]]] = {
     },
     "docs/policies/index.md": {"policies": list(policies())},
     "docs/policies/reference.md": {"rates": list(rates()), "success": list(ways())},
-    "docs/programs.md": {"programs": list(ran()), "settings": list(settings()), "others": list(others())},
+    "docs/programs.md": {
+        "programs": list(ran()),
+        "settings": list(settings()),
+        "others": list(others()),
+    },
     "docs/benchmarks/index.md": {"environments": list(environments())},
 }
 
 
 def with_tables(file: str, text: str) -> str:
-    """Return the text of a page with its tables, or that of mkdocs.yml with the pages of the adapters."""
+    """Return the text of a page with its tables, or that of mkdocs.yml with the pages of the
+    adapters.
+    """
     if file == "mkdocs.yml":
-        for folder, adapters in (("policies", entries("policies")), ("benchmarks", entries("envs"))):
+        for folder, adapters in (
+            ("policies", entries("policies")),
+            ("benchmarks", entries("envs")),
+        ):
             found = dict.fromkeys(page_of(name, one) for name, one in _listed(adapters))
             pages = "".join(f"          - {folder}/{page}.md\n" for page in found if page)
             index = f"          - {folder}/index.md\n"
-            text = re.sub(f"{index}(?:          - {folder}/.*\n)*", lambda _, new=index + pages: new, text)
+            text = re.sub(
+                f"{index}(?:          - {folder}/.*\n)*", lambda _, new=index + pages: new, text
+            )
         return text
     for name, rows in TABLES[file].items():
         begin, end = f"<!-- table: {name} -->", "<!-- /table -->"

@@ -1,8 +1,10 @@
-"""What an act asks of a GPU, counted without one: the device "meta" takes its place, which computes nothing.
+"""What an act asks of a GPU, counted without one: the device "meta" takes its place, which computes
+nothing.
 
-An eager act launches about one kernel for each ATen call that is no view, and each of them is some microseconds of
-Python. A copy to the CPU, or a value that Python reads, waits until the GPU has done all of its work so far; so does a
-copy of memory that is not pinned, such as that of `torch.tensor(numbers, device=…)`.
+An eager act launches about one kernel for each ATen call that is no view, and each of them is some
+microseconds of Python. A copy to the CPU, or a value that Python reads, waits until the GPU has
+done all of its work so far; so does a copy of memory that is not pinned, such as that of
+`torch.tensor(numbers, device=…)`.
 """
 
 from __future__ import annotations
@@ -17,7 +19,15 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
 
 META = torch.device("meta")
-_READ = {"_local_scalar_dense", "nonzero", "masked_select", "equal", "is_nonzero", "unique_dim", "_unique2"}
+_READ = {
+    "_local_scalar_dense",
+    "nonzero",
+    "masked_select",
+    "equal",
+    "is_nonzero",
+    "unique_dim",
+    "_unique2",
+}
 _ANY_DEVICE = {"aten.lift_fresh.default", "aten.detach.default"}  # calls that run nothing
 
 
@@ -38,13 +48,17 @@ class TorchCalls(TorchDispatchMode):
         tensors = [one for one in tree_leaves((args, kwargs)) if isinstance(one, torch.Tensor)]
         here = any(one.device == META for one in tensors)
         if name in ("_to_copy", "copy_"):
-            [source, target] = (args[1], args[0].device) if name == "copy_" else (args[0], kwargs.get("device"))
+            [source, target] = (
+                (args[1], args[0].device) if name == "copy_" else (args[0], kwargs.get("device"))
+            )
             if source.device == META and target is not None and target != META:
                 self._wait("copy to the CPU")
                 zeros = torch.zeros(source.shape, dtype=kwargs.get("dtype") or source.dtype)
                 return args[0].copy_(zeros) if name == "copy_" else zeros
             if source.device != META and META in (target, getattr(args[0], "device", None)):
-                self.uploads += bool(kwargs.get("non_blocking") or (name == "copy_" and args[2:3] == (True,)))
+                self.uploads += bool(
+                    kwargs.get("non_blocking") or (name == "copy_" and args[2:3] == (True,))
+                )
                 if not (kwargs.get("non_blocking") or (name == "copy_" and args[2:3] == (True,))):
                     self._wait("copy from the CPU")
                 return op(*args, **kwargs)
@@ -57,7 +71,9 @@ class TorchCalls(TorchDispatchMode):
         if here and name == "lift_fresh":
             self._wait("tensor of numbers")
         result = op(*args, **kwargs)
-        made = here or any(isinstance(one, torch.Tensor) and one.device == META for one in tree_leaves(result))
+        made = here or any(
+            isinstance(one, torch.Tensor) and one.device == META for one in tree_leaves(result)
+        )
         self.calls += made and not op.is_view and str(op) not in _ANY_DEVICE
         return result
 
@@ -77,12 +93,17 @@ def calls_of_an_act(policy: Any, sessions: Sequence[Any], views: Sequence[Any]) 
     with TorchCalls() as counted:
         acts = policy.act_batch(views, sessions)
     assert not [act for act in acts if isinstance(act, Exception)]
-    print(f"{type(policy).__name__}: {counted.calls} calls, {counted.uploads} copies, waits: {dict(counted.waits)}")
+    print(
+        f"{type(policy).__name__}: {counted.calls} calls, {counted.uploads} copies, waits: "
+        f"{dict(counted.waits)}"
+    )
     return counted
 
 
 def _copied(indices: Any) -> str:
-    """Return why an index waits: its truth values are counted, or it is a list, or a tensor on the CPU."""
+    """Return why an index waits: its truth values are counted, or it is a list, or a tensor on
+    the CPU.
+    """
     given = [one for one in tree_leaves(indices) if isinstance(one, torch.Tensor)]
     if any(one.dtype in (torch.bool, torch.uint8) for one in given):
         return "truth values"

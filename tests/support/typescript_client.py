@@ -14,10 +14,15 @@ _BUILT = CLIENT / "dist" / "index.js"
 
 def build() -> Path:
     """Install what it needs and compile it, unless both are done; returns its folder."""
-    if not _INSTALLED.exists() or _INSTALLED.stat().st_mtime < (CLIENT / "package-lock.json").stat().st_mtime:
+    if (
+        not _INSTALLED.exists()
+        or _INSTALLED.stat().st_mtime < (CLIENT / "package-lock.json").stat().st_mtime
+    ):
         _npm("ci", "--no-audit", "--no-fund", "--prefer-offline")
     sources = [*(CLIENT / "src").glob("*.ts"), CLIENT / "tsconfig.json", _INSTALLED]
-    if not _BUILT.exists() or _BUILT.stat().st_mtime < max(file.stat().st_mtime for file in sources):
+    if not _BUILT.exists() or _BUILT.stat().st_mtime < max(
+        file.stat().st_mtime for file in sources
+    ):
         _npm("run", "build")
         _BUILT.touch()  # the compiler leaves files alone that would be the same
     return CLIENT
@@ -33,7 +38,12 @@ def node_version() -> int:
 
 def _npm(*words: str) -> None:
     done = subprocess.run(
-        [str(NPM), *words], cwd=CLIENT, capture_output=True, text=True, check=False, stdin=subprocess.DEVNULL
+        [str(NPM), *words],
+        cwd=CLIENT,
+        capture_output=True,
+        text=True,
+        check=False,
+        stdin=subprocess.DEVNULL,
     )
     if done.returncode:
         raise RuntimeError(f"npm {' '.join(words)} in {CLIENT}:\n{done.stdout}{done.stderr}")

@@ -13,9 +13,11 @@ _CHUNK = 3
 
 
 def require_same_without_unseen_images(env: EvalEnv) -> None:
-    """Require that an env leaves out the images that no policy looks at, and that nothing else depends on them.
+    """Require that an env leaves out the images that no policy looks at, and that nothing else
+    depends on them.
 
-    Everything but the images of every step, and the images that are looked at, are equal to the bit.
+    Everything but the images of every step, and the images that are looked at, are equal to the
+    bit.
     """
     told, images = _played(env, every=1)
     sparing, few = _played(env, every=_CHUNK)
@@ -36,7 +38,9 @@ def _played(env: EvalEnv, *, every: int) -> tuple[list[Any], list[Any]]:
     add(env.reset(seed=3)[0])
     for i in range(1, env.max_steps + 1):
         env.looked_at = i % every == 0
-        obs, *outcome, info = env.step(Act(rng.uniform(-0.3, 0.3, env.contract.action.dim or 0).astype(np.float32)))
+        obs, *outcome, info = env.step(
+            Act(rng.uniform(-0.3, 0.3, env.contract.action.dim or 0).astype(np.float32))
+        )
         add(obs, *outcome, info["success"])
     return told, images
 

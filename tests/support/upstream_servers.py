@@ -1,9 +1,10 @@
 """Servers of other systems, in the bytes of their own packers; none of our codecs is used.
 
-`python upstream_servers.py KIND PORT [KIND PORT …]` serves all of them. A kind is a protocol, and for GR00T also
-`gr00t sim`: with `Gr00tSimPolicyWrapper`, or `gr00t packed`: with the newest servers' arrays. What they answer depends
-on each bit of the observation, so that an action that equals `answer` was computed from the very observation. The
-formats are those of openpi_client.msgpack_numpy, gr00t/policy/server_client.py, json_numpy and vla_eval.protocol.
+`python upstream_servers.py KIND PORT [KIND PORT …]` serves all of them. A kind is a protocol, and
+for GR00T also `gr00t sim`: with `Gr00tSimPolicyWrapper`, or `gr00t packed`: with the newest
+servers' arrays. What they answer depends on each bit of the observation, so that an action that
+equals `answer` was computed from the very observation. The formats are those of
+openpi_client.msgpack_numpy, gr00t/policy/server_client.py, json_numpy and vla_eval.protocol.
 """
 
 from __future__ import annotations
@@ -37,7 +38,9 @@ def answer(theirs: Mapping[str, Any], step: int = 0) -> np.ndarray:
 
 def _digest(value: Any) -> int:
     if isinstance(value, Mapping):
-        return zlib.crc32(repr([(str(key), _digest(value[key])) for key in sorted(value, key=str)]).encode())
+        return zlib.crc32(
+            repr([(str(key), _digest(value[key])) for key in sorted(value, key=str)]).encode()
+        )
     if isinstance(value, np.ndarray):
         return zlib.crc32(value.tobytes(), zlib.crc32(f"{value.dtype.str}{value.shape}".encode()))
     return zlib.crc32(repr(value).encode())
@@ -53,7 +56,12 @@ def obey(text: str) -> None:
 def pack_openpi(value: Any) -> bytes:
     def node(one: Any) -> Any:
         if isinstance(one, np.ndarray):
-            return {b"__ndarray__": True, b"data": one.tobytes(), b"dtype": one.dtype.str, b"shape": one.shape}
+            return {
+                b"__ndarray__": True,
+                b"data": one.tobytes(),
+                b"dtype": one.dtype.str,
+                b"shape": one.shape,
+            }
         return {b"__npgeneric__": True, b"data": one.item(), b"dtype": one.dtype.str}
 
     return msgpack.packb(value, default=node)
@@ -62,7 +70,9 @@ def pack_openpi(value: Any) -> bytes:
 def unpack_openpi(data: bytes) -> Any:
     def node(one: dict) -> Any:
         if b"__ndarray__" in one:
-            return np.ndarray(buffer=one[b"data"], dtype=np.dtype(one[b"dtype"]), shape=one[b"shape"])
+            return np.ndarray(
+                buffer=one[b"data"], dtype=np.dtype(one[b"dtype"]), shape=one[b"shape"]
+            )
         return one
 
     return msgpack.unpackb(data, object_hook=node)
@@ -91,7 +101,9 @@ def openpi(connection: Any) -> None:
 
 def roboarena(connection: Any) -> None:
     connection.send(
-        pack_openpi({"n_external_cameras": 1, "needs_wrist_camera": True, "action_space": "joint_position"})
+        pack_openpi(
+            {"n_external_cameras": 1, "needs_wrist_camera": True, "action_space": "joint_position"}
+        )
     )
     step = 0
     for message in connection:
@@ -111,7 +123,12 @@ def roboarena(connection: Any) -> None:
 
 def vla_eval(connection: Any) -> None:
     def array(one: Any) -> Any:
-        return {"__ndarray__": True, "data": one.tobytes(), "dtype": one.dtype.str, "shape": list(one.shape)}
+        return {
+            "__ndarray__": True,
+            "data": one.tobytes(),
+            "dtype": one.dtype.str,
+            "shape": list(one.shape),
+        }
 
     def node(one: dict) -> Any:
         if "__ndarray__" in one:
@@ -126,7 +143,11 @@ def vla_eval(connection: Any) -> None:
     for data in connection:
         message = msgpack.unpackb(data, object_hook=node)
         if message["type"] == "hello":
-            send("hello", {"harness_version": "0.8.0", "protocol_version": 1, "model_server": "Double"}, message["seq"])
+            send(
+                "hello",
+                {"harness_version": "0.8.0", "protocol_version": 1, "model_server": "Double"},
+                message["seq"],
+            )
         elif message["type"] == "episode_start":
             step = 0
         elif step < 0 or message["payload"].get("task_description") == BROKEN:
@@ -141,7 +162,13 @@ def gr00t(port: int, *variants: str) -> None:
 
     def array(one: Any) -> Any:
         if packed:
-            return {b"nd": True, b"type": one.dtype.str, b"kind": b"", b"shape": one.shape, b"data": one.tobytes()}
+            return {
+                b"nd": True,
+                b"type": one.dtype.str,
+                b"kind": b"",
+                b"shape": one.shape,
+                b"data": one.tobytes(),
+            }
         file = io.BytesIO()
         np.save(file, one, allow_pickle=False)
         return {"__ndarray_class__": True, "as_npy": file.getvalue()}
@@ -201,7 +228,11 @@ def gr00t_actions(observation: dict[str, Any]) -> dict[str, np.ndarray]:
     size = len(texts)
     each = [
         {
-            **{name: array[i] for kind in ("video", "state") for name, array in observation[kind].items()},
+            **{
+                name: array[i]
+                for kind in ("video", "state")
+                for name, array in observation[kind].items()
+            },
             key: texts[i],
         }
         for i in range(size)
@@ -222,13 +253,17 @@ class OpenVLA(BaseHTTPRequestHandler):
                 return np.frombuffer(data, one["dtype"]).reshape(one["shape"])
             return one
 
-        observation = json.loads(self.rfile.read(int(self.headers["Content-Length"])), object_hook=node)
+        observation = json.loads(
+            self.rfile.read(int(self.headers["Content-Length"])), object_hook=node
+        )
         if observation.get("instruction") == BROKEN:
             body = json.dumps("error")
         else:
             action = answer(observation)[0]
             data = base64.b64encode(action.tobytes()).decode()
-            body = json.dumps({"__numpy__": data, "dtype": action.dtype.str, "shape": list(action.shape)})
+            body = json.dumps(
+                {"__numpy__": data, "dtype": action.dtype.str, "shape": list(action.shape)}
+            )
         self.send_response(200)
         self.send_header("Content-Length", str(len(body)))
         self.end_headers()
@@ -264,9 +299,16 @@ def _main(kind: str, port: int) -> None:
     elif protocol == "openvla":
         ThreadingHTTPServer(("127.0.0.1", port), OpenVLA).serve_forever()
     else:
-        handlers = {"openpi": openpi, "openpi-batch": openpi, "roboarena": roboarena, "vla_eval": vla_eval}
+        handlers = {
+            "openpi": openpi,
+            "openpi-batch": openpi,
+            "roboarena": roboarena,
+            "vla_eval": vla_eval,
+        }
         options: dict[str, Any] = {"compression": None, "max_size": None}
-        with websockets.sync.server.serve(handlers[protocol], "127.0.0.1", port, **options) as server:
+        with websockets.sync.server.serve(
+            handlers[protocol], "127.0.0.1", port, **options
+        ) as server:
             server.serve_forever()
 
 

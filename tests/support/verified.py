@@ -1,8 +1,10 @@
-"""What the tests of a model family verify, for the family's page: `python tests/support/verified.py` writes all tables.
+"""What the tests of a model family verify, for the family's page: `python
+tests/support/verified.py` writes all tables.
 
-A test states with `@pytest.mark.verifies("parity")` what it verifies. `pytest --verified tests/families/FAMILY` notes
-what became of these tests in `verified.json` of that folder, and `make verified` does both. Why a test was skipped is
-in its report; why a file was left out is in `LEFT_OUT` of the folder's conftest.py, {file: reason}.
+A test states with `@pytest.mark.verifies("parity")` what it verifies. `pytest --verified
+tests/families/FAMILY` notes what became of these tests in `verified.json` of that folder, and `make
+verified` does both. Why a test was skipped is in its report; why a file was left out is in
+`LEFT_OUT` of the folder's conftest.py, {file: reason}.
 """
 
 from __future__ import annotations
@@ -25,7 +27,10 @@ import pytest
 from vlagents_ray.registry import entries, find_entry
 
 ROOT = Path(__file__).parents[2]
-FOLDERS = ("tests/families", *(str(path.relative_to(ROOT)) for path in sorted(ROOT.glob("plugins/*/tests/families"))))
+FOLDERS = (
+    "tests/families",
+    *(str(path.relative_to(ROOT)) for path in sorted(ROOT.glob("plugins/*/tests/families"))),
+)
 PAGES = ROOT / "docs" / "policies"
 PYTHON = "3.11"  # of this project's own environment
 BEGIN, END = "<!-- verified: {} -->", "<!-- /verified -->"
@@ -36,8 +41,10 @@ WHAT = {
     "loading": "refuses what cannot be loaded",
     "size": "has the published size",
 }
-PLUGINS = {"arro": "other#arro"}  # of packages in plugins/, with their place among the pages of the policies
-# Of each family: the names of its requirements, and the packages and checkouts whose versions matter.
+# Of packages in plugins/, with their place among the pages of the policies.
+PLUGINS = {"arro": "other#arro"}
+# Of each family: the names of its requirements, and the packages and checkouts whose versions
+# matter.
 RUN_WITH = {
     name: (" ".join(one.requirements), (*one.checkouts, *one.needs[bool(one.checkouts) :]))
     for name, one in entries("policies").items()
@@ -72,11 +79,16 @@ class VerifyingTests:
             name = f"{Path(file).name}::{test}"
             self._outcomes.setdefault(family, {}).setdefault(name, Counter())[report.outcome] += 1
             if report.skipped and isinstance(report.longrepr, tuple):
-                self._skipped.setdefault(family, {})[name] = report.longrepr[2].removeprefix("Skipped: ")
+                self._skipped.setdefault(family, {})[name] = report.longrepr[2].removeprefix(
+                    "Skipped: "
+                )
 
     def pytest_sessionfinish(self) -> None:
         for family, tests in self._outcomes.items():
-            noted = {**_environment(family), "tests": {name: dict(tests[name]) for name in sorted(tests)}}
+            noted = {
+                **_environment(family),
+                "tests": {name: dict(tests[name]) for name in sorted(tests)},
+            }
             noted["skipped"] = self._skipped.get(family, {})
             noted["left_out"] = self._left_out.get(family, {})
             noted_in(family).write_text(json.dumps(noted, indent=2) + "\n")
@@ -89,23 +101,31 @@ def folder_of(family: str) -> Path:
 
 
 def _verifies(folder: Path) -> bool:
-    """Return whether tests of the folder state what they verify; others of a family are of other distributions."""
+    """Return whether tests of the folder state what they verify; others of a family are of other
+    distributions.
+    """
     return any("pytest.mark.verifies(" in file.read_text() for file in folder.glob("test_*.py"))
 
 
 def noted_in(family: str) -> Path:
     """The file with the outcomes of a family's tests in this Python."""
     python = _python()
-    return folder_of(family) / ("verified.json" if python == PYTHON else f"verified.python{python}.json")
+    return folder_of(family) / (
+        "verified.json" if python == PYTHON else f"verified.python{python}.json"
+    )
 
 
 def notes(family: str) -> list[dict[str, Any]]:
     """What is noted of a family, for each Python in which it was tested."""
-    return [json.loads(file.read_text()) for file in sorted(folder_of(family).glob("verified*.json"))]
+    return [
+        json.loads(file.read_text()) for file in sorted(folder_of(family).glob("verified*.json"))
+    ]
 
 
 def marked(family: str) -> Iterator[tuple[str, str]]:
-    """Yield each test of a family that is marked `verifies`, as `file::test`, and what it verifies."""
+    """Yield each test of a family that is marked `verifies`, as `file::test`, and what it
+    verifies.
+    """
     for file in sorted(folder_of(family).glob("test_*.py")):
         for node in ast.parse(file.read_text()).body:
             for mark in node.decorator_list if isinstance(node, ast.FunctionDef) else ():
@@ -117,7 +137,11 @@ def table(family: str) -> str:
     """The table of a family's page, in Markdown."""
     requirements, _ = RUN_WITH[family]
     noted = [one for one in notes(family) if one["tests"]]
-    ran = f"They ran with {'; and with '.join(map(_with, noted))}." if noted else "They have not run yet."
+    ran = (
+        f"They ran with {'; and with '.join(map(_with, noted))}."
+        if noted
+        else "They have not run yet."
+    )
     groups: dict[tuple[str, str], list[str]] = {}  # tests by what they verify and by their file
     for name, what in sorted(marked(family), key=lambda one: list(WHAT).index(one[1])):
         groups.setdefault((what, name.partition("::")[0]), []).append(name)
@@ -128,7 +152,11 @@ def table(family: str) -> str:
     cases = [f"cases, Python {one['python']}" for one in noted] if len(noted) > 1 else ["cases"]
     return "\n".join(
         [
-            f"`make verified FAMILIES={_quoted(requirements)}` runs these tests with small random checkpoints. {ran}",
+            (
+                f"`make verified FAMILIES={_quoted(requirements)}` runs these tests with small "
+                "random "
+                f"checkpoints. {ran}"
+            ),
             "",
             f"| the policy … | `{folder_of(family).relative_to(ROOT)}` | {' | '.join(cases)} |",
             f"|---|---{'|---' * len(cases)}|",
@@ -142,7 +170,9 @@ def with_table(page: str, family: str) -> str:
     begin = BEGIN.format(family)
     if page.count(begin) != 1:
         raise ValueError(f"{page_of(family).name}: want {begin} once, and {END} after its table")
-    return re.sub(f"{begin}.*?{END}", lambda _: f"{begin}\n{table(family)}\n{END}", page, flags=re.DOTALL)
+    return re.sub(
+        f"{begin}.*?{END}", lambda _: f"{begin}\n{table(family)}\n{END}", page, flags=re.DOTALL
+    )
 
 
 def page_of(family: str) -> Path:
@@ -172,14 +202,20 @@ def _python() -> str:
 
 
 def _result(noted: dict[str, Any], names: list[str]) -> str:
-    """Return the summed outcomes of some tests, with the reasons why others were skipped or not run."""
+    """Return the summed outcomes of some tests, with the reasons why others were skipped or not
+    run.
+    """
     ran = [name for name in names if name in noted["tests"]]
     outcomes = sum((Counter(noted["tests"][name]) for name in ran), Counter[str]())
     said = ", ".join(f"{number} {what}" for what, number in sorted(outcomes.items()))
-    if skipped := _once(noted["skipped"][name] for name in ran if "skipped" in noted["tests"][name]):
+    if skipped := _once(
+        noted["skipped"][name] for name in ran if "skipped" in noted["tests"][name]
+    ):
         said = f"{said}: {skipped}"
     files = (name.partition("::")[0] for name in names if name not in ran)
-    not_run = _once(noted.get("left_out", {}).get(file, "it is newer than these results") for file in files)
+    not_run = _once(
+        noted.get("left_out", {}).get(file, "it is newer than these results") for file in files
+    )
     return "; ".join(filter(None, (said, not_run and f"not run: {not_run}")))
 
 
@@ -201,7 +237,9 @@ def installed_version(name: str) -> str:
     if name.isupper():
         folder = os.environ.get(name)
         command = ["git", "-C", folder or "", "rev-parse", "--short", "HEAD"]
-        done = subprocess.run(command, check=False, capture_output=True, text=True) if folder else None
+        done = (
+            subprocess.run(command, check=False, capture_output=True, text=True) if folder else None
+        )
         return "not set" if done is None else done.stdout.strip() or "of no commit"
     try:
         return version(name)
@@ -212,7 +250,11 @@ def installed_version(name: str) -> str:
 def _environment(family: str) -> dict[str, Any]:
     versions = {name: installed_version(name) for name in RUN_WITH[family][1]}
     torch = sys.modules.get("torch")
-    device = torch.cuda.get_device_name() if torch is not None and torch.cuda.is_available() else "a CPU, not on a GPU"
+    device = (
+        torch.cuda.get_device_name()
+        if torch is not None and torch.cuda.is_available()
+        else "a CPU, not on a GPU"
+    )
     return {"python": _python(), "versions": versions, "device": device}
 
 

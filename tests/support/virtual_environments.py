@@ -1,4 +1,6 @@
-"""Virtual environments for tests, made in seconds: after their own packages, they see those of this environment."""
+"""Virtual environments for tests, made in seconds: after their own packages, they see those of
+this environment.
+"""
 
 from __future__ import annotations
 
@@ -22,7 +24,9 @@ def ended(pid: int) -> bool:
 
 
 def layered(folder: Path, *requirements: str) -> Path:
-    """The Python of an environment in `folder` with `requirements`, without what those need, over this one's."""
+    """The Python of an environment in `folder` with `requirements`, without what those need,
+    over this one's.
+    """
     python = create(folder)
     install(python, ["--no-deps", *requirements])
     below = folder / "below"

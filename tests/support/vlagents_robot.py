@@ -1,8 +1,9 @@
 """A robot with the real client of vlagents; run by the peers' Python, it imports nothing of ours.
 
-`vlagents_robot.py HOST PORT MODEL MODE`, MODE "raw", "jpeg" or "shm". Each line of its standard input is a JSON object,
-which it answers with one: {"pixel", "joints", "gripper", "instruction", "robots"?, "calls"?, "kwargs"?}, or
-{"say": "name" | "git_status" | "is_initialized" | "segments" | "close"}.
+`vlagents_robot.py HOST PORT MODEL MODE`, MODE "raw", "jpeg" or "shm". Each line of its standard
+input is a JSON object, which it answers with one: {"pixel", "joints", "gripper", "instruction",
+"robots"?, "calls"?, "kwargs"?}, or {"say": "name" | "git_status" | "is_initialized" | "segments" |
+"close"}.
 """
 
 from __future__ import annotations
@@ -42,7 +43,9 @@ def plain(act: object) -> list:
     if SingleObs is None:
         return [["", act.action.tolist(), None, act.done, act.info]]
     return [
-        [name, one.action.tolist(), one.gripper, one.done, one.info] for step in act.acts for name, one in step.items()
+        [name, one.action.tolist(), one.gripper, one.done, one.info]
+        for step in act.acts
+        for name, one in step.items()
     ]
 
 

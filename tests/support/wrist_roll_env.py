@@ -1,4 +1,6 @@
-"""Envs whose state has an angle that wraps from pi to -pi, and a policy that solves them and then stops."""
+"""Envs whose state has an angle that wraps from pi to -pi, and a policy that solves them and
+then stops.
+"""
 
 from __future__ import annotations
 
@@ -16,7 +18,9 @@ ROLLER, TILTED_ROLLER = "wrist_roll_env:Roller", "wrist_roll_env:TiltedRoller"
 
 
 class Roller(EvalEnv):
-    """A wrist is turned over pi. If the seed is even, the task is solved at the sixth of twelve steps."""
+    """A wrist is turned over pi. If the seed is even, the task is solved at the sixth of twelve
+    steps.
+    """
 
     max_steps = 12
     TURN = 0.3  # rad a step
@@ -28,7 +32,13 @@ class Roller(EvalEnv):
             state={"joints": StateSpec(2, "rad"), "xyzrpy": StateSpec(6, "m+rad")},
             gripper=True,
             action=ActionSpec(
-                dim=2, delta=True, space="joint", gripper_open=1.0, gripper_closed=-1.0, low=-1.0, high=1.0
+                dim=2,
+                delta=True,
+                space="joint",
+                gripper_open=1.0,
+                gripper_closed=-1.0,
+                low=-1.0,
+                high=1.0,
             ),
             control_hz=10.0,
         )
@@ -37,7 +47,9 @@ class Roller(EvalEnv):
     def instruction(self) -> str:
         return "turn the wrist"
 
-    def reset(self, *, seed: int, options: Mapping[str, Any] | None = None) -> tuple[Obs, dict[str, Any]]:
+    def reset(
+        self, *, seed: int, options: Mapping[str, Any] | None = None
+    ) -> tuple[Obs, dict[str, Any]]:
         self.seed, self.turned, self.steps = seed, 2.5, 0
         return self.look(), {}
 
@@ -54,7 +66,10 @@ class Roller(EvalEnv):
         roll = float(np.angle(np.exp(1j * self.turned)))
         state = {"joints": [0.1, self.turned - 2.5], "xyzrpy": [0.1, 0.2, 0.3, roll, 0.0, 0.0]}
         return Obs(
-            cameras={"base": np.full((32, 48, 3), 90, np.uint8), "wrist": np.full((16, 16, 3), 30, np.uint8)},
+            cameras={
+                "base": np.full((32, 48, 3), 90, np.uint8),
+                "wrist": np.full((16, 16, 3), 30, np.uint8),
+            },
             gripper=1.0,
             state={name: np.array(values, np.float32) for name, values in state.items()},
         )
@@ -67,7 +82,10 @@ class TiltedRoller(Roller):
 
     @property
     def contract(self) -> Contract:
-        return replace(super().contract, state={"joints": StateSpec(2, "rad"), "xyz_axis_angle": StateSpec(6, "m+rad")})
+        return replace(
+            super().contract,
+            state={"joints": StateSpec(2, "rad"), "xyz_axis_angle": StateSpec(6, "m+rad")},
+        )
 
     def look(self) -> Obs:
         obs = super().look()

@@ -1,4 +1,6 @@
-"""Each check of `check_agent` fails for a policy that is broken in just that way, and says where two values differ."""
+"""Each check of `check_agent` fails for a policy that is broken in just that way, and says where
+two values differ.
+"""
 
 from __future__ import annotations
 
@@ -127,7 +129,9 @@ class PreparesOtherwise(GoodAgent):
         return obs.state["joints"] * np.float32(0.999)
 
     def act(self, obs: Obs) -> Any:
-        return super().act(obs if obs.prepared is None else replace(obs, state={"joints": obs.prepared}))
+        return super().act(
+            obs if obs.prepared is None else replace(obs, state={"joints": obs.prepared})
+        )
 
 
 class Prepares(GoodAgent):
@@ -227,10 +231,19 @@ class AgentClosesOnce(GoodAgent):
 BROKEN_AGENTS: list[tuple[type[GoodAgent], str]] = [
     (CannotCopy, "cannot be copied.*`shared`"),
     (SharesItsCount, "depends on other sessions"),
-    (with_reset(lambda agent, _: setattr(agent, "rng", np.random.default_rng()) or {}), "must give the same actions"),
+    (
+        with_reset(lambda agent, _: setattr(agent, "rng", np.random.default_rng()) or {}),
+        "must give the same actions",
+    ),
     (with_act(lambda act, obs: obs.state["joints"].fill(9) or act), "act changed the caller's"),
-    (with_reset(lambda _, obs: obs.cameras.update(front=obs.cameras["front"][:2]) or {}), "reset changed the caller's"),
-    (with_batch(lambda acts, obs: obs[0].info.update(seen=True) or acts), "act_batch changed the caller's"),
+    (
+        with_reset(lambda _, obs: obs.cameras.update(front=obs.cameras["front"][:2]) or {}),
+        "reset changed the caller's",
+    ),
+    (
+        with_batch(lambda acts, obs: obs[0].info.update(seen=True) or acts),
+        "act_batch changed the caller's",
+    ),
     (OneActionBuffer, "an earlier act.*a later one changed it"),
     (with_batch(lambda acts, _: acts[::-1]), "session 0 in a batch of 2"),
     (with_batch(lambda acts, _: acts[:2]), "got 2 of them, want a list of 3"),
@@ -248,8 +261,14 @@ BROKEN_AGENTS: list[tuple[type[GoodAgent], str]] = [
     (SharesItsTokenizer, r"prepare of session . on a thread.*\['tokens'\].*a tokenizer's padding"),
     (CountsTokensWithIt, "reset: raised ValueError.*too many tokens.*on several threads"),
     (PreparesOnOneThread, "prepare: raised RuntimeError.*Already borrowed.*on several threads"),
-    (ParsesItsInstruction, r"reset: raised KeyError.* for the instruction 'pick up the cube', .*instructions=\["),
-    (ParsesItInAct, r"act: raised KeyError.* for the instruction 'pick up the cube' .*instructions=\["),
+    (
+        ParsesItsInstruction,
+        r"reset: raised KeyError.* for the instruction 'pick up the cube', .*instructions=\[",
+    ),
+    (
+        ParsesItInAct,
+        r"act: raised KeyError.* for the instruction 'pick up the cube' .*instructions=\[",
+    ),
     (with_contract(replace(CONTRACT, chunk=4)), "has 1 rows, the contract states 4"),
     (with_contract({}), "contract: got dict"),
     (with_reset(lambda *_: None), "reset: got NoneType"),
@@ -263,7 +282,9 @@ def test_a_good_agent_passes(cls: type[GoodAgent]) -> None:
     check_agent(cls())
 
 
-@pytest.mark.parametrize(("cls", "message"), BROKEN_AGENTS, ids=lambda value: getattr(value, "__name__", str(value)))
+@pytest.mark.parametrize(
+    ("cls", "message"), BROKEN_AGENTS, ids=lambda value: getattr(value, "__name__", str(value))
+)
 def test_a_broken_agent_is_told_what_is_wrong(cls: type[GoodAgent], message: str) -> None:
     with pytest.raises(ContractViolation, match=f"(?s){message}"):
         check_agent(cls())
@@ -291,12 +312,22 @@ def test_a_difference_says_where_it_is() -> None:
     assert "'gripper'" in str(difference(Obs(gripper=0.5), Obs(gripper=0.6), "obs"))
     assert "has ['a'] once" in str(difference({"a": 1}, {"b": 1}, "info"))
     assert "2 items once" in str(difference([1, 2], [1], "info"))
-    assert "(2,) float32 once" in str(difference(np.zeros(2, np.float32), np.zeros(3, np.float32), "x"))
+    assert "(2,) float32 once" in str(
+        difference(np.zeros(2, np.float32), np.zeros(3, np.float32), "x")
+    )
     assert difference(np.zeros(2), np.full(2, 1e-6), "x", atol=1e-5) is None
 
 
 def test_what_the_wire_carries_is_accepted_and_nothing_else() -> None:
     require_wireable({"a": [None, True, 1, 1.5, "x", b"y", np.zeros(2, bool)], "b": {}}, "info")
-    for value in (object(), (1, 2), {1: "a"}, np.float32(1), np.array(["a"]), {"a": [object()]}, {1}):
+    for value in (
+        object(),
+        (1, 2),
+        {1: "a"},
+        np.float32(1),
+        np.array(["a"]),
+        {"a": [object()]},
+        {1},
+    ):
         with pytest.raises(ContractViolation, match="info"):
             require_wireable(value, "info")

@@ -45,11 +45,20 @@ class GoodEnv(EvalEnv):
         self.position = self.position + action
         self.count += 1
         success = bool(self.position[0] > 1)
-        return self.observe(), float(success), False, self.count >= self.truncated_at, {"success": success}
+        return (
+            self.observe(),
+            float(success),
+            False,
+            self.count >= self.truncated_at,
+            {"success": success},
+        )
 
     def observe(self) -> Obs:
         shade = int(abs(float(self.position[0])) * 40) % 256
-        return Obs(cameras={"front": np.full((4, 4, 3), shade, np.uint8)}, state={"joints": self.position.copy()})
+        return Obs(
+            cameras={"front": np.full((4, 4, 3), shade, np.uint8)},
+            state={"joints": self.position.copy()},
+        )
 
     def close(self) -> None:
         pass
@@ -171,7 +180,12 @@ BROKEN_ENVS: list[tuple[type[GoodEnv], str]] = [
     (with_contract(state={"joints": StateSpec(3)}), r"want \(3,\)"),
     (with_contract(gripper=True), "gripper: got none"),
     (with_obs(lambda obs: replace(obs, gripper=0.5)), "gripper is 0.5"),
-    (with_obs(lambda obs: replace(obs, state={"joints": obs.state["joints"].astype(np.float64)})), "float64"),
+    (
+        with_obs(
+            lambda obs: replace(obs, state={"joints": obs.state["joints"].astype(np.float64)})
+        ),
+        "float64",
+    ),
     (with_obs(lambda obs: replace(obs, state={"joints": obs.state["joints"] * np.nan})), "NaN"),
     (with_obs(lambda obs: replace(obs, cameras={"front": obs.cameras["front"] / 255})), "float64"),
     (with_obs(lambda obs: replace(obs, info={"sim": object()})), r"Obs.info\['sim'\]"),
@@ -181,14 +195,19 @@ BROKEN_ENVS: list[tuple[type[GoodEnv], str]] = [
     (with_step(lambda result: result.__setitem__(2, np.bool_(False))), "terminated is bool"),
     (with_step(lambda result: result.__setitem__(3, 0)), "truncated is int"),
     (with_step(lambda result: result.__setitem__(4, {})), "info.'success'. is NoneType"),
-    (with_step(lambda result: result.__setitem__(4, {"success": np.bool_(False)})), "info.'success'. is bool"),
+    (
+        with_step(lambda result: result.__setitem__(4, {"success": np.bool_(False)})),
+        "info.'success'. is bool",
+    ),
     (with_step(lambda result: result.__setitem__(4, None)), "info is NoneType"),
     (with_step(lambda result: result[4].update(score=np.float64(1))), r"info\['score'\]"),
     (variant(max_steps=0), "max_steps: got 0"),
     (NEVER_TRUNCATES, "is not truncated, but max_steps is 6"),
     (variant(truncated_at=5), "step 5 is truncated"),
     (
-        variant(step=lambda self, act: GoodEnv.step(self, Act(np.nan_to_num(np.resize(act.action, 2))))),
+        variant(
+            step=lambda self, act: GoodEnv.step(self, Act(np.nan_to_num(np.resize(act.action, 2))))
+        ),
         r"of shape \(3,\) was executed",
     ),
     (FailsOtherwise, "raised ValueError.*want InvalidAction"),
@@ -209,7 +228,9 @@ def test_a_good_env_passes_and_is_closed() -> None:
     check_env(GoodEnv())
 
 
-@pytest.mark.parametrize(("cls", "message"), BROKEN_ENVS, ids=lambda value: getattr(value, "__name__", str(value)))
+@pytest.mark.parametrize(
+    ("cls", "message"), BROKEN_ENVS, ids=lambda value: getattr(value, "__name__", str(value))
+)
 def test_a_broken_env_is_told_what_is_wrong(cls: type[GoodEnv], message: str) -> None:
     with pytest.raises(ContractViolation, match=f"(?s){message}"):
         check_env(cls())
@@ -217,7 +238,8 @@ def test_a_broken_env_is_told_what_is_wrong(cls: type[GoodEnv], message: str) ->
 
 def test_an_object_that_is_no_env_of_ours_is_refused() -> None:
     with pytest.raises(
-        ContractViolation, match=r"want an EvalEnv; make one of Gymnasium by make_env\('gymnasium/ID'\)"
+        ContractViolation,
+        match=r"want an EvalEnv; make one of Gymnasium by make_env\('gymnasium/ID'\)",
     ):
         check_env(object())  # type: ignore[arg-type]
 

@@ -11,11 +11,22 @@ from vlagents_ray.policies.scripted import Scripted
 from vlagents_ray.registry import entries, names, policy_class
 from vlagents_ray.testing import check_agent, check_env
 
-# Registered names whose own test modules run the suites, because they need a simulator or a setting.
+# Registered names whose own test modules run the suites, because they need a simulator or a
+# setting.
 CHECKED_ELSEWHERE = {
-    "libero", "libero_pro", "maniskill", "metaworld", "rcs", "duobench", "robosuite", "robocasa", "calvin", "simpler",
-    "aloha", "upstream",
-}  # fmt: skip
+    "libero",
+    "libero_pro",
+    "maniskill",
+    "metaworld",
+    "rcs",
+    "duobench",
+    "robosuite",
+    "robocasa",
+    "calvin",
+    "simpler",
+    "aloha",
+    "upstream",
+}
 VARIANTS = {  # of envs that are not tried by their own name alone
     "gymnasium": ["gymnasium/Pendulum-v1", "gymnasium/gym_pusht/PushT-v0"],
     "pusht": ["pusht", "pusht/keypoints"],
@@ -45,7 +56,8 @@ def test_every_registered_env_passes(suite: str) -> None:
 )
 def test_every_registered_policy_passes(name: str) -> None:
     cls = policy_class(name)
-    if issubclass(cls, ModelPolicy) and cls.Config.model_fields["checkpoint"].is_required():  # their own tests do
+    # Their own tests do.
+    if issubclass(cls, ModelPolicy) and cls.Config.model_fields["checkpoint"].is_required():
         with pytest.raises(ConfigError, match="checkpoint"):
             cls.from_config({})
         return
@@ -55,4 +67,6 @@ def test_every_registered_policy_passes(name: str) -> None:
         return
     with make_env("tabletop") as env:
         obs, _ = env.reset(seed=0)
-        check_agent(agent, obs=obs, instructions=[env.instruction], reset_kwargs={"env": "tabletop"})
+        check_agent(
+            agent, obs=obs, instructions=[env.instruction], reset_kwargs={"env": "tabletop"}
+        )

@@ -33,13 +33,17 @@ _RERUN = {  # component -> what it is called here
 
 
 def read_rrd(path: Path) -> dict[str, dict[int | None, Any]]:
-    """What a `.rrd` file says: entity -> tick (None: always) -> numbers, an image's file, a text, a tensor's rows."""
+    """What a `.rrd` file says: entity -> tick (None: always) -> numbers, an image's file, a
+    text, a tensor's rows.
+    """
     from rerun.chunk import RrdReader
 
     found: dict[str, dict[int | None, Any]] = defaultdict(dict)
     for chunk in RrdReader(path).stream().to_chunks():
         batch = chunk.to_record_batch()
-        ticks = batch["tick"].to_pylist() if "tick" in batch.schema.names else [None] * chunk.num_rows
+        ticks = (
+            batch["tick"].to_pylist() if "tick" in batch.schema.names else [None] * chunk.num_rows
+        )
         for column in _RERUN.keys() & set(batch.schema.names):
             for tick, value in zip(ticks, batch[column].to_pylist(), strict=True):
                 found[chunk.entity_path.lstrip("/")][tick] = _plain(_RERUN[column], value)
@@ -64,7 +68,10 @@ def frame(tick: int) -> ViewerFrame:
         tick,
         1e9 + tick / 50,
         cameras={"left/wrist": np.full((16, 24, 3), 40 * tick, np.uint8)},
-        state={"joints": np.array([tick, -tick], np.float32), "gripper": np.array([0.5], np.float32)},
+        state={
+            "joints": np.array([tick, -tick], np.float32),
+            "gripper": np.array([0.5], np.float32),
+        },
         executed=np.array([tick, 1, 2], np.float32),
         planned=np.array([tick, 1, 3], np.float32),
         chunk=np.arange(12, dtype=np.float32).reshape(4, 3) + tick if tick % 4 == 0 else None,
@@ -90,24 +97,34 @@ def test_a_recording_of_rerun_holds_what_was_sent(tmp_path: Path) -> None:
     assert found["timing/round_trip_ms"] == {tick: [3.5] for tick in ticks}
     assert found["log"] == {2: "deadline_exceeded"}
     pictures = found[r"cameras/left\/wrist"]
-    assert {tick: decode(data).shape for tick, data in pictures.items()} == dict.fromkeys(ticks, (16, 24, 3))
-    assert [round(float(decode(pictures[tick]).mean()), -1) for tick in ticks] == [40 * tick for tick in ticks]
+    assert {tick: decode(data).shape for tick, data in pictures.items()} == dict.fromkeys(
+        ticks, (16, 24, 3)
+    )
+    assert [round(float(decode(pictures[tick]).mean()), -1) for tick in ticks] == [
+        40 * tick for tick in ticks
+    ]
 
 
 @pytest.mark.library("rerun")
 def test_a_live_viewer_of_rerun_has_to_run() -> None:
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))  # and does not listen
-        with pytest.raises(ConfigError, match=r"no viewer listens at rerun\+http.*start it with `rerun`"):
+        with pytest.raises(
+            ConfigError, match=r"no viewer listens at rerun\+http.*start it with `rerun`"
+        ):
             open_viewer(f"rerun+http://127.0.0.1:{taken.getsockname()[1]}/proxy")
 
 
 def test_the_address_of_something_else_is_refused() -> None:
-    with pytest.raises(ConfigError, match=r"rerun: got 'ws://127.0.0.1:1', want a folder, 'live', or"):
+    with pytest.raises(
+        ConfigError, match=r"rerun: got 'ws://127.0.0.1:1', want a folder, 'live', or"
+    ):
         open_viewer("ws://127.0.0.1:1")
 
 
-def test_a_viewer_that_is_not_installed_names_its_extra(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_viewer_that_is_not_installed_names_its_extra(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setitem(sys.modules, "rerun", None)
     with pytest.raises(MissingDependency, match=r"pip install 'vlagents-ray\[rerun\]'"):
         open_viewer(str(tmp_path))
@@ -139,13 +156,16 @@ def rerun_viewer() -> Iterator[tuple[str, subprocess.Popen[bytes]]]:
 
 
 @pytest.mark.library("rerun")
-def test_a_viewer_of_rerun_gets_what_runs(rerun_viewer: tuple[str, subprocess.Popen[bytes]]) -> None:
+def test_a_viewer_of_rerun_gets_what_runs(
+    rerun_viewer: tuple[str, subprocess.Popen[bytes]],
+) -> None:
     address, _ = rerun_viewer
     viewer = open_viewer(address)
     with viewer, viewer.episode("ep0", "stack the cups"):
         for tick in range(TICKS):
             viewer.add(frame(tick))
-    assert (viewer.episodes, viewer.dropped, viewer.error) == (1, 0, None)  # its end says that all has arrived
+    # Its end says that all has arrived.
+    assert (viewer.episodes, viewer.dropped, viewer.error) == (1, 0, None)
 
 
 @pytest.mark.library("rerun")

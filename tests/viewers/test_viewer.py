@@ -1,4 +1,6 @@
-"""A viewer never delays what it shows, whatever becomes of its disk, or of the other side; a run of the loop in it."""
+"""A viewer never delays what it shows, whatever becomes of its disk, or of the other side; a run
+of the loop in it.
+"""
 
 from __future__ import annotations
 
@@ -22,7 +24,9 @@ class Slow:
 
     target, closing_s = "nowhere", None
 
-    def __init__(self, *, broken_at: int | None = None, going: bool = True, closing_s: float | None = None) -> None:
+    def __init__(
+        self, *, broken_at: int | None = None, going: bool = True, closing_s: float | None = None
+    ) -> None:
         self.go = threading.Event()
         self.taken = threading.Event()  # a frame is being written
         self.broken_at = broken_at
@@ -54,7 +58,8 @@ def test_frames_beyond_the_queue_are_dropped_and_counted_and_none_waits() -> Non
         with viewer.episode("one"):
             viewer.add(ViewerFrame(0, 0.0))
             assert target.taken.wait(60)
-            for tick in range(1, 1000):  # the writer stands still: had `add` waited, the test would hang
+            # The writer stands still: had `add` waited, the test would hang.
+            for tick in range(1, 1000):
                 viewer.add(ViewerFrame(tick, 0.0))
             assert not viewer.has_room
             target.go.set()
@@ -75,7 +80,9 @@ def test_every_frame_of_an_episode_is_written_in_order_before_it_is_closed() -> 
     assert (viewer.episodes, viewer.dropped, viewer.error) == (2, 0, None)
 
 
-def test_an_error_ends_what_is_shown_of_an_episode_and_the_next_one_is_shown(caplog: pytest.LogCaptureFixture) -> None:
+def test_an_error_ends_what_is_shown_of_an_episode_and_the_next_one_is_shown(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
     target = Slow(broken_at=3)
     with EpisodeViewer(target, frames=1000) as viewer:
         with viewer.episode("one"):
@@ -123,7 +130,10 @@ def test_a_frame_is_a_copy_of_the_observation() -> None:
     image[:], joints[:] = 0, 0
     assert (frame.tick, frame.time) == (3, 5.0)
     assert frame.cameras["front"].min() == 7
-    assert {name: part.tolist() for name, part in frame.state.items()} == {"joints": [1, 1], "gripper": [0.25]}
+    assert {name: part.tolist() for name, part in frame.state.items()} == {
+        "joints": [1, 1],
+        "gripper": [0.25],
+    }
 
 
 HZ, ROWS, CHUNKS = 100.0, 4, 3
@@ -164,7 +174,9 @@ def run(viewer: EpisodeViewer) -> None:
     agent = Counting()
     player = ChunkPlayer(agent, PlayerSettings(mode="open_loop"))
     robot = SimulatedRobot(agent.contract)
-    run_loop(robot, player, hz=HZ, instruction="count", viewer=viewer, until=lambda: agent.asked > CHUNKS)
+    run_loop(
+        robot, player, hz=HZ, instruction="count", viewer=viewer, until=lambda: agent.asked > CHUNKS
+    )
 
 
 def test_each_tick_is_shown_with_what_was_planned_and_executed() -> None:
@@ -178,7 +190,9 @@ def test_each_tick_is_shown_with_what_was_planned_and_executed() -> None:
     assert [float(frame.planned[0]) for frame in frames] == executed
     begins = [i for i, frame in enumerate(frames) if frame.chunk is not None]
     assert begins == list(range(0, len(frames), ROWS))
-    assert [frames[i].chunk[:, 0].tolist() for i in begins] == [[i, i + 1, i + 2, i + 3] for i in begins]
+    assert [frames[i].chunk[:, 0].tolist() for i in begins] == [
+        [i, i + 1, i + 2, i + 3] for i in begins
+    ]
     assert {frame.numbers["round_trip_ms"] for frame in frames} == {2.5}
     assert {frame.numbers["safe"] for frame in frames} == {0.0}
     assert all(frame.numbers["work_ms"] > 0 for frame in frames)
@@ -201,8 +215,20 @@ def test_spells_without_the_policy_are_shown_with_their_reason_once() -> None:
                 stop = "no signal from the server" if tick == 3 else ""
                 view.add(Obs(), act, None if stop else act.action, tick, 0.0, stop)
     shown = target.frames
-    assert [frame.note for frame in shown] == ["waiting for an answer", "", "", "no signal from the server"]
-    spells = [[frame.numbers[name] for name in ("safe", "intervention", "stopped")] for frame in shown]
+    assert [frame.note for frame in shown] == [
+        "waiting for an answer",
+        "",
+        "",
+        "no signal from the server",
+    ]
+    spells = [
+        [frame.numbers[name] for name in ("safe", "intervention", "stopped")] for frame in shown
+    ]
     assert spells == [[1, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]]
-    assert [None if frame.planned is None else frame.planned.tolist() for frame in shown] == [None, None, [3, 4], None]
+    assert [None if frame.planned is None else frame.planned.tolist() for frame in shown] == [
+        None,
+        None,
+        [3, 4],
+        None,
+    ]
     assert shown[3].executed is None

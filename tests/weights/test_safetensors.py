@@ -56,7 +56,11 @@ def test_a_file_of_the_safetensors_package_is_read() -> None:
     reader = ValuesReader(read_header(b"\xc8\0\0\0\0\0\0\0" + header))
     reader.add(b"\0\0\x80?\0\0\0@\0\0@@\1\0")
     found = reader.values()
-    assert {name: value.tolist() for name, value in found.items()} == {"n": [], "w": [[1, 2, 3]], "b": [True, False]}
+    assert {name: value.tolist() for name, value in found.items()} == {
+        "n": [],
+        "w": [[1, 2, 3]],
+        "b": [True, False],
+    }
 
 
 def test_a_value_without_a_type_of_the_format_is_named() -> None:
@@ -100,7 +104,10 @@ def entry(**changed: Any) -> dict[str, Any]:
         (header(entry(data_offsets=[8, 32])), "got bytes 8 to 32, want 0 to 24"),
         (header(entry(data_offsets=[24, 0])), "got bytes 24 to 0, want 0 to 24"),
         (header(entry() | {"v": entry()["w"]}), "got bytes 0 to 24, want 24 to 48"),
-        (header(entry() | {"v": entry(data_offsets=[32, 56])["w"]}), "got bytes 32 to 56, want 24 to 48"),
+        (
+            header(entry() | {"v": entry(data_offsets=[32, 56])["w"]}),
+            "got bytes 32 to 56, want 24 to 48",
+        ),
         (header(entry(shape=[10**14] * 30)), "got bytes 0 to 24"),
     ],
 )

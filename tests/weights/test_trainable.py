@@ -32,7 +32,10 @@ class Linear(Agent):
     trainable: ClassVar[str | None] = "tree"
 
     def initialize(self) -> None:
-        self.tree = {"layers": [{"w": np.eye(2, dtype=np.float32)}], "bias": np.zeros(2, np.float32)}
+        self.tree = {
+            "layers": [{"w": np.eye(2, dtype=np.float32)}],
+            "bias": np.zeros(2, np.float32),
+        }
 
     def act(self, obs: Obs) -> Act:
         return Act(self.tree["layers"][0]["w"] @ np.ones(2, np.float32) + self.tree["bias"])  # type: ignore[index,call-overload]
@@ -101,7 +104,9 @@ class TestTorch:
         module.tied = module[0].weight
         return module.eval()
 
-    def test_values_are_those_of_the_state_dict_buffers_and_tied_ones_included(self, module: Any) -> None:
+    def test_values_are_those_of_the_state_dict_buffers_and_tied_ones_included(
+        self, module: Any
+    ) -> None:
         import torch
 
         parameter, held = module[0].weight, named_values(module)
@@ -151,12 +156,18 @@ class TestTorch:
         assert portable(torch.ones(2)).dtype == np.float32
 
 
-HELD = {"w": np.zeros((2, 3), np.float32), "b": np.zeros(3, np.float16), "n": np.zeros((), np.int64)}
+HELD = {
+    "w": np.zeros((2, 3), np.float32),
+    "b": np.zeros(3, np.float16),
+    "n": np.zeros((), np.int64),
+}
 LARGE = np.zeros(10_000, np.float32)
 NEW = {"w": np.ones((2, 3), np.float32), "b": np.ones(3, np.float16), "n": np.ones((), np.int64)}
 
 
-def fitted(held: Any, pushed: Any, *, partial: bool = False, allow_same: bool = False) -> dict[str, Any]:
+def fitted(
+    held: Any, pushed: Any, *, partial: bool = False, allow_same: bool = False
+) -> dict[str, Any]:
     return completed(held, accepted(held, pushed, partial=partial), allow_same=allow_same)
 
 
@@ -168,8 +179,12 @@ def fitted(held: Any, pushed: Any, *, partial: bool = False, allow_same: bool = 
         (NEW | {"w": np.ones((3, 2), np.float32)}, r"'w': got shape \(3, 2\), want \(2, 3\)"),
         (NEW | {"w": np.ones((2, 3), np.int32)}, r"'w': got int32, want float32"),
         (NEW | {"w": [1.0]}, r"'w': got list, want an array"),
-        (NEW | {"w": np.full((2, 3), np.nan, np.float32)}, r"'w': got NaN or infinite values, want finite ones"),
-        (NEW | {"b": np.full(3, 1e5, np.float32)}, r"'b': got NaN or infinite"),  # above the largest float16
+        (
+            NEW | {"w": np.full((2, 3), np.nan, np.float32)},
+            r"'w': got NaN or infinite values, want finite ones",
+        ),
+        # Above the largest float16.
+        (NEW | {"b": np.full(3, 1e5, np.float32)}, r"'b': got NaN or infinite"),
         ({**{str(n): np.zeros(1) for n in range(7)}, **NEW}, r"and 2 more$"),
     ],
 )
@@ -183,24 +198,33 @@ def test_what_does_not_fit_is_refused(pushed: dict[str, Any], says: str) -> None
 @pytest.mark.parametrize("dtype", ["float32", "float16", "bfloat16", "float64"])
 @pytest.mark.parametrize("value", [float("nan"), float("inf"), -float("inf")])
 @pytest.mark.parametrize("place", [0, 1234, -1])
-def test_one_number_that_is_not_finite_is_found_among_many_tensors(dtype: str, value: float, place: int) -> None:
+def test_one_number_that_is_not_finite_is_found_among_many_tensors(
+    dtype: str, value: float, place: int
+) -> None:
     torch = pytest.importorskip("torch")
     kind = getattr(torch, dtype)
     held = {str(i): torch.zeros(3000, dtype=kind) for i in range(4)}
-    held |= {"empty": torch.zeros(0), "count": torch.zeros(2, dtype=torch.int64), "other": torch.zeros(5)}
+    held |= {
+        "empty": torch.zeros(0),
+        "count": torch.zeros(2, dtype=torch.int64),
+        "other": torch.zeros(5),
+    }
     pushed = {name: one + 1 for name, one in held.items()}
     pushed["3"][:] = torch.finfo(kind).max  # whose norms in other senses are infinite
     assert set(trainable.accepted(held, pushed)) == set(held)
     pushed["2"][place] = value
     with pytest.raises(
-        InvalidWeights, match=r"nothing was changed: '2': got NaN or infinite values, want finite ones$"
+        InvalidWeights,
+        match=r"nothing was changed: '2': got NaN or infinite values, want finite ones$",
     ):
         trainable.accepted(held, pushed)
 
 
 def test_infinite_values_fit_where_the_policy_has_them() -> None:
     mask = np.triu(np.full((2, 2), -np.inf, np.float32), 1)  # of causal attention
-    assert fitted(HELD | {"mask": mask}, NEW | {"mask": mask.copy()})["mask"].tolist() == mask.tolist()
+    assert (
+        fitted(HELD | {"mask": mask}, NEW | {"mask": mask.copy()})["mask"].tolist() == mask.tolist()
+    )
     for wrong in (mask.T, -mask, np.full_like(mask, np.nan)):
         with pytest.raises(InvalidWeights, match="'mask': got NaN or infinite"):
             fitted(HELD | {"mask": mask}, NEW | {"mask": wrong})
@@ -209,7 +233,9 @@ def test_infinite_values_fit_where_the_policy_has_them() -> None:
 def test_what_fits_is_converted() -> None:
     new = fitted(HELD, NEW | {"b": np.ones(3, np.float64)})
     assert list(new) == list(HELD)
-    assert {name: value.dtype for name, value in new.items()} == {name: value.dtype for name, value in HELD.items()}
+    assert {name: value.dtype for name, value in new.items()} == {
+        name: value.dtype for name, value in HELD.items()
+    }
 
 
 def test_a_part_keeps_the_rest() -> None:
@@ -232,7 +258,12 @@ def test_the_fingerprint_depends_on_names_shapes_types_and_values_alone() -> Non
     first = fingerprint(HELD)
     assert len(first) == 32
     assert fingerprint(dict(reversed(HELD.items()))) == first
-    others = [NEW, HELD | {"n": np.int64(1)}, HELD | {"w": np.zeros((3, 2), np.float32)}, HELD | {"x": np.zeros(1)}]
+    others = [
+        NEW,
+        HELD | {"n": np.int64(1)},
+        HELD | {"w": np.zeros((3, 2), np.float32)},
+        HELD | {"x": np.zeros(1)},
+    ]
     assert len({first, *map(fingerprint, others)}) == 5
 
 
@@ -248,7 +279,10 @@ def test_tensors_are_checked_as_arrays_are() -> None:
     torch = pytest.importorskip("torch")
     held = {"w": torch.zeros(4, dtype=torch.bfloat16), "n": torch.zeros((), dtype=torch.int64)}
     assert fitted(held, {"w": np.ones(4), "n": np.int64(2)})["w"].dtype == torch.bfloat16
-    for wrong, says in ((torch.full((4,), float("inf")), "infinite"), (torch.ones(4, dtype=torch.int8), "got int8")):
+    for wrong, says in (
+        (torch.full((4,), float("inf")), "infinite"),
+        (torch.ones(4, dtype=torch.int8), "got int8"),
+    ):
         with pytest.raises(InvalidWeights, match=says):
             fitted(held, {"w": wrong}, partial=True)
     with pytest.raises(UnchangedWeights):
@@ -263,7 +297,9 @@ def test_a_tree_may_have_modules() -> None:
     tree = {"network": network, "head": head}
     assert list(named_values(tree)) == ["network/weight", "network/bias", "head/scale"]
     weight = network.weight
-    set_values(tree, {"network/weight": torch.full((1, 2), 3.0), "head/scale": torch.full((1,), 4.0)})
+    set_values(
+        tree, {"network/weight": torch.full((1, 2), 3.0), "head/scale": torch.full((1,), 4.0)}
+    )
     assert network.weight is weight
     assert weight.tolist() == [[3, 3]]
     assert head["scale"].tolist() == [4]

@@ -1,4 +1,6 @@
-"""Another system's keys become an Obs, or an error that names their key; our action becomes theirs."""
+"""Another system's keys become an Obs, or an error that names their key; our action becomes
+theirs.
+"""
 
 from __future__ import annotations
 
@@ -57,7 +59,11 @@ def test_droids_gripper_is_closed_at_one_and_may_be_a_scalar() -> None:
 
 
 def test_aloha_images_are_turned_from_channels_first_and_nested_keys_are_found() -> None:
-    aloha = {"state": np.arange(14.0), "images": {"cam_high": IMAGE.transpose(2, 0, 1)}, "prompt": "insert"}
+    aloha = {
+        "state": np.arange(14.0),
+        "images": {"cam_high": IMAGE.transpose(2, 0, 1)},
+        "prompt": "insert",
+    }
     obs, _ = presets()["openpi-aloha"].obs(aloha)
     np.testing.assert_array_equal(obs.cameras["front"], IMAGE)
     assert list(obs.cameras) == ["front"]
@@ -70,7 +76,13 @@ def test_no_camera_is_missed_that_a_mapping_reads(caplog: pytest.LogCaptureFixtu
     mapping = KeyMapping.from_json(
         {"cameras": {"front": f"{long}rgb", "*": "video/*", "top": "a|b"}, "info": {"m": "mask"}}
     )
-    theirs = {f"{long}rgb": IMAGE, "video": {"x": IMAGE}, "b": IMAGE, "mask": IMAGE, "state": np.ones(3)}
+    theirs = {
+        f"{long}rgb": IMAGE,
+        "video": {"x": IMAGE},
+        "b": IMAGE,
+        "mask": IMAGE,
+        "state": np.ones(3),
+    }
     mapping.warn_of_unread_cameras(theirs, "test")
     assert caplog.messages == []
     mapping.warn_of_unread_cameras(theirs | {"c": IMAGE}, "test")
@@ -91,18 +103,28 @@ def test_no_camera_is_missed_that_a_mapping_reads(caplog: pytest.LogCaptureFixtu
         ({"observation/state": ["0"] * 8}, InvalidObservation, "observation/state"),
         ({"prompt": 3}, InvalidObservation, "prompt"),
         ({"prompt": "x" * 20_000}, MessageTooLarge, "prompt"),
-        ({"observation/image": np.zeros((70, 70, 3), np.uint8)}, MessageTooLarge, "observation/image"),
+        (
+            {"observation/image": np.zeros((70, 70, 3), np.uint8)},
+            MessageTooLarge,
+            "observation/image",
+        ),
     ],
 )
-def test_what_is_wrong_is_said_with_their_key(change: dict[str, Any], error: type[Exception], key: str) -> None:
+def test_what_is_wrong_is_said_with_their_key(
+    change: dict[str, Any], error: type[Exception], key: str
+) -> None:
     flat = {name: value for name, value in (LIBERO | change).items() if value is not None}
     with pytest.raises(error, match=key):
         presets()["openpi-libero"].obs(flat, Limits(pixels=64 * 64))
 
 
 def test_an_observation_without_camera_or_state_that_the_mapping_reads_is_refused() -> None:
-    with pytest.raises(InvalidObservation, match="of which the mapping reads nothing; it looks for"):
-        KeyMapping.from_json({"cameras": {"*": "images/*"}, "state": {"*": "proprio/*"}}).obs({"prompt": "pick"})
+    with pytest.raises(
+        InvalidObservation, match="of which the mapping reads nothing; it looks for"
+    ):
+        KeyMapping.from_json({"cameras": {"*": "images/*"}, "state": {"*": "proprio/*"}}).obs(
+            {"prompt": "pick"}
+        )
 
 
 def test_states_are_joined_in_their_order() -> None:
@@ -113,7 +135,10 @@ def test_states_are_joined_in_their_order() -> None:
 
 
 def test_an_observation_is_left_as_it_was() -> None:
-    flat = {name: value.copy() if isinstance(value, np.ndarray) else value for name, value in LIBERO.items()}
+    flat = {
+        name: value.copy() if isinstance(value, np.ndarray) else value
+        for name, value in LIBERO.items()
+    }
     presets()["openpi-libero"].obs(flat)
     for name, value in LIBERO.items():
         np.testing.assert_array_equal(flat[name], value)
@@ -127,7 +152,9 @@ def test_a_grippers_command_is_turned_to_their_polarity() -> None:
     assert action[:, 6].tolist() == [1, 0]
     for openvla in ("openvla", "openvla-oft"):  # its clients turn it into LIBERO's themselves
         assert presets()[openvla].rows(action, ours).tolist() == action.tolist()
-        assert presets()[openvla].rows(libero, ActionSpec(7, gripper_open=-1.0, gripper_closed=1.0))[:, 6].tolist() == [
+        assert presets()[openvla].rows(
+            libero, ActionSpec(7, gripper_open=-1.0, gripper_closed=1.0)
+        )[:, 6].tolist() == [
             1,
             0,
         ]
@@ -137,7 +164,9 @@ def test_a_grippers_command_is_turned_to_their_polarity() -> None:
 
 
 def test_an_action_is_split_by_their_names() -> None:
-    mapping = read_mapping({"preset": "gr00t", "action": {"arm": {"stop": 6}, "hand": {"start": 6}}})
+    mapping = read_mapping(
+        {"preset": "gr00t", "action": {"arm": {"stop": 6}, "hand": {"start": 6}}}
+    )
     parts = mapping.actions(np.arange(14.0).reshape(2, 7))
     assert {name: part.shape for name, part in parts.items()} == {"arm": (2, 6), "hand": (2, 1)}
     assert parts["hand"].ravel().tolist() == [6, 13]
@@ -183,21 +212,42 @@ def test_what_the_policy_needs_and_the_mapping_lacks_is_listed() -> None:
         action=ActionSpec(dim=6),
     )
     lines = presets()["openvla"].lacks(needs)
-    assert [line.partition(":")[0] for line in lines] == ["camera 'top'", "state 'joints'", "gripper", "action"]
+    assert [line.partition(":")[0] for line in lines] == [
+        "camera 'top'",
+        "state 'joints'",
+        "gripper",
+        "action",
+    ]
     assert presets()["openvla"].lacks(None) == []
-    assert presets()["vlagents"].lacks(Contract({"front": CameraSpec()}, {"joints": StateSpec(7)}, gripper=True)) == []
+    assert (
+        presets()["vlagents"].lacks(
+            Contract({"front": CameraSpec()}, {"joints": StateSpec(7)}, gripper=True)
+        )
+        == []
+    )
 
 
 junk = st.recursive(
     st.none() | st.booleans() | st.floats() | st.text(max_size=5) | st.binary(max_size=5),
-    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=5), inner, max_size=3),
+    lambda inner: (
+        st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=5), inner, max_size=3)
+    ),
     max_leaves=6,
 )
 
 
 @given(st.sampled_from(sorted(presets())), st.data())
 def test_whatever_lies_at_the_keys_only_our_errors_come_out(name: str, data: st.DataObject) -> None:
-    wanted = ["image", "images", "observation/image", "observation/state", "state", "video", "prompt", "instruction"]
+    wanted = [
+        "image",
+        "images",
+        "observation/image",
+        "observation/state",
+        "state",
+        "video",
+        "prompt",
+        "instruction",
+    ]
     flat = data.draw(st.dictionaries(st.sampled_from(wanted), junk, max_size=5))
     try:
         presets()[name].obs(flat)
@@ -213,7 +263,9 @@ def test_a_mapping_of_junk_is_refused_by_name(value: Any) -> None:
         return
 
 
-@pytest.mark.parametrize("value", [[1e308], np.array([1e308]), 10**400, [10**400], [-(10**400), 1.0]])
+@pytest.mark.parametrize(
+    "value", [[1e308], np.array([1e308]), 10**400, [10**400], [-(10**400), 1.0]]
+)
 def test_a_number_too_large_for_float32_is_refused(value: Any) -> None:
     with pytest.raises(InvalidObservation, match="joints"):
         KeyMapping.from_json({"state": {"joints": "joints"}}).obs({"joints": value})

@@ -1,7 +1,9 @@
-"""The buffer of action chunks, which selects the next row to execute, and the capture times of observations.
+"""The buffer of action chunks, which selects the next row to execute, and the capture times of
+observations.
 
-The chunk player, episodes of an evaluation (`vlagents_ray.evaluate.episode.latency`), policies that return the rows of
-their chunks one by one (`vlagents_ray.policies.base.policy`), and vla-eval's sessions all use this buffer.
+The chunk player, episodes of an evaluation (`vlagents_ray.evaluate.episode.latency`), policies that
+return the rows of their chunks one by one (`vlagents_ray.policies.base.policy`), and vla-eval's
+sessions all use this buffer.
 """
 
 from __future__ import annotations
@@ -18,14 +20,29 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 
 from vlagents_ray.errors import ConfigError, InvalidObservation, PolicyFailed
-from vlagents_ray.interface import AGE, AGE_MS, CAPTURED, CHUNK, DELAY, GIVEN, LEFTOVER, PLANNED, ROW, SILENT, Act, Obs
+from vlagents_ray.interface import (
+    AGE,
+    AGE_MS,
+    CAPTURED,
+    CHUNK,
+    DELAY,
+    GIVEN,
+    LEFTOVER,
+    PLANNED,
+    ROW,
+    SILENT,
+    Act,
+    Obs,
+)
 
 Mode = Literal["open_loop", "ensemble", "async"]
 Merge = Callable[[np.ndarray, np.ndarray], np.ndarray]
-"""Combines the action of the older chunks, (D,), with that of a newer one, (D,), for one tick; returns (D,)."""
+"""Combines the action of the older chunks, (D,), with that of a newer one, (D,), for one tick;
+returns (D,).
+"""
 
-# The names and weights of LeRobot 0.4.4, `lerobot/async_inference/configs.py`, AGGREGATE_FUNCTIONS; its "latest_only"
-# is called "newest" here.
+# The names and weights of LeRobot 0.4.4, `lerobot/async_inference/configs.py`, AGGREGATE_FUNCTIONS;
+# its "latest_only" is called "newest" here.
 MERGES: Mapping[str, Merge] = {
     "newest": lambda _, new: new,
     "average": lambda old, new: 0.5 * old + 0.5 * new,
@@ -34,7 +51,8 @@ MERGES: Mapping[str, Merge] = {
 }
 ENSEMBLE = "ensemble"
 ENSEMBLE_M = 0.01
-"""The m of the weights exp(-m * i), i = 0 for the oldest: Zhao et al. 2023 (ACT, https://arxiv.org/abs/2304.13705), and
+"""The m of the weights exp(-m * i), i = 0 for the oldest: Zhao et al. 2023 (ACT,
+https://arxiv.org/abs/2304.13705), and
 `temporal_agg` in their code.
 """
 
@@ -79,25 +97,30 @@ class Step(NamedTuple):
 
 
 class ChunkBuffer:
-    """The chunks of a plan, positioned by the number of actions that the robot had executed at their observation.
+    """The chunks of a plan, positioned by the number of actions that the robot had executed at
+    their observation.
 
-    Row r of a chunk is for r executed actions after its observation. Rows that were replaced by rows of earlier
-    chunks are therefore skipped, however late the answer arrives. While the robot holds still, the plan waits
-    with it, and no row is skipped for those ticks. If ticks were counted instead, the rows after a stall would begin
-    ahead of the robot's position: absolute targets would make it jump, and relative ones would omit a part of the
-    path. (LeRobot's real-time chunking has the same rule since huggingface/lerobot#4454.)
+    Row r of a chunk is for r executed actions after its observation. Rows that were replaced by
+    rows of earlier chunks are therefore skipped, however late the answer arrives. While the robot
+    holds still, the plan waits with it, and no row is skipped for those ticks. If ticks were
+    counted instead, the rows after a stall would begin ahead of the robot's position: absolute
+    targets would make it jump, and relative ones would omit a part of the path. (LeRobot's
+    real-time chunking has the same rule since huggingface/lerobot#4454.)
     """
 
     def __init__(self, merge: str | Merge = "newest", ensemble_m: float = ENSEMBLE_M) -> None:
         """Begin a plan without chunks; raises `ConfigError` if `merge` is an unknown name.
 
         Args:
-            merge: The combination of the rows that several chunks have for one step: a name of `MERGES`, "ensemble", or
-                a function that is folded over them from the oldest to the newest.
+            merge: The combination of the rows that several chunks have for one step: a name of
+                `MERGES`, "ensemble", or a function that is folded over them from the oldest to the
+                newest.
             ensemble_m: The m of the ensemble's weights exp(-m * i), oldest first.
         """
         if isinstance(merge, str) and merge not in MERGES and merge != ENSEMBLE:
-            raise ConfigError(f"merge: got {merge!r}, want one of {sorted([*MERGES, ENSEMBLE])} or a function")
+            raise ConfigError(
+                f"merge: got {merge!r}, want one of {sorted([*MERGES, ENSEMBLE])} or a function"
+            )
         self.executed = 0  # number of executed actions of this plan
         self._merge = MERGES.get(merge) if isinstance(merge, str) else merge  # None: the ensemble
         self._newest = merge == "newest"
@@ -107,8 +130,8 @@ class ChunkBuffer:
     def add(self, chunk: Chunk) -> bool:
         """Add a chunk; return False if it has no row left to execute, or came too late (`outruns`).
 
-        If no other row is left, the last row may be executed one step late: an answer with a single action has no
-        other row, and arrives after the previous action has been executed.
+        If no other row is left, the last row may be executed one step late: an answer with a single
+        action has no other row, and arrives after the previous action has been executed.
         """
         while self._chunks and self._chunks[0].end <= self.executed:
             self._chunks.popleft()
@@ -142,14 +165,18 @@ class ChunkBuffer:
         self.executed += 1
 
     def take(self) -> Step:
-        """Return `next` and count it as executed; raises `PolicyFailed` if no chunk reaches that far."""
+        """Return `next` and count it as executed; raises `PolicyFailed` if no chunk reaches that
+        far.
+        """
         if (step := self.next) is None:
             raise PolicyFailed(f"chunk: no row is left for step {self.executed} of the plan")
         self.advance()
         return step
 
     def replace(self, rows: np.ndarray, step: int | None = None) -> None:
-        """Replace all chunks by one of `rows`, (H, D), the first of which is for `step`; None: for the next step."""
+        """Replace all chunks by one of `rows`, (H, D), the first of which is for `step`; None:
+        for the next step.
+        """
         self._chunks.clear()
         self.add(Chunk(0, self.executed if step is None else step, rows))
 
@@ -161,17 +188,26 @@ class ChunkBuffer:
         return np.stack(rows) if rows else None
 
     def continuation(self, delay: int) -> dict[str, Any]:
-        """Return the `Obs.info` of a request with real-time chunking, whose answer is expected in `delay` ticks."""
+        """Return the `Obs.info` of a request with real-time chunking, whose answer is expected
+        in `delay` ticks.
+        """
         rest = self.leftover()
         return {} if rest is None else {LEFTOVER: rest, DELAY: min(delay, len(rest))}
 
     def outruns(self, step: int, info: Mapping[str, Any]) -> bool:
-        """Return whether more rows were executed since `step`, that of an answer, than it was `GIVEN` in its `info`."""
+        """Return whether more rows were executed since `step`, that of an answer, than it was
+        `GIVEN` in its `info`.
+        """
         return bool(self.executed - step > info.get(GIVEN, math.inf))
 
     def drop(self, before: float = math.inf) -> bool:
-        """Drop chunks with observations from before a time, s of `time.monotonic`; return whether there were any."""
-        count, kept = len(self._chunks), deque(chunk for chunk in self._chunks if chunk.seen_at >= before)
+        """Drop chunks with observations from before a time, s of `time.monotonic`; return
+        whether there were any.
+        """
+        count, kept = (
+            len(self._chunks),
+            deque(chunk for chunk in self._chunks if chunk.seen_at >= before),
+        )
         self._chunks = kept
         return len(kept) < count
 
@@ -184,7 +220,11 @@ class ChunkBuffer:
         row = place - newest.step
         if self._newest:
             return Step(newest.rows[row], newest, row)
-        rows = [chunk.rows[place - chunk.step] for chunk in self._chunks if chunk.step <= place < chunk.end]
+        rows = [
+            chunk.rows[place - chunk.step]
+            for chunk in self._chunks
+            if chunk.step <= place < chunk.end
+        ]
         if len(rows) == 1:
             action = rows[0]
         elif self._merge is None:
@@ -195,16 +235,20 @@ class ChunkBuffer:
         return Step(action, newest, row)
 
 
-_COLD = 2  # answers: the first ones that continue a plan run passes and sizes of batches that compile only then
+# answers: the first ones that continue a plan run passes and sizes of batches that compile only
+# then.
+_COLD = 2
 _RECENT = 10  # answers: at 10 ms to 1 s each, the estimate follows a slower network within seconds
-_QUANTILE = 0.9  # too short an estimate makes a jump, one too long only a later reaction: so not the median
+# Too short an estimate makes a jump, one too long only a later reaction: so not the median.
+_QUANTILE = 0.9
 
 
 class DelayEstimate:
     """Estimates the delay of the next answer, in ticks, from those of recent answers.
 
-    It is their 0.9 quantile, rounded down to a measured one, so that one slow answer among others does not count. The
-    first two answers may include a cold start, of seconds; they are left out as soon as there is another one.
+    It is their 0.9 quantile, rounded down to a measured one, so that one slow answer among others
+    does not count. The first two answers may include a cold start, of seconds; they are left out as
+    soon as there is another one.
     """
 
     def __init__(self) -> None:
@@ -230,12 +274,13 @@ SKEW_S = 0.1  # the largest lead of the clock of a sensor's computer over this m
 class CaptureClock:
     """Computes the capture time of an observation, in s of `time.monotonic`.
 
-    `captured_at` is `time.time`, since it is sent to other machines, and that clock may be set at any moment. So it is
-    read once, when a new `captured_at` is first seen; from then on, `time.monotonic` measures the age. If the same
-    observation is passed again, for instance because a camera hangs, it ages regardless of the clock. A jump of
-    the clock affects only the observation during which it happens: after a jump forward the observation is too old;
-    after one backward it lies in the future (by more than `SKEW_S`), and also counts as too old, since its age is
-    unknown.
+    `captured_at` is `time.time`, since it is sent to other machines, and that clock may be set at
+    any moment. So it is read once, when a new `captured_at` is first seen; from then on,
+    `time.monotonic` measures the age. If the same observation is passed again, for instance because
+    a camera hangs, it ages regardless of the clock. A jump of the clock affects only the
+    observation during which it happens: after a jump forward the observation is too old; after one
+    backward it lies in the future (by more than `SKEW_S`), and also counts as too old, since its
+    age is unknown.
     """
 
     def __init__(self) -> None:
@@ -243,12 +288,16 @@ class CaptureClock:
         self._at = 0.0
 
     def __call__(self, obs: Obs) -> float:
-        """Return the capture time; the current time if the observation has none; `-math.inf` for an impossible one."""
+        """Return the capture time; the current time if the observation has none; `-math.inf` for
+        an impossible one.
+        """
         now, stamp = time.monotonic(), obs.info.get(CAPTURED)
         if stamp is None:
             return now
         if not isinstance(stamp, (int, float)) or not math.isfinite(stamp):
-            raise InvalidObservation(f"info[{CAPTURED!r}]: got {stamp!r}, want seconds since 1970, as of time.time()")
+            raise InvalidObservation(
+                f"info[{CAPTURED!r}]: got {stamp!r}, want seconds since 1970, as of time.time()"
+            )
         if stamp != self._stamp:
             age_s = time.time() - stamp
             self._stamp, self._at = stamp, now - max(age_s, 0.0) if age_s >= -SKEW_S else -math.inf

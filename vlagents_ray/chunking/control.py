@@ -1,4 +1,6 @@
-"""The control of a robot: one state for its stops, pauses, takeovers and episodes, held on the robot's computer."""
+"""The control of a robot: one state for its stops, pauses, takeovers and episodes, held on the
+robot's computer.
+"""
 
 from __future__ import annotations
 
@@ -18,7 +20,8 @@ ControlState = Literal["autonomous", "paused", "human", "stopped"]
 Outcome = Literal["success", "failure"]
 PAUSED = "paused by an operator"
 COMMAND_S = 0.02
-"""The longest time, s, for which a stop waits for the end of a command: a tick at 50 Hz. A command takes less than a
+"""The longest time, s, for which a stop waits for the end of a command: a tick at 50 Hz. A command
+takes less than a
 millisecond, and a stop must not wait for one that hangs.
 """
 
@@ -26,9 +29,10 @@ millisecond, and a stop must not wait for one that hangs.
 class Leader(Protocol):
     """The interface of an operator's device: a keyboard, a SpaceMouse, a second arm.
 
-    A device that adds up its motions to absolute targets also has a method `rebase(last)`, which is called when its
-    action was not executed. The next target then begins at `last`, the executed command, (D,) float32, or at the
-    robot's measured pose if `last` is None. Else targets would run on while the guard refuses them.
+    A device that adds up its motions to absolute targets also has a method `rebase(last)`, which is
+    called when its action was not executed. The next target then begins at `last`, the executed
+    command, (D,) float32, or at the robot's measured pose if `last` is None. Else targets would run
+    on while the guard refuses them.
     """
 
     def engaged(self) -> bool:
@@ -51,14 +55,15 @@ class Control:
     | state | source of motion | ends by |
     |---|---|---|
     | "autonomous" | the policy | any of the others |
-    | "human" | the engaged leader | its release: then the policy continues, or the robot is paused |
+    | "human" | the engaged leader | its release: the policy continues, or the robot is paused |
     | "paused" | nothing | `resume`, or an engaged leader |
     | "stopped" | nothing | `restart` |
 
-    `update` sets the state once per tick. All methods may be called from any thread: a pause takes effect at the next
-    action, a stop at once. Stops and pauses persist from one run of the control loop to the next. Only `pause`, `stop`
-    and `mark` are called over a network (see `vlagents_ray.client.commands`): `resume` and `restart` are for the
-    operator at the robot, and for its own program.
+    `update` sets the state once per tick. All methods may be called from any thread: a pause takes
+    effect at the next action, a stop at once. Stops and pauses persist from one run of the control
+    loop to the next. Only `pause`, `stop` and `mark` are called over a network (see
+    `vlagents_ray.client.commands`): `resume` and `restart` are for the operator at the robot, and
+    for its own program.
 
     Args:
         leader: The operator's device, or None.
@@ -69,14 +74,17 @@ class Control:
         self.stops: list[str] = []
         """The reasons of all stops, oldest first."""
         self.running = False
-        """Whether `run_loop` drives the robot, which commands nothing while it is paused or stopped."""
+        """Whether `run_loop` drives the robot, which commands nothing while it is paused or
+        stopped.
+        """
         self._lock = threading.RLock()  # a signal handler may interrupt its owner
         self._commanding = threading.RLock()  # held during a command, and acquired before `_lock`
         self._stopping = 0  # calls of the robot's `stop` in progress
         self._state: ControlState = "autonomous"
         self._stop: str | None = None  # the reason of a commanded stop
         self._barked = False  # whether a silence stopped the robot
-        self._silent: set[str] = set()  # sources whose silence stopped the robot and that are still silent
+        # Sources whose silence stopped the robot and that are still silent.
+        self._silent: set[str] = set()
         self._unseen = False  # whether the loop has yet to hold the robot for the last stop
         self._auto = False
         self._pause: str | None = None
@@ -94,7 +102,9 @@ class Control:
 
     @property
     def reason(self) -> str | None:
-        """The reason why the robot is paused, or will be when the operator releases the device; None if it is not."""
+        """The reason why the robot is paused, or will be when the operator releases the device;
+        None if it is not.
+        """
         return self._pause
 
     @property
@@ -109,7 +119,9 @@ class Control:
             return sorted(self._silent)
 
     def pause(self, reason: str = PAUSED) -> None:
-        """Hold the robot still until `resume` or a takeover; a takeover in progress is not interrupted."""
+        """Hold the robot still until `resume` or a takeover; a takeover in progress is not
+        interrupted.
+        """
         with self._lock:
             self._pause = reason
             self._pauses += 1
@@ -120,7 +132,8 @@ class Control:
             self._pause = None
 
     def stop(self, reason: str, *, silent: str | None = None) -> None:
-        """Stop the robot until `restart`: the control loop begins no further command, and calls the robot's `stop`.
+        """Stop the robot until `restart`: the control loop begins no further command, and calls the
+        robot's `stop`.
 
         Args:
             reason: The reason, for `stops`.
@@ -139,8 +152,9 @@ class Control:
     def stopping(self) -> Iterator[None]:
         """Call the robot's `stop` within this context, on any thread, after `stop` of this object.
 
-        It begins when a command in progress has ended, or after `COMMAND_S` if that hangs. The loop begins no command
-        within the context, also not after `restart`, and afterwards holds the robot for at least one tick.
+        It begins when a command in progress has ended, or after `COMMAND_S` if that hangs. The loop
+        begins no command within the context, also not after `restart`, and afterwards holds the
+        robot for at least one tick.
         """
         with self._lock:
             self._stopping += 1
@@ -155,7 +169,9 @@ class Control:
 
     @contextlib.contextmanager
     def command(self) -> Iterator[Held | None]:
-        """Yield why the robot must not be commanded; None if one command may be sent within this context."""
+        """Yield why the robot must not be commanded; None if one command may be sent within this
+        context.
+        """
         with self._commanding:
             yield self.held
 
@@ -165,7 +181,8 @@ class Control:
             self._silent.discard(source)
 
     def restart(self) -> bool:
-        """Allow motion again after a stop, unless a source is `silent`; may also be called from a signal handler.
+        """Allow motion again after a stop, unless a source is `silent`; may also be called from a
+        signal handler.
 
         Returns:
             Whether motion is allowed; if it is not, call this again after the silence.
@@ -192,7 +209,9 @@ class Control:
             self._pause = self._pause or other._pause
 
     def begin(self, *, auto: bool) -> None:
-        """Begin a run of the loop; with `auto`, the end of a silence ends the stop that it caused."""
+        """Begin a run of the loop; with `auto`, the end of a silence ends the stop that it
+        caused.
+        """
         with self._lock:
             self._auto, self._outcome, self.running = auto, None, True
 
@@ -203,16 +222,23 @@ class Control:
             return self._outcome or ""
 
     def update(self) -> bool:
-        """Set the source of motion at the beginning of a tick; return whether the policy's plan must be discarded."""
+        """Set the source of motion at the beginning of a tick; return whether the policy's plan
+        must be discarded.
+        """
         pauses, engaged = self._pauses, False
         if self.leader is not None:
             try:
                 engaged = self.leader.engaged()
             except Exception as error:  # noqa: BLE001 - a broken device must not end the loop
-                self.pause(str(error) if isinstance(error, VLAgentsError) else f"the leader failed: {error!r}")
+                self.pause(
+                    str(error)
+                    if isinstance(error, VLAgentsError)
+                    else f"the leader failed: {error!r}"
+                )
         with self._lock:
             before = self._state
-            if engaged and not self._engaged and pauses == self._pauses:  # no pause since the takeover
+            # No pause since the takeover.
+            if engaged and not self._engaged and pauses == self._pauses:
                 self._pause = None
             self._engaged = engaged
             if self.stopped:
@@ -225,11 +251,17 @@ class Control:
 
     @property
     def held(self) -> Held | None:
-        """The reason why the robot must not move, from the last `update` and later events; None if it may move."""
+        """The reason why the robot must not move, from the last `update` and later events; None
+        if it may move.
+        """
         with self._lock:
             if self._state == "stopped" or self.stopped or self._unseen or self._stopping:
                 silent = " and the ".join(sorted(self._silent))
-                silence = f"no signal from the {silent}" if silent else "waiting for a restart (Watchdog.restart)"
+                silence = (
+                    f"no signal from the {silent}"
+                    if silent
+                    else "waiting for a restart (Watchdog.restart)"
+                )
                 return Held("stopped", f"stopped: {self._stop or silence}")
             if self._state == "paused" or (self._pause is not None and self._state != "human"):
                 return Held("paused", self._pause or PAUSED)
@@ -238,7 +270,8 @@ class Control:
     def hold(self) -> Held | None:
         """Return `held`, once per tick of a control loop that commands nothing while held.
 
-        After any stop the loop holds the robot for at least one tick, and so drops the earlier plan.
+        After any stop the loop holds the robot for at least one tick, and so drops the earlier
+        plan.
         """
         with self._lock:
             held = self.held

@@ -1,4 +1,6 @@
-"""The ease-in of a motion: a slow way from rest to the first action, then the plan's path with rising speed."""
+"""The ease-in of a motion: a slow way from rest to the first action, then the plan's path with
+rising speed.
+"""
 
 from __future__ import annotations
 
@@ -11,32 +13,44 @@ _ROUNDING = 1e-9
 
 
 class EaseIn:
-    """Commands from a pose at rest onto the path of a plan, whose rows are executed later instead of faster.
+    """Commands from a pose at rest onto the path of a plan, whose rows are executed later instead
+    of faster.
 
-    For `approach` ticks the command goes straight to the first row, by the quintic of least jerk (Flash & Hogan 1985),
-    at rest at both ends. Then the speed along the rows rises from zero to theirs within `ramp` ticks, in which half as
-    many rows are executed; so the ramp ends exactly at a row. The motion begins at rest, at the first row: if the ramp
-    began before it, a robot that is already there would meet the second row at an arbitrary speed.
+    For `approach` ticks the command goes straight to the first row, by the quintic of least jerk
+    (Flash & Hogan 1985), at rest at both ends. Then the speed along the rows rises from zero to
+    theirs within `ramp` ticks, in which half as many rows are executed; so the ramp ends exactly at
+    a row. The motion begins at rest, at the first row: if the ramp began before it, a robot that is
+    already there would meet the second row at an arbitrary speed.
 
-    If fewer rows are known, such as those of a short chunk, the ramp has a section for each chunk, which ends exactly
-    at its last row. The next section begins with the speed of the last one. If the full speed is out of reach, a
-    section ends with a speed at which the next one, for as many rows, need not brake.
+    If fewer rows are known, such as those of a short chunk, the ramp has a section for each chunk,
+    which ends exactly at its last row. The next section begins with the speed of the last one. If
+    the full speed is out of reach, a section ends with a speed at which the next one, for as many
+    rows, need not brake.
 
     Args:
         start: The pose at rest, (D,), in the action's units; its deltas are not used.
-        approach: The number of ticks to the first row; at least 1 if it is a pose, 0 if it has only deltas.
+        approach: The number of ticks to the first row; at least 1 if it is a pose, 0 if it has only
+            deltas.
         ramp: The number of ticks until the full speed; an even number.
         deltas: The columns that are deltas, which are scaled instead of approached.
-        at_once: The columns of grippers without limits, which take the values of the rows unchanged.
+        at_once: The columns of grippers without limits, which take the values of the rows
+            unchanged.
     """
 
     def __init__(
-        self, start: np.ndarray, approach: int, ramp: int, *, deltas: Sequence[int] = (), at_once: Sequence[int] = ()
+        self,
+        start: np.ndarray,
+        approach: int,
+        ramp: int,
+        *,
+        deltas: Sequence[int] = (),
+        at_once: Sequence[int] = (),
     ) -> None:
         self._from = start
         self._approach, self._ramp = approach, ramp
         self._deltas, self._at_once = list(deltas), list(at_once)
-        self._is_motion = bool(self._deltas)  # a row of deltas is a motion, so that the ramp begins before it
+        # A row of deltas is a motion, so that the ramp begins before it.
+        self._is_motion = bool(self._deltas)
         self._tick = -approach  # of the ramp
         self._speed = 0.0 if ramp else 1.0  # rows a tick
         self._rise = 0.0  # of the speed, a tick
@@ -56,10 +70,14 @@ class EaseIn:
 
     @property
     def may_end(self) -> bool:
-        """Whether the next row may be tried at full speed: between two sections, after the time of a whole ramp."""
+        """Whether the next row may be tried at full speed: between two sections, after the time
+        of a whole ramp.
+        """
         return self._ticks == 0 and self._tick >= self._ramp
 
-    def step(self, action: np.ndarray, after: np.ndarray | None, known: int) -> tuple[np.ndarray, int]:
+    def step(
+        self, action: np.ndarray, after: np.ndarray | None, known: int
+    ) -> tuple[np.ndarray, int]:
         """Return the command of a tick, and the number of rows that it completes.
 
         Args:
@@ -106,7 +124,9 @@ class EaseIn:
         for rows in range(max(1, first), known + 1):
             ticks = math.ceil(2 * rows / (1.0 + self._speed))
             rise = self._rise_of(rows, ticks)
-            if 0.0 <= rise * self._ramp <= 1.0 + _ROUNDING and self._is_full(self._speed + ticks * rise):
+            if 0.0 <= rise * self._ramp <= 1.0 + _ROUNDING and self._is_full(
+                self._speed + ticks * rise
+            ):
                 self._rows, self._ticks, self._rise = rows, ticks, rise
                 return
         self._rows, self._ticks = known, self._ticks_until_end(known)
@@ -120,7 +140,9 @@ class EaseIn:
         return float(self._rows) if self._ticks == 0 else place
 
     def _ticks_until_end(self, rows: int) -> int:
-        """Return the ticks until the last known row, with the largest speed that the next section can keep."""
+        """Return the ticks until the last known row, with the largest speed that the next
+        section can keep.
+        """
         ticks = 1
         while ticks * self._speed + ticks**2 / (2 * self._ramp) < rows - _ROUNDING:
             ticks += 1

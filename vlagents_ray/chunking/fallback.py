@@ -25,7 +25,8 @@ from vlagents_ray.validation import check_action
 
 SafeName = Literal["auto", "hold", "zero"]
 Cause = Literal[
-    "waiting",  # the last answer has no rows left, and the next one is pending: not counted as `safe`
+    # The last answer has no rows left, and the next one is pending: not counted as `safe`.
+    "waiting",
     "late",  # the answer arrived too late for all its rows, or for those that it was given
     "old",  # the plan is older than max_age_s
     "stale",  # the observation is older than max_age_s
@@ -51,15 +52,22 @@ class Held(NamedTuple):
 
 
 WAITING = Held("waiting", "waiting for an answer: all rows of the last one have been executed")
-LATE = Held("late", "the answer came so late that the robot had passed its rows; lower the latency, or the rate (hz)")
+LATE = Held(
+    "late",
+    "the answer came so late that the robot had passed its rows; lower the latency, or the rate "
+    "(hz)",
+)
 OLD = Held("old", "what was planned is older than max_age_s")
 STALE = Held(
     "stale",
-    "the observation is older than max_age_s, or of a clock that is ahead: look for a camera that hangs, for robot and "
+    "the observation is older than max_age_s, or of a clock that is ahead: look for a camera that "
+    "hangs, for robot and "
     "sensors with different clocks, or for an info['captured_at'] that is not time.time()",
 )
 STOPPED = Held("waiting", "the robot was stopped since the observation that was answered last")
-RELEASED = Held("waiting", "the operator has released the robot, or a pause is over: waiting for a new answer")
+RELEASED = Held(
+    "waiting", "the operator has released the robot, or a pause is over: waiting for a new answer"
+)
 _LOST = (ConnectionLost, PolicyUnavailable, DeadlineExceeded)
 
 
@@ -79,11 +87,12 @@ Safe = SafeName | np.ndarray | Callable[[Obs], np.ndarray]
 class SafeAction:
     """Computes the action that holds a robot still, which depends on the meaning of its actions.
 
-    "hold" repeats the last command, which is right for absolute targets. "zero" commands no motion, which is
-    right for deltas and velocities; the columns in `grippers` keep the last action's value, since 0 would half open a
-    gripper whose command is a position; before the first action, a single gripper has the measured opening. "auto"
-    chooses by the contract's `ActionSpec`. An array (D,), or a function of the observation that returns one (for
-    instance of the measured joints), is used unchanged.
+    "hold" repeats the last command, which is right for absolute targets. "zero" commands no motion,
+    which is right for deltas and velocities; the columns in `grippers` keep the last action's
+    value, since 0 would half open a gripper whose command is a position; before the first action, a
+    single gripper has the measured opening. "auto" chooses by the contract's `ActionSpec`. An array
+    (D,), or a function of the observation that returns one (for instance of the measured joints),
+    is used unchanged.
 
     Args:
         safe: The name, array or function of the safe action.
@@ -91,27 +100,37 @@ class SafeAction:
         grippers: The columns of the grippers; default: `ActionSpec.gripper_columns`.
 
     Raises:
-        ConfigError: The choice would be a guess or would move the robot: a repeated delta continues the motion, and
-            zeros as joint targets move the arm to its zero position. Only "hold" is allowed if the contract does
-            not describe the actions. Or the arms of the contract do not share its numbers equally.
+        ConfigError: The choice would be a guess or would move the robot: a repeated delta continues
+            the motion, and zeros as joint targets move the arm to its zero position. Only "hold" is
+            allowed if the contract does not describe the actions. Or the arms of the contract do
+            not share its numbers equally.
     """
 
     def __init__(self, safe: Safe, spec: ActionSpec, grippers: Sequence[int] | None = None) -> None:
         if isinstance(safe, str):
             if safe not in get_args(SafeName):
-                raise ConfigError(f"safe: got {safe!r}, want one of {list(get_args(SafeName))}, an array or a function")
+                raise ConfigError(
+                    f"safe: got {safe!r}, want one of {list(get_args(SafeName))}, an array or a "
+                    "function"
+                )
             if spec.relative is None and safe != "hold":
                 raise ConfigError(
-                    f"safe: got {safe!r}, and the policy's contract does not say whether its actions are relative or "
-                    "absolute; state it (ActionSpec.delta), or give safe='hold', which is right for absolute ones "
+                    f"safe: got {safe!r}, and the policy's contract does not say whether its "
+                    "actions are relative or "
+                    "absolute; state it (ActionSpec.delta), or give safe='hold', which is right "
+                    "for absolute ones "
                     "alone, or an action of your own"
                 )
             self._make: Safe = stopping(spec)
             if safe not in ("auto", self._make):
                 moves = (
-                    "absolute ones take for a pose to go to" if safe == "zero" else "relative actions go on moving with"
+                    "absolute ones take for a pose to go to"
+                    if safe == "zero"
+                    else "relative actions go on moving with"
                 )
-                raise ConfigError(f"safe: got {safe!r}, which {moves}; give safe={self._make!r}, or 'auto'")
+                raise ConfigError(
+                    f"safe: got {safe!r}, which {moves}; give safe={self._make!r}, or 'auto'"
+                )
         else:
             self._make = safe if callable(safe) else np.asarray(safe, np.float32)
         self._grippers = None if grippers is None else list(grippers)
@@ -122,7 +141,9 @@ class SafeAction:
         """Whether repeating the last action keeps the robot in place."""
 
     def __call__(self, obs: Obs, last: np.ndarray | None) -> np.ndarray:
-        """Return the safe action, (D,) float32, given any last command; raises `InvalidAction` if it needs one."""
+        """Return the safe action, (D,) float32, given any last command; raises `InvalidAction`
+        if it needs one.
+        """
         if callable(self._make):
             return np.asarray(self._make(obs), np.float32)
         if isinstance(self._make, np.ndarray):
@@ -131,7 +152,8 @@ class SafeAction:
             return first
         if last is None:
             raise InvalidAction(
-                f"safe: got {self._make!r} before the first action, which there is nothing to make from"
+                f"safe: got {self._make!r} before the first action, which there is nothing to make "
+                "from"
             )
         if self._make == "hold":
             return last.copy()
@@ -144,7 +166,9 @@ class SafeAction:
         return self._spec.gripper_columns(dim) if self._grippers is None else self._grippers
 
     def _first(self, obs: Obs) -> np.ndarray | None:
-        """Return an action without motion that holds the gripper, (D,); None if the contract is not sufficient."""
+        """Return an action without motion that holds the gripper, (D,); None if the contract is
+        not sufficient.
+        """
         spec = self._spec
         if spec.dim is None:
             return None
@@ -160,15 +184,21 @@ class SafeAction:
 
 
 def stopping(spec: ActionSpec) -> SafeName:
-    """Return the action that keeps a robot still: "zero" if its actions are known to be relative, else "hold"."""
+    """Return the action that keeps a robot still: "zero" if its actions are known to be
+    relative, else "hold".
+    """
     return "zero" if spec.relative else "hold"
 
 
 def neutral(spec: ActionSpec, dim: int | None = None) -> np.ndarray:
-    """Return an action without motion for relative actions, (D,) float32, with open grippers if `spec` states how."""
+    """Return an action without motion for relative actions, (D,) float32, with open grippers if
+    `spec` states how.
+    """
     dim = spec.dim if dim is None else dim
     if dim is None:
-        raise InvalidAction("neutral action: got a contract without action.dim; want one that states it")
+        raise InvalidAction(
+            "neutral action: got a contract without action.dim; want one that states it"
+        )
     action = np.zeros(dim, np.float32)
     if spec.gripper_open is not None:
         action[spec.gripper_columns(dim)] = spec.gripper_open
@@ -176,17 +206,21 @@ def neutral(spec: ActionSpec, dim: int | None = None) -> np.ndarray:
 
 
 Check = Callable[[np.ndarray, "np.ndarray | None"], np.ndarray]
-"""Returns the action to execute, given the action and the one before it, (D,) each, or raises `InvalidAction`."""
+"""Returns the action to execute, given the action and the one before it, (D,) each, or raises
+`InvalidAction`.
+"""
 
 
 class Motion:
     """The motion of a robot in an episode: every action passes the check against the one before it.
 
-    Without a `check`, such as a `vlagents_ray.robot.Guard`, only the contract is checked. Without a `safe` action, an
-    error is raised instead.
+    Without a `check`, such as a `vlagents_ray.robot.Guard`, only the contract is checked. Without a
+    `safe` action, an error is raised instead.
     """
 
-    def __init__(self, check: Check | None, contract: Contract | None = None, safe: SafeAction | None = None) -> None:
+    def __init__(
+        self, check: Check | None, contract: Contract | None = None, safe: SafeAction | None = None
+    ) -> None:
         self._check, self._contract, self._safe = check, contract, safe
         self.can_hold = safe is not None  # whether an action is known that keeps the robot still
         self._ease: EaseIn | None = None  # while a motion begins from rest
@@ -200,7 +234,8 @@ class Motion:
         return self._last is not None
 
     def keeps(self, plan: ChunkBuffer) -> bool:
-        """Return whether the plan must stay: a robot that comes from rest is on its way to the next row.
+        """Return whether the plan must stay: a robot that comes from rest is on its way to the next
+        row.
 
         Another answer would begin elsewhere, which the command would jump to.
         """
@@ -218,9 +253,12 @@ class Motion:
         self._state = "stopped"
 
     def move(self, action: np.ndarray, obs: Obs) -> np.ndarray:
-        """Return an action of policy or operator, (D,) float32; raises `InvalidAction` if it must not be sent."""
+        """Return an action of policy or operator, (D,) float32; raises `InvalidAction` if it
+        must not be sent.
+        """
         self._ease = None
-        if self._state == "held":  # by the last target; the robot may have been moved since, or never have arrived
+        # By the last target; the robot may have been moved since, or never have arrived.
+        if self._state == "held":
             with contextlib.suppress(InvalidAction):
                 self._last, self._state = self._checked(action, self._last), "moving"
                 return self._last
@@ -229,7 +267,8 @@ class Motion:
         return self._last
 
     def follow(self, plan: ChunkBuffer, obs: Obs) -> tuple[np.ndarray, int]:
-        """Return the command on the way of a plan, (D,) float32, and the number of rows that it completes.
+        """Return the command on the way of a plan, (D,) float32, and the number of rows that it
+        completes.
 
         From rest, the check's `ease_in` leads the robot onto the plan; its rows wait meanwhile.
 
@@ -262,7 +301,9 @@ class Motion:
         return self._last, rows
 
     def hold(self, obs: Obs, why: Held) -> tuple[np.ndarray, Held]:
-        """Return the action that keeps the robot still, (D,) float32, and why; raises `InvalidAction` without one."""
+        """Return the action that keeps the robot still, (D,) float32, and why; raises
+        `InvalidAction` without one.
+        """
         if self._safe is None:
             raise InvalidAction(f"no action for this tick: {why.reason}")
         self._ease = None
@@ -275,7 +316,8 @@ class Motion:
             why = why._replace(reason=f"{why.reason}; the safe action is refused, too: {refused}")
             if last is None or not self._safe.holds:
                 raise InvalidAction(
-                    f"no action for this tick: {why.reason}; let the guard pass it, or give another one (safe=)"
+                    f"no action for this tick: {why.reason}; let the guard pass it, or give "
+                    "another one (safe=)"
                 ) from refused
             action = self._checked(last, last)
         self._state = "held" if self._state == "moving" else self._state
@@ -288,7 +330,9 @@ class Motion:
         return self._last if reference is None else reference(obs, self._last)
 
     def _checked(self, action: np.ndarray, last: np.ndarray | None) -> np.ndarray:
-        """Return an action, (D,) float32, that may be sent to the robot; raises `InvalidAction` for any other."""
+        """Return an action, (D,) float32, that may be sent to the robot; raises `InvalidAction`
+        for any other.
+        """
         action = check_action(action, self._contract)
         if action.ndim != 1:
             raise InvalidAction(f"action: got {action.shape}, want (D,), a single row")

@@ -65,7 +65,8 @@ _IN_PLACE = 256  # largest number of recorded actions between two requests
 class AsyncCaller:
     """A thread that calls `agent.act`, so that the caller's own thread never waits for it.
 
-    Only one thread may use it, and nothing else may use the agent during a request; `settle` waits for its end.
+    Only one thread may use it, and nothing else may use the agent during a request; `settle` waits
+    for its end.
     """
 
     def __init__(self, agent: Agent) -> None:
@@ -97,7 +98,9 @@ class AsyncCaller:
         return answer
 
     def settle(self) -> None:
-        """Wait for the end of the request in progress, without a time limit, and drop its answer."""
+        """Wait for the end of the request in progress, without a time limit, and drop its
+        answer.
+        """
         if not self.idle:
             self._answers.get()
             self.idle = True
@@ -118,7 +121,8 @@ class AsyncCaller:
 
 class _Request(NamedTuple):
     tick: int = -1
-    step: int = 0  # `ChunkBuffer.executed` at its observation: the position of the answer's first row
+    # `ChunkBuffer.executed` at its observation: the position of the answer's first row.
+    step: int = 0
     seen_at: float = 0.0  # s, of `time.monotonic`: the capture time of the observation
 
 
@@ -131,29 +135,37 @@ class PlayerSettings:
     """
 
     mode: Mode = "open_loop"
-    """With "open_loop", execute `execute` rows, then send a request and wait for the answer. With "ensemble", send one
-    at each tick, and average the actions of all chunks with the weights exp(-m * i), oldest first (ACT's temporal
-    ensembling). With "async", send requests in the background, one at a time, with the newest observation.
+    """With "open_loop", execute `execute` rows, then send a request and wait for the answer. With
+    "ensemble", send one
+    at each tick, and average the actions of all chunks with the weights exp(-m * i), oldest first
+    (ACT's temporal ensembling). With "async", send requests in the background, one at a time, with
+    the newest observation.
     """
-    execute: int | None = None  # rows between two requests: of a chunk (default: all), or in "async" ticks (default: 1)
+    # Rows between two requests: of a chunk (default: all), or in "async" ticks (default: 1)
+    execute: int | None = None
     merge: str | Merge = "newest"
-    """The combination of several chunks' rows for one tick, in "async": "newest", "average", "weighted_average",
+    """The combination of several chunks' rows for one tick, in "async": "newest", "average",
+    "weighted_average",
     "conservative", "ensemble", or a function (see `vlagents_ray.chunking.buffer`).
     """
     ensemble_m: float = ENSEMBLE_M  # the m of the weights
     real_time_chunking: bool = False
-    """Whether each request contains the rest of the plan and the measured delay (`LEFTOVER`, `DELAY` in
+    """Whether each request contains the rest of the plan and the measured delay (`LEFTOVER`,
+    `DELAY` in
     `vlagents_ray.interface`), for policies that use them; in "async" only.
     """
     deadline_s: float | None = None  # time limit of `act`; 0 by default in "async", else none
     timeout_s: float | None = None  # time limit of a request; by default the agent's
-    horizon: int | None = None  # largest number of rows of a chunk to execute; a chunk with `done` is executed whole
+    # Largest number of rows of a chunk to execute; a chunk with `done` is executed whole.
+    horizon: int | None = None
     max_age_s: float | None = None
-    """The largest age of the observation of an executed action. The age counts from `info["captured_at"]`, that of the
+    """The largest age of the observation of an executed action. The age counts from
+    `info["captured_at"]`, that of the
     sensor read first, or else from the call of `act` (see `CaptureClock`).
     """
     safe: Safe = "auto"  # the action in place of a missing one (see `SafeAction`)
-    grippers: Sequence[int] | None = None  # the columns of the action that are grippers (see `SafeAction`)
+    # The columns of the action that are grippers (see `SafeAction`)
+    grippers: Sequence[int] | None = None
 
     def __post_init__(self) -> None:
         if self.mode not in get_args(Mode):
@@ -164,25 +176,30 @@ class PlayerSettings:
         if self.max_age_s is not None and not self.max_age_s > 0:
             raise ConfigError(f"max_age_s: got {self.max_age_s}, want above 0, or None")
         if self.mode != "async" and (self.merge != "newest" or self.real_time_chunking):
-            raise ConfigError(f"merge and real_time_chunking: got them with mode {self.mode!r}, want mode='async'")
+            raise ConfigError(
+                f"merge and real_time_chunking: got them with mode {self.mode!r}, want mode='async'"
+            )
         if self.mode == "async" and self.deadline_s is None:
             object.__setattr__(self, "deadline_s", 0.0)
 
 
 class ChunkPlayer(Agent):
-    """An `Agent` around another, local or remote, whose `act` returns single actions, (D,), one per control tick.
+    """An `Agent` around another, local or remote, whose `act` returns single actions, (D,), one per
+    control tick.
 
-    Ticks are counted by the calls of `act`. Row r of a chunk is for r executed actions after the chunk's observation,
-    whenever the chunk arrives: rows for ticks at which others were executed are skipped, except while the
-    robot holds still (see `vlagents_ray.chunking.buffer.ChunkBuffer`). `reset` may block: it begins the episode and,
-    with a deadline, waits for the first chunk.
+    Ticks are counted by the calls of `act`. Row r of a chunk is for r executed actions after the
+    chunk's observation, whenever the chunk arrives: rows for ticks at which others were executed
+    are skipped, except while the robot holds still (see
+    `vlagents_ray.chunking.buffer.ChunkBuffer`). `reset` may block: it begins the episode and, with
+    a deadline, waits for the first chunk.
 
-    In mode "async", and in the others with `deadline_s`, `act` returns within `deadline_s`: the policy's action, or the
-    `safe` one if that is missing, with the reason in `act.info["safe"]` and its kind in
-    `act.info["safe_cause"]`. `info` also has `age_ticks`, `chunk`, `row`, and `silent_s`, the time since the oldest
-    unanswered request. Errors that another request cannot cure (`InvalidInput`, and any that is not this package's) are
-    raised by the next `act`; the others are the reason of safe actions until the policy answers. Without a deadline,
-    errors are raised.
+    In mode "async", and in the others with `deadline_s`, `act` returns within `deadline_s`: the
+    policy's action, or the `safe` one if that is missing, with the reason in `act.info["safe"]` and
+    its kind in `act.info["safe_cause"]`. `info` also has `age_ticks`, `chunk`, `row`, and
+    `silent_s`, the time since the oldest unanswered request. Errors that another request cannot
+    cure (`InvalidInput`, and any that is not this package's) are raised by the next `act`; the
+    others are the reason of safe actions until the policy answers. Without a deadline, errors are
+    raised.
     """
 
     control: Control
@@ -200,20 +217,25 @@ class ChunkPlayer(Agent):
 
         Args:
             agent: The policy, in this process or a `RemoteAgent`.
-            settings: The requests to the policy, and the use of its answers; default: `PlayerSettings()`.
-            check: Checks every action before it is returned, such as a `vlagents_ray.robot.Guard`. If it refuses an
-                action of the policy, the safe one replaces it, and the plan is dropped; if it refuses a safe one, the
-                last action replaces it if that holds the robot still; else `act` raises `InvalidAction`. It also
-                receives the last action; a `Guard` with `measure` uses the measured pose if there is none, and after
-                safe actions.
-            override: The operator's device. While it is engaged, `act` returns its actions with `info["intervention"]`
-                and, if known, `info["policy_action"]`. `check` also applies to them.
+            settings: The requests to the policy, and the use of its answers; default:
+                `PlayerSettings()`.
+            check: Checks every action before it is returned, such as a `vlagents_ray.robot.Guard`.
+                If it refuses an action of the policy, the safe one replaces it, and the plan is
+                dropped; if it refuses a safe one, the last action replaces it if that holds the
+                robot still; else `act` raises `InvalidAction`. It also receives the last action; a
+                `Guard` with `measure` uses the measured pose if there is none, and after safe
+                actions.
+            override: The operator's device. While it is engaged, `act` returns its actions with
+                `info["intervention"]` and, if known, `info["policy_action"]`. `check` also applies
+                to them.
         """
         self.settings = settings = settings or PlayerSettings()
         self.check = check
         self.control = Control(override)
         self._agent = agent
-        self._plan = ChunkBuffer(ENSEMBLE if settings.mode == "ensemble" else settings.merge, settings.ensemble_m)
+        self._plan = ChunkBuffer(
+            ENSEMBLE if settings.mode == "ensemble" else settings.merge, settings.ensemble_m
+        )
         self._asker: AsyncCaller | None = None
         self._contract: Contract | None = None
         self._delay = DelayEstimate()
@@ -223,7 +245,8 @@ class ChunkPlayer(Agent):
         self._plan.drop()
         self._tick: int | None = None  # tick of the next `act`; None outside an episode
         self._request = _Request()  # the last one
-        # Actions, (D,), executed in place of the policy's since the last request, and whether this tick has one.
+        # Actions, (D,), executed in place of the policy's since the last request, and whether this
+        # tick has one.
         self._in_place, self._noted = deque[np.ndarray](maxlen=_IN_PLACE), False
         self._dropped = False  # whether its answer must not be executed
         self._chunks = 0  # number of answers
@@ -235,7 +258,8 @@ class ChunkPlayer(Agent):
     @property
     def contract(self) -> Contract | None:
         """The policy's contract, with single actions."""
-        if self._tick is None:  # during an episode the policy is busy, and a call to a remote one might block
+        # During an episode the policy is busy, and a call to a remote one might block.
+        if self._tick is None:
             self._contract = self._agent.contract
         return None if self._contract is None else replace(self._contract, chunk=1)
 
@@ -265,10 +289,12 @@ class ChunkPlayer(Agent):
         return info
 
     def interrupt(self) -> None:
-        """Drop the plan: the robot was stopped or moved, and did not execute the last action of `act`.
+        """Drop the plan: the robot was stopped or moved, and did not execute the last action of
+        `act`.
 
-        Answers to earlier observations are discarded, and the policy is queried again. `run_loop` calls this at each
-        tick at which it holds the robot; call it in your own loop when you stop or take over the robot.
+        Answers to earlier observations are discarded, and the policy is queried again. `run_loop`
+        calls this at each tick at which it holds the robot; call it in your own loop when you stop
+        or take over the robot.
         """
         self._begin_again(STOPPED)
         if self._noted:  # its action was not executed
@@ -282,8 +308,9 @@ class ChunkPlayer(Agent):
 
         Args:
             obs: The observation.
-            action: The action that the robot executed in place of the policy's, (D,), if your own loop chose it. It
-                counts as a tick, and the next request contains it (`EXECUTED` in `vlagents_ray.interface`).
+            action: The action that the robot executed in place of the policy's, (D,), if your own
+                loop chose it. It counts as a tick, and the next request contains it (`EXECUTED` in
+                `vlagents_ray.interface`).
 
         Raises:
             InvalidAction: The check refuses the action.
@@ -311,7 +338,8 @@ class ChunkPlayer(Agent):
         except Exception as error:
             if not led:
                 raise
-            self._trouble = Held("failed", str(error))  # the operator continues, without a known action of the policy
+            # The operator continues, without a known action of the policy.
+            self._trouble = Held("failed", str(error))
         self._tick = tick + 1
         act = self._led(obs) if led else self._chosen(obs, tick)
         if led and SAFE not in act.info:  # the operator's action is executed in place of a row
@@ -329,14 +357,18 @@ class ChunkPlayer(Agent):
         self._begin()
 
     def _ask(self, obs: Obs, tick: int, begun: float) -> None:
-        """Take the policy's answer, send the next request if it is due, and wait as long as allowed and needed."""
+        """Take the policy's answer, send the next request if it is due, and wait as long as
+        allowed and needed.
+        """
         asker = self._asker
         if asker is None or self.settings.deadline_s is None:
             if self._wants(tick, obs):
                 self._note_asked(tick, obs)
                 self._take(self._agent.act(stamped(obs, self._extras())))
         else:  # no tick waits for an action that will not be executed
-            deadline = begun + (self.settings.deadline_s if self.control.state == "autonomous" else 0.0)
+            deadline = begun + (
+                self.settings.deadline_s if self.control.state == "autonomous" else 0.0
+            )
             self._receive(asker.take(), tick)
             if asker.idle and self._wants(tick, obs):
                 self._note_asked(tick, obs)
@@ -366,11 +398,16 @@ class ChunkPlayer(Agent):
         self._dropped = self._motion.keeps(self._plan)
 
     def _is_old(self, seen_at: float) -> bool:
-        return self.settings.max_age_s is not None and seen_at < time.monotonic() - self.settings.max_age_s
+        return (
+            self.settings.max_age_s is not None
+            and seen_at < time.monotonic() - self.settings.max_age_s
+        )
 
     def _next(self) -> Step | None:
         """Return the current action from chunks whose observations are recent enough."""
-        if self.settings.max_age_s is not None and self._plan.drop(time.monotonic() - self.settings.max_age_s):
+        if self.settings.max_age_s is not None and self._plan.drop(
+            time.monotonic() - self.settings.max_age_s
+        ):
             self._trouble = OLD
         return self._plan.next
 
@@ -383,7 +420,8 @@ class ChunkPlayer(Agent):
             return step is None
         if self.settings.mode == "open_loop":
             return self.settings.execute is not None and step.row >= self.settings.execute
-        last = step.chunk.end == self._plan.executed + 1  # also true for every answer with a single action
+        # Also true for every answer with a single action.
+        last = step.chunk.end == self._plan.executed + 1
         return last or tick - self._request.tick >= (self.settings.execute or 1)
 
     def _receive(self, answer: Act | Exception | None, tick: int) -> None:
@@ -403,7 +441,9 @@ class ChunkPlayer(Agent):
         self._trouble = unanswered(answer)
 
     def _take(self, act: Act) -> None:
-        act = replace(act, info={key: value for key, value in act.info.items() if key not in OF_THE_LOOP})
+        act = replace(
+            act, info={key: value for key, value in act.info.items() if key not in OF_THE_LOOP}
+        )
         tick, step, seen_at = self._request
         rows = Act(check_action(act.action, self._contract)).rows()
         if not act.done:  # the task is done with the last row of this chunk, not before
@@ -424,7 +464,8 @@ class ChunkPlayer(Agent):
 
     def _led(self, obs: Obs) -> Act:
         """Return the operator's action, or the safe one if the guard refuses it."""
-        info: dict[str, Any] = {INTERVENTION: True, SILENT: 0.0}  # a silent policy does not stop an operator
+        # A silent policy does not stop an operator.
+        info: dict[str, Any] = {INTERVENTION: True, SILENT: 0.0}
         if (planned := self._next()) is not None:
             info[WANTED] = planned.action.copy()
         try:
@@ -470,7 +511,8 @@ class ChunkPlayer(Agent):
             try:
                 action, why = self._motion.hold(obs, why)
             except InvalidAction:
-                # The loop commands nothing to a robot that stands, such as one whose grippers' openings are unknown.
+                # The loop commands nothing to a robot that stands, such as one whose grippers'
+                # openings are unknown.
                 if self._motion.begun or not self.control.running or not self._motion.can_hold:
                     raise
                 action = np.zeros(0, np.float32)

@@ -14,7 +14,8 @@ from vlagents_ray.naming import did_you_mean
 
 def main() -> None:
     """Run the console script; name the packages to install if only the light install is there."""
-    default = signal.signal(signal.SIGINT, _end_at_once)  # until a command has its own: `cli.console.errors`
+    # Until a command has its own: `cli.console.errors`.
+    default = signal.signal(signal.SIGINT, _end_at_once)
     if sys.argv[1:2] == ["robot"]:  # the light install has it, and Ctrl-C in it stops the robot
         from vlagents_ray.cli.robot import main as robot
 
@@ -32,8 +33,10 @@ def main() -> None:
             raise
         guess = did_you_mean(" ".join(sys.argv[1:2]), ["robot"]) or "."
         sys.stderr.write(
-            f"vlagents-ray: {error.name!r} is not installed; this is the light install of a robot's computer{guess}\n"
-            "It has `vlagents-ray robot`. For the other commands: pip install 'vlagents-ray[serve]', and "
+            f"vlagents-ray: {error.name!r} is not installed; this is the light install of a "
+            f"robot's computer{guess}\n"
+            "It has `vlagents-ray robot`. For the other commands: pip install "
+            "'vlagents-ray[serve]', and "
             "'vlagents-ray[sim]' to evaluate.\n"
         )
         sys.exit(1)
@@ -48,7 +51,9 @@ def _end_at_once(_number: int, _frame: FrameType | None) -> None:
 
 
 def find_modules_here() -> None:
-    """Import modules of the working directory, as `python -m` and Ray's workers do, unless PYTHONSAFEPATH is set."""
+    """Import modules of the working directory, as `python -m` and Ray's workers do, unless
+    PYTHONSAFEPATH is set.
+    """
     if getattr(sys.flags, "safe_path", False):  # Python 3.10 has no such flag
         return
     try:

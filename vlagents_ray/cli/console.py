@@ -25,19 +25,26 @@ from vlagents_ray.settings import wrong_settings
 
 
 class PlainConsole(Console):
-    """A console that shows text as it is, for copying: `[serve]` is no markup, `:boat:` no picture, lines are not cut.
+    """A console that shows text as it is, for copying: `[serve]` is no markup, `:boat:` no picture,
+    lines are not cut.
 
-    Styled output is a `Text`, or has a `style`. On a terminal a table has its width, and breaks words that are too long
-    for its cells; elsewhere a table is as wide as its content.
+    Styled output is a `Text`, or has a `style`. On a terminal a table has its width, and breaks
+    words that are too long for its cells; elsewhere a table is as wide as its content.
     """
 
     def __init__(self, **options: Any) -> None:
         super().__init__(markup=False, emoji=False, highlight=False, soft_wrap=True, **options)
 
-    def render(self, renderable: RenderableType, options: ConsoleOptions | None = None) -> Iterable[Segment]:
-        """Render without control characters of the text, which may be a server's or from others' results."""
+    def render(
+        self, renderable: RenderableType, options: ConsoleOptions | None = None
+    ) -> Iterable[Segment]:
+        """Render without control characters of the text, which may be a server's or from others'
+        results.
+        """
         for segment in super().render(renderable, options):
-            is_plain = segment.control is not None or segment.text.isprintable() or segment.text == "\n"
+            is_plain = (
+                segment.control is not None or segment.text.isprintable() or segment.text == "\n"
+            )
             yield segment if is_plain else Segment(_without_controls(segment.text), segment.style)
 
     @property  # type: ignore[misc]
@@ -48,7 +55,9 @@ class PlainConsole(Console):
 
 
 def _without_controls(text: str) -> str:
-    return "".join(character if character.isprintable() or character in "\n\t" else "�" for character in text)
+    return "".join(
+        character if character.isprintable() or character in "\n\t" else "�" for character in text
+    )
 
 
 def table(*columns: str, **options: Any) -> Table:
@@ -65,12 +74,14 @@ err = PlainConsole(stderr=True)
 
 @contextlib.contextmanager
 def errors(*settings: type[BaseModel]) -> Iterator[None]:
-    """Print errors of this package as one message on stderr: exit code 1, 2 for wrong settings, 130 for Ctrl-C.
+    """Print errors of this package as one message on stderr: exit code 1, 2 for wrong settings, 130
+    for Ctrl-C.
 
     SIGTERM is treated as Ctrl-C, so that started processes end in order.
 
     Args:
-        settings: Further models of settings that a user writes, whose fields the message lists for an unknown one.
+        settings: Further models of settings that a user writes, whose fields the message lists for
+            an unknown one.
     """
     try:
         with interrupts():
@@ -95,7 +106,11 @@ def errors(*settings: type[BaseModel]) -> Iterator[None]:
             fail(f"the disk is full ({error.strerror}); make room, and repeat the command", 1)
         if error.filename is None:
             raise
-        fail(f"{error.filename}: cannot be used: {error.strerror}; choose another path, or change its permissions", 1)
+        fail(
+            f"{error.filename}: cannot be used: {error.strerror}; choose another path, or change "
+            "its permissions",
+            1,
+        )
     except KeyboardInterrupt as error:
         fail(str(error) or "interrupted", 130)
 
@@ -113,7 +128,8 @@ def say_error(message: str, console: Console | None = None) -> None:
 
 
 def fresh(folder: Path) -> Path:
-    """Return `folder`, or the first of folder-2, folder-3, … that does not exist, so that results never mix.
+    """Return `folder`, or the first of folder-2, folder-3, … that does not exist, so that results
+    never mix.
 
     Raises `ConfigError` if it is a file.
     """

@@ -44,7 +44,8 @@ DEFAULT_PORT = 8000
 _FIRST_FREE = 1024  # ports below are root's
 _WIDTH = 120  # columns of the table in a file or a pipe
 _STYLE = {"ok": "green", "warn": "yellow", "fail": "bold red"}
-# Prints the versions of torch and JAX in an interpreter, their CUDA, and the GPU that they use or what prevents it.
+# Prints the versions of torch and JAX in an interpreter, their CUDA, and the GPU that they use or
+# what prevents it.
 _LIBRARIES = """
 import json, os, sysconfig
 from importlib.metadata import distributions
@@ -52,17 +53,19 @@ os.environ["XLA_PYTHON_CLIENT_PREALLOCATE"] = "false"
 installed = {one.name: one.version for one in distributions()}
 found = {"headers": sysconfig.get_path("include"), "libraries": {}}
 for name in [name for name in ("torch", "jax") if name in installed]:
-    one = found["libraries"][name] = {"version": installed[name], "cuda": None, "device": None, "why": ""}
+    facts = {"version": installed[name], "cuda": None, "device": None, "why": ""}
+    found["libraries"][name] = facts
     try:
         library = __import__(name)
         if name == "torch":
-            one["cuda"] = library.version.cuda
-            one["device"] = library.cuda.get_device_name()
+            facts["cuda"] = library.version.cuda
+            facts["device"] = library.cuda.get_device_name()
         else:
-            one["cuda"] = next((cuda for cuda in ("12", "13") if f"jax-cuda{cuda}-plugin" in installed), None)
-            one["device"] = library.devices("gpu")[0].device_kind
+            plugins = [cuda for cuda in ("12", "13") if f"jax-cuda{cuda}-plugin" in installed]
+            facts["cuda"] = plugins[0] if plugins else None
+            facts["device"] = library.devices("gpu")[0].device_kind
     except Exception as error:
-        one["why"] = (str(error).splitlines() or [type(error).__name__])[0]
+        facts["why"] = (str(error).splitlines() or [type(error).__name__])[0]
 print("\\n" + json.dumps(found))
 """
 
@@ -94,9 +97,14 @@ def shared_memory() -> Check:
 
 
 def judge_shared_memory(total: float, free: float, memory: float) -> Check:
-    """Judge sizes in bytes: of /dev/shm, of its free space, and of the memory of the machine or container."""
+    """Judge sizes in bytes: of /dev/shm, of its free space, and of the memory of the machine or
+    container.
+    """
     store = min(_STORE_SHARE * memory, _STORE_MAX, max(_STORE_UNCAPPED, 0.95 * free))
-    detail = f"{free / GB:.1f} of {total / GB:.1f} GB free; Ray's object store takes up to {store / GB:.1f} GB"
+    detail = (
+        f"{free / GB:.1f} of {total / GB:.1f} GB free; Ray's object store takes up to "
+        f"{store / GB:.1f} GB"
+    )
     if free >= store:
         return Check("ok", detail)
     need = int(store / GB) + 1
@@ -105,7 +113,9 @@ def judge_shared_memory(total: float, free: float, memory: float) -> Check:
 
 
 def memory_bytes(limit_file: Path = Path("/sys/fs/cgroup/memory.max")) -> float:
-    """Return the memory of the machine in bytes, or the limit of the container (cgroup v2) if that is less."""
+    """Return the memory of the machine in bytes, or the limit of the container (cgroup v2) if
+    that is less.
+    """
     machine = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
     try:
         limit = limit_file.read_text().strip()
@@ -115,7 +125,9 @@ def memory_bytes(limit_file: Path = Path("/sys/fs/cgroup/memory.max")) -> float:
 
 
 def temp_dir() -> Check:
-    """Check that the folder of Ray's session files has space, and a path short enough for sockets."""
+    """Check that the folder of Ray's session files has space, and a path short enough for
+    sockets.
+    """
     path = os.environ.get("RAY_TMPDIR") or os.environ.get("TMPDIR") or tempfile.gettempdir()
     try:
         usage = shutil.disk_usage(path)
@@ -132,29 +144,38 @@ def judge_temp_dir(path: str, total: float, free: float) -> Check:
     if length > _SOCKET_PATH_MAX:
         return Check(
             "fail",
-            f"{path}: Ray's socket paths would have {length} bytes, the system allows {_SOCKET_PATH_MAX}",
-            f"set RAY_TMPDIR to a folder with at most {_SOCKET_PATH_MAX - len(_SESSION_SOCKET)} characters in its path",
+            f"{path}: Ray's socket paths would have {length} bytes, the system allows "
+            f"{_SOCKET_PATH_MAX}",
+            f"set RAY_TMPDIR to a folder with at most {_SOCKET_PATH_MAX - len(_SESSION_SOCKET)} "
+            "characters in its path",
         )
     if free < 1 * GB:
         return Check("fail", detail, cure)
     if free < 5 * GB:
         return Check("warn", f"{detail}; long runs may fill it", cure)
     if free < (1 - _DISK_FULL) * total:
-        return Check("warn", f"{detail}; over {_DISK_FULL:.0%} full, Ray stops spilling to it", cure)
+        return Check(
+            "warn", f"{detail}; over {_DISK_FULL:.0%} full, Ray stops spilling to it", cure
+        )
     return Check("ok", detail)
 
 
 def open_files() -> Check:
     """Check that one process may hold as many sockets and files as a server needs."""
     limits = resource.getrlimit(resource.RLIMIT_NOFILE)
-    return judge_open_files(*(sys.maxsize if one == resource.RLIM_INFINITY else one for one in limits))
+    return judge_open_files(
+        *(sys.maxsize if one == resource.RLIM_INFINITY else one for one in limits)
+    )
 
 
 def judge_open_files(soft: int, hard: int) -> Check:
     """Judge the limits; Ray raises the soft one by itself, up to the hard one or 65536."""
     if (effective := max(soft, min(hard, _FILES_RAISED_TO))) >= _FILES_ENOUGH:
         return Check("ok", f"{soft} a process, {effective} under Ray")
-    cure = f"ulimit -Hn {_FILES_WANTED} as root, or LimitNOFILE={_FILES_WANTED} in the service's systemd unit"
+    cure = (
+        f"ulimit -Hn {_FILES_WANTED} as root, or LimitNOFILE={_FILES_WANTED} in the service's "
+        "systemd unit"
+    )
     return Check("warn", f"{effective} a process; many robots or workers at once may run out", cure)
 
 
@@ -169,12 +190,23 @@ def port_free(port: int) -> Check:
                 raise
             why = "taken" if error.errno == errno.EADDRINUSE else "only root may listen on it"
             other = port + 1 if port >= _FIRST_FREE else DEFAULT_PORT
-            return Check("warn", why, f"`ss -ltnp` names its process; or vlagents-ray serve POLICY --port {other}")
+            return Check(
+                "warn",
+                why,
+                f"`ss -ltnp` names its process; or vlagents-ray serve POLICY --port {other}",
+            )
     return Check("ok", "free")
 
 
-def run(console: Console, port: int = DEFAULT_PORT, pythons: Sequence[Path] = (), *, as_json: bool = False) -> int:
-    """Print a row for each check, see `checks`. Returns the exit code: 1 if any check failed, else 0.
+def run(
+    console: Console,
+    port: int = DEFAULT_PORT,
+    pythons: Sequence[Path] = (),
+    *,
+    as_json: bool = False,
+) -> int:
+    """Print a row for each check, see `checks`. Returns the exit code: 1 if any check failed, else
+    0.
 
     Raises `ConfigError` if one of `pythons` is no program.
     """
@@ -187,7 +219,9 @@ def run(console: Console, port: int = DEFAULT_PORT, pythons: Sequence[Path] = ()
     else:
         rows = table("check", "", "found", "cure", box=None, header_style="bold", pad_edge=False)
         for name, check in found:
-            rows.add_row(name, Text(check.status, _STYLE[check.status]), Text(check.detail), Text(check.cure))
+            rows.add_row(
+                name, Text(check.status, _STYLE[check.status]), Text(check.detail), Text(check.cure)
+            )
         console.print(rows, width=None if console.is_terminal else _WIDTH)
     return int(any(check.status == "fail" for _, check in found))
 
@@ -196,15 +230,22 @@ def _require_program(interpreter: Path) -> None:
     if interpreter.is_file() and os.access(interpreter, os.X_OK):
         return
     what = "a folder" if interpreter.is_dir() else "no program"
-    cure = f"; did you mean {interpreter / 'bin/python'}?" if (interpreter / "bin/python").exists() else ""
+    cure = (
+        f"; did you mean {interpreter / 'bin/python'}?"
+        if (interpreter / "bin/python").exists()
+        else ""
+    )
     raise ConfigError(
-        f"--python: expected the interpreter of an environment, such as .venv-lerobot/bin/python, got {interpreter}, "
+        "--python: expected the interpreter of an environment, such as .venv-lerobot/bin/python, "
+        f"got {interpreter}, "
         f"which is {what}{cure}"
     )
 
 
 def checks(port: int = DEFAULT_PORT, pythons: Sequence[Path] = ()) -> Iterator[tuple[str, Check]]:
-    """Yield names and results of all checks; `pythons` take the place of those that `env make` made in this folder."""
+    """Yield names and results of all checks; `pythons` take the place of those that `env make`
+    made in this folder.
+    """
     todo: list[tuple[str, Callable[[], Check]]] = [
         ("Python", python_version),
         ("Ray", ray),
@@ -234,7 +275,9 @@ def guarded(check: Callable[[], Check]) -> Check:
         found, _, cure = str(error).partition("; ")
         return Check("warn", found, cure)
     except Exception as error:  # noqa: BLE001 - drivers and codecs raise anything; the other rows still matter
-        return Check("warn", f"the check itself broke: {type(error).__name__}: {error}", "please report this")
+        return Check(
+            "warn", f"the check itself broke: {type(error).__name__}: {error}", "please report this"
+        )
 
 
 def ray() -> Check:
@@ -246,7 +289,9 @@ def ray() -> Check:
     try:
         version = importlib.metadata.version("ray")
     except importlib.metadata.PackageNotFoundError:
-        return Check("fail", "not installed: robots can do without, servers and evaluations cannot", cure)
+        return Check(
+            "fail", "not installed: robots can do without, servers and evaluations cannot", cure
+        )
     needed = map(Requirement, importlib.metadata.requires("vlagents-ray") or [])
     wanted = next((one.specifier for one in needed if one.name == "ray"), SpecifierSet())
     if version not in wanted:
@@ -256,7 +301,9 @@ def ray() -> Check:
 
 def plugins() -> Check:
     """List the installed plug-ins, and those of the project that are not installed."""
-    missing = sorted({distribution for kind in published() for distribution in not_installed(kind).values()})
+    missing = sorted(
+        {distribution for kind in published() for distribution in not_installed(kind).values()}
+    )
     detail = ", ".join(plugin_distributions()) or "none"
     if missing:
         detail += f"; not installed: {', '.join(missing)}"
@@ -284,12 +331,17 @@ def gpu() -> Check:
         return Check(
             "warn",
             "no nvidia-smi: policies run on the CPU",
-            "enough for `scripted` and for simulation; a VLA model needs an NVIDIA GPU and its driver: docs/gpu.md",
+            "enough for `scripted` and for simulation; a VLA model needs an NVIDIA GPU and its "
+            "driver: docs/gpu.md",
         )
     answer = _output([smi, "--query-gpu=name,memory.total,driver_version", "--format=csv,noheader"])
     if answer.returncode != 0:
         why = _last_line(answer.stderr or answer.stdout)
-        return Check("warn", f"nvidia-smi: {why}", "reload or reinstall the NVIDIA driver; a reboot often helps")
+        return Check(
+            "warn",
+            f"nvidia-smi: {why}",
+            "reload or reinstall the NVIDIA driver; a reboot often helps",
+        )
     return Check("ok", "; ".join(answer.stdout.strip().splitlines()))
 
 
@@ -299,18 +351,28 @@ def python_version() -> Check:
     if sys.version_info[:2] == SUPPORTED:
         return Check("ok", found)
     wanted = ".".join(map(str, SUPPORTED))
-    return Check("warn", f"{found}; servers are tested with Python {wanted}", f"make an environment of Python {wanted}")
+    return Check(
+        "warn",
+        f"{found}; servers are tested with Python {wanted}",
+        f"make an environment of Python {wanted}",
+    )
 
 
-def libraries(python: Path, status: Literal["warn", "fail"] = "warn") -> Iterator[tuple[str, Check]]:
-    """Yield names and results of the checks of an interpreter: of torch, JAX and Triton's compiler, if it has them.
+def libraries(
+    python: Path, status: Literal["warn", "fail"] = "warn"
+) -> Iterator[tuple[str, Check]]:
+    """Yield names and results of the checks of an interpreter: of torch, JAX and Triton's compiler,
+    if it has them.
 
     `status` is that of an interpreter that does not run.
     """
     where = "" if str(python) == sys.executable else f" in {python.parent.parent}"
     answer = _output([str(python), "-c", _LIBRARIES])
     if answer.returncode != 0:
-        yield f"Python{where}", Check(status, _last_line(answer.stderr), "make it again: vlagents-ray env make")
+        yield (
+            f"Python{where}",
+            Check(status, _last_line(answer.stderr), "make it again: vlagents-ray env make"),
+        )
         return
     found = json.loads(_last_line(answer.stdout))
     driver = driver_version() if has_gpu() else None
@@ -320,8 +382,12 @@ def libraries(python: Path, status: Literal["warn", "fail"] = "warn") -> Iterato
         yield f"C compiler for Triton{where}", triton_compiler(Path(found["headers"]))
 
 
-def judge_library(name: str, driver: str | None, version: str, cuda: str | None, device: str | None, why: str) -> Check:
-    """Judge torch or jax: its version, its CUDA or None, its GPU or why it has none; `driver` is None without a GPU."""
+def judge_library(
+    name: str, driver: str | None, version: str, cuda: str | None, device: str | None, why: str
+) -> Check:
+    """Judge torch or jax: its version, its CUDA or None, its GPU or why it has none; `driver` is
+    None without a GPU.
+    """
     detail = f"{version}, {f'for CUDA {cuda}' if cuda else 'for CPUs only'}"
     if device is not None:
         return Check("ok", f"{detail}, uses {device}")
@@ -329,19 +395,39 @@ def judge_library(name: str, driver: str | None, version: str, cuda: str | None,
         return Check("ok", f"{detail}; no GPU here")
     if cuda is None:
         package = f"'jax[cuda12]=={version}'" if name == "jax" else "--force-reinstall torch"
-        return Check("warn", detail, f"uv pip install {package} there, without an index of CPU-only wheels")
-    if int(driver.partition(".")[0]) < (oldest := OLDEST_DRIVERS.get(int(cuda.partition(".")[0]), 0)):
-        cure = "update the driver, or make the environment again: env make takes torch for CUDA 12 with one from 525 on"
+        return Check(
+            "warn", detail, f"uv pip install {package} there, without an index of CPU-only wheels"
+        )
+    if int(driver.partition(".")[0]) < (
+        oldest := OLDEST_DRIVERS.get(int(cuda.partition(".")[0]), 0)
+    ):
+        cure = (
+            "update the driver, or make the environment again: env make takes torch for CUDA "
+            "12 "
+            "with one from 525 on"
+        )
         return Check("warn", f"{detail}, which needs driver {oldest} or newer; got {driver}", cure)
-    return Check("warn", f"{detail}, cannot use the GPU: {why}", "see the kernel's log (dmesg); a reboot often helps")
+    return Check(
+        "warn",
+        f"{detail}, cannot use the GPU: {why}",
+        "see the kernel's log (dmesg); a reboot often helps",
+    )
 
 
 def triton_compiler(headers: Path) -> Check:
-    """Check that Triton finds a C compiler and Python's headers, with which it builds a program that starts kernels."""
+    """Check that Triton finds a C compiler and Python's headers, with which it builds a program
+    that starts kernels.
+    """
     if (compiler := os.environ.get("CC") or shutil.which("gcc") or shutil.which("clang")) is None:
-        return Check("warn", "none, which torch.compile needs on a GPU", "apt-get install gcc libc6-dev")
+        return Check(
+            "warn", "none, which torch.compile needs on a GPU", "apt-get install gcc libc6-dev"
+        )
     if not (headers / "Python.h").exists():
-        return Check("warn", f"{compiler}, but no {headers}/Python.h", "apt-get install python3-dev, of this version")
+        return Check(
+            "warn",
+            f"{compiler}, but no {headers}/Python.h",
+            "apt-get install python3-dev, of this version",
+        )
     return Check("ok", compiler)
 
 
@@ -361,18 +447,24 @@ def egl() -> Check:
     if not probe.ok or fitting(probe.devices, gpu=False) is not None:
         return found
     cure = f"apt-get install libegl1 libgl1-mesa-dri; or {SHARE}"
-    return Check("warn", f"{found.detail}; no device renders in software, for workers without a GPU", cure)
+    return Check(
+        "warn", f"{found.detail}; no device renders in software, for workers without a GPU", cure
+    )
 
 
 def _rendered(simulator: str, probe: RenderProbe) -> Check:
     if probe.ok:
-        return Check("ok", f"a frame in {probe.seconds:.1f} s on {probe.device or 'an unnamed device'}")
+        return Check(
+            "ok", f"a frame in {probe.seconds:.1f} s on {probe.device or 'an unnamed device'}"
+        )
     return Check("warn", f"{simulator} cannot render: {probe.error}", probe.cure or "")
 
 
 def _output(command: list[str], timeout_s: float = 60) -> subprocess.CompletedProcess[str]:
     try:
-        return subprocess.run(command, capture_output=True, text=True, timeout=timeout_s, check=False)  # noqa: S603 - our own commands
+        return subprocess.run(  # noqa: S603
+            command, capture_output=True, text=True, timeout=timeout_s, check=False
+        )
     except OSError as error:
         return subprocess.CompletedProcess(command, 127, "", str(error))
     except subprocess.TimeoutExpired:

@@ -45,26 +45,32 @@ if TYPE_CHECKING:
 class EvalOptions:
     """The options of `vlagents-ray eval`.
 
-    An option that is a field of `EvalConfig`, or of its policy, suite or worker, has the field's name here.
+    An option that is a field of `EvalConfig`, or of its policy, suite or worker, has the field's
+    name here.
     """
 
     what: Annotated[
         list[str],
         typer.Argument(
-            metavar="FILE | ENV...", help="A file of runs (.yaml); or environments: tabletop, 'libero/*', …"
+            metavar="FILE | ENV...",
+            help="A file of runs (.yaml); or environments: tabletop, 'libero/*', …",
         ),
     ]
-    source: Annotated[str | None, typer.Option("--policy", help="Registered name, deployment file, or URL.")] = None
+    source: Annotated[
+        str | None, typer.Option("--policy", help="Registered name, deployment file, or URL.")
+    ] = None
     out: Annotated[Path | None, typer.Option("--out", help="Folder of the results.")] = None
     episodes: Annotated[
-        int | None, typer.Option(min=1, max=MOST_EPISODES, help="Episodes of each environment; default: 10.")
+        int | None,
+        typer.Option(min=1, max=MOST_EPISODES, help="Episodes of each environment; default: 10."),
     ] = None
     workers: Annotated[
         int | None,
         typer.Option(
             min=0,
             max=MOST_WORKERS,
-            help="Environments played in parallel; 0: in this process, without Ray. Default: 0 if short, else 1.",
+            help="Environments played in parallel; 0: in this process, without Ray. Default: 0 if "
+            "short, else 1.",
         ),
     ] = None
     cpus: Annotated[
@@ -88,36 +94,59 @@ class EvalOptions:
         ),
     ] = None
     seeds: Annotated[
-        int | None, typer.Option("--seed", min=0, max=MOST_SEED, help="Episode i uses seed + i; default: 0.")
+        int | None,
+        typer.Option("--seed", min=0, max=MOST_SEED, help="Episode i uses seed + i; default: 0."),
     ] = None
     video: Annotated[str | None, typer.Option(help="none, failures (default) or all.")] = None
-    record: Annotated[str | None, typer.Option(help="Trajectories: none (default), failures or all.")] = None
-    track: Annotated[str, typer.Option(help="Trackers such as wandb, with commas between them.")] = ""
-    resume: Annotated[bool, typer.Option("--resume", help="Go on with the results in --out.")] = False
+    record: Annotated[
+        str | None, typer.Option(help="Trajectories: none (default), failures or all.")
+    ] = None
+    track: Annotated[
+        str, typer.Option(help="Trackers such as wandb, with commas between them.")
+    ] = ""
+    resume: Annotated[bool, typer.Option("--resume", help="Go on with the results in --out.")] = (
+        False
+    )
     accept_changes: Annotated[
         bool,
-        typer.Option("--accept-changes", help="With --resume: although files or weights changed; the report says so."),
+        typer.Option(
+            "--accept-changes",
+            help="With --resume: although files or weights changed; the report says so.",
+        ),
     ] = False
     execute: Annotated[
-        int | None, typer.Option(min=1, max=MOST_ROWS, help="Rows executed of each chunk; default: all.")
+        int | None,
+        typer.Option(min=1, max=MOST_ROWS, help="Rows executed of each chunk; default: all."),
     ] = None
     retries: Annotated[
-        int | None, typer.Option(min=0, max=MOST_RETRIES, help="Attempts after a lost one; default: 3.")
+        int | None,
+        typer.Option(min=0, max=MOST_RETRIES, help="Attempts after a lost one; default: 3."),
     ] = None
     config: Set = field(default_factory=list)
     env_options: Annotated[
-        list[str], typer.Option("--env-set", metavar="KEY=VALUE", help="An option of the environments: width=256.")
+        list[str],
+        typer.Option(
+            "--env-set", metavar="KEY=VALUE", help="An option of the environments: width=256."
+        ),
     ] = field(default_factory=list)
     options: Annotated[
         list[str],
-        typer.Option("--reset-set", metavar="KEY=VALUE", help="An option of the policy's reset: checkpoint_step=9."),
+        typer.Option(
+            "--reset-set",
+            metavar="KEY=VALUE",
+            help="An option of the policy's reset: checkpoint_step=9.",
+        ),
     ] = field(default_factory=list)
     watch: Annotated[
         Path | None,
-        typer.Option(metavar="DIR", help="Evaluate each checkpoint that a training run writes there, until Ctrl-C."),
+        typer.Option(
+            metavar="DIR",
+            help="Evaluate each checkpoint that a training run writes there, until Ctrl-C.",
+        ),
     ] = None
     until: Annotated[
-        int | None, typer.Option(min=0, max=MOST_STEP, metavar="STEP", help="End --watch with this step.")
+        int | None,
+        typer.Option(min=0, max=MOST_STEP, metavar="STEP", help="End --watch with this step."),
     ] = None
     settle_s: Annotated[
         float | None,
@@ -125,56 +154,89 @@ class EvalOptions:
             min=0,
             max=MOST_S,
             callback=finite,
-            help="With --watch: a checkpoint is complete after this time without a change; default: 10.",
+            help="With --watch: a checkpoint is complete after this time without a change; "
+            "default: 10.",
         ),
     ] = None
-    marker: Annotated[str | None, typer.Option(metavar="NAME", help="With --watch: the trainer's last file.")] = None
-    dry_run: Annotated[bool, typer.Option("--dry-run", help="Print the plan, and the time left; play nothing.")] = False
+    marker: Annotated[
+        str | None, typer.Option(metavar="NAME", help="With --watch: the trainer's last file.")
+    ] = None
+    dry_run: Annotated[
+        bool, typer.Option("--dry-run", help="Print the plan, and the time left; play nothing.")
+    ] = False
     end_at: Annotated[
         str | None,
-        typer.Option(metavar="TIME", help="Begin no episode that would end later: 2027-01-31T18:30, or s since 1970."),
+        typer.Option(
+            metavar="TIME",
+            help="Begin no episode that would end later: 2027-01-31T18:30, or s since 1970.",
+        ),
     ] = None
     replica_per_gpu: Annotated[
-        bool, typer.Option("--replica-per-gpu", help="With --address: a policy has a replica on each of its GPUs.")
+        bool,
+        typer.Option(
+            "--replica-per-gpu", help="With --address: a policy has a replica on each of its GPUs."
+        ),
     ] = False
     arm: Annotated[
         str | None,
         typer.Option(
             "--robot",
             metavar="MODULE:CLASS",
-            help="Play the file's trials on a real robot, of this class: a person resets the scene and judges, and "
+            help="Play the file's trials on a real robot, of this class: a person resets the scene "
+            "and judges, and "
             "does not see which policy plays.",
         ),
     ] = None
     operator: Annotated[
         str | None,
-        typer.Option(metavar="page|terminal", help="With --robot: where that person is asked; default: page"),
+        typer.Option(
+            metavar="page|terminal", help="With --robot: where that person is asked; default: page"
+        ),
     ] = None
-    unblind: Annotated[bool, typer.Option("--unblind", help="With --robot: write the results so far.")] = False
+    unblind: Annotated[
+        bool, typer.Option("--unblind", help="With --robot: write the results so far.")
+    ] = False
     address: Address = None
     live: Live = False
     live_at: LiveAt = None
 
     def given(self, *names: str) -> list[str]:
-        """Return the set options among `names`, as the command line writes them; 0 counts as set, False does not."""
+        """Return the set options among `names`, as the command line writes them; 0 counts as
+        set, False does not.
+        """
         values = {name: getattr(self, name) for name in names}
-        return [f"--{name.replace('_', '-')}" for name, one in values.items() if one or (one == 0 and one is not False)]
+        return [
+            f"--{name.replace('_', '-')}"
+            for name, one in values.items()
+            if one or (one == 0 and one is not False)
+        ]
 
     def require_together(self, *, on_robot: bool) -> None:
         """Raise `ConfigError` for options that need another one, or that exclude one another."""
         if self.watch is None and (needing := self.given("until", "settle_s", "marker")):
             raise ConfigError(f"got {needing} without --watch")
         if self.dry_run and self.watch is not None:
-            raise ConfigError("--dry-run and --watch exclude each other: the steps of the training are not known yet")
+            raise ConfigError(
+                "--dry-run and --watch exclude each other: the steps of the training are not known "
+                "yet"
+            )
         if self.end_at is not None and self.watch is not None:
-            raise ConfigError("--end-at and --watch exclude each other: watching ends with --until, or by Ctrl-C")
+            raise ConfigError(
+                "--end-at and --watch exclude each other: watching ends with --until, or by Ctrl-C"
+            )
         if self.replica_per_gpu and self.address is None:
-            raise ConfigError("--replica-per-gpu: want --address, a cluster whose GPUs can be counted")
+            raise ConfigError(
+                "--replica-per-gpu: want --address, a cluster whose GPUs can be counted"
+            )
         if self.dry_run and self.given("live", "live_at"):
-            raise ConfigError("--dry-run and --live exclude each other: nothing is played that could be watched")
+            raise ConfigError(
+                "--dry-run and --live exclude each other: nothing is played that could be watched"
+            )
         if not on_robot and (needing := self.given("operator", "unblind")):
             raise ConfigError(f"got {needing} without --robot")
-        if on_robot and (excluded := self.given("watch", "dry_run", "end_at", "track", "live", "live_at")):
+        if on_robot and (
+            excluded := self.given("watch", "dry_run", "end_at", "track", "live", "live_at")
+        ):
             raise ConfigError(f"--robot and {excluded} exclude each other")
         if self.operator not in (None, "page", "terminal"):
             raise ConfigError(f"--operator: got {self.operator!r}, want page or terminal")
@@ -184,33 +246,53 @@ class EvalOptions:
 def evaluate_command(options: EvalOptions) -> None:
     """Evaluate policies: episodes in parallel, success rates with confidence intervals, videos.
 
-    A file holds policies, their checkpoints, suites of environments, seeds; --out, --workers, --video, --record,
-    --track, --retries and --resume win over it.
+    A file holds policies, their checkpoints, suites of environments, seeds; --out, --workers,
+    --video, --record, --track, --retries and --resume win over it.
 
-    Exit status: 0 when every episode has its result; 75 when --end-at left some over, 130 if interrupted (resume both
-    with --resume); 2 for invalid settings; 3 when an error of the policy ended every episode of a cell; 1 for any other
-    failure, and when infrastructure lost an episode for good (--resume tries it again).
+    Exit status: 0 when every episode has its result; 75 when --end-at left some over, 130 if
+    interrupted (resume both with --resume); 2 for invalid settings; 3 when an error of the policy
+    ended every episode of a cell; 1 for any other failure, and when infrastructure lost an episode
+    for good (--resume tries it again).
     """
     with errors():
         config = config_from_options(options)
         on_robot = config.real_robot is not None
         options.require_together(on_robot=on_robot)
-        from vlagents_ray.cli.evaluation import live_address, print_plan, run_evaluation, run_on_robot, watch_training
+        from vlagents_ray.cli.evaluation import (
+            live_address,
+            print_plan,
+            run_evaluation,
+            run_on_robot,
+            watch_training,
+        )
 
-        address, page = options.address, live_address(options.live_at) if options.live or options.live_at else None
+        address, page = (
+            options.address,
+            live_address(options.live_at) if options.live or options.live_at else None,
+        )
         if on_robot:
-            run_on_robot(config, address, operator=options.operator or "page", unblinded=options.unblind)
+            run_on_robot(
+                config, address, operator=options.operator or "page", unblinded=options.unblind
+            )
         elif options.dry_run:
             with quiet_ray(None):
                 print_plan(config, address)
         elif options.watch is not None:
             settle_s = 10.0 if options.settle_s is None else options.settle_s
             watch_training(
-                config, options.watch, address, until=options.until, settle_s=settle_s, marker=options.marker, live=page
+                config,
+                options.watch,
+                address,
+                until=options.until,
+                settle_s=settle_s,
+                marker=options.marker,
+                live=page,
             )
         else:
             end = None if options.end_at is None else parse_time(options.end_at, "--end-at")
-            run_evaluation(config, address, end_at=end, replica_per_gpu=options.replica_per_gpu, live=page)
+            run_evaluation(
+                config, address, end_at=end, replica_per_gpu=options.replica_per_gpu, live=page
+            )
 
 
 def config_from_options(options: EvalOptions) -> EvalConfig:
@@ -231,13 +313,20 @@ def config_from_options(options: EvalOptions) -> EvalConfig:
     )
     if what[0].endswith(YAML_SUFFIXES):
         if beside := [*what[1:], *policy, *suite]:
-            raise ConfigError(f"{what[0]} says what is evaluated; got {beside} beside it: write that there")
+            raise ConfigError(
+                f"{what[0]} says what is evaluated; got {beside} beside it: write that there"
+            )
         fields = read_run(Path(what[0])) | run
     else:
-        missing = [option for option, there in (("--policy", "source" in policy), ("--out", "out" in run)) if not there]
+        missing = [
+            option
+            for option, there in (("--policy", "source" in policy), ("--out", "out" in run))
+            if not there
+        ]
         if missing:
             raise ConfigError(
-                f"got no {' and no '.join(missing)}, want {' and '.join(missing)}; or a file of runs (.yaml)"
+                f"got no {' and no '.join(missing)}, want {' and '.join(missing)}; or a file of "
+                "runs (.yaml)"
             )
         fields = {"policies": [policy], "suites": [{"envs": list(what)} | suite], **run}
     if options.arm is not None:
@@ -247,24 +336,39 @@ def config_from_options(options: EvalOptions) -> EvalConfig:
     for one in config.policies:
         if one.source is not None and one.url is not None:
             raise ConfigError(
-                f"policy {one.name!r}: expected `source`, a policy to serve, or the `url` of a server, got both; "
+                f"policy {one.name!r}: expected `source`, a policy to serve, or the `url` of a "
+                "server, got both; "
                 f"leave one of them out"
             )
 
-    def filled(of: WorkerConfig) -> WorkerConfig:  # with the resources that are not in the configuration
-        return of.model_copy(update={name: value for name, value in worker.items() if name not in of.model_fields_set})
+    # With the resources that are not in the configuration.
+    def filled(of: WorkerConfig) -> WorkerConfig:
+        return of.model_copy(
+            update={
+                name: value for name, value in worker.items() if name not in of.model_fields_set
+            }
+        )
 
     suites = [
-        one if one.worker is None else one.model_copy(update={"worker": filled(one.worker)}) for one in config.suites
+        one if one.worker is None else one.model_copy(update={"worker": filled(one.worker)})
+        for one in config.suites
     ]
-    return config.model_copy(update={"worker": filled(config.worker), "suites": suites}) if worker else config
+    return (
+        config.model_copy(update={"worker": filled(config.worker), "suites": suites})
+        if worker
+        else config
+    )
 
 
 def _given(options: dict[str, Any], model: type[BaseModel]) -> dict[str, Any]:
     """Select the options that are fields of `model` and were given."""
     found = {name: options[name] for name in model.model_fields if name in options}
     # 0 was given, though it equals False.
-    return {name: value for name, value in found.items() if value not in (None, {}, []) and value is not False}
+    return {
+        name: value
+        for name, value in found.items()
+        if value not in (None, {}, []) and value is not False
+    }
 
 
 def read_run(file: Path) -> dict[str, Any]:

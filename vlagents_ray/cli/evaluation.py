@@ -1,4 +1,6 @@
-"""Evaluations by their configuration: played, planned, watched or on a robot, and the live page of `--live`."""
+"""Evaluations by their configuration: played, planned, watched or on a robot, and the live page
+of `--live`.
+"""
 
 from __future__ import annotations
 
@@ -18,7 +20,13 @@ from rich.table import Table
 from vlagents_ray.cli.console import fail, out
 from vlagents_ray.cli.exit_status import OUT_OF_TIME
 from vlagents_ray.cli.listing import require_packages
-from vlagents_ray.cli.policies import Agents, planned_workers, policy_deployment, resolve_policies, served
+from vlagents_ray.cli.policies import (
+    Agents,
+    planned_workers,
+    policy_deployment,
+    resolve_policies,
+    served,
+)
 from vlagents_ray.errors import ConfigError, PolicyFailed
 from vlagents_ray.evaluate import (
     EvalConfig,
@@ -56,7 +64,8 @@ def live_address(at: str | None) -> tuple[str, int]:
     """Return the (host, port) that `--live-at` states; None is `--live` alone.
 
     Raises:
-        ConfigError: The plug-in with the page is not installed, or other machines would reach it without a key.
+        ConfigError: The plug-in with the page is not installed, or other machines would reach it
+            without a key.
     """
     registered_class("pages", _PAGE)
     if at is None:
@@ -73,8 +82,11 @@ def live_address(at: str | None) -> tuple[str, int]:
 
 
 @contextlib.contextmanager
-def shown_progress(config: EvalConfig, live: tuple[str, int] | None, *, goes_on: bool = False) -> Iterator[Progress]:
-    """Show an evaluation on the terminal and, if that has an address, on the live page, within the context of its Ray.
+def shown_progress(
+    config: EvalConfig, live: tuple[str, int] | None, *, goes_on: bool = False
+) -> Iterator[Progress]:
+    """Show an evaluation on the terminal and, if that has an address, on the live page, within the
+    context of its Ray.
 
     Without workers the terminal shows lines: a table that is drawn again would disturb a debugger.
     """
@@ -97,13 +109,17 @@ def shown_progress(config: EvalConfig, live: tuple[str, int] | None, *, goes_on:
 
 
 def follow(results: Path, address: tuple[str, int]) -> None:
-    """Serve the page of an evaluation or a training that another process writes to a folder, until Ctrl-C."""
+    """Serve the page of an evaluation or a training that another process writes to a folder,
+    until Ctrl-C.
+    """
     with _page(ResultsDocument(results), [], address), contextlib.suppress(KeyboardInterrupt):
         threading.Event().wait()
 
 
 @contextlib.contextmanager
-def _page(document: ResultsDocument, apps: Sequence[str], address: tuple[str, int]) -> Iterator[None]:
+def _page(
+    document: ResultsDocument, apps: Sequence[str], address: tuple[str, int]
+) -> Iterator[None]:
     page: EvaluationPage = registered_class("pages", _PAGE)()
     with page.serve(document, apps, address, load_keys()) as url:
         out.print(f"live: {url}")
@@ -126,10 +142,13 @@ def run_evaluation(
         config = config.model_copy(update={"workers": 1})
     with contextlib.ExitStack() as stack:
         try:
-            ready, agents = stack.enter_context(served(config, address, replica_per_gpu=replica_per_gpu))
+            ready, agents = stack.enter_context(
+                served(config, address, replica_per_gpu=replica_per_gpu)
+            )
         except KeyboardInterrupt as error:
             raise KeyboardInterrupt(
-                "interrupted while Ray and the policies started; no episode began: repeat the command"
+                "interrupted while Ray and the policies started; no episode began: repeat the "
+                "command"
             ) from error
         progress = stack.enter_context(shown_progress(ready, live))
         summary = evaluate_and_print(ready, progress, end_at, agents)
@@ -137,15 +156,22 @@ def run_evaluation(
 
 
 def play_one(config: EvalConfig, address: str | None, only: tuple[int, int]) -> Summary:
-    """Serve the policy unless it is at a URL, and play one episode of it; `only` as in `evaluate`."""
+    """Serve the policy unless it is at a URL, and play one episode of it; `only` as in
+    `evaluate`.
+    """
     with served(config, address) as (ready, agents), shown_progress(ready, None) as progress:
         return evaluate(ready, agent_factory=agents, progress=progress, only=only)
 
 
 def evaluate_and_print(
-    config: EvalConfig, progress: Progress, end_at: float | None = None, agents: Agents | None = None
+    config: EvalConfig,
+    progress: Progress,
+    end_at: float | None = None,
+    agents: Agents | None = None,
 ) -> Summary:
-    """Evaluate policies, as `served` yields them; an interrupted evaluation prints its results so far."""
+    """Evaluate policies, as `served` yields them; an interrupted evaluation prints its results
+    so far.
+    """
     try:
         summary = evaluate(config, agent_factory=agents, progress=progress, end_at=end_at)
     except PolicyFailed as error:
@@ -164,7 +190,8 @@ def evaluate_and_print(
 
 
 def require_results(config: EvalConfig, summary: Summary) -> None:
-    """End the command with status 3 if an error of the policy ended every episode of a cell that `config` plans.
+    """End the command with status 3 if an error of the policy ended every episode of a cell that
+    `config` plans.
 
     The status is 1 if infrastructure lost an episode.
     """
@@ -173,14 +200,23 @@ def require_results(config: EvalConfig, summary: Summary) -> None:
     if failing := failing_cells(summary.results.among(mine)):
         (_, _, error), _ = errors_of_policies(summary.results.among(failing))[0]
         where = ", ".join(f"{cell.contender} in {cell.task}" for cell in failing)
-        fail(f"every episode ended by an error of the policy: {where}; the first one: {error.strip()}", POLICY_ERRORS)
+        fail(
+            f"every episode ended by an error of the policy: {where}; the first one: "
+            f"{error.strip()}",
+            POLICY_ERRORS,
+        )
     if not (missing := sum(cell.missing for cell in mine)):
         return
     lost = [attempt for cell in mine for attempt in cell.attempts if not attempt.retried]
     last = max(lost, key=lambda attempt: attempt.at, default=None)
-    why = "" if last is None else f", the last one to {last.code}: {last.error.strip().partition(chr(10))[0]}"
+    why = (
+        ""
+        if last is None
+        else f", the last one to {last.code}: {last.error.strip().partition(chr(10))[0]}"
+    )
     fail(
-        f"{missing} of {sum(cell.planned for cell in mine)} episodes have no result: lost to infrastructure{why}; "
+        f"{missing} of {sum(cell.planned for cell in mine)} episodes have no result: lost to "
+        f"infrastructure{why}; "
         f"the report lists every attempt under Errors, --resume tries them again",
         1,
     )
@@ -198,13 +234,18 @@ def watch_training(
 ) -> None:
     """Evaluate each step of the one policy whose checkpoint holds `{step}` once it is whole.
 
-    All results go into one folder, and one server stays up. Policies without `{step}` are evaluated in the first round.
-    `live` is the address of the live page, as for `shown_progress`. Ends as `rounds` does, or by Ctrl-C; resume to
-    continue. An episode without a result ends the command with status 1, after the last round.
+    All results go into one folder, and one server stays up. Policies without `{step}` are evaluated
+    in the first round. `live` is the address of the live page, as for `shown_progress`. Ends as
+    `rounds` does, or by Ctrl-C; resume to continue. An episode without a result ends the command
+    with status 1, after the last round.
     """
     place, pattern = _watched(config)
-    if (config.out / FILE).is_file() and not config.resume:  # raised now, not at the first checkpoint
-        raise ConfigError(f"{config.out} already has results: resume them (--resume), or choose another out folder")
+    # Raised now, not at the first checkpoint.
+    if (config.out / FILE).is_file() and not config.resume:
+        raise ConfigError(
+            f"{config.out} already has results: resume them (--resume), or choose another out "
+            "folder"
+        )
     if address is None:
         for part in resolve_policies(_at(config, place, [0]), ask=False)[1].values():
             require_packages(part)
@@ -218,10 +259,15 @@ def watch_training(
                 out.print(f"step {step}: not yet: {why}")
         threading.Event().wait(LOOK_S)
 
-    out.print(f"watching {watcher.folder}{'' if watcher.folder.is_dir() else ', which is not there yet'}")
+    out.print(
+        f"watching {watcher.folder}{'' if watcher.folder.is_dir() else ', which is not there yet'}"
+    )
     found = rounds(watcher, until, pause)
     if (first := next(found, None)) is None:
-        raise ConfigError(f"{watcher.folder}: watching ended without a checkpoint; still waiting: {watcher.waiting()}")
+        raise ConfigError(
+            f"{watcher.folder}: watching ended without a checkpoint; still waiting: "
+            f"{watcher.waiting()}"
+        )
     workers = 1 if config.workers is None else config.workers  # a training is long
     planned = _at(config, place, first).model_copy(update={"workers": workers})
     with contextlib.ExitStack() as stack:
@@ -246,17 +292,22 @@ def _watched(config: EvalConfig) -> tuple[int, str]:
     for place, policy in enumerate(config.policies):
         settings: dict[str, Any] = {CHOICE: policy.checkpoint}
         if policy.source is not None and "://" not in policy.source:
-            settings |= own_settings(policy_deployment(policy, policy.source, step_follows=True).applications[0])
+            settings |= own_settings(
+                policy_deployment(policy, policy.source, step_follows=True).applications[0]
+            )
         if isinstance(pattern := settings[CHOICE], str) and STEP in pattern:
             found[place] = pattern
     if len(found) != 1:
         raise ConfigError(
-            f"--watch: got {STEP} in the checkpoints of {len(found)} policies, want it in that of one, such as "
+            f"--watch: got {STEP} in the checkpoints of {len(found)} policies, want it in that of "
+            "one, such as "
             f"checkpoint: /runs/a/{STEP}"
         )
     [(place, pattern)] = found.items()
     if config.policies[place].steps:
-        raise ConfigError(f"policy {config.policies[place].name!r}: --watch finds its steps; leave `steps` out")
+        raise ConfigError(
+            f"policy {config.policies[place].name!r}: --watch finds its steps; leave `steps` out"
+        )
     return place, pattern
 
 
@@ -266,16 +317,30 @@ def _at(config: EvalConfig, place: int, steps: list[int]) -> EvalConfig:
     return config.model_copy(update={"policies": policies})
 
 
-def run_on_robot(config: EvalConfig, address: str | None, *, operator: str, unblinded: bool) -> None:
+def run_on_robot(
+    config: EvalConfig, address: str | None, *, operator: str, unblinded: bool
+) -> None:
     """Serve the policies that are not at a URL, play the trials, print the table."""
-    from vlagents_ray.evaluate.robot import PageOperator, TerminalOperator, evaluate_on_robot, planned_cells, unblind
+    from vlagents_ray.evaluate.robot import (
+        PageOperator,
+        TerminalOperator,
+        evaluate_on_robot,
+        planned_cells,
+        unblind,
+    )
 
     if unblinded:
-        print_summary(out, unblind(config.out, config.robot.key if config.robot is not None else None))
+        print_summary(
+            out, unblind(config.out, config.robot.key if config.robot is not None else None)
+        )
         return
     planned_cells(config)  # raises before anything starts
     with served(config, address) as (ready, _), contextlib.ExitStack() as stack:
-        person = TerminalOperator() if operator == "terminal" else stack.enter_context(PageOperator(out.print))
+        person = (
+            TerminalOperator()
+            if operator == "terminal"
+            else stack.enter_context(PageOperator(out.print))
+        )
         summary = evaluate_on_robot(ready, person)
     print_summary(out, summary)
 
@@ -312,20 +377,33 @@ def print_plan(config: EvalConfig, address: str | None = None) -> None:
             str(one.cell.planned),
             str(one.finished),
             str(one.left),
-            *(("?", "?") if one.seconds is None else (f"{one.seconds:.3g}", _time(one.left * one.seconds))),
+            *(
+                ("?", "?")
+                if one.seconds is None
+                else (f"{one.seconds:.3g}", _time(one.left * one.seconds))
+            ),
         )
     out.print(shown)
     cases = [one.cell for one in found]
-    policies, envs = len({case.contender for case in cases}), len({(case.suite.name, case.env) for case in cases})
+    policies, envs = (
+        len({case.contender for case in cases}),
+        len({(case.suite.name, case.env) for case in cases}),
+    )
     planned, finished = sum(case.planned for case in cases), sum(one.finished for one in found)
     left = sum(one.left for one in found)
     # Workers share one queue, so that at most one episode's time is lost at the end.
     seconds = sum(one.left * (one.seconds or 0.0) for one in found) / max(1, min(workers, left))
     unknown = sum(one.seconds is None for one in found)
     beside = f"; not played yet: {unknown} of {counted(len(found), 'cell')}" if unknown else ""
-    factors = f"{counted(policies, 'policy', 'policies')} at each checkpoint x {counted(envs, 'environment')} of suites"
+    factors = (
+        f"{counted(policies, 'policy', 'policies')} at each checkpoint x "
+        f"{counted(envs, 'environment')} of suites"
+    )
     out.print(f"{counted(len(found), 'cell')}: {factors}")
-    out.print(f"{counted(planned, 'episode')}, {finished} of them finished in {config.out}, {left} to play")
+    out.print(
+        f"{counted(planned, 'episode')}, {finished} of them finished in {config.out}, {left} to "
+        "play"
+    )
     where = f"with {counted(workers, 'worker')}" if workers else "in one process, without Ray"
     time = "unknown time" if unknown == len(found) else f"{_time(seconds)} as by earlier episodes"
     out.print(f"{time} {where}{beside}")
@@ -336,11 +414,16 @@ def forecasts(planned: Sequence[EvalCase], results: Results | None) -> list[Fore
     earlier = results.cells if results is not None else ()
     found = []
     for cell in planned:
-        same = next((one for one in earlier if (one.contender, one.suite, one.env) == cell.name), None)
+        same = next(
+            (one for one in earlier if (one.contender, one.suite, one.env) == cell.name), None
+        )
         recorded = [] if same is None else [one.result for one in same.episodes]
         done = {(one.key.episode, one.key.seed) for one in recorded if one.status != "infra_failed"}
         planned_seeds = set(cell.suite.seeds)
-        finished = sum(episode < cell.suite.episodes and seed - episode in planned_seeds for episode, seed in done)
+        finished = sum(
+            episode < cell.suite.episodes and seed - episode in planned_seeds
+            for episode, seed in done
+        )
         has_stopped = same is not None and same.stopped_at is not None
         alike = [one for one in earlier if (one.policy, one.env) == (cell.policy.name, cell.env)]
         seconds = [episode.seconds for one in alike for episode in one.counted]

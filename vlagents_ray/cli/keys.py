@@ -16,9 +16,14 @@ from vlagents_ray.errors import ConfigError
 from vlagents_ray.serve.access.api_keys import FILE_VARIABLE
 from vlagents_ray.serve.access.key_store import new_key, read_keys, revoke
 
-keys = typer.Typer(no_args_is_help=True, help="The API keys of a server: make, list and revoke them.")
+keys = typer.Typer(
+    no_args_is_help=True, help="The API keys of a server: make, list and revoke them."
+)
 File = Annotated[
-    Path | None, typer.Option("--keys", help=f"The key file; default: {FILE_VARIABLE}, or keys.json in this folder.")
+    Path | None,
+    typer.Option(
+        "--keys", help=f"The key file; default: {FILE_VARIABLE}, or keys.json in this folder."
+    ),
 ]
 Name = Annotated[str, typer.Argument(help="Who has the key: arm-1, lab, …")]
 
@@ -27,28 +32,47 @@ Name = Annotated[str, typer.Argument(help="Who has the key: arm-1, lab, …")]
 def new(
     name: Name,
     file: File = None,
-    app: Annotated[list[str], typer.Option(help="An application that it is for, repeatable; default: all.")] = [],  # noqa: B006
+    app: Annotated[
+        list[str], typer.Option(help="An application that it is for, repeatable; default: all.")
+    ] = [],  # noqa: B006
     rate: Annotated[
-        float | None, typer.Option(min=0.001, max=1e6, callback=finite, help="Requests a second, at each replica.")
+        float | None,
+        typer.Option(
+            min=0.001, max=1e6, callback=finite, help="Requests a second, at each replica."
+        ),
     ] = None,
     sessions: Annotated[
-        int | None, typer.Option(min=1, max=1_000_000, help="Sessions held at once, at each replica.")
+        int | None,
+        typer.Option(min=1, max=1_000_000, help="Sessions held at once, at each replica."),
     ] = None,
-    rank: Annotated[str | None, typer.Option(help="'simulation': none of its requests goes before a robot's.")] = None,
+    rank: Annotated[
+        str | None, typer.Option(help="'simulation': none of its requests goes before a robot's.")
+    ] = None,
     scope: Annotated[
         list[str],
-        typer.Option(help="What else it may: 'weights' push, 'watch' all sessions, 'operate' them; repeatable."),
+        typer.Option(
+            help="What else it may: 'weights' push, 'watch' all sessions, 'operate' them; "
+            "repeatable."
+        ),
     ] = [],  # noqa: B006
     days: Annotated[
         float | None,
-        typer.Option(min=0.001, max=36_500, callback=finite, help="It expires after this number of days."),
+        typer.Option(
+            min=0.001, max=36_500, callback=finite, help="It expires after this number of days."
+        ),
     ] = None,
 ) -> None:
     """Make a key. It is shown this once; the file keeps its hash."""
     with errors():
         expires = None if days is None else time.time() + days * 86_400
         place = _file(file)
-        allowed = {"apps": tuple(app), "rate": rate, "sessions": sessions, "rank": rank, "scopes": tuple(scope)}
+        allowed = {
+            "apps": tuple(app),
+            "rate": rate,
+            "sessions": sessions,
+            "rank": rank,
+            "scopes": tuple(scope),
+        }
         token = new_key(place, name, expires=expires, **allowed)
         err.print(f"key {name} added to {place}; it is not shown again:")
         out.print(token)
@@ -60,7 +84,9 @@ def list_(file: File = None) -> None:
     with errors():
         listed = table("name", "for", "requests/s", "sessions", "class", "may also", "state")
         for key in read_keys(_existing(file)):
-            limits = ("any" if value is None else f"{value:g}" for value in (key.rate, key.sessions))
+            limits = (
+                "any" if value is None else f"{value:g}" for value in (key.rate, key.sessions)
+            )
             apps, scopes = ", ".join(key.apps) or "all", ", ".join(key.scopes)
             state = Text("revoked", "red") if key.revoked else Text("valid", "green")
             if key.expires is not None and not key.revoked:
@@ -73,7 +99,9 @@ def list_(file: File = None) -> None:
 
 @keys.command("revoke")
 def revoke_(name: Name, file: File = None) -> None:
-    """Revoke a key. Running servers notice within seconds, and close the connections that use it."""
+    """Revoke a key. Running servers notice within seconds, and close the connections that use
+    it.
+    """
     with errors():
         revoke(_existing(file), name)
         out.print(f"key {name} revoked")
@@ -83,7 +111,8 @@ def _file(file: Path | None) -> Path:
     place = file or Path(os.environ.get(FILE_VARIABLE) or "keys.json")
     if place.is_dir():
         raise ConfigError(
-            f"--keys: expected a key file, got the folder {place}; add its name, as {place / 'keys.json'}"
+            f"--keys: expected a key file, got the folder {place}; add its name, as "
+            f"{place / 'keys.json'}"
         )
     return place
 
@@ -91,5 +120,8 @@ def _file(file: Path | None) -> Path:
 def _existing(file: Path | None) -> Path:
     place = _file(file)
     if not place.is_file():
-        raise ConfigError(f"keys file {place} does not exist; `vlagents-ray keys new NAME --keys {place}` makes it")
+        raise ConfigError(
+            f"keys file {place} does not exist; `vlagents-ray keys new NAME --keys {place}` makes "
+            "it"
+        )
     return place

@@ -1,4 +1,6 @@
-"""The listings of `vlagents-ray policies` and `vlagents-ray envs`: names, state, and installation commands."""
+"""The listings of `vlagents-ray policies` and `vlagents-ray envs`: names, state, and
+installation commands.
+"""
 
 from __future__ import annotations
 
@@ -12,6 +14,7 @@ from dataclasses import dataclass
 from itertools import groupby
 from typing import TYPE_CHECKING, Any
 
+from vlagents_ray.docstrings import summary_of
 from vlagents_ray.errors import MissingDependency, VLAgentsError
 from vlagents_ray.registry import (
     env_class,
@@ -36,26 +39,35 @@ class Listed:
     kind: str  # "policy", "wrapper" or "environment"
     name: str  # as registered
     what: str  # a description, or an environment's tasks, in one line
-    missing: str | None  # the reason why it cannot run in this Python, with the cure; None if it is ready
-    details: list[str]  # the settings of a policy or wrapper as `name=default`, the tasks of an environment
+    # The reason why it cannot run in this Python, with the cure; None if it is ready.
+    missing: str | None
+    # The settings of a policy or wrapper as `name=default`, the tasks of an environment.
+    details: list[str]
 
     def lines(self) -> Iterator[str]:
         """Yield the full description, in whole lines, which can be copied and searched."""
         yield f"{self.name}: {self.what}"
         yield f"  {'ready' if self.missing is None else self.missing}"
-        yield f"  {'tasks' if self.kind == 'environment' else 'settings'}: {', '.join(self.details) or 'none'}"
+        yield (
+            f"  {'tasks' if self.kind == 'environment' else 'settings'}: "
+            f"{', '.join(self.details) or 'none'}"
+        )
 
 
 def policies_and_wrappers() -> Iterator[Listed]:
     """Yield the policies, then the wrappers."""
-    for kind, registered, find in (("policy", "policies", policy_class), ("wrapper", "wrappers", wrapper_class)):
+    for kind, registered, find in (
+        ("policy", "policies", policy_class),
+        ("wrapper", "wrappers", wrapper_class),
+    ):
         for name in sorted(names(registered)):
             try:
                 cls = find(name)
             except VLAgentsError as error:
                 yield Listed(kind, name, "cannot be loaded", str(error), [])
                 continue
-            what = (sys.modules[target_of(registered, name).partition(":")[0]].__doc__ or "").strip().partition("\n")[0]
+            module = sys.modules[target_of(registered, name).partition(":")[0]]
+            what = summary_of(module)
             yield Listed(kind, name, what, missing_packages(name), list(settings_of(cls)))
         yield from _in_other_plugins(kind, registered)
 
@@ -71,7 +83,9 @@ def environments() -> Iterator[Listed]:
         shown = list(ranges(tasks))
         short = shown if len(shown) <= _SHORT else [shown[0], "…", shown[-1]]
         what = (
-            f"{len(tasks)} task{'s' * (len(tasks) != 1)}: {', '.join(short)}" if tasks else "any task of the simulator"
+            f"{len(tasks)} task{'s' * (len(tasks) != 1)}: {', '.join(short)}"
+            if tasks
+            else "any task of the simulator"
         )
         yield Listed("environment", name, what, missing, shown)
     yield from _in_other_plugins("environment", "envs")
@@ -85,16 +99,24 @@ def _in_other_plugins(kind: str, registered: str) -> Iterator[Listed]:
 
 
 def installing(listed: Sequence[Listed]) -> Iterator[str]:
-    """Yield a line for each way to install missing packages: a command and its adapters, or an environment's cure."""
+    """Yield a line for each way to install missing packages: a command and its adapters, or an
+    environment's cure.
+    """
     wanted: dict[str, list[str]] = {}
     for one in listed:
-        modules, sources, requirements = _lacking(one.name) if one.kind != "environment" else ([], [], "")
+        modules, sources, requirements = (
+            _lacking(one.name) if one.kind != "environment" else ([], [], "")
+        )
         if modules or sources:
             wanted.setdefault(f"vlagents-ray env make {requirements}  # {{}}", []).append(one.name)
         if sources:
-            wanted.setdefault(f"export {sources[0]}=FOLDER  # a checkout, for {{}}", []).append(one.name)
+            wanted.setdefault(f"export {sources[0]}=FOLDER  # a checkout, for {{}}", []).append(
+                one.name
+            )
         if one.missing is not None and not (modules or sources):
-            wanted.setdefault(f"{{}}: {one.missing.replace('{', '{{').replace('}', '}}')}", []).append(one.name)
+            wanted.setdefault(
+                f"{{}}: {one.missing.replace('{', '{{').replace('}', '}}')}", []
+            ).append(one.name)
     for line, of in wanted.items():
         yield line.format(", ".join(of))
 
@@ -106,12 +128,18 @@ def require_packages(config: Deployment) -> None:
     """
     for app in config.applications:
         name, environment = str(app.args.get("policy")), app.args.get("environment")
-        if not environment and not app.runtime_env and (missing := missing_packages(name, checkout=False)) is not None:
+        if (
+            not environment
+            and not app.runtime_env
+            and (missing := missing_packages(name, checkout=False)) is not None
+        ):
             raise MissingDependency(f"policy {name!r}: {missing}")
 
 
 def missing_packages(name: str, *, checkout: bool = True) -> str | None:
-    """Return the packages that a model family lacks in this environment, with the cure; None if it lacks none."""
+    """Return the packages that a model family lacks in this environment, with the cure; None if
+    it lacks none.
+    """
     entry = find_entry("policies", name)
     if entry is not None and entry.extra and not all(map(importlib.util.find_spec, entry.needs)):
         cure = pip_install(entry.extra, entry.distribution)
@@ -119,7 +147,12 @@ def missing_packages(name: str, *, checkout: bool = True) -> str | None:
     modules, sources, requirements = _lacking(name)
     if not modules and not (sources and checkout):
         return None
-    cures = [f"`vlagents-ray env make {requirements}`, and that Python in `environment` of its deployment"]
+    cures = [
+        (
+            f"`vlagents-ray env make {requirements}`, and that Python in `environment` of its "
+            "deployment"
+        )
+    ]
     if sources:
         cures.append(f"{' or '.join(sources)}=FOLDER of a checkout")
         modules = [*modules, "its source"]
@@ -127,12 +160,16 @@ def missing_packages(name: str, *, checkout: bool = True) -> str | None:
 
 
 def _lacking(name: str) -> tuple[list[str], list[str], str]:
-    """Return the modules and checkout variables that a family lacks, and the name of its requirements."""
+    """Return the modules and checkout variables that a family lacks, and the name of its
+    requirements.
+    """
     entry = find_entry("policies", name)
     if entry is None or not entry.requirements:
         return [], [], ""
     has_checkout = any(os.environ.get(variable) for variable in entry.checkouts)
-    lacking = [module for module in entry.needs[has_checkout:] if importlib.util.find_spec(module) is None]
+    lacking = [
+        module for module in entry.needs[has_checkout:] if importlib.util.find_spec(module) is None
+    ]
     no_source = bool(entry.checkouts) and not has_checkout and entry.needs[0] in lacking
     return lacking[no_source:], list(entry.checkouts) if no_source else [], entry.requirements[0]
 
@@ -142,7 +179,11 @@ def settings_of(cls: type) -> Iterator[str]:
     fields: Mapping[str, Any] | None = getattr(getattr(cls, "Config", None), "model_fields", None)
     if fields is not None:
         for name, field in fields.items():
-            yield name if field.is_required() else f"{name}={field.get_default(call_default_factory=True)!r}"
+            yield (
+                name
+                if field.is_required()
+                else f"{name}={field.get_default(call_default_factory=True)!r}"
+            )
         return
     for parameter in inspect.signature(cls).parameters.values():
         if parameter.kind in (parameter.POSITIONAL_OR_KEYWORD, parameter.KEYWORD_ONLY):
@@ -151,12 +192,20 @@ def settings_of(cls: type) -> Iterator[str]:
 
 
 def ranges(tasks: list[str]) -> Iterator[str]:
-    """Join numbered names of one kind: "libero_spatial/0" to "libero_spatial/9" as "libero_spatial/0..9"."""
+    """Join numbered names of one kind: "libero_spatial/0" to "libero_spatial/9" as
+    "libero_spatial/0..9".
+    """
     split = [re.fullmatch(r"(.*/)(\d+)", task) for task in tasks]
-    for stem, group in groupby(zip(tasks, split, strict=True), lambda one: None if one[1] is None else one[1][1]):
+    for stem, group in groupby(
+        zip(tasks, split, strict=True), lambda one: None if one[1] is None else one[1][1]
+    ):
         members = list(group)
         numbers = [int(found[2]) for _, found in members if found is not None]
-        if stem is not None and len(numbers) > 1 and numbers == list(range(numbers[0], numbers[-1] + 1)):
+        if (
+            stem is not None
+            and len(numbers) > 1
+            and numbers == list(range(numbers[0], numbers[-1] + 1))
+        ):
             yield f"{stem}{numbers[0]}..{numbers[-1]}"
         else:
             yield from (task for task, _ in members)

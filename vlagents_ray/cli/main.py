@@ -1,4 +1,6 @@
-"""The commands of `vlagents-ray`; each is thin around a folder of the package. Nothing here loads Ray."""
+"""The commands of `vlagents-ray`; each is thin around a folder of the package. Nothing here
+loads Ray.
+"""
 
 from __future__ import annotations
 
@@ -25,7 +27,9 @@ from vlagents_ray.registry import find_entry, names, not_installed, pip_install,
 if TYPE_CHECKING:
     from vlagents_ray.cli.listing import Listed
 
-OneName = Annotated[str | None, typer.Argument(metavar="[NAME]", help="Say all about this one alone.")]
+OneName = Annotated[
+    str | None, typer.Argument(metavar="[NAME]", help="Say all about this one alone.")
+]
 
 app = typer.Typer(
     cls=Commands,
@@ -45,20 +49,30 @@ def _print_version(wanted: bool) -> None:
 @app.callback()
 def commands(
     version: Annotated[
-        bool, typer.Option("--version", is_eager=True, callback=_print_version, help="Print the version.")
+        bool,
+        typer.Option(
+            "--version", is_eager=True, callback=_print_version, help="Print the version."
+        ),
     ] = False,
 ) -> None:
     """Serve Vision-Language-Action models with Ray, and evaluate them in parallel simulation."""
 
 
-env = typer.Typer(no_args_is_help=True, help="Python environments for policies that the server's own does not suit.")
+env = typer.Typer(
+    no_args_is_help=True,
+    help="Python environments for policies that the server's own does not suit.",
+)
 _MORE = "More commands"
 app.command("serve")(serve_command)
-app.command("eval", short_help="Evaluate policies in parallel: success with intervals, videos.")(evaluate_command)
+app.command("eval", short_help="Evaluate policies in parallel: success with intervals, videos.")(
+    evaluate_command
+)
 
 
 @app.command(
-    "robot", add_help_option=False, context_settings={"allow_extra_args": True, "ignore_unknown_options": True}
+    "robot",
+    add_help_option=False,
+    context_settings={"allow_extra_args": True, "ignore_unknown_options": True},
 )
 def robot_command(context: typer.Context) -> None:
     """Drive a robot or a simulation by a policy, an operator, or both."""
@@ -68,35 +82,57 @@ def robot_command(context: typer.Context) -> None:
 
 
 @app.command(short_help="Try it in a minute: serve a policy, evaluate it, record videos.")
-def demo(out_dir: Annotated[Path, typer.Option("--out", help="Folder of the results.")] = Path("runs/demo")) -> None:
+def demo(
+    out_dir: Annotated[Path, typer.Option("--out", help="Folder of the results.")] = Path(
+        "runs/demo"
+    ),
+) -> None:
     """Try it in a minute: serve a policy, evaluate it on the tabletop, record videos.
 
-    In a checkout this is the reference policy, which was trained; elsewhere the scripted one, which needs no weights.
+    In a checkout this is the reference policy, which was trained; elsewhere the scripted one, which
+    needs no weights.
     """
     from vlagents_ray.cli.evaluation import run_evaluation
     from vlagents_ray.evaluate import EvalConfig, PolicyConfig, SuiteConfig
 
     policy = PolicyConfig(name="scripted", source="scripted")
     if (rates := Path("reference/checkpoint/rates.json")).is_file():
-        solved, episodes = map(sum, zip(*json.loads(rates.read_text())["tabletop"].values(), strict=True))
+        solved, episodes = map(
+            sum, zip(*json.loads(rates.read_text())["tabletop"].values(), strict=True)
+        )
         said = (
-            f"solves {100 * solved / episodes:.0f} % of {episodes} such episodes; its card is {rates.parent}/README.md"
+            f"solves {100 * solved / episodes:.0f} % of {episodes} such episodes; its card is "
+            f"{rates.parent}/README.md"
         )
         out.print(f"The policy was learned from demonstrations, and {said}.")
         policy = PolicyConfig(name="reference", source="deployments/reference.yaml")
     tasks = ["tabletop/pick_place", "tabletop/slide", "tabletop/stack", "tabletop/lift"]
-    suite = SuiteConfig(envs=tasks, env_options={"cameras": ["front", "wrist"], "width": 64, "height": 64}, episodes=5)
+    suite = SuiteConfig(
+        envs=tasks,
+        env_options={"cameras": ["front", "wrist"], "width": 64, "height": 64},
+        episodes=5,
+    )
     with errors():
-        run_evaluation(EvalConfig(policies=[policy], suites=[suite], workers=2, video="all", out=fresh(out_dir)))
+        run_evaluation(
+            EvalConfig(
+                policies=[policy], suites=[suite], workers=2, video="all", out=fresh(out_dir)
+            )
+        )
 
 
 @app.command(short_help="Check this machine: Python, Ray, GPU, ports; each with the cure.")
 def doctor(
-    port: Annotated[int, typer.Option(min=1, max=65535, help="The port that a server would take.")] = 8000,
-    python: Annotated[list[Path], typer.Option(help="A policy's Python, repeatable; default: in .venv-*.")] = [],  # noqa: B006
+    port: Annotated[
+        int, typer.Option(min=1, max=65535, help="The port that a server would take.")
+    ] = 8000,
+    python: Annotated[
+        list[Path], typer.Option(help="A policy's Python, repeatable; default: in .venv-*.")
+    ] = [],  # noqa: B006
     as_json: AsJson = False,
 ) -> None:
-    """Check this machine: Python, Ray, GPU, torch, JAX, rendering, shared memory, ports; each with the cure."""
+    """Check this machine: Python, Ray, GPU, torch, JAX, rendering, shared memory, ports; each
+    with the cure.
+    """
     from vlagents_ray.cli.doctor import run
 
     with errors():
@@ -120,7 +156,9 @@ for _commands, _name, _line in (
 
 
 def _add_commands_of_plugins() -> None:
-    """Add the commands of installed plug-ins; one that cannot be imported fails when it is called."""
+    """Add the commands of installed plug-ins; one that cannot be imported fails when it is
+    called.
+    """
     for name in names("commands"):
         if "." in name:  # a subcommand, which `cli.robot` runs
             continue
@@ -149,15 +187,21 @@ def _add_failing(name: str, line: str, message: str) -> None:
         fail(message, 2)
 
     context = {"allow_extra_args": True, "ignore_unknown_options": True}
-    app.command(name, short_help=line, help=message, rich_help_panel=_MORE, context_settings=context)(failing)
+    app.command(
+        name, short_help=line, help=message, rich_help_panel=_MORE, context_settings=context
+    )(failing)
 
 
 _add_commands_of_plugins()
 
 
-@app.command(short_help="List policies and wrappers, and how to install them.", rich_help_panel=_MORE)
+@app.command(
+    short_help="List policies and wrappers, and how to install them.", rich_help_panel=_MORE
+)
 def policies(name: OneName = None, as_json: AsJson = False) -> None:
-    """List policies and wrappers: their models, whether their packages are installed, and installation commands."""
+    """List policies and wrappers: their models, whether their packages are installed, and
+    installation commands.
+    """
     from vlagents_ray.cli.listing import policies_and_wrappers
 
     _list(list(policies_and_wrappers()), name, as_json=as_json)
@@ -172,7 +216,9 @@ def envs(name: OneName = None, as_json: AsJson = False) -> None:
 
 
 def _list(listed: Sequence[Listed], name: str | None, *, as_json: bool) -> None:
-    """Print a listing: a line for each with installation commands, or the full description of one name."""
+    """Print a listing: a line for each with installation commands, or the full description of
+    one name.
+    """
     from vlagents_ray.cli.listing import installing
 
     if not (chosen := [one for one in listed if name in (None, one.name)]):
@@ -200,14 +246,28 @@ def _list(listed: Sequence[Listed], name: str | None, *, as_json: bool) -> None:
 
 @env.command("make")
 def make(
-    requirements: Annotated[Path, typer.Argument(help="A family's name, such as lerobot, or a requirements file.")],
-    out_dir: Annotated[Path | None, typer.Option("--out", help="Folder; default: .venv- and that name.")] = None,
-    more: Annotated[list[Path], typer.Option("--with", help="A further requirements file, repeatable.")] = [],  # noqa: B006
-    python: Annotated[str | None, typer.Option(help="Version or interpreter; default: the file's, or this.")] = None,
-    light: Annotated[bool, typer.Option("--light", help="Without Ray, for a child process.")] = False,
-    cuda: Annotated[bool, typer.Option("--cuda", help="CUDA packages also without a GPU: several GB.")] = False,
+    requirements: Annotated[
+        Path, typer.Argument(help="A family's name, such as lerobot, or a requirements file.")
+    ],
+    out_dir: Annotated[
+        Path | None, typer.Option("--out", help="Folder; default: .venv- and that name.")
+    ] = None,
+    more: Annotated[
+        list[Path], typer.Option("--with", help="A further requirements file, repeatable.")
+    ] = [],  # noqa: B006
+    python: Annotated[
+        str | None, typer.Option(help="Version or interpreter; default: the file's, or this.")
+    ] = None,
+    light: Annotated[
+        bool, typer.Option("--light", help="Without Ray, for a child process.")
+    ] = False,
+    cuda: Annotated[
+        bool, typer.Option("--cuda", help="CUDA packages also without a GPU: several GB.")
+    ] = False,
 ) -> None:
-    """Make a virtual environment with this vlagents-ray and a policy's requirements, and print how to use it."""
+    """Make a virtual environment with this vlagents-ray and a policy's requirements, and print
+    how to use it.
+    """
     from vlagents_ray.registry import requirements_file
     from vlagents_ray.serve.python_env.create import make_environment
 
@@ -215,5 +275,7 @@ def make(
     with errors():
         file = requirements_file(requirements.name) if is_name else requirements
         folder = out_dir or Path(f".venv-{file.stem}")
-        made = make_environment(file, folder, more=more, python=python, light=light, cuda=cuda, progress=progress)
+        made = make_environment(
+            file, folder, more=more, python=python, light=light, cuda=cuda, progress=progress
+        )
     out.print(f"ready; in a deployment file, under args:\n\nenvironment:\n  python: {made}")

@@ -1,6 +1,8 @@
-"""Skeletons of a policy, an environment, a dialect and a plug-in, which work at once and pass their own tests.
+"""Skeletons of a policy, an environment, a dialect and a plug-in, which work at once and pass their
+own tests.
 
-`skeletons/KIND/` has their templates, in which `$name` is the module's name and `$title` that of its class.
+`skeletons/KIND/` has their templates, in which `$name` is the module's name and `$title` that of
+its class.
 """
 
 from __future__ import annotations
@@ -23,8 +25,11 @@ from vlagents_ray.cli.console import errors, out
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.registry import names
 
-new = typer.Typer(no_args_is_help=True, help="Write a working skeleton, with its test, into the current folder.")
-# Of each kind, the files that are written, with $name for the name, and their templates in skeletons/KIND.
+new = typer.Typer(
+    no_args_is_help=True, help="Write a working skeleton, with its test, into the current folder."
+)
+# Of each kind, the files that are written, with $name for the name, and their templates in
+# skeletons/KIND.
 _MODULE = {"$name.py": "module.py", "test_$name.py": "test.py", "$name.yaml": "run.yaml"}
 _FILES = {
     "policy": _MODULE,
@@ -43,12 +48,16 @@ _FILES = {
     },
 }
 Kind = Literal["policy", "env", "dialect", "plugin"]
-Name = Annotated[str, typer.Argument(metavar="NAME", help="Name of the module: lower case, such as my_policy.")]
+Name = Annotated[
+    str, typer.Argument(metavar="NAME", help="Name of the module: lower case, such as my_policy.")
+]
 
 
 @new.command()
 def policy(name: Name) -> None:
-    """Write NAME.py, test_NAME.py and NAME.yaml: a new policy, its test, and its deployment file."""
+    """Write NAME.py, test_NAME.py and NAME.yaml: a new policy, its test, and its deployment
+    file.
+    """
     with errors():
         _write(name, "policy")
         command = as_typed("vlagents-ray")
@@ -60,7 +69,9 @@ def policy(name: Name) -> None:
 
 @new.command("env")
 def environment(name: Name) -> None:
-    """Write NAME.py, test_NAME.py and NAME.yaml: a new environment, its test, and a file of runs."""
+    """Write NAME.py, test_NAME.py and NAME.yaml: a new environment, its test, and a file of
+    runs.
+    """
     with errors():
         _write(name, "env")
         _print_steps((f"{as_typed('vlagents-ray')} eval {name}.yaml", "runs ten episodes in it"))
@@ -68,7 +79,9 @@ def environment(name: Name) -> None:
 
 @new.command()
 def dialect(name: Name) -> None:
-    """Write NAME.py, test_NAME.py and NAME.yaml: a new protocol, its test, and a deployment file."""
+    """Write NAME.py, test_NAME.py and NAME.yaml: a new protocol, its test, and a deployment
+    file.
+    """
     with errors():
         _write(name, "dialect")
         _print_steps(
@@ -82,7 +95,9 @@ def dialect(name: Name) -> None:
 
 @new.command()
 def plugin(name: Name, context: typer.Context) -> None:
-    """Write the folder NAME: a package with a policy, a part of the server and a command, and their test."""
+    """Write the folder NAME: a package with a policy, a part of the server and a command, and
+    their test.
+    """
     with errors():
         commands = cast(TyperGroup, context.find_root().command)
         registered = {
@@ -92,7 +107,9 @@ def plugin(name: Name, context: typer.Context) -> None:
         }
         for kind, taken in registered.items():
             if name in taken:
-                raise ConfigError(f"NAME: {name!r} is the name of a {kind} already; choose another one")
+                raise ConfigError(
+                    f"NAME: {name!r} is the name of a {kind} already; choose another one"
+                )
         _write(name, "plugin")
         command, python = as_typed("vlagents-ray"), as_typed("python")
         _print_steps(
@@ -104,7 +121,9 @@ def plugin(name: Name, context: typer.Context) -> None:
 
 
 def render(name: str, kind: Kind) -> dict[Path, str]:
-    """Return the text of each file of a skeleton; the paths are relative to the folder of the user."""
+    """Return the text of each file of a skeleton; the paths are relative to the folder of the
+    user.
+    """
     names = {"name": name, "title": "".join(word.title() for word in name.split("_"))}
     templates = files(__package__ or "") / "skeletons" / kind
     texts = {}
@@ -115,14 +134,23 @@ def render(name: str, kind: Kind) -> dict[Path, str]:
 
 
 def _write(name: str, kind: Kind) -> None:
-    """Write the files into the current folder, or none of them. Raises `ConfigError` for an invalid name."""
+    """Write the files into the current folder, or none of them. Raises `ConfigError` for an
+    invalid name.
+    """
     if not re.fullmatch(r"[a-z][a-z0-9_]*", name) or keyword.iskeyword(name):
-        raise ConfigError(f"NAME: got {name!r}, want the name of a Python module in lower case, such as my_policy")
+        raise ConfigError(
+            f"NAME: got {name!r}, want the name of a Python module in lower case, such as my_policy"
+        )
     texts = render(name, kind)
     if there := [str(path) for path in texts if path.exists()]:
-        raise ConfigError(f"{', '.join(there)}: there already, and nothing was written; choose another NAME")
+        raise ConfigError(
+            f"{', '.join(there)}: there already, and nothing was written; choose another NAME"
+        )
     if importlib.util.find_spec(name) is not None:
-        raise ConfigError(f"NAME: {name!r} is a module that is installed, and yours would hide it; choose another one")
+        raise ConfigError(
+            f"NAME: {name!r} is a module that is installed, and yours would hide it; choose "
+            "another one"
+        )
     created: list[Path] = []  # files and folders, in order
     try:
         for path, text in texts.items():
@@ -146,12 +174,16 @@ def _write(name: str, kind: Kind) -> None:
 
 
 def as_typed(program: str) -> str:
-    """Return a program of this environment as a user types it: its name if the shell finds it, else its path."""
+    """Return a program of this environment as a user types it: its name if the shell finds it,
+    else its path.
+    """
     path = Path(sys.executable).with_name(program)
     on_path = shutil.which(program)
     if on_path is not None and Path(on_path).absolute() == path:
         return program
-    return shlex.quote(str(path.relative_to(Path.cwd()) if path.is_relative_to(Path.cwd()) else path))
+    return shlex.quote(
+        str(path.relative_to(Path.cwd()) if path.is_relative_to(Path.cwd()) else path)
+    )
 
 
 def _print_steps(*steps: tuple[str, str]) -> None:

@@ -22,7 +22,10 @@ from vlagents_ray.yaml_text import load_yaml, read_yaml
 
 YAML_SUFFIXES = (".yaml", ".yml")
 
-Set = Annotated[list[str], typer.Option("--set", metavar="KEY=VALUE", help="A setting of the policy, repeatable.")]
+Set = Annotated[
+    list[str],
+    typer.Option("--set", metavar="KEY=VALUE", help="A setting of the policy, repeatable."),
+]
 Address = Annotated[
     str | None,
     typer.Option(
@@ -33,21 +36,33 @@ Address = Annotated[
 
 AsJson = Annotated[bool, typer.Option("--json", help="As JSON, for programs.")]
 Live = Annotated[
-    bool, typer.Option("--live", help="Serve a page in the browser that fills up as it runs, on 127.0.0.1:8050.")
+    bool,
+    typer.Option(
+        "--live", help="Serve a page in the browser that fills up as it runs, on 127.0.0.1:8050."
+    ),
 ]
 LiveAt = Annotated[
     str | None,
-    typer.Option("--live-at", metavar="HOST:PORT", help="The same there; beyond this machine it needs API keys."),
+    typer.Option(
+        "--live-at",
+        metavar="HOST:PORT",
+        help="The same there; beyond this machine it needs API keys.",
+    ),
 ]
 
 StateDims = Annotated[
-    list[str], typer.Option("--state-dim", metavar="PART=N", help="Numbers in a part, where the policy does not say.")
+    list[str],
+    typer.Option(
+        "--state-dim", metavar="PART=N", help="Numbers in a part, where the policy does not say."
+    ),
 ]
 _MOST_DIMS = 1_000_000  # numbers in a part of the state
 _Options = TypeVar("_Options")
 
 
-def command_of(options: type[_Options]) -> Callable[[Callable[[_Options], None]], Callable[..., None]]:
+def command_of(
+    options: type[_Options],
+) -> Callable[[Callable[[_Options], None]], Callable[..., None]]:
     """Make a command for Typer from a function that takes its options as one object.
 
     Each field of the dataclass `options` is annotated with its `typer.Option` or `typer.Argument`.
@@ -58,7 +73,9 @@ def command_of(options: type[_Options]) -> Callable[[Callable[[_Options], None]]
         made = one.default if one.default_factory is dataclasses.MISSING else one.default_factory()
         default = inspect.Parameter.empty if made is dataclasses.MISSING else made
         kind = inspect.Parameter.KEYWORD_ONLY
-        parameters.append(inspect.Parameter(one.name, kind, default=default, annotation=hints[one.name]))
+        parameters.append(
+            inspect.Parameter(one.name, kind, default=default, annotation=hints[one.name])
+        )
 
     def decorate(command: Callable[[_Options], None]) -> Callable[..., None]:
         @functools.wraps(command)
@@ -85,16 +102,20 @@ class Commands(TyperGroup):
 
 
 def finite(value: float | None) -> float | None:
-    """Return the value of an option, for Typer, whose bounds accept a number that is not one; that is an error here."""
+    """Return the value of an option, for Typer, whose bounds accept a number that is not one;
+    that is an error here.
+    """
     if value is not None and not math.isfinite(value):
         raise typer.BadParameter(f"expected a finite number, got {value}")
     return value
 
 
 def parse_settings(texts: Iterable[str], option: str) -> dict[str, Any]:
-    """Parse `a.b=1` and the like to nested settings; the value is YAML, so `[1, 2]` and `true` work.
+    """Parse `a.b=1` and the like to nested settings; the value is YAML, so `[1, 2]` and `true`
+    work.
 
-    A value that is not YAML, such as `@handle`, is text, unless it begins like a list, a mapping or a quotation.
+    A value that is not YAML, such as `@handle`, is text, unless it begins like a list, a mapping or
+    a quotation.
     """
     settings: dict[str, Any] = {}
     for text in texts:
@@ -106,7 +127,9 @@ def parse_settings(texts: Iterable[str], option: str) -> dict[str, Any]:
         for name in path[:-1]:
             place = place.setdefault(name, {})
             if not isinstance(place, dict):
-                raise ConfigError(f"{option}: {key!r} goes below {name!r}, which has a value already")
+                raise ConfigError(
+                    f"{option}: {key!r} goes below {name!r}, which has a value already"
+                )
         try:
             place[path[-1]] = load_yaml(value)
         except ValueError as error:
@@ -121,7 +144,9 @@ def parse_dims(texts: Iterable[str], option: str) -> dict[str, int]:
     """Parse `PART=N`, the numbers in parts of the state."""
     dims = parse_settings(texts, option)
     if not all(type(number) is int and 1 <= number <= _MOST_DIMS for number in dims.values()):
-        raise ConfigError(f"{option}: expected a whole number from 1 to {_MOST_DIMS} for each part, got {dims}")
+        raise ConfigError(
+            f"{option}: expected a whole number from 1 to {_MOST_DIMS} for each part, got {dims}"
+        )
     return dims
 
 
@@ -131,21 +156,28 @@ def parse_list(text: str) -> list[str]:
 
 
 def parse_time(text: str, option: str) -> float:
-    """Parse seconds since 1970, or a date and time of day (local unless it has a zone), to seconds since 1970."""
+    """Parse seconds since 1970, or a date and time of day (local unless it has a zone), to
+    seconds since 1970.
+    """
     try:
         with contextlib.suppress(ValueError):
             return datetime.datetime.fromtimestamp(float(text)).timestamp()  # within the calendar
         return datetime.datetime.fromisoformat(text).timestamp()
     except (ValueError, OverflowError, OSError) as error:
         raise ConfigError(
-            f"{option}: expected seconds since 1970, or a time such as 2027-01-31T18:30, got {text!r}"
+            f"{option}: expected seconds since 1970, or a time such as 2027-01-31T18:30, got "
+            f"{text!r}"
         ) from error
 
 
 def read_run_file(file: Path, kind: str, keys: str) -> dict[str, Any]:
-    """Read a YAML file of the settings of a run; results go to runs/NAME unless it names a folder."""
+    """Read a YAML file of the settings of a run; results go to runs/NAME unless it names a
+    folder.
+    """
     if file.is_dir():
-        raise ConfigError(f"{kind} {str(file)!r}: expected a file, got a folder; name a .yaml file in it")
+        raise ConfigError(
+            f"{kind} {str(file)!r}: expected a file, got a folder; name a .yaml file in it"
+        )
     if not file.is_file():
         raise ConfigError(f"{kind} {str(file)!r} does not exist")
     document = read_yaml(file)

@@ -37,10 +37,16 @@ _DAEMON = "raylet"
 _OF_SERVE = ("HAProxyManager", "ProxyActor", "ServeController")  # Serve's own actors
 _ACTOR = ":actor_name:"  # begins the line that names the actor of the file
 _TITLES = (_ACTOR, ":task_name:", ":job_id:")
-_LOAD_FAILURES = ("Exception in Replica(", "Failed to update the deployments", "the policy did not load")
+_LOAD_FAILURES = (
+    "Exception in Replica(",
+    "Failed to update the deployments",
+    "the policy did not load",
+)
 _SERVES_LINE = re.compile(r"[A-Z]+ \d{4}-\d\d-\d\d \d\d:")
-_SERVES_INFO = re.compile(r"(INFO|DEBUG) \d{4}-\d\d-\d\d \d\d:")  # begin of each line of Serve's processes
-# Warnings about intended settings of `own_ray`: it is on loopback, has a token and does not handle signals.
+# Begin of each line of Serve's processes.
+_SERVES_INFO = re.compile(r"(INFO|DEBUG) \d{4}-\d\d-\d\d \d\d:")
+# Warnings about intended settings of `own_ray`: it is on loopback, has a token and does not handle
+# signals.
 _MEANT = (
     "won't accept connections from HAProxy on other nodes",
     "Token authentication is enabled",
@@ -56,11 +62,12 @@ def quiet_ray(name: str | None, started: threading.Event | None = None) -> Itera
 
     Args:
         name: The prefix of the log file's name; None keeps no log.
-        started: Set once the server serves. Until then, the traceback of a policy that does not load is kept off the
-            terminal as well, since the command ends with its last line.
+        started: Set once the server serves. Until then, the traceback of a policy that does not
+            load is kept off the terminal as well, since the command ends with its last line.
 
     Yields:
-        The log file, which stays unless it is empty and which this user alone can read; None without one.
+        The log file, which stays unless it is empty and which this user alone can read; None
+        without one.
     """
     file = kept = None
     if name is not None:
@@ -72,7 +79,9 @@ def quiet_ray(name: str | None, started: threading.Event | None = None) -> Itera
     for logger in loggers:
         logger.addFilter(terminal.is_shown)
     ended = threading.Event()
-    follower = threading.Thread(target=_follow, args=(terminal, ended), name="ray-logs", daemon=True)
+    follower = threading.Thread(
+        target=_follow, args=(terminal, ended), name="ray-logs", daemon=True
+    )
     if name is not None:
         follower.start()
     try:
@@ -140,7 +149,9 @@ def _follow(terminal: _Terminal, ended: threading.Event) -> None:
         node = node_of_this_process()
         if node is not None and started_here():
             folder = Path(node.get_logs_dir_path())
-            for path in (one for pattern in _LOG_FILES for one in folder.glob(pattern) if one not in files):
+            for path in (
+                one for pattern in _LOG_FILES for one in folder.glob(pattern) if one not in files
+            ):
                 files[path] = _LogFile(path)
         for file in files.values():
             for line in file.new_lines():
@@ -152,12 +163,15 @@ class _LogFile:
 
     def __init__(self, path: Path) -> None:
         self.actor = "ray"
-        self.process = path.stem.rpartition("-")[2]  # the end of "worker-WORKER-JOB-PID", or "raylet"
+        # The end of "worker-WORKER-JOB-PID", or "raylet".
+        self.process = path.stem.rpartition("-")[2]
         self._path = path
         self._offset = 0
 
     def new_lines(self) -> Iterator[str]:
-        """Yield the complete lines since the last call, without those by which Ray names the process."""
+        """Yield the complete lines since the last call, without those by which Ray names the
+        process.
+        """
         try:
             if self._path.stat().st_size < self._offset:  # rotated
                 self._offset = 0
@@ -180,7 +194,9 @@ def _is_problem(text: str, level: int) -> bool:
 
 @contextlib.contextmanager
 def exit_if_ray_is_lost(cure: str) -> Iterator[RayLoss]:
-    """End the process with status 1 if its Ray is lost within the context, in order if that takes at most 10 s."""
+    """End the process with status 1 if its Ray is lost within the context, in order if that
+    takes at most 10 s.
+    """
     import ray  # noqa: F401 - before the thread does: one that two threads import at once is seen half made
 
     loss = RayLoss(cure)
@@ -213,19 +229,24 @@ class RayLoss:
         self._known = threading.Event()
 
     def wait(self) -> None:
-        """Block until Ray is lost and raise `ClusterLost`; an interrupt has the command end within `_END_S`."""
+        """Block until Ray is lost and raise `ClusterLost`; an interrupt has the command end
+        within `_END_S`.
+        """
         try:
             while not self._known.wait(_LOOK_S):
                 raise_dropped_interrupt()
         except KeyboardInterrupt:
             self.left.set()
-            faulthandler.dump_traceback_later(_END_S, exit=True)  # and prints the stacks of all threads
+            # And prints the stacks of all threads.
+            faulthandler.dump_traceback_later(_END_S, exit=True)
             raise
         if self.error is not None:
             raise self.error
 
     def watch(self) -> None:
-        """Watch Ray until the command ends, and end the process if Ray is lost. Runs on its own thread."""
+        """Watch Ray until the command ends, and end the process if Ray is lost. Runs on its own
+        thread.
+        """
         while self.error is None and not self.left.is_set():
             self._watch_ray()
         if self.error is None:

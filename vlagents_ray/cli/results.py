@@ -23,10 +23,15 @@ def report_command(
     path: Annotated[
         Path | None, typer.Option("--out", help="Default: report.html in FOLDER; of several, here.")
     ] = None,
-    inline: Annotated[bool, typer.Option("--inline", help="With videos in the page, as far as they fit.")] = False,
+    inline: Annotated[
+        bool, typer.Option("--inline", help="With videos in the page, as far as they fit.")
+    ] = False,
     accept_changes: Annotated[
         bool,
-        typer.Option("--accept-changes", help="Compare although files, weights or envs differ; the report says so."),
+        typer.Option(
+            "--accept-changes",
+            help="Compare although files, weights or envs differ; the report says so.",
+        ),
     ] = False,
     as_json: AsJson = False,
     live: Live = False,
@@ -34,7 +39,8 @@ def report_command(
 ) -> None:
     """Write the report: success with intervals, comparisons, latency, failures, and settings.
 
-    With --live it shows the results in FOLDER as another process adds to them, until Ctrl-C, and writes no report.
+    With --live it shows the results in FOLDER as another process adds to them, until Ctrl-C, and
+    writes no report.
     """
     from vlagents_ray.evaluate import Results
     from vlagents_ray.evaluate.artifacts.storage import require_folder_of
@@ -49,7 +55,8 @@ def report_command(
 
             if len(folders) != 1 or path is not None or as_json:
                 raise ConfigError(
-                    "--live shows one folder, and writes nothing: want one FOLDER, no --out and no --json"
+                    "--live shows one folder, and writes nothing: want one FOLDER, no --out and no "
+                    "--json"
                 )
             follow(folders[0], live_address(live_at))
             return
@@ -72,15 +79,24 @@ def _described_formats() -> Iterator[str]:
 
 def export_command(
     folder: Folder,
-    path: Annotated[Path, typer.Option("--out", help="File to write, or a new folder, as the format has it.")],
+    path: Annotated[
+        Path, typer.Option("--out", help="File to write, or a new folder, as the format has it.")
+    ],
     to: Annotated[str, typer.Option(help="; ".join(_described_formats()) + ".")],
-    policy: Annotated[str | None, typer.Option(help="Only this one: NAME, or NAME@STEP in a sweep.")] = None,
+    policy: Annotated[
+        str | None, typer.Option(help="Only this one: NAME, or NAME@STEP in a sweep.")
+    ] = None,
     env: Annotated[str | None, typer.Option(help="Only this one.")] = None,
     settings: Annotated[
-        list[str], typer.Option("--set", metavar="KEY=VALUE", help="A setting of the format, such as successes=true.")
+        list[str],
+        typer.Option(
+            "--set", metavar="KEY=VALUE", help="A setting of the format, such as successes=true."
+        ),
     ] = [],  # noqa: B006 - typer reads it
 ) -> None:
-    """Write the episodes of an evaluation in a format for other programs, such as CSV or a LeRobotDataset."""
+    """Write the episodes of an evaluation in a format for other programs, such as CSV or a
+    LeRobotDataset.
+    """
     from vlagents_ray.evaluate import Results
     from vlagents_ray.evaluate.artifacts.storage import storing
 
@@ -93,7 +109,9 @@ def export_command(
     out.print(f"wrote {number} episodes to {path}")
 
 
-def settings_of_export(name: str, export: Callable[..., int], texts: Sequence[str]) -> dict[str, Any]:
+def settings_of_export(
+    name: str, export: Callable[..., int], texts: Sequence[str]
+) -> dict[str, Any]:
     """Parse the settings of a format, which are the keyword-only parameters of its function.
 
     Raises:
@@ -110,7 +128,9 @@ def settings_of_export(name: str, export: Callable[..., int], texts: Sequence[st
     try:
         read = model.model_validate(parse_settings(texts, "--set"))
     except ValidationError as error:
-        raise ConfigError(f"--set, for --to {name}: {wrong_settings(error, model, '--set')}") from error
+        raise ConfigError(
+            f"--set, for --to {name}: {wrong_settings(error, model, '--set')}"
+        ) from error
     return {field: getattr(read, field) for field in read.model_fields_set}
 
 
@@ -119,8 +139,12 @@ def replay_command(
     episode: Annotated[
         str | None, typer.Argument(help="Its key, or ENV#NUMBER: 'tabletop#3'.", show_default=False)
     ] = None,
-    policy: Annotated[str | None, typer.Option(help="Name, deployment file, or URL; default: the run's own.")] = None,
-    out_dir: Annotated[Path | None, typer.Option("--out", help="Folder of the replay; default: a new one.")] = None,
+    policy: Annotated[
+        str | None, typer.Option(help="Name, deployment file, or URL; default: the run's own.")
+    ] = None,
+    out_dir: Annotated[
+        Path | None, typer.Option("--out", help="Folder of the replay; default: a new one.")
+    ] = None,
     address: Address = None,
 ) -> None:
     """Play an episode of an evaluation again, and compare: exit code 0 if all is the same."""
@@ -131,7 +155,9 @@ def replay_command(
 
         recorded = find(Results.load(folder), episode)
         other: dict[str, Any] | None = (
-            None if policy is None else {"source": policy, "url": None, "config": {}, "checkpoint": None}
+            None
+            if policy is None
+            else {"source": policy, "url": None, "config": {}, "checkpoint": None}
         )
         into = out_dir or fresh(folder / "replays" / "replay")
         summary = play_one(recorded.config(into, policy=other), address, recorded.number_and_seed)
@@ -141,8 +167,10 @@ def replay_command(
         same = f"the same: {steps} actions byte for byte, and what came of them"
         if difference is not None:
             same = (
-                f"the same up to rounding: {steps} actions, and what came of them; the first to differ is that of step "
-                f"{difference.step}, by {difference.at_first:.2g}, as in batches of another size, later ones differ by "
+                f"the same up to rounding: {steps} actions, and what came of them; the first to "
+                "differ is that of step "
+                f"{difference.step}, by {difference.at_first:.2g}, as in batches of another size, "
+                "later ones differ by "
                 f"at most {difference.largest:.2g}"
             )
         for line in [*(found or [same]), f"replay: {into}"]:

@@ -1,11 +1,14 @@
-"""Drive a robot, with the light install: a served policy in the control loop, and a report at its end.
+"""Drive a robot, with the light install: a served policy in the control loop, and a report at its
+end.
 
-With --env a simulation is driven: by a policy, by an operator, or by a policy that an operator corrects.
+With --env a simulation is driven: by a policy, by an operator, or by a policy that an operator
+corrects.
 
-The server's API key is read from the variable VLAGENTS_RAY_API_KEY, and the file of your own CA from
-SSL_CERT_FILE.
+The server's API key is read from the variable VLAGENTS_RAY_API_KEY, and the file of your own CA
+from SSL_CERT_FILE.
 
-Exit status: 0 if every tick had an action of the policy, 1 if not, 3 if fewer than half had, 2 if it could not run.
+Exit status: 0 if every tick had an action of the policy, 1 if not, 3 if fewer than half had, 2 if
+it could not run.
 """
 
 from __future__ import annotations
@@ -52,18 +55,27 @@ from vlagents_ray.viewers import open_viewer
 
 logger = logging.getLogger(__name__)
 MOSTLY_SAFE = 3  # exit status
-WAIT_S = 1.0  # deadline of a tick in the modes that wait for an answer; half of the default of --silent-s
+# Deadline of a tick in the modes that wait for an answer; half of the default of --silent-s.
+WAIT_S = 1.0
 _HZ = 50.0  # of a robot
 _MOST_HZ = 10_000.0  # no arm and no loop in Python is faster
 _LABELS = {"y": "success", "n": "failure"}
 KEYS = (
-    "keys: p pauses and continues; y (success), n (failure), x (discard) and q end the run and stop the robot; "
+    "keys: p pauses and continues; y (success), n (failure), x (discard) and q end the run and "
+    "stop the robot; "
     "c or Enter restarts it after a stop"
 )
-# Of options that other programs have. An option with a key would be readable in the list of processes.
+# Of options that other programs have. An option with a key would be readable in the list of
+# processes.
 _OF_KEYS = "the API key is read from a variable: export VLAGENTS_RAY_API_KEY=vlr_..."
 _OF_CAS = "the file of your CA is read from a variable: export SSL_CERT_FILE=ca.pem"
-_CURES = {"--api-key": _OF_KEYS, "--key": _OF_KEYS, "--ca": _OF_CAS, "--cacert": _OF_CAS, "--tls-ca": _OF_CAS}
+_CURES = {
+    "--api-key": _OF_KEYS,
+    "--key": _OF_KEYS,
+    "--ca": _OF_CAS,
+    "--cacert": _OF_CAS,
+    "--tls-ca": _OF_CAS,
+}
 RESTART_KEYS = "c\n"  # without Enter while the keyboard moves the robot
 _HEADER = ("", "ticks", "missed", "within 2 ms", "p50 ms", "p99 ms", "max ms")
 
@@ -93,7 +105,9 @@ def main(arguments: Sequence[str]) -> int:
 
 
 def _run_subcommand(name: str, arguments: Sequence[str]) -> int:
-    """Run a subcommand that a plug-in registers, such as "robot.check", and return its exit status."""
+    """Run a subcommand that a plug-in registers, such as "robot.check", and return its exit
+    status.
+    """
     try:
         run: Callable[[Sequence[str]], int] = registered_function("commands", name)
     except VLAgentsError as error:
@@ -115,17 +129,24 @@ def parse(arguments: Sequence[str]) -> argparse.Namespace:
     if not in_env and options.policy is None:
         parser.error("got neither a URL nor --env, want one of them")
     if options.robot_set and options.robot is None:
-        parser.error("got --robot-set without --robot; name the robot with --robot NAME:ARGUMENT or MODULE:CLASS")
+        parser.error(
+            "got --robot-set without --robot; name the robot with --robot NAME:ARGUMENT or "
+            "MODULE:CLASS"
+        )
     if options.mode is None:
         options.mode = "open_loop" if in_env else "async"
     if options.mode != "async" and (options.merge != "newest" or options.rtc):
-        parser.error(f"--merge and --rtc: got one of them with --mode {options.mode}, want --mode async")
+        parser.error(
+            f"--merge and --rtc: got one of them with --mode {options.mode}, want --mode async"
+        )
     return options
 
 
 @contextlib.contextmanager
 def _ended_by_signals() -> Iterator[None]:
-    """End the loop at SIGTERM (systemd), SIGHUP (a closed terminal) and Ctrl-C, which stops the robot."""
+    """End the loop at SIGTERM (systemd), SIGHUP (a closed terminal) and Ctrl-C, which stops the
+    robot.
+    """
 
     def end(number: int, _: object) -> None:
         signal.signal(number, signal.SIG_IGN)  # a second signal would interrupt the stop
@@ -155,7 +176,10 @@ def _run(options: argparse.Namespace) -> LoopReport:
     with contextlib.ExitStack() as stack:
         commands = CommandInbox() if options.operate else None
         agent = RemoteAgent(  # the player closes it
-            options.policy, transport=options.transport, timeout_s=options.timeout_s, commands=commands
+            options.policy,
+            transport=options.transport,
+            timeout_s=options.timeout_s,
+            commands=commands,
         )
         agent.initialize()
         contract = agent.contract
@@ -170,13 +194,23 @@ def _run(options: argparse.Namespace) -> LoopReport:
         if options.safe == "auto" and not options.robot and not stated:
             options.safe = "hold"  # the simulated robot uses such actions as absolute targets
         settings = PlayerSettings(
-            options.mode, options.execute, merge=options.merge, horizon=options.horizon, safe=options.safe,
-            max_age_s=options.max_age_s, deadline_s=deadline_s, real_time_chunking=options.rtc,
-        )  # fmt: skip
+            options.mode,
+            options.execute,
+            merge=options.merge,
+            horizon=options.horizon,
+            safe=options.safe,
+            max_age_s=options.max_age_s,
+            deadline_s=deadline_s,
+            real_time_chunking=options.rtc,
+        )
         guard = Guard(
-            contract, max_step=options.max_step, measure=measured_state(options.measure), limits=options.limits, hz=hz,
+            contract,
+            max_step=options.max_step,
+            measure=measured_state(options.measure),
+            limits=options.limits,
+            hz=hz,
             soft_start_s=options.soft_start_s,
-        )  # fmt: skip
+        )
         player = stack.enter_context(ChunkPlayer(agent, settings, check=guard, override=leader))
         player.initialize()  # refuses unfit settings before anything is timed or moves
         make_robot = make_robot or partial(SimulatedRobot, contract)
@@ -185,7 +219,9 @@ def _run(options: argparse.Namespace) -> LoopReport:
         fit = _require_fit(options, agent, robot, guard.limits, say)
         recorder = None
         if options.record:
-            recorder = stack.enter_context(Recorder(options.record, hz, interventions=leader is not None))
+            recorder = stack.enter_context(
+                Recorder(options.record, hz, interventions=leader is not None)
+            )
         viewer = None if options.rerun is None else stack.enter_context(open_viewer(options.rerun))
         hangs_s = max(0.2, 5 / hz) + deadline_s
 
@@ -196,13 +232,28 @@ def _run(options: argparse.Namespace) -> LoopReport:
         watchdog = robot_watchdog(robot, stop, {"server": options.silent_s, "loop": hangs_s})
         keys = _RunKeys(recorder, say)
         has_terminal = stack.enter_context(_restarting(watchdog, say, keys.press))
-        say(KEYS if has_terminal else "keys: none, as there is no terminal; SIGTERM ends the run, SIGUSR1 restarts it")
+        say(
+            KEYS
+            if has_terminal
+            else "keys: none, as there is no terminal; SIGTERM ends the run, SIGUSR1 restarts it"
+        )
         try:
             run_loop(
-                robot, player, hz=hz, watchdog=watchdog, recorder=recorder, viewer=viewer, commands=commands,
-                instruction=options.instruction, seconds=options.seconds, restart=options.restart,
-                real_time=options.real_time, fit=fit, until=lambda: keys.over, report=report,
-            )  # fmt: skip
+                robot,
+                player,
+                hz=hz,
+                watchdog=watchdog,
+                recorder=recorder,
+                viewer=viewer,
+                commands=commands,
+                instruction=options.instruction,
+                seconds=options.seconds,
+                restart=options.restart,
+                real_time=options.real_time,
+                fit=fit,
+                until=lambda: keys.over,
+                report=report,
+            )
         except BaseException as error:  # noqa: BLE001 - raised again below, after the report
             ended = error
         if report.outcome:
@@ -211,7 +262,10 @@ def _run(options: argparse.Namespace) -> LoopReport:
             _say_table(report, f"{options.mode}, {agent.transport}", say)
             _say_outcome(report, say, led=leader is not None)
     if recorder is not None:  # closed: everything is written
-        say(f"recorded: {recorder.episodes} episodes in {options.record}, {recorder.dropped} frames dropped")
+        say(
+            f"recorded: {recorder.episodes} episodes in {options.record}, {recorder.dropped} "
+            "frames dropped"
+        )
     if viewer is not None:
         say(viewer.report())
     if ended is not None:
@@ -220,7 +274,9 @@ def _run(options: argparse.Namespace) -> LoopReport:
 
 
 def _require_part(part: str | None, robot: Robot) -> None:
-    """Raise `ConfigError`, before the robot moves, if --measure names a part that its state does not have."""
+    """Raise `ConfigError`, before the robot moves, if --measure names a part that its state does
+    not have.
+    """
     if part is None:
         return
     state = robot.observe().state
@@ -232,15 +288,22 @@ def _require_part(part: str | None, robot: Robot) -> None:
 
 
 def _require_fit(
-    options: argparse.Namespace, agent: Agent, robot: Robot, limits: Limits | None, say: Callable[[str], None]
+    options: argparse.Namespace,
+    agent: Agent,
+    robot: Robot,
+    limits: Limits | None,
+    say: Callable[[str], None],
 ) -> Fit:
-    """Show the first chunk beside the training of the checkpoint and the limits of the arm, and compare them."""
+    """Show the first chunk beside the training of the checkpoint and the limits of the arm, and
+    compare them.
+    """
     trained = None if options.trained_on is None else Trained.read(options.trained_on)
     fit = fit_of(agent, robot, limits, trained=trained, accept=options.accept_misfit)
     is_default = options.robot is None
     if fit.trained == Trained() and not is_default:
         text = (
-            "the policy states no ranges of its training, so this arm's pose and the first chunk are not compared with "
+            "the policy states no ranges of its training, so this arm's pose and the first chunk "
+            "are not compared with "
             "them; --trained-on FILE names them"
         )
         say(text)
@@ -258,17 +321,30 @@ def _require_fit(
 
 def _say_table(report: LoopReport, name: str, say: Callable[[str], None]) -> None:
     jitter = report.jitter
-    numbers = [f"{jitter['ticks']:.0f}", f"{jitter['missed']:.0f}", f"{100 * jitter['on_time']:.2f} %"]
+    numbers = [
+        f"{jitter['ticks']:.0f}",
+        f"{jitter['missed']:.0f}",
+        f"{100 * jitter['on_time']:.2f} %",
+    ]
     times = (f"{jitter[key]:.3f}" for key in ("p50_ms", "p99_ms", "max_ms"))
     for first, *cells in (_HEADER, (name, *numbers, *times)):
         say(f"{first:<20}" + "".join(f"{cell:>13}" for cell in cells))
 
 
 def _say_outcome(report: LoopReport, say: Callable[[str], None], *, led: bool) -> None:
-    say(f"from a tick until its action is applied: p50 {report.work_p50_ms:.2f} ms, p99 {report.work_p99_ms:.2f} ms")
+    say(
+        f"from a tick until its action is applied: p50 {report.work_p50_ms:.2f} ms, p99 "
+        f"{report.work_p99_ms:.2f} ms"
+    )
     if led:
-        say(f"ticks at which an operator moved the robot: {report.interventions}; ticks paused: {report.paused}")
-    say(f"ticks without an action of the policy: {report.safe_ticks} of {report.jitter['ticks']:.0f}")
+        say(
+            f"ticks at which an operator moved the robot: {report.interventions}; ticks paused: "
+            f"{report.paused}"
+        )
+    say(
+        f"ticks without an action of the policy: {report.safe_ticks} of "
+        f"{report.jitter['ticks']:.0f}"
+    )
     causes = {**report.safe, "waiting": report.waiting}
     for cause, ticks in sorted(causes.items(), key=lambda one: -one[1]):
         if ticks:
@@ -283,7 +359,9 @@ def _say_outcome(report: LoopReport, say: Callable[[str], None], *, led: bool) -
 
 
 class _RunKeys:
-    """The operator's keys at the terminal of a run on a robot. A key that ends the run also stops the robot."""
+    """The operator's keys at the terminal of a run on a robot. A key that ends the run also
+    stops the robot.
+    """
 
     def __init__(self, recorder: Recorder | None, say: Callable[[str], None]) -> None:
         self.over = False  # whether the operator ended the run
@@ -312,9 +390,12 @@ class _RunKeys:
 
 @contextlib.contextmanager
 def _restarting(
-    watchdog: Watchdog, say: Callable[[str], None], press: Callable[[str, Control], bool] = lambda *_: False
+    watchdog: Watchdog,
+    say: Callable[[str], None],
+    press: Callable[[str, Control], bool] = lambda *_: False,
 ) -> Iterator[bool]:
-    """Restart motion after a stop or a pause by the operator: Enter or C at the terminal, or SIGUSR1.
+    """Restart motion after a stop or a pause by the operator: Enter or C at the terminal, or
+    SIGUSR1.
 
     Other keys are passed to `press`. Yields whether there is a terminal.
     """
@@ -330,7 +411,10 @@ def _restarting(
             return press(key, watchdog.control)
         stood = watchdog.control.stopped or watchdog.control.reason is not None
         if not restarted():
-            say(f"not restarted: still no signal from the {' and the '.join(watchdog.control.silent)}")
+            say(
+                "not restarted: still no signal from the "
+                f"{' and the '.join(watchdog.control.silent)}"
+            )
         elif stood:
             say("restarted")
         return True
@@ -344,7 +428,9 @@ def _restarting(
 
 
 def _names_of_plugins() -> str:
-    """Return the subcommands, robots and devices of plug-ins as lines, also of those that are not installed."""
+    """Return the subcommands, robots and devices of plug-ins as lines, also of those that are
+    not installed.
+    """
     lines: list[str] = []
     for title, kind, prefix in (
         ("subcommands", "commands", "robot."),
@@ -372,14 +458,17 @@ class _RobotParser(argparse.ArgumentParser):
         return super().format_help()
 
 
-def command_parser() -> tuple[argparse.ArgumentParser, list[argparse.Action], list[argparse.Action]]:
+def command_parser() -> tuple[
+    argparse.ArgumentParser, list[argparse.Action], list[argparse.Action]
+]:
     """Return the parser, the options that are refused with --env, and those that need it."""
     parser = _RobotParser(
         prog="vlagents-ray robot",
         description=__doc__,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.usage = "vlagents-ray robot [http://HOST:PORT] [OPTION ...]"  # else each error lists all options
+    # Else each error lists all options.
+    parser.usage = "vlagents-ray robot [http://HOST:PORT] [OPTION ...]"
     groups = parser.add_argument_group("a robot"), parser.add_argument_group("a simulation")
     of_robot: list[argparse.Action] = []
     of_env: list[argparse.Action] = []
@@ -393,14 +482,40 @@ def command_parser() -> tuple[argparse.ArgumentParser, list[argparse.Action], li
     def simulated(*names: str, **settings: Any) -> None:
         of_env.append(groups[1].add_argument(*names, **settings))
 
-    add("policy", nargs="?", help="URL of its server; with --env also a registered policy, 'module:Class', or nothing")
-    add("--hz", type=number(above=True, most=_MOST_HZ), help=f"control rate (default: {_HZ:g}, or the environment's)")
+    add(
+        "policy",
+        nargs="?",
+        help="URL of its server; with --env also a registered policy, 'module:Class', or nothing",
+    )
+    add(
+        "--hz",
+        type=number(above=True, most=_MOST_HZ),
+        help=f"control rate (default: {_HZ:g}, or the environment's)",
+    )
     real("--seconds", type=seconds, default=60.0, help="how long (%(default)s)")
     real("--instruction", help="the task in words")
-    real("--robot", metavar="ROBOT", help="a name as below, or your MODULE:CLASS; default: a simulated one")
-    real("--robot-set", metavar="KEY=VALUE", action="append", default=[], help="an argument of the robot, repeatable")
-    add("--leader", metavar="LEADER", help="device for taking over: a name as below, or your MODULE:CLASS")
-    add("--step", type=seconds, help="what a key or axis of these adds to a number of the action at a tick")
+    real(
+        "--robot",
+        metavar="ROBOT",
+        help="a name as below, or your MODULE:CLASS; default: a simulated one",
+    )
+    real(
+        "--robot-set",
+        metavar="KEY=VALUE",
+        action="append",
+        default=[],
+        help="an argument of the robot, repeatable",
+    )
+    add(
+        "--leader",
+        metavar="LEADER",
+        help="device for taking over: a name as below, or your MODULE:CLASS",
+    )
+    add(
+        "--step",
+        type=seconds,
+        help="what a key or axis of these adds to a number of the action at a tick",
+    )
     add(
         "--mode",
         **one_of(*get_args(Mode)),
@@ -408,44 +523,115 @@ def command_parser() -> tuple[argparse.ArgumentParser, list[argparse.Action], li
     )
     add("--execute", type=rows, metavar="N", help="rows of a chunk to execute before asking again")
     real("--horizon", type=rows, metavar="N", help="rows of a chunk that may be executed at all")
-    real("--max-age-s", type=seconds, metavar="S", help="largest age of the observation of an executed action")
+    real(
+        "--max-age-s",
+        type=seconds,
+        metavar="S",
+        help="largest age of the observation of an executed action",
+    )
     real(
         "--merge",
         **one_of(*MERGES, ENSEMBLE),
         default="newest",
         help="how overlapping chunks merge (%(default)s)",
     )
-    real("--rtc", action="store_true", help="real-time chunking: send the rest of the plan, and the delay")
-    real("--deadline-ms", type=number(), help=f"wait of a tick for an action (async: 0, else {WAIT_S * 1e3:.0f})")
+    real(
+        "--rtc",
+        action="store_true",
+        help="real-time chunking: send the rest of the plan, and the delay",
+    )
+    real(
+        "--deadline-ms",
+        type=number(),
+        help=f"wait of a tick for an action (async: 0, else {WAIT_S * 1e3:.0f})",
+    )
     real(
         "--safe",
         **one_of("auto", "hold", "zero"),
         default="auto",
         help="at a tick without an action (%(default)s)",
     )
-    add("--max-step", type=number(), help="largest change of a number of the action from one tick to the next")
-    real("--measure", metavar="PART", help="part of the state with the measured pose, for --max-step, e.g. joints")
-    add("--limits", metavar="PATH", help="limits of motion: .yaml, .json, .urdf or dataset; see docs/control_loop.md")
-    add("--soft-start-s", type=number(), default=SOFT_START_S, help="in which these rise from half (%(default)s)")
-    trained = "file with statistics of the training, which arm and first chunk must fit (default: the server's, if any)"
+    add(
+        "--max-step",
+        type=number(),
+        help="largest change of a number of the action from one tick to the next",
+    )
+    real(
+        "--measure",
+        metavar="PART",
+        help="part of the state with the measured pose, for --max-step, e.g. joints",
+    )
+    add(
+        "--limits",
+        metavar="PATH",
+        help="limits of motion: .yaml, .json, .urdf or dataset; see docs/control_loop.md",
+    )
+    add(
+        "--soft-start-s",
+        type=number(),
+        default=SOFT_START_S,
+        help="in which these rise from half (%(default)s)",
+    )
+    trained = (
+        "file with statistics of the training, which arm and first chunk must fit (default: "
+        "the server's, if any)"
+    )
     real("--trained-on", metavar="FILE", help=trained)
-    real("--accept-misfit", action="store_true", help="move although they do not fit; the log shows it")
+    real(
+        "--accept-misfit",
+        action="store_true",
+        help="move although they do not fit; the log shows it",
+    )
     real(
         "--restart",
         **one_of(*get_args(Restart)),
         help="after a stop: by Enter, C or SIGUSR1; if simulated: auto",
     )
-    real("--silent-s", type=seconds, default=2.0, help="stop the robot if the server is silent this long (%(default)s)")
-    real("--timeout-s", type=seconds, default=10.0, help="time after which a request is given up (%(default)s)")
-    real("--transport", **one_of("auto", "shm", "websocket", "http"), default="auto", help="(%(default)s)")
-    add("--record", metavar="DIR", help="record a LeRobotDataset v3.0 there; needs the extra 'record'")
-    add("--rerun", metavar="DIR", help="write a .rrd file there for Rerun, or 'live': show the run in its viewer")
-    real("--operate", action="store_true", help="obey the server's live page: pause, stop, success, failure")
+    real(
+        "--silent-s",
+        type=seconds,
+        default=2.0,
+        help="stop the robot if the server is silent this long (%(default)s)",
+    )
+    real(
+        "--timeout-s",
+        type=seconds,
+        default=10.0,
+        help="time after which a request is given up (%(default)s)",
+    )
+    real(
+        "--transport",
+        **one_of("auto", "shm", "websocket", "http"),
+        default="auto",
+        help="(%(default)s)",
+    )
+    add(
+        "--record",
+        metavar="DIR",
+        help="record a LeRobotDataset v3.0 there; needs the extra 'record'",
+    )
+    add(
+        "--rerun",
+        metavar="DIR",
+        help="write a .rrd file there for Rerun, or 'live': show the run in its viewer",
+    )
+    real(
+        "--operate",
+        action="store_true",
+        help="obey the server's live page: pause, stop, success, failure",
+    )
     real("--real-time", action="store_true", help="ask for SCHED_FIFO in place of a nice value")
-    groups[1].add_argument("--env", metavar="NAME", help="the environment: tabletop, maniskill/PickCube-v1, …")
+    groups[1].add_argument(
+        "--env", metavar="NAME", help="the environment: tabletop, maniskill/PickCube-v1, …"
+    )
     settings: dict[str, Any] = {"action": "append", "metavar": "KEY=VALUE", "default": []}
     simulated("--env-set", **settings, help="an option of the environment: width=256")
     simulated("--set", **settings, help="a setting of the policy, repeatable")
     simulated("--episodes", type=rows, default=10, metavar="N", help="how many (%(default)s)")
-    simulated("--seed", type=number(int), default=0, help="of the first episode; the others count on (%(default)s)")
+    simulated(
+        "--seed",
+        type=number(int),
+        default=0,
+        help="of the first episode; the others count on (%(default)s)",
+    )
     return parser, of_robot, of_env

@@ -26,27 +26,52 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class ServeOptions:
-    source: Annotated[str, typer.Argument(help="A registered policy, 'module:Class', or a deployment file (.yaml).")]
+    source: Annotated[
+        str,
+        typer.Argument(help="A registered policy, 'module:Class', or a deployment file (.yaml)."),
+    ]
     host: Annotated[
-        str | None, typer.Option(help="0.0.0.0, or an address of this machine; default: the file's, or 127.0.0.1.")
+        str | None,
+        typer.Option(
+            help="0.0.0.0, or an address of this machine; default: the file's, or 127.0.0.1."
+        ),
     ] = None
-    port: Annotated[int | None, typer.Option(min=1, max=65535, help="Default: the file's, or 8000.")] = None
+    port: Annotated[
+        int | None, typer.Option(min=1, max=65535, help="Default: the file's, or 8000.")
+    ] = None
     settings: Set = field(default_factory=list)
     serve_set: Annotated[
-        list[str], typer.Option("--serve-set", metavar="KEY=VALUE", help="A setting of the server: batch.max_size=8.")
+        list[str],
+        typer.Option(
+            "--serve-set", metavar="KEY=VALUE", help="A setting of the server: batch.max_size=8."
+        ),
     ] = field(default_factory=list)
     vlagents_port: Annotated[
-        int | None, typer.Option(min=1, max=65535, help="Also accept clients of the package vlagents, at this port.")
+        int | None,
+        typer.Option(
+            min=1, max=65535, help="Also accept clients of the package vlagents, at this port."
+        ),
     ] = None
     address: Address = None
     keys: Annotated[
-        Path | None, typer.Option(help="File of the API keys; default: VLAGENTS_RAY_KEYS_FILE or VLAGENTS_RAY_KEYS.")
+        Path | None,
+        typer.Option(
+            help="File of the API keys; default: VLAGENTS_RAY_KEYS_FILE or VLAGENTS_RAY_KEYS."
+        ),
     ] = None
-    insecure: Annotated[bool, typer.Option("--insecure", help="Accept every client, without keys.")] = False
-    plain_http: Annotated[bool, typer.Option("--plain-http", help="No warning of unencrypted keys.")] = False
-    tls_cert: Annotated[Path | None, typer.Option(help="Certificate in PEM: serve https:// and wss://.")] = None
+    insecure: Annotated[
+        bool, typer.Option("--insecure", help="Accept every client, without keys.")
+    ] = False
+    plain_http: Annotated[
+        bool, typer.Option("--plain-http", help="No warning of unencrypted keys.")
+    ] = False
+    tls_cert: Annotated[
+        Path | None, typer.Option(help="Certificate in PEM: serve https:// and wss://.")
+    ] = None
     tls_key: Annotated[Path | None, typer.Option(help="Its key, in PEM.")] = None
-    tls_client_ca: Annotated[Path | None, typer.Option(help="CA of the certificates of clients, in PEM.")] = None
+    tls_client_ca: Annotated[
+        Path | None, typer.Option(help="CA of the certificates of clients, in PEM.")
+    ] = None
 
     def server_args(self) -> dict[str, Any]:
         """Return the settings below `args` of the deployment that the options state.
@@ -61,7 +86,9 @@ class ServeOptions:
         return {**args, **({"config": config} if config else {})}
 
     def tls(self) -> Tls | None:
-        """Return the certificates that the options name; raises `ConfigError` if one of the two is missing."""
+        """Return the certificates that the options name; raises `ConfigError` if one of the two
+        is missing.
+        """
         from vlagents_ray.serve.launch.haproxy import Tls
 
         if self.tls_cert is None and self.tls_key is None and self.tls_client_ca is None:
@@ -74,7 +101,11 @@ class ServeOptions:
 @command_of(ServeOptions)
 def serve_command(options: ServeOptions) -> None:
     """Serve a policy until Ctrl-C."""
-    from vlagents_ray.serve.launch.deployment_file import read_deployment, with_dialect, with_gateways_at
+    from vlagents_ray.serve.launch.deployment_file import (
+        read_deployment,
+        with_dialect,
+        with_gateways_at,
+    )
     from vlagents_ray.serve.launch.server import running_server
 
     with errors():
@@ -84,7 +115,10 @@ def serve_command(options: ServeOptions) -> None:
             config = with_dialect(config, "vlagents", {"port": options.vlagents_port})
         if address is None:
             require_packages(config)
-        host, port = options.host or config.http_options.host, options.port or config.http_options.port
+        host, port = (
+            options.host or config.http_options.host,
+            options.port or config.http_options.port,
+        )
         access: dict[str, Any] = {
             "keys_file": keys,
             "insecure": insecure,
@@ -97,7 +131,9 @@ def serve_command(options: ServeOptions) -> None:
             running_server(config, host=host, port=port, address=address, **access) as server,
         ):
             started.set()
-            for line in connection_lines(with_gateways_at(config, host), server.apps, host, keys, insecure=insecure):
+            for line in connection_lines(
+                with_gateways_at(config, host), server.apps, host, keys, insecure=insecure
+            ):
                 out.print(line)
             out.print(f"metrics for Prometheus: {', '.join(server.metrics)}")
             if address is None:
@@ -109,9 +145,16 @@ def serve_command(options: ServeOptions) -> None:
 
 
 def connection_lines(
-    config: Deployment, urls: Mapping[str, str], host: str, keys: Path | None = None, *, insecure: bool = False
+    config: Deployment,
+    urls: Mapping[str, str],
+    host: str,
+    keys: Path | None = None,
+    *,
+    insecure: bool = False,
 ) -> Iterator[str]:
-    """Return lines with the URL, policy and page of each application, and addresses for clients of other systems."""
+    """Return lines with the URL, policy and page of each application, and addresses for clients
+    of other systems.
+    """
     from vlagents_ray.registry import registered_class
     from vlagents_ray.serve.config.deployment import ServerArgs
     from vlagents_ray.serve.launch.deployment_file import IMPORT_PATH, own_settings
@@ -141,5 +184,9 @@ def connection_lines(
             places = [one["address"]] if "address" in one else []
             for path in () if places else one["paths"]:  # such as "WS /openpi"
                 method, _, place = path.partition(" ")
-                places.append(f"ws{url.removeprefix('http')}{place}" if method == "WS" else f"{method} {url}{place}")
+                places.append(
+                    f"ws{url.removeprefix('http')}{place}"
+                    if method == "WS"
+                    else f"{method} {url}{place}"
+                )
             yield f"  {name}: {', '.join(places)}"

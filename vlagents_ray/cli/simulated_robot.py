@@ -1,4 +1,6 @@
-"""Episodes of an environment in the control loop of a robot: driven by a policy, an operator, or both."""
+"""Episodes of an environment in the control loop of a robot: driven by a policy, an operator, or
+both.
+"""
 
 from __future__ import annotations
 
@@ -65,7 +67,11 @@ def drive(options: argparse.Namespace) -> int:
             try:
                 run.play(range(options.seed, options.seed + options.episodes))
             except KeyboardInterrupt:
-                kept = "" if run.recorder is None else f"; {run.recorder.episodes} episodes are in {options.record}"
+                kept = (
+                    ""
+                    if run.recorder is None
+                    else f"; {run.recorder.episodes} episodes are in {options.record}"
+                )
                 raise KeyboardInterrupt(f"interrupted{kept}") from None
     except typer.Exit as ended:
         return ended.exit_code
@@ -98,7 +104,13 @@ class RobotRun:
             hz = self.options.hz or env.contract.control_hz or _HZ
             leader = self._leader(env.contract, stack)
             limits, soft_start_s = self.options.limits, self.options.soft_start_s
-            guard = Guard(env.contract, max_step=self.options.max_step, limits=limits, hz=hz, soft_start_s=soft_start_s)
+            guard = Guard(
+                env.contract,
+                max_step=self.options.max_step,
+                limits=limits,
+                hz=hz,
+                soft_start_s=soft_start_s,
+            )
             agent = stack.enter_context(self._agent(env.contract, leader, guard))
             self._control = agent.control
             if self.options.record is not None:
@@ -142,7 +154,10 @@ class RobotRun:
             viewer=self._viewer,
             until=ended,
         )
-        counts = f"{robot.steps} steps, {report.interventions} by the operator; paused for {report.paused} ticks"
+        counts = (
+            f"{robot.steps} steps, {report.interventions} by the operator; paused for "
+            f"{report.paused} ticks"
+        )
         out.print(f"  {label()}: {counts}")
 
     def _leader(self, contract: Contract, stack: contextlib.ExitStack) -> Leader | None:
@@ -173,14 +188,21 @@ class RobotRun:
     def _agent(self, contract: Contract, leader: Leader | None, guard: Guard) -> Agent:
         if self.options.policy is None:
             if leader is None:
-                raise ConfigError("robot: got neither a policy nor --leader, want one of them, or both")
+                raise ConfigError(
+                    "robot: got neither a policy nor --leader, want one of them, or both"
+                )
             return TeleoperatedAgent(leader, contract)
         remote = "://" in self.options.policy
         if remote and self._settings:
             raise ConfigError(
-                f"--set: got {sorted(self._settings)}, but {self.options.policy} has its settings already"
+                f"--set: got {sorted(self._settings)}, but {self.options.policy} has its settings "
+                "already"
             )
-        inner = RemoteAgent(self.options.policy) if remote else build_agent(self.options.policy, self._settings)
+        inner = (
+            RemoteAgent(self.options.policy)
+            if remote
+            else build_agent(self.options.policy, self._settings)
+        )
         policy = EnvPolicy(inner, contract)
         policy.initialize()
         require_match(inner.contract, contract)

@@ -42,11 +42,16 @@ if TYPE_CHECKING:
 
 # no replica has the session; `NotReset` if it could not be resumed in time
 _LOST = (NotReset, UnknownSession)
-# Errors after which another replica may answer; a running replica refuses a reset if it is full, for instance.
-_RETRYABLE = {"reset": (ConnectionLost, NoReplica), "act": (ConnectionLost, PolicyUnavailable, *_LOST)}
+# Errors after which another replica may answer; a running replica refuses a reset if it is full,
+# for instance.
+_RETRYABLE = {
+    "reset": (ConnectionLost, NoReplica),
+    "act": (ConnectionLost, PolicyUnavailable, *_LOST),
+}
 _FIRST_PAUSE_S = 0.02
 _LONGEST_PAUSE_S = 0.5
-# No attempt begins with less time left: a late request would be executed after its caller has given up.
+# No attempt begins with less time left: a late request would be executed after its caller has given
+# up.
 _RESERVE_S, _RESERVE_SHARE = 0.5, 0.25
 
 
@@ -56,7 +61,8 @@ class EpisodeState:
     instruction: str | None
     kwargs: dict[str, Any]
     contract: dict[str, Any] | None
-    recent: deque[Obs] = field(default_factory=lambda: deque(maxlen=0))  # the last observations with an answer
+    # The last observations with an answer.
+    recent: deque[Obs] = field(default_factory=lambda: deque(maxlen=0))
     step: int | None = 0  # the server's count of acts; None if an answer may be lost
 
 
@@ -65,7 +71,8 @@ class ClientSession:
 
     def __init__(self, connection: Connection, rank: RankName) -> None:
         self.id = uuid.uuid4().hex
-        self.episode: EpisodeState | None = None  # None before the first reset and after the end of an episode
+        # None before the first reset and after the end of an episode.
+        self.episode: EpisodeState | None = None
         self.step: int | None = None  # the server's count in its last reply, of any episode
         self.resumed = False  # whether the episode was resumed and no action has reported it yet
         self._connection = connection
@@ -91,7 +98,14 @@ class ClientSession:
         if self.episode is None:
             raise NotReset("act before reset: this agent has no session, or lost it; reset first")
         request_id = self._connection.request_id()
-        return Request("act", obs, session=self.id, rank=self._rank, step=self.episode.step, request_id=request_id)
+        return Request(
+            "act",
+            obs,
+            session=self.id,
+            rank=self._rank,
+            step=self.episode.step,
+            request_id=request_id,
+        )
 
     def begun(self, reply: Reply) -> None:
         """Record the reply that began, resumed or continued the episode."""
@@ -100,13 +114,17 @@ class ClientSession:
             self.episode.step = reply.step
 
     def is_lost(self, reply: Reply) -> bool:
-        """Return whether the session must be resumed; if not, its replica checks that no answer was lost."""
+        """Return whether the session must be resumed; if not, its replica checks that no answer
+        was lost.
+        """
         return isinstance(reply.error, _LOST) or self.episode is None or self.episode.step is None
 
     def begin_again(self, request: Request) -> Request:
-        """Return the reset that resumes the session under a new id; `request` follows it, with that id.
+        """Return the reset that resumes the session under a new id; `request` follows it, with that
+        id.
 
-        With a new id, any later reply to `request` comes from the new session, even if the reply to the reset is late.
+        With a new id, any later reply to `request` comes from the new session, even if the reply to
+        the reset is late.
         """
         if self.episode is None:
             raise NotReset("act before reset; reset first")
@@ -116,19 +134,26 @@ class ClientSession:
 
 
 def call_with_recovery(
-    connection: Connection, sessions: Sequence[ClientSession], requests: Sequence[Request], timeout_s: float
+    connection: Connection,
+    sessions: Sequence[ClientSession],
+    requests: Sequence[Request],
+    timeout_s: float,
 ) -> list[Reply]:
-    """Return the reply to one request of each session, from another replica if the session's replica is gone.
+    """Return the reply to one request of each session, from another replica if the session's
+    replica is gone.
 
-    Retries until `timeout_s` is over; then the reply holds the last error, or `DeadlineExceeded` for a session that is
-    not resumed yet. The first action after an episode was resumed has `info["resumed"]`.
+    Retries until `timeout_s` is over; then the reply holds the last error, or `DeadlineExceeded`
+    for a session that is not resumed yet. The first action after an episode was resumed has
+    `info["resumed"]`.
     """
     deadline = time.monotonic() + timeout_s
     last_attempt = deadline - min(_RESERVE_S, _RESERVE_SHARE * timeout_s)
     replies = connection.call(requests, timeout_s)
     lost: set[int] = set()  # sessions whose state no replica has
     pause_s = 0.0
-    while gone := [i for i, reply in enumerate(replies) if isinstance(reply.error, _RETRYABLE[requests[i].op])]:
+    while gone := [
+        i for i, reply in enumerate(replies) if isinstance(reply.error, _RETRYABLE[requests[i].op])
+    ]:
         if time.monotonic() + pause_s >= last_attempt:
             break
         time.sleep(pause_s)
@@ -136,7 +161,9 @@ def call_with_recovery(
         lost |= {i for i in gone if requests[i].op == "act" and sessions[i].is_lost(replies[i])}
         if again := [i for i in gone if i in lost]:
             resets = [sessions[i].begin_again(requests[i]) for i in again]
-            for i, reply in zip(again, connection.call(resets, deadline - time.monotonic()), strict=True):
+            for i, reply in zip(
+                again, connection.call(resets, deadline - time.monotonic()), strict=True
+            ):
                 if reply.error is None:
                     sessions[i].begun(reply)
                     requests[i].step = reply.step
@@ -155,7 +182,9 @@ def call_with_recovery(
     for session, request, reply in zip(sessions, requests, replies, strict=True):
         # these errors advise a reset, which is not needed here
         if isinstance(reply.error, _LOST) and request.op == "act":
-            reply.error = DeadlineExceeded(f"the session did not begin again within {timeout_s:g} s; the next act does")
+            reply.error = DeadlineExceeded(
+                f"the session did not begin again within {timeout_s:g} s; the next act does"
+            )
         if session.resumed and reply.act is not None:
             reply.act.info["resumed"], session.resumed = True, False
     return replies
@@ -164,12 +193,13 @@ def call_with_recovery(
 class RemoteAgent(Agent):
     """A policy on a server, as an `Agent`; one object is one session.
 
-    When the replica stops, crashes or has more sessions than others, the session continues on another replica within
-    `timeout_s`. If the old replica still runs, the session moves with all its state. Otherwise the client resumes it
-    with the same instruction and options and sends the last observations (`Contract.history` of them; see
-    `Agent.observe`); `act.info["resumed"]` is then set. If a replica has not answered for 5 s (in one call, or in
-    several that reached their deadlines), the next call uses another replica, if one answers. A session never acts
-    twice on one observation.
+    When the replica stops, crashes or has more sessions than others, the session continues on
+    another replica within `timeout_s`. If the old replica still runs, the session moves with all
+    its state. Otherwise the client resumes it with the same instruction and options and sends the
+    last observations (`Contract.history` of them; see `Agent.observe`); `act.info["resumed"]` is
+    then set. If a replica has not answered for 5 s (in one call, or in several that reached their
+    deadlines), the next call uses another replica, if one answers. A session never acts twice on
+    one observation.
     """
 
     def __init__(
@@ -191,22 +221,30 @@ class RemoteAgent(Agent):
 
         Args:
             url: `http(s)://HOST:PORT[/APP]`, `ws(s)://…` or, inside a Ray cluster, `serve://APP`.
-            transport: "auto" selects the fastest available: shared memory to a server of the same user on this machine,
-                else a WebSocket; inside the cluster a plasma channel to a replica on this node, else a Serve handle.
-                The others force one. `agent.transport` names it, once connected.
-            timeout_s: Time limit of a `reset` or `act`; an observation's `info["deadline_ms"]` shortens it for its
-                `act`. 2 to 5 s suit a robot, since a call to a hung replica lasts until this limit.
-            connect_timeout_s: How long to wait for a server that cannot be reached or is still loading, by default
-                `timeout_s`; after 2 s, a warning is logged.
-            codec: The encoding of images for a network: "auto" is JPEG, which changes the pixels a little, and
-                "exact" is PNG; to a server on this machine, both leave the pixels raw. "raw", which is faster from
-                300 MB/s (2.4 Gbit/s) on, "lossless" (PNG), "jpeg" or an `ImageCodec` force one.
+            transport: "auto" selects the fastest available: shared memory to a server of the same
+                user on this machine, else a WebSocket; inside the cluster a plasma channel to a
+                replica on this node, else a Serve handle. The others force one. `agent.transport`
+                names it, once connected.
+            timeout_s: Time limit of a `reset` or `act`; an observation's `info["deadline_ms"]`
+                shortens it for its `act`. 2 to 5 s suit a robot, since a call to a hung replica
+                lasts until this limit.
+            connect_timeout_s: How long to wait for a server that cannot be reached or is still
+                loading, by default `timeout_s`; after 2 s, a warning is logged.
+            codec: The encoding of images for a network: "auto" is JPEG, which changes the pixels a
+                little, and "exact" is PNG; to a server on this machine, both leave the pixels raw.
+                "raw", which is faster from 300 MB/s (2.4 Gbit/s) on, "lossless" (PNG), "jpeg" or an
+                `ImageCodec` force one.
             rank: The class of the requests: a "robot" has priority over a "simulation".
-            resume: If False, the loss of a session raises `ConnectionLost`, and the episode needs a new `reset`.
-            api_key: The API key, for a server that requires one; by default the value of `VLAGENTS_RAY_API_KEY`.
-            ca: With `https://`, `wss://`: PEM file of the server's authorities; by default the system's.
-            certificate: The PEM files of this client's certificate and its key, for a server that requires one.
-            commands: Receives the commands from the live page to this agent's session; by default they are ignored.
+            resume: If False, the loss of a session raises `ConnectionLost`, and the episode needs a
+                new `reset`.
+            api_key: The API key, for a server that requires one; by default the value of
+                `VLAGENTS_RAY_API_KEY`.
+            ca: With `https://`, `wss://`: PEM file of the server's authorities; by default the
+                system's.
+            certificate: The PEM files of this client's certificate and its key, for a server that
+                requires one.
+            commands: Receives the commands from the live page to this agent's session; by default
+                they are ignored.
 
         Raises:
             ConfigError: The URL has none of these forms, or does not fit the transport.
@@ -217,7 +255,12 @@ class RemoteAgent(Agent):
         self.credentials = Credentials(api_key, ca, certificate)
         new_transport = partial(select_transport, url, transport, choice, self.credentials)
         connection = Connection(
-            url, new_transport, choice, timeout_s, connect_timeout_s or timeout_s, leaves_silent=resume
+            url,
+            new_transport,
+            choice,
+            timeout_s,
+            connect_timeout_s or timeout_s,
+            leaves_silent=resume,
         )
         self._connection = connection
         self._commands = commands
@@ -227,7 +270,9 @@ class RemoteAgent(Agent):
         self._tracer = tracer()
 
     def sessions(self, n: int) -> list[Self]:
-        """Open `n` more sessions on this agent's connection, for `reset_batch` and `act_batch`; close each of them."""
+        """Open `n` more sessions on this agent's connection, for `reset_batch` and `act_batch`;
+        close each of them.
+        """
         made = [copy.copy(self) for _ in range(n)]
         for agent in made:
             agent._commands, agent._session = None, ClientSession(self._connection, self._rank)
@@ -240,18 +285,24 @@ class RemoteAgent(Agent):
 
     @property
     def session(self) -> str:
-        """The id of the session; it changes after `close`, and when an episode is resumed on another replica."""
+        """The id of the session; it changes after `close`, and when an episode is resumed on
+        another replica.
+        """
         return self._session.id
 
     @property
     def transport(self) -> str:
-        """The transport of the requests: "shm", "plasma", "websocket", "http" or "handle"; "auto" until connected."""
+        """The transport of the requests: "shm", "plasma", "websocket", "http" or "handle";
+        "auto" until connected.
+        """
         return self._connection.transport.name
 
     @property
     def codec(self) -> ImageCodec | None:
         """The codec of the cameras; None until it is chosen when the agent connects."""
-        return RAW if self.transport in ("shm", "plasma", "handle") else self._connection.codec.codec
+        return (
+            RAW if self.transport in ("shm", "plasma", "handle") else self._connection.codec.codec
+        )
 
     @property
     def reconnects(self) -> int:
@@ -271,7 +322,9 @@ class RemoteAgent(Agent):
         return self._connection.contract
 
     def initialize(self) -> None:
-        """Connect, waiting for the server to become ready; raises `PolicyUnavailable` if it does not."""
+        """Connect, waiting for the server to become ready; raises `PolicyUnavailable` if it does
+        not.
+        """
         self._connection.open()
         self.statistics = ((self._connection.metadata or {}).get("weights") or {}).get("statistics")
 
@@ -285,9 +338,10 @@ class RemoteAgent(Agent):
     ) -> dict[str, Any]:
         """Begin an episode; `kwargs` are passed to the policy's `reset`.
 
-        `checkpoint` and `checkpoint_step` are not passed on: they select one of `metadata["checkpoints"]`, which the
-        returned info names. With `contract`, that of the robot or the environment, the server first compares it with
-        the policy's, and raises `ContractMismatch` with every difference.
+        `checkpoint` and `checkpoint_step` are not passed on: they select one of
+        `metadata["checkpoints"]`, which the returned info names. With `contract`, that of the robot
+        or the environment, the server first compares it with the policy's, and raises
+        `ContractMismatch` with every difference.
         """
         [info] = self.reset_batch([obs], [instruction], [self], contract=contract, **kwargs)
         if isinstance(info, Exception):
@@ -315,7 +369,8 @@ class RemoteAgent(Agent):
             kwargs: Options of the policy's `reset`, the same for all sessions.
 
         Returns:
-            The result of `reset` for each session, or its exception, which affects only that session.
+            The result of `reset` for each session, or its exception, which affects only that
+            session.
         """
         siblings = self._siblings(sessions)
         for first in obs:
@@ -323,14 +378,26 @@ class RemoteAgent(Agent):
         self._connection.open()
         stated = contract.to_json() if isinstance(contract, Contract) else contract
         history = (self._connection.contract.history if self._connection.contract else None) or 1
-        options = [kwargs] * len(siblings) if seeds is None else [{**kwargs, "seed": seed} for seed in seeds]
+        options = (
+            [kwargs] * len(siblings)
+            if seeds is None
+            else [{**kwargs, "seed": seed} for seed in seeds]
+        )
         episodes = [
-            EpisodeState(copied(first) if self._resume else first, text, own, stated, deque(maxlen=history - 1))
+            EpisodeState(
+                copied(first) if self._resume else first,
+                text,
+                own,
+                stated,
+                deque(maxlen=history - 1),
+            )
             for first, text, own in zip(obs, instructions, options, strict=True)
         ]
         for session in siblings:
             session.episode = None
-        requests = [session.reset(episode) for session, episode in zip(siblings, episodes, strict=True)]
+        requests = [
+            session.reset(episode) for session, episode in zip(siblings, episodes, strict=True)
+        ]
         replies = self._call(siblings, requests, self._connection.timeout_s)
         infos: list[dict[str, Any] | Exception] = []
         for session, episode, reply in zip(siblings, episodes, replies, strict=True):
@@ -344,10 +411,13 @@ class RemoteAgent(Agent):
     def act(self, obs: Obs) -> Act:
         """Return the next action, (D,) float32, or chunk of actions, (H, D).
 
-        `act.info["timing"]` holds times in milliseconds by stage. The server measures from the last byte of the
-        request: `decode_ms`, `queue_ms`, `inference_ms` (until the device has finished), `encode_ms`, and `total_ms`,
-        which is their sum and the time between them. The client adds `round_trip_ms` and, as the rest of it, `wire_ms`:
-        its own coding, the network, and proxies. `batch_size` is a number of requests, not a time.
+        `act.info["timing"]` holds times in milliseconds by stage. The server measures from the last
+        byte of the
+        request: `decode_ms`, `queue_ms`, `inference_ms` (until the device has finished),
+            `encode_ms`, and `total_ms`,
+        which is their sum and the time between them. The client adds `round_trip_ms` and, as the
+        rest of it, `wire_ms`: its own coding, the network, and proxies. `batch_size` is a number of
+        requests, not a time.
         """
         commands = self._commands
         require_obs(obs)
@@ -359,24 +429,30 @@ class RemoteAgent(Agent):
         return act
 
     def act_batch(self, obs: Sequence[Obs], sessions: Sequence[Agent]) -> list[Act | Exception]:
-        """Return one action for each of several sessions of this connection, with one message in each direction.
+        """Return one action for each of several sessions of this connection, with one message in
+        each direction.
 
             envs = agent.sessions(16)
             agent.reset_batch(observations, ["pick up the cube"] * 16, envs)
             acts = agent.act_batch(observations, envs)
 
-        The server runs them in as few batches as its limit allows. An exception affects only its own session.
+        The server runs them in as few batches as its limit allows. An exception affects only its
+        own session.
         """
         begun = time.perf_counter()
         siblings = self._siblings(sessions)
         if len(obs) != len(siblings):
-            raise ConfigError(f"act_batch: got {len(obs)} observations for {len(siblings)} sessions")
+            raise ConfigError(
+                f"act_batch: got {len(obs)} observations for {len(siblings)} sessions"
+            )
         for one in obs:
             require_obs(one)
         requests = [session.act(one) for session, one in zip(siblings, obs, strict=True)]
         replies = self._call(siblings, requests, min(self._connection.timeout_s, _deadline_s(obs)))
         round_trip_ms = (time.perf_counter() - begun) * 1e3
-        return [self._take(*each, round_trip_ms) for each in zip(siblings, obs, replies, strict=True)]
+        return [
+            self._take(*each, round_trip_ms) for each in zip(siblings, obs, replies, strict=True)
+        ]
 
     @property
     def continues_plans(self) -> bool:
@@ -392,12 +468,21 @@ class RemoteAgent(Agent):
         found: list[ClientSession] = []
         for agent in sessions:
             if not isinstance(agent, RemoteAgent) or agent._connection is not self._connection:
-                raise ConfigError("sessions: want agents made by sessions() of this one, which share its connection")
+                raise ConfigError(
+                    "sessions: want agents made by sessions() of this one, which share its "
+                    "connection"
+                )
             found.append(agent._session)
         return found
 
-    def _call(self, sessions: Sequence[ClientSession], requests: Sequence[Request], timeout_s: float) -> list[Reply]:
-        call = partial(call_with_recovery, self._connection, sessions) if self._resume else self._connection.call
+    def _call(
+        self, sessions: Sequence[ClientSession], requests: Sequence[Request], timeout_s: float
+    ) -> list[Reply]:
+        call = (
+            partial(call_with_recovery, self._connection, sessions)
+            if self._resume
+            else self._connection.call
+        )
         if self._tracer is None:
             return call(requests, timeout_s)
         # Within a span, a child of the caller's if there is one and the parent of the server's.
@@ -405,7 +490,9 @@ class RemoteAgent(Agent):
         context: Any = require("opentelemetry.trace.propagation.tracecontext", extra="otel")
         about = {"server.url": self.url, "transport": self.transport, "requests": len(requests)}
         name = f"vlagents {requests[0].op}"
-        with self._tracer.start_as_current_span(name, kind=trace.SpanKind.CLIENT, attributes=about) as span:
+        with self._tracer.start_as_current_span(
+            name, kind=trace.SpanKind.CLIENT, attributes=about
+        ) as span:
             carrier: dict[str, str] = {}
             context.TraceContextTextMapPropagator().inject(carrier)
             for request in requests:
@@ -417,7 +504,9 @@ class RemoteAgent(Agent):
                 span.set_status(trace.StatusCode.ERROR, f"{failed[0].code}: {failed[0]}")
             return replies
 
-    def _take(self, session: ClientSession, obs: Obs, reply: Reply, round_trip_ms: float) -> Act | Exception:
+    def _take(
+        self, session: ClientSession, obs: Obs, reply: Reply, round_trip_ms: float
+    ) -> Act | Exception:
         episode = session.episode
         if reply.error is not None or reply.act is None or episode is None:
             if isinstance(reply.error, DeadlineExceeded) and episode is not None:
@@ -440,5 +529,7 @@ def _deadline_s(obs: Sequence[Obs]) -> float:
     stated_ms = [one.info[DEADLINE] for one in obs if DEADLINE in one.info]
     for value in stated_ms:
         if not isinstance(value, (int, float)) or not value > 0:
-            raise InvalidObservation(f"info[{DEADLINE!r}]: got {value!r}, want milliseconds above 0")
+            raise InvalidObservation(
+                f"info[{DEADLINE!r}]: got {value!r}, want milliseconds above 0"
+            )
     return min(stated_ms, default=math.inf) / 1e3

@@ -1,4 +1,6 @@
-"""Commands from the live page to a robot, which arrive in the replies to its requests; they can only make it stop."""
+"""Commands from the live page to a robot, which arrive in the replies to its requests; they can
+only make it stop.
+"""
 
 from __future__ import annotations
 
@@ -12,7 +14,8 @@ from vlagents_ray.errors import ConfigError, printable
 from vlagents_ray.interface import Act, Obs
 
 COMMAND = "command"  # the entry of `Act.info` with a command: {"id", "do", "by"}, str each
-COMMANDED = "commanded"  # the entry of `Obs.info` with outcomes by id: why it was refused, or "" if executed
+# The entry of `Obs.info` with outcomes by id: why it was refused, or "" if executed.
+COMMANDED = "commanded"
 COMMANDS = ("pause", "stop", "success", "failure")  # none of them can start a motion
 logger = logging.getLogger(__name__)
 _BY = 80  # characters of a name that are kept
@@ -28,13 +31,17 @@ class Command:
 
 
 class CommandInbox:
-    """The commands for one session, from `RemoteAgent(url, commands=inbox)` to the state of the robot.
+    """The commands for one session, from `RemoteAgent(url, commands=inbox)` to the state of the
+    robot.
 
-    The agent's thread adds commands and collects outcomes; `obey` runs on the thread of the control loop.
+    The agent's thread adds commands and collects outcomes; `obey` runs on the thread of the control
+    loop.
     """
 
     def __init__(self, allow: Collection[str] = COMMANDS) -> None:
-        """Create an inbox; commands that are not in `allow` are refused. Raises `ConfigError` for an unknown one."""
+        """Create an inbox; commands that are not in `allow` are refused. Raises `ConfigError`
+        for an unknown one.
+        """
         if unknown := sorted(set(allow) - set(COMMANDS)):
             raise ConfigError(f"allow: got {unknown}, want some of {list(COMMANDS)}")
         self.control = Control()  # that of the last run
@@ -49,13 +56,17 @@ class CommandInbox:
         return replace(obs, info={**obs.info, COMMANDED: answers}) if answers else obs
 
     def came(self, act: Act | Exception) -> None:
-        """Remove the command from the answer to that request, and queue or refuse it; ignore an invalid entry."""
+        """Remove the command from the answer to that request, and queue or refuse it; ignore an
+        invalid entry.
+        """
         if isinstance(act, Exception):
             return
         for told in self._sent:  # these have reached the server
             self._answers.pop(told, None)
         stated = act.info.pop(COMMAND, None)
-        if not isinstance(stated, dict) or not all(isinstance(stated.get(name), str) for name in ("id", "do")):
+        if not isinstance(stated, dict) or not all(
+            isinstance(stated.get(name), str) for name in ("id", "do")
+        ):
             return
         command = Command(stated["id"], stated["do"], printable(str(stated.get("by", ""))[:_BY]))
         if command.do in self._allow:
@@ -63,7 +74,9 @@ class CommandInbox:
         elif command.do in COMMANDS:
             self._answers[command.id] = f"{command.do}: not allowed here"
         else:
-            self._answers[command.id] = f"{command.do[:_BY]!r}: no such command, want one of {list(COMMANDS)}"
+            self._answers[command.id] = (
+                f"{command.do[:_BY]!r}: no such command, want one of {list(COMMANDS)}"
+            )
 
     @property
     def waiting(self) -> list[Command]:
@@ -71,7 +84,9 @@ class CommandInbox:
         return list(self._waiting)
 
     def obey(self, control: Control) -> list[Command]:
-        """Apply the commands received since the last call to the state of the robot, and return them."""
+        """Apply the commands received since the last call to the state of the robot, and return
+        them.
+        """
         done = []
         while self._waiting:
             command = self._waiting.popleft()

@@ -1,4 +1,6 @@
-"""The connection to a server, shared by all sessions of one `RemoteAgent`, and the server's metadata."""
+"""The connection to a server, shared by all sessions of one `RemoteAgent`, and the server's
+metadata.
+"""
 
 from __future__ import annotations
 
@@ -12,7 +14,14 @@ from typing import TYPE_CHECKING, Any
 from urllib.parse import urlsplit
 
 from vlagents_ray.contract import Contract
-from vlagents_ray.errors import ConfigError, DeadlineExceeded, NoReplica, PolicyUnavailable, UnknownApp, VLAgentsError
+from vlagents_ray.errors import (
+    ConfigError,
+    DeadlineExceeded,
+    NoReplica,
+    PolicyUnavailable,
+    UnknownApp,
+    VLAgentsError,
+)
 from vlagents_ray.interface import OF_THE_LOOP
 from vlagents_ray.protocol.messages import (
     PROTOCOL_VERSION,
@@ -30,17 +39,19 @@ if TYPE_CHECKING:
 logger = logging.getLogger(__name__)
 
 _CLOSE_S = 2.0
-# The deadline sent to the server is shorter by the time of transport: this share of it, at most this many s.
+# The deadline sent to the server is shorter by the time of transport: this share of it, at most
+# this many s.
 _TRANSPORT_SHARE, _TRANSPORT_S = 0.1, 0.2
 _LOOK_UP_S, _LOOK_UP_PAUSE_S = 10.0, 1.0  # s to find another replica, and between two attempts
-SILENT_S = 5.0  # s without any answer, over one or several calls, after which the next call uses another replica
+# S without any answer, over one or several calls, after which the next call uses another replica.
+SILENT_S = 5.0
 
 
 class Connection:
     """Connects on first use, and again after a lost connection or at the replica's request.
 
-    A replica that requests a reconnection still answers, so its connection is used until another replica has answered.
-    Only one thread may use a connection at a time.
+    A replica that requests a reconnection still answers, so its connection is used until another
+    replica has answered. Only one thread may use a connection at a time.
     """
 
     def __init__(
@@ -55,15 +66,18 @@ class Connection:
     ) -> None:
         """Set up the connection, without opening it; each has its own choice by `codec`.
 
-        The time limits are the defaults of a call and of `open`. With `leaves_silent` it switches to another replica
-        when one no longer answers.
+        The time limits are the defaults of a call and of `open`. With `leaves_silent` it switches
+        to another replica when one no longer answers.
         """
         self.url, self._new_transport, self._leaves_silent = url, new_transport, leaves_silent
-        self._silent_since: float | None = None  # time.monotonic(); calls begun since then have no answer
+        # time.monotonic(); calls begun since then have no answer.
+        self._silent_since: float | None = None
         self._silent = False  # whether the silence has lasted for `SILENT_S`
-        # The transport to the silent replica, kept until another one answers, since its sessions may still be moved.
+        # The transport to the silent replica, kept until another one answers, since its sessions
+        # may still be moved.
         self._old_transport: Transport | None = None
-        self._next: _NextTransport | None = None  # to the next replica, while the current one still answers
+        # To the next replica, while the current one still answers.
+        self._next: _NextTransport | None = None
         self._look_up_at = float("-inf")  # time.monotonic(), earliest time of the next look-up
         self.transport = new_transport()
         self.codec, self.timeout_s = codec, timeout_s
@@ -73,7 +87,8 @@ class Connection:
         self._connect_timeout_s = connect_timeout_s
         self.reconnects = 0  # number of reconnections
         self._must_reconnect = False  # connect again before the next request
-        self._asked_to_move = False  # whether the replica keeps the sessions when its connection is closed
+        # Whether the replica keeps the sessions when its connection is closed.
+        self._asked_to_move = False
         self._prefix = uuid.uuid4().hex[:16]
         self._requests = 0
 
@@ -82,7 +97,9 @@ class Connection:
         return f"{self._prefix}-{self._requests:x}"
 
     def open(self, timeout_s: float | None = None) -> None:
-        """Connect, waiting for the server to become ready; raises `PolicyUnavailable` if it does not."""
+        """Connect, waiting for the server to become ready; raises `PolicyUnavailable` if it does
+        not.
+        """
         if self._must_reconnect:
             self._drop_next()
             self.reconnects += 1
@@ -95,14 +112,19 @@ class Connection:
             self.metadata, self._must_reconnect, self._asked_to_move = None, False, False
         if self.metadata is not None:
             return
-        self._connected(self.transport.connect(self._connect_timeout_s if timeout_s is None else timeout_s))
+        self._connected(
+            self.transport.connect(self._connect_timeout_s if timeout_s is None else timeout_s)
+        )
 
     def _connected(self, metadata: dict[str, Any]) -> None:
-        """Store the metadata of the replica to which the transport has connected; close it if they are invalid."""
+        """Store the metadata of the replica to which the transport has connected; close it if
+        they are invalid.
+        """
         try:
             if metadata.get("protocol") != PROTOCOL_VERSION:
                 raise ConfigError(
-                    f"{self.url}: speaks protocol {metadata.get('protocol')}, this client {PROTOCOL_VERSION}; "
+                    f"{self.url}: speaks protocol {metadata.get('protocol')}, this client "
+                    f"{PROTOCOL_VERSION}; "
                     f"upgrade the older of the two"
                 )
             contract = metadata.get("contract")
@@ -112,13 +134,19 @@ class Connection:
             self.transport.close()
             raise
         # A tunnel to another machine also begins at a loopback address.
-        near = local is not None and local.boot_id == boot_id() != "" and is_loopback(urlsplit(self.url).hostname or "")
+        near = (
+            local is not None
+            and local.boot_id == boot_id() != ""
+            and is_loopback(urlsplit(self.url).hostname or "")
+        )
         self.codec.connected(near=near)
         self._silent, self._silent_since = False, None  # even if the transport is unchanged
         self.metadata = metadata
 
     def _move(self) -> None:
-        """Switch to the next transport once it is connected; if it fails, keep the current one and retry later."""
+        """Switch to the next transport once it is connected; if it fails, keep the current one
+        and retry later.
+        """
         if self._next is None or not self._next.ended:
             return
         found, self._next = self._next, None
@@ -138,7 +166,9 @@ class Connection:
             self._next = None
 
     def call(self, requests: Sequence[Request], timeout_s: float) -> list[Reply]:
-        """Send requests in one message and return their replies; a transport error replaces a reply."""
+        """Send requests in one message and return their replies; a transport error replaces a
+        reply.
+        """
         begun = time.monotonic()
         try:
             self._move()
@@ -146,7 +176,9 @@ class Connection:
                 self.open(timeout_s)
                 timeout_s -= time.monotonic() - begun
                 if timeout_s <= 0:  # nothing is sent; the next call uses the new connection
-                    late = DeadlineExceeded(f"{self.url}: connected again, but too late for this call")
+                    late = DeadlineExceeded(
+                        f"{self.url}: connected again, but too late for this call"
+                    )
                     return [Reply(request.request_id, error=late) for request in requests]
             left_s = max(1e-3, timeout_s)
             server_deadline_ms = (left_s - min(_TRANSPORT_SHARE * left_s, _TRANSPORT_S)) * 1e3
@@ -160,23 +192,30 @@ class Connection:
             if isinstance(error, DeadlineExceeded):
                 self._silent_since = begun if self._silent_since is None else self._silent_since
                 self._silent = time.monotonic() - self._silent_since >= SILENT_S
-                self._must_reconnect = self._must_reconnect or (self._silent and self._leaves_silent)
+                self._must_reconnect = self._must_reconnect or (
+                    self._silent and self._leaves_silent
+                )
             replies = [Reply(request.request_id, error=error) for request in requests]
         for reply in replies:
             if reply.act is not None:  # a server must not set keys of the control loop
                 for name in OF_THE_LOOP:
                     reply.act.info.pop(name, None)
-        if len(replies) == len(requests) and not any(reply.error or reply.draining for reply in replies):
+        if len(replies) == len(requests) and not any(
+            reply.error or reply.draining for reply in replies
+        ):
             return replies
         return self._noted(requests, replies)
 
     def _noted(self, requests: Sequence[Request], replies: list[Reply]) -> list[Reply]:
         """Record errors and whether to reconnect; return a reply for each request."""
         for reply in replies:
-            if isinstance(reply.error, UnknownApp):  # the app existed: the server is stopping or restarting
+            # The app existed: the server is stopping or restarting.
+            if isinstance(reply.error, UnknownApp):
                 reply.error = NoReplica(f"{self.url}: the application is gone ({reply.error})")
         if len(replies) != len(requests):  # one reply for the whole frame
-            whole = replies[0].error or PolicyUnavailable(f"got {len(replies)} replies to {len(requests)} requests")
+            whole = replies[0].error or PolicyUnavailable(
+                f"got {len(replies)} replies to {len(requests)} requests"
+            )
             replies = [Reply(request.request_id, error=whole) for request in requests]
         if any(isinstance(reply.error, PolicyUnavailable) for reply in replies):
             self._must_reconnect, self._asked_to_move = True, False
@@ -187,14 +226,23 @@ class Connection:
         return replies
 
     def end_session(self, user: object, session: str) -> None:
-        """End the session of `user`, if it was begun; with the last session, close the connection."""
+        """End the session of `user`, if it was begun; with the last session, close the
+        connection.
+        """
         begun = user in self.users
         self.users.discard(user)
         ended = self.transport.holds_sessions and not self.users  # by closing the connection
-        if begun and self.metadata is not None and (self._asked_to_move or not (ended or self._must_reconnect)):
-            close = Request("close", session=session, request_id=self.request_id(), deadline_ms=_CLOSE_S * 1e3)
+        if (
+            begun
+            and self.metadata is not None
+            and (self._asked_to_move or not (ended or self._must_reconnect))
+        ):
+            close = Request(
+                "close", session=session, request_id=self.request_id(), deadline_ms=_CLOSE_S * 1e3
+            )
             with contextlib.suppress(VLAgentsError):  # harmless: the server drops idle sessions
-                self.transport.call([close], _CLOSE_S)  # on the old connection, which holds the session
+                # On the old connection, which holds the session.
+                self.transport.call([close], _CLOSE_S)
         if not self.users:
             self._drop_next()
             self._close_old_transport()

@@ -1,4 +1,6 @@
-"""The credentials of a client: its API key and, over TLS, its certificate and the authorities that it trusts."""
+"""The credentials of a client: its API key and, over TLS, its certificate and the authorities
+that it trusts.
+"""
 
 from __future__ import annotations
 
@@ -19,7 +21,9 @@ logger = logging.getLogger(__name__)
 
 KEY_VARIABLE = "VLAGENTS_RAY_API_KEY"
 WEBSOCKET_LOG = logging.getLogger("vlagents_ray.client.transports.websocket.protocol")
-"""The logger for websockets, which at DEBUG logs the headers that it sends: drops lines with the key."""
+"""The logger for websockets, which at DEBUG logs the headers that it sends: drops lines with the
+key.
+"""
 WEBSOCKET_LOG.addFilter(lambda record: "authorization" not in str(record.args).lower())
 _Path = str | os.PathLike[str]
 _OTHER_NAMES = (62, 64)  # X509_V_ERR_HOSTNAME_MISMATCH, X509_V_ERR_IP_ADDRESS_MISMATCH
@@ -27,7 +31,9 @@ _OTHER_NAMES = (62, 64)  # X509_V_ERR_HOSTNAME_MISMATCH, X509_V_ERR_IP_ADDRESS_M
 
 @dataclass(frozen=True, slots=True)
 class Credentials:
-    """The credentials of one client: its API key, its certificate and key, and the CA; all files are PEM files."""
+    """The credentials of one client: its API key, its certificate and key, and the CA; all files
+    are PEM files.
+    """
 
     api_key: str | None = field(default=None, repr=False)
     ca: _Path | None = None
@@ -37,7 +43,9 @@ class Credentials:
         """Take the key from the environment if none is given."""
         key = os.environ.get(KEY_VARIABLE) if self.api_key is None else self.api_key
         if key is not None and not (key.isascii() and key.isprintable() and " " not in key):
-            raise ConfigError("api_key: want visible ASCII characters without spaces, as `keys new` printed them")
+            raise ConfigError(
+                "api_key: want visible ASCII characters without spaces, as `keys new` printed them"
+            )
         object.__setattr__(self, "api_key", key or None)
 
     def become_default(self) -> None:
@@ -57,14 +65,17 @@ class Credentials:
             warn_of_plain_http(f"{parts.scheme}://{parts.netloc.rpartition('@')[2]}")
 
     def context(self, url: str) -> ssl.SSLContext | None:
-        """Return the TLS context for a URL, None if it is not encrypted; raises `ConfigError` for an unusable file."""
+        """Return the TLS context for a URL, None if it is not encrypted; raises `ConfigError`
+        for an unusable file.
+        """
         if urlsplit(url).scheme not in ("https", "wss"):
             return None
         try:
             context = ssl.create_default_context(cafile=self.ca)
         except OSError as error:  # ssl.SSLError is a subclass
             raise ConfigError(
-                f"TLS: ca={self.ca!r}: expected a file with the certificate of the CA that signed the server's, in "
+                f"TLS: ca={self.ca!r}: expected a file with the certificate of the CA that signed "
+                "the server's, in "
                 f"PEM (it begins with -----BEGIN CERTIFICATE-----), got {error}"
             ) from error
         try:
@@ -72,7 +83,8 @@ class Credentials:
                 context.load_cert_chain(*self.certificate)
         except OSError as error:
             raise ConfigError(
-                f"TLS: certificate={self.certificate!r}: expected this client's certificate and its private key, two "
+                f"TLS: certificate={self.certificate!r}: expected this client's certificate and "
+                "its private key, two "
                 f"PEM files that belong together, got {error}"
             ) from error
         return context
@@ -83,7 +95,9 @@ ANONYMOUS = Credentials("")
 
 @contextlib.contextmanager
 def withheld() -> Iterator[None]:
-    """Remove the key from the environment within the context, so that processes started in it do not inherit it."""
+    """Remove the key from the environment within the context, so that processes started in it do
+    not inherit it.
+    """
     key = os.environ.pop(KEY_VARIABLE, None)
     try:
         yield
@@ -96,34 +110,55 @@ def withheld() -> Iterator[None]:
 def warn_of_plain_http(origin: str) -> None:
     """Log, once per server, that an API key is sent to it unencrypted over a network."""
     if not is_loopback(urlsplit(origin).hostname or ""):
-        logger.warning("%s: the API key goes there unencrypted, and others may read it; use https:// or wss://", origin)
+        logger.warning(
+            "%s: the API key goes there unencrypted, and others may read it; use https:// or wss://",
+            origin,
+        )
 
 
 def tls_failure(url: str, error: ssl.SSLError) -> VLAgentsError:
-    """Return the error for a failed TLS handshake, with its cure; only a lost connection is worth a retry."""
+    """Return the error for a failed TLS handshake, with its cure; only a lost connection is
+    worth a retry.
+    """
     if isinstance(error, (ssl.SSLEOFError, ssl.SSLZeroReturnError)):
-        return ConnectionLost(f"{url}: the connection ended ({error}); does the server speak TLS at this port?")
+        return ConnectionLost(
+            f"{url}: the connection ended ({error}); does the server speak TLS at this port?"
+        )
     if isinstance(error, ssl.SSLCertVerificationError):
         cure = (
-            "if the server's certificate is signed by a CA of your own, give the file of the CA's certificate, not of "
+            "if the server's certificate is signed by a CA of your own, give the file of the CA's "
+            "certificate, not of "
             "the server's, as ca=, or in SSL_CERT_FILE"
         )
         if error.verify_code in _OTHER_NAMES:
-            cure = "write the URL with a name that the certificate has, or make a certificate with this name"
-        return ConfigError(f"{url}: the server's certificate is not to be trusted: {error.verify_message}; {cure}")
+            cure = (
+                "write the URL with a name that the certificate has, or make a certificate "
+                "with "
+                "this name"
+            )
+        return ConfigError(
+            f"{url}: the server's certificate is not to be trusted: {error.verify_message}; {cure}"
+        )
     if "CERTIFICATE" in (error.reason or "") or "UNKNOWN_CA" in (error.reason or ""):
         return ConfigError(
-            f"{url}: the server refuses this client's certificate, or that it has none ({error.reason}); "
-            f"give certificate=(certificate file, key file), signed by the CA that the server trusts"
+            f"{url}: the server refuses this client's certificate, or that it has none "
+            f"({error.reason}); "
+            "give certificate=(certificate file, key file), signed by the CA that the server "
+            "trusts"
         )
     if error.reason in ("WRONG_VERSION_NUMBER", "RECORD_LAYER_FAILURE", "UNSUPPORTED_PROTOCOL"):
         plain = url.replace("https://", "http://", 1).replace("wss://", "ws://", 1)
-        return ConfigError(f"{url}: got no TLS from this port ({error.reason}); if the server has none, write {plain}")
+        return ConfigError(
+            f"{url}: got no TLS from this port ({error.reason}); if the server has none, write "
+            f"{plain}"
+        )
     return ConfigError(f"{url}: TLS failed ({error}); does the server speak TLS at this port?")
 
 
 def require_plain(url: SplitResult, timeout_s: float) -> None:
-    """Raise `ConfigError` if the URL is not encrypted but its port speaks TLS, whatever the certificate."""
+    """Raise `ConfigError` if the URL is not encrypted but its port speaks TLS, whatever the
+    certificate.
+    """
     if url.scheme not in ("http", "ws"):
         return
     context = ssl.create_default_context()
@@ -132,7 +167,8 @@ def require_plain(url: SplitResult, timeout_s: float) -> None:
         with socket.create_connection((url.hostname, url.port or 80), timeout_s) as connection:
             context.wrap_socket(connection, server_hostname=url.hostname).close()
     except OSError as error:
-        if not isinstance(error, ssl.SSLError) or "ALERT" not in (error.reason or ""):  # an alert is a sign of TLS
+        # An alert is a sign of TLS.
+        if not isinstance(error, ssl.SSLError) or "ALERT" not in (error.reason or ""):
             return
     port = url.netloc.rpartition("@")[2]
     raise ConfigError(f"http://{port}: this port speaks TLS; write https://{port}")

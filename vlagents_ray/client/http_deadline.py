@@ -1,7 +1,7 @@
 """A socket for `http.client` whose exchanges end by a deadline, however slowly the server sends.
 
-The time limit of a plain socket holds for each read: a server that sends a byte now and then would keep its client
-waiting for ever.
+The time limit of a plain socket holds for each read: a server that sends a byte now and then would
+keep its client waiting for ever.
 """
 
 from __future__ import annotations
@@ -17,7 +17,9 @@ from vlagents_ray.protocol.frame_layout import Buffer
 
 
 class DeadlineSocket:
-    """The part of a connected socket that `http.client` uses, with one time limit for all of an exchange."""
+    """The part of a connected socket that `http.client` uses, with one time limit for all of an
+    exchange.
+    """
 
     def __init__(self, sock: socket.socket) -> None:
         self._socket = sock
@@ -31,18 +33,24 @@ class DeadlineSocket:
         return installed
 
     def begin_exchange(self, timeout_s: float) -> None:
-        """Set the time, s, until which the next request must be sent, and its whole answer received."""
+        """Set the time, s, until which the next request must be sent, and its whole answer
+        received.
+        """
         self._deadline = time.monotonic() + timeout_s
 
     def apply_deadline(self) -> None:
-        """Limit the next operation of the socket to the time that is left; raises `TimeoutError` if none is."""
+        """Limit the next operation of the socket to the time that is left; raises `TimeoutError`
+        if none is.
+        """
         left_s = self._deadline - time.monotonic()
         if left_s <= 0:
             raise TimeoutError("timed out")
         self._socket.settimeout(None if math.isinf(left_s) else left_s)
 
     def sendall(self, data: Buffer) -> None:
-        """Send all of it. A TLS socket's own `sendall` would apply the time limit to each record."""
+        """Send all of it. A TLS socket's own `sendall` would apply the time limit to each
+        record.
+        """
         remaining = memoryview(data).cast("B")
         while remaining:
             self.apply_deadline()
@@ -52,7 +60,9 @@ class DeadlineSocket:
         """Return a buffered reader of one answer, for `http.client.HTTPResponse`."""
         if mode != "rb":
             raise ValueError(f"mode: expected 'rb', got {mode!r}")
-        return io.BufferedReader(_AnswerReader(self, cast(io.RawIOBase, self._socket.makefile("rb", buffering=0))))
+        return io.BufferedReader(
+            _AnswerReader(self, cast(io.RawIOBase, self._socket.makefile("rb", buffering=0)))
+        )
 
     def fileno(self) -> int:
         return self._socket.fileno()
@@ -75,5 +85,6 @@ class _AnswerReader(io.RawIOBase):
         return self._raw.readinto(buffer)
 
     def close(self) -> None:
-        self._raw.close()  # `http.client` may have closed the socket already, which stays open until now
+        # `http.client` may have closed the socket already, which stays open until now.
+        self._raw.close()
         super().close()

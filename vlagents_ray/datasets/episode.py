@@ -1,4 +1,6 @@
-"""A running episode, with its videos on disk and its numbers in memory, and the statistics of a complete one."""
+"""A running episode, with its videos on disk and its numbers in memory, and the statistics of a
+complete one.
+"""
 
 from __future__ import annotations
 
@@ -27,9 +29,11 @@ MOMENTS = {  # further columns of each recorded frame
     SAFE_COLUMN: "bool",  # whether the action is a safe one, not the policy's
 }
 WANTED_ACTION, INTERVENTION_COLUMN = "policy_action", "intervention"
-INTERVENTIONS = {  # further columns of a recording with interventions, beside `WANTED_ACTION`, (D,) float32
+# Further columns of a recording with interventions, beside `WANTED_ACTION`, (D,) float32.
+INTERVENTIONS = {
     INTERVENTION_COLUMN: "bool",  # whether the action is an operator's
-    "policy_known": "bool",  # whether the policy's action is known; if not, `WANTED_ACTION` is zeros
+    # Whether the policy's action is known; if not, `WANTED_ACTION` is zeros.
+    "policy_known": "bool",
 }
 # LeRobot's own names for the outcome of an action; `success` is that of the state after it.
 OUTCOMES = {"next.reward": "float32", "next.success": "bool", "next.done": "bool"}
@@ -52,12 +56,14 @@ class FinishedEpisode:
 
     instruction: str
     features: dict[str, Any]  # as in `meta/info.json`
-    rows: dict[str, np.ndarray]  # (N, D) float32, or (N,) of the feature's dtype; of texts, (N,) objects
+    # (N, D) float32, or (N,) of the feature's dtype; of texts, (N,) objects.
+    rows: dict[str, np.ndarray]
     images: dict[str, Stats]  # statistics of the videos' frames
     videos: dict[str, Path]  # MP4 files with at least N frames, of which the first N count
     about: DatasetContract  # the same for each episode of a dataset
     label: Label | None = None
-    folder: Path | None = None  # of the running episode, which is removed with the rest of its files
+    # Of the running episode, which is removed with the rest of its files.
+    folder: Path | None = None
 
 
 @dataclass(slots=True, eq=False)
@@ -87,12 +93,16 @@ class RunningEpisode:
         wanted: np.ndarray | None = None,
         more: Mapping[str, Any] = MappingProxyType({}),
     ) -> None:
-        """Append a frame; raises `InvalidObservation` if cameras or shapes differ from those of the frames before.
+        """Append a frame; raises `InvalidObservation` if cameras or shapes differ from those of the
+        frames before.
 
-        `wanted` is the policy's action, (D,), if another one was executed; None if it is not known. `more` are further
-        columns by name, the same in each frame: a bool, int, float, text, or (D,) float32.
+        `wanted` is the policy's action, (D,), if another one was executed; None if it is not known.
+        `more` are further columns by name, the same in each frame: a bool, int, float, text, or
+        (D,) float32.
         """
-        values, names = state_vector(obs.state, None if obs.gripper is None else np.array(obs.gripper))
+        values, names = state_vector(
+            obs.state, None if obs.gripper is None else np.array(obs.gripper)
+        )
         if not self.rows:
             self._first(obs, names, len(action), more)
         keys = camera_keys(obs.cameras)
@@ -103,7 +113,9 @@ class RunningEpisode:
         for name, shape in ((STATE, values.shape), (ACTION, action.shape)):
             first = tuple(self.features[name]["shape"]) if name in self.features else (0,)
             if shape != first:
-                raise InvalidObservation(f"recording: got {name} of {shape}, want {first} as in the first frame")
+                raise InvalidObservation(
+                    f"recording: got {name} of {shape}, want {first} as in the first frame"
+                )
         for name, image in obs.cameras.items():
             self.videos[keys[name]][1].add(image)
             self.images[keys[name]].add(image)
@@ -118,7 +130,9 @@ class RunningEpisode:
             frame[STATE] = values
         if self.interventions:
             policy = wanted if safe or intervention else action
-            frame[WANTED_ACTION] = np.zeros_like(frame[ACTION]) if policy is None else np.asarray(policy, np.float32)
+            frame[WANTED_ACTION] = (
+                np.zeros_like(frame[ACTION]) if policy is None else np.asarray(policy, np.float32)
+            )
             frame |= {INTERVENTION_COLUMN: intervention, "policy_known": policy is not None}
         for key, value in frame.items():
             self.rows.setdefault(key, []).append(value)
@@ -161,19 +175,29 @@ class RunningEpisode:
             video = Mp4(path, image.shape, self.fps, key_frames=_KEY_FRAMES, lossless=self.lossless)
             self.videos[key], self.images[key] = (path, video), ImageStatistics()
             height, width = video.size
-            features[key] = video_feature(height, width, self.fps, "gbrp" if self.lossless else "yuv420p")
+            features[key] = video_feature(
+                height, width, self.fps, "gbrp" if self.lossless else "yuv420p"
+            )
         if names:
             features[STATE] = vector_feature(names)
         features[ACTION] = vector_feature([f"action_{i}" for i in range(action_dim)])
         if self.interventions:
-            features |= {WANTED_ACTION: features[ACTION]} | number_features(INTERVENTIONS | OUTCOMES)
+            features |= {WANTED_ACTION: features[ACTION]} | number_features(
+                INTERVENTIONS | OUTCOMES
+            )
         features |= number_features(MOMENTS | INDEX)
         for name, value in more.items():
             dtype = "float32" if isinstance(value, np.ndarray) else _DTYPES[type(value)]
             features[name] = {"dtype": dtype, "shape": [np.size(value)], "names": None}
         if self.features and self.features != features:
-            odd = sorted(k for k in self.features.keys() | features.keys() if self.features.get(k) != features.get(k))
-            raise InvalidObservation(f"recording: {odd} differ from the dataset's; record into a new folder")
+            odd = sorted(
+                k
+                for k in self.features.keys() | features.keys()
+                if self.features.get(k) != features.get(k)
+            )
+            raise InvalidObservation(
+                f"recording: {odd} differ from the dataset's; record into a new folder"
+            )
         self.features = features
         parts = parts_of(obs.state, obs.gripper is not None)
         own = [part for part in parts if part != GRIPPER or obs.gripper is None]
@@ -193,9 +217,13 @@ class RunningEpisode:
 def parts_of(state: Iterable[str], gripper: bool) -> list[str]:
     """Return the parts of the proprioception in the order of `observation.state`.
 
-    If an observation has `Obs.gripper`, "gripper" is `Obs.gripper`, and a part of the state of that name is left out.
+    If an observation has `Obs.gripper`, "gripper" is `Obs.gripper`, and a part of the state of that
+    name is left out.
     """
-    return [*sorted(part for part in state if part != GRIPPER or not gripper), *([GRIPPER] if gripper else [])]
+    return [
+        *sorted(part for part in state if part != GRIPPER or not gripper),
+        *([GRIPPER] if gripper else []),
+    ]
 
 
 def camera_keys(names: Iterable[str]) -> dict[str, str]:
@@ -209,9 +237,16 @@ def without_slash(name: str) -> str:
 
 
 def video_feature(height: int, width: int, fps: float, pixels: str = "yuv420p") -> dict[str, Any]:
-    """Describe the feature of a camera whose videos have this size, in pixels, rate, in Hz, and pixel format."""
+    """Describe the feature of a camera whose videos have this size, in pixels, rate, in Hz, and
+    pixel format.
+    """
     size = {"video.height": height, "video.width": width, "video.fps": fps, "video.channels": 3}
-    kind = {"video.codec": "h264", "video.pix_fmt": pixels, "video.is_depth_map": False, "has_audio": False}
+    kind = {
+        "video.codec": "h264",
+        "video.pix_fmt": pixels,
+        "video.is_depth_map": False,
+        "has_audio": False,
+    }
     names = ["height", "width", "channels"]
     return {"dtype": "video", "shape": [height, width, 3], "names": names, "info": size | kind}
 
@@ -235,9 +270,11 @@ def outcome_rows(rewards: np.ndarray, success: np.ndarray) -> dict[str, np.ndarr
 def state_vector(
     parts: Mapping[str, np.ndarray], gripper: np.ndarray | None, order: Iterable[str] | None = None
 ) -> tuple[np.ndarray, list[str]]:
-    """Concatenate the parts of the proprioception, (..., d) each, as LeRobot's policies expect them, in `order`.
+    """Concatenate the parts of the proprioception, (..., d) each, as LeRobot's policies expect
+    them, in `order`.
 
-    `gripper`, (...,), is the opening. Returns the numbers, (..., D) float32, and a name for each of the D.
+    `gripper`, (...,), is the opening. Returns the numbers, (..., D) float32, and a name for each of
+    the D.
     """
     chosen = parts_of(parts, gripper is not None) if order is None else order
     columns: list[np.ndarray] = []
@@ -253,7 +290,8 @@ def state_vector(
     return values.astype(np.float32), names
 
 
-# The statistics of recorded features for LeRobot's normalisation (0.4.4, `lerobot/datasets/compute_stats.py`).
+# The statistics of recorded features for LeRobot's normalisation (0.4.4,
+# `lerobot/datasets/compute_stats.py`).
 
 _QUANTILES = {"q01": 0.01, "q10": 0.1, "q50": 0.5, "q90": 0.9, "q99": 0.99}
 _PIXEL_STRIDE = 4  # in both directions; LeRobot samples pixels as well
@@ -273,7 +311,9 @@ def of_values(values: np.ndarray) -> Stats:
 
 
 class ImageStatistics:
-    """The statistics of one camera in one episode, by channel, of pixels in [0, 1], (3, 1, 1) each."""
+    """The statistics of one camera in one episode, by channel, of pixels in [0, 1], (3, 1, 1)
+    each.
+    """
 
     def __init__(self) -> None:
         self._counts = np.zeros((3, 256), np.int64)
@@ -303,18 +343,25 @@ class ImageStatistics:
             "std": np.sqrt(np.maximum(share @ levels**2 - mean**2, 0)),
             **{name: quantile(q) for name, q in _QUANTILES.items()},
         }
-        return {name: value.reshape(3, 1, 1) for name, value in stats.items()} | {"count": np.array([self._images])}
+        return {name: value.reshape(3, 1, 1) for name, value in stats.items()} | {
+            "count": np.array([self._images])
+        }
 
 
 def joined(a: Mapping[str, Stats], b: Mapping[str, Stats]) -> dict[str, Stats]:
-    """Combine the statistics of two sets of frames; quantiles are averaged by count, as LeRobot does."""
+    """Combine the statistics of two sets of frames; quantiles are averaged by count, as LeRobot
+    does.
+    """
     return {key: _joined(a[key], b[key]) if key in a else b[key] for key in b}
 
 
 def _joined(a: Stats, b: Stats) -> Stats:
     n, m = float(a["count"][0]), float(b["count"][0])
     mean = (n * a["mean"] + m * b["mean"]) / (n + m)
-    variance = (n * (a["std"] ** 2 + (a["mean"] - mean) ** 2) + m * (b["std"] ** 2 + (b["mean"] - mean) ** 2)) / (n + m)
+    variance = (
+        n * (a["std"] ** 2 + (a["mean"] - mean) ** 2)
+        + m * (b["std"] ** 2 + (b["mean"] - mean) ** 2)
+    ) / (n + m)
     return {
         "min": np.minimum(a["min"], b["min"]),
         "max": np.maximum(a["max"], b["max"]),

@@ -1,9 +1,10 @@
 """A LeRobotDataset v3.0 on disk: Parquet and MP4, written one episode at a time.
 
-The layout, names and columns are those of LeRobot 0.4.4 (`lerobot/datasets/utils.py`, `lerobot_dataset.py`). LeRobot
-may put many episodes into a file; here each episode has its own files, so that it is either complete or absent. Files
-are renamed to their names when they are complete, `meta/info.json` last. Files of an episode that `info.json` does not
-count are removed when the dataset is opened again.
+The layout, names and columns are those of LeRobot 0.4.4 (`lerobot/datasets/utils.py`,
+`lerobot_dataset.py`). LeRobot may put many episodes into a file; here each episode has its own
+files, so that it is either complete or absent. Files are renamed to their names when they are
+complete, `meta/info.json` last. Files of an episode that `info.json` does not count are removed
+when the dataset is opened again.
 """
 
 from __future__ import annotations
@@ -34,16 +35,28 @@ from vlagents_ray.registry import require
 
 VERSION = "v3.0"
 FILE = "chunk-{chunk_index:03d}/file-{file_index:03d}"
-DATA, VIDEO, EPISODES = f"data/{FILE}.parquet", f"videos/{{video_key}}/{FILE}.mp4", f"meta/episodes/{FILE}.parquet"
+DATA, VIDEO, EPISODES = (
+    f"data/{FILE}.parquet",
+    f"videos/{{video_key}}/{FILE}.mp4",
+    f"meta/episodes/{FILE}.parquet",
+)
 FILES_IN_CHUNK = 1000
 UNFINISHED = "unfinished"  # folder of the running episodes
 
 
 class Dataset:
-    """A dataset to which episodes are added; opening an existing one continues it with the same columns."""
+    """A dataset to which episodes are added; opening an existing one continues it with the same
+    columns.
+    """
 
     def __init__(
-        self, root: Path, fps: float, *, interventions: bool = False, lossless: bool = False, durable: bool = True
+        self,
+        root: Path,
+        fps: float,
+        *,
+        interventions: bool = False,
+        lossless: bool = False,
+        durable: bool = True,
     ) -> None:
         """Open or begin a dataset of frames at `fps` Hz; `lossless` videos keep each pixel.
 
@@ -81,7 +94,9 @@ class Dataset:
         if (root / "meta/info.json").exists():
             self._open(rate)
         elif root.is_dir() and any(path.name != UNFINISHED for path in root.iterdir()):
-            raise ConfigError(f"{root}: not a LeRobotDataset, and not empty; record into a new folder")
+            raise ConfigError(
+                f"{root}: not a LeRobotDataset, and not empty; record into a new folder"
+            )
         # Remove the files of a running or uncounted episode after a crash.
         shutil.rmtree(root / UNFINISHED, ignore_errors=True)
         stray = FILE.format(**_place(self.episodes))
@@ -103,7 +118,13 @@ class Dataset:
         folder = Path(tempfile.mkdtemp(dir=unfinished))
         meaning = meaning or ActionSpec()
         return RunningEpisode(
-            folder, instruction, self.info["fps"], self.info["features"], self.interventions, self._lossless, meaning
+            folder,
+            instruction,
+            self.info["fps"],
+            self.info["features"],
+            self.interventions,
+            self._lossless,
+            meaning,
         )
 
     def save(self, episode: FinishedEpisode) -> None:
@@ -123,16 +144,27 @@ class Dataset:
         numbers = {key: values for key, values in rows.items() if values.dtype != object}
         stats = {key: of_values(values.reshape(frames, -1)) for key, values in numbers.items()}
         stats |= episode.images
-        about: dict[str, Any] = {"episode_index": number, "tasks": [episode.instruction], "length": frames}
+        about: dict[str, Any] = {
+            "episode_index": number,
+            "tasks": [episode.instruction],
+            "length": frames,
+        }
         if self.interventions:
             about["label"] = episode.label or "none"
         about |= {f"data/{name}": value for name, value in place.items()}
         about |= {"dataset_from_index": first, "dataset_to_index": first + frames}
         for key in episode.videos:
             about |= {f"videos/{key}/{name}": value for name, value in place.items()}
-            about |= {f"videos/{key}/from_timestamp": 0.0, f"videos/{key}/to_timestamp": frames / self.info["fps"]}
+            about |= {
+                f"videos/{key}/from_timestamp": 0.0,
+                f"videos/{key}/to_timestamp": frames / self.info["fps"],
+            }
         about |= {f"meta/episodes/{name}": value for name, value in place.items()}
-        about |= {f"stats/{key}/{name}": v.tolist() for key, one in stats.items() for name, v in one.items()}
+        about |= {
+            f"stats/{key}/{name}": v.tolist()
+            for key, one in stats.items()
+            for name, v in one.items()
+        }
 
         for key, path in episode.videos.items():
             self._move(path, self.root / VIDEO.format(video_key=key, **place))
@@ -140,8 +172,16 @@ class Dataset:
         self._parquet(self._tasks_table(), "meta/tasks.parquet")
         self._parquet(self._pa.Table.from_pylist([about]), EPISODES.format(**place))
         stats = joined(self._stats, stats)
-        total = {"total_episodes": number + 1, "total_frames": first + frames, "total_tasks": len(self.tasks)}
-        info = self.info | total | {"features": episode.features, "splits": {"train": f"0:{number + 1}"}}
+        total = {
+            "total_episodes": number + 1,
+            "total_frames": first + frames,
+            "total_tasks": len(self.tasks),
+        }
+        info = (
+            self.info
+            | total
+            | {"features": episode.features, "splits": {"train": f"0:{number + 1}"}}
+        )
         info[INFO] = episode.about.to_json()
         plain = {key: {name: v.tolist() for name, v in one.items()} for key, one in stats.items()}
         self._json(plain | episode.about.to_statistics(first + frames), "meta/stats.json")
@@ -152,9 +192,17 @@ class Dataset:
 
     def _open(self, fps: float) -> None:
         info = json.loads((self.root / "meta/info.json").read_text())
-        for key, mine in (("codebase_version", VERSION), ("fps", fps), ("data_path", DATA), ("video_path", VIDEO)):
+        for key, mine in (
+            ("codebase_version", VERSION),
+            ("fps", fps),
+            ("data_path", DATA),
+            ("video_path", VIDEO),
+        ):
             if info.get(key) != mine:
-                raise ConfigError(f"{self.root}: has {key} {info.get(key)!r}, want {mine!r}; record into a new folder")
+                raise ConfigError(
+                    f"{self.root}: has {key} {info.get(key)!r}, want {mine!r}; record into a new "
+                    "folder"
+                )
         has = INTERVENTION_COLUMN in info["features"]
         if self.interventions and not has:
             raise ConfigError(
@@ -164,13 +212,19 @@ class Dataset:
         self.info, self.interventions = info, has
         stats = json.loads((self.root / "meta/stats.json").read_text())
         stats.pop(STATISTICS, None)
-        self._stats = {key: {name: np.array(value) for name, value in one.items()} for key, one in stats.items()}
+        self._stats = {
+            key: {name: np.array(value) for name, value in one.items()}
+            for key, one in stats.items()
+        }
         table = self._pq.read_table(self.root / "meta/tasks.parquet")
         self.tasks = table.column("__index_level_0__").to_pylist()[: info["total_tasks"]]
-        if int(self._stats[ACTION]["count"][0]) != info["total_frames"]:  # a crash left an uncounted episode
+        # A crash left an uncounted episode.
+        if int(self._stats[ACTION]["count"][0]) != info["total_frames"]:
             self._stats = {}
             for number in range(self.episodes):
-                [about] = self._pq.read_table(self.root / EPISODES.format(**_place(number))).to_pylist()
+                [about] = self._pq.read_table(
+                    self.root / EPISODES.format(**_place(number))
+                ).to_pylist()
                 found: dict[str, Stats] = {}
                 for column, value in about.items():
                     if column.startswith("stats/"):
@@ -182,29 +236,43 @@ class Dataset:
         pa = self._pa
         columns = {}
         for key, values in rows.items():
-            if features[key]["shape"] == [1]:  # LeRobot reads a single number as a scalar, not as a list
-                columns[key] = pa.array(values.reshape(-1), pa.type_for_alias(features[key]["dtype"]))
+            # LeRobot reads a single number as a scalar, not as a list.
+            if features[key]["shape"] == [1]:
+                columns[key] = pa.array(
+                    values.reshape(-1), pa.type_for_alias(features[key]["dtype"])
+                )
             else:
                 flat = pa.array(np.ascontiguousarray(values, np.float32).ravel())
                 columns[key] = pa.FixedSizeListArray.from_arrays(flat, values.shape[1])
         return pa.table(columns)
 
     def _tasks_table(self) -> Any:
-        """Make the table of tasks in the format that LeRobot reads: that of a pandas frame indexed by task."""
+        """Make the table of tasks in the format that LeRobot reads: that of a pandas frame
+        indexed by task.
+        """
         pa, name = self._pa, "__index_level_0__"
         text: dict[str, Any] = {"pandas_type": "unicode", "numpy_type": "object"}
         columns: list[dict[str, Any]] = [
-            {"name": "task_index", "field_name": "task_index", "pandas_type": "int64", "numpy_type": "int64"},
+            {
+                "name": "task_index",
+                "field_name": "task_index",
+                "pandas_type": "int64",
+                "numpy_type": "int64",
+            },
             {"name": None, "field_name": name, **text},
         ]
         pandas = {
             "index_columns": [name],
-            "column_indexes": [{"name": None, "field_name": None, **text, "metadata": {"encoding": "UTF-8"}}],
+            "column_indexes": [
+                {"name": None, "field_name": None, **text, "metadata": {"encoding": "UTF-8"}}
+            ],
             "columns": [{**column, "metadata": None} for column in columns],
             "creator": {"library": "pyarrow", "version": pa.__version__},
             "pandas_version": "2.2.0",
         }
-        table = pa.table({"task_index": pa.array(range(len(self.tasks)), pa.int64()), name: pa.array(self.tasks)})
+        table = pa.table(
+            {"task_index": pa.array(range(len(self.tasks)), pa.int64()), name: pa.array(self.tasks)}
+        )
         return table.replace_schema_metadata({"pandas": json.dumps(pandas)})
 
     def _parquet(self, table: Any, name: str) -> None:
@@ -223,7 +291,9 @@ class Dataset:
         return folder / name.replace("/", "_")
 
     def _move(self, part: Path, path: Path) -> None:
-        """Rename a complete file, which is on the disk with its new name when this returns, if that is wanted."""
+        """Rename a complete file, which is on the disk with its new name when this returns, if
+        that is wanted.
+        """
         path.parent.mkdir(parents=True, exist_ok=True)
         if self._durable:
             _sync(part)

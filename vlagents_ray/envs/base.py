@@ -37,23 +37,27 @@ class Environment(ABC):
     """The task's step limit; `step` reports `truncated` when it is reached."""
 
     init_states: int | None = None
-    """The number of initial states that the benchmark fixes for the task; None if the seed alone determines the state.
+    """The number of initial states that the benchmark fixes for the task; None if the seed alone
+    determines the state.
 
-    Episode i of an evaluation begins in state i modulo this number, passed to `reset` as `options["init_state"]`.
+    Episode i of an evaluation begins in state i modulo this number, passed to `reset` as
+    `options["init_state"]`.
     """
 
     looked_at: bool = True
-    """Whether the next observation is used; if not, an env may omit its images, which saves rendering them.
+    """Whether the next observation is used; if not, an env may omit its images, which saves
+    rendering them.
 
-    Observations between the rows of a chunk are not used unless videos are made; nor is that of the last step. Only
-    the images may depend on this.
+    Observations between the rows of a chunk are not used unless videos are made; nor is that of the
+    last step. Only the images may depend on this.
     """
 
     several_tasks: bool = False
-    """Whether an episode is a sequence of tasks, as in CALVIN, so that a step may change the instruction.
+    """Whether an episode is a sequence of tasks, as in CALVIN, so that a step may change the
+    instruction.
 
-    An evaluation then resets the policy with the new instruction and with the observation of that step, which has
-    images whatever `looked_at` says. The rest of the chunk is dropped.
+    An evaluation then resets the policy with the new instruction and with the observation of that
+    step, which has images whatever `looked_at` says. The rest of the chunk is dropped.
     """
 
     @property
@@ -62,7 +66,9 @@ class Environment(ABC):
         """The observations (cameras, state, gripper, rate) and the actions of each environment."""
 
     def renderer(self) -> Renderer | None:
-        """The device that renders the images; None before it is made. Here: that of this thread's OpenGL context."""
+        """The device that renders the images; None before it is made. Here: that of this
+        thread's OpenGL context.
+        """
         return opengl_renderer()
 
     def describe(self) -> dict[str, Any]:
@@ -81,10 +87,11 @@ class Environment(ABC):
 
 
 class EvalEnv(Environment):
-    """The interface of an environment, which a worker creates once and resets for each of its episodes.
+    """The interface of an environment, which a worker creates once and resets for each of its
+    episodes.
 
-    An episode is a pure function of its seed and options: two resets with the same ones give the same first
-    observation, in any process and after any other episodes.
+    An episode is a pure function of its seed and options: two resets with the same ones give the
+    same first observation, in any process and after any other episodes.
     """
 
     known: ClassVar[Collection[str]] = ()  # the names of the tasks, for `tasks`
@@ -100,10 +107,12 @@ class EvalEnv(Environment):
 
         Args:
             seed: The seed of the episode.
-            options: The options of the episode, e.g. `init_state` (int); those allowed depend on the env.
+            options: The options of the episode, e.g. `init_state` (int); those allowed depend on
+                the env.
 
         Returns:
-            The first observation, and information about the episode with values that a message can carry.
+            The first observation, and information about the episode with values that a message can
+            carry.
 
         Raises:
             ConfigError: An option is unknown or has a wrong value.
@@ -115,12 +124,14 @@ class EvalEnv(Environment):
         """Execute an action.
 
         Args:
-            act: A single action, (D,) float32, in the units of the contract; its array must not be changed.
+            act: A single action, (D,) float32, in the units of the contract; its array must not be
+                changed.
 
         Returns:
-            `(obs, reward, terminated, truncated, info)`, with the meaning of Gymnasium's `Env.step`. `info["success"]`
-            is a bool: whether the task is solved in this state. An env may continue after success; `terminated` only
-            reports that it cannot continue. `truncated` means that `max_steps` is reached.
+            `(obs, reward, terminated, truncated, info)`, with the meaning of Gymnasium's
+            `Env.step`. `info["success"]` is a bool: whether the task is solved in this state. An
+            env may continue after success; `terminated` only reports that it cannot continue.
+            `truncated` means that `max_steps` is reached.
 
         Raises:
             InvalidAction: The action has a wrong shape or is not finite.
@@ -134,7 +145,8 @@ class EvalEnv(Environment):
 
     @classmethod
     def require_task(cls, task: str | None) -> None:
-        """Raise `UnknownEnv` if the task is not known, if that can be determined without the simulator.
+        """Raise `UnknownEnv` if the task is not known, if that can be determined without the
+        simulator.
 
         Args:
             task: The part of the env's name after the first slash; None if it has none.
@@ -142,7 +154,8 @@ class EvalEnv(Environment):
 
     @classmethod
     def known_contract(cls, arguments: Mapping[str, Any]) -> Contract | None:  # noqa: ARG003 - for those that override it
-        """Return the contract of an environment before it is made; None if it requires the simulator.
+        """Return the contract of an environment before it is made; None if it requires the
+        simulator.
 
         A mismatch with a policy is then an error before anything starts.
 
@@ -173,9 +186,10 @@ class EvalEnv(Environment):
 class BatchEnv(Environment):
     """Several environments of one task, which differ only in their episodes.
 
-    They begin and step together: an environment whose episode is over is idle, and its rows have no meaning, until all
-    episodes are over and `reset` begins the next ones. Row i of every argument and result belongs to environment i. Its
-    episode is a pure function of its seed and options, as in `EvalEnv`, and does not depend on the other environments.
+    They begin and step together: an environment whose episode is over is idle, and its rows have no
+    meaning, until all episodes are over and `reset` begins the next ones. Row i of every argument
+    and result belongs to environment i. Its episode is a pure function of its seed and options, as
+    in `EvalEnv`, and does not depend on the other environments.
 
     The images of a camera in one step are rows of one array, (num_envs, height, width, 3) uint8.
     """
@@ -183,7 +197,8 @@ class BatchEnv(Environment):
     num_envs: int
     """The number of environments."""
 
-    restarts: bool = False  # whether `restart` can begin an episode in one environment while the others continue theirs
+    # Whether `restart` can begin an episode in one environment while the others continue theirs.
+    restarts: bool = False
 
     @property
     @abstractmethod
@@ -191,11 +206,14 @@ class BatchEnv(Environment):
         """The tasks of the current episodes in words; with `several_tasks`, the current tasks."""
 
     @abstractmethod
-    def reset(self, *, seeds: Sequence[int], options: Sequence[Options | None] | None = None) -> list[Obs]:
+    def reset(
+        self, *, seeds: Sequence[int], options: Sequence[Options | None] | None = None
+    ) -> list[Obs]:
         """Begin an episode for each seed.
 
         Args:
-            seeds: The seeds, 1 to `num_envs`; if there are fewer, the remaining environments are idle.
+            seeds: The seeds, 1 to `num_envs`; if there are fewer, the remaining environments are
+                idle.
             options: The options of each episode; None for no options.
 
         Returns:
@@ -216,7 +234,9 @@ class BatchEnv(Environment):
         Raises:
             ConfigError: `restarts` is false.
         """
-        raise ConfigError(f"env {index}: {type(self).__name__} resets its environments together; use `reset`")
+        raise ConfigError(
+            f"env {index}: {type(self).__name__} resets its environments together; use `reset`"
+        )
 
     @abstractmethod
     def step(self, acts: Sequence[Act | None]) -> Steps:
@@ -226,7 +246,8 @@ class BatchEnv(Environment):
             acts: A single action, (D,) float32, for each episode; None for an idle environment.
 
         Returns:
-            `(obs, rewards, terminated, truncated, infos)`, one item for each episode (see `EvalEnv.step`).
+            `(obs, rewards, terminated, truncated, infos)`, one item for each episode (see
+            `EvalEnv.step`).
 
         Raises:
             InvalidAction: An action is not valid; none was executed.
@@ -235,7 +256,8 @@ class BatchEnv(Environment):
 
 
 def make_env(name: str, **options: Any) -> EvalEnv:
-    """Make an environment by its name, e.g. `make_env("maniskill/PushCube-v1", width=224, height=224)`.
+    """Make an environment by its name, e.g. `make_env("maniskill/PushCube-v1", width=224,
+    height=224)`.
 
     Args:
         name: A registered name, with the task after a slash, or "module:Class".
@@ -255,10 +277,14 @@ def make_env(name: str, **options: Any) -> EvalEnv:
 
 
 def env_arguments(name: str, options: Mapping[str, Any]) -> tuple[type[EvalEnv], dict[str, Any]]:
-    """Return the class of the env `name` and its constructor's arguments; raises the errors of `make_env`."""
+    """Return the class of the env `name` and its constructor's arguments; raises the errors of
+    `make_env`.
+    """
     cls = env_class(name)
     if not issubclass(cls, EvalEnv):
-        raise UnknownEnv(f"env {name!r}: is no EvalEnv; an environment of Gymnasium is named gymnasium/MODULE:ID")
+        raise UnknownEnv(
+            f"env {name!r}: is no EvalEnv; an environment of Gymnasium is named gymnasium/MODULE:ID"
+        )
     task = env_task(name)
     arguments = {"task": task, **options} if task is not None else dict(options)
     require_arguments(f"env {name!r}", cls, arguments)
@@ -285,7 +311,9 @@ DELTA_POSE = ActionSpec(
     low=-1.0,
     high=1.0,
 )
-"""A change of the end effector's pose, and the gripper, as in robosuite; others differ in a few fields."""
+"""A change of the end effector's pose, and the gripper, as in robosuite; others differ in a few
+fields.
+"""
 
 
 def require_cameras(env: str, names: Collection[str], have: Collection[str]) -> None:
@@ -302,19 +330,25 @@ def require_known(suite: str, task: str | None, known: Sequence[str], others: st
 
 
 def one_row(act: Act, contract: Contract) -> np.ndarray:
-    """Return the action of a step as (D,) float32; raises `InvalidAction` if it is a chunk or not valid."""
+    """Return the action of a step as (D,) float32; raises `InvalidAction` if it is a chunk or
+    not valid.
+    """
     action = check_action(act.action, contract)
     if action.ndim != 1:
         dim = contract.action.dim
-        raise InvalidAction(f"action: got {action.shape}, want ({dim},); step through a chunk row by row")
+        raise InvalidAction(
+            f"action: got {action.shape}, want ({dim},); step through a chunk row by row"
+        )
     return action
 
 
 def make_batch(name: str, num_envs: int, **options: Any) -> BatchEnv:
-    """Make several environments as `make_env` does, in one simulator if the suite supports that with these options.
+    """Make several environments as `make_env` does, in one simulator if the suite supports that
+    with these options.
 
     Raises:
-        ConfigError: `num_envs` is below 1, or an option is wrong; other errors are those of `make_env`.
+        ConfigError: `num_envs` is below 1, or an option is wrong; other errors are those of
+            `make_env`.
     """
     if num_envs < 1:
         raise ConfigError(f"env {name!r}: num_envs is {num_envs}, want at least 1")
@@ -331,10 +365,12 @@ ERROR = "error"  # in the info of an environment whose step failed, beside other
 
 
 class SequentialBatch(BatchEnv):
-    """Environments that are stepped one after another, while one call of the policy serves all of them.
+    """Environments that are stepped one after another, while one call of the policy serves all of
+    them.
 
-    If the step of one of several environments raises an exception, such as `InvalidAction` for a refused action, it
-    stands as `ERROR` in its info, and the others are stepped: an episode does not depend on those beside it.
+    If the step of one of several environments raises an exception, such as `InvalidAction` for a
+    refused action, it stands as `ERROR` in its info, and the others are stepped: an episode does
+    not depend on those beside it.
     """
 
     restarts = True
@@ -346,7 +382,11 @@ class SequentialBatch(BatchEnv):
         self._playing = 0  # the number of environments, from the first, that have an episode
         self._seen: list[Obs] = []  # the last observation of each environment
         first = self._envs[0]
-        self.num_envs, self.max_steps, self.init_states = len(self._envs), first.max_steps, first.init_states
+        self.num_envs, self.max_steps, self.init_states = (
+            len(self._envs),
+            first.max_steps,
+            first.init_states,
+        )
 
     @property
     def contract(self) -> Contract:
@@ -356,7 +396,9 @@ class SequentialBatch(BatchEnv):
     def instructions(self) -> list[str]:
         return [env.instruction for env in self._envs[: self._playing]]
 
-    def reset(self, *, seeds: Sequence[int], options: Sequence[Options | None] | None = None) -> list[Obs]:
+    def reset(
+        self, *, seeds: Sequence[int], options: Sequence[Options | None] | None = None
+    ) -> list[Obs]:
         self._playing = episodes_of(seeds, self.num_envs)
         given = zip(self._envs, seeds, options or [None] * self._playing, strict=False)
         self._seen = self._stacked([_begun(*each) for each in given], range(self._playing))
@@ -368,7 +410,9 @@ class SequentialBatch(BatchEnv):
 
     def step(self, acts: Sequence[Act | None]) -> Steps:
         if (n := len(acts)) != self._playing:
-            raise ConfigError(f"step: got {n} actions, want {self._playing}, one for each episode or None")
+            raise ConfigError(
+                f"step: got {n} actions, want {self._playing}, one for each episode or None"
+            )
         moving = {i: act for i, act in enumerate(acts) if act is not None}
         if n > 1:  # a single environment checks its action itself
             for act in moving.values():
@@ -400,7 +444,9 @@ class SequentialBatch(BatchEnv):
         return self._envs[0].renderer()
 
     def describe(self) -> dict[str, Any]:
-        return self._envs[0].describe() | ({} if self.num_envs == 1 else {"num_envs": self.num_envs})
+        return self._envs[0].describe() | (
+            {} if self.num_envs == 1 else {"num_envs": self.num_envs}
+        )
 
     def close(self) -> None:
         with ExitStack() as closing:
@@ -408,18 +454,24 @@ class SequentialBatch(BatchEnv):
                 closing.callback(env.close)
 
     def _stacked(self, seen: list[Obs], moved: Collection[int]) -> list[Obs]:
-        """Return the observations with the images of each camera as rows of one array, if images are used.
+        """Return the observations with the images of each camera as rows of one array, if images
+        are used.
 
-        An idle environment may have left its images out when it last moved; images of one that moved then take their
-        place.
+        An idle environment may have left its images out when it last moved; images of one that
+        moved then take their place.
         """
         if len(seen) == 1 or not moved or not self.looked_at:
             return seen
         if not (shown := seen[min(moved)].cameras):
             return seen
-        cameras = [obs.cameras if i in moved else {**shown, **obs.cameras} for i, obs in enumerate(seen)]
+        cameras = [
+            obs.cameras if i in moved else {**shown, **obs.cameras} for i, obs in enumerate(seen)
+        ]
         images = {name: np.stack([one[name] for one in cameras]) for name in cameras[0]}
-        return [replace(obs, cameras={name: rows[i] for name, rows in images.items()}) for i, obs in enumerate(seen)]
+        return [
+            replace(obs, cameras={name: rows[i] for name, rows in images.items()})
+            for i, obs in enumerate(seen)
+        ]
 
 
 def _begun(env: EvalEnv, seed: int, options: Options | None) -> Obs:
@@ -431,10 +483,13 @@ def _begun(env: EvalEnv, seed: int, options: Options | None) -> Obs:
 
 
 def episodes_of(seeds: Sequence[int], num_envs: int) -> int:
-    """Return the number of episodes that `seeds` begin; raises `ConfigError` if there are too many or none."""
+    """Return the number of episodes that `seeds` begin; raises `ConfigError` if there are too
+    many or none.
+    """
     if not 1 <= len(seeds) <= num_envs:
         raise ConfigError(
-            f"reset: got {len(seeds)} seeds, want 1 to {num_envs}, one for each environment that is to play"
+            f"reset: got {len(seeds)} seeds, want 1 to {num_envs}, one for each environment that "
+            "is to play"
         )
     return len(seeds)
 

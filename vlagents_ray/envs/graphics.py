@@ -1,11 +1,12 @@
-"""The device that renders an env's images: EGL's devices, their CUDA numbers, and a check that the chosen one is used.
+"""The device that renders an env's images: EGL's devices, their CUDA numbers, and a check that the
+chosen one is used.
 
-Ray sets CUDA_VISIBLE_DEVICES to the GPU of a worker, but neither EGL nor Vulkan reads it: each would take its first
-device, which may be the GPU that a policy uses. This module therefore chooses the device, unless CUDA_VISIBLE_DEVICES
-is not set.
+Ray sets CUDA_VISIBLE_DEVICES to the GPU of a worker, but neither EGL nor Vulkan reads it: each
+would take its first device, which may be the GPU that a policy uses. This module therefore chooses
+the device, unless CUDA_VISIBLE_DEVICES is not set.
 
-Its probes render one frame in a child process with a time-out, because a broken driver may hang or crash the process
-that loads it. Their results are cached for the life of the process.
+Its probes render one frame in a child process with a time-out, because a broken driver may hang or
+crash the process that loads it. Their results are cached for the life of the process.
 
     probe = render_probe()                  # Vulkan, as SAPIEN (ManiSkill 3) uses it
     probe.ok, probe.device, probe.cure      # True, "llvmpipe (LLVM 15.0.6, 256 bits)", None
@@ -45,7 +46,8 @@ _Value = ctypes.c_ssize_t  # EGLAttrib
 class EglDevice:
     number: int  # in EGL's own order, as in MUJOCO_EGL_DEVICE_ID
     software: bool
-    cuda: int | None  # its number among the CUDA devices that this process may use; None if CUDA does not know it
+    # Its number among the CUDA devices that this process may use; None if CUDA does not know it.
+    cuda: int | None
 
 
 def devices() -> list[EglDevice]:
@@ -55,7 +57,9 @@ def devices() -> list[EglDevice]:
 
 
 class _Functions:
-    """The EGL functions used here; the constructor raises `AttributeError` or `OSError` if one is missing."""
+    """The EGL functions used here; the constructor raises `AttributeError` or `OSError` if one
+    is missing.
+    """
 
     def __init__(self) -> None:
         self.library = ctypes.CDLL("libEGL.so.1")
@@ -63,8 +67,12 @@ class _Functions:
         self.library.eglGetProcAddress.argtypes = [ctypes.c_char_p]
         self.library.eglGetCurrentDisplay.restype = ctypes.c_void_p
         pointers, whole = ctypes.POINTER(ctypes.c_void_p), ctypes.POINTER(ctypes.c_int)
-        self._query = self._extension("eglQueryDevicesEXT", ctypes.c_uint, ctypes.c_int, pointers, whole)
-        self._text = self._extension("eglQueryDeviceStringEXT", ctypes.c_char_p, ctypes.c_void_p, ctypes.c_int)
+        self._query = self._extension(
+            "eglQueryDevicesEXT", ctypes.c_uint, ctypes.c_int, pointers, whole
+        )
+        self._text = self._extension(
+            "eglQueryDeviceStringEXT", ctypes.c_char_p, ctypes.c_void_p, ctypes.c_int
+        )
         asking = (ctypes.c_uint, ctypes.c_void_p, ctypes.c_int, ctypes.POINTER(_Value))
         self._attribute = self._extension("eglQueryDeviceAttribEXT", *asking)
         self.display_attribute = self._extension("eglQueryDisplayAttribEXT", *asking)
@@ -77,7 +85,9 @@ class _Functions:
         found = []
         for i, handle in enumerate(handles[: number.value]):
             extensions = (self._text(handle, _EXTENSIONS) or b"").decode().split()
-            cuda = self.value(self._attribute, handle, _CUDA_DEVICE) if _CUDA in extensions else None
+            cuda = (
+                self.value(self._attribute, handle, _CUDA_DEVICE) if _CUDA in extensions else None
+            )
             found.append((handle, EglDevice(i, _SOFTWARE in extensions, cuda)))
         return found
 
@@ -101,18 +111,22 @@ def _functions() -> _Functions | None:
 
 GPUS = "CUDA_VISIBLE_DEVICES"
 EGL_DEVICE = "MUJOCO_EGL_DEVICE_ID"
-VULKAN_DRIVERS = ("VK_ICD_FILENAMES", "VK_DRIVER_FILES")  # SAPIEN's older loader only reads the first
+# SAPIEN's older loader only reads the first.
+VULKAN_DRIVERS = ("VK_ICD_FILENAMES", "VK_DRIVER_FILES")
 _ICD_FOLDERS = ("/usr/local/share/vulkan/icd.d", "/usr/share/vulkan/icd.d", "/etc/vulkan/icd.d")
-_SAPIENS_OWN = "sapien/vulkan_library/"  # of NVIDIA's driver, which SAPIEN names if it finds no other
+# Of NVIDIA's driver, which SAPIEN names if it finds no other.
+_SAPIENS_OWN = "sapien/vulkan_library/"
 _SOFTWARE_VULKAN = "llvmpipe"  # lavapipe's name of its device
 
 SHARE = "worker: {gpus: 0.25}, or --worker-gpus 0.25, gives each worker a part of a GPU"
 _CURE_HIDDEN = (
-    f"{SHARE}; to render in software install Mesa's drivers (libegl1 libgl1-mesa-dri mesa-vulkan-drivers) on that node"
+    f"{SHARE}; to render in software install Mesa's drivers (libegl1 libgl1-mesa-dri "
+    "mesa-vulkan-drivers) on that node"
 )
 _CURE_OWN = (
     "install the NVIDIA driver's graphics part on that node (libnvidia-gl; in a container "
-    "NVIDIA_DRIVER_CAPABILITIES=all), or leave worker.gpus at 0 to render in software; if it is intended, set "
+    "NVIDIA_DRIVER_CAPABILITIES=all), or leave worker.gpus at 0 to render in software; if it is "
+    "intended, set "
     f"render_backend in env_options (ManiSkill) or {EGL_DEVICE} in worker.runtime_env.env_vars"
 )
 
@@ -121,9 +135,11 @@ _CURE_OWN = (
 class Renderer:
     """The device that renders an env's images."""
 
-    name: str  # the driver's name of the device: "llvmpipe (LLVM 15.0.6, 256 bits)", "NVIDIA H200/PCIe/SSE2"
+    # The driver's name of the device: "llvmpipe (LLVM 15.0.6, 256 bits)", "NVIDIA H200/PCIe/SSE2".
+    name: str
     software: bool
-    cuda: int | None  # its number among the CUDA devices that this process may use; None if CUDA does not know it
+    # Its number among the CUDA devices that this process may use; None if CUDA does not know it.
+    cuda: int | None
     asked_for: bool = False  # the environment's options name this very device
 
 
@@ -134,17 +150,23 @@ def has_gpu() -> bool | None:
 
 
 def fitting(devices: Sequence[EglDevice], *, gpu: bool) -> EglDevice | None:
-    """Return the device to render on: CUDA's first one, or without `gpu` the software device; None if there is none."""
+    """Return the device to render on: CUDA's first one, or without `gpu` the software device;
+    None if there is none.
+    """
     if gpu:
-        return min((one for one in devices if one.cuda is not None), key=lambda one: one.cuda or 0, default=None)
+        return min(
+            (one for one in devices if one.cuda is not None),
+            key=lambda one: one.cuda or 0,
+            default=None,
+        )
     return next((one for one in devices if one.software), None)
 
 
 def prepare_rendering() -> None:
     """Set variables of drivers and simulators for rendering without a display on shared cores.
 
-    Variables set by the user are kept. Call it before any simulator is imported: ManiSkill also imports MuJoCo, which
-    chooses its OpenGL once, on import.
+    Variables set by the user are kept. Call it before any simulator is imported: ManiSkill also
+    imports MuJoCo, which chooses its OpenGL once, on import.
     """
     os.environ.setdefault("LP_NUM_THREADS", "1")  # otherwise Mesa's software drivers use all cores
     if not os.environ.get("MUJOCO_GL") and not os.environ.get("DISPLAY") and _has_egl():
@@ -153,18 +175,28 @@ def prepare_rendering() -> None:
 
 
 def choose_devices() -> None:
-    """Set the variables that select the devices, before libraries are loaded; variables set by the user are kept."""
+    """Set the variables that select the devices, before libraries are loaded; variables set by
+    the user are kept.
+    """
     if (gpu := has_gpu()) is None:
         return
     if EGL_DEVICE not in os.environ and (device := fitting(devices(), gpu=gpu)) is not None:
         os.environ[EGL_DEVICE] = str(device.number)
-    if not gpu and not any(os.environ.get(name) for name in VULKAN_DRIVERS) and (driver := _lavapipe()) is not None:
+    if (
+        not gpu
+        and not any(os.environ.get(name) for name in VULKAN_DRIVERS)
+        and (driver := _lavapipe()) is not None
+    ):
         os.environ[VULKAN_DRIVERS[0]] = str(driver)
 
 
 def opengl_renderer() -> Renderer | None:
-    """Return the renderer of this thread's OpenGL context; None if there is none, or if it is not EGL's."""
-    if (functions := _functions()) is None or not (display := functions.library.eglGetCurrentDisplay()):
+    """Return the renderer of this thread's OpenGL context; None if there is none, or if it is
+    not EGL's.
+    """
+    if (functions := _functions()) is None or not (
+        display := functions.library.eglGetCurrentDisplay()
+    ):
         return None
     handle = functions.value(functions.display_attribute, display, _DEVICE)
     device = next((device for pointer, device in functions.devices() if pointer == handle), None)
@@ -176,34 +208,48 @@ def opengl_renderer() -> Renderer | None:
 
 
 def vulkan_renderer(name: str, cuda: int | None, *, asked_for: bool = False) -> Renderer:
-    """Return the renderer for the device that SAPIEN uses; `asked_for` is whether the env's options named it."""
+    """Return the renderer for the device that SAPIEN uses; `asked_for` is whether the env's
+    options named it.
+    """
     files = filter(None, map(os.environ.get, VULKAN_DRIVERS))
     named = has_gpu() is False and any(_SAPIENS_OWN not in file for file in files)
     return Renderer(name, name.startswith(_SOFTWARE_VULKAN), cuda, asked_for or named)
 
 
 def require_own(renderer: Renderer) -> None:
-    """Raise `ConfigError` if `renderer` is not the GPU assigned to this process, or a GPU though none is assigned."""
+    """Raise `ConfigError` if `renderer` is not the GPU assigned to this process, or a GPU though
+    none is assigned.
+    """
     gpu = has_gpu()
-    if gpu is None or renderer.asked_for or (renderer.cuda is not None if gpu else renderer.software):
+    if (
+        gpu is None
+        or renderer.asked_for
+        or (renderer.cuda is not None if gpu else renderer.software)
+    ):
         return
     if gpu:
         raise ConfigError(
-            f"the worker was given the GPU {os.environ[GPUS]}, but its env renders on {renderer.name!r}; {_CURE_OWN}"
+            f"the worker was given the GPU {os.environ[GPUS]}, but its env renders on "
+            f"{renderer.name!r}; {_CURE_OWN}"
         )
     raise ConfigError(
-        f"the worker was given no GPU (worker.gpus: 0), but its env renders on {renderer.name!r}, which a policy may "
+        f"the worker was given no GPU (worker.gpus: 0), but its env renders on {renderer.name!r}, "
+        "which a policy may "
         f"be using; {_CURE_HIDDEN}"
     )
 
 
 def _lavapipe() -> Path | None:
-    return next((path for folder in _ICD_FOLDERS for path in sorted(Path(folder).glob("lvp_icd*.json"))), None)
+    return next(
+        (path for folder in _ICD_FOLDERS for path in sorted(Path(folder).glob("lvp_icd*.json"))),
+        None,
+    )
 
 
 def _has_egl() -> bool:
     try:
-        ctypes.CDLL("libEGL.so.1")  # without this library, `MUJOCO_GL=egl` makes `import mujoco` fail
+        # Without this library, `MUJOCO_GL=egl` makes `import mujoco` fail.
+        ctypes.CDLL("libEGL.so.1")
     except OSError:
         return False
     return True
@@ -214,17 +260,22 @@ def _has_egl() -> bool:
 TIMEOUT_S = 60.0  # a software driver compiles its shaders in 3 to 10 s
 
 VULKAN_CURE = (
-    "install a Vulkan driver: Mesa 25 renders in software (Debian 12: apt-get install -t bookworm-backports "
-    "mesa-vulkan-drivers, its own 22.3 is too old; elsewhere: mesa-vulkan-drivers); for an unpacked one set "
+    "install a Vulkan driver: Mesa 25 renders in software (Debian 12: apt-get install -t "
+    "bookworm-backports "
+    "mesa-vulkan-drivers, its own 22.3 is too old; elsewhere: mesa-vulkan-drivers); for an "
+    "unpacked one set "
     "VK_ICD_FILENAMES to its lvp_icd.json"
 )
 VULKAN_CURE_NVIDIA = (
-    "an NVIDIA driver is here but no Vulkan device: install the driver's graphics part (libnvidia-gl), or start the "
+    "an NVIDIA driver is here but no Vulkan device: install the driver's graphics part "
+    "(libnvidia-gl), or start the "
     "container with NVIDIA_DRIVER_CAPABILITIES=all"
 )
 EGL_CURE = (
-    "install EGL: apt-get install libegl1 libgl1-mesa-dri renders in software; on NVIDIA the driver's graphics part "
-    "(libnvidia-gl), in a container NVIDIA_DRIVER_CAPABILITIES=all; MUJOCO_GL must be set before mujoco is imported"
+    "install EGL: apt-get install libegl1 libgl1-mesa-dri renders in software; on NVIDIA the "
+    "driver's graphics part "
+    "(libnvidia-gl), in a container NVIDIA_DRIVER_CAPABILITIES=all; MUJOCO_GL must be set before "
+    "mujoco is imported"
 )
 
 _BOX_XML = """
@@ -244,7 +295,8 @@ class RenderProbe:
 
     ok: bool
     seconds: float  # the child's run time, imports included
-    device: str | None = None  # the driver's name of the device; "llvmpipe ..." is Mesa's software driver
+    # The driver's name of the device; "llvmpipe ..." is Mesa's software driver.
+    device: str | None = None
     error: str | None = None
     cure: str | None = None
     devices: tuple[EglDevice, ...] = ()  # all devices of EGL, if EGL was tried
@@ -269,31 +321,38 @@ def vulkan_cure() -> str:
 
 
 def vulkan_device(*, on_gpu: bool) -> tuple[str, int | None] | None:
-    """Return the name and CUDA number of the device on which SAPIEN renders in this process; see `usable_devices`."""
+    """Return the name and CUDA number of the device on which SAPIEN renders in this process; see
+    `usable_devices`.
+    """
     import sapien.render
 
     usable = usable_devices(sapien.render.get_device_summary())
-    usable.sort(key=lambda device: (device[1] is not None) != on_gpu)  # a stable sort keeps SAPIEN's order otherwise
+    # A stable sort keeps SAPIEN's order otherwise.
+    usable.sort(key=lambda device: (device[1] is not None) != on_gpu)
     return usable[0] if usable else None
 
 
 def usable_devices(summary: str) -> list[tuple[str, int | None]]:
     """List the devices that SAPIEN's `summary` calls supported, in its order.
 
-    Each has a name, such as "llvmpipe (LLVM 15.0.6, 256 bits)", and its number among the CUDA devices of this process;
-    None if CUDA does not know it.
+    Each has a name, such as "llvmpipe (LLVM 15.0.6, 256 bits)", and its number among the CUDA
+    devices of this process; None if CUDA does not know it.
     """
     found = []
     for block in summary.split("GPU:")[1:]:
         name, *lines = block.splitlines()
-        facts = {key.strip(): value.strip() for key, _, value in (line.partition(":") for line in lines)}
+        facts = {
+            key.strip(): value.strip() for key, _, value in (line.partition(":") for line in lines)
+        }
         if facts.get("Supported") == "1":
             cuda = int(facts.get("cudaId", "-1"))
             found.append((name.strip(), cuda if cuda >= 0 else None))
     return found
 
 
-def _probed(api: Literal["vulkan", "egl"], module: str, extra: str, cure: str, timeout_s: float) -> RenderProbe:
+def _probed(
+    api: Literal["vulkan", "egl"], module: str, extra: str, cure: str, timeout_s: float
+) -> RenderProbe:
     """Render one frame in a child process with `module`, which the extra `extra` installs."""
     if importlib.util.find_spec(module) is None:
         error, cure = f"{module} is not installed", f"pip install 'vlagents-ray[{extra}]'"
@@ -304,7 +363,8 @@ def _probed(api: Literal["vulkan", "egl"], module: str, extra: str, cure: str, t
     try:
         child = subprocess.run(  # noqa: S603 - our own interpreter and module, no outside input
             [sys.executable, "-c", f"from {__name__} import _main; _main({api!r})"],
-            env={**os.environ, "PYTHONPATH": path, "MUJOCO_GL": "egl"},  # which SAPIEN does not read
+            # Which SAPIEN does not read.
+            env={**os.environ, "PYTHONPATH": path, "MUJOCO_GL": "egl"},
             stdin=subprocess.DEVNULL,
             capture_output=True,
             text=True,
@@ -322,7 +382,9 @@ def _probed(api: Literal["vulkan", "egl"], module: str, extra: str, cure: str, t
         return RenderProbe(ok=True, seconds=seconds, device=answer["device"], devices=devices)
     errors = [line for line in child.stderr.splitlines() if line.strip()]
     ended = f"the child ended with {child.returncode}"
-    return RenderProbe(ok=False, seconds=seconds, error=errors[-1].strip() if errors else ended, cure=cure)
+    return RenderProbe(
+        ok=False, seconds=seconds, error=errors[-1].strip() if errors else ended, cure=cure
+    )
 
 
 def _render_vulkan() -> str | None:

@@ -1,8 +1,8 @@
 """Environments of Gymnasium behind the interface of `EvalEnv`, and PushT by its published protocol.
 
-`gymnasium/<id>`, for instance `gymnasium/Pendulum-v1` or `gymnasium/gym_pusht/PushT-v0`. Images and vectors in the
-observation space are found automatically; an environment without images is rendered. Everything else is an option
-of `Gymnasium`.
+`gymnasium/<id>`, for instance `gymnasium/Pendulum-v1` or `gymnasium/gym_pusht/PushT-v0`. Images and
+vectors in the observation space are found automatically; an environment without images is rendered.
+Everything else is an option of `Gymnasium`.
 """
 
 from __future__ import annotations
@@ -19,7 +19,14 @@ from vlagents_ray.contract import ActionSpec, CameraSpec, Contract, StateSpec
 from vlagents_ray.envs.base import EvalEnv, one_row, require_known
 from vlagents_ray.envs.graphics import prepare_rendering
 from vlagents_ray.envs.simulator import BenchmarkProtocol, without
-from vlagents_ray.errors import ConfigError, EnvFailed, MissingDependency, NotReset, UnknownEnv, VLAgentsError
+from vlagents_ray.errors import (
+    ConfigError,
+    EnvFailed,
+    MissingDependency,
+    NotReset,
+    UnknownEnv,
+    VLAgentsError,
+)
 from vlagents_ray.interface import Act, Obs
 from vlagents_ray.naming import did_you_mean
 from vlagents_ray.registry import require
@@ -98,8 +105,9 @@ _FETCH = BenchmarkProtocol(
 class Gymnasium(EvalEnv):
     """A Gymnasium environment with a continuous action vector, Box (D,).
 
-    Actions are clipped to the Box. Success is `info["is_success"]` or `info["success"]` if the environment returns one.
-    Otherwise, and without the option `success`, no episode succeeds and only the returns are meaningful.
+    Actions are clipped to the Box. Success is `info["is_success"]` or `info["success"]` if the
+    environment returns one. Otherwise, and without the option `success`, no episode succeeds and
+    only the returns are meaningful.
     """
 
     def __init__(
@@ -138,7 +146,8 @@ class Gymnasium(EvalEnv):
             width: The width to which every image is stretched, pixels.
             height: The height to which every image is stretched, pixels.
             max_steps: The step limit, instead of the registered one.
-            remake: Whether each reset makes the simulator again, for one whose own reset keeps some state.
+            remake: Whether each reset makes the simulator again, for one whose own reset keeps some
+                state.
 
         Raises:
             UnknownEnv: There is no such id.
@@ -163,12 +172,16 @@ class Gymnasium(EvalEnv):
             spec = self._env.spec
             limit = max_steps or (spec.max_episode_steps if spec is not None else None)
             if limit is None or limit < 1:
-                raise ConfigError(f"{self._name}: its step limit is {limit}; set `max_steps` to 1 or more")
+                raise ConfigError(
+                    f"{self._name}: its step limit is {limit}; set `max_steps` to 1 or more"
+                )
             self.max_steps = int(limit)
             self._action_space, self._size = str(self._env.action_space), (height, width)
             self._low, self._high, self._dtype = bounds(self._env.action_space)
             if unit_actions and not np.isfinite([self._low, self._high]).all():
-                raise ConfigError(f"{self._name}: unit_actions needs finite bounds, got {self._env.action_space}")
+                raise ConfigError(
+                    f"{self._name}: unit_actions needs finite bounds, got {self._env.action_space}"
+                )
             seen_cameras, seen_state = parts(self._env.observation_space, self._env.render_mode)
             cameras = cameras if cameras is not None else defaults.cameras
             self._cameras = _picks(cameras if cameras is not None else seen_cameras)
@@ -176,9 +189,13 @@ class Gymnasium(EvalEnv):
             self._gripper = Pick.parse(gripper) if gripper is not None else None
             self._closed, self._open = gripper_range
             if self._closed == self._open:
-                raise ConfigError(f"{self._name}: gripper_range is {gripper_range}, want two different numbers")
+                raise ConfigError(
+                    f"{self._name}: gripper_range is {gripper_range}, want two different numbers"
+                )
             first, _ = self._call("reset", seed=0)
-            self._contract = self._contract_of(self._observe(first), control_hz or defaults.control_hz)
+            self._contract = self._contract_of(
+                self._observe(first), control_hz or defaults.control_hz
+            )
         except BaseException:
             self.close()
             raise
@@ -207,7 +224,9 @@ class Gymnasium(EvalEnv):
             "protocol": self._protocol.describe(**played) if self._protocol is not None else played,
         }
 
-    def reset(self, *, seed: int, options: Mapping[str, Any] | None = None) -> tuple[Obs, dict[str, Any]]:
+    def reset(
+        self, *, seed: int, options: Mapping[str, Any] | None = None
+    ) -> tuple[Obs, dict[str, Any]]:
         if seed < 0:
             raise ConfigError(f"{self._name}: seed is {seed}, want 0 or more")
         if self._env is None:
@@ -235,8 +254,15 @@ class Gymnasium(EvalEnv):
         else:
             success = any(bool(info.get(key, False)) for key in SUCCESS_KEYS)
         stopped = bool(truncated) or self._steps >= self.max_steps
-        # Unused images are also rendered: rendering changes the state of some envs (the target of the Fetch tasks).
-        return self._observe(nested), float(reward), bool(terminated), stopped, {**plain(info), "success": success}
+        # Unused images are also rendered: rendering changes the state of some envs (the target of
+        # the Fetch tasks).
+        return (
+            self._observe(nested),
+            float(reward),
+            bool(terminated),
+            stopped,
+            {**plain(info), "success": success},
+        )
 
     def close(self) -> None:
         self._ready = False
@@ -248,7 +274,9 @@ class Gymnasium(EvalEnv):
         # pygame, the renderer of several environments, otherwise prints a greeting on import
         os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")
         gymnasium = require("gymnasium")
-        namespace = "" if self._id in gymnasium.registry else self._id.rpartition("/")[0].partition(":")[0]
+        namespace = (
+            "" if self._id in gymnasium.registry else self._id.rpartition("/")[0].partition(":")[0]
+        )
         if module := self._module or namespace:
             require(module)
         arguments = {"render_mode": "rgb_array", "disable_env_checker": True, **self._kwargs}
@@ -258,11 +286,15 @@ class Gymnasium(EvalEnv):
             raise MissingDependency(f"{self._name}: {error}") from error
         except gymnasium.error.UnregisteredEnv as error:
             meant = did_you_mean(self._id.rpartition("/")[2], gymnasium.registry)
-            raise UnknownEnv(f"{self._name}: {error}; gymnasium/MODULE:ID imports what registers it{meant}") from error
+            raise UnknownEnv(
+                f"{self._name}: {error}; gymnasium/MODULE:ID imports what registers it{meant}"
+            ) from error
         except gymnasium.error.Error as error:
             raise ConfigError(f"{self._name}: {error}") from error
         except TypeError as error:
-            raise ConfigError(f"{self._name}: {error}; check `kwargs`, got {self._kwargs}") from error
+            raise ConfigError(
+                f"{self._name}: {error}; check `kwargs`, got {self._kwargs}"
+            ) from error
 
     def _call(self, method: str, *args: Any, **kwargs: Any) -> Any:
         try:
@@ -270,18 +302,26 @@ class Gymnasium(EvalEnv):
         except VLAgentsError:
             raise
         except Exception as error:
-            raise EnvFailed(f"{self._name}: {method} raised {type(error).__name__}: {error}") from error
+            raise EnvFailed(
+                f"{self._name}: {method} raised {type(error).__name__}: {error}"
+            ) from error
 
     def _observe(self, nested: Any) -> Obs:
         cameras = {
-            name: as_image(self._call("render") if pick.text == RENDER else pick.value(nested), name, self._size)
+            name: as_image(
+                self._call("render") if pick.text == RENDER else pick.value(nested),
+                name,
+                self._size,
+            )
             for name, pick in self._cameras.items()
         }
         gripper = None
         if self._gripper is not None:
             share = (self._gripper.number(nested) - self._closed) / (self._open - self._closed)
             gripper = min(max(share, 0.0), 1.0)
-        return Obs(cameras, gripper, {name: pick.vector(nested) for name, pick in self._state.items()})
+        return Obs(
+            cameras, gripper, {name: pick.vector(nested) for name, pick in self._state.items()}
+        )
 
     def _contract_of(self, obs: Obs, control_hz: float | None) -> Contract:
         low, high = (-1.0, 1.0) if self._unit_actions else (uniform(self._low), uniform(self._high))
@@ -306,10 +346,11 @@ _TASKS: dict[str, Mapping[str, Any]] = {
 class PushT(Gymnasium):
     """PushT by its published protocol, "image" or "keypoints".
 
-    Observation: `state["agent_pos"]`, (2,) in pixels of the field, 512 by 512. With "image" also "front", (96, 96, 3)
-    by default; with "keypoints" `state["environment_state"]`, (16,), x and y of eight points of the block, in pixels.
-    In `info["sim_state"]`, (7,) float64, the simulator's state: x, y of the agent and its velocity, pixels and
-    pixels/s; x, y and angle of the block, pixels and rad.
+    Observation: `state["agent_pos"]`, (2,) in pixels of the field, 512 by 512. With "image" also
+        "front", (96, 96, 3)
+    by default; with "keypoints" `state["environment_state"]`, (16,), x and y of eight points of the
+    block, in pixels. In `info["sim_state"]`, (7,) float64, the simulator's state: x, y of the agent
+    and its velocity, pixels and pixels/s; x, y and angle of the block, pixels and rad.
 
     Action: (2,) in [0, 512]: the target of the disc, in the same pixels.
     """
@@ -317,7 +358,12 @@ class PushT(Gymnasium):
     known = tuple(_TASKS)
 
     def __init__(
-        self, task: str = "image", *, width: int | None = None, height: int | None = None, max_steps: int | None = None
+        self,
+        task: str = "image",
+        *,
+        width: int | None = None,
+        height: int | None = None,
+        max_steps: int | None = None,
     ) -> None:
         """Make the environment; images are stretched to `width` and `height`, pixels."""
         self.require_task(task)
@@ -334,7 +380,9 @@ class PushT(Gymnasium):
     def _observe(self, nested: Any) -> Obs:
         obs = super()._observe(nested)
         agent, block = self._env.unwrapped.agent, self._env.unwrapped.block
-        obs.info["sim_state"] = np.array([*agent.position, *agent.velocity, *block.position, block.angle])
+        obs.info["sim_state"] = np.array(
+            [*agent.position, *agent.velocity, *block.position, block.angle]
+        )
         return obs
 
 
@@ -352,17 +400,28 @@ class Pick:
 
     @classmethod
     def parse(cls, text: str) -> Pick:
-        """Parse a path: `"images/top"`, `"agent_pos"`, `"robot/qpos[0:7]"`, `"[2:]"`; `""` is the whole observation."""
+        """Parse a path: `"images/top"`, `"agent_pos"`, `"robot/qpos[0:7]"`, `"[2:]"`; `""` is
+        the whole observation.
+        """
         if (match := _PATH.fullmatch(text)) is None:
-            raise ConfigError(f"path {text!r}: want keys joined by '/', then perhaps a range, as in 'robot/qpos[0:7]'")
+            raise ConfigError(
+                f"path {text!r}: want keys joined by '/', then perhaps a range, as in "
+                "'robot/qpos[0:7]'"
+            )
         start, stop = (int(match[name]) if match[name] else None for name in ("start", "stop"))
         return cls(text, tuple(key for key in match["keys"].split("/") if key), slice(start, stop))
 
     def value(self, nested: Any) -> Any:
-        """Return the value under the keys, without the range; raises `ConfigError` if there is none."""
+        """Return the value under the keys, without the range; raises `ConfigError` if there is
+        none.
+        """
         for key in self.keys:
             if not isinstance(nested, Mapping) or key not in nested:
-                have = sorted(map(str, nested)) if isinstance(nested, Mapping) else type(nested).__name__
+                have = (
+                    sorted(map(str, nested))
+                    if isinstance(nested, Mapping)
+                    else type(nested).__name__
+                )
                 raise ConfigError(f"path {self.text!r}: there is no {key!r} in {have}")
             nested = nested[key]
         return nested
@@ -373,30 +432,43 @@ class Pick:
             raise ConfigError(f"path {self.text!r}: got shape {array.shape}, want (D,)")
         found: np.ndarray = np.atleast_1d(array)[self.part]
         if found.size == 0:
-            raise ConfigError(f"path {self.text!r}: the range is empty, the value has {array.size} numbers")
+            raise ConfigError(
+                f"path {self.text!r}: the range is empty, the value has {array.size} numbers"
+            )
         return found
 
     def number(self, nested: Any) -> float:
         vector = self.vector(nested)
         if vector.size != 1:
-            raise ConfigError(f"path {self.text!r}: got {vector.size} numbers, want one, as in '{self.text}[0:1]'")
+            raise ConfigError(
+                f"path {self.text!r}: got {vector.size} numbers, want one, as in '{self.text}[0:1]'"
+            )
         return float(vector[0])
 
 
-def as_image(value: Any, name: str, size: tuple[int | None, int | None] = (None, None)) -> np.ndarray:
-    """Copy a value to an array (H, W, 3) uint8 RGB, stretched to `size` (height, width), px; None keeps a side."""
+def as_image(
+    value: Any, name: str, size: tuple[int | None, int | None] = (None, None)
+) -> np.ndarray:
+    """Copy a value to an array (H, W, 3) uint8 RGB, stretched to `size` (height, width), px;
+    None keeps a side.
+    """
     image = np.asarray(value)
     if image.ndim != 3 or image.shape[2] != 3 or image.dtype != np.uint8:
-        raise ConfigError(f"camera {name!r}: got {image.shape} {image.dtype}, want (H, W, 3) uint8 RGB")
+        raise ConfigError(
+            f"camera {name!r}: got {image.shape} {image.dtype}, want (H, W, 3) uint8 RGB"
+        )
     height, width = size[0] or image.shape[0], size[1] or image.shape[1]
     if (height, width) == image.shape[:2]:
         return np.array(image, order="C")
     pil = require("PIL.Image")
-    return np.array(pil.fromarray(np.ascontiguousarray(image)).resize((width, height), pil.Resampling.BILINEAR))
+    return np.array(
+        pil.fromarray(np.ascontiguousarray(image)).resize((width, height), pil.Resampling.BILINEAR)
+    )
 
 
 def plain(value: Any) -> Any:
-    """Convert a value to one that a message can carry: numpy scalars to Python's, tuples to lists, keys to strings.
+    """Convert a value to one that a message can carry: numpy scalars to Python's, tuples to lists,
+    keys to strings.
 
     Other values (objects, functions) become None; mappings omit None.
     """
@@ -428,7 +500,9 @@ def uniform(bounds: np.ndarray) -> float | None:
 
 
 def parts(space: Any, render_mode: str | None) -> tuple[dict[str, str], dict[str, str]]:
-    """Return the cameras and state parts of an observation space; adds a rendered camera if there is no image."""
+    """Return the cameras and state parts of an observation space; adds a rendered camera if
+    there is no image.
+    """
     cameras: dict[str, str] = {}
     state: dict[str, str] = {}
     pending = [("", space)]

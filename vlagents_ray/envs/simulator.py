@@ -25,7 +25,9 @@ Size = tuple[int, int]  # height, width in pixels
 
 @dataclass(frozen=True, slots=True)
 class BenchmarkProtocol:
-    """The settings that published numbers of a benchmark share, and their source; `describe()["protocol"]` has it."""
+    """The settings that published numbers of a benchmark share, and their source;
+    `describe()["protocol"]` has it.
+    """
 
     name: str
     source: str  # the publication or code with these settings
@@ -39,7 +41,9 @@ class BenchmarkProtocol:
     episodes: int | None = None  # episodes per task in published tables; None if they differ
 
     def describe(self, **played: Any) -> dict[str, Any]:
-        """Return the protocol as plain values; `deviations` lists the fields of `played` that differ from it."""
+        """Return the protocol as plain values; `deviations` lists the fields of `played` that
+        differ from it.
+        """
         deviations = [
             f"{name}: {value}, the protocol says {getattr(self, name)}"
             for name, value in played.items()
@@ -53,21 +57,25 @@ class SimulatorEnv(EvalEnv):
 
         with RoboCasa("NavigateKitchen") as env:
             obs, _ = env.reset(seed=0)
-            obs, reward, terminated, truncated, info = env.step(Act(action=np.zeros(12, np.float32)))
+            obs, reward, terminated, truncated, info = env.step(Act(action=np.zeros(12,
+            np.float32)))
 
-    A subclass sets the class variables below, makes its simulator in the constructor within `_making`, and registers
-    its clean-up with `_resources`. `_begin` begins an episode and `_advance` executes a step; both are only called
-    while the simulator is open, and their errors become `EnvFailed`.
+    A subclass sets the class variables below, makes its simulator in the constructor within
+    `_making`, and registers its clean-up with `_resources`. `_begin` begins an episode and
+    `_advance` executes a step; both are only called while the simulator is open, and their errors
+    become `EnvFailed`.
 
-    Most constructors have the following options; None selects the default of the task or the protocol: `width` and
-    `height` of each image, pixels; `instruction`, the task in words; `max_steps`, the step limit; `ends_on_success`,
+    Most constructors have the following options; None selects the default of the task or the
+    protocol: `width` and `height` of each image, pixels; `instruction`, the task in words;
+        `max_steps`, the step limit; `ends_on_success`,
     whether success ends the episode (if not, success at the end can also be measured).
     """
 
     suite: ClassVar[str]
     title: ClassVar[str]  # the name as used in sentences
     packages: ClassVar[tuple[str, ...]]  # the modules that the subclass imports
-    distributions: ClassVar[tuple[str, ...]] = ("mujoco",)  # the packages whose versions are recorded in results
+    # The packages whose versions are recorded in results.
+    distributions: ClassVar[tuple[str, ...]] = ("mujoco",)
     cure: ClassVar[str]  # the command that installs the packages
 
     _contract: Contract
@@ -78,7 +86,9 @@ class SimulatorEnv(EvalEnv):
     _steps: int | None = None  # steps of the current episode; None before the first reset
 
     def __init__(self, task: str, **sizes: int | None) -> None:
-        """Check the task, and that each of `sizes` is at least 1 or None; set the variables that drivers read."""
+        """Check the task, and that each of `sizes` is at least 1 or None; set the variables that
+        drivers read.
+        """
         self.require_task(task)
         self._name = f"{self.suite}/{task}"
         require_sizes(self._name, **sizes)
@@ -100,7 +110,9 @@ class SimulatorEnv(EvalEnv):
 
     @classmethod
     def missing(cls) -> str | None:
-        """Return why the simulator cannot run here; the first call in a process renders one frame in a child."""
+        """Return why the simulator cannot run here; the first call in a process renders one
+        frame in a child.
+        """
         if lacks := without(cls.packages, cls.cure):
             return lacks
         try:
@@ -108,13 +120,17 @@ class SimulatorEnv(EvalEnv):
         except EnvFailed as error:
             return str(error)
         probe = egl_probe()
-        return None if probe.ok else f"{cls.title} cannot render without a display ({probe.error}); {probe.cure}"
+        return (
+            None
+            if probe.ok
+            else f"{cls.title} cannot render without a display ({probe.error}); {probe.cure}"
+        )
 
     def reset(self, *, seed: int, options: Options | None = None) -> tuple[Obs, dict[str, Any]]:
         """Begin the episode of `seed`, taken modulo 2^32.
 
-        If the task has fixed initial states, the episode begins in state `options["init_state"]`, or in one that the
-        seed selects. There are no other options.
+        If the task has fixed initial states, the episode begins in state `options["init_state"]`,
+        or in one that the seed selects. There are no other options.
         """
         self._alive()
         given, count = options or {}, self.init_states
@@ -123,7 +139,9 @@ class SimulatorEnv(EvalEnv):
             raise ConfigError(f"{self._name}: unknown reset options {unknown}, want {want}")
         state = given.get("init_state", seed % (count or 1))
         if type(state) is not int or not 0 <= state < (count or 1):
-            raise ConfigError(f"{self._name}: init_state is {state!r}, want 0 to {(count or 1) - 1}")
+            raise ConfigError(
+                f"{self._name}: init_state is {state!r}, want 0 to {(count or 1) - 1}"
+            )
         with failing(self._name, "reset"):
             obs, info = self._begin(seed % 2**32, state)
         self._steps = 0
@@ -147,7 +165,9 @@ class SimulatorEnv(EvalEnv):
             "render_backend": os.environ.get("MUJOCO_GL", "glfw"),
         }
         if self._protocol is not None:
-            facts["protocol"] = self._protocol.describe(max_steps=self.max_steps, ends_on_success=self._ends_on_success)
+            facts["protocol"] = self._protocol.describe(
+                max_steps=self.max_steps, ends_on_success=self._ends_on_success
+            )
         return facts
 
     def close(self) -> None:
@@ -156,15 +176,18 @@ class SimulatorEnv(EvalEnv):
 
     @abstractmethod
     def _begin(self, seed: int, state: int) -> tuple[Obs, dict[str, Any]]:
-        """Begin an episode by its seed, 0 to 2^32 - 1, and the number of its initial state, 0 if none is fixed.
+        """Begin an episode by its seed, 0 to 2^32 - 1, and the number of its initial state, 0 if
+        none is fixed.
 
-        Returns the first observation, and further entries of `info`; `init_state` and `success` (False) are added if
-        missing.
+        Returns the first observation, and further entries of `info`; `init_state` and `success`
+        (False) are added if missing.
         """
 
     @abstractmethod
     def _advance(self, action: np.ndarray) -> tuple[Obs, float, bool, dict[str, Any]]:
-        """Execute an action, (D,) float32; return `(obs, reward, terminated, info)` as for `EvalEnv.step`."""
+        """Execute an action, (D,) float32; return `(obs, reward, terminated, info)` as for
+        `EvalEnv.step`.
+        """
 
     @classmethod
     def _require_assets(cls) -> None:
@@ -181,7 +204,9 @@ class SimulatorEnv(EvalEnv):
 
     @contextmanager
     def _making(self) -> Iterator[None]:
-        """Guard the construction of the simulator: turn an error into `EnvFailed`, and free what was made."""
+        """Guard the construction of the simulator: turn an error into `EnvFailed`, and free what
+        was made.
+        """
         try:
             with failing(self._name, "make"):
                 yield
@@ -203,20 +228,26 @@ class MujocoCameras:
         upside_down: Collection[str] = (),
         shadows: bool = True,
     ) -> None:
-        """Make the renderer of a `mujoco.MjModel`, and grow the model's frame buffer if needed; `env` is for errors.
+        """Make the renderer of a `mujoco.MjModel`, and grow the model's frame buffer if needed;
+        `env` is for errors.
 
-        Images of cameras in `upside_down` are turned by 180 degrees. Without `shadows` there are no reflections and no
-        smooth edges either, and an image in software takes a tenth of the time.
+        Images of cameras in `upside_down` are turned by 180 degrees. Without `shadows` there are no
+        reflections and no smooth edges either, and an image in software takes a tenth of the time.
         """
         require_cameras(env, cameras, camera_names(model))
         self._cameras, self._upside_down = list(cameras), upside_down
         buffer = model.vis.global_
-        buffer.offheight, buffer.offwidth = max(buffer.offheight, size[0]), max(buffer.offwidth, size[1])
+        buffer.offheight, buffer.offwidth = (
+            max(buffer.offheight, size[0]),
+            max(buffer.offwidth, size[1]),
+        )
         mujoco = require("mujoco")
         if not shadows:
             model.vis.quality.offsamples = 0
         self._renderer: Any = mujoco.Renderer(model, *size)
-        for effect in () if shadows else (mujoco.mjtRndFlag.mjRND_SHADOW, mujoco.mjtRndFlag.mjRND_REFLECTION):
+        for effect in (
+            () if shadows else (mujoco.mjtRndFlag.mjRND_SHADOW, mujoco.mjtRndFlag.mjRND_REFLECTION)
+        ):
             self._renderer.scene.flags[effect] = 0
 
     def render(self, data: Any) -> dict[str, np.ndarray]:
@@ -225,7 +256,9 @@ class MujocoCameras:
         for camera in self._cameras:
             self._renderer.update_scene(data, camera=camera)
             image: np.ndarray = self._renderer.render()
-            images[camera] = np.ascontiguousarray(image[::-1, ::-1]) if camera in self._upside_down else image
+            images[camera] = (
+                np.ascontiguousarray(image[::-1, ::-1]) if camera in self._upside_down else image
+            )
         return images
 
     def close(self) -> None:
@@ -251,7 +284,9 @@ def without(modules: Sequence[str], cure: str) -> str | None:
 
 @contextmanager
 def failing(env: str, doing: str) -> Iterator[None]:
-    """Turn errors of a simulator into `EnvFailed`, with the cure of its driver; this package's own pass unchanged."""
+    """Turn errors of a simulator into `EnvFailed`, with the cure of its driver; this package's
+    own pass unchanged.
+    """
     try:
         yield
     except VLAgentsError:
@@ -262,4 +297,6 @@ def failing(env: str, doing: str) -> Iterator[None]:
             cure = f"; {EGL_CURE}"
         elif any(word in str(error) for word in ("vk::", "rendering device", "Vulkan")):
             cure = f"; {vulkan_cure()}"
-        raise EnvFailed(f"{env} failed to {doing}: {type(error).__name__}: {error}{cure}") from error
+        raise EnvFailed(
+            f"{env} failed to {doing}: {type(error).__name__}: {error}{cure}"
+        ) from error

@@ -1,8 +1,8 @@
 """Evaluation: episodes as keyed jobs, played in parallel by Ray actors, recorded exactly once.
 
     suites = [{"envs": ["tabletop"]}]
-    config = EvalConfig(policies=[{"url": "http://localhost:8000"}], suites=suites, out="runs/first")
-    summary = evaluate(config)
+    config = EvalConfig(policies=[{"url": "http://localhost:8000"}], suites=suites,
+    out="runs/first") summary = evaluate(config)
 
 Configurations and results are read without Ray; code that plays or prints is loaded on first use.
 """
@@ -35,7 +35,12 @@ from vlagents_ray.evaluate.results.statistics import (
 from vlagents_ray.evaluate.results.summary import Group, Summary
 
 if TYPE_CHECKING:
-    from vlagents_ray.evaluate.report.terminal import Progress, print_summary, progress_for, results_table
+    from vlagents_ray.evaluate.report.terminal import (
+        Progress,
+        print_summary,
+        progress_for,
+        results_table,
+    )
     from vlagents_ray.evaluate.run import EvaluationInterrupted, OutOfTime, check, evaluate
     from vlagents_ray.evaluate.workers.cluster import most_cpus, most_gpus
 

@@ -16,7 +16,8 @@ from vlagents_ray.policies.base.checkpoint_files import unfinished
 
 FINISHED = "training_finished"  # a file of this name in the folder means that no checkpoint follows
 
-Snapshot = frozenset[tuple[str, int, int]]  # (path, size in bytes, time of change in ns) of each file
+# (path, size in bytes, time of change in ns) of each file.
+Snapshot = frozenset[tuple[str, int, int]]
 
 
 @dataclass(slots=True)
@@ -32,11 +33,19 @@ class _SeenFile:
 class CheckpointWatcher:
     """Polls a folder for checkpoints."""
 
-    def __init__(self, pattern: str, folder: Path | None = None, *, settle_s: float = 10.0, marker: str | None = None):
+    def __init__(
+        self,
+        pattern: str,
+        folder: Path | None = None,
+        *,
+        settle_s: float = 10.0,
+        marker: str | None = None,
+    ):
         """Watch for checkpoints.
 
-        A checkpoint is complete when `vlagents_ray.policies.base.checkpoint_files` finds no fault in it, and either its
-        names, sizes and times have not changed for `settle_s` seconds, or it holds a file called `marker`.
+        A checkpoint is complete when `vlagents_ray.policies.base.checkpoint_files` finds no fault
+        in it, and either its names, sizes and times have not changed for `settle_s` seconds, or it
+        holds a file called `marker`.
 
         Args:
             pattern: A checkpoint's path with `{step}` in it.
@@ -46,7 +55,9 @@ class CheckpointWatcher:
         """
         parts = PurePath(pattern).parts
         if (place := next((i for i, part in enumerate(parts) if STEP in part), None)) is None:
-            raise ConfigError(f"checkpoint {pattern!r}: has no {STEP} in it; write one where the step stands")
+            raise ConfigError(
+                f"checkpoint {pattern!r}: has no {STEP} in it; write one where the step stands"
+            )
         self.folder = Path(*parts[:place]) if folder is None else folder
         self._below = parts[place + 1 :]
         self._name = re.compile(re.escape(parts[place]).replace(re.escape(STEP), r"(\d+)", 1))
@@ -55,10 +66,16 @@ class CheckpointWatcher:
         self._complete: set[int] = set()
 
     def scan(self, now: float) -> list[int]:
-        """Return the steps completed since the last call, ascending; `now` is in s, of any clock."""
+        """Return the steps completed since the last call, ascending; `now` is in s, of any
+        clock.
+        """
         found = self._found()
         self._seen = {step: seen for step, seen in self._seen.items() if step in found}
-        new = [step for step in sorted(found.keys() - self._complete) if self._is_complete(step, found[step], now)]
+        new = [
+            step
+            for step in sorted(found.keys() - self._complete)
+            if self._is_complete(step, found[step], now)
+        ]
         self._complete.update(new)
         for step in new:
             del self._seen[step]
@@ -78,15 +95,21 @@ class CheckpointWatcher:
         return {step: seen.why for step, seen in sorted(self._seen.items())}
 
     def _found(self) -> dict[int, tuple[Path, Path]]:
-        """Return by step the entry of the folder, and the path that the policy loads: the entry, or one in it."""
+        """Return by step the entry of the folder, and the path that the policy loads: the entry,
+        or one in it.
+        """
         found: dict[int, tuple[Path, Path]] = {}
         for entry in self.folder.iterdir() if self.folder.is_dir() else ():
             match = self._name.fullmatch(entry.name)
             step = int(match[1]) if match else -1
-            if match is None or match[1] not in (str(step), f"{step:06d}"):  # as `find_checkpoint` accepts it
+            # As `find_checkpoint` accepts it.
+            if match is None or match[1] not in (str(step), f"{step:06d}"):
                 continue
             if step not in found or match[1] == str(step):  # the policy looks for this name first
-                found[step] = entry, entry.joinpath(*(at_step(part, match[1]) for part in self._below))
+                found[step] = (
+                    entry,
+                    entry.joinpath(*(at_step(part, match[1]) for part in self._below)),
+                )
         return found
 
     def _is_complete(self, step: int, found: tuple[Path, Path], now: float) -> bool:
@@ -118,7 +141,8 @@ def rounds(
     It ends when a step at or after `until` is complete, or when the training has announced its end.
     """
     while True:
-        now, finished = clock(), watcher.finished  # read before the scan, which then finds all checkpoints
+        # Read before the scan, which then finds all checkpoints.
+        now, finished = clock(), watcher.finished
         steps = watcher.scan(now)
         if wanted := [step for step in steps if until is None or step <= until]:
             yield wanted

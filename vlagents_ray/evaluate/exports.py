@@ -31,7 +31,9 @@ class Column:
 
 
 def _of_result(name: str, kind: Type, meaning: str, field: str | None = None) -> Column:
-    return Column(name, kind, meaning, lambda _cell, episode: getattr(episode.result, field or name))
+    return Column(
+        name, kind, meaning, lambda _cell, episode: getattr(episode.result, field or name)
+    )
 
 
 def _of_cell(name: str, kind: Type, meaning: str) -> Column:
@@ -43,23 +45,63 @@ def _of_episode(name: str, kind: Type, meaning: str) -> Column:
 
 
 COLUMNS = (
-    _of_result("key", "string", "identifies the episode by all that determines it, its weights included", "full_key"),
+    _of_result(
+        "key",
+        "string",
+        "identifies the episode by all that determines it, its weights included",
+        "full_key",
+    ),
     _of_cell("policy", "string", "its name in the evaluation"),
     _of_cell("step", "integer", "of training, in a sweep over checkpoints"),
     _of_result("checkpoint", "string", "that the policy's reset named"),
-    _of_result("weights", "string", "digest of the weights loaded from it; null if the policy states none"),
-    _of_result("policy_version", "integer", "of the weights that computed the last act; 0 is the loaded checkpoint"),
-    _of_result("policy_fingerprint", "string", "of that version, computed by its replica from the weights in memory"),
+    _of_result(
+        "weights", "string", "digest of the weights loaded from it; null if the policy states none"
+    ),
+    _of_result(
+        "policy_version",
+        "integer",
+        "of the weights that computed the last act; 0 is the loaded checkpoint",
+    ),
+    _of_result(
+        "policy_fingerprint",
+        "string",
+        "of that version, computed by its replica from the weights in memory",
+    ),
     _of_result("first_policy_version", "integer", "of the weights that computed the first act"),
     _of_cell("suite", "string", "its name in the evaluation"),
     _of_cell("env", "string", "full name, with the task"),
-    Column("episode", "integer", "its number, from 0", lambda _cell, episode: episode.result.key.episode),
-    Column("seed", "integer", "of the env's and the policy's reset", lambda _cell, episode: episode.result.key.seed),
-    _of_cell("settings", "json", "all else that decides the episode: options of env and policy, checkpoint, codec"),
+    Column(
+        "episode",
+        "integer",
+        "its number, from 0",
+        lambda _cell, episode: episode.result.key.episode,
+    ),
+    Column(
+        "seed",
+        "integer",
+        "of the env's and the policy's reset",
+        lambda _cell, episode: episode.result.key.seed,
+    ),
+    _of_cell(
+        "settings",
+        "json",
+        "all else that decides the episode: options of env and policy, checkpoint, codec",
+    ),
     _of_cell("described", "json", "the env's description of itself: versions, protocol"),
-    _of_cell("code", "json", "of the env: its git commit, and the SHA-256 of the difference from it"),
-    _of_result("status", "string", "done; policy_error: the policy failed; infra_failed: it counts in no rate"),
-    Column("counted", "boolean", "whether it counts in the rates", lambda _cell, episode: episode.counts),
+    _of_cell(
+        "code", "json", "of the env: its git commit, and the SHA-256 of the difference from it"
+    ),
+    _of_result(
+        "status",
+        "string",
+        "done; policy_error: the policy failed; infra_failed: it counts in no rate",
+    ),
+    Column(
+        "counted",
+        "boolean",
+        "whether it counts in the rates",
+        lambda _cell, episode: episode.counts,
+    ),
     _of_result("success_once", "boolean", "the task was solved after some step"),
     _of_result("success_at_end", "boolean", "the task was solved after the last step"),
     _of_result("first_success", "integer", "steps after which it was solved for the first time"),
@@ -68,7 +110,9 @@ COLUMNS = (
     _of_result("ending", "string", "terminated, truncated, policy_done or error"),
     _of_result("instruction", "string", "the task in words"),
     _of_result("error", "string", "of a status other than done"),
-    _of_result("actions_sha256", "string", "of the actions as executed: (steps, D) little-endian float32"),
+    _of_result(
+        "actions_sha256", "string", "of the actions as executed: (steps, D) little-endian float32"
+    ),
     _of_result("seconds", "number", "from reset to the last step"),
     _of_result("reset_ms", "number", "of the env"),
     _of_result("env_step_ms", "number", "median of the env's steps"),
@@ -76,8 +120,12 @@ COLUMNS = (
     _of_result("acts", "integer", "answers of the policy; fewer than steps with chunks"),
     _of_result("policy_ms", "number", "median of the policy's answers, transport included"),
     _of_result("policy_p95_ms", "number", "their 95th percentile"),
-    _of_result("policy_seconds", "number", "time that the policy computed for it: its share of each batch"),
-    _of_result("latency_ms", "number", "in real-time mode: the env's time that one answer took, median"),
+    _of_result(
+        "policy_seconds", "number", "time that the policy computed for it: its share of each batch"
+    ),
+    _of_result(
+        "latency_ms", "number", "in real-time mode: the env's time that one answer took, median"
+    ),
     _of_result("ticks_waited", "integer", "steps executed while the policy computed"),
     _of_result("ticks_held", "integer", "of these, steps with no row of a chunk left"),
     _of_result("timing_ms", "json", "median times of one answer on the server, by stage"),
@@ -85,18 +133,31 @@ COLUMNS = (
     _of_episode("attempts", "integer", "1, and one more for each failure of infrastructure"),
     _of_episode("run", "integer", "number of the run over the plan, from 1"),
     Column(
-        "finished", "time", "when it was recorded", lambda _, one: datetime.fromtimestamp(one.finished, timezone.utc)
+        "finished",
+        "time",
+        "when it was recorded",
+        lambda _, one: datetime.fromtimestamp(one.finished, timezone.utc),
     ),
     _of_episode("videos", "json", "paths in the folder of results"),
     _of_episode("trajectory", "string", "path in the folder of results"),
-    _of_result("revision", "string", "the hub's commit of the checkpoint, if it was loaded from the hub's cache"),
-    _of_episode("env_program", "string", "digest of the files of the env, its code included; null if installed"),
+    _of_result(
+        "revision",
+        "string",
+        "the hub's commit of the checkpoint, if it was loaded from the hub's cache",
+    ),
+    _of_episode(
+        "env_program",
+        "string",
+        "digest of the files of the env, its code included; null if installed",
+    ),
     _of_episode("policy_program", "string", "the same of the policy"),
-)  # fmt: skip
+)
 
 
 def rows(results: Results, *, flat: bool = False) -> Iterator[dict[str, Any]]:
-    """Yield every recorded episode as Python values by column; those of type "json" are nested or, if `flat`, text."""
+    """Yield every recorded episode as Python values by column; those of type "json" are nested
+    or, if `flat`, text.
+    """
     for cell in results.cells:
         for episode in cell.episodes:
             row = {column.name: column.value(cell, episode) for column in COLUMNS}
@@ -107,16 +168,21 @@ _JSON = {column.name for column in COLUMNS if column.type == "json"}
 
 
 def to_json(results: Results, path: Path) -> int:
-    """Write a list with one object for each episode; times are ISO 8601, in UTC. Returns the number of episodes."""
+    """Write a list with one object for each episode; times are ISO 8601, in UTC. Returns the
+    number of episodes.
+    """
     require_folder_of(path)
     found = list(rows(results))
     with whole(path) as part:
-        part.write_text(json.dumps(found, indent=1, default=_text, ensure_ascii=False) + "\n", encoding="utf-8")
+        part.write_text(
+            json.dumps(found, indent=1, default=_text, ensure_ascii=False) + "\n", encoding="utf-8"
+        )
     return len(found)
 
 
 def to_csv(results: Results, path: Path) -> int:
-    """Write a header, and a line for each episode; None is an empty field, a boolean `true` or `false`.
+    """Write a header, and a line for each episode; None is an empty field, a boolean `true` or
+    `false`.
 
     Returns the number of episodes.
     """
@@ -126,8 +192,15 @@ def to_csv(results: Results, path: Path) -> int:
         writer = csv.DictWriter(file, [column.name for column in COLUMNS])
         writer.writeheader()
         for number, row in enumerate(rows(results, flat=True), 1):  # noqa: B007 - the last one counts
-            row |= {name: str(value).lower() for name, value in row.items() if isinstance(value, bool)}
-            writer.writerow({name: _text(one) if isinstance(one, datetime) else one for name, one in row.items()})
+            row |= {
+                name: str(value).lower() for name, value in row.items() if isinstance(value, bool)
+            }
+            writer.writerow(
+                {
+                    name: _text(one) if isinstance(one, datetime) else one
+                    for name, one in row.items()
+                }
+            )
     return number
 
 

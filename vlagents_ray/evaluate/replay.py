@@ -16,15 +16,18 @@ from vlagents_ray.evaluate.plan.config import EvalConfig
 from vlagents_ray.evaluate.results.reader import CellResults, Episode, Results
 
 _FEW = 5  # names in a message
-# Largest differences of actions of 1 or less, else relative. At the first step that differs, a batch of another size
-# changes 1e-7 to 1e-5. Later steps amplify that, since each observation depends on the actions before it.
+# Largest differences of actions of 1 or less, else relative. At the first step that differs, a
+# batch of another size changes 1e-7 to 1e-5. Later steps amplify that, since each observation
+# depends on the actions before it.
 ROUNDING = 1e-4
 DRIFT = 1e-2
 
 
 @dataclass(frozen=True, slots=True)
 class ActionsDifference:
-    """By how much the actions of two episodes of one length differ: absolutely, or relatively to numbers above 1."""
+    """By how much the actions of two episodes of one length differ: absolutely, or relatively to
+    numbers above 1.
+    """
 
     step: int  # the first that differs; the observations until then were the same
     at_first: float  # the largest of a number of that step's action
@@ -32,7 +35,9 @@ class ActionsDifference:
 
     @property
     def is_rounding(self) -> bool:
-        """Whether another rounding explains the difference, at the first step and as it grew later."""
+        """Whether another rounding explains the difference, at the first step and as it grew
+        later.
+        """
         return self.at_first <= ROUNDING and self.largest <= DRIFT
 
 
@@ -50,7 +55,8 @@ class Recorded:
         return self.episode.result.key.episode, self.episode.result.key.seed
 
     def config(self, out: Path, *, policy: dict[str, Any] | None = None) -> EvalConfig:
-        """Settings of an evaluation of this episode's cell alone into `out`, with video and trajectory.
+        """Settings of an evaluation of this episode's cell alone into `out`, with video and
+        trajectory.
 
         They are those of its run. `policy` replaces settings of the policy.
         """
@@ -71,20 +77,30 @@ class Recorded:
         if policy is not None:
             given = {name: value for name, value in given.items() if name != "name"} | policy
         suite = cell.suite.model_dump() | {"envs": [cell.env], "worker": cell.worker.model_dump()}
-        alone = {"policies": [given], "suites": [suite], "out": out, "workers": None, "resume": False}
-        return EvalConfig.model_validate(config.model_dump() | alone | {"video": "all", "record": "all", "track": []})
+        alone = {
+            "policies": [given],
+            "suites": [suite],
+            "out": out,
+            "workers": None,
+            "resume": False,
+        }
+        return EvalConfig.model_validate(
+            config.model_dump() | alone | {"video": "all", "record": "all", "track": []}
+        )
 
 
 def find(results: Results, name: str | None) -> Recorded:
     """Find the episode with the key `name`, or the only one with number N in an env, as "ENV#N".
 
-    Raises `ConfigError` if no name is given, if there is none, if there are several, or if it failed by infrastructure.
+    Raises `ConfigError` if no name is given, if there is none, if there are several, or if it
+    failed by infrastructure.
     """
     found = [
         Recorded(results, cell, one)
         for cell in results.cells
         for one in cell.episodes
-        if name in (one.result.full_key, str(one.result.key), f"{cell.env}#{one.result.key.episode}")
+        if name
+        in (one.result.full_key, str(one.result.key), f"{cell.env}#{one.result.key.episode}")
     ]
     if not found:
         have = [one.result.full_key for cell in results.cells for one in cell.episodes][:_FEW]
@@ -99,15 +115,18 @@ def find(results: Results, name: str | None) -> Recorded:
 
 
 def compare(recorded: Recorded, replayed: Results) -> list[str]:
-    """Return the differences of the replay, a sentence each; empty if it is the same episode up to rounding.
+    """Return the differences of the replay, a sentence each; empty if it is the same episode up to
+    rounding.
 
-    Actions that differ in their bytes are the same if that `is_rounding` (see `actions_difference`), and so are then
-    returns that differ by no more than `DRIFT`. Durations are not compared. Raises `ConfigError` if infrastructure
-    failed the replay.
+    Actions that differ in their bytes are the same if that `is_rounding` (see
+    `actions_difference`), and so are then returns that differ by no more than `DRIFT`. Durations
+    are not compared. Raises `ConfigError` if infrastructure failed the replay.
     """
     [[again]] = [cell.episodes for cell in replayed.cells]
     if again.result.status == "infra_failed":
-        raise ConfigError(f"the replay did not end, so that there is nothing to compare: {again.result.error}")
+        raise ConfigError(
+            f"the replay did not end, so that there is nothing to compare: {again.result.error}"
+        )
     before, now = recorded.episode.result.outcome, again.result.outcome
     difference = actions_difference(recorded, replayed)
     is_rounding = difference is not None and difference.is_rounding
@@ -124,7 +143,8 @@ def compare(recorded: Recorded, replayed: Results) -> list[str]:
     weights = [one.result.weights for one in (recorded.episode, again)]
     if found and None not in weights and weights[0] != weights[1]:
         found.append(
-            f"weights: {weights[0]} played it, now it is {weights[1]}: another checkpoint, or other files in it"
+            f"weights: {weights[0]} played it, now it is {weights[1]}: another checkpoint, or "
+            "other files in it"
         )
     return found
 
@@ -133,7 +153,8 @@ def actions_difference(recorded: Recorded, replayed: Results) -> ActionsDifferen
     """Return by how much the replayed actions differ.
 
     Returns:
-        None if they are equal byte for byte, if their numbers differ, or if a trajectory is missing.
+        None if they are equal byte for byte, if their numbers differ, or if a trajectory is
+        missing.
     """
     [[again]] = [cell.episodes for cell in replayed.cells]
     if recorded.episode.result.actions_sha256 == again.result.actions_sha256:
@@ -144,7 +165,9 @@ def actions_difference(recorded: Recorded, replayed: Results) -> ActionsDifferen
     ]
     if not all(path is not None and path.is_file() for path in paths):
         return None
-    before, now = (Trajectory.load(path).actions.astype(np.float64) for path in paths if path is not None)
+    before, now = (
+        Trajectory.load(path).actions.astype(np.float64) for path in paths if path is not None
+    )
     if before.shape != now.shape:
         return None
     by_step = np.max(np.abs(before - now) / np.maximum(1.0, np.abs(before)), axis=1)
@@ -155,21 +178,32 @@ def actions_difference(recorded: Recorded, replayed: Results) -> ActionsDifferen
 def _actions(recorded: Recorded, replayed: Path) -> str:
     if (path := recorded.episode.trajectory) is None:
         return (
-            "actions: they differ; from which step on is not known, nor whether by more than rounding, as no "
-            "trajectory was recorded (eval --record all, or `record: all` in its file); the size of a batch, which "
+            "actions: they differ; from which step on is not known, nor whether by more than "
+            "rounding, as no "
+            "trajectory was recorded (eval --record all, or `record: all` in its file); the size "
+            "of a batch, which "
             "several episodes share, changes the last digits of an action, about 1e-7"
         )
     file = recorded.results.file(path)
     if not file.is_file():
-        return f"actions: they differ; from which step on is not known, as {file}, the recorded trajectory, is gone"
+        return (
+            f"actions: they differ; from which step on is not known, as {file}, the recorded "
+            "trajectory, is gone"
+        )
     before = Trajectory.load(file).actions
     now = Trajectory.load(replayed).actions
     rows = zip(before, now, strict=False)
     step = next((i for i, (a, b) in enumerate(rows) if a.tobytes() != b.tobytes()), None)
     if step is None:
         same = min(len(before), len(now))
-        return f"actions: {len(before)} were recorded, now they are {len(now)}; the first {same} are the same"
-    return f"actions: they differ from step {step} on: {_row(before[step])} was recorded, now it is {_row(now[step])}"
+        return (
+            f"actions: {len(before)} were recorded, now they are {len(now)}; the first {same} "
+            "are the same"
+        )
+    return (
+        f"actions: they differ from step {step} on: {_row(before[step])} was recorded, now it "
+        f"is {_row(now[step])}"
+    )
 
 
 def _row(action: np.ndarray) -> str:

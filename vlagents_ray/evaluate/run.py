@@ -12,7 +12,13 @@ from dataclasses import dataclass
 
 from vlagents_ray.errors import ConfigError, StorageFailed, VLAgentsError, from_code
 from vlagents_ray.evaluate.artifacts.recorder import Artifacts, save
-from vlagents_ray.evaluate.artifacts.storage import driver_code, policy_code, save_diffs, storing, versions
+from vlagents_ray.evaluate.artifacts.storage import (
+    driver_code,
+    policy_code,
+    save_diffs,
+    storing,
+    versions,
+)
 from vlagents_ray.evaluate.episode.failures import Failure
 from vlagents_ray.evaluate.episode.records import EpisodeResult
 from vlagents_ray.evaluate.plan.cases import require_envs
@@ -24,9 +30,21 @@ from vlagents_ray.evaluate.results.statistics import Stopping
 from vlagents_ray.evaluate.results.store import Store
 from vlagents_ray.evaluate.results.summary import Summary, summarize, write_summary
 from vlagents_ray.evaluate.trackers import TrackerFeed, tracker_class
-from vlagents_ray.evaluate.workers.base import SIGNAL_S, FailedAttempts, Workers, chosen_workers, dispatch
+from vlagents_ray.evaluate.workers.base import (
+    SIGNAL_S,
+    FailedAttempts,
+    Workers,
+    chosen_workers,
+    dispatch,
+)
 from vlagents_ray.evaluate.workers.in_process import workers_class
-from vlagents_ray.evaluate.workers.rollout import AgentFactory, OwnAgents, Report, agents, factory_programs
+from vlagents_ray.evaluate.workers.rollout import (
+    AgentFactory,
+    OwnAgents,
+    Report,
+    agents,
+    factory_programs,
+)
 from vlagents_ray.policies.base.program import Program
 from vlagents_ray.ray_tools.signals import stop_signals
 
@@ -47,12 +65,17 @@ class EvaluationInterrupted(KeyboardInterrupt):
 
     def __init__(self, summary: Summary) -> None:
         done, planned = summary.total.episodes, summary.total.planned
-        super().__init__(f"{self.why} after {done} of {planned} episodes; go on with --resume --out {summary.out}")
+        super().__init__(
+            f"{self.why} after {done} of {planned} episodes; go on with --resume --out "
+            f"{summary.out}"
+        )
         self.summary = summary
 
 
 class OutOfTime(EvaluationInterrupted):
-    """No further episode would have ended by `end_at`; `resume` continues, as after an interruption."""
+    """No further episode would have ended by `end_at`; `resume` continues, as after an
+    interruption.
+    """
 
     why = "out of time"
 
@@ -67,20 +90,21 @@ def evaluate(
 ) -> Summary:
     """Play every episode of `config` that has no result yet, and write the results to `config.out`.
 
-    Episodes run in Ray actors: in the cluster of this process, else in that of `RAY_ADDRESS`, else in a local one for
-    the length of the run. With `config.workers` 0 they run in this process, on this thread, and time limits do not
-    apply; a short evaluation does that by default (see `chosen_workers`). Results are the same. Each worker uses the
-    policy at its `url`, or its own agent from `agent_factory`. Even if an exception is raised, recorded episodes are
-    kept, and summary.json and report.html are written if the disk has room.
+    Episodes run in Ray actors: in the cluster of this process, else in that of `RAY_ADDRESS`, else
+    in a local one for the length of the run. With `config.workers` 0 they run in this process, on
+    this thread, and time limits do not apply; a short evaluation does that by default (see
+    `chosen_workers`). Results are the same. Each worker uses the policy at its `url`, or its own
+    agent from `agent_factory`. Even if an exception is raised, recorded episodes are kept, and
+    summary.json and report.html are written if the disk has room.
 
     Args:
         config: The policies, the envs, and the folder of results.
-        agent_factory: Called in each worker to make its agent, in place of a connection to the policy's `url`; or such
-            functions by the names of policies.
+        agent_factory: Called in each worker to make its agent, in place of a connection to the
+            policy's `url`; or such functions by the names of policies.
         progress: Shows the progress (`progress_for`); by default nothing is shown.
         only: (number, seed) of the one episode of each env that is played; by default all are.
-        end_at: A time in seconds since 1970. No episode begins that would not end by then, by the durations of earlier
-            ones.
+        end_at: A time in seconds since 1970. No episode begins that would not end by then, by the
+            durations of earlier ones.
 
     Returns:
         The summary of all results in `config.out`, those of earlier runs included.
@@ -89,12 +113,17 @@ def evaluate(
         ConfigError: The settings are invalid, or contradict the results in `config.out`.
         ContractMismatch: A policy and an env do not fit together.
         StorageFailed: The disk is full, or cannot be written to.
-        EvaluationInterrupted: Ctrl-C or SIGTERM; its subclass `OutOfTime` if `end_at` left episodes.
-        VLAgentsError: The last infrastructure error, after `config.abort_after` lost episodes in a row; `PolicyFailed`
-            with the last error, after as many in a row that an error of a policy ended.
+        EvaluationInterrupted: Ctrl-C or SIGTERM; its subclass `OutOfTime` if `end_at` left
+            episodes.
+        VLAgentsError: The last infrastructure error, after `config.abort_after` lost episodes in a
+            row; `PolicyFailed` with the last error, after as many in a row that an error of a
+            policy ended.
     """
     if config.real_robot is not None:
-        raise ConfigError("robot.arm: got a real robot, want a plan in simulation; see vlagents_ray.evaluate.robot")
+        raise ConfigError(
+            "robot.arm: got a real robot, want a plan in simulation; see "
+            "vlagents_ray.evaluate.robot"
+        )
     config = config.model_copy(update={"workers": chosen_workers(config)})
     factory = agents(config, agent_factory)
     tracking = TrackerFeed(config)
@@ -109,7 +138,8 @@ def evaluate(
                 run = _Run(config, store, progress or Progress(), tracking, only, end_at, local)
                 state, summary = run.play(factory)
         except BaseException:
-            with contextlib.suppress(StorageFailed):  # probably the same disk error; report the first one
+            # Probably the same disk error; report the first one.
+            with contextlib.suppress(StorageFailed):
                 conclude(config, store, "stopped")
             raise
     for stopped in (EvaluationInterrupted, OutOfTime):
@@ -120,7 +150,8 @@ def evaluate(
 
 def conclude(config: EvalConfig, store: Store, state: str) -> Summary:
     """Record the end of the run, and write its summary and its report."""
-    from vlagents_ray.evaluate.report.page import FILE, write_report  # late: an evaluation begins sooner
+    # late: an evaluation begins sooner.
+    from vlagents_ray.evaluate.report.page import FILE, write_report
 
     with storing(config.out):
         store.end_run(state)
@@ -134,8 +165,8 @@ def check(config: EvalConfig) -> None:
     """Check the settings as `evaluate` does, before a policy is served for it.
 
     Raises:
-        ConfigError: An env or a tracker is not registered or not installed, or the settings contradict the results in
-            `config.out`.
+        ConfigError: An env or a tracker is not registered or not installed, or the settings
+            contradict the results in `config.out`.
     """
     require_envs(config)
     for name in config.track:
@@ -161,8 +192,11 @@ class _Run:
         self._attempts = FailedAttempts(config)
         self._checked_gpus = not config.workers  # when an env first drew
         earlier = {cell.cell: cell for cell in Results.load(config.out).cells}
-        self._recorded = {cell: rate_of([results], "success_once") for cell, results in earlier.items()}
-        self._diverged: dict[EpisodeKey, tuple[int, str | None]] = {}  # steps and digest of the actions
+        self._recorded = {
+            cell: rate_of([results], "success_once") for cell, results in earlier.items()
+        }
+        # Steps and digest of the actions.
+        self._diverged: dict[EpisodeKey, tuple[int, str | None]] = {}
         self._stopping: dict[str, Stopping] = {}
         if config.stop is not None:
             for cell in store.cells:
@@ -170,18 +204,23 @@ class _Run:
                 stopping.add_all(episode.result for episode in earlier[cell.fingerprint].episodes)
                 self._stopping[cell.fingerprint] = stopping
         finished = store.finished()
-        wanted = [job for job in plan(store.cells) if self.only in (None, (job.key.episode, job.key.seed))]
-        pending = [job for job in wanted if str(job.key) not in finished and not self._has_stopped(job)]
+        wanted = [
+            job for job in plan(store.cells) if self.only in (None, (job.key.episode, job.key.seed))
+        ]
+        pending = [
+            job for job in wanted if str(job.key) not in finished and not self._has_stopped(job)
+        ]
         self._queue = JobQueue(pending)
         self._left = Counter(job.key.settings for job in pending)  # by cell
         played = (one.result.seconds for cell in earlier.values() for one in cell.episodes)
         self._deadline = Deadline(self.end_at, played)
 
     def play(self, factory: AgentFactory) -> tuple[str, Summary]:
-        """Play all queued episodes, until a signal or the deadline ends the run; returns its state and summary.
+        """Play all queued episodes, until a signal or the deadline ends the run; returns its state
+        and summary.
 
-        The summary is written before Ray is left: when Slurm cancels a job, Ray stops responding at once and the job is
-        killed seconds later.
+        The summary is written before Ray is left: when Slurm cancels a job, Ray stops responding at
+        once and the job is killed seconds later.
         """
         if not len(self._queue):
             return "complete", conclude(self.config, self.store, "complete")
@@ -193,7 +232,9 @@ class _Run:
                 with pool_of(self.config, factory) as pool:
                     try:
                         while not stop.is_set() and not self._deadline.is_over:
-                            if not pool.busy and not (len(self._queue) and self._deadline.leaves_room):
+                            if not pool.busy and not (
+                                len(self._queue) and self._deadline.leaves_room
+                            ):
                                 break
                             self._poll_pool(pool, stop)
                         if not stop.is_set():
@@ -204,7 +245,10 @@ class _Run:
                     except VLAgentsError as error:
                         if isinstance(error, StorageFailed) or not stop.wait(SIGNAL_S):
                             raise
-                        log.info("a part of the evaluation that the signal ended, too, reported: %s", error)
+                        log.info(
+                            "a part of the evaluation that the signal ended, too, reported: %s",
+                            error,
+                        )
                     state = OutOfTime.why if len(self._queue) or pool.busy else "complete"
                     if stop.is_set():
                         state = EvaluationInterrupted.why
@@ -219,10 +263,12 @@ class _Run:
         for job, report in pool.wait(POLL_S):
             self._deadline.end(job)
             if report.failure is not None:
-                # A terminal or a service manager also signals workers and policies: that costs no attempt.
+                # A terminal or a service manager also signals workers and policies: that costs no
+                # attempt.
                 if stop.wait(late_s):
                     continue
-                late_s = 0.0  # one wait is for all failures of a poll: a lost policy fails many episodes at once
+                # One wait is for all failures of a poll: a lost policy fails many episodes at once.
+                late_s = 0.0
             with storing(self.config.out):
                 self._handle(job, report)
 
@@ -250,7 +296,8 @@ class _Run:
                 self._attempts.note_played()
             if (reason := report.artifacts.not_repeatable) is not None:
                 log.warning(
-                    "%s: nothing of it is recorded, as its actions do not repeat it in the simulator: %s; its worker "
+                    "%s: nothing of it is recorded, as its actions do not repeat it in the "
+                    "simulator: %s; its worker "
                     "renders further episodes as they are played",
                     job.key,
                     reason,
@@ -278,7 +325,9 @@ class _Run:
         self._attempts.note_lost(failure, "resume when this is mended (--resume)")
 
     def _diverged_again(self, job: Job, failure: Failure) -> bool:
-        """Record a simulation that diverged twice under the same actions: the policy is the cause, and has failed."""
+        """Record a simulation that diverged twice under the same actions: the policy is the
+        cause, and has failed.
+        """
         result = failure.diverged
         if result is None:
             return False
@@ -313,12 +362,19 @@ class _Run:
 
 
 class Deadline:
-    """Measures the duration of episodes in the driver, with the start of a simulator and waiting for a policy."""
+    """Measures the duration of episodes in the driver, with the start of a simulator and waiting
+    for a policy.
+    """
 
     def __init__(
-        self, end_at: float | None, known_s: Iterable[float] = (), now: Callable[[], float] = time.time
+        self,
+        end_at: float | None,
+        known_s: Iterable[float] = (),
+        now: Callable[[], float] = time.time,
     ) -> None:
-        """`end_at` is in seconds since 1970, None for no deadline; `known_s` are durations of earlier episodes, s."""
+        """`end_at` is in seconds since 1970, None for no deadline; `known_s` are durations of
+        earlier episodes, s.
+        """
         self._end_at = end_at
         self._longest_s = max(known_s, default=0.0)
         self._now = now

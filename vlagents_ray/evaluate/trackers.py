@@ -26,14 +26,17 @@ CLOSE_S = 120.0  # for trackers to send what is buffered
 
 @dataclass(frozen=True, slots=True)
 class TrackedPolicy:
-    """The subject of a tracker's run: one policy of one folder of results, with all its checkpoints."""
+    """The subject of a tracker's run: one policy of one folder of results, with all its
+    checkpoints.
+    """
 
     out: Path
     project: str
     group: str
     name: str  # of the policy
     id: str  # is kept when an evaluation resumes this folder
-    config: dict[str, Any]  # `evaluation`: its settings; `served`: the policy's identity; `code`: git states
+    # `evaluation`: its settings; `served`: the policy's identity; `code`: git states.
+    config: dict[str, Any]
     diffs: Sequence[Path]  # of the working trees from their commits
 
 
@@ -69,21 +72,26 @@ def tracker_class(name: str) -> type[TrackerRun]:
 
 
 class TrackerFeed:
-    """Logs to the trackers from a thread, as a tracker may wait for a network. Use as a context manager around a run.
+    """Logs to the trackers from a thread, as a tracker may wait for a network. Use as a context
+    manager around a run.
 
-    A tracker that fails is not used again in this run: a warning is logged, and the results are unaffected. The results
-    record what was logged, so that a resumed run logs only new values.
+    A tracker that fails is not used again in this run: a warning is logged, and the results are
+    unaffected. The results record what was logged, so that a resumed run logs only new values.
     """
 
     def __init__(self, config: EvalConfig) -> None:
-        """Raise `ConfigError` for a tracker that is not registered, `MissingDependency` if its package is missing."""
+        """Raise `ConfigError` for a tracker that is not registered, `MissingDependency` if its
+        package is missing.
+        """
         self._classes = {name: tracker_class(name) for name in config.track}
         self._config = config
         self._working = list(config.track)  # those that have not failed
         self._runs: dict[tuple[str, str], TrackerRun] = {}  # by tracker and policy
         self._updated = threading.Event()
         self._closing = False
-        self._thread = threading.Thread(target=self._loop, name="vlagents-ray-trackers", daemon=True)
+        self._thread = threading.Thread(
+            target=self._loop, name="vlagents-ray-trackers", daemon=True
+        )
 
     def update(self) -> None:
         """Request a check for complete cells. Calls while trackers are busy count as one."""
@@ -100,19 +108,27 @@ class TrackerFeed:
             self._updated.set()
             self._thread.join(CLOSE_S)
             if self._thread.is_alive():
-                log.warning("%s: still sending after %g s; given up", ", ".join(self._working), CLOSE_S)
+                log.warning(
+                    "%s: still sending after %g s; given up", ", ".join(self._working), CLOSE_S
+                )
 
     def _loop(self) -> None:
         over = False
         while not over:
             self._updated.wait()
             self._updated.clear()
-            over = self._closing  # read before the results, so that all cells complete by then are logged
+            # Read before the results, so that all cells complete by then are logged.
+            over = self._closing
             for tracker in list(self._working):
                 try:
                     self._log_to(tracker, Results.load(self._config.out))
                 except Exception as error:  # noqa: BLE001 - whatever a tracker raises
-                    log.warning("%s: %s: %s; nothing more is logged to it", tracker, type(error).__name__, error)
+                    log.warning(
+                        "%s: %s: %s; nothing more is logged to it",
+                        tracker,
+                        type(error).__name__,
+                        error,
+                    )
                     self._working.remove(tracker)
         for (name, _), run in self._runs.items():
             try:
@@ -121,13 +137,20 @@ class TrackerFeed:
                 log.warning("%s: %s: %s", name, type(error).__name__, error)
 
     def _log_to(self, name: str, results: Results) -> None:
-        """Log the complete cells, and then the complete policies, of which the tracker has other numbers or none."""
+        """Log the complete cells, and then the complete policies, of which the tracker has other
+        numbers or none.
+        """
         summary = summarize(results)
-        groups = [(cell.cell, [cell], group) for cell, group in zip(results.cells, summary.cells, strict=True)]
+        groups = [
+            (cell.cell, [cell], group)
+            for cell, group in zip(results.cells, summary.cells, strict=True)
+        ]
         for policy, total in zip(results.contenders, summary.totals, strict=True):
             groups.append((policy, results.of(policy), total))
         with closing(sqlite3.connect(self._config.out / FILE, timeout=WAIT_S)) as db:
-            logged = dict(db.execute("SELECT what, episodes FROM tracked WHERE tracker = ?", (name,)))
+            logged = dict(
+                db.execute("SELECT what, episodes FROM tracked WHERE tracker = ?", (name,))
+            )
             for identity, cells, group in groups:
                 if not all(map(_is_complete, cells)) or logged.get(identity) == group.episodes:
                     continue
@@ -139,7 +162,10 @@ class TrackerFeed:
                     if videos:
                         run.videos(label, videos, cells[0].step)
                 with db:
-                    db.execute("INSERT OR REPLACE INTO tracked VALUES (?, ?, ?)", (name, identity, group.episodes))
+                    db.execute(
+                        "INSERT OR REPLACE INTO tracked VALUES (?, ?, ?)",
+                        (name, identity, group.episodes),
+                    )
 
     def _run_of(self, name: str, results: Results, policy: str) -> TrackerRun:
         run = self._runs.get((name, policy))

@@ -1,4 +1,6 @@
-"""Image codecs for the cameras of a message: raw pixels, PNG or JPEG, in several threads if that is faster."""
+"""Image codecs for the cameras of a message: raw pixels, PNG or JPEG, in several threads if that
+is faster.
+"""
 
 from __future__ import annotations
 
@@ -22,16 +24,18 @@ T = TypeVar("T")
 NAMES = ("raw", "lossless", "jpeg")
 SUBSAMPLINGS = ("444", "422", "440", "420")
 
-_JPEG_S, _PNG_S = 1.7e-9, 7e-9  # time to encode on one core, s per byte of pixels: 1 to 2, and 6 to 12 ns
+# Time to encode on one core, s per byte of pixels: 1 to 2, and 6 to 12 ns.
+_JPEG_S, _PNG_S = 1.7e-9, 7e-9
 
 
 @dataclass(frozen=True, slots=True)
 class ImageCodec:
     """The encoding of camera images in a message: "raw" pixels, "lossless" (PNG) or "jpeg".
 
-    Only JPEG loses information, and only JPEG has settings. The default, quality 85 without subsampling, is the fastest
-    setting of its signal-to-noise ratio: with subsampled colour ("422", "420") the same ratio needs quality 92 to 99,
-    more bytes and as much time, and is never reached at saturated edges.
+    Only JPEG loses information, and only JPEG has settings. The default, quality 85 without
+    subsampling, is the fastest setting of its signal-to-noise ratio: with subsampled colour ("422",
+    "420") the same ratio needs quality 92 to 99, more bytes and as much time, and is never reached
+    at saturated edges.
 
     Raises:
         InvalidInput: A setting has an unknown value.
@@ -39,7 +43,8 @@ class ImageCodec:
 
     name: str = "jpeg"
     quality: int = 85  # 1 to 100
-    subsampling: str = "444"  # of colour: "444" keeps all, "422" and "440" half, "420" a quarter of the samples
+    # Of colour: "444" keeps all, "422" and "440" half, "420" a quarter of the samples.
+    subsampling: str = "444"
 
     def __post_init__(self) -> None:
         if self.name not in NAMES:
@@ -47,7 +52,9 @@ class ImageCodec:
         if not 1 <= self.quality <= 100:
             raise InvalidInput(f"quality: got {self.quality!r}, want 1 to 100")
         if self.subsampling not in SUBSAMPLINGS:
-            raise InvalidInput(f"subsampling: got {self.subsampling!r}, want one of {list(SUBSAMPLINGS)}")
+            raise InvalidInput(
+                f"subsampling: got {self.subsampling!r}, want one of {list(SUBSAMPLINGS)}"
+            )
 
     def file(self, image: np.ndarray) -> bytes:
         """Encode an image, (H, W, 3) uint8 RGB, as a JPEG or PNG file; a raw codec has no files."""
@@ -67,8 +74,11 @@ def encode_files(cameras: Sequence[np.ndarray], codec: ImageCodec) -> list[bytes
     return thread_map(codec.file, cameras, work_s)
 
 
-def decode_files(files: Sequence[bytes | memoryview], budget: Budget, names: Sequence[str] = ()) -> list[np.ndarray]:
-    """Decode JPEG or PNG files to (H, W, 3) uint8 RGB images, after reserving memory and time for all of them.
+def decode_files(
+    files: Sequence[bytes | memoryview], budget: Budget, names: Sequence[str] = ()
+) -> list[np.ndarray]:
+    """Decode JPEG or PNG files to (H, W, 3) uint8 RGB images, after reserving memory and time for
+    all of them.
 
     Errors name the camera of a file if `names`, in the order of the files, has it.
 
@@ -99,7 +109,13 @@ def decode_files(files: Sequence[bytes | memoryview], budget: Budget, names: Seq
     scratch_bytes = sum(sorted(file.scratch_bytes for file in checked)[-threads:])
     with budget.decoding(seconds, scratch_bytes):
         indices = range(len(checked))
-        images = [decode(index) for index in indices] if budget.serial else thread_map(decode, indices, seconds)
+        images = (
+            [decode(index) for index in indices]
+            if budget.serial
+            else thread_map(decode, indices, seconds)
+        )
     if budget.files is not None:
-        budget.files.update((id(image), (image, file)) for image, file in zip(images, files, strict=True))
+        budget.files.update(
+            (id(image), (image, file)) for image, file in zip(images, files, strict=True)
+        )
     return images

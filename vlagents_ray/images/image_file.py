@@ -1,8 +1,9 @@
 """The structure of a JPEG or PNG file, which is checked before any of it is decoded.
 
-The size in the header of a file does not bound the cost of decoding it: a progressive JPEG may have any number of
-scans, of 12 bytes each, and a PNG any number of chunks. So a file is admitted by its structure, and its cost is
-estimated from what the decoder will do: samples with their padding, scans, rows and bytes.
+The size in the header of a file does not bound the cost of decoding it: a progressive JPEG may have
+any number of scans, of 12 bytes each, and a PNG any number of chunks. So a file is admitted by its
+structure, and its cost is estimated from what the decoder will do: samples with their padding,
+scans, rows and bytes.
 """
 
 from __future__ import annotations
@@ -15,12 +16,14 @@ from vlagents_ray.errors import MalformedMessage, MessageTooLarge
 
 JPEG_MAGIC = b"\xff\xd8\xff"
 PNG_MAGIC = b"\x89PNG\r\n\x1a\n"
-PNG_HEADER = struct.Struct(">2I5B")  # width, height, depth, colour type, compression, filter, interlace
+# width, height, depth, colour type, compression, filter, interlace.
+PNG_HEADER = struct.Struct(">2I5B")
 RGB8 = (8, 2, 0, 0, 0)  # the rest of the header of an RGB image of 8 bits, not interlaced
 
 # Limits of the structure. Encoders write about ten scans, and chunks of at least 4 KiB.
 _MOST_SCANS = 100
-_MOST_SEGMENTS = 256  # segments of a JPEG before its first scan, or chunks of a PNG, and one more in each KiB
+# Segments of a JPEG before its first scan, or chunks of a PNG, and one more in each KiB.
+_MOST_SEGMENTS = 256
 _MOST_METADATA = 64 * 1024  # bytes of a file beyond twice those of its pixels
 
 # Estimates of the time on one core: a file of no known kind takes more than three times as long.
@@ -28,13 +31,16 @@ _FILE_S = 20e-6
 _SAMPLE_S = 1.7e-9  # per sample of a JPEG
 _SCAN_S = 0.1e-9  # per sample of a JPEG and scan after the first
 _BASELINE_BYTE_S, _PROGRESSIVE_BYTE_S = 5e-9, 20e-9  # per byte of a JPEG
-_OWN_PNG_S, _PNG_S = 7e-9, 12e-9  # per byte of the unpacked rows: those of `encode_png`, and with Pillow
+# Per byte of the unpacked rows: those of `encode_png`, and with Pillow.
+_OWN_PNG_S, _PNG_S = 7e-9, 12e-9
 _PILLOW_S = 70e-6  # per file
 _PILLOW_ROW_S = 0.1e-6  # per row
-_PILLOW_PIXEL_BYTES = 16  # memory beside the result, per pixel: the image in 32 bits, and copies of it
+# Memory beside the result, per pixel: the image in 32 bits, and copies of it.
+_PILLOW_PIXEL_BYTES = 16
 
 _SOF = {0xC0: "baseline", 0xC1: "extended", 0xC2: "progressive"}
-_OTHER_SOF = {*range(0xC3, 0xD0)} - {0xC4, 0xC8, 0xCC}  # lossless, hierarchical or arithmetic coding
+# lossless, hierarchical or arithmetic coding.
+_OTHER_SOF = {*range(0xC3, 0xD0)} - {0xC4, 0xC8, 0xCC}
 _SOS, _EOI = 0xDA, 0xD9
 _FILL = re.compile(b"\xff+")  # any number of these may precede a marker
 _CHANNELS = {0: 1, 2: 3, 3: 1, 4: 2, 6: 4}  # by the colour type of a PNG
@@ -50,7 +56,8 @@ class ImageFile:
     width: int
     decoding_s: float  # estimated time on one core, s
     scratch_bytes: int  # memory that decoding needs beside the image, bytes
-    chunks: tuple[tuple[bytes, int, int], ...] = ()  # name, start and end of each critical chunk of a PNG
+    # name, start and end of each critical chunk of a PNG.
+    chunks: tuple[tuple[bytes, int, int], ...] = ()
 
     @property
     def is_jpeg(self) -> bool:
@@ -67,14 +74,17 @@ def read_structure(data: bytes | memoryview, max_pixels: int) -> ImageFile:
 
     Raises:
         MalformedMessage: The data are no JPEG or PNG file, or one that no camera writes.
-        MessageTooLarge: The image declares more than `max_pixels`, or the file has too many scans, segments or bytes.
+        MessageTooLarge: The image declares more than `max_pixels`, or the file has too many scans,
+            segments or bytes.
     """
     file = bytes(data)
     if file.startswith(JPEG_MAGIC):
         return _read_jpeg(file, max_pixels)
     if file.startswith(PNG_MAGIC):
         return _read_png(file, max_pixels)
-    raise MalformedMessage(f"image: got {len(file)} bytes starting {file[:4]!r}, want a JPEG or PNG file")
+    raise MalformedMessage(
+        f"image: got {len(file)} bytes starting {file[:4]!r}, want a JPEG or PNG file"
+    )
 
 
 def _read_jpeg(file: bytes, max_pixels: int) -> ImageFile:
@@ -84,7 +94,8 @@ def _read_jpeg(file: bytes, max_pixels: int) -> ImageFile:
         marker, start, end = _jpeg_segment(file, at)
         if marker in _OTHER_SOF:
             raise MalformedMessage(
-                f"image: got a JPEG of the process SOF{marker - 0xC0}, want baseline or progressive Huffman coding"
+                f"image: got a JPEG of the process SOF{marker - 0xC0}, want baseline or "
+                "progressive Huffman coding"
             )
         if marker in _SOF:
             if frame is not None:
@@ -94,21 +105,28 @@ def _read_jpeg(file: bytes, max_pixels: int) -> ImageFile:
             break
         at = end
     else:
-        raise MessageTooLarge("image: a JPEG with too many segments before its first scan; encode it again")
+        raise MessageTooLarge(
+            "image: a JPEG with too many segments before its first scan; encode it again"
+        )
     if frame is None:
         raise MalformedMessage("image: broken JPEG (its first scan precedes its header)")
 
     kind, header = frame
     height, width, components, unit_height, unit_width = _jpeg_frame(header)
     _check_size(len(file), height, width, 3, max_pixels)
-    scans = file.count(bytes((0xFF, _SOS)))  # at least the scans: all these bytes are the marker, or metadata
+    # At least the scans: all these bytes are the marker, or metadata.
+    scans = file.count(bytes((0xFF, _SOS)))
     if scans > _MOST_SCANS:
-        raise MessageTooLarge(f"image: a JPEG of {scans} scans, the limit is {_MOST_SCANS}; encode it again")
+        raise MessageTooLarge(
+            f"image: a JPEG of {scans} scans, the limit is {_MOST_SCANS}; encode it again"
+        )
 
     # The decoder pads an image to whole units, of up to 32 x 32 pixels.
     padded_pixels = -(-height // unit_height) * unit_height * -(-width // unit_width) * unit_width
     samples = components * padded_pixels
-    is_buffered = kind == 0xC2 or scans > 1 or (components > 1 and end - start != 4 + 2 * components)
+    is_buffered = (
+        kind == 0xC2 or scans > 1 or (components > 1 and end - start != 4 + 2 * components)
+    )
     byte_s = _PROGRESSIVE_BYTE_S if is_buffered else _BASELINE_BYTE_S
     seconds = _FILE_S + samples * (_SAMPLE_S + (scans - 1) * _SCAN_S) + len(file) * byte_s
     coefficients = 2 * samples if is_buffered else 0  # 16 bits each, of the whole image
@@ -130,14 +148,21 @@ def _jpeg_segment(file: bytes, at: int) -> tuple[int, int, int]:
 
 
 def _jpeg_frame(header: bytes) -> tuple[int, int, int, int, int]:
-    """Return the height, the width, the number of components, and the height and width of a unit, pixels."""
+    """Return the height, the width, the number of components, and the height and width of a
+    unit, pixels.
+    """
     if len(header) < 9 or len(header) != 6 + 3 * header[5]:
         raise MalformedMessage("image: broken JPEG (its header has another length)")
     precision, height, width, components = struct.unpack_from(">BHHB", header)
     sampling = header[7::3]
-    unit_width, unit_height = max(8 * (each >> 4) for each in sampling), max(8 * (each & 15) for each in sampling)
+    unit_width, unit_height = (
+        max(8 * (each >> 4) for each in sampling),
+        max(8 * (each & 15) for each in sampling),
+    )
     if precision != 8 or components > 4 or not 0 < unit_width <= 32 or not 0 < unit_height <= 32:
-        raise MalformedMessage("image: broken JPEG (its header has invalid values, or other than 8 bits)")
+        raise MalformedMessage(
+            "image: broken JPEG (its header has invalid values, or other than 8 bits)"
+        )
     return height, width, components, unit_height, unit_width
 
 
@@ -145,10 +170,20 @@ def _read_png(file: bytes, max_pixels: int) -> ImageFile:
     chunks = _png_chunks(file)
     names = [name for name, _, _ in chunks]
     first, last = (names.index(b"IDAT"), len(names) - 1) if b"IDAT" in names else (0, 0)
-    if names[:1] != [b"IHDR"] or names.count(b"IHDR") > 1 or chunks[0][2] - chunks[0][1] != 12 + PNG_HEADER.size:
+    if (
+        names[:1] != [b"IHDR"]
+        or names.count(b"IHDR") > 1
+        or chunks[0][2] - chunks[0][1] != 12 + PNG_HEADER.size
+    ):
         raise MalformedMessage("image: broken PNG (it does not begin with its only header)")
-    if names[last:] != [b"IEND"] or names.count(b"PLTE") > 1 or names[first:last] != [b"IDAT"] * (last - first):
-        raise MalformedMessage("image: broken PNG (its data are missing, incomplete or not in one piece)")
+    if (
+        names[last:] != [b"IEND"]
+        or names.count(b"PLTE") > 1
+        or names[first:last] != [b"IDAT"] * (last - first)
+    ):
+        raise MalformedMessage(
+            "image: broken PNG (its data are missing, incomplete or not in one piece)"
+        )
 
     width, height, depth, colour, *_ = PNG_HEADER.unpack_from(file, 16)
     if colour not in _CHANNELS or depth > 16:
@@ -162,7 +197,9 @@ def _read_png(file: bytes, max_pixels: int) -> ImageFile:
     else:
         seconds = _PILLOW_S + rows_bytes * _PNG_S + height * _PILLOW_ROW_S
         scratch = _PILLOW_PIXEL_BYTES * height * (width + 1)
-    return ImageFile(file, height, width, seconds + len(file) * _BASELINE_BYTE_S, scratch, tuple(chunks))
+    return ImageFile(
+        file, height, width, seconds + len(file) * _BASELINE_BYTE_S, scratch, tuple(chunks)
+    )
 
 
 def _png_chunks(file: bytes) -> list[tuple[bytes, int, int]]:
@@ -182,24 +219,32 @@ def _png_chunks(file: bytes) -> list[tuple[bytes, int, int]]:
     raise MessageTooLarge("image: a PNG with too many chunks; encode it again")
 
 
-def is_own_png(file: bytes, chunks: list[tuple[bytes, int, int]] | tuple[tuple[bytes, int, int], ...]) -> bool:
+def is_own_png(
+    file: bytes, chunks: list[tuple[bytes, int, int]] | tuple[tuple[bytes, int, int], ...]
+) -> bool:
     """Return whether a PNG has the chunks that `encode_png` writes, and no more."""
     header_end, data_start = chunks[0][2], chunks[1][1]
     is_whole = len(chunks) == 3 and header_end == data_start and chunks[2][2] == len(file)
-    return is_whole and chunks[1][2] == chunks[2][1] and PNG_HEADER.unpack_from(file, 16)[2:] == RGB8
+    return (
+        is_whole and chunks[1][2] == chunks[2][1] and PNG_HEADER.unpack_from(file, 16)[2:] == RGB8
+    )
 
 
-def _check_size(file_bytes: int, height: int, width: int, pixel_bytes: int, max_pixels: int) -> None:
+def _check_size(
+    file_bytes: int, height: int, width: int, pixel_bytes: int, max_pixels: int
+) -> None:
     if not height or not width:
         raise MalformedMessage(f"image: declares {height}x{width} pixels, want at least 1x1")
     if height * width > max_pixels:
         raise MessageTooLarge(
-            f"image: declares {height}x{width} pixels, the limit is {max_pixels}; send a smaller one, or raise "
+            f"image: declares {height}x{width} pixels, the limit is {max_pixels}; send a smaller "
+            "one, or raise "
             f"`limits.pixels`"
         )
     most = 2 * pixel_bytes * height * width + _MOST_METADATA
     if file_bytes > most:
         raise MessageTooLarge(
-            f"image: a file of {file_bytes} bytes for {height}x{width} pixels, the limit is {most}; encode it again "
+            f"image: a file of {file_bytes} bytes for {height}x{width} pixels, the limit is "
+            f"{most}; encode it again "
             f"without metadata"
         )

@@ -1,11 +1,12 @@
 """JPEG and PNG files of (H, W, 3) uint8 RGB images.
 
-The structure of a file is checked first, see `vlagents_ray.images.image_file`: an image that declares more pixels than
-the caller allows is refused before memory is allocated for it.
+The structure of a file is checked first, see `vlagents_ray.images.image_file`: an image that
+declares more pixels than the caller allows is refused before memory is allocated for it.
 
-PNG files are written with only numpy and zlib: all rows have the filter "Up" (the difference to the row above), and
-zlib uses its run-length strategy. A search for better filters or longer matches takes several times as long and saves a
-few per cent on camera images with noise. Files of this form are read in the same way; others need Pillow.
+PNG files are written with only numpy and zlib: all rows have the filter "Up" (the difference to the
+row above), and zlib uses its run-length strategy. A search for better filters or longer matches
+takes several times as long and saves a few per cent on camera images with noise. Files of this form
+are read in the same way; others need Pillow.
 """
 
 from __future__ import annotations
@@ -19,18 +20,34 @@ import zlib
 import numpy as np
 import simplejpeg
 
-from vlagents_ray.errors import InvalidObservation, MalformedMessage, MessageTooLarge, MissingDependency
-from vlagents_ray.images.image_file import PNG_HEADER, PNG_MAGIC, RGB8, ImageFile, is_own_png, read_structure
+from vlagents_ray.errors import (
+    InvalidObservation,
+    MalformedMessage,
+    MessageTooLarge,
+    MissingDependency,
+)
+from vlagents_ray.images.image_file import (
+    PNG_HEADER,
+    PNG_MAGIC,
+    RGB8,
+    ImageFile,
+    is_own_png,
+    read_structure,
+)
 
 MAX_PIXELS = 4096 * 4096  # default limit of one image
 _UP = 2
 
 
 def encode_jpeg(image: np.ndarray, quality: int = 85, subsampling: str = "444") -> bytes:
-    """Encode an (H, W, 3) uint8 RGB image as JPEG, with subsampling "444", "422", "420" or "440"."""
+    """Encode an (H, W, 3) uint8 RGB image as JPEG, with subsampling "444", "422", "420" or
+    "440".
+    """
     _check(image)
     pixels = np.ascontiguousarray(image)
-    data: bytes = simplejpeg.encode_jpeg(pixels, quality=quality, colorspace="RGB", colorsubsampling=subsampling)
+    data: bytes = simplejpeg.encode_jpeg(
+        pixels, quality=quality, colorspace="RGB", colorsubsampling=subsampling
+    )
     return data
 
 
@@ -46,7 +63,9 @@ def encode_png(image: np.ndarray) -> bytes:
     deflate = zlib.compressobj(1, zlib.DEFLATED, 15, 9, zlib.Z_RLE)
     data = deflate.compress(rows.data) + deflate.flush()
     header = PNG_HEADER.pack(width, height, *RGB8)
-    return b"".join((PNG_MAGIC, _chunk(b"IHDR", header), _chunk(b"IDAT", data), _chunk(b"IEND", b"")))
+    return b"".join(
+        (PNG_MAGIC, _chunk(b"IHDR", header), _chunk(b"IDAT", data), _chunk(b"IEND", b""))
+    )
 
 
 def decode(data: bytes | memoryview, max_pixels: int = MAX_PIXELS) -> np.ndarray:
@@ -54,19 +73,25 @@ def decode(data: bytes | memoryview, max_pixels: int = MAX_PIXELS) -> np.ndarray
 
     Raises:
         MalformedMessage: The data are not a complete image.
-        MessageTooLarge: The image declares more than `max_pixels`, or its file has too many parts or bytes.
+        MessageTooLarge: The image declares more than `max_pixels`, or its file has too many parts
+            or bytes.
     """
     return decode_file(read_structure(data, max_pixels))
 
 
 def decode_file(file: ImageFile) -> np.ndarray:
-    """Decode a file whose structure has been checked, as `decode` does; raises `MalformedMessage`."""
+    """Decode a file whose structure has been checked, as `decode` does; raises
+    `MalformedMessage`.
+    """
     if not file.is_jpeg:
         own = _decode_own_png(file) if is_own_png(file.data, file.chunks) else None
         return _decode_png(file) if own is None else own
     try:  # strict, the default, refuses truncated data, which libjpeg would fill with grey
-        # The library's defaults, "fast" transform and upsampling, save a twentieth of the time and cost up to 1.3 dB.
-        image: np.ndarray = simplejpeg.decode_jpeg(file.data, colorspace="RGB", fastdct=False, fastupsample=False)
+        # The library's defaults, "fast" transform and upsampling, save a twentieth of the time and
+        # cost up to 1.3 dB.
+        image: np.ndarray = simplejpeg.decode_jpeg(
+            file.data, colorspace="RGB", fastdct=False, fastupsample=False
+        )
     except ValueError as error:
         raise MalformedMessage(f"image: broken JPEG ({error})") from error
     return image
@@ -75,12 +100,15 @@ def decode_file(file: ImageFile) -> np.ndarray:
 def _decode_png(file: ImageFile) -> np.ndarray:
     """Decode any PNG file with Pillow, which is passed nothing but the chunks that its pixels need.
 
-    Pillow would read all others in Python, and raises errors of its own kinds for some that are invalid.
+    Pillow would read all others in Python, and raises errors of its own kinds for some that are
+    invalid.
     """
     try:
         from PIL import Image
     except ModuleNotFoundError as error:
-        raise MissingDependency("PNG images need Pillow; pip install 'vlagents-ray[serve]'") from error
+        raise MissingDependency(
+            "PNG images need Pillow; pip install 'vlagents-ray[serve]'"
+        ) from error
     data = b"".join([PNG_MAGIC, *(file.data[start:end] for _, start, end in file.chunks)])
     try:
         with warnings.catch_warnings():
@@ -98,7 +126,9 @@ def _decode_png(file: ImageFile) -> np.ndarray:
 
 
 def _decode_own_png(file: ImageFile) -> np.ndarray | None:
-    """Decode a file of the form of `encode_png`, with no more memory than its size needs; None for other filters."""
+    """Decode a file of the form of `encode_png`, with no more memory than its size needs; None
+    for other filters.
+    """
     height, width = file.height, file.width
     _, start, end = file.chunks[1]
     stride = 1 + width * 3
@@ -108,7 +138,9 @@ def _decode_own_png(file: ImageFile) -> np.ndarray | None:
     except zlib.error as error:
         raise MalformedMessage(f"image: broken PNG ({error})") from error
     if len(raw) != height * stride or not inflate.eof:  # zlib compares the checksum at the end
-        raise MalformedMessage(f"image: broken PNG (its data are not {height} rows of {width} pixels)")
+        raise MalformedMessage(
+            f"image: broken PNG (its data are not {height} rows of {width} pixels)"
+        )
     rows = np.frombuffer(raw, np.uint8).reshape(height, stride)
     if (rows[:, 0] != _UP).any():
         return None
@@ -127,4 +159,6 @@ def data_url(kind: str, data: bytes) -> str:
 
 def _check(image: np.ndarray) -> None:
     if image.ndim != 3 or image.shape[2] != 3 or image.dtype != np.uint8 or image.size == 0:
-        raise InvalidObservation(f"image: got {image.shape} {image.dtype}, want (H, W, 3) uint8 RGB")
+        raise InvalidObservation(
+            f"image: got {image.shape} {image.dtype}, want (H, W, 3) uint8 RGB"
+        )

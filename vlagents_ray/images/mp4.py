@@ -18,7 +18,8 @@ from vlagents_ray.registry import require
 def rgb_converter() -> Callable[[Any], np.ndarray]:
     """Return what converts the decoded frames of one video to images, (H, W, 3) uint8 RGB.
 
-    It keeps its tables and threads, which the `to_ndarray` of a frame makes for that frame alone, in at least 0.25 ms.
+    It keeps its tables and threads, which the `to_ndarray` of a frame makes for that frame alone,
+    in at least 0.25 ms.
     """
     reformat = require("av").video.reformatter.VideoReformatter().reformat
     return lambda frame: reformat(frame, format="rgb24").to_ndarray()
@@ -42,28 +43,46 @@ class Mp4:
             target: The file, or a buffer in memory.
             shape: The shape of its images, (H, W, 3).
             fps: The rate of the frames, Hz.
-            key_frames: The number of frames from one key frame to the next; None selects x264's default.
-            lossless: Whether to keep each pixel, in RGB: about ten times larger, and unsuitable for browsers.
+            key_frames: The number of frames from one key frame to the next; None selects x264's
+                default.
+            lossless: Whether to keep each pixel, in RGB: about ten times larger, and unsuitable for
+                browsers.
         """
         self._av: Any = require("av")
         self._shape = shape
         height, width = shape[:2]
-        self._pad = (0, 0) if lossless else (height % 2, width % 2)  # yuv420p halves both dimensions
-        self._container = self._av.open(target if isinstance(target, io.BytesIO) else str(target), "w", format="mp4")
-        options = {"preset": "ultrafast", "threads": "1", **({"qp": "0"} if lossless else {"crf": "23"})}
+        # yuv420p halves both dimensions.
+        self._pad = (0, 0) if lossless else (height % 2, width % 2)
+        self._container = self._av.open(
+            target if isinstance(target, io.BytesIO) else str(target), "w", format="mp4"
+        )
+        options = {
+            "preset": "ultrafast",
+            "threads": "1",
+            **({"qp": "0"} if lossless else {"crf": "23"}),
+        }
         if key_frames is not None:
             options["g"] = str(key_frames)
         self._stream = self._container.add_stream(
-            "libx264rgb" if lossless else "libx264", rate=Fraction(fps).limit_denominator(1000), options=options
+            "libx264rgb" if lossless else "libx264",
+            rate=Fraction(fps).limit_denominator(1000),
+            options=options,
         )
         # Unless the video is lossless, the last row or column of an odd image is repeated.
-        self.size = self._stream.height, self._stream.width = height + self._pad[0], width + self._pad[1]
+        self.size = self._stream.height, self._stream.width = (
+            height + self._pad[0],
+            width + self._pad[1],
+        )
         self._stream.pix_fmt = "rgb24" if lossless else "yuv420p"
 
     def add(self, image: np.ndarray) -> None:
-        """Append an image, (H, W, 3) uint8 RGB; raises `InvalidObservation` if its shape differs."""
+        """Append an image, (H, W, 3) uint8 RGB; raises `InvalidObservation` if its shape
+        differs.
+        """
         if image.shape != self._shape or image.dtype != np.uint8:
-            raise InvalidObservation(f"got an image of {image.shape} {image.dtype}, want {self._shape} uint8 as before")
+            raise InvalidObservation(
+                f"got an image of {image.shape} {image.dtype}, want {self._shape} uint8 as before"
+            )
         if any(self._pad):
             image = np.pad(image, ((0, self._pad[0]), (0, self._pad[1]), (0, 0)), mode="edge")
         frame = self._av.VideoFrame.from_ndarray(np.ascontiguousarray(image), format="rgb24")

@@ -33,10 +33,14 @@ _MOST_HELPERS = 3  # largest number of threads beside the caller's; robots have 
 MOST_THREADS = 1 + _MOST_HELPERS
 
 
-def thread_map(function: Callable[[Item], Result], items: Sequence[Item], work_s: float) -> list[Result]:
-    """Compute `[function(item) for item in items]`, in several threads if the time on one core, `work_s`, is long.
+def thread_map(
+    function: Callable[[Item], Result], items: Sequence[Item], work_s: float
+) -> list[Result]:
+    """Compute `[function(item) for item in items]`, in several threads if the time on one core,
+    `work_s`, is long.
 
-    The function does not wait for other calls of itself. An exception is that of the first item that raised one.
+    The function does not wait for other calls of itself. An exception is that of the first item
+    that raised one.
     """
     threads = min(len(items), allowed(), MOST_THREADS)
     if threads < 2 or work_s < _LEAST_WORK_S:
@@ -70,8 +74,8 @@ def thread_map(function: Callable[[Item], Result], items: Sequence[Item], work_s
 class _Helpers(ThreadPoolExecutor):
     """Threads that avoid the core of their caller.
 
-    Wake-affine scheduling would often place them there, where they wait for the caller: on two cores, two to four
-    cameras took 20 to 50 % longer.
+    Wake-affine scheduling would often place them there, where they wait for the caller: on two
+    cores, two to four cameras took 20 to 50 % longer.
     """
 
     def __init__(self) -> None:
@@ -97,5 +101,7 @@ class _Helpers(ThreadPoolExecutor):
 
 @cache
 def _helpers(_process: int) -> _Helpers:
-    """Return the helpers of this process; a forked process has its own, since threads do not survive a fork."""
+    """Return the helpers of this process; a forked process has its own, since threads do not
+    survive a fork.
+    """
     return _Helpers()

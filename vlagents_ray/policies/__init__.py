@@ -1,1 +1,3 @@
-"""Policies, and what model families share; `vlagents_ray.registry` maps the names to the classes."""
+"""Policies, and what model families share; `vlagents_ray.registry` maps the names to the
+classes.
+"""

@@ -1,4 +1,6 @@
-"""The wrapper that makes a policy's relative actions absolute, by the state from which their chunk was computed."""
+"""The wrapper that makes a policy's relative actions absolute, by the state from which their
+chunk was computed.
+"""
 
 from __future__ import annotations
 
@@ -13,7 +15,12 @@ from vlagents_ray.contract import Contract
 from vlagents_ray.errors import ConfigError, InvalidAction
 from vlagents_ray.interface import DISTRIBUTION, LEFTOVER, Act, Agent, Obs
 from vlagents_ray.policies.base import ModelPolicy
-from vlagents_ray.policies.base.model_inputs import leftover_plan, needs_gripper, state_specs, state_vector
+from vlagents_ray.policies.base.model_inputs import (
+    leftover_plan,
+    needs_gripper,
+    state_specs,
+    state_vector,
+)
 from vlagents_ray.policies.outcomes import attempt
 from vlagents_ray.policies.wrapper import Wrapper
 
@@ -23,25 +30,30 @@ class AbsoluteActionsConfig(BaseModel, extra="forbid"):
 
     state: list[str] = Field(
         min_length=1,
-        description="parts of the proprioception to which actions are relative: in turn a number for each relative "
+        description="parts of the proprioception to which actions are relative: in turn a number "
+        "for each relative "
         "column of an action",
     )
     absolute: list[int] = Field(
-        default=[], description="columns of an action that are absolute already, such as grippers; -1 is the last"
+        default=[],
+        description="columns of an action that are absolute already, such as grippers; -1 is the "
+        "last",
     )
 
 
 class AbsoluteActions(Wrapper):
     """Adds the state of an observation to all rows of the chunk that a policy computes from it.
 
-    Afterwards rows of several chunks have one meaning, however late each arrives: they can be merged, delayed and
-    continued. A leftover plan, which is absolute, is made relative to the state of the new observation. Policies of
-    LeRobot, openpi and GR00T do this by their checkpoints' own processors. The wrapper is for any other policy that was
-    trained with actions relative to the state at the beginning of a chunk; not for actions that are each relative to
-    the pose before, such as LIBERO's.
+    Afterwards rows of several chunks have one meaning, however late each arrives: they can be
+    merged, delayed and continued. A leftover plan, which is absolute, is made relative to the state
+    of the new observation. Policies of LeRobot, openpi and GR00T do this by their checkpoints' own
+    processors. The wrapper is for any other policy that was trained with actions relative to the
+    state at the beginning of a chunk; not for actions that are each relative to the pose before,
+    such as LIBERO's.
 
     Args:
-        agent: The policy, with whole chunks of relative actions that add up with states: joints or positions.
+        agent: The policy, with whole chunks of relative actions that add up with states: joints or
+            positions.
         config: The settings.
 
     Raises:
@@ -57,13 +69,17 @@ class AbsoluteActions(Wrapper):
             agent = agent.agent
         if isinstance(agent, ModelPolicy) and agent.config.actions != "chunk":
             raise ConfigError(
-                f"absolute_actions: got a policy with actions: {agent.config.actions}, whose rows belong to chunks of "
-                f"earlier states; want actions: chunk, and let the chunk player or the evaluation execute them"
+                f"absolute_actions: got a policy with actions: {agent.config.actions}, whose rows "
+                "belong to chunks of "
+                "earlier states; want actions: chunk, and let the chunk player or the evaluation "
+                "execute them"
             )
 
     @property
     def contract(self) -> Contract | None:
-        """The contract of the policy, with absolute actions and the parts of the state that they need."""
+        """The contract of the policy, with absolute actions and the parts of the state that they
+        need.
+        """
         inner, parts = self.agent.contract, self.config.state
         if inner is None:
             return None
@@ -77,7 +93,9 @@ class AbsoluteActions(Wrapper):
         )
 
     def initialize(self) -> None:
-        """Initialize the policy; raises `ConfigError` if its actions are not relative to a state."""
+        """Initialize the policy; raises `ConfigError` if its actions are not relative to a
+        state.
+        """
         super().initialize()
         inner = self.agent.contract
         if inner is None:
@@ -90,11 +108,14 @@ class AbsoluteActions(Wrapper):
         }
         if wrong := [what for what, is_so in got.items() if is_so]:
             raise ConfigError(
-                f"absolute_actions: the policy has {' and '.join(wrong)}, want relative ones that add up with its "
+                f"absolute_actions: the policy has {' and '.join(wrong)}, want relative ones that "
+                "add up with its "
                 f"state, such as joints; leave the wrapper out"
             )
 
-    def change_batch(self, obs: Sequence[Obs], sessions: Sequence[Wrapper]) -> list[Obs | Exception]:
+    def change_batch(
+        self, obs: Sequence[Obs], sessions: Sequence[Wrapper]
+    ) -> list[Obs | Exception]:
         return [attempt(self._with_relative_plan, one) for one in obs]
 
     def act_batch(self, obs: Sequence[Obs], sessions: Sequence[Agent]) -> list[Act | Exception]:
@@ -119,9 +140,14 @@ class AbsoluteActions(Wrapper):
         return Act(act.action + origin, act.done, info)
 
     def _origin(self, obs: Obs, dim: int) -> np.ndarray:
-        """Return the pose to which actions are relative, (dim,) float32; zeros in absolute columns."""
+        """Return the pose to which actions are relative, (dim,) float32; zeros in absolute
+        columns.
+        """
         if outside := [column for column in self.config.absolute if not -dim <= column < dim]:
-            raise InvalidAction(f"absolute_actions: got the absolute columns {outside} of actions with {dim} numbers")
+            raise InvalidAction(
+                f"absolute_actions: got the absolute columns {outside} of actions with {dim} "
+                "numbers"
+            )
         relative = np.ones(dim, bool)
         relative[self.config.absolute] = False
         origin = np.zeros(dim, np.float32)

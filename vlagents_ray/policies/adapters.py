@@ -1,9 +1,10 @@
 """LoRA adapters of one network, with a separate adapter for each row of a batch.
 
-The weights of the network remain those of the base. After each linear layer that an adapter changes, a hook adds
-B[i] A[i] x to the layer's result, where i is the adapter of x's row: two small products for all rows of the batch, with
-the A and B of all adapters in one tensor each. Adapters of a smaller rank are padded with zeros, and rows without an
-adapter use one of zeros. S-LoRA (arXiv 2311.03285) and Punica (arXiv 2310.18547) serve language models in this way.
+The weights of the network remain those of the base. After each linear layer that an adapter
+changes, a hook adds B[i] A[i] x to the layer's result, where i is the adapter of x's row: two small
+products for all rows of the batch, with the A and B of all adapters in one tensor each. Adapters of
+a smaller rank are padded with zeros, and rows without an adapter use one of zeros. S-LoRA (arXiv
+2311.03285) and Punica (arXiv 2310.18547) serve language models in this way.
 """
 
 from __future__ import annotations
@@ -18,7 +19,13 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from vlagents_ray.errors import ConfigError, MalformedMessage, PolicyFailed, UnknownCheckpoint, UnknownSession
+from vlagents_ray.errors import (
+    ConfigError,
+    MalformedMessage,
+    PolicyFailed,
+    UnknownCheckpoint,
+    UnknownSession,
+)
 from vlagents_ray.interface import POLICY
 from vlagents_ray.weights.safetensors import read_values
 from vlagents_ray.weights.trainable import converted
@@ -33,7 +40,8 @@ class Adapter:
 
     source: str = ""  # path or hub id, as in the settings
     weights: str = ""  # digest of the base's files and the adapter's
-    fingerprint: str = ""  # the beginning of that digest; empty: the session acts with the base alone
+    # The beginning of that digest; empty: the session acts with the base alone.
+    fingerprint: str = ""
     revision: str | None = None  # the hub's commit of the adapter
 
     @property
@@ -60,7 +68,9 @@ class _Values(dict[str, Any]):
         self._targets: dict[str, tuple[Any, Any, float]] = {}
 
     def read(self, name: str, value: Any, target: Any, scale: float) -> None:
-        """Set a value of the file, which is written into `target` after multiplication by `scale`."""
+        """Set a value of the file, which is written into `target` after multiplication by
+        `scale`.
+        """
         self._targets[name] = value, target, scale
         self[name] = value
 
@@ -77,7 +87,8 @@ class Adapters:
 
     def __init__(self) -> None:
         self.base = ""  # fingerprint of the base alone
-        self.moved: list[tuple[Any, Any]] = []  # memory of the base that is on the host while the policy sleeps
+        # Memory of the base that is on the host while the policy sleeps.
+        self.moved: list[tuple[Any, Any]] = []
         self._named: dict[str, Adapter] = {}
         self._values = {"": _Values(0)}  # by fingerprint; those of the base are zeros
         self._device: Any = None
@@ -88,7 +99,9 @@ class Adapters:
 
     @property
     def trainable(self) -> dict[str, dict[str, Any]]:
-        """The values of each adapter by their names in its file, which act when they are replaced."""
+        """The values of each adapter by their names in its file, which act when they are
+        replaced.
+        """
         return {name: self._values[adapter.fingerprint] for name, adapter in self._named.items()}
 
     def load(
@@ -111,7 +124,8 @@ class Adapters:
         """
         import torch
 
-        layers: dict[str, dict[str, tuple[Any, Any, float]]] = {}  # A, B and scale by layer and fingerprint
+        # A, B and scale by layer and fingerprint.
+        layers: dict[str, dict[str, tuple[Any, Any, float]]] = {}
         for name, source in sources.items():
             try:
                 adapter, folder = find(source)
@@ -126,8 +140,12 @@ class Adapters:
         for layer, found in layers.items():
             weight = modules[layer].weight
             (outputs, *inputs), rank = weight.shape, max(len(down) for down, _, _ in found.values())
-            downs = torch.zeros(len(self._values), rank, *inputs, dtype=weight.dtype, device=weight.device)
-            ups = torch.zeros(len(self._values), outputs, rank, dtype=weight.dtype, device=weight.device)
+            downs = torch.zeros(
+                len(self._values), rank, *inputs, dtype=weight.dtype, device=weight.device
+            )
+            ups = torch.zeros(
+                len(self._values), outputs, rank, dtype=weight.dtype, device=weight.device
+            )
             for fingerprint, (down, up, scale) in found.items():
                 values = self._values[fingerprint]
                 values.read(f"{_PREFIX}{layer}{_DOWN}", down, downs[values.place, : len(down)], 1.0)
@@ -136,7 +154,9 @@ class Adapters:
             self._device = weight.device
 
     def named(self, name: object) -> Adapter:
-        """Return the adapter with this name, or no adapter for None; raises `UnknownCheckpoint` for an unknown name."""
+        """Return the adapter with this name, or no adapter for None; raises `UnknownCheckpoint`
+        for an unknown name.
+        """
         if name is None:
             return Adapter()
         if not isinstance(name, str) or name not in self._named:
@@ -146,19 +166,25 @@ class Adapters:
         return self._named[name]
 
     def example(self, number: int) -> str:
-        """Return an adapter's fingerprint for example row `number`; successive rows have different ones."""
+        """Return an adapter's fingerprint for example row `number`; successive rows have
+        different ones.
+        """
         return list(self._values)[(number + 1) % len(self._values)]
 
     def require(self, fingerprint: str) -> str:
-        """Return the fingerprint; raise `UnknownSession` if the adapter of a moved session is not loaded here."""
+        """Return the fingerprint; raise `UnknownSession` if the adapter of a moved session is
+        not loaded here.
+        """
         if fingerprint not in self._values:
             raise UnknownSession(f"its adapter {fingerprint} is not loaded here; reset the session")
         return fingerprint
 
     def stated(self, fingerprint: str) -> dict[str, Any]:
-        """Return the info of an act about its weights, which no push has changed; empty if the server states them.
+        """Return the info of an act about its weights, which no push has changed; empty if the
+        server states them.
 
-        A version of a learner is one of all adapters, which a replica that starts later gets as a whole.
+        A version of a learner is one of all adapters, which a replica that starts later gets as a
+        whole.
         """
         if fingerprint and any(values.pushed for values in self._values.values()):
             return {}
@@ -180,29 +206,39 @@ class Adapters:
             _CHOSEN.reset(before)
 
     def _add(self, downs: Any, ups: Any, module: Any, inputs: tuple[Any, ...], output: Any) -> Any:
-        """Return the output of a layer, with N entries, after adding the change of each row's adapter."""
+        """Return the output of a layer, with N entries, after adding the change of each row's
+        adapter.
+        """
         chosen, [x] = _CHOSEN.get(), inputs
         if chosen is None:
             return output
         if len(x) % len(chosen):
-            raise PolicyFailed(f"adapters: a layer got {len(x)} entries for {len(chosen)} rows, want as many for each")
+            raise PolicyFailed(
+                f"adapters: a layer got {len(x)} entries for {len(chosen)} rows, want as many for "
+                "each"
+            )
         if downs.ndim == 3:
             entries = x.reshape(len(chosen), -1, x.shape[-1])
             change = (entries @ downs[chosen].mT) @ ups[chosen].mT
         else:
-            change = _convolved(module, x, downs, ups, chosen.repeat_interleave(len(x) // len(chosen)))
+            change = _convolved(
+                module, x, downs, ups, chosen.repeat_interleave(len(x) // len(chosen))
+            )
         return output + change.view(output.shape).to(output.dtype)
 
 
 def _convolved(module: Any, x: Any, downs: Any, ups: Any, chosen: Any) -> Any:
-    """Return ups (n, out, r) after convolutions downs (n, r, in, h, w) of x (N, in, H, W), as chosen for each entry.
+    """Return ups (n, out, r) after convolutions downs (n, r, in, h, w) of x (N, in, H, W), as
+    chosen for each entry.
 
     The entries are groups of one convolution, whose other settings are those of the module.
     """
     from torch.nn.functional import conv2d
 
     weight, entries = downs[chosen].flatten(0, 1), x.flatten(0, 1)[None]
-    seen = conv2d(entries, weight, None, module.stride, module.padding, module.dilation, groups=len(x))
+    seen = conv2d(
+        entries, weight, None, module.stride, module.padding, module.dilation, groups=len(x)
+    )
     return ups[chosen] @ seen.view(len(x), downs.shape[1], -1)
 
 
@@ -212,23 +248,50 @@ _PREFIX = "base_model.model."  # of all names in the file
 _DOWN, _UP = ".lora_A.weight", ".lora_B.weight"
 _BASE = ".base_layer."  # in the names of values of a layer with an adapter
 _LISTED = 5
-# Settings that do not change how a saved LoRA acts, or that are used below. All others must be unset: they select other
-# methods, or parts of the fine-tune that are not a low-rank change of a linear layer.
+# Settings that do not change how a saved LoRA acts, or that are used below. All others must be
+# unset: they select other methods, or parts of the fine-tune that are not a low-rank change of a
+# linear layer.
 _KNOWN = {
-    *("auto_mapping", "base_model_name_or_path", "revision", "peft_type", "task_type", "inference_mode"),
-    *("peft_version", "r", "lora_alpha", "use_rslora", "rank_pattern", "lora_dropout", "target_modules"),
-    *("exclude_modules", "layers_to_transform", "layers_pattern", "megatron_core", "runtime_config", "eva_config"),
+    *(
+        "auto_mapping",
+        "base_model_name_or_path",
+        "revision",
+        "peft_type",
+        "task_type",
+        "inference_mode",
+    ),
+    *(
+        "peft_version",
+        "r",
+        "lora_alpha",
+        "use_rslora",
+        "rank_pattern",
+        "lora_dropout",
+        "target_modules",
+    ),
+    *(
+        "exclude_modules",
+        "layers_to_transform",
+        "layers_pattern",
+        "megatron_core",
+        "runtime_config",
+        "eva_config",
+    ),
     "qalora_group_size",
 }
-_INITIAL = (True, False, None, "gaussian", "orthogonal", "eva")  # other values also change the weights of the base
+# Other values also change the weights of the base.
+_INITIAL = (True, False, None, "gaussian", "orthogonal", "eva")
 
 
 def base_of(folder: Path) -> str | None:
-    """Return the checkpoint that the adapter's training names as its base; None if it names none."""
+    """Return the checkpoint that the adapter's training names as its base; None if it names
+    none.
+    """
     named = _config(folder).get("base_model_name_or_path") or None
     if named is not None and not isinstance(named, str):
         raise ConfigError(
-            f"{folder / CONFIG}: got {type(named).__name__} as base_model_name_or_path, want the name of a checkpoint"
+            f"{folder / CONFIG}: got {type(named).__name__} as base_model_name_or_path, want the "
+            "name of a checkpoint"
         )
     return named
 
@@ -241,19 +304,22 @@ def read_adapter(folder: Path, network: Any) -> dict[str, tuple[Any, Any, float]
         network: The torch module that the adapter changes.
 
     Returns:
-        For each layer that the adapter changes, by the name of its module: A (r, in), or (r, in, height, width) of a
-        convolution, B (out, r), or (out, r, 1, 1), both float32 in the memory of the host, and the scale of B.
+        For each layer that the adapter changes, by the name of its module: A (r, in), or (r, in,
+        height, width) of a convolution, B (out, r), or (out, r, 1, 1), both float32 in the memory
+        of the host, and the scale of B.
 
     Raises:
-        ConfigError: The adapter is not a LoRA of linear layers and convolutions, is damaged, or does not fit the
-            network.
+        ConfigError: The adapter is not a LoRA of linear layers and convolutions, is damaged, or
+            does not fit the network.
     """
     config = _config(folder)
     try:
         with (folder / WEIGHTS).open("rb") as file:
             saved = read_values(file)
     except (OSError, MalformedMessage, MemoryError) as error:
-        raise ConfigError(f"{folder / WEIGHTS}: is damaged, or of another format ({error}); copy it again") from error
+        raise ConfigError(
+            f"{folder / WEIGHTS}: is damaged, or of another format ({error}); copy it again"
+        ) from error
     _require_complete(folder, saved, network)
     modules = dict(network.named_modules())
     names = [key.removeprefix(_PREFIX).removesuffix(_DOWN) for key in saved if key.endswith(_DOWN)]
@@ -265,26 +331,35 @@ def _config(folder: Path) -> dict[str, Any]:
     try:
         config = json.loads((folder / CONFIG).read_text(encoding="utf-8"))
     except (OSError, ValueError, RecursionError) as error:
-        raise ConfigError(f"{folder / CONFIG}: cannot be read as JSON ({error}); copy it again") from error
+        raise ConfigError(
+            f"{folder / CONFIG}: cannot be read as JSON ({error}); copy it again"
+        ) from error
     if not isinstance(config, dict) or config.get("peft_type") != "LORA":
         got = config.get("peft_type") if isinstance(config, dict) else type(config).__name__
         raise ConfigError(
-            f"{folder / CONFIG}: got peft_type {got!r}, want 'LORA'; merge another kind into its base "
+            f"{folder / CONFIG}: got peft_type {got!r}, want 'LORA'; merge another kind into its "
+            "base "
             f"(merge_and_unload) and serve that as a checkpoint of its own"
         )
-    other = {name: value for name, value in config.items() if name not in _KNOWN and value and value != "none"}
+    other = {
+        name: value
+        for name, value in config.items()
+        if name not in _KNOWN and value and value != "none"
+    }
     if config.get("init_lora_weights") in _INITIAL:
         other.pop("init_lora_weights", None)
     if other:
         raise ConfigError(
-            f"{folder / CONFIG}: got {other}, want a plain LoRA of linear layers without these; merge the fine-tune "
+            f"{folder / CONFIG}: got {other}, want a plain LoRA of linear layers without these; "
+            "merge the fine-tune "
             f"into its base (merge_and_unload) and serve that as a checkpoint of its own"
         )
     return config
 
 
 def _require_complete(folder: Path, saved: Mapping[str, Any], network: Any) -> None:
-    """Raise `ConfigError` unless the file holds pairs of A and B, and otherwise only unchanged values of the network.
+    """Raise `ConfigError` unless the file holds pairs of A and B, and otherwise only unchanged
+    values of the network.
 
     If the last layer of a language model has an adapter, PEFT also saves the whole layer.
     """
@@ -294,11 +369,16 @@ def _require_complete(folder: Path, saved: Mapping[str, Any], network: Any) -> N
     held = network.state_dict() if set(saved) - wanted else {}
     for key in sorted(set(saved) - wanted):
         value = held.get(key.removeprefix(_PREFIX).replace(_BASE, "."))
-        if value is None or saved[key].shape != tuple(value.shape) or not converted(saved[key], value).equal(value):
+        if (
+            value is None
+            or saved[key].shape != tuple(value.shape)
+            or not converted(saved[key], value).equal(value)
+        ):
             faults.append(key)
     if faults or not wanted:
         raise ConfigError(
-            f"{folder / WEIGHTS}: got {faults[:_LISTED] or 'no adapters'}, want pairs {_PREFIX}LAYER{_DOWN} and "
+            f"{folder / WEIGHTS}: got {faults[:_LISTED] or 'no adapters'}, want pairs "
+            f"{_PREFIX}LAYER{_DOWN} and "
             f"{_PREFIX}LAYER{_UP}, and no changes of the base; merge another kind of fine-tune "
             f"into it (merge_and_unload)"
         )
@@ -309,10 +389,13 @@ def _require_adaptable(folder: Path, names: list[str], modules: Mapping[str, Any
 
     if unknown := sorted(name for name in names if name not in modules):
         raise ConfigError(
-            f"{folder / WEIGHTS}: {len(unknown)} of its {len(names)} layers are not in the network: "
-            f"{unknown[:_LISTED]}; want an adapter that was trained on this checkpoint, with this version of its code"
+            f"{folder / WEIGHTS}: {len(unknown)} of its {len(names)} layers are not in the "
+            "network: "
+            f"{unknown[:_LISTED]}; want an adapter that was trained on this checkpoint, with this "
+            "version of its code"
         )
-    # no derived classes: some, as in torch's attention, are never called, and only their weights are used
+    # no derived classes: some, as in torch's attention, are never called, and only their weights
+    # are used
     other = {
         name: type(module).__name__
         for name, module in ((name, modules[name]) for name in sorted(names))
@@ -321,7 +404,8 @@ def _require_adaptable(folder: Path, names: list[str], modules: Mapping[str, Any
     }
     if other:
         raise ConfigError(
-            f"{folder / WEIGHTS}: got adapters of {dict(list(other.items())[:_LISTED])}, want those of linear layers "
+            f"{folder / WEIGHTS}: got adapters of {dict(list(other.items())[:_LISTED])}, want "
+            "those of linear layers "
             f"and plain convolutions; merge this one into its base (merge_and_unload)"
         )
 
@@ -334,7 +418,8 @@ def _layer(
     raw = [saved[f"{_PREFIX}{name}{end}"] for end in (_DOWN, _UP)]
     if not all(one.dtype.kind in "fV" for one in raw):  # V: bfloat16, which numpy lacks
         raise ConfigError(
-            f"{folder / WEIGHTS}: {name}: got A {raw[0].dtype} and B {raw[1].dtype}, want real numbers; save the "
+            f"{folder / WEIGHTS}: {name}: got A {raw[0].dtype} and B {raw[1].dtype}, want real "
+            "numbers; save the "
             f"adapter without quantization"
         )
     # scaled before rounding to the type of the weights
@@ -343,7 +428,8 @@ def _layer(
     wanted = (rank, *inputs), (outputs, rank, *(1 for _ in inputs[1:]))
     if (tuple(down.shape), tuple(up.shape)) != wanted or not rank:
         raise ConfigError(
-            f"{folder / WEIGHTS}: {name}: got A {tuple(down.shape)} and B {tuple(up.shape)}, want them for weights "
+            f"{folder / WEIGHTS}: {name}: got A {tuple(down.shape)} and B {tuple(up.shape)}, want "
+            "them for weights "
             f"{tuple(weight.shape)}; want an adapter that was trained on this checkpoint"
         )
     alpha = config.get("lora_alpha")
@@ -352,7 +438,8 @@ def _layer(
     scale = alpha / (math.sqrt(rank) if config.get("use_rslora") else rank)
     if not all(one.to(weight.dtype).isfinite().all() for one in (down, up * scale)):
         raise ConfigError(
-            f"{folder / WEIGHTS}: {name}: got NaN or infinite values as {weight.dtype}, want finite ones; take an "
+            f"{folder / WEIGHTS}: {name}: got NaN or infinite values as {weight.dtype}, want "
+            "finite ones; take an "
             f"earlier step of the training"
         )
     return down, up, scale

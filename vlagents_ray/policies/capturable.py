@@ -12,10 +12,12 @@ _COPIES = (torch.tensor, torch.as_tensor, torch.Tensor.to, torch.Tensor.cuda)
 
 
 class Capturable(TorchFunctionMode):  # type: ignore[misc]
-    """A core whose later calls use the tensors that its first call copied from the host, as no capture may do that.
+    """A core whose later calls use the tensors that its first call copied from the host, as no
+    capture may do that.
 
-    They are the same in each call, as a core depends on nothing but its arguments, and are found by their order. Casts
-    of weights by `autocast` are not cached, as the cache ends with its context, and the graph does not.
+    They are the same in each call, as a core depends on nothing but its arguments, and are found by
+    their order. Casts of weights by `autocast` are not cached, as the cache ends with its context,
+    and the graph does not.
     """
 
     def __init__(self, function: Callable[..., Any]) -> None:
@@ -33,7 +35,11 @@ class Capturable(TorchFunctionMode):  # type: ignore[misc]
             torch.set_autocast_cache_enabled(cached)
 
     def __torch_function__(
-        self, func: Any, types: Any, args: tuple[Any, ...] = (), kwargs: Mapping[str, Any] | None = None
+        self,
+        func: Any,
+        types: Any,
+        args: tuple[Any, ...] = (),
+        kwargs: Mapping[str, Any] | None = None,
     ) -> Any:
         if func not in _COPIES:
             return func(*args, **(kwargs or {}))

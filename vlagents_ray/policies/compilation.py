@@ -1,10 +1,12 @@
-"""Pure cores of a model, compiled for a few batch sizes, and compared with the eager pass before they are used.
+"""Pure cores of a model, compiled for a few batch sizes, and compared with the eager pass before
+they are used.
 
-A core is a function of tensors alone, whose first dimension is the batch and whose other dimensions are fixed; it
-returns such a tensor, or a tuple of them. On a GPU it is captured in a CUDA graph for each batch size, and so is what
-`torch.compile` makes of it, without graph breaks; the faster graph is used. On a CPU there is only torch's program. All
-programs are made while the policy loads. A batch between two sizes is padded with copies of its last row, whose results
-are dropped; one for which there is no program, as its rows have another shape, or as it is too large, runs eagerly.
+A core is a function of tensors alone, whose first dimension is the batch and whose other dimensions
+are fixed; it returns such a tensor, or a tuple of them. On a GPU it is captured in a CUDA graph for
+each batch size, and so is what `torch.compile` makes of it, without graph breaks; the faster graph
+is used. On a CPU there is only torch's program. All programs are made while the policy loads. A
+batch between two sizes is padded with copies of its last row, whose results are dropped; one for
+which there is no program, as its rows have another shape, or as it is too large, runs eagerly.
 """
 
 from __future__ import annotations
@@ -31,17 +33,22 @@ _TORCH = "TORCHINDUCTOR_CACHE_DIR"
 
 
 def keep_torch_programs() -> None:
-    """Keep torch's programs in the user's cache, unless `TORCHINDUCTOR_CACHE_DIR` names another folder.
+    """Keep torch's programs in the user's cache, unless `TORCHINDUCTOR_CACHE_DIR` names another
+    folder.
 
     Torch writes its own choice, /tmp/torchinductor_USER, into that variable when it first needs it.
     """
     chosen = Path(os.environ.get(_TORCH, "")).name
-    if (not chosen or chosen.startswith("torchinductor_")) and (folder := _folder("torch")) is not None:
+    if (not chosen or chosen.startswith("torchinductor_")) and (
+        folder := _folder("torch")
+    ) is not None:
         os.environ[_TORCH] = str(folder)
 
 
 def keep_jax_programs(jax: Any, platform: str) -> None:
-    """Keep JAX's programs for a GPU in the user's cache, unless `JAX_COMPILATION_CACHE_DIR` is set."""
+    """Keep JAX's programs for a GPU in the user's cache, unless `JAX_COMPILATION_CACHE_DIR` is
+    set.
+    """
     if platform == "cpu":
         return
     chosen = getattr(jax.config, "jax_compilation_cache_dir", "an older JAX, without this setting")
@@ -68,9 +75,10 @@ def quantize(policy: Any, kind: Quantization) -> None:
     """Replace the weights of all linear layers of a loaded policy's network, in place.
 
     Args:
-        policy: The policy; its `network` names the attribute that is a torch module, on the device of its forward pass.
-        kind: "int8", with a scale for each output of a layer, or "float8", of four bits of exponent and three of
-            mantissa.
+        policy: The policy; its `network` names the attribute that is a torch module, on the device
+            of its forward pass.
+        kind: "int8", with a scale for each output of a layer, or "float8", of four bits of exponent
+            and three of mantissa.
 
     Raises:
         ConfigError: The policy names no network, or torchao cannot quantize it here.
@@ -84,7 +92,8 @@ def quantize(policy: Any, kind: Quantization) -> None:
         torchao.quantize_(attrgetter(policy.network)(policy), config)
     except (RuntimeError, AttributeError, NotImplementedError, AssertionError) as error:
         raise ConfigError(
-            f"quantization {kind!r}: torchao cannot use it here ({type(error).__name__}: {error}); try the other one, "
+            f"quantization {kind!r}: torchao cannot use it here ({type(error).__name__}: {error}); "
+            "try the other one, "
             f"or dtype: bfloat16"
         ) from error
 
@@ -94,20 +103,25 @@ _EMPTY = "CUDA Graph is empty"  # in torch's warning
 
 
 class CaptureLock:
-    """Keeps acts, of which it is the context, and pushes of weights out of the captures of this process.
+    """Keeps acts, of which it is the context, and pushes of weights out of the captures of this
+    process.
 
-    A call that waits for a whole device ends any capture on it, with an error on both threads, whatever the mode of the
-    capture. A waiting capture goes before the next act, but waits for a push without delaying acts.
+    A call that waits for a whole device ends any capture on it, with an error on both threads,
+    whatever the mode of the capture. A waiting capture goes before the next act, but waits for a
+    push without delaying acts.
     """
 
     def __init__(self) -> None:
         self._changed = threading.Condition()
         self._acting: set[int] = set()  # threads
         self._capturing = False  # or about to
-        self.pushes = threading.RLock()  # the context of a push, within which its thread may also act
+        # The context of a push, within which its thread may also act.
+        self.pushes = threading.RLock()
 
     def __enter__(self) -> None:
-        """Begin an act: wait for the end of a capture. None begins until its end; a thread enters once at a time."""
+        """Begin an act: wait for the end of a capture. None begins until its end; a thread
+        enters once at a time.
+        """
         with self._changed:
             self._changed.wait_for(lambda: not self._capturing)
             self._acting.add(threading.get_ident())
@@ -121,7 +135,9 @@ class CaptureLock:
     def capture(self) -> Iterator[None]:
         """Wait for running acts and pushes, and block new ones within this context."""
         if threading.get_ident() in self._acting:
-            raise RuntimeError("a CUDA graph cannot be captured within an act; capture it in Agent.initialize")
+            raise RuntimeError(
+                "a CUDA graph cannot be captured within an act; capture it in Agent.initialize"
+            )
         with self.pushes:
             try:
                 with self._changed:
@@ -140,8 +156,8 @@ CAPTURES = CaptureLock()
 class GraphMemory:
     """The memory and the stream of all CUDA graphs of a policy on one device.
 
-    A replay may overwrite the results of all other graphs. That is safe, since the replays of a policy are serial and
-    on one stream, and a result is copied before the next one.
+    A replay may overwrite the results of all other graphs. That is safe, since the replays of a
+    policy are serial and on one stream, and a result is copied before the next one.
     """
 
     def __init__(self, device: Any) -> None:
@@ -161,16 +177,20 @@ class GraphMemory:
 
 
 class CudaGraph:
-    """A function, captured once with inputs of one shape; calls copy their inputs to where the graph reads them.
+    """A function, captured once with inputs of one shape; calls copy their inputs to where the
+    graph reads them.
 
-    It is captured here, and not by `torch.compile`, whose graphs belong to the thread that captured them: a checkpoint
-    is loaded on another thread than the one that acts with it.
+    It is captured here, and not by `torch.compile`, whose graphs belong to the thread that captured
+    them: a checkpoint is loaded on another thread than the one that acts with it.
     """
 
     replays: ClassVar[int] = 0  # of all graphs of this process
 
-    def __init__(self, function: Callable[..., Any], inputs: Sequence[Any], memory: GraphMemory | None = None) -> None:
-        """Capture a function of tensors on one GPU without other effects; raises `RuntimeError` if that fails.
+    def __init__(
+        self, function: Callable[..., Any], inputs: Sequence[Any], memory: GraphMemory | None = None
+    ) -> None:
+        """Capture a function of tensors on one GPU without other effects; raises `RuntimeError` if
+        that fails.
 
         Args:
             function: The function. It is kept, since the graph reads its constants.
@@ -180,7 +200,8 @@ class CudaGraph:
         torch, device = require("torch"), inputs[0].device
         memory = memory or GraphMemory(device)
         self._function, self._inputs = function, inputs
-        # The current stream is entered again, since `torch.cuda.graph` leaves its own if the capture fails.
+        # The current stream is entered again, since `torch.cuda.graph` leaves its own if the
+        # capture fails.
         own, current = memory.stream, torch.cuda.current_stream(device)
         with torch.cuda.device(device), torch.cuda.stream(current):
             own.wait_stream(current)
@@ -192,10 +213,14 @@ class CudaGraph:
             with CAPTURES.capture(), warnings.catch_warnings(record=True) as said:
                 warnings.simplefilter("always")
                 # Other threads still prepare acts; their calls must not end the capture.
-                with torch.cuda.graph(self._graph, memory.pool, own, capture_error_mode="thread_local"):
+                with torch.cuda.graph(
+                    self._graph, memory.pool, own, capture_error_mode="thread_local"
+                ):
                     self._result = function(*inputs)
         if any(_EMPTY in str(warning.message) for warning in said):
-            raise RuntimeError("the CUDA graph is empty: all work ran on another stream, or on another device")
+            raise RuntimeError(
+                "the CUDA graph is empty: all work ran on another stream, or on another device"
+            )
 
     def __call__(self, *tensors: Any) -> Any:
         """Return the results of at most as many rows as were captured, in memory of their own."""
@@ -223,21 +248,24 @@ class CudaGraph:
 
 CompileMode = bool | Literal["auto", "graphs", "require"]
 
-# Errors of a row of a core's result are shares of the row's norm. Compiled sums run in another order, and merged
-# kernels keep float32 where the eager pass rounds between them. How much that changes depends on the checkpoint: it is
-# measured, as the error of the eager core with smaller batches and other roundings. Torch's programs had half of it.
+# Errors of a row of a core's result are shares of the row's norm. Compiled sums run in another
+# order, and merged kernels keep float32 where the eager pass rounds between them. How much that
+# changes depends on the checkpoint: it is measured, as the error of the eager core with smaller
+# batches and other roundings. Torch's programs had half of it.
 _ROUNDINGS = 2.0  # largest error of a program, as a multiple of that one
 _LEAST = 1e-3  # the error that is always accepted
-# The largest error that is ever accepted, by the coarsest type in which a core computes. In bfloat16, ten steps of a
-# flow of 3.5 billion parameters differ by 0.067 from the same eager pass with fewer rows.
+# The largest error that is ever accepted, by the coarsest type in which a core computes. In
+# bfloat16, ten steps of a flow of 3.5 billion parameters differ by 0.067 from the same eager pass
+# with fewer rows.
 TOLERANCE = {"float32": _LEAST, "float16": 1e-2, "bfloat16": 1e-1}
 _SHOWN = 300  # characters of a compiler's error in the log
-# A compiled program replaces the graph of the eager core if its replay takes at most this share of the time: a smaller
-# gain may be noise, and only the graph computes as the eager pass does.
+# A compiled program replaces the graph of the eager core if its replay takes at most this share of
+# the time: a smaller gain may be noise, and only the graph computes as the eager pass does.
 _FASTER = 0.97
 _REPLAYS = 5  # of each, of which the shortest counts
 
-_GRAPH, _COMPILED = "CUDA graph", "torch.compile"  # tiers: the eager core, and torch's program, both in graphs on a GPU
+# tiers: the eager core, and torch's program, both in graphs on a GPU.
+_GRAPH, _COMPILED = "CUDA graph", "torch.compile"
 
 
 class Compilation:
@@ -246,14 +274,17 @@ class Compilation:
     backend: ClassVar[str] = "inductor"  # of torch.compile
 
     def __init__(self, mode: CompileMode) -> None:
-        """Begin to compile: False: nothing, "graphs": CUDA graphs of eager cores, True: `torch.compile` also.
+        """Begin to compile: False: nothing, "graphs": CUDA graphs of eager cores, True:
+        `torch.compile` also.
 
-        "require" is True with an error for each failure. "auto" stays open until the policy is loaded.
+        "require" is True with an error for each failure. "auto" stays open until the policy is
+        loaded.
         """
         self.mode = mode
         self.sizes: list[int] = []  # batch sizes for which a core is compiled, ascending
         self.building: int | None = None  # the batch size whose programs are being made
-        self.tier_of_parts: str | None = None  # the tier that a core with parts now calls of them; None: it is open
+        # The tier that a core with parts now calls of them; None: it is open.
+        self.tier_of_parts: str | None = None
         self.cores: list[Core] = []
         self.memories: dict[Any, GraphMemory] = {}  # by device
         self.graph_bytes = 0  # which CUDA graphs took on all devices
@@ -261,18 +292,23 @@ class Compilation:
             keep_torch_programs()
 
     def core(
-        self, name: str, function: Callable[..., Any], rows: int | None = None, parts: Sequence[Any] = ()
+        self,
+        name: str,
+        function: Callable[..., Any],
+        rows: int | None = None,
+        parts: Sequence[Any] = (),
     ) -> Callable[..., Any]:
         """Return a function's compiled form, or the function itself if nothing is compiled.
 
         Args:
             name: The core's name in messages.
-            function: The core. Its arguments are tensors on the model's device. It must read nothing that changes but
-                the model's weights, whose values may change.
-            rows: The most rows of a call, if that does not follow from the batch size, such as those of a planner's
-                candidates: the core then has one program, for so many rows. None: those of each batch size.
-            parts: The cores that the function calls. It is then one CUDA graph with all of them; on a CPU, only they
-                are compiled.
+            function: The core. Its arguments are tensors on the model's device. It must read
+                nothing that changes but the model's weights, whose values may change.
+            rows: The most rows of a call, if that does not follow from the batch size, such as
+                those of a planner's candidates: the core then has one program, for so many rows.
+                None: those of each batch size.
+            parts: The cores that the function calls. It is then one CUDA graph with all of them; on
+                a CPU, only they are compiled.
         """
         if not self.mode:
             return function
@@ -280,10 +316,12 @@ class Compilation:
         return self.cores[-1]
 
     def add_size(self, size: int, forward: Callable[[], object]) -> None:
-        """Make the programs of all cores for a batch size, and compare them twice with the eager pass.
+        """Make the programs of all cores for a batch size, and compare them twice with the eager
+        pass.
 
-        Sizes are added from the largest to the smallest, so that graphs of smaller ones fit into the memory of larger
-        ones. A core whose programs all fail uses that of the next larger size, or runs eagerly.
+        Sizes are added from the largest to the smallest, so that graphs of smaller ones fit into
+        the memory of larger ones. A core whose programs all fail uses that of the next larger size,
+        or runs eagerly.
 
         Args:
             size: The number of rows.
@@ -300,7 +338,10 @@ class Compilation:
             self.building = None
         failures = [failure for core in self.cores for failure in core.settle(size)]
         if failures and self.mode == "require":
-            raise ConfigError(f"compile: require: {'; '.join(failures)}; with `compile: true` it would run without")
+            raise ConfigError(
+                f"compile: require: {'; '.join(failures)}; with `compile: true` it would run "
+                "without"
+            )
         if failures:
             report_uncompiled(f"{size} rows: {'; '.join(failures)}")
         if used := {core.name: tier for core in self.cores if (tier := core.tier(size))}:
@@ -310,7 +351,9 @@ class Compilation:
 
     @contextmanager
     def parts(self, tier: str) -> Iterator[None]:
-        """Let cores call a tier of their parts within the context: eager functions, or torch's programs."""
+        """Let cores call a tier of their parts within the context: eager functions, or torch's
+        programs.
+        """
         self.tier_of_parts = tier
         try:
             yield
@@ -318,7 +361,9 @@ class Compilation:
             self.tier_of_parts = None
 
     def drop_graphs(self) -> None:
-        """Free all CUDA graphs, since they read weights at fixed addresses; `add_size` makes them again."""
+        """Free all CUDA graphs, since they read weights at fixed addresses; `add_size` makes
+        them again.
+        """
         if not self.memories:
             return
         self.sizes.clear()
@@ -332,14 +377,21 @@ class Core:
     """A core with its programs."""
 
     def __init__(
-        self, owner: Compilation, name: str, function: Callable[..., Any], rows: int | None, parts: Sequence[Core]
+        self,
+        owner: Compilation,
+        name: str,
+        function: Callable[..., Any],
+        rows: int | None,
+        parts: Sequence[Core],
     ) -> None:
         self.name = name
         self._owner, self._function, self._rows, self._parts = owner, function, rows, parts
-        self._programs: dict[int, dict[str, Any]] = {}  # by rows and tier, of which one is left once settled
+        # By rows and tier, of which one is left once settled.
+        self._programs: dict[int, dict[str, Any]] = {}
         self._kinds: dict[int, list[Any]] = {}  # of the rows of arguments, for each program
         self._compiled: dict[int, Callable[..., Any]] = {}  # torch's programs, by rows
-        self._held: list[Any] = []  # inputs of the graph with the most rows, of which others read the first rows
+        # Inputs of the graph with the most rows, of which others read the first rows.
+        self._held: list[Any] = []
         self._failures: list[str] = []  # of the batch size whose programs are being made
 
     def __call__(self, *tensors: Any) -> Any:
@@ -348,10 +400,18 @@ class Core:
             return self._function(*tensors)
         if owner.tier_of_parts is not None:
             compiled = owner.tier_of_parts == _COMPILED
-            return self._compiled[rows](*map(_of_one_kind, tensors)) if compiled else self._function(*tensors)
+            return (
+                self._compiled[rows](*map(_of_one_kind, tensors))
+                if compiled
+                else self._function(*tensors)
+            )
         if owner.building is not None:
             own = rows == (self._rows or owner.building)
-            return self._compared(list(map(_of_one_kind, tensors))) if own else self._function(*tensors)
+            return (
+                self._compared(list(map(_of_one_kind, tensors)))
+                if own
+                else self._function(*tensors)
+            )
         sizes = owner.sizes if self._rows is None else [self._rows]
         size = next((size for size in sizes if size >= rows and size in self._programs), None)
         if size is None or self._kinds[size] != _row_kinds(tensors):
@@ -367,7 +427,9 @@ class Core:
         return next(iter(self._programs.get(self._rows or size, ())), None)
 
     def drop_graphs(self) -> None:
-        """Free the graphs, and their inputs; torch's programs read no fixed addresses, and are kept."""
+        """Free the graphs, and their inputs; torch's programs read no fixed addresses, and are
+        kept.
+        """
         self._programs.clear()
         self._kinds.clear()
         self._held.clear()
@@ -376,17 +438,28 @@ class Core:
         """Keep the fastest program of a batch size; return the reasons for which others failed."""
         size, failures, self._failures = self._rows or size, self._failures, []
         programs = self._programs.get(size, {})
-        if len(programs) > 1:  # both are graphs; they alternate, so that other work on the GPU slows both
-            times = [[program.replay_ms() for program in programs.values()] for _ in range(_REPLAYS)]
+        # Both are graphs; they alternate, so that other work on the GPU slows both.
+        if len(programs) > 1:
+            times = [
+                [program.replay_ms() for program in programs.values()] for _ in range(_REPLAYS)
+            ]
             graph_ms, compiled_ms = map(min, zip(*times, strict=True))
-            logger.info("%r, %d rows: %.3f ms eager, %.3f ms compiled", self.name, size, graph_ms, compiled_ms)
+            logger.info(
+                "%r, %d rows: %.3f ms eager, %.3f ms compiled",
+                self.name,
+                size,
+                graph_ms,
+                compiled_ms,
+            )
             del programs[_GRAPH if compiled_ms <= _FASTER * graph_ms else _COMPILED]
         if not programs:
             self._programs.pop(size, None)
         return failures
 
     def _compared(self, tensors: Sequence[Any]) -> Any:
-        """Return the eager result, once the programs are made; keep those whose results are near it."""
+        """Return the eager result, once the programs are made; keep those whose results are near
+        it.
+        """
         wanted, size = self._function(*tensors), len(tensors[0])
         tiers = list(self._programs.get(size, ()))
         if missing := size not in self._programs:
@@ -407,16 +480,19 @@ class Core:
                 programs[tier] = program
                 if error <= limit:
                     continue
-                said = f"its results are off by {error:.2g}, want at most {limit:g}"  # or it is not a number
+                # Or it is not a number.
+                said = f"its results are off by {error:.2g}, want at most {limit:g}"
             programs.pop(tier, None)
             self._failures.append(f"{self.name!r} by {tier}: {said}")
         return wanted
 
     def _limit(self, tensors: Sequence[Any], wanted: Any) -> float:
-        """Return the largest error of a right program, as measured with the eager core on the same inputs.
+        """Return the largest error of a right program, as measured with the eager core on the same
+        inputs.
 
-        The core runs with the first and the second half of the batch, and with other roundings. Another composition
-        alone often changes nothing, since the same kernels compute each row as before.
+        The core runs with the first and the second half of the batch, and with other roundings.
+        Another composition alone often changes nothing, since the same kernels compute each row as
+        before.
         """
         from vlagents_ray.policies.rounding import OtherRounding
 
@@ -435,10 +511,15 @@ class Core:
     def _made(self, tier: str, tensors: Sequence[Any]) -> Any:
         """Return a tier's program for tensors of these shapes.
 
-        It is made with other values than those of a comparison: a CUDA graph that missed a part of the core returns the
-        results of the values with which it was captured.
+        It is made with other values than those of a comparison: a CUDA graph that missed a part of
+        the core returns the results of the values with which it was captured.
         """
-        function, owner, size, device = self._function, self._owner, len(tensors[0]), tensors[0].device
+        function, owner, size, device = (
+            self._function,
+            self._owner,
+            len(tensors[0]),
+            tensors[0].device,
+        )
         inputs = self._inputs(tensors)
         if tier == _COMPILED and not self._parts:
             function = self._compiled[size] = self._compiled.get(size) or self._program(inputs)
@@ -454,9 +535,15 @@ class Core:
             return CudaGraph(function, inputs, owner.memories[device])
 
     def _inputs(self, tensors: Sequence[Any]) -> list[Any]:
-        """Return zeros of these shapes, in the memory of the inputs of more rows if there are such."""
+        """Return zeros of these shapes, in the memory of the inputs of more rows if there are
+        such.
+        """
         size = len(tensors[0])
-        if not self._held or len(self._held[0]) < size or _row_kinds(self._held) != _row_kinds(tensors):
+        if (
+            not self._held
+            or len(self._held[0]) < size
+            or _row_kinds(self._held) != _row_kinds(tensors)
+        ):
             self._held = [require("torch").zeros_like(tensor) for tensor in tensors]
         return [held[:size].zero_() for held in self._held]
 
@@ -468,14 +555,19 @@ class Core:
             return function(*tensors)
 
         # torch counts the programs of each code object, and gives up after eight of them
-        core.__code__ = core.__code__.replace(co_name=f"{self.name}_{len(tensors[0])}".replace(" ", "_"))
-        program: Callable[..., Any] = torch.compile(core, fullgraph=True, dynamic=False, backend=self._owner.backend)
+        core.__code__ = core.__code__.replace(
+            co_name=f"{self.name}_{len(tensors[0])}".replace(" ", "_")
+        )
+        program: Callable[..., Any] = torch.compile(
+            core, fullgraph=True, dynamic=False, backend=self._owner.backend
+        )
         program(*tensors)
         return program
 
 
 def _of_one_kind(tensor: Any) -> Any:
-    """Return the tensor as programs were made for it: contiguous, and an inference tensor in inference mode.
+    """Return the tensor as programs were made for it: contiguous, and an inference tensor in
+    inference mode.
 
     `torch.compile` makes another program for tensors of another kind.
     """
@@ -484,7 +576,11 @@ def _of_one_kind(tensor: Any) -> Any:
 
 def _padded(tensor: Any, size: int) -> Any:
     missing = size - len(tensor)
-    return require("torch").cat([tensor, tensor[-1:].expand(missing, *tensor.shape[1:])]) if missing else tensor
+    return (
+        require("torch").cat([tensor, tensor[-1:].expand(missing, *tensor.shape[1:])])
+        if missing
+        else tensor
+    )
 
 
 def _row_kinds(tensors: Sequence[Any]) -> list[Any]:
@@ -496,10 +592,14 @@ def _each(result: Any) -> Sequence[Any]:
 
 
 def _largest_error(got: Any, wanted: Any) -> float:
-    """Return the largest relative error of a row, by its Euclidean norm, among all tensors of the results."""
+    """Return the largest relative error of a row, by its Euclidean norm, among all tensors of
+    the results.
+    """
     errors = []
     for one, other in zip(_each(got), _each(wanted), strict=True):
-        off, size = (part.float().reshape(len(part), -1).norm(dim=1) for part in (one - other, other))
+        off, size = (
+            part.float().reshape(len(part), -1).norm(dim=1) for part in (one - other, other)
+        )
         errors.append((off / size.clamp(min=1e-12)).max())
     return float(require("torch").stack(errors).max())  # which is NaN if any of them is
 

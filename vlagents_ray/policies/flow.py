@@ -1,12 +1,13 @@
 """Flow matching in random steps, so that an action chunk has a log-probability (Flow-SDE).
 
-A flow's steps from noise to actions are deterministic, and the density of its actions is not known. The stochastic
-differential equation with the same marginal distributions at each time (Song et al. 2021, arXiv 2011.13456) makes each
-step a normal distribution, and the steps a Markov chain whose log-probability is a sum. Learners that fine-tune flows
-train with it: Flow-GRPO (arXiv 2505.05470), whose noise schedule this is, and πRL (arXiv 2510.25889).
+A flow's steps from noise to actions are deterministic, and the density of its actions is not known.
+The stochastic differential equation with the same marginal distributions at each time (Song et al.
+2021, arXiv 2011.13456) makes each step a normal distribution, and the steps a Markov chain whose
+log-probability is a sum. Learners that fine-tune flows train with it: Flow-GRPO (arXiv 2505.05470),
+whose noise schedule this is, and πRL (arXiv 2510.25889).
 
-Flow time is openpi's: 1 is noise, 0 is the actions, and the velocity is noise minus actions. The functions take arrays
-of any library, and are differentiable there.
+Flow time is openpi's: 1 is noise, 0 is the actions, and the velocity is noise minus actions. The
+functions take arrays of any library, and are differentiable there.
 """
 
 from __future__ import annotations
@@ -32,14 +33,17 @@ _LOG_2_PI = math.log(2 * math.pi)
 
 
 Change = Callable[[Any, Any, float], Any]
-"""The velocity (B, H, D), noisy actions (B, H, D) and flow time of a step -> the velocity that it takes."""
+"""The velocity (B, H, D), noisy actions (B, H, D) and flow time of a step -> the velocity that
+it takes.
+"""
 
 
 def follow(velocity: Callable[[Any, float], Any], noise: Any, steps: int, *changes: Change) -> Any:
     """Integrate noise (B, H, D) to actions in Euler steps, from flow time 1 to 0.
 
     Args:
-        velocity: Returns the flow's velocity (B, H, D) at noisy actions (B, H, D) and a flow time in (0, 1].
+        velocity: Returns the flow's velocity (B, H, D) at noisy actions (B, H, D) and a flow time
+            in (0, 1].
         noise: The actions at time 1.
         steps: The number of steps.
         changes: Applied to the velocity of each step, one after another.
@@ -62,8 +66,8 @@ def normal_logprob(values: Any, mean: Any, std: float) -> Any:
 def step_std(step: int, steps: int, noise_level: float) -> float:
     """Return the standard deviation of each number after a step.
 
-    It is a * sqrt(t / (1 - t) / steps) for the noise level a at the time t = 1 - step / steps, with the time of the
-    next step for 1 - t in the first one, where that is 0.
+    It is a * sqrt(t / (1 - t) / steps) for the noise level a at the time t = 1 - step / steps, with
+    the time of the next step for 1 - t in the first one, where that is 0.
     """
     return noise_level * math.sqrt((steps - step) / max(step, 1) / steps)
 
@@ -88,17 +92,19 @@ def step_mean(actions: Any, velocity: Any, step: int, steps: int, noise_level: f
 
 
 def logprob_of_chain(velocity: Callable[[Any, float], Any], chain: Any, noise_level: float) -> Any:
-    """Return the log-probability of the steps from noise to actions, given the noise, under a learner's weights.
+    """Return the log-probability of the steps from noise to actions, given the noise, under a
+    learner's weights.
 
     Args:
-        velocity: Returns the flow's velocity (B, H, D) at noisy actions (B, H, D) and a flow time in (0, 1].
-        chain: The noisy actions before and after each step, (B, K + 1, H, D), in the model's units: `replay["chain"]`
-            of B acts or samples.
+        velocity: Returns the flow's velocity (B, H, D) at noisy actions (B, H, D) and a flow time
+            in (0, 1].
+        chain: The noisy actions before and after each step, (B, K + 1, H, D), in the model's units:
+            `replay["chain"]` of B acts or samples.
         noise_level: `replay["noise_level"]`.
 
     Returns:
-        The log-probability of each number, summed over the steps, (B, H, D), nats. That of an act is of the rows and
-        numbers that it returns: `[:, :execute, :action_dim]`.
+        The log-probability of each number, summed over the steps, (B, H, D), nats. That of an act
+        is of the rows and numbers that it returns: `[:, :execute, :action_dim]`.
     """
     steps = chain.shape[1] - 1
     total: Any = 0.0
@@ -110,18 +116,29 @@ def logprob_of_chain(velocity: Callable[[Any, float], Any], chain: Any, noise_le
 
 
 def chain_entropy(steps: int, noise_level: float) -> float:
-    """Return the entropy of one number of a chain, given the noise, nats: it depends on the noise level alone."""
-    return sum(math.log(step_std(step, steps, noise_level)) + 0.5 * (1.0 + _LOG_2_PI) for step in range(steps))
+    """Return the entropy of one number of a chain, given the noise, nats: it depends on the
+    noise level alone.
+    """
+    return sum(
+        math.log(step_std(step, steps, noise_level)) + 0.5 * (1.0 + _LOG_2_PI)
+        for step in range(steps)
+    )
 
 
 class RandomSteps:
-    """The random steps of the rows of a batch with requested values; the others keep their velocity.
+    """The random steps of the rows of a batch with requested values; the others keep their
+    velocity.
 
-    Each row draws from its session's generator, so that neighbours do not matter. Arrays are torch tensors.
+    Each row draws from its session's generator, so that neighbours do not matter. Arrays are torch
+    tensors.
     """
 
     def __init__(
-        self, rows: Sequence[Row], shape: tuple[int, int, int], noise_level: float, convert: Callable[[np.ndarray], Any]
+        self,
+        rows: Sequence[Row],
+        shape: tuple[int, int, int],
+        noise_level: float,
+        convert: Callable[[np.ndarray], Any],
     ) -> None:
         """Draw the noise of all steps.
 
@@ -133,20 +150,34 @@ class RandomSteps:
         """
         self._wants = {i: row.want for i, row in enumerate(rows) if row.want}
         self._steps, self._level = shape[0], noise_level
-        self._draws = convert(np.stack([rows[i].noise(*shape) for i in self._wants], axis=1))  # (K, E, H, D)
-        self._index = convert(np.array(list(self._wants)))  # (E,); a list would be copied to the device at each step
+        # (K, E, H, D)
+        self._draws = convert(np.stack([rows[i].noise(*shape) for i in self._wants], axis=1))
+        # (E,); a list would be copied to the device at each step.
+        self._index = convert(np.array(list(self._wants)))
         self._chain: list[Any] = []  # noisy actions (E, H, D) at first, and after each step
         self._means: list[Any] = []  # of those after each step
 
     @classmethod
     def of(
-        cls, rows: Sequence[Row], shape: tuple[int, int, int], noise_level: float, convert: Callable[[np.ndarray], Any]
+        cls,
+        rows: Sequence[Row],
+        shape: tuple[int, int, int],
+        noise_level: float,
+        convert: Callable[[np.ndarray], Any],
     ) -> RandomSteps | None:
-        """Return the random steps of a batch; None if there are none, in which case nothing is drawn."""
-        return cls(rows, shape, noise_level, convert) if noise_level and any(row.want for row in rows) else None
+        """Return the random steps of a batch; None if there are none, in which case nothing is
+        drawn.
+        """
+        return (
+            cls(rows, shape, noise_level, convert)
+            if noise_level and any(row.want for row in rows)
+            else None
+        )
 
     def change(self, velocity: Any, actions: Any, time: float) -> Any:
-        """Return the velocity (B, H, D) of the next step, which moves the requested rows to drawn actions."""
+        """Return the velocity (B, H, D) of the next step, which moves the requested rows to
+        drawn actions.
+        """
         step, before = len(self._means), actions[self._index]
         mean = step_mean(before, velocity[self._index], step, self._steps, self._level)
         drawn = mean + step_std(step, self._steps, self._level) * self._draws[step]
@@ -157,10 +188,13 @@ class RandomSteps:
         return velocity.index_copy(0, self._index, change.to(velocity.dtype))
 
     def stated(self, execute: int | None, dim: int | None) -> dict[int, dict[str, Any]]:
-        """Return the outputs requested of rows, by their places, after the last step; None: all rows, all numbers."""
+        """Return the outputs requested of rows, by their places, after the last step; None: all
+        rows, all numbers.
+        """
         stds = [step_std(step, self._steps, self._level) for step in range(self._steps)]
         total = sum(map(normal_logprob, self._chain[1:], self._means, stds))
-        *chains, logprobs = fetch(require("torch").stack([*self._chain, total]))  # one copy, for which it waits
+        # One copy, for which it waits.
+        *chains, logprobs = fetch(require("torch").stack([*self._chain, total]))
         logprob = logprobs[:, :execute, :dim]
         entropy = chain_entropy(self._steps, self._level) * logprob[0].size
         found: dict[int, dict[str, Any]] = {}
@@ -173,7 +207,9 @@ class RandomSteps:
 
 @dataclass(frozen=True, slots=True)
 class Guide:
-    """The plan that each row of a batch of chunks follows, as arrays of the library in which the model is written."""
+    """The plan that each row of a batch of chunks follows, as arrays of the library in which the
+    model is written.
+    """
 
     plan: Any  # (B, H, D) in the model's units, i.e. normalised; zeros where there is no plan
     frozen: Any  # (B, H, 1): 1.0 where a row will have been executed, else 0.0
@@ -181,7 +217,9 @@ class Guide:
 
     @classmethod
     def of(cls, rows: Sequence[Row], horizon: int, dim: int) -> Guide | None:
-        """Return the guide of the rows' `delay` and `leftover`, in the model's units; None if no row has any."""
+        """Return the guide of the rows' `delay` and `leftover`, in the model's units; None if no
+        row has any.
+        """
         if all(row.leftover is None for row in rows):
             return None
         plan = np.zeros((len(rows), horizon, dim), np.float32)
@@ -193,7 +231,8 @@ class Guide:
                 delay = min(max(row.delay, 0), len(left))
                 plan[i, : len(left), : left.shape[1]] = left
                 frozen[i, :delay] = 1.0
-                # the paper's soft mask, from about 1 after the frozen rows down to 0 where the plan ends
+                # the paper's soft mask, from about 1 after the frozen rows down to 0 where the plan
+                # ends
                 behind = np.arange(delay, horizon, dtype=np.float32)
                 share = np.clip((len(left) - behind) / (len(left) - delay + 1), 0.0, 1.0)
                 weight[i, delay:, 0] = share * np.expm1(share) / np.expm1(1.0)
@@ -204,10 +243,12 @@ class Guide:
         return Guide(convert(self.plan), convert(self.frozen), convert(self.weight))
 
     def given(self, noise: Any) -> Any:
-        """Return noise (B, H, D) with the frozen rows of the plan in it, for a policy that was trained with prefixes.
+        """Return noise (B, H, D) with the frozen rows of the plan in it, for a policy that was
+        trained with prefixes.
 
-        Such a policy reads these rows as actions, at flow time 0 (`FlowPasses.sample`'s `given`), and continues them
-        without any correction (training-time action conditioning, https://arxiv.org/abs/2512.05964).
+        Such a policy reads these rows as actions, at flow time 0 (`FlowPasses.sample`'s `given`),
+        and continues them without any correction (training-time action conditioning,
+        https://arxiv.org/abs/2512.05964).
         """
         return self.frozen * self.plan + (1.0 - self.frozen) * noise
 
@@ -226,10 +267,12 @@ class Guide:
         limit: float,
         lower: Callable[[Any, float], Any] = min,
     ) -> Any:
-        """Return the velocity (B, H, D), corrected by the plan, at the noisy actions of a time of a flow from `noise`.
+        """Return the velocity (B, H, D), corrected by the plan, at the noisy actions of a time of a
+        flow from `noise`.
 
-        The gain of the correction of a later row is at most `limit`, and at most the number of steps: with that, one
-        step goes to the end. `lower` returns the smaller of two numbers, for libraries whose `time` is not a plain
+        The gain of the correction of a later row is at most `limit`, and at most the number of
+        steps: with that, one step goes to the end. `lower` returns the smaller of two numbers, for
+            libraries whose `time` is not a plain
         number.
         """
         spread = (1.0 - time) ** 2 + time**2
@@ -239,13 +282,16 @@ class Guide:
 
 
 class FlowPasses(abc.ABC):
-    """The passes of a model: one over its inputs, and one for each step of the flow, or one for all steps."""
+    """The passes of a model: one over its inputs, and one for each step of the flow, or one for
+    all steps.
+    """
 
     def __init__(self, model: Any, compilation: Compilation) -> None:
         """Use the passes of a model, in their compiled form if there is one."""
         self.model = model
         self.adapters = Adapters()  # of the policy
-        self.module = sys.modules[type(model).__module__]  # with the functions of its authors' own passes
+        # With the functions of its authors' own passes.
+        self.module = sys.modules[type(model).__module__]
         self._compilation = compilation
         self._encode = compilation.core("encode", self.encode)
         self._velocity = compilation.core("velocity", self.velocity)
@@ -257,8 +303,11 @@ class FlowPasses(abc.ABC):
         return images
 
     @abc.abstractmethod
-    def encode(self, tokens: Any, mask: Any, cameras: Any, state: Any, *images: Any) -> tuple[Any, Any]:
-        """Return keys and values, or all else that `velocity` reads of inputs, and which tokens (P, L) are there.
+    def encode(
+        self, tokens: Any, mask: Any, cameras: Any, state: Any, *images: Any
+    ) -> tuple[Any, Any]:
+        """Return keys and values, or all else that `velocity` reads of inputs, and which tokens (P,
+        L) are there.
 
         Args:
             tokens: Of the instruction, (P, T) int64.
@@ -270,7 +319,9 @@ class FlowPasses(abc.ABC):
 
     @abc.abstractmethod
     def velocity(self, encoded: Any, seen: Any, state: Any, actions: Any, times: Any) -> Any:
-        """Return the velocity (B, H, D) of noisy actions (B, H, D) at times (B,), or (B, H) with `by_row`."""
+        """Return the velocity (B, H, D) of noisy actions (B, H, D) at times (B,), or (B, H) with
+        `by_row`.
+        """
 
     def chunks(
         self,
@@ -284,13 +335,15 @@ class FlowPasses(abc.ABC):
         dim: int | None,
         convert: Callable[[np.ndarray], Any],
     ) -> tuple[np.ndarray, dict[int, dict[str, Any]]]:
-        """Return actions (B, H, D) in the model's units, and the outputs requested of rows, by their places.
+        """Return actions (B, H, D) in the model's units, and the outputs requested of rows, by
+        their places.
 
         Args:
             rows: Those of the batch, with plans in the model's units.
             inputs: The first five arguments of `sample`.
             owners: The observation of each row.
-            noise: Drawn for each row, (B, H, D), before that of the steps, which only some rows draw.
+            noise: Drawn for each row, (B, H, D), before that of the steps, which only some rows
+                draw.
             steps: The number of steps.
             config: The policy's `noise_level`, `guidance` and `execute`.
             dim: How many of the numbers are the robot's; None: all.
@@ -298,12 +351,18 @@ class FlowPasses(abc.ABC):
         """
         start, changes, (_, horizon, width) = convert(noise), list[Change](), noise.shape
         if (guide := Guide.of(rows, horizon, width)) is not None:
-            changes.append(partial(guide.to(convert).steer, noise=start, steps=steps, limit=config.guidance))
+            changes.append(
+                partial(guide.to(convert).steer, noise=start, steps=steps, limit=config.guidance)
+            )
         random = RandomSteps.of(rows, (steps, horizon, width), config.noise_level, convert)
         if random is not None:
             changes.append(random.change)
-        adapters: Sequence[str] = [row.adapter for row in rows] if any(row.adapter for row in rows) else ()
-        flow = self.sample(*inputs, noise=start, owners=owners, steps=steps, changes=changes, fingerprints=adapters)
+        adapters: Sequence[str] = (
+            [row.adapter for row in rows] if any(row.adapter for row in rows) else ()
+        )
+        flow = self.sample(
+            *inputs, noise=start, owners=owners, steps=steps, changes=changes, fingerprints=adapters
+        )
         return fetch(flow), {} if random is None else random.stated(config.execute, dim)
 
     def sample(
@@ -336,8 +395,10 @@ class FlowPasses(abc.ABC):
             steps: Of the flow.
             changes: See `follow`.
             fingerprints: The adapter of each row, see `Row.adapter`; empty: none has one.
-            given: With `by_row`, which rows of the chunks are actions already, at time 0: (B, H, 1), 1.0 or 0.0.
-            states: Of a memory, from LeRobot's π0.5 after 0.6.1, and None, as models with a memory are refused.
+            given: With `by_row`, which rows of the chunks are actions already, at time 0: (B, H,
+                1), 1.0 or 0.0.
+            states: Of a memory, from LeRobot's π0.5 after 0.6.1, and None, as models with a memory
+                are refused.
             state_masks: As `states`.
         """
         torch = require("torch")
@@ -360,9 +421,18 @@ class FlowPasses(abc.ABC):
             return flow(encoded, seen, state, noise)
 
     def _flow(
-        self, steps: int, changes: Sequence[Change], given: Any, encoded: Any, seen: Any, state: Any, noise: Any
+        self,
+        steps: int,
+        changes: Sequence[Change],
+        given: Any,
+        encoded: Any,
+        seen: Any,
+        state: Any,
+        noise: Any,
     ) -> Any:
-        """Return actions (B, H, D): without changes, whose values differ for each batch, all steps are one core."""
+        """Return actions (B, H, D): without changes, whose values differ for each batch, all
+        steps are one core.
+        """
         float32 = require("torch").float32
 
         def velocity(actions: Any, time: float) -> Any:

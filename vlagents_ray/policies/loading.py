@@ -23,14 +23,21 @@ class LoadingReport:
 
     on_progress: Callable[[str], None]  # called with each step, on the loading thread
     batch_sizes: Sequence[int]  # the server's, ascending
-    uncompiled: list[str] = field(default_factory=list)  # parts that run without compilation, although `compile` is set
-    devices: list[dict[str, Any]] = field(default_factory=list)  # of the models, see `accelerator.torch_device`
+    # Parts that run without compilation, although `compile` is set.
+    uncompiled: list[str] = field(default_factory=list)
+    # Of the models, see `accelerator.torch_device`.
+    devices: list[dict[str, Any]] = field(default_factory=list)
     most_rows: int | None = None  # of a forward pass, if memory limits it
-    pads: bool = False  # whether the policy itself pads batches to its sizes, with fewer rows than a server knows of
-    pass_s: dict[int, float] = field(default_factory=dict)  # shortest duration of a forward pass so far, s, by its rows
-    on_out_of_memory: Callable[[], None] = lambda: None  # called whenever a forward pass does not fit, even later
-    on_gpu_ms: Callable[[float], None] = lambda _: None  # called with the time of each forward pass on a GPU
-    timer: Callable[[], AbstractContextManager[None]] = nullcontext  # returns the context of a forward pass
+    # Whether the policy itself pads batches to its sizes, with fewer rows than a server knows of.
+    pads: bool = False
+    # Shortest duration of a forward pass so far, s, by its rows.
+    pass_s: dict[int, float] = field(default_factory=dict)
+    # Called whenever a forward pass does not fit, even later.
+    on_out_of_memory: Callable[[], None] = lambda: None
+    # Called with the time of each forward pass on a GPU.
+    on_gpu_ms: Callable[[float], None] = lambda _: None
+    # Returns the context of a forward pass.
+    timer: Callable[[], AbstractContextManager[None]] = nullcontext
 
     @property
     def accelerated(self) -> bool:
@@ -48,8 +55,12 @@ def loading_report(
     on_out_of_memory: Callable[[], None] = lambda: None,
     on_gpu_ms: Callable[[float], None] = lambda _: None,
 ) -> Iterator[LoadingReport]:
-    """Yield the report of the policy that is loaded in this context; see the fields of `LoadingReport`."""
-    report = LoadingReport(on_progress, batch_sizes, on_out_of_memory=on_out_of_memory, on_gpu_ms=on_gpu_ms)
+    """Yield the report of the policy that is loaded in this context; see the fields of
+    `LoadingReport`.
+    """
+    report = LoadingReport(
+        on_progress, batch_sizes, on_out_of_memory=on_out_of_memory, on_gpu_ms=on_gpu_ms
+    )
     token = _report.set(report)
     try:
         yield report
@@ -82,7 +93,9 @@ def report_device(device: dict[str, Any]) -> None:
 
 
 def report_uncompiled(what: str) -> None:
-    """Log and report a part that runs uncompiled although its policy's settings require compilation."""
+    """Log and report a part that runs uncompiled although its policy's settings require
+    compilation.
+    """
     logger.warning("not compiled: %s", what)
     if (report := _report.get()) is not None:
         report.uncompiled.append(what)

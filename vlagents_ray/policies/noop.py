@@ -17,14 +17,20 @@ class NoopConfig(BaseModel, extra="forbid"):
     """Size of the zero action, and latency of the simulated model."""
 
     action_dim: int = Field(default=7, ge=1)
-    delta: bool | None = Field(default=None, description="whether the contract states relative actions")
-    chunk: int = Field(default=1, ge=1, description="rows an `act` returns; 1 gives a single action, (D,)")
+    delta: bool | None = Field(
+        default=None, description="whether the contract states relative actions"
+    )
+    chunk: int = Field(
+        default=1, ge=1, description="rows an `act` returns; 1 gives a single action, (D,)"
+    )
     base_ms: float = Field(default=0.0, ge=0, description="time a batch takes, whatever its size")
     per_item_ms: float = Field(default=0.0, ge=0, description="time that each item of a batch adds")
 
 
 class Noop(Agent):
-    """Returns zeros, (D,) or (chunk, D). A batch of B takes `base_ms + per_item_ms * B`, in a single sleep."""
+    """Returns zeros, (D,) or (chunk, D). A batch of B takes `base_ms + per_item_ms * B`, in a
+    single sleep.
+    """
 
     Config: ClassVar[type] = NoopConfig
     shared: ClassVar[tuple[str, ...]] = ("config",)
@@ -34,7 +40,10 @@ class Noop(Agent):
 
     @property
     def contract(self) -> Contract:
-        return Contract(action=ActionSpec(dim=self.config.action_dim, delta=self.config.delta), chunk=self.config.chunk)
+        return Contract(
+            action=ActionSpec(dim=self.config.action_dim, delta=self.config.delta),
+            chunk=self.config.chunk,
+        )
 
     def act(self, obs: Obs) -> Act:
         self._sleep(1)

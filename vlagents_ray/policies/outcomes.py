@@ -1,4 +1,6 @@
-"""The results of a batch in which an error stands in the place of a row, and fails the request of its session alone."""
+"""The results of a batch in which an error stands in the place of a row, and fails the request
+of its session alone.
+"""
 
 from __future__ import annotations
 
@@ -15,9 +17,13 @@ def attempt(function: Callable[..., Any], *args: Any) -> Any:
 
 
 def of_good(rows: Sequence[Any], compute: Callable[[list[Any]], Iterable[Any]]) -> list[Any]:
-    """Compute the rows that are no exceptions in one call, if there are any; return their results among the others."""
+    """Compute the rows that are no exceptions in one call, if there are any; return their
+    results among the others.
+    """
     found = list(rows)
     good = [place for place, row in enumerate(rows) if not isinstance(row, Exception)]
-    for place, result in zip(good, compute([rows[place] for place in good]) if good else (), strict=True):
+    for place, result in zip(
+        good, compute([rows[place] for place in good]) if good else (), strict=True
+    ):
         found[place] = result
     return found

@@ -18,7 +18,9 @@ class RandomConfig(BaseModel, extra="forbid"):
     """Bounds and size of the actions; `seed` is mixed with the seed of each episode."""
 
     action_dim: int = Field(default=7, ge=1)
-    chunk: int = Field(default=1, ge=1, description="rows an `act` returns; 1 gives a single action, (D,)")
+    chunk: int = Field(
+        default=1, ge=1, description="rows an `act` returns; 1 gives a single action, (D,)"
+    )
     low: float = Field(default=-1.0, allow_inf_nan=False)
     high: float = Field(default=1.0, allow_inf_nan=False)
     seed: int = Field(default=0, ge=0)
@@ -31,9 +33,11 @@ class RandomConfig(BaseModel, extra="forbid"):
 
 
 class Random(Agent):
-    """Returns actions that are uniform in [low, high] and depend only on the seeds of the config and the episode.
+    """Returns actions that are uniform in [low, high] and depend only on the seeds of the config
+    and the episode.
 
-    For an observation with `info["samples"] = N` it also returns its distribution, as RL fine-tuning needs.
+    For an observation with `info["samples"] = N` it also returns its distribution, as RL
+    fine-tuning needs.
     """
 
     Config: ClassVar[type] = RandomConfig
@@ -42,12 +46,16 @@ class Random(Agent):
     def __init__(self, config: RandomConfig | None = None) -> None:
         self.config = config or RandomConfig()
         self._rng: np.random.Generator | None = None
-        self._draws: np.random.Generator | None = None  # of samples, so that requesting them changes no action
+        # Of samples, so that requesting them changes no action.
+        self._draws: np.random.Generator | None = None
 
     @property
     def contract(self) -> Contract:
         config = self.config
-        return Contract(action=ActionSpec(dim=config.action_dim, low=config.low, high=config.high), chunk=config.chunk)
+        return Contract(
+            action=ActionSpec(dim=config.action_dim, low=config.low, high=config.high),
+            chunk=config.chunk,
+        )
 
     def reset(self, obs: Obs, instruction: str | None, **kwargs: Any) -> dict[str, Any]:
         """Begin the episode of `kwargs["seed"]` (an int, 0 if not given)."""

@@ -1,7 +1,9 @@
-"""Another rounding of the same computation, from which the noise of a checkpoint's own numbers is measured.
+"""Another rounding of the same computation, from which the noise of a checkpoint's own numbers is
+measured.
 
-It is Monte Carlo arithmetic (Parker 1997, https://web.cs.ucla.edu/~stott/mca/): each result of 16 bits is moved by a
-random part of its last place, as another order of sums or another kernel would move it.
+It is Monte Carlo arithmetic (Parker 1997, https://web.cs.ucla.edu/~stott/mca/): each result of 16
+bits is moved by a random part of its last place, as another order of sums or another kernel would
+move it.
 """
 
 from __future__ import annotations
@@ -16,7 +18,9 @@ _ROUNDED = (torch.float16, torch.bfloat16)
 
 
 class OtherRounding(TorchDispatchMode):  # type: ignore[misc]
-    """A context in which results of 16 bits are rounded another way; it draws from no generator of the process."""
+    """A context in which results of 16 bits are rounded another way; it draws from no generator
+    of the process.
+    """
 
     def __init__(self) -> None:
         super().__init__()
@@ -24,7 +28,9 @@ class OtherRounding(TorchDispatchMode):  # type: ignore[misc]
         self._generators: dict[Any, Any] = {}  # by device
 
     def run(self, function: Callable[..., Any], *tensors: Any) -> Any:
-        """Return the function's result; casts of weights by `autocast` are not cached, as they are rounded here."""
+        """Return the function's result; casts of weights by `autocast` are not cached, as they
+        are rounded here.
+        """
         cached = torch.is_autocast_cache_enabled()
         torch.set_autocast_cache_enabled(False)
         try:
@@ -34,7 +40,11 @@ class OtherRounding(TorchDispatchMode):  # type: ignore[misc]
             torch.set_autocast_cache_enabled(cached)
 
     def __torch_dispatch__(
-        self, func: Any, types: Any, args: tuple[Any, ...] = (), kwargs: Mapping[str, Any] | None = None
+        self,
+        func: Any,
+        types: Any,
+        args: tuple[Any, ...] = (),
+        kwargs: Mapping[str, Any] | None = None,
     ) -> Any:
         result = func(*args, **(kwargs or {}))
         if any(returned.alias_info is not None for returned in func._schema.returns):

@@ -14,10 +14,16 @@ from vlagents_ray.registry import named_class
 
 
 class ScriptedConfig(BaseModel, extra="forbid"):
-    """Settings of `Scripted`: the env to assume if a client names none, and an expert of the user."""
+    """Settings of `Scripted`: the env to assume if a client names none, and an expert of the
+    user.
+    """
 
-    task: str | None = Field(default=None, description="an env's full name, e.g. 'tabletop' or 'maniskill/PushCube-v1'")
-    expert: str | None = Field(default=None, description="'module:Class' of an expert, in place of the env's own one")
+    task: str | None = Field(
+        default=None, description="an env's full name, e.g. 'tabletop' or 'maniskill/PushCube-v1'"
+    )
+    expert: str | None = Field(
+        default=None, description="'module:Class' of an expert, in place of the env's own one"
+    )
 
 
 class Scripted(Agent):
@@ -51,5 +57,7 @@ class Scripted(Agent):
 
     def act(self, obs: Obs) -> Act:
         if self._expert is None:
-            raise NotReset("scripted: act before reset; call reset(obs, instruction, env=...) first")
+            raise NotReset(
+                "scripted: act before reset; call reset(obs, instruction, env=...) first"
+            )
         return self._expert.act(obs)

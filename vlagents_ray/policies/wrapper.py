@@ -1,4 +1,6 @@
-"""Wrappers, which change the observations of any policy, and the construction of a policy with its wrappers."""
+"""Wrappers, which change the observations of any policy, and the construction of a policy with
+its wrappers.
+"""
 
 from __future__ import annotations
 
@@ -16,7 +18,8 @@ from vlagents_ray.settings import wrong_settings
 class Wrapper(Agent):
     """An agent that passes changed observations to an inner agent.
 
-    `Config` and `shared` are those of any agent. A session has its own copy of the wrapper and of the inner agent.
+    `Config` and `shared` are those of any agent. A session has its own copy of the wrapper and of
+    the inner agent.
 
     Args:
         agent: The inner agent.
@@ -28,22 +31,31 @@ class Wrapper(Agent):
 
     @classmethod
     def around(cls, agent: Agent, settings: Mapping[str, Any]) -> Wrapper:
-        """Wrap an agent with the wrapper's settings from the deployment file; raises `ConfigError` if any is wrong."""
+        """Wrap an agent with the wrapper's settings from the deployment file; raises
+        `ConfigError` if any is wrong.
+        """
         try:
-            return cls(agent) if cls.Config is None and not settings else cls(agent, cls.Config(**settings))  # type: ignore[misc]
+            if cls.Config is None and not settings:
+                return cls(agent)
+            return cls(agent, cls.Config(**settings))  # type: ignore[misc]
         except (TypeError, ValueError) as error:
             message = wrong_settings(error, cls.Config) if isinstance(error, ValueError) else error
             raise ConfigError(f"wrapper {cls.__name__}: {message}") from error
 
     def begin(self, obs: Obs, instruction: str | None) -> Obs:
-        """Begin an episode with its first observation; returns the observation for the inner agent."""
+        """Begin an episode with its first observation; returns the observation for the inner
+        agent.
+        """
         return obs
 
-    def change_batch(self, obs: Sequence[Obs], sessions: Sequence[Wrapper]) -> list[Obs | Exception]:
+    def change_batch(
+        self, obs: Sequence[Obs], sessions: Sequence[Wrapper]
+    ) -> list[Obs | Exception]:
         """Change an observation of each session, given the sessions' copies of the wrapper.
 
         Returns:
-            The observations for the inner agent; an exception in the place of one fails that session's request alone.
+            The observations for the inner agent; an exception in the place of one fails that
+            session's request alone.
         """
         return list(obs)
 
@@ -79,7 +91,9 @@ class Wrapper(Agent):
         self.agent.observe(changed)
 
     def act_batch(self, obs: Sequence[Obs], sessions: Sequence[Agent]) -> list[Act | Exception]:
-        """Change the observations, and compute the inner agent's actions for those without an exception."""
+        """Change the observations, and compute the inner agent's actions for those without an
+        exception.
+        """
         changed = self.change_batch(obs, sessions)  # type: ignore[arg-type]
         good = [i for i, one in enumerate(changed) if not isinstance(one, Exception)]
         inner = [sessions[i].agent for i in good]  # type: ignore[attr-defined]
@@ -99,17 +113,25 @@ class Wrapper(Agent):
 
 
 def build_agent(
-    policy: str, config: Mapping[str, Any], wrappers: Sequence[str | Mapping[str, Mapping[str, Any]]] = ()
+    policy: str,
+    config: Mapping[str, Any],
+    wrappers: Sequence[str | Mapping[str, Mapping[str, Any]]] = (),
 ) -> Agent:
-    """Make a policy, named or "module:Class", with its wrappers; raises `ConfigError` for a wrong name or setting.
+    """Make a policy, named or "module:Class", with its wrappers; raises `ConfigError` for a wrong
+    name or setting.
 
-    Wrappers are names, or {name: settings}; the first is the outermost one, which receives the robot's observations and
-    is returned.
+    Wrappers are names, or {name: settings}; the first is the outermost one, which receives the
+    robot's observations and is returned.
     """
     if not issubclass(kind := policy_class(policy), Agent):
-        raise UnknownPolicy(f"policy {policy!r}: is no Agent; derive the class from vlagents_ray.Agent")
+        raise UnknownPolicy(
+            f"policy {policy!r}: is no Agent; derive the class from vlagents_ray.Agent"
+        )
     if kind.act is Agent.act and kind.act_batch is Agent.act_batch:
-        raise ConfigError(f"policy {policy!r}: expected a class that defines act or act_batch, got {kind.__name__}")
+        raise ConfigError(
+            f"policy {policy!r}: expected a class that defines act or act_batch, got "
+            f"{kind.__name__}"
+        )
     try:
         agent: Agent = kind.from_config(config)
     except ConfigError as error:
@@ -117,17 +139,24 @@ def build_agent(
     for entry in reversed(wrappers):
         named = {entry: {}} if isinstance(entry, str) else dict(entry)
         if len(named) != 1:
-            raise ConfigError(f"wrappers: got {sorted(named)} in one entry, want one name each, with its settings")
+            raise ConfigError(
+                f"wrappers: got {sorted(named)} in one entry, want one name each, with its settings"
+            )
         [(name, settings)] = named.items()
         cls = wrapper_class(name)
         if not issubclass(cls, Wrapper):
-            raise ConfigError(f"wrappers: {name!r} is {cls.__name__}, want a subclass of {Wrapper.__module__}.Wrapper")
+            raise ConfigError(
+                f"wrappers: {name!r} is {cls.__name__}, want a subclass of "
+                f"{Wrapper.__module__}.Wrapper"
+            )
         agent = cls.around(agent, settings or {})
     return agent
 
 
 def _example_of(policy: str, kind: type[Agent], config: Mapping[str, Any]) -> str:
-    """Return the end of a message that names a file and a page with the settings that `config` lacks, if any."""
+    """Return the end of a message that names a file and a page with the settings that `config`
+    lacks, if any.
+    """
     fields = getattr(kind.Config, "model_fields", {})
     missing = any(field.is_required() and name not in config for name, field in fields.items())
     entry = find_entry("policies", policy)
@@ -138,7 +167,10 @@ def _example_of(policy: str, kind: type[Agent], config: Mapping[str, Any]) -> st
         return f". {page} explains it"
     file, _, section = page.partition("#")
     where = f"docs/policies/{file}.md" + (f"#{section}" if section else "")
-    return f". deployments/{entry.deployment or policy}.yaml of a checkout has an example, and {where} explains it"
+    return (
+        f". deployments/{entry.deployment or policy}.yaml of a checkout has an example, and "
+        f"{where} explains it"
+    )
 
 
 def unloaded_contract(agent: Agent) -> Contract | None:

@@ -26,14 +26,18 @@ _PREFIX = struct.Struct("<3sBI")
 _ALIGN = 8
 HEADER_BYTES = 2**20  # maximum size of a request's JSON; only the size of the body limits a reply's
 VALUES = 20_000  # maximum number of values in a request's JSON; parsing as many takes about 2 ms
-_INLINE_BYTES = 64 * 1024  # longer JSON is parsed within a budget, which may move it to a decoding thread
+# Longer JSON is parsed within a budget, which may move it to a decoding thread.
+_INLINE_BYTES = 64 * 1024
 _LONG_VALUES = 1_000_000
 _PLAIN = re.compile(r"[<|][biuf][1248]")
-dump = json.JSONEncoder(separators=(",", ":")).encode  # created once, as `json.dumps` creates an encoder per call
+# Created once, as `json.dumps` creates an encoder per call.
+dump = json.JSONEncoder(separators=(",", ":")).encode
 
 
 def pack(header: dict[str, Any], blobs: list[Buffer]) -> list[Buffer]:
-    """Return the pieces of a frame in order, and set "blobs" in `header`; the blobs are not copied."""
+    """Return the pieces of a frame in order, and set "blobs" in `header`; the blobs are not
+    copied.
+    """
     header["blobs"] = [len(blob) for blob in blobs]
     return assemble(dump(header), blobs)
 
@@ -50,7 +54,9 @@ def assemble(header: str, blobs: list[Buffer]) -> list[Buffer]:
     return parts
 
 
-def unpack(data: Buffer, limits: Limits, budget: Budget | None = None) -> tuple[dict[str, Any], list[Buffer]]:
+def unpack(
+    data: Buffer, limits: Limits, budget: Budget | None = None
+) -> tuple[dict[str, Any], list[Buffer]]:
     """Return the header of a frame, and views of its blobs.
 
     A request's header is charged to `budget`; None is for a reply, whose header may be longer.
@@ -65,14 +71,22 @@ def unpack(data: Buffer, limits: Limits, budget: Budget | None = None) -> tuple[
         raise MalformedMessage(f"frame: got {len(data)} bytes, want at least {_PREFIX.size}")
     magic, version, length = _PREFIX.unpack_from(data)
     if magic != b"VLA":
-        raise MalformedMessage(f"frame: got {magic!r} at its start, want b'VLA'; is this a vlagents_ray frame?")
+        raise MalformedMessage(
+            f"frame: got {magic!r} at its start, want b'VLA'; is this a vlagents_ray frame?"
+        )
     if version != PROTOCOL_VERSION:
-        raise MalformedMessage(f"frame: got version {version}, this side speaks {PROTOCOL_VERSION}; upgrade the older")
+        raise MalformedMessage(
+            f"frame: got version {version}, this side speaks {PROTOCOL_VERSION}; upgrade the older"
+        )
     view = memoryview(data)
     at = _PREFIX.size + length
     if at > len(view):
-        raise MalformedMessage(f"frame: ends inside its header ({len(view)} of {at} bytes); it was truncated")
-    header = parse_json(view[_PREFIX.size : at], "frame: the header is", budget=budget, long=budget is None)
+        raise MalformedMessage(
+            f"frame: ends inside its header ({len(view)} of {at} bytes); it was truncated"
+        )
+    header = parse_json(
+        view[_PREFIX.size : at], "frame: the header is", budget=budget, long=budget is None
+    )
     lengths = header.get("blobs") if isinstance(header, dict) else None
     if not isinstance(lengths, list) or not all(type(n) is int and n >= 0 for n in lengths):
         raise MalformedMessage("frame: the header has no list 'blobs' of lengths")
@@ -80,7 +94,9 @@ def unpack(data: Buffer, limits: Limits, budget: Budget | None = None) -> tuple[
     for n in lengths:
         at += -at % _ALIGN
         if at + n > len(view):
-            raise MalformedMessage(f"frame: ends inside a blob ({len(view)} of {at + n} bytes); it was truncated")
+            raise MalformedMessage(
+                f"frame: ends inside a blob ({len(view)} of {at + n} bytes); it was truncated"
+            )
         blobs.append(view[at : at + n])
         at += n
     if at != len(view):
@@ -101,7 +117,8 @@ def parse_json(
     Args:
         text: The text; bytes are UTF-8.
         what: The beginning of the error message, such as "obs:".
-        pairs: Converts the keys and values of each object; its `ValueError`s become `MalformedMessage`.
+        pairs: Converts the keys and values of each object; its `ValueError`s become
+            `MalformedMessage`.
         budget: The budget to charge before a long text is parsed.
         long: Whether the text may be longer than a request, as a server's reply or a file may be.
 
@@ -111,7 +128,8 @@ def parse_json(
     """
     if len(text) > HEADER_BYTES and not long:
         raise MessageTooLarge(
-            f"message: got {len(text)} bytes of JSON, the limit is {HEADER_BYTES}; send arrays and files as bytes"
+            f"message: got {len(text)} bytes of JSON, the limit is {HEADER_BYTES}; send arrays and "
+            "files as bytes"
         )
     if budget is not None and len(text) > _INLINE_BYTES:
         budget.parse(len(text))
@@ -119,13 +137,17 @@ def parse_json(
     most = _LONG_VALUES if long else VALUES
     if len(data) > 2 * most:  # each value takes at least two characters
         marks: tuple[Any, ...] = (",", "[", "{") if isinstance(data, str) else (b",", b"[", b"{")
-        if sum(map(data.count, marks)) > most:  # parsing would need far more memory and time than the length suggests
-            raise MessageTooLarge(f"message: more than {most} values in its JSON; send arrays instead of lists")
+        # Parsing would need far more memory and time than the length suggests.
+        if sum(map(data.count, marks)) > most:
+            raise MessageTooLarge(
+                f"message: more than {most} values in its JSON; send arrays instead of lists"
+            )
     try:
         decoded = data if isinstance(data, str) else data.removeprefix(codecs.BOM_UTF8).decode()
         value = json.loads(decoded, object_pairs_hook=pairs)
         if "\\u" in decoded:
-            json.dumps(value, ensure_ascii=False).encode()  # raises an error for an unpaired surrogate
+            # Raises an error for an unpaired surrogate.
+            json.dumps(value, ensure_ascii=False).encode()
     except (ValueError, RecursionError) as error:
         raise MalformedMessage(f"{what} not JSON ({error})") from error
     return value
@@ -151,15 +173,26 @@ def plain_dtype(dtype: Any) -> np.dtype[Any]:
 
 
 def read_array(data: Buffer, dtype: Any, shape: Any) -> np.ndarray:
-    """Return a read-only array over `data`; raise `MalformedMessage` unless data, dtype and shape match."""
+    """Return a read-only array over `data`; raise `MalformedMessage` unless data, dtype and
+    shape match.
+    """
     kind = plain_dtype(dtype)
     if not isinstance(data, (bytes, memoryview)):
         raise MalformedMessage(f"array: got {type(data).__name__} for its data, want bytes")
-    if not isinstance(shape, (list, tuple)) or len(shape) > 8 or not all(type(n) is int and n >= 0 for n in shape):
-        raise MalformedMessage(f"array: got shape {shown(shape)}, want up to 8 non-negative integers")
+    if (
+        not isinstance(shape, (list, tuple))
+        or len(shape) > 8
+        or not all(type(n) is int and n >= 0 for n in shape)
+    ):
+        raise MalformedMessage(
+            f"array: got shape {shown(shape)}, want up to 8 non-negative integers"
+        )
     if math.prod(shape) * kind.itemsize != len(data):
         raise MalformedMessage(f"array: got {len(data)} bytes, want {shown(shape)} of {dtype}")
     try:
         return np.ndarray(shape, kind, data)
-    except (ValueError, OverflowError) as error:  # numpy cannot represent such a long axis, even beside an empty one
-        raise MalformedMessage(f"array: got shape {shown(shape)}, which numpy does not know") from error
+    except (ValueError, OverflowError) as error:
+        # numpy cannot represent such a long axis, even beside an empty one
+        raise MalformedMessage(
+            f"array: got shape {shown(shape)}, which numpy does not know"
+        ) from error

@@ -1,8 +1,8 @@
 """The binary frame: a complete message, with its images and arrays as aligned raw bytes.
 
 HTTP bodies, WebSocket messages and shared memory contain the same frame. Its header (see
-`vlagents_ray.protocol.frame_layout`) is one request or reply, or a list of them under "requests" or "replies", as a
-vector of environments sends them.
+`vlagents_ray.protocol.frame_layout`) is one request or reply, or a list of them under "requests" or
+"replies", as a vector of environments sends them.
 """
 
 from __future__ import annotations
@@ -41,12 +41,23 @@ from vlagents_ray.protocol.messages import (
 from vlagents_ray.protocol.values import ValueReader, ValueWriter, is_number, read_obs, write_obs
 
 CONTENT_TYPE = "application/x-vlagents-frame"
-_OPTIONAL: dict[str, Any] = {"request_id": "", "session": "", "rank": "robot", "deadline_ms": None}  # with defaults
+# With defaults.
+_OPTIONAL: dict[str, Any] = {"request_id": "", "session": "", "rank": "robot", "deadline_ms": None}
 _WITH_OBS = ("reset", "act", "observe")
 _RESET_PARAMETERS = {"self", "obs", "instruction"}  # which no option of a reset may be named
 _OF_RESET = ("instruction", "kwargs", "contract", "history")
 _OF_CLOSE = ("op", "step", *_OPTIONAL)
-_REQUEST_KEYS = {"op", "obs", "instruction", "kwargs", "contract", "history", "blobs", "step", *_OPTIONAL}
+_REQUEST_KEYS = {
+    "op",
+    "obs",
+    "instruction",
+    "kwargs",
+    "contract",
+    "history",
+    "blobs",
+    "step",
+    *_OPTIONAL,
+}
 
 
 def encode_requests(requests: Sequence[Request], codec: ImageCodec = RAW) -> bytes:
@@ -55,7 +66,9 @@ def encode_requests(requests: Sequence[Request], codec: ImageCodec = RAW) -> byt
 
 
 def request_parts(requests: Sequence[Request], codec: ImageCodec = RAW) -> list[Buffer]:
-    """Return the pieces of a frame of requests, in order; raw images and arrays are views, not copies."""
+    """Return the pieces of a frame of requests, in order; raw images and arrays are views, not
+    copies.
+    """
     writer = ValueWriter()
     nodes = [_write_request(request, writer, codec) for request in requests]
     return pack(nodes[0] if len(nodes) == 1 else {"requests": nodes}, writer.blobs)
@@ -82,7 +95,9 @@ def _write_request(request: Request, writer: ValueWriter, codec: ImageCodec) -> 
 
 
 class Decoded(NamedTuple):
-    """The requests decoded from a frame, and the error replies to unreadable ones by their index in the frame."""
+    """The requests decoded from a frame, and the error replies to unreadable ones by their index
+    in the frame.
+    """
 
     requests: list[Request]
     refused: dict[int, Reply]
@@ -92,8 +107,8 @@ def decode_requests(data: Buffer, budget: Budget, ops: Sequence[Op] = OPS) -> De
     """Decode the requests in a frame.
 
     Args:
-        budget: The budget to charge for the message before any of it is parsed, and for each further request before its
-            images are decoded.
+        budget: The budget to charge for the message before any of it is parsed, and for each
+            further request before its images are decoded.
 
     Raises:
         MalformedMessage: The data are not a frame of requests.
@@ -107,7 +122,9 @@ def decode_requests(data: Buffer, budget: Budget, ops: Sequence[Op] = OPS) -> De
     if not isinstance(nodes, list) or {*map(type, nodes)} != {dict}:
         raise MalformedMessage(f"requests: got {shown(nodes)}, want a list of requests")
     if len(nodes) > limits.requests:
-        raise MessageTooLarge(f"requests: got {len(nodes)}, the limit is {limits.requests} in one frame")
+        raise MessageTooLarge(
+            f"requests: got {len(nodes)}, the limit is {limits.requests} in one frame"
+        )
     decoded = Decoded([], {})
     reader = ValueReader(blobs, budget)
     for place, node in enumerate(nodes):
@@ -117,23 +134,31 @@ def decode_requests(data: Buffer, budget: Budget, ops: Sequence[Op] = OPS) -> De
             decoded.requests.append(_read_request(node, reader, ops))
         except VLAgentsError as error:
             name = node.get("request_id")
-            decoded.refused[place] = Reply(name if isinstance(name, str) and is_name(name) else "", error=error)
+            decoded.refused[place] = Reply(
+                name if isinstance(name, str) and is_name(name) else "", error=error
+            )
     return decoded
 
 
 def _read_request(node: dict[str, Any], reader: ValueReader, ops: Sequence[Op]) -> Request:
     limits = reader.limits
     if unknown := node.keys() - _REQUEST_KEYS:
-        raise MalformedMessage(f"request: unknown keys {shown(sorted(unknown))}, want some of {sorted(_REQUEST_KEYS)}")
+        raise MalformedMessage(
+            f"request: unknown keys {shown(sorted(unknown))}, want some of {sorted(_REQUEST_KEYS)}"
+        )
     if node.get("op") not in ops:
         raise MalformedMessage(f"op: got {shown(node.get('op'))}, want one of {list(ops)}")
     if node["op"] == "close":  # a close has no payload and costs nothing
         node = {name: value for name, value in node.items() if name in _OF_CLOSE}
     obs, history = node.get("obs"), node.get("history") or []
     if not isinstance(history, list):
-        raise MalformedMessage(f"history: got {type(history).__name__}, want a list of observations")
+        raise MalformedMessage(
+            f"history: got {type(history).__name__}, want a list of observations"
+        )
     if len(history) > limits.history:
-        raise MessageTooLarge(f"history: got {len(history)} observations, the limit is {limits.history}")
+        raise MessageTooLarge(
+            f"history: got {len(history)} observations, the limit is {limits.history}"
+        )
     return check_request(
         Request(
             op=cast(Op, node["op"]),
@@ -150,22 +175,33 @@ def _read_request(node: dict[str, Any], reader: ValueReader, ops: Sequence[Op]) 
 
 
 def _step(node: dict[str, Any]) -> Any:
-    """Return the `step` of a request or reply. It is sent as text: some JSON parsers round numbers above 2**53."""
+    """Return the `step` of a request or reply. It is sent as text: some JSON parsers round
+    numbers above 2**53.
+    """
     if (step := node.get("step")) is None:
         return None
     if not (isinstance(step, str) and step.isascii() and step.isdecimal() and len(step) < 20):
-        raise MalformedMessage(f"step: got {shown(step)}, want the text of the last answer, such as '7'")
+        raise MalformedMessage(
+            f"step: got {shown(step)}, want the text of the last answer, such as '7'"
+        )
     return int(step)
 
 
 def check_request(request: Request, limits: Limits) -> Request:
-    """Check the types and sizes that JSON itself does not enforce, for a request of any format; return the request."""
-    if not isinstance(request.kwargs, dict):  # a reference is an object in JSON, and may be an array, bytes or a number
+    """Check the types and sizes that JSON itself does not enforce, for a request of any format;
+    return the request.
+    """
+    # A reference is an object in JSON, and may be an array, bytes or a number.
+    if not isinstance(request.kwargs, dict):
         raise MalformedMessage(f"kwargs: got {type(request.kwargs).__name__}, want an object")
     if request.contract is not None and not isinstance(request.contract, dict):
         raise MalformedMessage(f"contract: got {type(request.contract).__name__}, want an object")
-    if request.op in ("act", "close") and (of_reset := [name for name in _OF_RESET if getattr(request, name)]):
-        raise MalformedMessage(f"{request.op}: got {of_reset}, which a reset states for its whole episode")
+    if request.op in ("act", "close") and (
+        of_reset := [name for name in _OF_RESET if getattr(request, name)]
+    ):
+        raise MalformedMessage(
+            f"{request.op}: got {of_reset}, which a reset states for its whole episode"
+        )
     if request.obs is None and request.op in _WITH_OBS:
         raise MalformedMessage(f"{request.op}: no 'obs'; send the observation")
     for name in ("instruction", "request_id", "session"):
@@ -175,16 +211,21 @@ def check_request(request: Request, limits: Limits) -> Request:
         if text and len(text) > (limits.text if name == "instruction" else NAME_CHARACTERS):
             raise MessageTooLarge(f"{name}: got {len(text)} characters, which is over the limit")
         if text and name != "instruction" and not is_name(text):
-            raise MalformedMessage(f"{name}: got {text[:40]!r}, want visible ASCII characters without spaces")
+            raise MalformedMessage(
+                f"{name}: got {text[:40]!r}, want visible ASCII characters without spaces"
+            )
     if request.op == "reset" and (taken := _RESET_PARAMETERS & request.kwargs.keys()):
-        raise MalformedMessage(f"kwargs: got {sorted(taken)}, which are parameters of `reset` itself; rename them")
+        raise MalformedMessage(
+            f"kwargs: got {sorted(taken)}, which are parameters of `reset` itself; rename them"
+        )
     if not isinstance(request.rank, str) or request.rank not in RANKS:
         raise MalformedMessage(f"rank: got {shown(request.rank)}, want one of {list(RANKS)}")
     if request.deadline_ms is not None and not (
         is_number(request.deadline_ms) and 0 < request.deadline_ms < MOST_DEADLINE_MS
     ):
         raise MalformedMessage(
-            f"deadline_ms: got {shown(request.deadline_ms)}, want a number above 0 and below {MOST_DEADLINE_MS:g}"
+            f"deadline_ms: got {shown(request.deadline_ms)}, want a number above 0 and below "
+            f"{MOST_DEADLINE_MS:g}"
         )
     return request
 
@@ -192,24 +233,35 @@ def check_request(request: Request, limits: Limits) -> Request:
 def encode_replies(replies: Sequence[Reply], *, arrived: float | None = None) -> bytes:
     """Encode the replies to one frame of requests as one frame, in the order of the requests.
 
-    If `arrived` is given, the time at which the requests arrived, s, of `time.perf_counter()`, the `timing` of replies
-    without an error also gets `encode_ms` and `total_ms`, which exclude only the final joining of the frame.
+    If `arrived` is given, the time at which the requests arrived, s, of `time.perf_counter()`, the
+    `timing` of replies without an error also gets `encode_ms` and `total_ms`, which exclude only
+    the final joining of the frame.
     """
     begun = time.perf_counter()
     writer = ValueWriter()
     nodes = [dump(_write_reply(reply, writer)) for reply in replies]
     if len(nodes) > 1 and sum(map(len, (*nodes, *writer.blobs))) > DEFAULT_LIMITS.body_bytes:
-        large = MessageTooLarge(f"replies: over {DEFAULT_LIMITS.body_bytes} bytes together; ask for fewer at once")
-        return encode_replies([Reply(reply.request_id, error=large) for reply in replies], arrived=arrived)
+        large = MessageTooLarge(
+            f"replies: over {DEFAULT_LIMITS.body_bytes} bytes together; ask for fewer at once"
+        )
+        return encode_replies(
+            [Reply(reply.request_id, error=large) for reply in replies], arrived=arrived
+        )
     if arrived is not None:
         ended = time.perf_counter()
         both = {"encode_ms": (ended - begun) * 1e3, "total_ms": (ended - arrived) * 1e3}
         for reply in replies:
             if reply.error is None:
                 reply.timing |= both
-    for i, reply in enumerate(replies):  # last, in a separate loop, so that `timing` covers the encoding of the rest
+    # last, in a separate loop, so that `timing` covers the encoding of the rest.
+    for i, reply in enumerate(replies):
         if reply.timing:  # 4 decimals (0.1 us): all digits would take a third of the encoding time
-            times = ",".join([f'"{k}":{v:.4f}' if type(v) is float else f'"{k}":{v}' for k, v in reply.timing.items()])
+            times = ",".join(
+                [
+                    f'"{k}":{v:.4f}' if type(v) is float else f'"{k}":{v}'
+                    for k, v in reply.timing.items()
+                ]
+            )
             nodes[i] = f'{nodes[i][:-1]},"timing":{{{times}}}}}'
     blobs = f"[{','.join([str(len(blob)) for blob in writer.blobs])}]"
     head = nodes[0][1:-1] if len(nodes) == 1 else f'"replies":[{",".join(nodes)}]'
@@ -255,11 +307,17 @@ def _read_reply(node: dict[str, Any], reader: ValueReader) -> Reply:
         reply.error = read_error(error)
     elif (act := node.get("act")) is not None:
         try:
-            reply.act = Act(reader.blob(act["action"]), bool(act["done"]), _info(act["info"], reader))
+            reply.act = Act(
+                reader.blob(act["action"]), bool(act["done"]), _info(act["info"], reader)
+            )
         except (KeyError, TypeError) as error:
-            raise MalformedMessage(f"reply: got {shown(act)}, want action, done and info") from error
+            raise MalformedMessage(
+                f"reply: got {shown(act)}, want action, done and info"
+            ) from error
         if not isinstance(reply.act.action, np.ndarray):
-            raise MalformedMessage(f"reply: action: got {shown(reply.act.action)}, expected an array")
+            raise MalformedMessage(
+                f"reply: action: got {shown(reply.act.action)}, expected an array"
+            )
     else:
         reply.info = _info(node.get("info") or {}, reader)
     return reply
@@ -281,7 +339,9 @@ def _timing(node: object) -> dict[str, float]:
 
 
 def describe_error(error: VLAgentsError) -> dict[str, Any]:
-    """Return an error as a node of a reply or a problem+json document; the inverse of `read_error`."""
+    """Return an error as a node of a reply or a problem+json document; the inverse of
+    `read_error`.
+    """
     node: dict[str, Any] = {"code": error.code, "detail": str(error)}
     if isinstance(error, TooManyRequests | Overloaded):
         node["retry_after_s"] = round(error.retry_after_s, 3)

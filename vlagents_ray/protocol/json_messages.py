@@ -1,7 +1,8 @@
-"""Requests and replies for clients without this project's frames: JSON, with images as separate JPEG or PNG files.
+"""Requests and replies for clients without this project's frames: JSON, with images as separate
+JPEG or PNG files.
 
-The JSON of a request holds `instruction`, `gripper`, `state`, `info`, and for reset `kwargs` and `contract`; each
-camera is a separate file. Arrays in a reply become lists.
+The JSON of a request holds `instruction`, `gripper`, `state`, `info`, and for reset `kwargs` and
+`contract`; each camera is a separate file. Arrays in a reply become lists.
 """
 
 from __future__ import annotations
@@ -22,11 +23,23 @@ from vlagents_ray.protocol.values import ValueReader, read_obs
 
 PROBLEM_TYPE = "application/problem+json"
 CAMERA_PREFIX = "cameras."
-_KEYS = {"instruction", "gripper", "state", "info", "kwargs", "contract", "request_id", "deadline_ms"}
+_KEYS = {
+    "instruction",
+    "gripper",
+    "state",
+    "info",
+    "kwargs",
+    "contract",
+    "request_id",
+    "deadline_ms",
+}
 
 
-def request_from_parts(op: Op, text: str | bytes, images: Mapping[str, bytes], budget: Budget) -> Request:
-    """Build a request from its JSON document and its images by camera name, each a JPEG or PNG file.
+def request_from_parts(
+    op: Op, text: str | bytes, images: Mapping[str, bytes], budget: Budget
+) -> Request:
+    """Build a request from its JSON document and its images by camera name, each a JPEG or PNG
+    file.
 
     The `budget` is charged before anything is decoded.
     """
@@ -37,11 +50,14 @@ def request_from_parts(op: Op, text: str | bytes, images: Mapping[str, bytes], b
     unknown = document.keys() - _KEYS
     if "cameras" in unknown:
         raise MalformedMessage(
-            "obs: got 'cameras' in the JSON document; send multipart/form-data, in it the document as part 'obs' and "
+            "obs: got 'cameras' in the JSON document; send multipart/form-data, in it the document "
+            "as part 'obs' and "
             "each image as a file 'cameras.<name>', JPEG or PNG"
         )
     if unknown:
-        raise MalformedMessage(f"obs: unknown keys {shown(sorted(unknown))}, want some of {sorted(_KEYS)}")
+        raise MalformedMessage(
+            f"obs: unknown keys {shown(sorted(unknown))}, want some of {sorted(_KEYS)}"
+        )
     names = [] if op == "close" else list(images)  # a close has no payload and costs nothing
     reader = ValueReader([images[name] for name in names], budget)
     obs = {key: document[key] for key in ("gripper", "state", "info") if key in document}
@@ -64,14 +80,20 @@ def reply_to_json(reply: Reply) -> dict[str, Any]:
     """Convert a reply without an error to plain JSON values."""
     document: dict[str, Any] = {"request_id": reply.request_id}
     if reply.act is not None:
-        document |= {"action": reply.act.action.tolist(), "done": reply.act.done, "info": plain_values(reply.act.info)}
+        document |= {
+            "action": reply.act.action.tolist(),
+            "done": reply.act.done,
+            "info": plain_values(reply.act.info),
+        }
     else:
         document["info"] = plain_values(reply.info or {})
     return document | {"timing": reply.timing}
 
 
 def problem(error: VLAgentsError, request_id: str = "") -> dict[str, Any]:
-    """Return the problem+json document (RFC 9457) of an error; clients should test `code`, which is stable."""
+    """Return the problem+json document (RFC 9457) of an error; clients should test `code`, which
+    is stable.
+    """
     return {
         "type": "about:blank",
         "title": type(error).__name__,
@@ -84,20 +106,26 @@ def problem(error: VLAgentsError, request_id: str = "") -> dict[str, Any]:
 def plain_values(value: Any) -> Any:
     """Convert a value to JSON types.
 
-    Arrays become lists, bytes become base64, and NaN and infinity, which JSON cannot represent, become None.
+    Arrays become lists, bytes become base64, and NaN and infinity, which JSON cannot represent,
+    become None.
     """
     if isinstance(value, Mapping):
         return {key: plain_values(item) for key, item in value.items()}
     if isinstance(value, (list, tuple)):
         return [plain_values(item) for item in value]
     if isinstance(value, np.ndarray):
-        return value.tolist() if value.dtype.kind != "f" or np.isfinite(value).all() else plain_values(value.tolist())
+        return (
+            value.tolist()
+            if value.dtype.kind != "f" or np.isfinite(value).all()
+            else plain_values(value.tolist())
+        )
     if isinstance(value, np.generic):
         return plain_values(value.item())
     if isinstance(value, float) and not math.isfinite(value):
         return None
     if isinstance(value, (bytes, bytearray, memoryview)):
         return base64.b64encode(value).decode()
-    if isinstance(value, Sequence) and not isinstance(value, str):  # such as a deque, which a frame has as a list
+    # Such as a deque, which a frame has as a list.
+    if isinstance(value, Sequence) and not isinstance(value, str):
         return [plain_values(item) for item in value]
     return value

@@ -22,23 +22,30 @@ REQUEST_ID_HEADER = "x-request-id"
 MACHINE_HEADER = "x-boot-id"  # header of GET /v1/metadata: the caller's machine (see `boot_id`), or
 SERVERS_MACHINE = "server"  # the machine of the process that replies
 DEADLINE_HEADER = "x-deadline-ms"
-# header of a reply: the session's step. A request with it is refused if the session is at any other step.
+# header of a reply: the session's step. A request with it is refused if the session is at any other
+# step.
 STEP_HEADER = "x-step"
 RANK_HEADER = "x-rank"
 MOST_DEADLINE_MS = 1e9  # 11 days
 NAME_CHARACTERS = 128  # maximum length of a session's or a request's id
 STREAM_PATH = "/v1/stream/"  # path on a replica's own port, followed by an unguessable part
-STREAM_BYTES = 16 * 2**20  # maximum size of a WebSocket message: uvicorn's limit, which Serve does not let us change
+# Maximum size of a WebSocket message: uvicorn's limit, which Serve does not let us change.
+STREAM_BYTES = 16 * 2**20
 
 
 def is_name(text: str) -> bool:
-    """Return whether a text is a valid session or request id: visible ASCII, which cannot forge a line in a log."""
-    return text.isascii() and text.isprintable() and " " not in text and len(text) <= NAME_CHARACTERS
+    """Return whether a text is a valid session or request id: visible ASCII, which cannot forge
+    a line in a log.
+    """
+    return (
+        text.isascii() and text.isprintable() and " " not in text and len(text) <= NAME_CHARACTERS
+    )
 
 
 Op = Literal["reset", "act", "close", "observe", "export", "adopt", "weights", "release"]
 OPS: tuple[Op, ...] = ("reset", "act", "close")
-# Only a replica may send these, to the process that runs its policy; "export" and "adopt" contain pickles.
+# Only a replica may send these, to the process that runs its policy; "export" and "adopt" contain
+# pickles.
 INNER_OPS: tuple[Op, ...] = (*OPS, "observe", "export", "adopt", "weights")
 RankName = Literal["robot", "simulation"]  # the class of a request; robots are scheduled first
 RANKS: tuple[RankName, ...] = ("robot", "simulation")
@@ -46,10 +53,11 @@ RANKS: tuple[RankName, ...] = ("robot", "simulation")
 
 @dataclass(slots=True)
 class Request:
-    """One call of `Agent.reset`, `Agent.act` or `Agent.close` on a remote policy, or one of `INNER_OPS`.
+    """One call of `Agent.reset`, `Agent.act` or `Agent.close` on a remote policy, or one of
+    `INNER_OPS`.
 
-    A decoded request is not modified, except by `drop_observations`. The class is not frozen, since creating a frozen
-    instance takes three times as long (2.2 instead of 0.7 us).
+    A decoded request is not modified, except by `drop_observations`. The class is not frozen, since
+    creating a frozen instance takes three times as long (2.2 instead of 0.7 us).
     """
 
     op: Op
@@ -57,15 +65,19 @@ class Request:
     instruction: str | None = None  # reset only
     # for reset: `seed`, ...; for adopt: the reply to export; for weights: see `WeightUpdates.obey`
     kwargs: dict[str, Any] = field(default_factory=dict)
-    # reset only: the contract of the robot or the environment, which the server checks against the policy's
+    # reset only: the contract of the robot or the environment, which the server checks against the
+    # policy's
     contract: dict[str, Any] | None = None
-    history: list[Obs] = field(default_factory=list)  # reset only: earlier observations of the session, oldest first
+    # Reset only: earlier observations of the session, oldest first.
+    history: list[Obs] = field(default_factory=list)
     session: str = ""  # id of the sender's session; empty for the only session of its connection
     rank: RankName = "robot"
-    # for act and reset: the `step` of the last reply; an act is refused if the session is at another step
+    # for act and reset: the `step` of the last reply; an act is refused if the session is at
+    # another step
     step: int | None = None
     request_id: str = ""
-    deadline_ms: float | None = None  # time from the request's arrival after which the reply is of no use
+    # Time from the request's arrival after which the reply is of no use.
+    deadline_ms: float | None = None
 
     def drop_observations(self) -> None:
         """Drop the observations after use, since their memory may belong to the sender."""
@@ -82,24 +94,32 @@ class Reply:
     act: Act | None = None
     info: dict[str, Any] | None = None  # the return value of `Agent.reset`
     error: VLAgentsError | None = None
-    step: int | None = None  # the session's step: each act adds 1; a reset draws a number above all earlier steps
-    draining: bool = False  # the replica stops or is overloaded: the client should reconnect, and its session is moved
+    # The session's step: each act adds 1; a reset draws a number above all earlier steps.
+    step: int | None = None
+    # The replica stops or is overloaded: the client should reconnect, and its session is moved.
+    draining: bool = False
     timing: dict[str, float] = field(default_factory=dict)  # ms, by stage
 
     def answers(self, request: Request) -> bool:
-        """Return whether this is the reply to that request, not an earlier one; an unreadable frame has no id."""
+        """Return whether this is the reply to that request, not an earlier one; an unreadable
+        frame has no id.
+        """
         return self.request_id in ("", request.request_id)
 
     @property
     def identity(self) -> dict[str, Any]:
-        """Return the checkpoint, its digest and the commit of the weights, as far as the info of a reset names them."""
+        """Return the checkpoint, its digest and the commit of the weights, as far as the info of
+        a reset names them.
+        """
         info = self.info or {}
         return {name: info[name] for name in ("checkpoint", "weights", "revision") if name in info}
 
 
 @dataclass(frozen=True, slots=True)
 class Limits:
-    """The limits of a decoder; anything larger raises `MessageTooLarge` before memory is allocated for it."""
+    """The limits of a decoder; anything larger raises `MessageTooLarge` before memory is
+    allocated for it.
+    """
 
     body_bytes: int = 64 * 2**20
     pixels: int = 4096 * 2304  # per image: 4K, for both television and cinema
@@ -113,7 +133,8 @@ class Limits:
     reply_bytes: int = 16 * 2**20  # size of the action and the info of one reply
     # Size of the images and bytes in one request, counted once for each reference to them.
     decoded_bytes: int = 128 * 2**20
-    in_flight_bytes: int = 512 * 2**20  # size of all messages that a replica is processing, encoded and decoded
+    # Size of all messages that a replica is processing, encoded and decoded.
+    in_flight_bytes: int = 512 * 2**20
 
 
 DEFAULT_LIMITS = Limits()
@@ -125,22 +146,30 @@ class LocalAddress:
 
     socket: str  # name of a Unix socket in the abstract namespace, not in a file system
     boot_id: str  # random id of the machine, which Linux draws at each boot
-    keyed: bool = False  # whether the first message is the client's API key, which is replied to only if it is refused
+    # Whether the first message is the client's API key, which is replied to only if it is refused.
+    keyed: bool = False
 
-    # The data of a request are in a memory file of the client, which is sent with the first message that names it: a
-    # frame or, with COMPACT, the arrays of the acts that follow the message's header (see
-    # `vlagents_ray.protocol.shm_layout`). A reply follows its header, or is in a memory file that is sent with it.
-    REQUEST: ClassVar[struct.Struct] = struct.Struct("<IIQ")  # number of the memory file, flags, number of bytes in it
-    REPLY: ClassVar[struct.Struct] = struct.Struct("<QHxx")  # bit n: memory file n is free again; flags
-    IN_FILE: ClassVar[int] = 1  # flag: the frame of the reply is in the memory file sent with the message
+    # The data of a request are in a memory file of the client, which is sent with the first message
+    # that names it: a frame or, with COMPACT, the arrays of the acts that follow the message's
+    # header (see `vlagents_ray.protocol.shm_layout`). A reply follows its header, or is in a memory
+    # file that is sent with it.
+    # Number of the memory file, flags, number of bytes in it.
+    REQUEST: ClassVar[struct.Struct] = struct.Struct("<IIQ")
+    # Bit n: memory file n is free again; flags.
+    REPLY: ClassVar[struct.Struct] = struct.Struct("<QHxx")
+    # flag: the frame of the reply is in the memory file sent with the message.
+    IN_FILE: ClassVar[int] = 1
     COMPACT: ClassVar[int] = 2  # flag: no frame
-    # Maximum number of a client's memory files; a policy that keeps observations needs more than one.
+    # Maximum number of a client's memory files; a policy that keeps observations needs more than
+    # one.
     FILES: ClassVar[int] = 16
 
 
 @dataclass(frozen=True, slots=True)
 class StreamAddress:
-    """The replica's own port for WebSockets, on the host of the server's URL: `stream` in the metadata."""
+    """The replica's own port for WebSockets, on the host of the server's URL: `stream` in the
+    metadata.
+    """
 
     port: int
     path: str  # unguessable: known only to clients that may read the metadata
@@ -149,19 +178,24 @@ class StreamAddress:
         if not 0 < self.port < 2**16:
             raise MalformedMessage(f"metadata: stream: got port {self.port}, expected 1 to 65535")
         if not (self.path.startswith(STREAM_PATH) and is_name(self.path)):
-            raise MalformedMessage(f"metadata: stream: got path {shown(self.path)}, expected {STREAM_PATH} and a name")
+            raise MalformedMessage(
+                f"metadata: stream: got path {shown(self.path)}, expected {STREAM_PATH} and a name"
+            )
 
 
 @dataclass(frozen=True, slots=True)
 class PlasmaAddress:
-    """The address for processes of the Ray cluster on the replica's node: `plasma` in the metadata of the replica."""
+    """The address for processes of the Ray cluster on the replica's node: `plasma` in the
+    metadata of the replica.
+    """
 
     socket: str  # path of a Unix socket in Ray's folder
     node: str  # Ray's id of the node
 
     # Ray's id of the channel that contains the frame or the arrays; flags as in `LocalAddress`.
     REQUEST: ClassVar[struct.Struct] = struct.Struct("<28sI")
-    TAG: ClassVar[bytes] = b"VLA1"  # Ray's metadata of the channel's content: out-of-band buffers, to be joined
+    # Ray's metadata of the channel's content: out-of-band buffers, to be joined.
+    TAG: ClassVar[bytes] = b"VLA1"
 
 
 Address = TypeVar("Address", LocalAddress, StreamAddress, PlasmaAddress)
@@ -169,7 +203,8 @@ _ADDRESS_TYPES = {"str": str, "int": int, "bool": bool}  # by annotation
 
 
 def read_address(kind: type[Address], document: object) -> Address | None:
-    """Read an address in the metadata of a server, which may be hostile; None if the server has none.
+    """Read an address in the metadata of a server, which may be hostile; None if the server has
+    none.
 
     Args:
         kind: `LocalAddress`, `StreamAddress` or `PlasmaAddress`.
@@ -181,20 +216,26 @@ def read_address(kind: type[Address], document: object) -> Address | None:
     if document is None:
         return None
     if not isinstance(document, dict):
-        raise MalformedMessage(f"metadata: got {shown(document)}, expected the entries of a {kind.__name__}")
+        raise MalformedMessage(
+            f"metadata: got {shown(document)}, expected the entries of a {kind.__name__}"
+        )
     values: dict[str, Any] = {}
     for entry in fields(kind):
         if entry.name not in document and entry.default is not MISSING:
             continue
         value = document.get(entry.name)
         if type(value) is not _ADDRESS_TYPES[str(entry.type)]:
-            raise MalformedMessage(f"metadata: {kind.__name__}.{entry.name}: got {shown(value)}, expected {entry.type}")
+            raise MalformedMessage(
+                f"metadata: {kind.__name__}.{entry.name}: got {shown(value)}, expected {entry.type}"
+            )
         values[entry.name] = value
     return kind(**values)
 
 
 def boot_id() -> str:
-    """Return an id that differs between machines and between their boots; empty on systems other than Linux."""
+    """Return an id that differs between machines and between their boots; empty on systems other
+    than Linux.
+    """
     try:
         return Path("/proc/sys/kernel/random/boot_id").read_text().strip()
     except OSError:
@@ -202,13 +243,19 @@ def boot_id() -> str:
 
 
 def peer_uid(connection: socket.socket) -> int:
-    """Return the user id of the process at the other end of a Unix socket, as the kernel reports it."""
+    """Return the user id of the process at the other end of a Unix socket, as the kernel reports
+    it.
+    """
     return peer_process(connection)[1]
 
 
 def peer_process(connection: socket.socket) -> tuple[int, int]:
-    """Return the process id and the user id at the other end of a Unix socket, as the kernel reports them."""
-    credentials = connection.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, struct.calcsize("3i"))
+    """Return the process id and the user id at the other end of a Unix socket, as the kernel
+    reports them.
+    """
+    credentials = connection.getsockopt(
+        socket.SOL_SOCKET, socket.SO_PEERCRED, struct.calcsize("3i")
+    )
     pid, uid, _ = struct.unpack("3i", credentials)
     return pid, uid
 
@@ -226,16 +273,20 @@ def is_loopback(host: str) -> bool:
 
 DecodedFiles = dict[int, tuple[np.ndarray, "bytes | memoryview"]]
 """Each image with the file from which it was decoded, by the `id` of the image."""
-_JSON_FACTOR = 4  # size of the parsed Python objects per byte of JSON, within the limits of `frame_layout`
-_DECODING_S = 20e-9  # limit of the time to decode a request's images, s per byte of `decoded_bytes`: slow PNG files
+# Size of the parsed Python objects per byte of JSON, within the limits of `frame_layout`.
+_JSON_FACTOR = 4
+# Limit of the time to decode a request's images, s per byte of `decoded_bytes`: slow PNG files.
+_DECODING_S = 20e-9
 _LEAST_DECODING_S = 10e-3
 
 
 class Budget:
-    """The budget of one message: it checks declared sizes before an image is decoded or bytes are copied.
+    """The budget of one message: it checks declared sizes before an image is decoded or bytes are
+    copied.
 
-    This class enforces the limits only. A server's subclass also enforces those of the caller's key and of the
-    replica's memory, and chooses the decoding thread: `vlagents_ray.serve.engine.admission.MessageAdmission`.
+    This class enforces the limits only. A server's subclass also enforces those of the caller's key
+    and of the replica's memory, and chooses the decoding thread:
+    `vlagents_ray.serve.engine.admission.MessageAdmission`.
     """
 
     __slots__ = ("_left", "_seconds_left", "files", "limits", "serial")
@@ -243,18 +294,25 @@ class Budget:
     def __init__(self, limits: Limits) -> None:
         self.limits = limits
         self.serial = False  # whether images are decoded one after the other
-        self.files: DecodedFiles | None = None  # receives the files of decoded images; None if not needed
+        # Receives the files of decoded images; None if not needed.
+        self.files: DecodedFiles | None = None
         self._refill()
 
     def begin_message(self) -> None:
-        """Count the message for its sender before any of it is parsed; raise an error if it is refused."""
+        """Count the message for its sender before any of it is parsed; raise an error if it is
+        refused.
+        """
 
     def parse(self, size: int) -> None:
-        """Count the memory for the values of `size` bytes of JSON before they are parsed; raise as `hold`."""
+        """Count the memory for the values of `size` bytes of JSON before they are parsed; raise
+        as `hold`.
+        """
         self.hold(_JSON_FACTOR * size)
 
     def begin(self, op: object, rank: object = "robot") -> None:
-        """Begin the next request of the message after its header is parsed; raise an error if it is refused."""
+        """Begin the next request of the message after its header is parsed; raise an error if it
+        is refused.
+        """
         self._refill()
 
     def _refill(self) -> None:
@@ -263,16 +321,21 @@ class Budget:
         self._seconds_left = _LEAST_DECODING_S + _DECODING_S * self.limits.decoded_bytes
 
     def count(self, size: int) -> None:
-        """Count `size` bytes of the request that are in memory already; raise `MessageTooLarge` over the limit."""
+        """Count `size` bytes of the request that are in memory already; raise `MessageTooLarge`
+        over the limit.
+        """
         self._left -= size
         if self._left < 0:
             raise MessageTooLarge(
-                f"request: its images and bytes take more than {self.limits.decoded_bytes} bytes, decoded, each as "
+                f"request: its images and bytes take more than {self.limits.decoded_bytes} bytes, "
+                "decoded, each as "
                 f"often as it is named; send fewer or smaller ones, or raise `limits.decoded_bytes`"
             )
 
     def hold(self, size: int) -> None:
-        """Count `size` bytes before they are allocated for the request; raise an error if they exceed a limit."""
+        """Count `size` bytes before they are allocated for the request; raise an error if they
+        exceed a limit.
+        """
         self.count(size)
 
     @contextlib.contextmanager
@@ -286,15 +349,17 @@ class Budget:
         self._seconds_left -= seconds
         if self._seconds_left < 0:
             raise MessageTooLarge(
-                f"request: decoding its images takes {-self._seconds_left:.3g} s longer than it may; send fewer or "
+                f"request: decoding its images takes {-self._seconds_left:.3g} s longer than it "
+                "may; send fewer or "
                 f"smaller ones, or raise `limits.decoded_bytes`, to which the time is in proportion"
             )
         yield
 
 
-# A probe tests the link. It is answered at once, without a session or the policy. It consists of b"VLA?", an unused
-# uint32, and as many bytes as the link should be tested with; it is one WebSocket message, under the limits of a
-# request. The answer is b"VLA!" and the number of bytes that arrived, uint64 little-endian.
+# A probe tests the link. It is answered at once, without a session or the policy. It consists of
+# b"VLA?", an unused uint32, and as many bytes as the link should be tested with; it is one
+# WebSocket message, under the limits of a request. The answer is b"VLA!" and the number of bytes
+# that arrived, uint64 little-endian.
 
 _HEAD_BYTES = 8  # size of the tag and the uint32
 _PROBE_TAG, _ANSWER_TAG = b"VLA?", b"VLA!"
@@ -307,7 +372,9 @@ def is_probe(message: bytes | memoryview) -> bool:
 
 
 def read_probe(message: bytes, budget: Budget) -> None:
-    """Count a probe as one request of a simulation; raise `MalformedMessage` for any other message."""
+    """Count a probe as one request of a simulation; raise `MalformedMessage` for any other
+    message.
+    """
     budget.begin_message()
     if not is_probe(message):
         raise MalformedMessage(f"probe: got {message[:4]!r} at its start, want {_PROBE_TAG!r}")

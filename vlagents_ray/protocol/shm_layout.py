@@ -1,9 +1,11 @@
-"""A compact form of acts between two processes of one machine, which omits the fields that are the same at each step.
+"""A compact form of acts between two processes of one machine, which omits the fields that are the
+same at each step.
 
-An observation's layout (session, class, names and sizes of cameras and state) is sent once, as JSON; later messages
-refer to it by its number. The rest of a request is an `ITEM`, and its arrays, which are stored one after the other in
-shared memory, each at a multiple of 64. A reply consists of an `ANSWER`, the action, and the `WEIGHTS` that acted. All
-other messages (a reset, `info`, an error) are sent as frames; see `vlagents_ray.protocol.frames`.
+An observation's layout (session, class, names and sizes of cameras and state) is sent once, as
+JSON; later messages refer to it by its number. The rest of a request is an `ITEM`, and its arrays,
+which are stored one after the other in shared memory, each at a multiple of 64. A reply consists of
+an `ANSWER`, the action, and the `WEIGHTS` that acted. All other messages (a reset, `info`, an
+error) are sent as frames; see `vlagents_ray.protocol.frames`.
 """
 
 from __future__ import annotations
@@ -33,10 +35,13 @@ _NONE = float("nan")
 _UINT8, _FLOAT32 = np.dtype(np.uint8), np.dtype(np.float32)
 
 COUNT = struct.Struct("<I")
-ITEM = struct.Struct(f"<IIqdd{_ID_BYTES}s")  # layout, size of its JSON, step or -1, deadline ms, gripper, request id
-ANSWER = struct.Struct(f"<{_ID_BYTES}sqBB2xIIIddddd")  # id, step, flags, dimensions, H, D, batch size, times in ms
+# layout, size of its JSON, step or -1, deadline ms, gripper, request id.
+ITEM = struct.Struct(f"<IIqdd{_ID_BYTES}s")
+# id, step, flags, dimensions, H, D, batch size, times in ms.
+ANSWER = struct.Struct(f"<{_ID_BYTES}sqBB2xIIIddddd")
 _DONE, _DRAINING, _POLICY = 1, 2, 4
-WEIGHTS = struct.Struct("<q16s")  # per answer, after all actions, if the flag _POLICY is set: version, digest
+# Per answer, after all actions, if the flag _POLICY is set: version, digest.
+WEIGHTS = struct.Struct("<q16s")
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,8 +55,12 @@ class Layout:
     size: int  # total size of the arrays, bytes
 
     @classmethod
-    def of(cls, session: str, rank: RankName, cameras: Sequence[Any], state: Sequence[Any]) -> Layout:
-        """Compute the layout of arrays, given as pairs of name and shape: (H, W, 3) for cameras, (D,) for states."""
+    def of(
+        cls, session: str, rank: RankName, cameras: Sequence[Any], state: Sequence[Any]
+    ) -> Layout:
+        """Compute the layout of arrays, given as pairs of name and shape: (H, W, 3) for cameras,
+        (D,) for states.
+        """
         at = 0
         placed: tuple[list[Any], list[Any]] = ([], [])
         for group, arrays, width in zip(placed, (cameras, state), (1, 4), strict=True):
@@ -61,7 +70,8 @@ class Layout:
         return cls(session, rank, tuple(placed[0]), tuple(placed[1]), at)
 
     def placed(self, request: Request, at: int) -> list[tuple[int, np.ndarray]] | None:
-        """Return the offset of each array if the first one is at `at`; None if the request is no act of this layout.
+        """Return the offset of each array if the first one is at `at`; None if the request is no
+        act of this layout.
 
         Comparing each array is faster than computing the request's `_key`.
         """
@@ -71,14 +81,28 @@ class Layout:
         if len(obs.cameras) != len(self.cameras) or len(obs.state) != len(self.state):
             return None
         arrays = []
-        for (name, shape, offset), (own, image) in zip(self.cameras, obs.cameras.items(), strict=True):
-            if type(image) is not np.ndarray or own != name or image.shape != shape or image.dtype != _UINT8:
+        for (name, shape, offset), (own, image) in zip(
+            self.cameras, obs.cameras.items(), strict=True
+        ):
+            if (
+                type(image) is not np.ndarray
+                or own != name
+                or image.shape != shape
+                or image.dtype != _UINT8
+            ):
                 return None
             arrays.append((at + offset, image))
         for (name, shape, offset), (own, part) in zip(self.state, obs.state.items(), strict=True):
-            if type(part) is not np.ndarray or own != name or part.shape != shape or part.dtype.kind != "f":
+            if (
+                type(part) is not np.ndarray
+                or own != name
+                or part.shape != shape
+                or part.dtype.kind != "f"
+            ):
                 return None
-            arrays.append((at + offset, part if part.dtype == _FLOAT32 else part.astype(np.float32)))
+            arrays.append(
+                (at + offset, part if part.dtype == _FLOAT32 else part.astype(np.float32))
+            )
         return arrays
 
 
@@ -87,10 +111,13 @@ class ShmWriter:
 
     def __init__(self) -> None:
         self._known: dict[Any, tuple[int, Layout]] = {}
-        self._latest: dict[str, tuple[int, Layout]] = {}  # by session; its next act probably has the same layout
+        # By session; its next act probably has the same layout.
+        self._latest: dict[str, tuple[int, Layout]] = {}
 
     def write(self, requests: Sequence[Request]) -> Written | None:
-        """Return the message and the offsets of the arrays; None if the requests must be sent as a frame."""
+        """Return the message and the offsets of the arrays; None if the requests must be sent as
+        a frame.
+        """
         items, texts = [COUNT.pack(len(requests))], []
         arrays: list[tuple[int, np.ndarray]] = []
         new: dict[Any, tuple[int, Layout]] = {}
@@ -118,7 +145,11 @@ class ShmWriter:
             step = -1 if request.step is None else request.step
             deadline_ms = _NONE if request.deadline_ms is None else request.deadline_ms
             gripper = _NONE if obs.gripper is None else obs.gripper
-            items.append(ITEM.pack(number, len(text), step, deadline_ms, gripper, request.request_id.encode()))
+            items.append(
+                ITEM.pack(
+                    number, len(text), step, deadline_ms, gripper, request.request_id.encode()
+                )
+            )
         if latest:
             self._known |= new
             self._latest |= latest
@@ -132,7 +163,9 @@ class Written:
     arrays: list[tuple[int, np.ndarray]]  # offset, array
 
     def parts(self) -> list[Buffer]:
-        """Return the content of the memory: the arrays, not copied where possible, and the gaps between them."""
+        """Return the content of the memory: the arrays, not copied where possible, and the gaps
+        between them.
+        """
         pieces: list[Buffer] = []
         end = 0
         for at, array in self.arrays:
@@ -158,7 +191,9 @@ class ShmReader:
         try:
             (count,) = COUNT.unpack_from(message)
             if count > self._limits.requests:
-                raise MessageTooLarge(f"local: got {count} acts, the limit is {self._limits.requests} in one message")
+                raise MessageTooLarge(
+                    f"local: got {count} acts, the limit is {self._limits.requests} in one message"
+                )
             text_at = COUNT.size + count * ITEM.size
             requests = []
             at = 0
@@ -166,16 +201,25 @@ class ShmReader:
                 number, text_bytes, step, deadline_ms, gripper, request_id = item
                 if text_bytes:
                     if number >= _MOST:
-                        raise MessageTooLarge(f"local: layout {number}, want a number below {_MOST}")
-                    self._known[number] = self._layout(bytes(message[text_at : text_at + text_bytes]))
+                        raise MessageTooLarge(
+                            f"local: layout {number}, want a number below {_MOST}"
+                        )
+                    self._known[number] = self._layout(
+                        bytes(message[text_at : text_at + text_bytes])
+                    )
                     text_at += text_bytes
                 layout = self._known[number]
                 if at + layout.size > memory.size:
-                    raise MalformedMessage(f"local: {memory.size} bytes of memory, the arrays need more")
+                    raise MalformedMessage(
+                        f"local: {memory.size} bytes of memory, the arrays need more"
+                    )
                 id_bytes = request_id.rstrip(b"\0")
                 name_of_request = id_bytes.decode()
-                if not id_bytes.isalnum() and not is_name(name_of_request):  # the first of these is no call of Python
-                    raise MalformedMessage(f"local: request_id: got {name_of_request!r}, want visible ASCII characters")
+                # The first of these is no call of Python.
+                if not id_bytes.isalnum() and not is_name(name_of_request):
+                    raise MalformedMessage(
+                        f"local: request_id: got {name_of_request!r}, want visible ASCII characters"
+                    )
                 obs = Obs(gripper=None if math.isnan(gripper) else gripper)
                 for name, shape, place in layout.cameras:
                     obs.cameras[name] = np.ndarray(shape, _UINT8, memory, at + place)
@@ -195,7 +239,9 @@ class ShmReader:
         except (struct.error, ValueError, KeyError, TypeError) as error:
             if isinstance(error, InvalidInput):
                 raise
-            raise MalformedMessage(f"local: not an act ({type(error).__name__}: {error})") from error
+            raise MalformedMessage(
+                f"local: not an act ({type(error).__name__}: {error})"
+            ) from error
         if len(requests) != count or not count:
             raise MalformedMessage(f"local: {len(requests)} acts in a message that says {count}")
         return requests
@@ -208,19 +254,28 @@ class ShmReader:
             raise MalformedMessage("local: cameras and state: want lists of names and shapes")
         if max(len(cameras), len(state)) > limits.cameras:
             raise MessageTooLarge(
-                f"obs: got {len(cameras)} cameras and {len(state)} states, the limit is {limits.cameras}"
+                f"obs: got {len(cameras)} cameras and {len(state)} states, the limit is "
+                f"{limits.cameras}"
             )
         for (name, shape), dimensions, most in (
             *((each, 3, limits.pixels) for each in cameras),
             *((each, 1, limits.state_values) for each in state),
         ):
             if not isinstance(name, str) or not isinstance(shape, list) or len(shape) != dimensions:
-                raise MalformedMessage(f"local: got {name!r} of {shape!r}, want a name and {dimensions} dimensions")
+                raise MalformedMessage(
+                    f"local: got {name!r} of {shape!r}, want a name and {dimensions} dimensions"
+                )
             require_array_name(name)
-            if not all(type(n) is int and n >= 0 for n in shape) or (dimensions == 3 and shape[2] != 3):
-                raise MalformedMessage(f"local: {name!r}: got shape {shape!r}, want (H, W, 3) or (D,)")
+            if not all(type(n) is int and n >= 0 for n in shape) or (
+                dimensions == 3 and shape[2] != 3
+            ):
+                raise MalformedMessage(
+                    f"local: {name!r}: got shape {shape!r}, want (H, W, 3) or (D,)"
+                )
             if (size := math.prod(shape[:2])) > most:
-                raise MessageTooLarge(f"local: {name!r}: got {size} pixels or values, the limit is {most}")
+                raise MessageTooLarge(
+                    f"local: {name!r}: got {size} pixels or values, the limit is {most}"
+                )
         return Layout.of(session, rank, cameras, state)
 
 
@@ -228,7 +283,8 @@ def _is_plain(request: Request, obs: Obs) -> bool:
     """Return whether a request can be sent in compact form, apart from its arrays."""
     if request.op != "act" or obs.info or len(request.request_id) > _ID_BYTES:
         return False
-    return obs.gripper is None or 0.0 <= obs.gripper <= 1.0  # an invalid value is sent as a frame, to get an error
+    # An invalid value is sent as a frame, to get an error.
+    return obs.gripper is None or 0.0 <= obs.gripper <= 1.0
 
 
 def _key(request: Request) -> tuple[Any, ...] | None:
@@ -237,7 +293,12 @@ def _key(request: Request) -> tuple[Any, ...] | None:
     if obs is None or not _is_plain(request, obs):
         return None
     for image in obs.cameras.values():
-        if type(image) is not np.ndarray or image.dtype != _UINT8 or image.ndim != 3 or image.shape[2] != 3:
+        if (
+            type(image) is not np.ndarray
+            or image.dtype != _UINT8
+            or image.ndim != 3
+            or image.shape[2] != 3
+        ):
             return None
     for part in obs.state.values():
         if type(part) is not np.ndarray or part.ndim != 1 or part.dtype.kind != "f":
@@ -251,7 +312,9 @@ def _key(request: Request) -> tuple[Any, ...] | None:
 
 
 def write_answers(replies: Sequence[Reply], *, arrived: float) -> bytes | None:
-    """Encode the replies to acts, with the `timing` of `encode_replies`; None if they must be sent as a frame."""
+    """Encode the replies to acts, with the `timing` of `encode_replies`; None if they must be
+    sent as a frame.
+    """
     begun = time.perf_counter()
     actions, weights = [], []
     for reply in replies:
@@ -262,10 +325,15 @@ def write_answers(replies: Sequence[Reply], *, arrived: float) -> bytes | None:
             if (packed := _packed(act.info)) is None:
                 return None
             weights.append(packed)
-        if act.action.ndim not in (1, 2) or act.action.shape[0] > 0xFFFF or len(reply.request_id) > _ID_BYTES:
+        if (
+            act.action.ndim not in (1, 2)
+            or act.action.shape[0] > 0xFFFF
+            or len(reply.request_id) > _ID_BYTES
+        ):
             return None
         actions.append(act.action.tobytes())
-    if weights and len(weights) != len(replies):  # the compact form has weights for all replies or for none
+    # The compact form has weights for all replies or for none.
+    if weights and len(weights) != len(replies):
         return None
     named = _POLICY if weights else 0
     ended = time.perf_counter()
@@ -297,19 +365,26 @@ def write_answers(replies: Sequence[Reply], *, arrived: float) -> bytes | None:
 
 
 def _packed(info: Mapping[str, Any]) -> bytes | None:
-    """Encode the weights that the info of an act names; return None if the info contains anything else."""
+    """Encode the weights that the info of an act names; return None if the info contains
+    anything else.
+    """
     policy = info.get(POLICY)
     if len(info) != 1 or type(policy) is not dict or len(policy) != 2:
         return None
     try:
         return _pack(policy["version"], policy["fingerprint"])
-    except (KeyError, TypeError, AttributeError, ValueError, struct.error):  # the policy uses this key for other data
+    except (KeyError, TypeError, AttributeError, ValueError, struct.error):
+        # the policy uses this key for other data
         return None
 
 
 @lru_cache(64)
 def _pack(version: int, digest: str) -> bytes | None:
-    return WEIGHTS.pack(version, digest.encode("ascii")) if len(digest) <= 16 and "\0" not in digest else None
+    return (
+        WEIGHTS.pack(version, digest.encode("ascii"))
+        if len(digest) <= 16 and "\0" not in digest
+        else None
+    )
 
 
 @lru_cache(64)
@@ -324,8 +399,23 @@ def read_answers(message: memoryview) -> list[Reply]:
     named = len(message) - count * WEIGHTS.size  # start of the weights, if the flag _POLICY is set
     replies = []
     for answer in ANSWER.iter_unpack(message[COUNT.size : at]):
-        request_id, step, flags, dimensions, rows, columns, batch_size, queue, inference, decode, encode, total = answer
-        action = np.frombuffer(message, _FLOAT32, columns if dimensions == 1 else rows * columns, at).copy()
+        (
+            request_id,
+            step,
+            flags,
+            dimensions,
+            rows,
+            columns,
+            batch_size,
+            queue,
+            inference,
+            decode,
+            encode,
+            total,
+        ) = answer
+        action = np.frombuffer(
+            message, _FLOAT32, columns if dimensions == 1 else rows * columns, at
+        ).copy()
         at += action.nbytes
         if dimensions == 2:
             action = action.reshape(rows, columns)
@@ -343,5 +433,9 @@ def read_answers(message: memoryview) -> list[Reply]:
             named += WEIGHTS.size
             info = {POLICY: {"version": version, "fingerprint": _text(digest)}}
         act, draining = Act(action, bool(flags & _DONE), info), bool(flags & _DRAINING)
-        replies.append(Reply(request_id.rstrip(b"\0").decode(), act, step=step, draining=draining, timing=timing))
+        replies.append(
+            Reply(
+                request_id.rstrip(b"\0").decode(), act, step=step, draining=draining, timing=timing
+            )
+        )
     return replies

@@ -1,4 +1,6 @@
-"""Conversion between nested values (None, bool, numbers, text, bytes, arrays, lists, dicts) and JSON with blobs."""
+"""Conversion between nested values (None, bool, numbers, text, bytes, arrays, lists, dicts) and
+JSON with blobs.
+"""
 
 from __future__ import annotations
 
@@ -10,7 +12,13 @@ from typing import Any
 
 import numpy as np
 
-from vlagents_ray.errors import InvalidInput, InvalidObservation, MalformedMessage, MessageTooLarge, shown
+from vlagents_ray.errors import (
+    InvalidInput,
+    InvalidObservation,
+    MalformedMessage,
+    MessageTooLarge,
+    shown,
+)
 from vlagents_ray.images.codecs import ImageCodec, decode_files, encode_files
 from vlagents_ray.interface import Obs
 from vlagents_ray.protocol.frame_layout import Buffer, is_plain, parse_json, read_array
@@ -28,10 +36,14 @@ class ValueWriter:
         self.blobs: list[Buffer] = []
 
     def array(self, value: np.ndarray) -> dict[str, Any]:
-        """Return a reference to an array, whose bytes become a blob, without a copy where possible."""
+        """Return a reference to an array, whose bytes become a blob, without a copy where
+        possible.
+        """
         dtype = value.dtype.newbyteorder("<")
         if not is_plain(dtype.str):
-            raise InvalidInput(f"array: got dtype {value.dtype}, want bool, integers or floats; convert it")
+            raise InvalidInput(
+                f"array: got dtype {value.dtype}, want bool, integers or floats; convert it"
+            )
         data = np.ascontiguousarray(value, dtype)
         self.blobs.append(data.data.cast("B") if data.size else b"")
         return {"$": ["nd", len(self.blobs) - 1, dtype.str, value.shape]}
@@ -41,7 +53,9 @@ class ValueWriter:
         return {"$": ["img", len(self.blobs) - 1]}
 
     def value(self, value: Any) -> Any:
-        """Return the JSON form of a supported value; raise `InvalidInput` with the type of an unsupported one."""
+        """Return the JSON form of a supported value; raise `InvalidInput` with the type of an
+        unsupported one.
+        """
         if value is None or isinstance(value, (bool, str, int)):
             return value
         if isinstance(value, float):
@@ -49,11 +63,16 @@ class ValueWriter:
         if isinstance(value, np.ndarray):
             return self.array(value)
         if isinstance(value, np.generic):
-            return self.value(value.item()) if value.dtype.kind in "biuf" else self.array(np.asarray(value))
+            return (
+                self.value(value.item())
+                if value.dtype.kind in "biuf"
+                else self.array(np.asarray(value))
+            )
         if isinstance(value, (bytes, bytearray, memoryview)):
             self.blobs.append(bytes(value))
             return {"$": ["bin", len(self.blobs) - 1]}
-        if isinstance(value, (dict, Mapping)):  # `dict` first: an abstract class takes ten times as long
+        # `dict` first: an abstract class takes ten times as long.
+        if isinstance(value, (dict, Mapping)):
             for key in value:
                 if not isinstance(key, str) or key == "$":
                     raise InvalidInput(f"info: got key {key!r}, want text other than '$'")
@@ -61,7 +80,8 @@ class ValueWriter:
         if isinstance(value, (list, Sequence)):
             return [self.value(item) for item in value]
         raise InvalidInput(
-            f"info: got {type(value).__name__}, want None, bool, int, float, str, bytes, array, list or dict"
+            f"info: got {type(value).__name__}, want None, bool, int, float, str, bytes, array, "
+            "list or dict"
         )
 
 
@@ -72,16 +92,20 @@ class ValueReader:
         self._blobs, self._budget = blobs, budget
         self.limits = budget.limits
         self._items = 0
-        self._images: dict[int, np.ndarray] = {}  # by blob: each image is decoded once, whatever its number of uses
+        # By blob: each image is decoded once, whatever its number of uses.
+        self._images: dict[int, np.ndarray] = {}
         self._copies: dict[int, bytes] = {}  # by blob: the bytes of each are copied once
-        self._fresh: set[int] = set()  # blobs that were decoded in advance and have no reference yet
+        # Blobs that were decoded in advance and have no reference yet.
+        self._fresh: set[int] = set()
 
     def begin(self) -> None:
         """Begin another request and reset its limits."""
         self._items = 0
 
     def decode_images(self, nodes: Mapping[str, Any]) -> None:
-        """Decode the images of several cameras together, so that `blob` returns them without further decoding."""
+        """Decode the images of several cameras together, so that `blob` returns them without
+        further decoding.
+        """
         new: dict[int, str] = {}
         for name, node in nodes.items():
             reference = _reference(node)
@@ -89,15 +113,21 @@ class ValueReader:
             if type(index) is int and index not in self._images:
                 new.setdefault(index, name)
         if new:
-            decoded = decode_files([self._get(index) for index in new], self._budget, list(new.values()))
+            decoded = decode_files(
+                [self._get(index) for index in new], self._budget, list(new.values())
+            )
             self._images |= zip(new, decoded, strict=True)
             self._fresh.update(new)
 
     def value(self, node: Any, depth: int = 0) -> Any:
-        """Return the value of a JSON node; raise `MalformedMessage` or `MessageTooLarge` if it is invalid."""
+        """Return the value of a JSON node; raise `MalformedMessage` or `MessageTooLarge` if it
+        is invalid.
+        """
         self._items += 1
         if self._items > self.limits.items:
-            raise MessageTooLarge(f"info: more than {self.limits.items} values; send arrays instead of lists")
+            raise MessageTooLarge(
+                f"info: more than {self.limits.items} values; send arrays instead of lists"
+            )
         if not isinstance(node, (dict, list)):
             return node
         if isinstance(node, dict) and "$" in node:
@@ -123,7 +153,9 @@ class ValueReader:
             return self._bytes_of(rest[0])
         if kind == "float" and rest in (["nan"], ["inf"], ["-inf"]):
             return float(rest[0])
-        raise MalformedMessage(f"reference: got {shown(reference)}, want 'nd', 'img', 'bin' or 'float'")
+        raise MalformedMessage(
+            f"reference: got {shown(reference)}, want 'nd', 'img', 'bin' or 'float'"
+        )
 
     def _image(self, index: Any) -> np.ndarray:
         data = self._get(index)
@@ -148,7 +180,9 @@ class ValueReader:
 
     def _get(self, index: Any) -> Buffer:
         if type(index) is not int or not 0 <= index < len(self._blobs):
-            raise MalformedMessage(f"reference: got blob {shown(index, 20)}, want a number below {len(self._blobs)}")
+            raise MalformedMessage(
+                f"reference: got blob {shown(index, 20)}, want a number below {len(self._blobs)}"
+            )
         return self._blobs[index]
 
 
@@ -159,29 +193,41 @@ def _reference(node: Any) -> list[Any]:
 
 
 def read_obs(node: Any, reader: ValueReader) -> Obs:
-    """Read an observation from its JSON form, in which cameras and state parts may be references or lists."""
+    """Read an observation from its JSON form, in which cameras and state parts may be references
+    or lists.
+    """
     limits = reader.limits
     if not isinstance(node, dict):
         raise MalformedMessage(f"obs: got {type(node).__name__}, want an object")
     if unknown := node.keys() - _OBS_KEYS:
-        raise MalformedMessage(f"obs: unknown keys {shown(sorted(unknown))}, want some of {sorted(_OBS_KEYS)}")
+        raise MalformedMessage(
+            f"obs: unknown keys {shown(sorted(unknown))}, want some of {sorted(_OBS_KEYS)}"
+        )
     cameras, state = node.get("cameras") or {}, node.get("state") or {}
     info, gripper = node.get("info") or {}, node.get("gripper")
     for name, value in (("cameras", cameras), ("state", state), ("info", info)):
         if not isinstance(value, dict):
             raise MalformedMessage(f"obs.{name}: got {type(value).__name__}, want an object")
     if max(len(cameras), len(state)) > limits.cameras:
-        raise MessageTooLarge(f"obs: got {len(cameras)} cameras and {len(state)} states, the limit is {limits.cameras}")
+        raise MessageTooLarge(
+            f"obs: got {len(cameras)} cameras and {len(state)} states, the limit is "
+            f"{limits.cameras}"
+        )
     for name in (*cameras, *state):
         require_array_name(name)
     if gripper is not None and not is_number(gripper):
-        raise InvalidObservation(f"gripper: got {shown(gripper)}, want a number in [0, 1] where 1 = open")
+        raise InvalidObservation(
+            f"gripper: got {shown(gripper)}, want a number in [0, 1] where 1 = open"
+        )
     reader.decode_images(cameras)
     read_info = reader.value(info)
-    if not isinstance(read_info, dict):  # a reference is an object in JSON, and may be an array, bytes or a number
+    # A reference is an object in JSON, and may be an array, bytes or a number.
+    if not isinstance(read_info, dict):
         raise MalformedMessage(f"obs.info: got {described(read_info)}, want an object")
     return Obs(
-        cameras={name: as_camera(name, reader.blob(image), limits) for name, image in cameras.items()},
+        cameras={
+            name: as_camera(name, reader.blob(image), limits) for name, image in cameras.items()
+        },
         gripper=None if gripper is None else float(gripper),
         state={
             name: as_state(name, reader.blob(part) if isinstance(part, dict) else part, limits)
@@ -192,32 +238,51 @@ def read_obs(node: Any, reader: ValueReader) -> Obs:
 
 
 def require_array_name(name: str) -> None:
-    """Raise `InvalidObservation` unless a text can be the name of a camera or of a part of the state."""
+    """Raise `InvalidObservation` unless a text can be the name of a camera or of a part of the
+    state.
+    """
     if not 0 < len(name) <= NAME_CHARACTERS or not name.isprintable():
         raise InvalidObservation(
-            f"obs: got a camera or state named {name[:40]!r}, want 1 to {NAME_CHARACTERS} printable characters"
+            f"obs: got a camera or state named {name[:40]!r}, want 1 to {NAME_CHARACTERS} "
+            "printable characters"
         )
 
 
 def as_camera(name: str, image: Any, limits: Limits) -> np.ndarray:
-    """Return `image` unchanged if it is (H, W, 3) uint8 RGB within the limits; errors mention `name`."""
-    if not isinstance(image, np.ndarray) or image.ndim != 3 or image.shape[2] != 3 or image.dtype != _UINT8:
-        raise InvalidObservation(f"camera {name!r}: got {described(image)}, want (H, W, 3) uint8 RGB")
+    """Return `image` unchanged if it is (H, W, 3) uint8 RGB within the limits; errors mention
+    `name`.
+    """
+    if (
+        not isinstance(image, np.ndarray)
+        or image.ndim != 3
+        or image.shape[2] != 3
+        or image.dtype != _UINT8
+    ):
+        raise InvalidObservation(
+            f"camera {name!r}: got {described(image)}, want (H, W, 3) uint8 RGB"
+        )
     if image.shape[0] * image.shape[1] > limits.pixels:
         raise MessageTooLarge(
-            f"camera {name!r}: got {image.shape[:2]} pixels, the limit is {limits.pixels}; send it smaller, or raise "
+            f"camera {name!r}: got {image.shape[:2]} pixels, the limit is {limits.pixels}; send it "
+            "smaller, or raise "
             f"`limits.pixels`"
         )
     return image
 
 
 def as_state(name: str, part: Any, limits: Limits) -> np.ndarray:
-    """Convert `part`, a list of numbers or an array, to (D,) float32 within the limits; errors mention `name`."""
+    """Convert `part`, a list of numbers or an array, to (D,) float32 within the limits; errors
+    mention `name`.
+    """
     is_list = isinstance(part, list)
-    if not is_list and (not isinstance(part, np.ndarray) or part.ndim != 1 or part.dtype.kind not in "fiu"):
+    if not is_list and (
+        not isinstance(part, np.ndarray) or part.ndim != 1 or part.dtype.kind not in "fiu"
+    ):
         raise InvalidObservation(f"state {name!r}: got {described(part)}, want (D,) float32")
     if len(part) > limits.state_values:
-        raise MessageTooLarge(f"state {name!r}: got {len(part)} values, the limit is {limits.state_values}")
+        raise MessageTooLarge(
+            f"state {name!r}: got {len(part)} values, the limit is {limits.state_values}"
+        )
     if is_list and not all(is_number(x) for x in part):
         raise InvalidObservation(f"state {name!r}: want a list of numbers")
     array: np.ndarray = np.array(part, dtype=np.float64) if is_list else part
@@ -227,22 +292,28 @@ def as_state(name: str, part: Any, limits: Limits) -> np.ndarray:
         with np.errstate(over="raise"):
             return array.astype(np.float32)
     except FloatingPointError as error:
-        raise InvalidObservation(f"state {name!r}: got a number beyond those of float32, want it within") from error
+        raise InvalidObservation(
+            f"state {name!r}: got a number beyond those of float32, want it within"
+        ) from error
 
 
 def require_obs(obs: Any) -> None:
     """Raise `InvalidObservation` for a value of a program that cannot be sent as an observation."""
     if not isinstance(obs, Obs):
         raise InvalidObservation(
-            f"observation: expected an Obs, got {described(obs)}; make one, as in Obs(cameras={{…}}, state={{…}})"
+            f"observation: expected an Obs, got {described(obs)}; make one, as in "
+            f"Obs(cameras={{…}}, state={{…}})"
         )
     for name, value in (("cameras", obs.cameras), ("state", obs.state), ("info", obs.info)):
         if not isinstance(value, Mapping):
-            raise InvalidObservation(f"{name}: expected a dict of values by name, got {described(value)}")
+            raise InvalidObservation(
+                f"{name}: expected a dict of values by name, got {described(value)}"
+            )
     for name, image in obs.cameras.items():
         if not hasattr(image, "dtype"):
             raise InvalidObservation(
-                f"camera {name!r}: expected (H, W, 3) uint8 RGB, got {described(image)}; leave out a camera that has "
+                f"camera {name!r}: expected (H, W, 3) uint8 RGB, got {described(image)}; leave out "
+                "a camera that has "
                 f"no picture, and convert others: np.asarray(image, np.uint8)"
             )
     for name, part in obs.state.items():
@@ -252,21 +323,28 @@ def require_obs(obs: Any) -> None:
         try:
             float(obs.gripper)
         except (TypeError, ValueError) as error:
-            raise InvalidObservation(f"gripper: expected None or a number, got {described(obs.gripper)}") from error
+            raise InvalidObservation(
+                f"gripper: expected None or a number, got {described(obs.gripper)}"
+            ) from error
 
 
 def _as_float32(name: str, part: Any) -> np.ndarray:
     try:
         array = np.asarray(part)
-        if part is None or array.dtype.kind not in "fiubO":  # text and complex numbers would also be converted
+        # Text and complex numbers would also be converted.
+        if part is None or array.dtype.kind not in "fiubO":
             raise TypeError
         return array.astype(np.float32)
     except (TypeError, ValueError) as error:
-        raise InvalidObservation(f"state {name!r}: expected (D,) float32, numbers, got {described(part)}") from error
+        raise InvalidObservation(
+            f"state {name!r}: expected (D,) float32, numbers, got {described(part)}"
+        ) from error
 
 
 def write_obs(obs: Obs, writer: ValueWriter, codec: ImageCodec) -> dict[str, Any]:
-    """Convert an observation, which is not changed, to its JSON form; raw images and arrays are views, not copies."""
+    """Convert an observation, which is not changed, to its JSON form; raw images and arrays are
+    views, not copies.
+    """
     if codec.name == "raw":
         cameras = {name: writer.array(image) for name, image in obs.cameras.items()}
     else:
@@ -275,20 +353,26 @@ def write_obs(obs: Obs, writer: ValueWriter, codec: ImageCodec) -> dict[str, Any
     return {
         "cameras": cameras,
         "gripper": None if obs.gripper is None else float(obs.gripper),
-        "state": {name: writer.array(np.asarray(part, np.float32)) for name, part in obs.state.items()},
+        "state": {
+            name: writer.array(np.asarray(part, np.float32)) for name, part in obs.state.items()
+        },
         "info": writer.value(obs.info),
     }
 
 
 def is_number(value: object) -> bool:
-    """Return whether a value is a number that a float can represent; a bool is not a number, as in JSON."""
+    """Return whether a value is a number that a float can represent; a bool is not a number, as
+    in JSON.
+    """
     if isinstance(value, int):
         return not isinstance(value, bool) and value.bit_length() < 1024
     return isinstance(value, float)
 
 
 def require_plain(value: Any, depth: int) -> None:
-    """Raise an error unless a value of another protocol has only wire types, text keys and at most `depth` levels."""
+    """Raise an error unless a value of another protocol has only wire types, text keys and at
+    most `depth` levels.
+    """
     if isinstance(value, (dict, list)):
         if depth <= 0:
             raise MessageTooLarge("message: nested too deep; flatten it")
@@ -297,16 +381,24 @@ def require_plain(value: Any, depth: int) -> None:
                 raise MalformedMessage(f"message: got key {shown(key)}, want text")
         for item in value.values() if isinstance(value, dict) else value:
             require_plain(item, depth - 1)
-    elif value is not None and not isinstance(value, (bool, int, float, str, bytes, np.ndarray, np.generic)):
-        raise MalformedMessage(f"message: got a {type(value).__name__}, want plain values and arrays")
+    elif value is not None and not isinstance(
+        value, (bool, int, float, str, bytes, np.ndarray, np.generic)
+    ):
+        raise MalformedMessage(
+            f"message: got a {type(value).__name__}, want plain values and arrays"
+        )
 
 
 def to_text(value: Any) -> str:
-    """Convert a supported value to JSON with arrays and bytes in base64; raise `InvalidInput` as `ValueWriter` does."""
+    """Convert a supported value to JSON with arrays and bytes in base64; raise `InvalidInput` as
+    `ValueWriter` does.
+    """
     writer = ValueWriter()
     plain = writer.value(value)
     blobs = [base64.b64encode(blob).decode() for blob in writer.blobs]
-    return json.dumps({"value": plain, "blobs": blobs} if blobs else {"value": plain}, separators=(",", ":"))
+    return json.dumps(
+        {"value": plain, "blobs": blobs} if blobs else {"value": plain}, separators=(",", ":")
+    )
 
 
 def from_text(text: str, budget: Budget) -> Any:

@@ -1,4 +1,6 @@
-"""WebSocket frames (RFC 6455, 5.2), with fewer copies and calls than those of the library `websockets`."""
+"""WebSocket frames (RFC 6455, 5.2), with fewer copies and calls than those of the library
+`websockets`.
+"""
 
 from __future__ import annotations
 
@@ -9,15 +11,20 @@ from websockets.frames import Frame, Opcode
 from websockets.protocol import OPEN, SERVER, Protocol
 from websockets.streams import StreamReader
 
-_SMALL_BYTES = 1024  # parts of a frame up to this size are copied, since a view of them may outlast the buffer
+# Parts of a frame up to this size are copied, since a view of them may outlast the buffer.
+_SMALL_BYTES = 1024
 _BINARY = 0x80 | Opcode.BINARY  # first byte of a message in one frame
-HEAD_BYTES = 14  # maximum size of a frame's head: two bytes, eight bytes of the size, and a mask of four bytes
-# A connection may send a control frame each second, 16 at once: for keep-alive, one in 20 s is usual.
+# Maximum size of a frame's head: two bytes, eight bytes of the size, and a mask of four bytes.
+HEAD_BYTES = 14
+# A connection may send a control frame each second, 16 at once: for keep-alive, one in 20 s is
+# usual.
 CONTROL_FRAMES_PER_S, CONTROL_FRAMES = 1.0, 16
 
 
 def frame_head(size: int, mask: bytes = b"") -> bytes:
-    """Return the head of the frame of a binary message of `size` bytes; a client's frame has a mask of four bytes."""
+    """Return the head of the frame of a binary message of `size` bytes; a client's frame has a
+    mask of four bytes.
+    """
     bit = 0x80 if mask else 0
     if size < 126:
         return bytes((_BINARY, bit | size)) + mask
@@ -27,7 +34,9 @@ def frame_head(size: int, mask: bytes = b"") -> bytes:
 
 
 def frame_size(head: bytes) -> int | None:
-    """Return the size of a frame with its head, in bytes; None if `head` is not the complete head."""
+    """Return the size of a frame with its head, in bytes; None if `head` is not the complete
+    head.
+    """
     if len(head) < 2:
         return None
     mask_bytes = 4 if head[1] & 0x80 else 0
@@ -44,8 +53,8 @@ def frame_size(head: bytes) -> int | None:
 class ReceiveBuffer(StreamReader):
     """The bytes of WebSocket frames that one connection has received, until they are parsed.
 
-    A message that arrives as a whole is parsed where it was read, and only copied when its mask is removed. The reader
-    of `websockets` copies each message three times.
+    A message that arrives as a whole is parsed where it was read, and only copied when its mask is
+    removed. The reader of `websockets` copies each message three times.
     """
 
     buffer: bytes | bytearray | memoryview  # type: ignore[assignment]
@@ -56,11 +65,14 @@ class ReceiveBuffer(StreamReader):
         self._limit = limit
         self._start = 0  # start of the unparsed bytes in `buffer`
         self._between_frames = False  # whether the next byte begins a frame
-        self._fragments = False  # whether a frame was a part of a message: the parser then checks all that follow
+        # Whether a frame was a part of a message: the parser then checks all that follow.
+        self._fragments = False
 
     @property
     def size(self) -> int:
-        """Number of unparsed bytes; on other threads than that of `parse`, only whether it is 0 is reliable."""
+        """Number of unparsed bytes; on other threads than that of `parse`, only whether it is 0
+        is reliable.
+        """
         return len(self.buffer) - self._start
 
     def attach(self, protocol: Protocol) -> None:
@@ -72,11 +84,17 @@ class ReceiveBuffer(StreamReader):
 
     def parse(self, data: bytes | memoryview) -> None:
         """Parse bytes of memory that is reused, and copy the rest after the last complete frame."""
-        if self._between_frames and not self._fragments and (message := self._message(data)) is not None:
+        if (
+            self._between_frames
+            and not self._fragments
+            and (message := self._message(data)) is not None
+        ):
             self._protocol.events.append(Frame(Opcode.BINARY, message))
             return
         self._protocol.receive_data(data)  # type: ignore[arg-type]
-        self._fragments |= any(isinstance(event, Frame) and not event.fin for event in self._protocol.events)
+        self._fragments |= any(
+            isinstance(event, Frame) and not event.fin for event in self._protocol.events
+        )
         if isinstance(self.buffer, bytearray):
             del self.buffer[: self._start]
         else:
@@ -84,9 +102,16 @@ class ReceiveBuffer(StreamReader):
         self._start = 0
 
     def _message(self, data: bytes | memoryview) -> bytes | None:
-        """Return the message if `data` are one binary frame; None if they must be parsed step by step."""
+        """Return the message if `data` are one binary frame; None if they must be parsed step by
+        step.
+        """
         masked = self._protocol.side is SERVER  # only a client's frames have a mask
-        if self._protocol.state is not OPEN or len(data) < 2 or data[0] != _BINARY or (data[1] > 127) is not masked:
+        if (
+            self._protocol.state is not OPEN
+            or len(data) < 2
+            or data[0] != _BINARY
+            or (data[1] > 127) is not masked
+        ):
             return None
         at, size = 2, data[1] & 127
         if size > 125:
@@ -108,7 +133,9 @@ class ReceiveBuffer(StreamReader):
             self.buffer, self._start = data, 0
 
     def read_exact(self, n: int) -> Generator[None, None, bytearray]:
-        """Return the next `n` bytes once they have arrived; many bytes that were just received are a view."""
+        """Return the next `n` bytes once they have arrived; many bytes that were just received
+        are a view.
+        """
         while self.size < n:
             if self.eof:
                 raise EOFError(f"stream ends after {self.size} bytes, expected {n} bytes")
@@ -118,7 +145,9 @@ class ReceiveBuffer(StreamReader):
         return found if n > _SMALL_BYTES else bytearray(found)  # type: ignore[return-value]
 
     def at_eof(self) -> Generator[None, None, bool]:
-        """Return whether the connection has ended, as soon as that is known; unparsed bytes mean that it has not."""
+        """Return whether the connection has ended, as soon as that is known; unparsed bytes mean
+        that it has not.
+        """
         while not self.size:
             if self.eof:
                 return True

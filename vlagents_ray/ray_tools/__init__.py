@@ -1,1 +1,3 @@
-"""Ray around this project: joining or starting a cluster, watching its head, cleaning up after it."""
+"""Ray around this project: joining or starting a cluster, watching its head, cleaning up after
+it.
+"""

@@ -21,33 +21,43 @@ class GitState:
     """The state of a repository's tracked files; untracked files are not part of it."""
 
     commit: str  # 40 hexadecimal digits
-    diff_sha256: str | None  # hash of the complete difference from the commit; None if there is none
+    # Hash of the complete difference from the commit; None if there is none.
+    diff_sha256: str | None
     diff: bytes  # output of `git diff`, truncated to `MOST_BYTES`
 
     def to_json(self) -> dict[str, Any]:
         """Return the commit and the hash of the difference, without the difference itself."""
-        return {"commit": self.commit, "dirty": self.diff_sha256 is not None, "diff_sha256": self.diff_sha256}
+        return {
+            "commit": self.commit,
+            "dirty": self.diff_sha256 is not None,
+            "diff_sha256": self.diff_sha256,
+        }
 
 
 def code_in(folder: Path) -> GitState | None:
-    """Return the state of the repository that contains a folder; None if there is none, or git is not installed."""
+    """Return the state of the repository that contains a folder; None if there is none, or git
+    is not installed.
+    """
     top = _git(folder, "rev-parse", "--show-toplevel")
     return None if top is None else _code(top.decode().rstrip("\n"))
 
 
 def code_of(target: str) -> GitState | None:
-    """Return the state of the repository of "module" or "module:Class"; None if git does not track its file.
+    """Return the state of the repository of "module" or "module:Class"; None if git does not track
+    its file.
 
     The module is located, but not imported.
     """
     try:
         spec = importlib.util.find_spec(target.partition(":")[0])
-    except (ImportError, ValueError):  # a parent package is not installed, or the module has no spec
+    except (ImportError, ValueError):
+        # a parent package is not installed, or the module has no spec
         return None
     if spec is None or spec.origin is None or not Path(spec.origin).is_file():
         return None
     file = Path(spec.origin)
-    # An installed package may be in a virtual environment within a repository that does not track it.
+    # An installed package may be in a virtual environment within a repository that does not track
+    # it.
     if _git(file.parent, "ls-files", "--error-unmatch", "--", file.name) is None:
         return None
     return code_in(file.parent)
@@ -71,7 +81,11 @@ def _git(folder: Path, *words: str) -> bytes | None:
     quiet = os.environ | {"GIT_OPTIONAL_LOCKS": "0"}
     try:
         asked = subprocess.run(  # noqa: S603 - words of ours, and a folder
-            [git, "-C", str(folder), *words], capture_output=True, timeout=_TIMEOUT_S, env=quiet, check=False
+            [git, "-C", str(folder), *words],
+            capture_output=True,
+            timeout=_TIMEOUT_S,
+            env=quiet,
+            check=False,
         )
     except (OSError, subprocess.TimeoutExpired):
         return None

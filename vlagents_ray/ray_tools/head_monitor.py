@@ -1,8 +1,8 @@
 """Detects that the cluster's head, or Ray's daemon on this machine, has ended.
 
-Ray kills a process a minute after it has lost the cluster's head, without a chance to write anything. It does not
-notice the end of its daemon (the raylet) on the same machine. Most calls of Ray block in the meantime. Therefore the
-driver checks both by itself, and exits in time.
+Ray kills a process a minute after it has lost the cluster's head, without a chance to write
+anything. It does not notice the end of its daemon (the raylet) on the same machine. Most calls of
+Ray block in the meantime. Therefore the driver checks both by itself, and exits in time.
 """
 
 from __future__ import annotations
@@ -23,26 +23,34 @@ log = logging.getLogger(__name__)
 
 PERIOD_S = 2.0  # interval of the checks
 ANSWER_S = 1.0  # timeout of a check, which blocks the driver
-_RAY_TIMEOUT = "RAY_gcs_rpc_server_reconnect_timeout_s"  # time after which Ray kills a process without a head
+# Time after which Ray kills a process without a head.
+_RAY_TIMEOUT = "RAY_gcs_rpc_server_reconnect_timeout_s"
 _RAY_TIMEOUT_S = 60.0  # its default
-_SHARE = 0.4  # share of Ray's timeout after which the head counts as lost; the rest is for an orderly end
+# Share of Ray's timeout after which the head counts as lost; the rest is for an orderly end.
+_SHARE = 0.4
 _SOCKETS = Path("/proc/net/unix")
 
 
 class HeadMonitor:
-    """Checks whether the cluster's head accepts connections, and whether the local daemon's socket exists."""
+    """Checks whether the cluster's head accepts connections, and whether the local daemon's
+    socket exists.
+    """
 
     def __init__(self, cure: str) -> None:
-        """Monitor the cluster of this process; `cure` is the end of the error message when the cluster is lost."""
+        """Monitor the cluster of this process; `cure` is the end of the error message when the
+        cluster is lost.
+        """
         self.node = node_of_this_process()
         self._address = host, port = _address()
         self._name = f"the head of the Ray cluster, {host}:{port},"
         self._cure = cure
         self._timeout_s = _SHARE * float(os.environ.get(_RAY_TIMEOUT) or _RAY_TIMEOUT_S)
         if started_here():
-            self._timeout_s = min(self._timeout_s, PERIOD_S)  # nothing replaces a head of this process
+            # Nothing replaces a head of this process.
+            self._timeout_s = min(self._timeout_s, PERIOD_S)
         self._daemon = None if self.node is None else str(self.node.raylet_socket_name)
-        if self._daemon is not None and not _exists(self._daemon):  # the system does not list its sockets
+        # The system does not list its sockets.
+        if self._daemon is not None and not _exists(self._daemon):
             self._daemon = None
         self._looked = self._answered = monotonic()
 
@@ -50,17 +58,21 @@ class HeadMonitor:
         """Return whether the head answered the last check, which is repeated every `PERIOD_S`.
 
         Raises:
-            ClusterLost: The head has not answered for too long, or the daemon on this machine has ended.
+            ClusterLost: The head has not answered for too long, or the daemon on this machine has
+                ended.
         """
         if monotonic() - self._looked > PERIOD_S:
             if self._daemon is not None and not _exists(self._daemon):
-                raise ClusterLost(f"Ray's daemon on this machine, the raylet, has ended; {self._cure}")
+                raise ClusterLost(
+                    f"Ray's daemon on this machine, the raylet, has ended; {self._cure}"
+                )
             try:
                 socket.create_connection(self._address, ANSWER_S).close()
             except OSError as error:
                 if self._looked == self._answered and self._timeout_s > PERIOD_S:
                     log.warning(
-                        "%s does not answer (%s): no worker is started until it does; this ends after %.0f s",
+                        "%s does not answer (%s): no worker is started until it does; this ends "
+                        "after %.0f s",
                         self._name, error, self._timeout_s,
                     )  # fmt: skip
                 self._looked = monotonic()
@@ -73,7 +85,9 @@ class HeadMonitor:
 
 
 def head_is_gone() -> bool:
-    """Return whether the head refuses connections, as it does from SIGTERM until its process ends seconds later."""
+    """Return whether the head refuses connections, as it does from SIGTERM until its process
+    ends seconds later.
+    """
     try:
         socket.create_connection(_address(), ANSWER_S).close()
     except OSError as error:

@@ -1,9 +1,10 @@
 """The private names of Ray and of Ray Serve that this package uses, all in one place.
 
-They were checked in the sources of Ray 2.60 and 2.59; check them again before another version is allowed
-(`tests/support/ray_names.py` lists those that a version lacks). Ray is imported inside the functions, as clients
-without Ray import this module. Only `vlagents_ray.serve.scaling.router` uses further private names: its class overrides
-private methods of Serve, which sends that module by value to processes that may lack this package.
+They were checked in the sources of Ray 2.60 and 2.59; check them again before another version is
+allowed (`tests/support/ray_names.py` lists those that a version lacks). Ray is imported inside the
+functions, as clients without Ray import this module. Only `vlagents_ray.serve.scaling.router` uses
+further private names: its class overrides private methods of Serve, which sends that module by
+value to processes that may lack this package.
 """
 
 from __future__ import annotations
@@ -17,21 +18,28 @@ from pathlib import Path
 from typing import Any
 
 # The loggers of Ray and Serve in the process that started them.
-LOGGERS = ("ray.serve", "ray._private.worker", "ray._private.authentication.authentication_token_setup")
+LOGGERS = (
+    "ray.serve",
+    "ray._private.worker",
+    "ray._private.authentication.authentication_token_setup",
+)
 START_LOGGER = "ray._private.services"  # logs the start of Ray's processes
 
 # The connection of this process.
 
 
 def node_of_this_process() -> Any:
-    """Return Ray's record of the local daemons; None if this process is not connected, or has not imported Ray.
+    """Return Ray's record of the local daemons; None if this process is not connected, or has not
+    imported Ray.
 
-    The record contains data that no public function returns: the daemons' sockets, their log folder, and whether this
-    process started them. It exists before the connection does; a call of Ray from another thread would then start a
-    second cluster.
+    The record contains data that no public function returns: the daemons' sockets, their log
+    folder, and whether this process started them. It exists before the connection does; a call of
+    Ray from another thread would then start a second cluster.
     """
     worker: Any = sys.modules.get("ray._private.worker")
-    return None if worker is None or not worker.global_worker.connected else worker.global_worker.node
+    return (
+        None if worker is None or not worker.global_worker.connected else worker.global_worker.node
+    )
 
 
 def use_loopback(on: bool) -> bool:
@@ -61,7 +69,8 @@ def reread_authentication() -> None:
 
 
 def address_of_ray_start() -> str | None:
-    """Return the address of the cluster that `ray start` started last on this machine; None if there is none.
+    """Return the address of the cluster that `ray start` started last on this machine; None if
+    there is none.
 
     `ray.init("auto")` would report a missing cluster only after ten minutes.
     """
@@ -77,12 +86,14 @@ def address_of_ray_start() -> str | None:
 def start_head(temp_dir: str, dashboard_port: int, **params: Any) -> Any:
     """Start the daemons of a one-machine cluster that requires the token of `RAY_AUTH_TOKEN_PATH`.
 
-    `ray.init("local")` does the same, but always with an autoscaler and a log monitor, which one machine does not need
-    (90 MB, 1 s), and with an agent at a fixed port, whose start takes 3 s longer while another Ray uses that port.
+    `ray.init("local")` does the same, but always with an autoscaler and a log monitor, which one
+    machine does not need (90 MB, 1 s), and with an agent at a fixed port, whose start takes 3 s
+    longer while another Ray uses that port.
 
     Args:
         dashboard_port: The port of the dashboard, which is not served.
-        params: Resources and further parameters of Ray's nodes: `num_cpus`, `num_gpus`, `resources`, ...
+        params: Resources and further parameters of Ray's nodes: `num_cpus`, `num_gpus`,
+            `resources`, ...
 
     Returns:
         Ray's record of the daemons.
@@ -106,8 +117,11 @@ def start_head(temp_dir: str, dashboard_port: int, **params: Any) -> Any:
         no_monitor=True,
         **params,
     )
-    # `ray_init_cluster`: started by a driver, not by `ray start`, so that nothing else joins it by default.
-    return Node(ray_params, head=True, shutdown_at_exit=False, spawn_reaper=True, ray_init_cluster=True)
+    # `ray_init_cluster`: started by a driver, not by `ray start`, so that nothing else joins it by
+    # default.
+    return Node(
+        ray_params, head=True, shutdown_at_exit=False, spawn_reaper=True, ray_init_cluster=True
+    )
 
 
 def node_that_failed(error: BaseException) -> Any:
@@ -122,12 +136,15 @@ def node_that_failed(error: BaseException) -> Any:
 
 
 def gpus_here() -> float:
-    """Count the GPUs that Ray would offer on this machine, without starting Ray and without torch."""
+    """Count the GPUs that Ray would offer on this machine, without starting Ray and without
+    torch.
+    """
     from ray._private.accelerators import get_accelerator_manager_for_resource
 
     if (manager := get_accelerator_manager_for_resource("GPU")) is None:
         return 0.0
-    visible = manager.get_current_process_visible_accelerator_ids()  # from CUDA_VISIBLE_DEVICES and similar variables
+    # From CUDA_VISIBLE_DEVICES and similar variables.
+    visible = manager.get_current_process_visible_accelerator_ids()
     found = manager.get_current_node_num_accelerators()
     return float(found if visible is None else min(found, len(visible)))
 
@@ -155,14 +172,17 @@ def create_channel(size: int) -> Any:
 
 
 def register_writer(channel: Any) -> None:
-    """Register this process as the writer of a channel, which Ray's `Channel` does only together with pickling."""
+    """Register this process as the writer of a channel, which Ray's `Channel` does only together
+    with pickling.
+    """
     _worker().core_worker.experimental_channel_register_writer(channel, {})
 
 
 def write_channel(channel: Any, content: Any, wait_ms: int) -> str | None:
     """Write the content to a channel; return the reason if that is impossible, otherwise None.
 
-    An exception raised here would retain the channel's memory for as long as its traceback is referenced.
+    An exception raised here would retain the channel's memory for as long as its traceback is
+    referenced.
     """
     import ray
 
@@ -174,7 +194,8 @@ def write_channel(channel: Any, content: Any, wait_ms: int) -> str | None:
 
 
 def read_channel(channel: Any) -> Any:
-    """Return the newest content, with `metadata` and `data`, in place: it is valid while the caller holds it.
+    """Return the newest content, with `metadata` and `data`, in place: it is valid while the caller
+    holds it.
 
     Raises:
         ray.exceptions.RayChannelTimeoutError: Nothing was written since the last call.
@@ -183,7 +204,8 @@ def read_channel(channel: Any) -> Any:
 
 
 def channel_content(tag: bytes, pieces: Iterable[memoryview]) -> Any:
-    """Return pieces of memory in a form that Ray copies directly into a channel, one after the other.
+    """Return pieces of memory in a form that Ray copies directly into a channel, one after the
+    other.
 
     This is Ray's writer of out-of-band buffers, without any pickled data in band.
     """
@@ -196,14 +218,18 @@ def channel_content(tag: bytes, pieces: Iterable[memoryview]) -> Any:
 
 
 def plain_content(data: bytes) -> Any:
-    """Return bytes in a form that Ray copies into a channel, without the tag and the pieces of `channel_content`."""
+    """Return bytes in a form that Ray copies into a channel, without the tag and the pieces of
+    `channel_content`.
+    """
     import ray
 
     return ray._raylet.RawSerializedObject(data)
 
 
 def channel_pieces(data: Any) -> Any:
-    """Return the pieces in the data of a channel, in place, without unpickling; Ray's parser trusts the data."""
+    """Return the pieces in the data of a channel, in place, without unpickling; Ray's parser
+    trusts the data.
+    """
     import ray
 
     _, pieces = ray._raylet.unpack_pickle5_buffers(data)
@@ -214,7 +240,8 @@ def channel_pieces(data: Any) -> Any:
 
 
 def start_serve(http: dict[str, Any], location: str) -> tuple[Any, list[Any]]:
-    """Return Serve's client and the refs of its proxies, like `serve_start`, but without waiting for the proxies.
+    """Return Serve's client and the refs of its proxies, like `serve_start`, but without waiting
+    for the proxies.
 
     The proxies then start while a policy is built and loaded.
     """
@@ -225,7 +252,9 @@ def start_serve(http: dict[str, Any], location: str) -> tuple[Any, list[Any]]:
     if _get_global_client(raise_if_no_controller_running=False) is not None:
         return api.serve_start(http_options=http, proxy_location=location), []
     options = api._coerce_controller_options(None)
-    controller, proxies = api._create_controller_and_proxy_refs(http, None, None, None, options, location)
+    controller, proxies = api._create_controller_and_proxy_refs(
+        http, None, None, None, options, location
+    )
     client = ServeControllerClient(controller)
     _set_global_client(client)
     return client, proxies
@@ -243,7 +272,8 @@ def proxies_now(client: Any) -> list[Any]:
 
 
 def long_polls(client: Any) -> Iterator[Any]:
-    """Yield the long polls that the handles of Serve's client have open at the controller, each with `stop`.
+    """Yield the long polls that the handles of Serve's client have open at the controller, each
+    with `stop`.
 
     `serve.shutdown` leaves them open, and Ray would report them as failed tasks.
     """
@@ -252,11 +282,15 @@ def long_polls(client: Any) -> Iterator[Any]:
     for handle in client.handle_cache.values():
         if (router := getattr(handle._router, "_asyncio_router", None)) is not None:
             yield router.long_poll_client
-            yield SharedRouterLongPollClient.get_or_create(client._controller, router._event_loop).long_poll_client
+            yield SharedRouterLongPollClient.get_or_create(
+                client._controller, router._event_loop
+            ).long_poll_client
 
 
 def end_controller(client: Any) -> Any:
-    """Begin to shut Serve down; return the ref of the call, which fails because it ends the controller."""
+    """Begin to shut Serve down; return the ref of the call, which fails because it ends the
+    controller.
+    """
     return client._controller.graceful_shutdown.options(max_task_retries=0).remote()
 
 
@@ -269,20 +303,25 @@ def forget_serve(client: Any) -> None:
 
 
 def http_options() -> Any:
-    """Return Serve's HTTP options: `host`, `port`, `ssl_certfile`, ... `serve.status` does not contain them."""
+    """Return Serve's HTTP options: `host`, `port`, `ssl_certfile`, ... `serve.status` does not
+    contain them.
+    """
     from ray.serve.context import _get_global_client
 
     return _get_global_client().http_config
 
 
 def replica_is_ending() -> bool:
-    """Return whether Serve has begun to stop the replica in this process; Serve has no public hook for that."""
+    """Return whether Serve has begun to stop the replica in this process; Serve has no public
+    hook for that.
+    """
     worker = _worker()
     return bool(worker.actors.get(worker.actor_id)._replica_impl._shutting_down)
 
 
 def replica_is_initialized(replica: Any) -> Any:
-    """Ask a replica's actor whether it has made its callable; Ray before 2.60 does not say, and counts as true.
+    """Ask a replica's actor whether it has made its callable; Ray before 2.60 does not say, and
+    counts as true.
 
     Returns:
         An awaitable of a bool.
@@ -293,7 +332,11 @@ def replica_is_initialized(replica: Any) -> Any:
 
 
 def replica_request(request_id: str, method: str) -> bytes:
-    """Return the header of a call of a replica's method, as Serve's own router sends it to the replica's actor."""
+    """Return the header of a call of a replica's method, as Serve's own router sends it to the
+    replica's actor.
+    """
     from ray.serve._private.common import RequestMetadata
 
-    return pickle.dumps(RequestMetadata(request_id=request_id, internal_request_id=request_id, call_method=method))
+    return pickle.dumps(
+        RequestMetadata(request_id=request_id, internal_request_id=request_id, call_method=method)
+    )

@@ -1,10 +1,10 @@
 """Cleans up after a killed driver: `python reaper.py FOLDER`, with a pipe as its standard input.
 
-A local cluster normally ends with its driver. After `kill -9` parts of it can remain: an HAProxy whose manager was
-killed first, agents that take a minute to exit, the folder. The end of the pipe signals that the driver has ended. A
-driver that exits in order, while its Ray runs, first writes a byte. In that case only processes that use files of the
-folder can remain: an HAProxy that waits for its last connection to close, and Ray's agents, which take a moment to
-exit.
+A local cluster normally ends with its driver. After `kill -9` parts of it can remain: an HAProxy
+whose manager was killed first, agents that take a minute to exit, the folder. The end of the pipe
+signals that the driver has ended. A driver that exits in order, while its Ray runs, first writes a
+byte. In that case only processes that use files of the folder can remain: an HAProxy that waits for
+its last connection to close, and Ray's agents, which take a moment to exit.
 """
 
 from __future__ import annotations
@@ -23,17 +23,19 @@ MARK = "VLAGENTS_RAY_CLUSTER"  # environment variable of every process of the cl
 _GRACE_S = 3.0  # time for Ray to end by itself
 _ORDERLY = b"."
 _SWEEPS = 200  # at least 10 s: on a busy machine a killed process takes a while to end
-_QUIET_SWEEPS = 3  # consecutive sweeps that must find nothing; during exec a process has no environment
+# Consecutive sweeps that must find nothing; during exec a process has no environment.
+_QUIET_SWEEPS = 3
 
 
 @contextmanager
 def reaped(folder: Path, lost: type[Exception]) -> Iterator[None]:
     """End the processes marked with `folder` if this process dies within the context.
 
-    An exception of the type `lost` within the context has the same effect, as the cluster then does not end its
-    remaining processes.
+    An exception of the type `lost` within the context has the same effect, as the cluster then does
+    not end its remaining processes.
     """
-    # The reaper runs as a script, which starts quickly; therefore this module imports no other module of the package.
+    # The reaper runs as a script, which starts quickly; therefore this module imports no other
+    # module of the package.
     command = [sys.executable, "-I", __file__, str(folder)]
     reaper = subprocess.Popen(command, stdin=subprocess.PIPE, start_new_session=True)  # noqa: S603 - our own module
     if reaper.stdin is None:
@@ -55,8 +57,9 @@ def reaped(folder: Path, lost: type[Exception]) -> Iterator[None]:
 def marked(folder: str) -> list[int]:
     """List this user's processes that were started for the cluster of `folder`.
 
-    Ray may overwrite the mark in the environment of its processes with their titles. Those processes have their log
-    files in the folder open, as do drivers that joined the cluster and continue.
+    Ray may overwrite the mark in the environment of its processes with their titles. Those
+    processes have their log files in the folder open, as do drivers that joined the cluster and
+    continue.
     """
     mark = f"{MARK}={folder}".encode()
     found = []
@@ -90,7 +93,9 @@ def has_open_files(process: Path, folder: str) -> bool:
 
 
 def about(folder: str) -> list[int]:
-    """List the marked processes that no user started: their command line names the folder, or is a title set by Ray."""
+    """List the marked processes that no user started: their command line names the folder, or is
+    a title set by Ray.
+    """
     found = []
     for pid in marked(folder):
         with suppress(OSError):
@@ -102,7 +107,8 @@ def about(folder: str) -> list[int]:
 
 def main() -> None:
     """Wait for the end of the driver, and kill the remaining processes."""
-    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):  # systemd and Slurm signal every process of a service
+    # Systemd and Slurm signal every process of a service.
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, signal.SIG_IGN)
     folder = sys.argv[1]
     orderly = os.read(0, 1) == _ORDERLY

@@ -1,4 +1,6 @@
-"""A check for secrets in Ray runtime environments, which Ray writes to logs that every user of a machine can read."""
+"""A check for secrets in Ray runtime environments, which Ray writes to logs that every user of a
+machine can read.
+"""
 
 from __future__ import annotations
 
@@ -8,25 +10,38 @@ from typing import Any
 
 from vlagents_ray.errors import ConfigError
 
-# Only the last word of a variable's name is checked, so that TOKENIZERS_PARALLELISM, HF_TOKEN_PATH and MAX_TOKENS pass.
-_SECRET = re.compile(r"(^|_)(API|ACCESS)?KEY$|(TOKEN|SECRET|PASSWORD|PASSWD|PASSPHRASE|CREDENTIALS?)$", re.IGNORECASE)
+# Only the last word of a variable's name is checked, so that TOKENIZERS_PARALLELISM, HF_TOKEN_PATH
+# and MAX_TOKENS pass.
+_SECRET = re.compile(
+    r"(^|_)(API|ACCESS)?KEY$|(TOKEN|SECRET|PASSWORD|PASSWD|PASSPHRASE|CREDENTIALS?)$", re.IGNORECASE
+)
 _PASSWORD_IN_URL = re.compile(r"://[^/@\s:]*:(?!\$\{)[^/@\s]+@")  # pip replaces ${NAME} later
 
 
 def require_no_secrets(runtime_env: Mapping[str, Any]) -> None:
-    """Raise `ConfigError` if a variable in `env_vars` is named like a secret, or any URL contains a password."""
+    """Raise `ConfigError` if a variable in `env_vars` is named like a secret, or any URL
+    contains a password.
+    """
     variables = runtime_env.get("env_vars") or {}
-    named = sorted(name for name in variables if _SECRET.search(name)) if isinstance(variables, Mapping) else []
+    named = (
+        sorted(name for name in variables if _SECRET.search(name))
+        if isinstance(variables, Mapping)
+        else []
+    )
     if named:
         raise ConfigError(
-            f"env_vars: got {named}, want no secrets: Ray logs them where every user of the machine can read them. Set "
-            f"them in the environment in which Ray is started on each node (by `ray start`, `vlagents-ray serve`), or "
+            f"env_vars: got {named}, want no secrets: Ray logs them where every user of the "
+            "machine can read them. Set "
+            "them in the environment in which Ray is started on each node (by `ray start`, "
+            "`vlagents-ray serve`), or "
             f"in a file that only you can read, and replace the secrets that were given here before"
         )
     if any(_PASSWORD_IN_URL.search(text) for text in _texts(runtime_env)):
         raise ConfigError(
-            "runtime environment: got a URL with a password, want none: Ray logs it where every user of the machine "
-            "can read it. Put the password into ~/.netrc, or write ${NAME} for a variable that the nodes have"
+            "runtime environment: got a URL with a password, want none: Ray logs it where every "
+            "user of the machine "
+            "can read it. Put the password into ~/.netrc, or write ${NAME} for a variable that the "
+            "nodes have"
         )
 
 

@@ -1,4 +1,6 @@
-"""The connection of this process to a Ray cluster, which is either running already or started here."""
+"""The connection of this process to a Ray cluster, which is either running already or started
+here.
+"""
 
 from __future__ import annotations
 
@@ -26,13 +28,17 @@ from vlagents_ray.ray_tools.signals import own_sigterm
 log = logging.getLogger(__name__)
 
 _ATTEMPTS = 3
-# Without this setting, a driver whose head has ended waits 5 s to send its last events, which are not used here.
+# Without this setting, a driver whose head has ended waits 5 s to send its last events, which are
+# not used here.
 _CONFIG = {"task_events_shutdown_flush_timeout_ms": 300}
-_RESOURCES = ("num_cpus", "num_gpus", "resources", "object_store_memory")  # options of the cluster, not of its driver
+# Options of the cluster, not of its driver.
+_RESOURCES = ("num_cpus", "num_gpus", "resources", "object_store_memory")
 _FAILED = "Check failed: "  # prefix in the log of a daemon that aborted
 FILES = "ray"  # the folder of Ray's files in a `ray_folder`
 _SHORT = "/tmp"  # noqa: S108 - used if the names of Ray's sockets would be too long elsewhere
-_SOCKETS = (  # the longest socket names in such a folder: Ray's, and HAProxy's, whose folder is named after the node
+# The longest socket names in such a folder: Ray's, and HAProxy's, whose folder is named after the
+# node.
+_SOCKETS = (
     f"{FILES}/session_2026-01-31_12-00-00_123456_1234567/sockets/.vla12345678",
     f"{'0' * 56}/admin.1234567.tmp",
 )
@@ -43,8 +49,8 @@ _FILE = "server.json"  # written into the private folder of a server's Ray when 
 _TOKEN_FILE = "token"  # noqa: S105 - the token of the cluster, in its `ray_folder`
 
 MODE, _TOKEN, _TOKEN_PATH = "RAY_AUTH_MODE", "RAY_AUTH_TOKEN", "RAY_AUTH_TOKEN_PATH"
-# If this variable is "0", Ray assumes a single-node cluster and uses the loopback address as the node's, so that all
-# ports are bound there. (Ray replaces an address given as `_node_ip_address`.)
+# If this variable is "0", Ray assumes a single-node cluster and uses the loopback address as the
+# node's, so that all ports are bound there. (Ray replaces an address given as `_node_ip_address`.)
 ALONE = "RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER"
 _started: list[Any] = []  # Ray's record of the daemons started by this process, at most one
 
@@ -54,9 +60,10 @@ def joined(address: str | None = None, **options: Any) -> Iterator[None]:
     """Connect this process to a Ray cluster within the context, or use its existing connection.
 
     Args:
-        address: The address of the cluster. None selects the cluster of RAY_ADDRESS, or of this machine. The URL of a
-            server on this machine selects that server's cluster. "auto" selects the cluster of `ray start` or, without
-            one, a server's. "local" starts a cluster that ends with the context.
+        address: The address of the cluster. None selects the cluster of RAY_ADDRESS, or of this
+            machine. The URL of a server on this machine selects that server's cluster. "auto"
+            selects the cluster of `ray start` or, without one, a server's. "local" starts a cluster
+            that ends with the context.
         options: Further options of `ray.init`.
 
     Raises:
@@ -77,8 +84,11 @@ def joined(address: str | None = None, **options: Any) -> Iterator[None]:
                 stack.enter_context(variables(token_variables(folder)))
                 with variables({MARK: str(folder)}):
                     start_ray(folder, **options)
-            # Without a cluster of `ray start`, Ray would try that of a server here, and wait for ten minutes.
-            elif url or (where == "auto" and private.address_of_ray_start() is None and local_servers()):
+            # Without a cluster of `ray start`, Ray would try that of a server here, and wait for
+            # ten minutes.
+            elif url or (
+                where == "auto" and private.address_of_ray_start() is None and local_servers()
+            ):
                 with own_sigterm():
                     join(url, **options)
             else:
@@ -86,7 +96,8 @@ def joined(address: str | None = None, **options: Any) -> Iterator[None]:
                     ray.init(address=address, **options)
         except (ConnectionError, ray.exceptions.AuthenticationError) as error:
             raise ConfigError(
-                f"cannot connect to a Ray cluster at {where!r}: {error}. Start Ray on this machine, or join it to a "
+                f"cannot connect to a Ray cluster at {where!r}: {error}. Start Ray on this "
+                "machine, or join it to a "
                 f"cluster (`ray start`); the page docs/cluster/index.md shows how"
             ) from error
         stack.push(unless_lost(leave_ray))
@@ -95,14 +106,18 @@ def joined(address: str | None = None, **options: Any) -> Iterator[None]:
 
 @contextlib.contextmanager
 def ray_folder() -> Iterator[Path]:
-    """Create a folder that is private to this user, with a subfolder `FILES` for the Ray that this process starts.
+    """Create a folder that is private to this user, with a subfolder `FILES` for the Ray that this
+    process starts.
 
-    Ray makes the folders of its sockets and logs accessible to every user. At the end of the context, or when this
-    process is killed, the folder is removed and the processes that use it are ended.
+    Ray makes the folders of its sockets and logs accessible to every user. At the end of the
+    context, or when this process is killed, the folder is removed and the processes that use it are
+    ended.
     """
     base = os.environ.get("RAY_TMPDIR") or tempfile.gettempdir()
     if len(os.fsencode(base)) > _LONGEST:
-        log.info("Ray's files are in %s: the names of its sockets would be too long in %s", _SHORT, base)
+        log.info(
+            "Ray's files are in %s: the names of its sockets would be too long in %s", _SHORT, base
+        )
         base = _SHORT
     Path(base).mkdir(parents=True, exist_ok=True)
     folder = Path(tempfile.mkdtemp(prefix="vlr-", dir=base))
@@ -118,11 +133,13 @@ def ray_folder() -> Iterator[Path]:
 
 
 def token_variables(folder: Path) -> dict[str, str | None]:
-    """Create the token of the cluster that is about to start, and return the variables that select it.
+    """Create the token of the cluster that is about to start, and return the variables that select
+    it.
 
-    The token runs any code as this user. Ray itself would write one for all clusters of the user to ~/.ray/auth_token,
-    with the permissions of the umask, which usually let every account of the machine read it. A token that the user or
-    another cluster has set is replaced: only processes that `join` reach this cluster, and `join` finds its token.
+    The token runs any code as this user. Ray itself would write one for all clusters of the user to
+    ~/.ray/auth_token, with the permissions of the umask, which usually let every account of the
+    machine read it. A token that the user or another cluster has set is replaced: only processes
+    that `join` reach this cluster, and `join` finds its token.
 
     Args:
         folder: The `ray_folder` of the cluster, which no other user can enter.
@@ -136,7 +153,9 @@ def token_variables(folder: Path) -> dict[str, str | None]:
 
 @contextlib.contextmanager
 def variables(values: Mapping[str, str | None]) -> Iterator[None]:
-    """Set environment variables for processes that are started within the context; None unsets one."""
+    """Set environment variables for processes that are started within the context; None unsets
+    one.
+    """
     before = {name: os.environ.get(name) for name in values}
     _set_variables(values)
     try:
@@ -156,12 +175,13 @@ def _set_variables(values: Mapping[str, str | None]) -> None:
 def start_ray(folder: Path, **options: Any) -> None:
     """Start a Ray cluster of this machine and join it; try again if the start times out.
 
-    Ray's daemon waits at most 15 s for each of its helpers (ray issue 65983), which can be too short on a busy machine
-    or if Python's modules are on a slow disk. The next attempt is faster, as the modules are cached by then.
-    `leave_ray` ends the cluster.
+    Ray's daemon waits at most 15 s for each of its helpers (ray issue 65983), which can be too
+    short on a busy machine or if Python's modules are on a slow disk. The next attempt is faster,
+    as the modules are cached by then. `leave_ray` ends the cluster.
 
     Args:
-        folder: A `ray_folder`, for the files of Ray. The output of its processes is in log files there.
+        folder: A `ray_folder`, for the files of Ray. The output of its processes is in log files
+            there.
         options: Further options of `ray.init`: resources, `logging_level`, `namespace`, ...
 
     Raises:
@@ -176,11 +196,14 @@ def start_ray(folder: Path, **options: Any) -> None:
         node = None
         try:
             with own_sigterm(), _taken_port() as port:
-                node = private.start_head(str(folder / FILES), port, _system_config=_CONFIG, **resources)
+                node = private.start_head(
+                    str(folder / FILES), port, _system_config=_CONFIG, **resources
+                )
                 ray.init(node.gcs_address, **({"log_to_driver": False} | options))
         except Exception as error:  # Ray raises a plain Exception
             node = node or private.node_that_failed(error)
-            if node is None or not node.all_processes:  # nothing was started, so time is not the cause
+            # Nothing was started, so time is not the cause.
+            if node is None or not node.all_processes:
                 raise
             node.kill_all_processes(check_alive=False, wait=True)  # Ray does not end them itself
             if isinstance(error, ValueError):  # an invalid option
@@ -188,11 +211,18 @@ def start_ray(folder: Path, **options: Any) -> None:
             reason = f"{error} {_daemon_error(node)}".rstrip()
             if attempt == _ATTEMPTS:
                 raise ConfigError(
-                    f"Ray did not start on this machine in {_ATTEMPTS} attempts: {reason}. If the machine is busy, run "
-                    f"less on it; if Python's modules are on a slow disk, copy the environment to a local one. Logs: "
+                    f"Ray did not start on this machine in {_ATTEMPTS} attempts: {reason}. If the "
+                    "machine is busy, run "
+                    "less on it; if Python's modules are on a slow disk, copy the environment to "
+                    "a local one. Logs: "
                     f"{_kept_logs(node)}"
                 ) from error
-            log.warning("Ray did not start, trying again (attempt %d of %d): %s", attempt + 1, _ATTEMPTS, reason)
+            log.warning(
+                "Ray did not start, trying again (attempt %d of %d): %s",
+                attempt + 1,
+                _ATTEMPTS,
+                reason,
+            )
         else:
             _started.append(node)
             return
@@ -218,8 +248,8 @@ def started_here() -> bool:
 def _taken_port() -> Iterator[int]:
     """Yield a port that no other process can listen on, as the port of the unused dashboard.
 
-    Ray starts the dashboard's server even without a dashboard, for usage statistics, and waits 2 s for it unless the
-    port is taken. If it is, Ray logs an error, which is dropped here.
+    Ray starts the dashboard's server even without a dashboard, for usage statistics, and waits 2 s
+    for it unless the port is taken. If it is, Ray logs an error, which is dropped here.
     """
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port: int = taken.getsockname()[1]
@@ -231,16 +261,20 @@ def _taken_port() -> Iterator[int]:
         logger.addFilter(is_shown)
         try:
             with warnings.catch_warnings():
-                warnings.simplefilter("ignore", ResourceWarning)  # Ray does not close the socket of its attempt
+                # Ray does not close the socket of its attempt.
+                warnings.simplefilter("ignore", ResourceWarning)
                 yield port
         finally:
             logger.removeFilter(is_shown)
 
 
 def _kept_logs(node: Any) -> Path:
-    """Copy a node's logs to a folder of this user, as the cluster's folder is about to be removed."""
+    """Copy a node's logs to a folder of this user, as the cluster's folder is about to be
+    removed.
+    """
     kept = Path(tempfile.mkdtemp(prefix="vlr-logs-"))
-    with contextlib.suppress(OSError):  # shutil.Error is an OSError; the other files have been copied
+    # shutil.Error is an OSError; the other files have been copied.
+    with contextlib.suppress(OSError):
         shutil.copytree(node.get_logs_dir_path(), kept, dirs_exist_ok=True)
     return kept
 
@@ -256,7 +290,9 @@ def _daemon_error(node: Any) -> str:
 
 
 def unless_lost(leave: Callable[[], None]) -> Callable[..., None]:
-    """Make an exit callback for an `ExitStack` that skips `leave` if the head is lost, since `leave` would block."""
+    """Make an exit callback for an `ExitStack` that skips `leave` if the head is lost, since
+    `leave` would block.
+    """
 
     def end(kind: type[BaseException] | None, *_: object) -> None:
         if kind is not ClusterLost:
@@ -272,29 +308,34 @@ class LocalServer:
     url: str  # http(s)://host:port
     apps: tuple[str, ...]  # names of its applications, reached at serve://APP inside the cluster
     ray_address: str  # host:port of its Ray cluster
-    token_file: str  # path of the token of that cluster, which runs any code as this user: `RAY_AUTH_TOKEN_PATH`
+    # Path of the token of that cluster, which runs any code as this user: `RAY_AUTH_TOKEN_PATH`.
+    token_file: str
 
 
 def join(server: str | None = None, **options: Any) -> LocalServer:
     """Connect this process to the Ray cluster of a server on this machine, in place of `ray.init`.
 
-    The server's Ray is on the loopback address, in a private folder, and requires a token: `ray.init("auto")` finds it,
-    but connects to another address of this machine, and times out after minutes.
+    The server's Ray is on the loopback address, in a private folder, and requires a token:
+    `ray.init("auto")` finds it, but connects to another address of this machine, and times out
+    after minutes.
 
-    Actors and tasks of this process then run in that cluster, with the server's Python and with the modules of this
-    process's script and working directory. `RemoteAgent("serve://APP")` reaches the policy from this process and from
-    each of them. They end with the server. `ray.shutdown()` leaves the cluster; the server continues.
+    Actors and tasks of this process then run in that cluster, with the server's Python and with the
+    modules of this process's script and working directory. `RemoteAgent("serve://APP")` reaches the
+    policy from this process and from each of them. They end with the server. `ray.shutdown()`
+    leaves the cluster; the server continues.
 
     Args:
-        server: The URL of the server, or the name of one of its applications; required if several servers run.
+        server: The URL of the server, or the name of one of its applications; required if several
+            servers run.
         options: Further options of `ray.init`, such as `log_to_driver`.
 
     Returns:
-        The URL of the server, its applications, and the address and the token's file of its Ray cluster.
+        The URL of the server, its applications, and the address and the token's file of its Ray
+        cluster.
 
     Raises:
-        ConfigError: No server of this user is ready on this machine, or several are ready and `server` is None, or this
-            process is in another Ray cluster.
+        ConfigError: No server of this user is ready on this machine, or several are ready and
+            `server` is None, or this process is in another Ray cluster.
     """
     import ray
 
@@ -303,11 +344,14 @@ def join(server: str | None = None, **options: Any) -> LocalServer:
         if ray.get_runtime_context().gcs_address == chosen.ray_address:
             return chosen
         raise ConfigError(
-            f"got a process in another Ray cluster, {ray.get_runtime_context().gcs_address}; want it in that of "
+            f"got a process in another Ray cluster, {ray.get_runtime_context().gcs_address}; want "
+            "it in that of "
             f"{chosen.url}: call ray.shutdown() before, or join() in place of ray.init()"
         )
     if os.environ.get(MODE, "token").lower() != "token":
-        raise ConfigError(f"{MODE}={os.environ[MODE]}: the Ray of {chosen.url} needs its token; unset {MODE}")
+        raise ConfigError(
+            f"{MODE}={os.environ[MODE]}: the Ray of {chosen.url} needs its token; unset {MODE}"
+        )
     _set_variables({MODE: "token", ALONE: "0", _TOKEN: None, _TOKEN_PATH: chosen.token_file})
     private.use_loopback(True)  # Ray has already read the variables, when it was imported
     private.reread_authentication()
@@ -316,7 +360,8 @@ def join(server: str | None = None, **options: Any) -> LocalServer:
 
 
 def announce(url: str, apps: Mapping[str, str], ray_address: str) -> None:
-    """Announce the server of this process's Ray, which is ready, in a file that other programs of this user can find.
+    """Announce the server of this process's Ray, which is ready, in a file that other programs of
+    this user can find.
 
     `apps` are its applications by name, and `ray_address` is host:port of its Ray cluster.
     """
@@ -347,16 +392,24 @@ def _chosen(wanted: str | None) -> LocalServer:
     """Return the server whose URL or application is `wanted`."""
     servers = local_servers()
     url = None if wanted is None else wanted.rstrip("/").replace("://localhost:", "://127.0.0.1:")
-    fitting = [server for server in servers if wanted is None or url == server.url or wanted in server.apps]
+    fitting = [
+        server for server in servers if wanted is None or url == server.url or wanted in server.apps
+    ]
     if len(fitting) == 1:
         return fitting[0]
     there = ", ".join(f"{server.url} ({', '.join(server.apps)})" for server in servers)
     if fitting:
-        raise ConfigError(f"got {len(fitting)} servers on this machine, {there}; say which: join('{servers[0].url}')")
+        raise ConfigError(
+            f"got {len(fitting)} servers on this machine, {there}; say which: "
+            f"join('{servers[0].url}')"
+        )
     if servers:
-        raise ConfigError(f"got {wanted!r}, want the URL or an application of a server on this machine: {there}")
+        raise ConfigError(
+            f"got {wanted!r}, want the URL or an application of a server on this machine: {there}"
+        )
     raise ConfigError(
-        "no server of this user is ready on this machine; start one with `vlagents-ray serve POLICY`. Those of other "
+        "no server of this user is ready on this machine; start one with `vlagents-ray serve "
+        "POLICY`. Those of other "
         "users, and on other machines, are reached at their URL: RemoteAgent('http://HOST:8000')"
     )
 
@@ -373,7 +426,8 @@ def _running_servers() -> Iterator[LocalServer]:
             content = json.loads((Path(environment[MARK]) / _FILE).read_text())
             server = LocalServer(**{**content, "apps": tuple(content["apps"])})
             address = f"--gcs-address={server.ray_address}"
-        except (OSError, KeyError, ValueError, TypeError):  # it has ended, is another user's, or is not announced
+        except (OSError, KeyError, ValueError, TypeError):
+            # it has ended, is another user's, or is not announced
             continue
         # A killed cluster may have left the folder, and another cluster may use it now.
         if any(address in os.fsdecode(word) for word in words):

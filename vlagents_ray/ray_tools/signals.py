@@ -1,4 +1,6 @@
-"""Signal handlers: Ctrl-C and SIGTERM in a process that uses Ray, and an event that requests a stop."""
+"""Signal handlers: Ctrl-C and SIGTERM in a process that uses Ray, and an event that requests a
+stop.
+"""
 
 from __future__ import annotations
 
@@ -15,9 +17,9 @@ _interrupted = threading.Event()
 def interrupts() -> Iterator[None]:
     """Raise `KeyboardInterrupt` on Ctrl-C and SIGTERM within the context, and record the signal.
 
-    Python drops an exception that a handler raises while a destructor or a callback of Ray's C code runs; in that case
-    `raise_dropped_interrupt` raises it later. Outside the main thread, where Python delivers no signals, this does
-    nothing.
+    Python drops an exception that a handler raises while a destructor or a callback of Ray's C code
+    runs; in that case `raise_dropped_interrupt` raises it later. Outside the main thread, where
+    Python delivers no signals, this does nothing.
     """
     if threading.current_thread() is not threading.main_thread():
         yield
@@ -27,7 +29,9 @@ def interrupts() -> Iterator[None]:
         _interrupted.set()
         signal.default_int_handler(number, frame)
 
-    before = {number: signal.signal(number, on_signal) for number in (signal.SIGINT, signal.SIGTERM)}
+    before = {
+        number: signal.signal(number, on_signal) for number in (signal.SIGINT, signal.SIGTERM)
+    }
     try:
         yield
     finally:
@@ -42,7 +46,9 @@ def is_interrupted() -> bool:
 
 
 def raise_dropped_interrupt() -> None:
-    """Raise `KeyboardInterrupt` if a signal arrived within `interrupts` and its exception was dropped."""
+    """Raise `KeyboardInterrupt` if a signal arrived within `interrupts` and its exception was
+    dropped.
+    """
     if _interrupted.is_set():
         raise KeyboardInterrupt
 
@@ -51,8 +57,8 @@ def raise_dropped_interrupt() -> None:
 def own_sigterm() -> Iterator[None]:
     """Preserve this process's SIGTERM handler during `ray.init`.
 
-    Ray installs a handler whose alarm aborts the process three seconds later, during an orderly exit. If the process
-    had no handler, Ray's remains.
+    Ray installs a handler whose alarm aborts the process three seconds later, during an orderly
+    exit. If the process had no handler, Ray's remains.
     """
     before = signal.getsignal(signal.SIGTERM)
     if not callable(before) or threading.current_thread() is not threading.main_thread():
@@ -70,8 +76,8 @@ def own_sigterm() -> Iterator[None]:
 def stop_signals() -> Iterator[threading.Event]:
     """Yield an event that Ctrl-C and SIGTERM set; a second signal raises `KeyboardInterrupt`.
 
-    A handler that only sets a flag cannot interrupt a transaction. Outside the main thread, where Python delivers no
-    signals, the event is never set.
+    A handler that only sets a flag cannot interrupt a transaction. Outside the main thread, where
+    Python delivers no signals, the event is never set.
     """
     raise_dropped_interrupt()
     stop = threading.Event()
@@ -84,7 +90,9 @@ def stop_signals() -> Iterator[threading.Event]:
             raise KeyboardInterrupt
         stop.set()
 
-    before = {number: signal.signal(number, on_signal) for number in (signal.SIGINT, signal.SIGTERM)}
+    before = {
+        number: signal.signal(number, on_signal) for number in (signal.SIGINT, signal.SIGTERM)
+    }
     try:
         yield stop
     finally:
@@ -94,10 +102,11 @@ def stop_signals() -> Iterator[threading.Event]:
 
 @contextlib.contextmanager
 def raised_at_once() -> Iterator[None]:
-    """Raise `KeyboardInterrupt` in this thread on a signal within the context, after its handler has run.
+    """Raise `KeyboardInterrupt` in this thread on a signal within the context, after its handler
+    has run.
 
-    Code that looks at the event of `stop_signals` does so between two calls. A call that lasts needs this, unless it
-    writes results. A signal without a handler keeps its default action.
+    Code that looks at the event of `stop_signals` does so between two calls. A call that lasts
+    needs this, unless it writes results. A signal without a handler keeps its default action.
     """
     if threading.current_thread() is not threading.main_thread():
         yield

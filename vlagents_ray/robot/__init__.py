@@ -1,4 +1,6 @@
-"""The control loop of a robot, with its guard, watchdog and recorder; its dependencies are those of `client`."""
+"""The control loop of a robot, with its guard, watchdog and recorder; its dependencies are those
+of `client`.
+"""
 
 from vlagents_ray.chunking.control import Control
 from vlagents_ray.client.commands import CommandInbox
@@ -7,4 +9,13 @@ from vlagents_ray.robot.limits import Limits
 from vlagents_ray.robot.loop import LoopReport, Robot, run_loop
 from vlagents_ray.robot.watchdog import Watchdog
 
-__all__ = ["CommandInbox", "Control", "Guard", "Limits", "LoopReport", "Robot", "Watchdog", "run_loop"]
+__all__ = [
+    "CommandInbox",
+    "Control",
+    "Guard",
+    "Limits",
+    "LoopReport",
+    "Robot",
+    "Watchdog",
+    "run_loop",
+]

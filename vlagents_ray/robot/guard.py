@@ -18,39 +18,47 @@ from vlagents_ray.robot.limits import Limits
 SOFT_START_S = 120.0
 _ROUNDING = 2.0**-23  # of a float32, with a margin for actions of earlier ticks that were larger
 _FIRST_S = 0.5  # of the limit of velocity: how far the first action may be
-_SLOWLY = 2.0  # how many times longer than its limits require the way from rest to the first action takes
+# How many times longer than its limits require the way from rest to the first action takes.
+_SLOWLY = 2.0
 
 
 class Guard:
-    """A check that accepts an action or raises `InvalidAction`; it never clips one, as that would be another motion.
+    """A check that accepts an action or raises `InvalidAction`; it never clips one, as that would
+    be another motion.
 
-    The guard checks the action's shape, that its numbers are finite and within the bounds, and that it is not too far
-    from the previous one. There is no previous action before the first one, and after a stop the arm need not be where
-    the last action commanded it. With `measure` these actions are compared with the measured pose, and the grippers
-    with their last command. Without it the first absolute action may be anywhere within the bounds, and one after a
-    stop is compared with the last action. Relative actions are compared with no motion; their grippers, which are
+    The guard checks the action's shape, that its numbers are finite and within the bounds, and that
+    it is not too far from the previous one. There is no previous action before the first one, and
+    after a stop the arm need not be where the last action commanded it. With `measure` these
+    actions are compared with the measured pose, and the grippers with their last command. Without
+    it the first absolute action may be anywhere within the bounds, and one after a stop is compared
+    with the last action. Relative actions are compared with no motion; their grippers, which are
     positions, with the last command.
 
-    With `limits`, speed, acceleration and jerk are also checked, and the position of the tip. Braking is always
-    allowed, as the robot's own stop is harder. A chunk player then eases each motion in from rest
-    (`vlagents_ray.chunking.ease`), as rows of a plan that continue at full speed could not be reached in one tick.
+    With `limits`, speed, acceleration and jerk are also checked, and the position of the tip.
+    Braking is always allowed, as the robot's own stop is harder. A chunk player then eases each
+    motion in from rest (`vlagents_ray.chunking.ease`), as rows of a plan that continue at full
+    speed could not be reached in one tick.
 
     Args:
         contract: The policy's contract, for the action's dimension and bounds; None checks neither.
-        low: Lower bound, for all numbers of an action or (D,), in the action's units; the strictest of this, the
-            contract's and that of `limits` applies. Bounds of relative actions are of the actions themselves.
+        low: Lower bound, for all numbers of an action or (D,), in the action's units; the strictest
+            of this, the contract's and that of `limits` applies. Bounds of relative actions are of
+            the actions themselves.
         high: Upper bound, as `low`.
-        max_step: Largest difference between two consecutive actions, for all numbers or (D,); None checks none.
-        measure: Returns the measured pose in an observation, (D,) in the action's order and units, e.g.
-            `lambda obs: obs.state["joints"]`; not for relative actions.
+        max_step: Largest difference between two consecutive actions, for all numbers or (D,); None
+            checks none.
+        measure: Returns the measured pose in an observation, (D,) in the action's order and units,
+            e.g. `lambda obs: obs.state["joints"]`; not for relative actions.
         limits: The limits of the robot's motion, or the path that `Limits.read` reads.
         hz: The control rate, Hz; needed with `limits`.
-        soft_start_s: The time of motion, s, within which the limits of speed, acceleration and jerk rise from half to
-            their values, since most accidents happen in the first minutes of a new checkpoint; 0 for none.
+        soft_start_s: The time of motion, s, within which the limits of speed, acceleration and jerk
+            rise from half to their values, since most accidents happen in the first minutes of a
+            new checkpoint; 0 for none.
 
     Raises:
-        ConfigError: A bound is NaN, `max_step` is negative, `measure` is given for relative actions, `limits` without
-            `hz`, or a limit that has no effect on the actions of the contract.
+        ConfigError: A bound is NaN, `max_step` is negative, `measure` is given for relative
+            actions, `limits` without `hz`, or a limit that has no effect on the actions of the
+            contract.
     """
 
     def __init__(
@@ -66,7 +74,9 @@ class Guard:
         soft_start_s: float = SOFT_START_S,
     ) -> None:
         spec = contract.action if contract is not None else ActionSpec()
-        self.limits = limits = Limits.read(limits, spec) if isinstance(limits, (str, Path)) else limits
+        self.limits = limits = (
+            Limits.read(limits, spec) if isinstance(limits, (str, Path)) else limits
+        )
         self.hz = hz
         self._spec = spec
         self._dim = spec.dim
@@ -74,20 +84,24 @@ class Guard:
         self._low = _bounds("low", np.maximum, spec.low, low, own.low)
         self._high = _bounds("high", np.minimum, spec.high, high, own.high)
         self._max_step = None if max_step is None else np.asarray(max_step, np.float64)
-        if self._max_step is not None and not (self._max_step >= 0).all():  # with NaN any step would pass
+        # With NaN any step would pass.
+        if self._max_step is not None and not (self._max_step >= 0).all():
             raise ConfigError(f"max_step: got {max_step}, want 0 or above, or None")
         if measure is not None and spec.relative:
             raise ConfigError(
-                "measure: got one for relative actions, which cannot be compared with a pose; leave it out"
+                "measure: got one for relative actions, which cannot be compared with a pose; "
+                "leave it out"
             )
         if limits is not None and (hz is None or not hz > 0 or not soft_start_s >= 0):
             raise ConfigError(
-                f"limits: got hz={hz}, soft_start_s={soft_start_s}, want the control rate, and 0 s or more"
+                f"limits: got hz={hz}, soft_start_s={soft_start_s}, want the control rate, and 0 s "
+                "or more"
             )
         self._measure = measure
         self._soft_ticks = soft_start_s * (hz or 0.0)
         self._moved = 0  # ticks of motion
-        self._columns: list[list[float]] = []  # low, high, max_step, velocity, acceleration, jerk; units and ticks
+        # low, high, max_step, velocity, acceleration, jerk; units and ticks.
+        self._columns: list[list[float]] = []
         self._grippers: list[int] = []
         self._deltas: list[int] = []
         self._then: list[float] | None = None  # the last accepted action; None at rest
@@ -121,12 +135,17 @@ class Guard:
         pose = np.array(self._measure(obs), np.float32)
         wanted = self._dim if last is None else len(last)
         if pose.ndim != 1 or wanted not in (None, len(pose)):
-            raise ConfigError(f"measure: got {pose.shape}, want ({wanted or 'D'},), as an action is")
+            raise ConfigError(
+                f"measure: got {pose.shape}, want ({wanted or 'D'},), as an action is"
+            )
         if not np.isfinite(pose).all():
-            raise InvalidAction(f"measure: got {pose.tolist()}, want finite numbers; the robot's sensors are broken")
+            raise InvalidAction(
+                f"measure: got {pose.tolist()}, want finite numbers; the robot's sensors are broken"
+            )
         if last is not None:
             self._limits_of(len(last))
-            pose[self._grippers] = last[self._grippers]  # a stop keeps the grasp, which the measured opening loosens
+            # A stop keeps the grasp, which the measured opening loosens.
+            pose[self._grippers] = last[self._grippers]
         return pose
 
     def __call__(self, action: np.ndarray, last: np.ndarray | None = None) -> np.ndarray:
@@ -134,32 +153,41 @@ class Guard:
 
         Args:
             action: The action, (D,) float32.
-            last: The action or pose from which the motion begins, (D,); None skips the checks of steps and speeds.
+            last: The action or pose from which the motion begins, (D,); None skips the checks of
+                steps and speeds.
 
         Returns:
             The action, unchanged.
 
         Raises:
-            InvalidAction: The action has a wrong shape, is not finite, exceeds a bound, or is too far from `last`.
+            InvalidAction: The action has a wrong shape, is not finite, exceeds a bound, or is too
+                far from `last`.
         """
         action = np.asarray(action)
         if action.ndim != 1 or action.dtype.kind != "f" or self._dim not in (None, len(action)):
             wanted = f"({self._dim if self._dim is not None else 'D'},) float32"
-            raise InvalidAction(f"action: got {action.shape} {action.dtype}, want {wanted}, a single row")
+            raise InvalidAction(
+                f"action: got {action.shape} {action.dtype}, want {wanted}, a single row"
+            )
         now = action.tolist()  # plain floats: for so few numbers they are faster than numpy
         if not all(map(math.isfinite, now)):
-            raise InvalidAction(f"action: got {now}, want finite numbers; the policy's output is broken")
+            raise InvalidAction(
+                f"action: got {now}, want finite numbers; the policy's output is broken"
+            )
         low, high, steps, *dynamic = self._limits_of(len(now))
         for i, number in enumerate(now):
             if not low[i] <= number <= high[i]:
                 name, limit = ("below", low[i]) if number < low[i] else ("above", high[i])
                 raise InvalidAction(
-                    f"action[{i}]: got {number:g}, {name} the limit {limit:g}; see the contract", cause="limits"
+                    f"action[{i}]: got {number:g}, {name} the limit {limit:g}; see the contract",
+                    cause="limits",
                 )
         if self.limits is not None and self.limits.chain is not None:
             self._check_workspace(self.limits, self.limits.chain.tip(now))
         if last is not None and last.shape != action.shape:
-            raise InvalidAction(f"action: got {action.shape} after {np.shape(last)}, want as many numbers as before")
+            raise InvalidAction(
+                f"action: got {action.shape} after {np.shape(last)}, want as many numbers as before"
+            )
         then = now.copy() if last is None else last.tolist()
         if last is None:  # from an unknown pose, but at rest
             self._then = None
@@ -168,7 +196,8 @@ class Guard:
         for i, number in enumerate(now):
             if abs(number - then[i]) > steps[i] + 2 * _ROUNDING * max(abs(number), abs(then[i])):
                 raise InvalidAction(
-                    f"action[{i}]: got {number:g} after {then[i]:g}, a larger step than max_step allows",
+                    f"action[{i}]: got {number:g} after {then[i]:g}, a larger step than max_step "
+                    "allows",
                     cause="max_step",
                 )
         if self.limits is not None:
@@ -176,19 +205,26 @@ class Guard:
         return action
 
     def ease_in(
-        self, start: np.ndarray | None, goal: np.ndarray, *, plan: np.ndarray | None = None, far: bool = False
+        self,
+        start: np.ndarray | None,
+        goal: np.ndarray,
+        *,
+        plan: np.ndarray | None = None,
+        far: bool = False,
     ) -> EaseIn | None:
         """Plan the ease-in from a pose at rest to an action.
 
         Args:
-            start: The pose at rest, (D,) in the action's units; None if it is unknown. Of relative actions only the
-                grippers are used.
+            start: The pose at rest, (D,) in the action's units; None if it is unknown. Of relative
+                actions only the grippers are used.
             goal: The first action, (D,).
-            plan: The rows of the plan from `goal` on, (H, D), whose speeds apply where the limits have none.
+            plan: The rows of the plan from `goal` on, (H, D), whose speeds apply where the limits
+                have none.
             far: Whether the distance is not checked.
 
         Returns:
-            The ease-in; None without limits of speed, acceleration and jerk, or from an unknown pose.
+            The ease-in; None without limits of speed, acceleration and jerk, or from an unknown
+            pose.
 
         Raises:
             InvalidAction: The action is farther from the pose than `Limits.first`.
@@ -204,7 +240,9 @@ class Guard:
         of_time = (self.limits.velocity, self.limits.acceleration, self.limits.jerk)
         if all(limit is None for limit in of_time):
             return None
-        at_once = [i for i in self._grippers if velocity[i] == acceleration[i] == jerk[i] == math.inf]
+        at_once = [
+            i for i in self._grippers if velocity[i] == acceleration[i] == jerk[i] == math.inf
+        ]
         ways = np.abs(goal.astype(np.float64) - start)
         ways[self._deltas + at_once] = 0.0
         speeds = self._speeds(goal if plan is None else plan)
@@ -220,7 +258,9 @@ class Guard:
         ticks = math.ceil(approach) if self._deltas else max(1, math.ceil(approach))
         return EaseIn(start, ticks, 2 * math.ceil(ramp / 2), deltas=self._deltas, at_once=at_once)
 
-    def _check_first(self, limits: Limits, start: np.ndarray, goal: np.ndarray, velocity: list[float]) -> None:
+    def _check_first(
+        self, limits: Limits, start: np.ndarray, goal: np.ndarray, velocity: list[float]
+    ) -> None:
         """Raise `InvalidAction` if the first action is too far from the pose at rest."""
         dim, hz = len(goal), self.hz or 0.0
         if limits.first is None:
@@ -231,8 +271,10 @@ class Guard:
             way = abs(end - begin)
             if way > allowed[i] + 2 * _ROUNDING * max(abs(begin), abs(end)):
                 raise InvalidAction(
-                    f"action[{i}]: got {end:g} as the first action, {way:g} from the pose {begin:g}, want "
-                    f"{allowed[i]:.3g} at most; is it another arm's or in another order or unit? Else raise `first`",
+                    f"action[{i}]: got {end:g} as the first action, {way:g} from the pose "
+                    f"{begin:g}, want "
+                    f"{allowed[i]:.3g} at most; is it another arm's or in another order or unit? "
+                    "Else raise `first`",
                     cause="max_step",
                 )
 
@@ -244,7 +286,9 @@ class Guard:
         return speeds
 
     def way_to_rest(self, last: np.ndarray) -> Iterator[np.ndarray]:
-        """Yield the commands, (D,) float32, of the slow way from the last one to the rest pose, if `limits` has one."""
+        """Yield the commands, (D,) float32, of the slow way from the last one to the rest pose,
+        if `limits` has one.
+        """
         if self.limits is None or self.limits.rest is None:
             return
         self._limits_of(len(last))
@@ -259,7 +303,9 @@ class Guard:
             yield command
 
     def _limits_of(self, dim: int) -> list[list[float]]:
-        """Return the limits of each number of an action; raises `ConfigError` if they do not fit its meaning."""
+        """Return the limits of each number of an action; raises `ConfigError` if they do not fit
+        its meaning.
+        """
         if not self._columns or len(self._columns[0]) != dim:
             limits, tick_s = self.limits or Limits(), 1.0 / (self.hz or 1.0)
             self._grippers = self._spec.gripper_columns(dim)
@@ -270,14 +316,20 @@ class Guard:
                     np.broadcast_to(math.inf if self._high is None else self._high, dim).tolist(),
                     _tolerant(math.inf if self._max_step is None else self._max_step, dim),
                 ]
-                for order, limit in enumerate((limits.velocity, limits.acceleration, limits.jerk), 1):
+                for order, limit in enumerate(
+                    (limits.velocity, limits.acceleration, limits.jerk), 1
+                ):
                     per_s = math.inf if limit is None else np.asarray(limit, np.float64)
                     columns.append(_tolerant(per_s * tick_s**order, dim))
                 np.broadcast_to(0.0 if limits.first is None else limits.first, dim)
             except ValueError as error:
-                raise ConfigError(f"limits: {error}; want one number, or {dim} as an action has") from error
+                raise ConfigError(
+                    f"limits: {error}; want one number, or {dim} as an action has"
+                ) from error
             if any(low > high for low, high in zip(columns[0], columns[1], strict=True)):
-                raise ConfigError(f"low and high: expected low below high, got {columns[0]} and {columns[1]}")
+                raise ConfigError(
+                    f"low and high: expected low below high, got {columns[0]} and {columns[1]}"
+                )
             self._check_places(limits, dim)
             self._columns = columns
         return self._columns
@@ -285,11 +337,16 @@ class Guard:
     def _check_places(self, limits: Limits, dim: int) -> None:
         """Raise `ConfigError` if a limit of places has no effect, or would move a gripper."""
         if limits.rest is not None and len(limits.rest) != dim:
-            raise ConfigError(f"rest: expected {dim} numbers, as an action has, got {len(limits.rest)}")
-        moved = [] if limits.rest is None else [i for i in self._grippers if limits.rest[i] is not None]
+            raise ConfigError(
+                f"rest: expected {dim} numbers, as an action has, got {len(limits.rest)}"
+            )
+        moved = (
+            [] if limits.rest is None else [i for i in self._grippers if limits.rest[i] is not None]
+        )
         if moved:
             raise ConfigError(
-                f"rest: expected null for the grippers, numbers {moved}, as the way to rest keeps what they hold; got "
+                f"rest: expected null for the grippers, numbers {moved}, as the way to rest keeps "
+                "what they hold; got "
                 f"{limits.rest}"
             )
         if not self._deltas:
@@ -302,15 +359,20 @@ class Guard:
                 without_effect.append(name)
         if without_effect:
             raise ConfigError(
-                f"limits: got {', '.join(without_effect)} for relative actions, which cannot be compared with a place; "
+                f"limits: got {', '.join(without_effect)} for relative actions, which cannot be "
+                "compared with a place; "
                 "remove them, or use a file with velocity, acceleration and jerk alone"
             )
 
     def _softness(self) -> float:
         """Return the share of the limits of speed, acceleration and jerk that applies now."""
-        return 1.0 if self._moved >= self._soft_ticks else 0.5 + 0.5 * self._moved / self._soft_ticks
+        return (
+            1.0 if self._moved >= self._soft_ticks else 0.5 + 0.5 * self._moved / self._soft_ticks
+        )
 
-    def _check_dynamics(self, now: list[float], then: list[float], limits: Sequence[list[float]]) -> None:
+    def _check_dynamics(
+        self, now: list[float], then: list[float], limits: Sequence[list[float]]
+    ) -> None:
         zeros = [0.0] * len(now)
         continues = then == self._then
         speeds, changes = (self._speed, self._change) if continues else (zeros.copy(), zeros)
@@ -320,7 +382,8 @@ class Guard:
             speeds[i] = then[i]
         share = self._softness()
         for i, (v, u, c, *limit) in enumerate(zip(moved, speeds, changes, *limits, strict=True)):
-            # An action's rounding to float32 counts twice in a speed, and twice as often in each further difference.
+            # An action's rounding to float32 counts twice in a speed, and twice as often in each
+            # further difference.
             rounding = 2 * _ROUNDING * max(abs(now[i]), abs(then[i]))
             if abs(v) > share * limit[0] + rounding:
                 raise self._refusal("velocity", i, v, share * limit[0], 1)
@@ -339,22 +402,29 @@ class Guard:
         per_s = (self.hz or 1.0) ** order
         soft = "" if self._moved >= self._soft_ticks else ", which the soft start lowers"
         return InvalidAction(
-            f"action[{i}]: got {what} {got * per_s:.4g}, want {limit * per_s:.3g} at most (units/s^{order}{soft})",
+            f"action[{i}]: got {what} {got * per_s:.4g}, want {limit * per_s:.3g} at most "
+            f"(units/s^{order}{soft})",
             cause="max_step" if order == 1 else "dynamics",
         )
 
     def _check_workspace(self, limits: Limits, tip: tuple[float, float, float]) -> None:
-        for bound, wrong, name in ((limits.workspace_low, 1, "below"), (limits.workspace_high, -1, "above")):
+        for bound, wrong, name in (
+            (limits.workspace_low, 1, "below"),
+            (limits.workspace_high, -1, "above"),
+        ):
             for axis, place, limit in zip("xyz", tip, bound or tip, strict=True):
                 if wrong * (limit - place) > 0:
                     raise InvalidAction(
-                        f"action: the tip would be at {axis} = {place:.3f} m, {name} the workspace's {limit:g} m",
+                        f"action: the tip would be at {axis} = {place:.3f} m, {name} the "
+                        f"workspace's {limit:g} m",
                         cause="limits",
                     )
 
 
 def measured_state(part: str | None) -> Callable[[Obs], np.ndarray] | None:
-    """Return a `measure` of a `Guard`: a part of the state, such as "joints"; None measures nothing."""
+    """Return a `measure` of a `Guard`: a part of the state, such as "joints"; None measures
+    nothing.
+    """
 
     def measured(obs: Obs) -> np.ndarray:
         if part not in obs.state:
@@ -364,8 +434,12 @@ def measured_state(part: str | None) -> Callable[[Obs], np.ndarray] | None:
     return None if part is None else measured
 
 
-def _bounds(name: str, stricter: np.ufunc, *given: float | np.ndarray | tuple[float, ...] | None) -> np.ndarray | None:
-    """Return the strictest of the bounds as float32, the type of actions, so that a bound of 0.1 accepts 0.1."""
+def _bounds(
+    name: str, stricter: np.ufunc, *given: float | np.ndarray | tuple[float, ...] | None
+) -> np.ndarray | None:
+    """Return the strictest of the bounds as float32, the type of actions, so that a bound of 0.1
+    accepts 0.1.
+    """
     stated = [np.asarray(one, np.float32) for one in given if one is not None]
     if any(np.isnan(one).any() for one in stated):
         raise ConfigError(f"{name}: got {given}, want numbers")
@@ -373,5 +447,7 @@ def _bounds(name: str, stricter: np.ufunc, *given: float | np.ndarray | tuple[fl
 
 
 def _tolerant(limit: float | np.ndarray, dim: int) -> list[float]:
-    """Return the limit of each number, with a tolerance, as float32 rounds a step of 0.1 to slightly more."""
+    """Return the limit of each number, with a tolerance, as float32 rounds a step of 0.1 to
+    slightly more.
+    """
     return (np.broadcast_to(limit, dim) * (1 + 1e-4) + 1e-6).tolist()  # type: ignore[no-any-return]

@@ -23,9 +23,11 @@ Measure = Callable[[Obs], np.ndarray]  # returns the robot's pose in an observat
 
 
 class OpenLeader(Protocol):
-    """The interface of a function that opens an operator's device; plug-ins register it in `vlagents_ray.leaders`.
+    """The interface of a function that opens an operator's device; plug-ins register it in
+    `vlagents_ray.leaders`.
 
-    If the leader has an attribute `help`, a line that explains how to use the device, the command line prints it.
+    If the leader has an attribute `help`, a line that explains how to use the device, the command
+    line prints it.
     """
 
     def __call__(
@@ -48,7 +50,8 @@ def leader_named(option: str, name: str) -> OpenLeader:
 
     Args:
         option: The option that names the device, such as "--leader", for errors.
-        name: A registered name, such as "keyboard", or a class "module:Class" that is made without arguments.
+        name: A registered name, such as "keyboard", or a class "module:Class" that is made without
+            arguments.
 
     Returns:
         The function, which opens the device for a contract.
@@ -79,7 +82,8 @@ def _opened(where: str, make: Callable[[], Leader]) -> Iterator[Leader]:
         raise
     except Exception as error:
         raise ConfigError(
-            f"{where}: could not be made: {type(error).__name__}: {error}; want a class that is made without arguments"
+            f"{where}: could not be made: {type(error).__name__}: {error}; want a class that is "
+            "made without arguments"
         ) from error
     if isinstance(leader, AbstractContextManager):
         with leader as entered:

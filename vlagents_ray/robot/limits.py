@@ -1,4 +1,6 @@
-"""The limits of a robot's motion: from its own file, from a dataset of demonstrations, or from a URDF."""
+"""The limits of a robot's motion: from its own file, from a dataset of demonstrations, or from a
+URDF.
+"""
 
 from __future__ import annotations
 
@@ -22,7 +24,9 @@ from vlagents_ray.yaml_text import load_yaml
 Numbers = float | tuple[float, ...]  # one for all numbers of an action, or one for each
 QUANTILE = 0.999  # of the demonstrations' speeds: a single broken frame must not set a limit
 MARGIN = 2.0
-"""Limits from a dataset are its quantiles times this. The soft start begins at half of them, i.e. at the quantiles."""
+"""Limits from a dataset are its quantiles times this. The soft start begins at half of them,
+i.e. at the quantiles.
+"""
 _PER_RAD = {"rad": 1.0, "deg": 180 / math.pi}
 _ROOM = 0.1  # share of the demonstrated range by which an action may leave it
 
@@ -32,7 +36,8 @@ class Limits:
     """The limits of the actions, (D,) in their units and order; None checks nothing.
 
     Raises:
-        ConfigError: A number is NaN or otherwise wrong, or has no effect without another field that is not set.
+        ConfigError: A number is NaN or otherwise wrong, or has no effect without another field that
+            is not set.
     """
 
     low: Numbers | None = None
@@ -41,22 +46,41 @@ class Limits:
     acceleration: Numbers | None = None  # units/s^2, of speeding up; a robot may always brake
     jerk: Numbers | None = None  # units/s^3, as `acceleration`
     first: Numbers | None = None
-    """The largest distance of the first action from the pose at rest; default: that of 0.5 s at `velocity`."""
+    """The largest distance of the first action from the pose at rest; default: that of 0.5 s at
+    `velocity`.
+    """
     rest: tuple[float | None, ...] | None = None
-    """The pose to which the arm goes slowly at the end of a run; a number that is None, as that of a gripper must be,
+    """The pose to which the arm goes slowly at the end of a run; a number that is None, as that of
+    a gripper must be,
     stays as it was commanded."""
     joints: tuple[str, ...] = ()  # the names of the action's numbers, in order
     unit: str = "rad"  # "rad" or "deg", of the joints
-    workspace_low: tuple[float, float, float] | None = None  # m, of the tip in the base frame of the URDF
+    # m, of the tip in the base frame of the URDF.
+    workspace_low: tuple[float, float, float] | None = None
     workspace_high: tuple[float, float, float] | None = None
     chain: Chain | None = None  # from joints to the tip
 
     def __post_init__(self) -> None:
-        for name in ("low", "high", "velocity", "acceleration", "jerk", "first", "workspace_low", "workspace_high"):
+        for name in (
+            "low",
+            "high",
+            "velocity",
+            "acceleration",
+            "jerk",
+            "first",
+            "workspace_low",
+            "workspace_high",
+        ):
             numbers = _numbers(name, getattr(self, name))
             if name in ("velocity", "acceleration", "jerk", "first") and (numbers < 0).any():
-                raise ConfigError(f"{name}: expected numbers of 0 or more, got {getattr(self, name)}")
-            if name.startswith("workspace") and getattr(self, name) is not None and numbers.shape != (3,):
+                raise ConfigError(
+                    f"{name}: expected numbers of 0 or more, got {getattr(self, name)}"
+                )
+            if (
+                name.startswith("workspace")
+                and getattr(self, name) is not None
+                and numbers.shape != (3,)
+            ):
                 raise ConfigError(f"{name}: expected x, y and z in m, got {getattr(self, name)}")
         poses = () if self.rest is None else [number for number in self.rest if number is not None]
         if not np.isfinite(_numbers("rest", poses)).all():
@@ -66,14 +90,17 @@ class Limits:
 
     @classmethod
     def read(cls, path: str | Path, action: ActionSpec | None = None) -> Limits:
-        """Read limits from a `.yaml` or `.json` file, a `.urdf` file, or the folder of a LeRobotDataset v3.0.
+        """Read limits from a `.yaml` or `.json` file, a `.urdf` file, or the folder of a
+        LeRobotDataset v3.0.
 
-        The keys of a YAML or JSON file are the fields of this class, without `chain`, and further `urdf`, a file beside
-        it whose limits also apply, and `tip`, the link that the workspace is for.
+        The keys of a YAML or JSON file are the fields of this class, without `chain`, and further
+        `urdf`, a file beside it whose limits also apply, and `tip`, the link that the workspace is
+        for.
 
         Args:
             path: The file or folder.
-            action: The meaning of the actions of a dataset that does not contain it; default: absolute targets.
+            action: The meaning of the actions of a dataset that does not contain it; default:
+                absolute targets.
 
         Returns:
             The limits of the file; those of a dataset allow somewhat more than its demonstrations.
@@ -89,9 +116,18 @@ class Limits:
             if path.suffix == ".urdf":
                 return cls._of_urdf(path, (), None, 1.0)
             return cls._of_document(path, _document(path))
-        except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError, ET.ParseError) as error:
+        except (
+            OSError,
+            ValueError,
+            KeyError,
+            TypeError,
+            AttributeError,
+            RecursionError,
+            ET.ParseError,
+        ) as error:
             raise ConfigError(
-                f"limits {path}: {type(error).__name__}: {error}; want a .yaml or .json file of limits, a .urdf, or a "
+                f"limits {path}: {type(error).__name__}: {error}; want a .yaml or .json file of "
+                "limits, a .urdf, or a "
                 f"LeRobotDataset v3.0; see docs/control_loop.md"
             ) from error
 
@@ -108,23 +144,30 @@ class Limits:
         bounds_workspace = limits.workspace_low is not None or limits.workspace_high is not None
         if bounds_workspace != (tip is not None) or (tip is not None and urdf is None):
             raise ConfigError(
-                "tip, urdf and workspace: expected `tip` and `urdf` with `workspace_low` or `workspace_high`, as each "
+                "tip, urdf and workspace: expected `tip` and `urdf` with `workspace_low` or "
+                "`workspace_high`, as each "
                 "has no effect without the others; add what is missing, or remove the rest"
             )
         if urdf is None:
             if "unit" in document:
                 raise ConfigError(
-                    "unit: expected `urdf` with it, whose numbers it converts; got none, and limits are in the units "
+                    "unit: expected `urdf` with it, whose numbers it converts; got none, and "
+                    "limits are in the units "
                     "of the actions; remove `unit`"
                 )
             return limits
-        return limits.stricter(cls._of_urdf(path.parent / urdf, limits.joints, tip, _PER_RAD[limits.unit]))
+        return limits.stricter(
+            cls._of_urdf(path.parent / urdf, limits.joints, tip, _PER_RAD[limits.unit])
+        )
 
     def bounds(self, dim: int) -> tuple[np.ndarray, np.ndarray]:
-        """Return `low` and `high`, (dim,) each; infinite where none is set, and for another number of joints."""
+        """Return `low` and `high`, (dim,) each; infinite where none is set, and for another
+        number of joints.
+        """
         ends, fitting = ((self.low, -np.inf), (self.high, np.inf)), ((), (dim,))
         low, high = (
-            np.broadcast_to(one if one is not None and np.shape(one) in fitting else free, dim) for one, free in ends
+            np.broadcast_to(one if one is not None and np.shape(one) in fitting else free, dim)
+            for one, free in ends
         )
         return low, high
 
@@ -135,10 +178,15 @@ class Limits:
             a, b = getattr(self, name), getattr(other, name)
             if a is None or b is None:
                 return b if a is None else a  # type: ignore[no-any-return]
-            return tuple((np.maximum if name == "low" else np.minimum)(*np.broadcast_arrays(a, b)).ravel().tolist())
+            return tuple(
+                (np.maximum if name == "low" else np.minimum)(*np.broadcast_arrays(a, b))
+                .ravel()
+                .tolist()
+            )
 
         bounds = {name: least(name) for name in ("low", "high", "velocity", "acceleration", "jerk")}
-        return replace(self, chain=self.chain or other.chain, joints=self.joints or other.joints, **bounds)  # type: ignore[arg-type]
+        chain, joints = self.chain or other.chain, self.joints or other.joints
+        return replace(self, chain=chain, joints=joints, **bounds)  # type: ignore[arg-type]
 
     @classmethod
     def _of_dataset(cls, folder: Path, action: ActionSpec | None) -> Limits:
@@ -189,16 +237,26 @@ class Limits:
     @classmethod
     def _of_urdf(cls, file: Path, joints: Sequence[str], tip: str | None, scale: float) -> Limits:
         robot = ET.parse(file).getroot()  # noqa: S314 - a file of this robot's owner
-        elements = {one.attrib["name"]: one for one in robot.iter("joint") if one.find("child") is not None}
-        names = [*joints] or [name for name, one in elements.items() if one.attrib["type"] != "fixed"]
+        elements = {
+            one.attrib["name"]: one for one in robot.iter("joint") if one.find("child") is not None
+        }
+        names = [*joints] or [
+            name for name, one in elements.items() if one.attrib["type"] != "fixed"
+        ]
         if unknown := sorted(set(names) - set(elements)):
-            raise ConfigError(f"{file}: has no joints {unknown}, has {sorted(elements)}; name them in `joints`")
+            raise ConfigError(
+                f"{file}: has no joints {unknown}, has {sorted(elements)}; name them in `joints`"
+            )
 
         def stated(name: str, key: str, default: float) -> float:
             joint = elements[name]
             limit, unit = joint.find("limit"), 1.0 if joint.attrib["type"] == "prismatic" else scale
-            bounded = limit is not None and (key == "velocity" or joint.attrib["type"] != "continuous")
-            value = float(limit.attrib.get(key, default)) if limit is not None and bounded else default
+            bounded = limit is not None and (
+                key == "velocity" or joint.attrib["type"] != "continuous"
+            )
+            value = (
+                float(limit.attrib.get(key, default)) if limit is not None and bounded else default
+            )
             return (value or default) * unit if key == "velocity" else value * unit
 
         return cls(
@@ -211,14 +269,21 @@ class Limits:
 
 
 class Chain:
-    """The forward kinematics from joints to the position of a link, in plain floats: numpy is slower for one point."""
+    """The forward kinematics from joints to the position of a link, in plain floats: numpy is
+    slower for one point.
+    """
 
-    def __init__(self, joints: Mapping[str, Any], tip: str, names: Sequence[str], to_rad: float) -> None:
-        """Read the joints from the base to the link `tip`; `names` are those of an action's numbers, in order."""
+    def __init__(
+        self, joints: Mapping[str, Any], tip: str, names: Sequence[str], to_rad: float
+    ) -> None:
+        """Read the joints from the base to the link `tip`; `names` are those of an action's
+        numbers, in order.
+        """
         parents = {one.find("child").attrib["link"]: (name, one) for name, one in joints.items()}
         if tip not in parents:
             raise ConfigError(f"tip: got {tip!r}, want one of the links {sorted(parents)}")
-        self._links: list[tuple[list[float], list[float], list[float], int, bool]] = []  # from the tip to the base
+        # From the tip to the base.
+        self._links: list[tuple[list[float], list[float], list[float], int, bool]] = []
         self._to_rad = to_rad
         while tip in parents:
             name, one = parents[tip]
@@ -248,7 +313,11 @@ class Chain:
                     z * c + (ax * y - ay * x) * s + az * along,
                 )
             a, b, c, d, e, f, g, h, i = turn
-            x, y, z = a * x + b * y + c * z + ox, d * x + e * y + f * z + oy, g * x + h * y + i * z + oz
+            x, y, z = (
+                a * x + b * y + c * z + ox,
+                d * x + e * y + f * z + oy,
+                g * x + h * y + i * z + oz,
+            )
         return x, y, z
 
 
@@ -270,7 +339,8 @@ def _three(text: str) -> list[float]:
 
 
 def _path(actions: np.ndarray, deltas: list[int]) -> np.ndarray:
-    """Return the path of an episode's actions, (T, D); with deltas (T + 3, D), their sum, which begins at rest.
+    """Return the path of an episode's actions, (T, D); with deltas (T + 3, D), their sum, which
+    begins at rest.
 
     The differences of a path are speeds for both kinds of actions.
     """
@@ -284,16 +354,26 @@ def _path(actions: np.ndarray, deltas: list[int]) -> np.ndarray:
 
 
 def _numbers(name: str, value: object) -> np.ndarray:
-    """Return the number, or the numbers of a list, of a limit; none for None. Raises `ConfigError` for others."""
-    values = [] if value is None else value if isinstance(value, (tuple, list, np.ndarray)) else [value]
+    """Return the number, or the numbers of a list, of a limit; none for None. Raises
+    `ConfigError` for others.
+    """
+    values = (
+        [] if value is None else value if isinstance(value, (tuple, list, np.ndarray)) else [value]
+    )
     for number in values:
-        if isinstance(number, bool) or not isinstance(number, (int, float, np.number)) or math.isnan(number):
+        if (
+            isinstance(number, bool)
+            or not isinstance(number, (int, float, np.number))
+            or math.isnan(number)
+        ):
             raise ConfigError(f"{name}: expected numbers, got {number!r} in {value}")
     return np.array(values, np.float64)
 
 
 def _value(key: str, value: Any) -> Any:
-    """Return the value of a key of a file, where null in a list is no limit, or a number of `rest` that stays."""
+    """Return the value of a key of a file, where null in a list is no limit, or a number of
+    `rest` that stays.
+    """
     if not isinstance(value, list):
         return value
     unlimited = -math.inf if key in ("low", "workspace_low") else math.inf

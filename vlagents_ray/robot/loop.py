@@ -23,7 +23,18 @@ from vlagents_ray.chunking.fallback import Cause, Held
 from vlagents_ray.client.commands import CommandInbox
 from vlagents_ray.contract import Contract, require_match
 from vlagents_ray.errors import ConfigError, InvalidAction, VLAgentsError
-from vlagents_ray.interface import CAPTURED, CAUSE, INTERVENTION, PLANNED, SAFE, SILENT, WANTED, Act, Agent, Obs
+from vlagents_ray.interface import (
+    CAPTURED,
+    CAUSE,
+    INTERVENTION,
+    PLANNED,
+    SAFE,
+    SILENT,
+    WANTED,
+    Act,
+    Agent,
+    Obs,
+)
 from vlagents_ray.naming import did_you_mean
 from vlagents_ray.registry import names, not_installed, registered_class
 from vlagents_ray.robot.fit import Fit, Trained
@@ -45,17 +56,19 @@ ROBOT = ("observe", "apply", "stop")  # the methods of a `Robot`
 class Robot(Protocol):
     """The interface of a robot that the control loop drives.
 
-    A simulated robot may have the attribute `simulated = True`: it starts again by itself after a stop (see `restart`
-    of `run_loop`). A robot may have an attribute `holds`, the reason why it must not move now, such as a camera that
-    hangs. While it is not None the robot is stopped; then the loop continues with a new observation. A class around
-    another robot derives from `vlagents_ray.robot.wrapper.RobotWrapper`, which keeps these attributes.
+    A simulated robot may have the attribute `simulated = True`: it starts again by itself after a
+    stop (see `restart` of `run_loop`). A robot may have an attribute `holds`, the reason why it
+    must not move now, such as a camera that hangs. While it is not None the robot is stopped; then
+    the loop continues with a new observation. A class around another robot derives from
+    `vlagents_ray.robot.wrapper.RobotWrapper`, which keeps these attributes.
 
-    `vlagents-ray robot` and the check of a robot use further attributes of a robot that has them: `contract`, what it
-    gives and takes; `joint_names`, its joints in the order of an action, without grippers; `joint_limits`, (D, 2) in
-    their units; `dates_pictures`, whether `captured_at` is from the time stamps of its sensors, so that a camera that
-    hangs is found by them; of a simulated one `operator`, which answers the check in place of the person at the robot,
-    and `clock`, the module `time` of its simulation; and `close`, called at the end. A robot that is a context manager
-    is entered before its first use and left at the end, in place of `close`.
+    `vlagents-ray robot` and the check of a robot use further attributes of a robot that has them:
+    `contract`, what it gives and takes; `joint_names`, its joints in the order of an action,
+    without grippers; `joint_limits`, (D, 2) in their units; `dates_pictures`, whether `captured_at`
+    is from the time stamps of its sensors, so that a camera that hangs is found by them; of a
+    simulated one `operator`, which answers the check in place of the person at the robot, and
+    `clock`, the module `time` of its simulation; and `close`, called at the end. A robot that is a
+    context manager is entered before its first use and left at the end, in place of `close`.
     """
 
     def observe(self) -> Obs:
@@ -69,33 +82,51 @@ class Robot(Protocol):
         """
 
     def stop(self) -> None:
-        """Bring the robot to rest from any state; may be called repeatedly, and from another thread."""
+        """Bring the robot to rest from any state; may be called repeatedly, and from another
+        thread.
+        """
 
 
 def contract_of(robot: Robot) -> Contract:
-    """Return what a robot states of itself, with the names of its joints; empty if it states nothing."""
-    stated, names = getattr(robot, "contract", None) or Contract(), tuple(getattr(robot, "joint_names", ()))
-    return replace(stated, action=replace(stated.action, names=stated.action.names or names or None))
+    """Return what a robot states of itself, with the names of its joints; empty if it states
+    nothing.
+    """
+    stated, names = (
+        getattr(robot, "contract", None) or Contract(),
+        tuple(getattr(robot, "joint_names", ())),
+    )
+    return replace(
+        stated, action=replace(stated.action, names=stated.action.names or names or None)
+    )
 
 
 def fit_of(
-    agent: Agent, robot: Robot, limits: Limits | None = None, *, trained: Trained | None = None, accept: bool = False
+    agent: Agent,
+    robot: Robot,
+    limits: Limits | None = None,
+    *,
+    trained: Trained | None = None,
+    accept: bool = False,
 ) -> Fit:
-    """Compare a policy's contract with a robot's, and return the comparison of their numbers for the first motion.
+    """Compare a policy's contract with a robot's, and return the comparison of their numbers for
+    the first motion.
 
     Args:
         agent: The policy, after `initialize`.
         robot: The robot.
         limits: The limits of the robot.
-        trained: The ranges of the policy's training; default: those of `agent.statistics`. A simulated robot without a
-            contract is not compared with them, as it follows numbers of any unit.
+        trained: The ranges of the policy's training; default: those of `agent.statistics`. A
+            simulated robot without a contract is not compared with them, as it follows numbers of
+            any unit.
         accept: Whether numbers that do not fit are only logged.
 
     Raises:
         ContractMismatch: The contracts differ.
     """
     require_match(agent.contract, contract_of(robot))
-    has_units = not getattr(robot, "simulated", False) or getattr(robot, "contract", None) is not None
+    has_units = (
+        not getattr(robot, "simulated", False) or getattr(robot, "contract", None) is not None
+    )
     if trained is None:
         trained = Trained.from_statistics(agent.statistics or {}) if has_units else Trained()
     contract = agent.contract or Contract()
@@ -103,12 +134,15 @@ def fit_of(
     return Fit(trained, limits, tuple(getattr(robot, "joint_names", ())), parts, accept)
 
 
-def robot_watchdog(robot: Robot, stop: Callable[[str], None], silent_s: dict[str, float]) -> Watchdog:
+def robot_watchdog(
+    robot: Robot, stop: Callable[[str], None], silent_s: dict[str, float]
+) -> Watchdog:
     """Return a watchdog that also watches the robot's own sources.
 
     Args:
-        robot: The robot. Its attribute `silent_s`, if any, has further sources and their longest silences, s; its
-            attribute `watchdog`, if any, is set, so that the robot records their signs of life.
+        robot: The robot. Its attribute `silent_s`, if any, has further sources and their longest
+            silences, s; its attribute `watchdog`, if any, is set, so that the robot records their
+            signs of life.
         stop: As of `Watchdog`.
         silent_s: As of `Watchdog`.
     """
@@ -130,11 +164,14 @@ def import_class(option: str, name: str, methods: Sequence[str] = ()) -> Any:
         imported = importlib.import_module(module)
     except (ImportError, ValueError) as error:
         raise ConfigError(
-            f"{option} {name}: {error}; go to the folder of its module ({os.getcwd()} is this one), add that to "
+            f"{option} {name}: {error}; go to the folder of its module ({os.getcwd()} is this "
+            "one), add that to "
             f"PYTHONPATH, or install it"
         ) from error
     except Exception as error:  # whatever the module raises, a syntax error among them
-        raise ConfigError(f"{option} {name}: {type(error).__name__}: {error}; correct the module {module!r}") from error
+        raise ConfigError(
+            f"{option} {name}: {type(error).__name__}: {error}; correct the module {module!r}"
+        ) from error
     if (found := getattr(imported, attribute, None)) is None:
         public = [known for known in vars(imported) if not known.startswith("_")]
         guess = did_you_mean(attribute, public) or "; write the name of a class in it"
@@ -146,20 +183,26 @@ def _with_methods(where: str, cls: Any, methods: Sequence[str]) -> Any:
     """Return the class; raises `ConfigError` if it lacks one of the methods."""
     missing = [method for method in methods if not callable(getattr(cls, method, None))]
     if missing:
-        raise ConfigError(f"{where}: lacks {', '.join(missing)}; want a class with {', '.join(methods)}")
+        raise ConfigError(
+            f"{where}: lacks {', '.join(missing)}; want a class with {', '.join(methods)}"
+        )
     return cls
 
 
 def robot_named(option: str, name: str, settings: Iterable[str] = ()) -> Callable[..., Robot]:
-    """Return what makes a robot: "module:Class", or a registered name and its argument, "mujoco:so101".
+    """Return what makes a robot: "module:Class", or a registered name and its argument,
+    "mujoco:so101".
 
-    The `settings` are further arguments as KEY=VALUE, of which the value is JSON or else text. Raises `ConfigError`.
+    The `settings` are further arguments as KEY=VALUE, of which the value is JSON or else text.
+    Raises `ConfigError`.
     """
     given: dict[str, Any] = {}
     for text in settings:
         key, equals, value = text.partition("=")
         if not equals:
-            raise ConfigError(f"{option}-set: got {text!r}, want KEY=VALUE, as in port=/dev/ttyACM0")
+            raise ConfigError(
+                f"{option}-set: got {text!r}, want KEY=VALUE, as in port=/dev/ttyACM0"
+            )
         try:
             given[key] = json.loads(value)
         except json.JSONDecodeError:
@@ -167,7 +210,10 @@ def robot_named(option: str, name: str, settings: Iterable[str] = ()) -> Callabl
     registered, _, argument = name.partition(":")
     make: Callable[..., Robot]
     if registered in names("robots") or registered in not_installed("robots"):
-        make = partial(_with_methods(f"{option} {name}", registered_class("robots", registered), ROBOT), argument)
+        make = partial(
+            _with_methods(f"{option} {name}", registered_class("robots", registered), ROBOT),
+            argument,
+        )
     else:
         make = import_class(option, name, ROBOT)
     require_arguments(f"{option} {name}", make, given)
@@ -176,7 +222,8 @@ def robot_named(option: str, name: str, settings: Iterable[str] = ()) -> Callabl
 
 @contextlib.contextmanager
 def opened(make: Callable[[], Robot]) -> Iterator[Robot]:
-    """Yield a new robot, which is closed at the end: it is a context manager, or has `close`, or needs neither.
+    """Yield a new robot, which is closed at the end: it is a context manager, or has `close`, or
+    needs neither.
 
     Raises:
         ConfigError: It cannot be made.
@@ -188,7 +235,8 @@ def opened(make: Callable[[], Robot]) -> Iterator[Robot]:
     except Exception as error:
         logger.info("robot: could not be made", exc_info=True)
         raise ConfigError(
-            f"robot: could not be made: {type(error).__name__}: {error}; check its arguments (--robot-set), its cables "
+            f"robot: could not be made: {type(error).__name__}: {error}; check its arguments "
+            "(--robot-set), its cables "
             f"and its power, or correct its class"
         ) from error
     with contextlib.ExitStack() as stack:
@@ -201,19 +249,24 @@ def opened(make: Callable[[], Robot]) -> Iterator[Robot]:
 
 @dataclass(slots=True)
 class LoopReport:
-    """The outcome of a run of the control loop: its timing, and the ticks without an action of the policy."""
+    """The outcome of a run of the control loop: its timing, and the ticks without an action of
+    the policy.
+    """
 
     hz: float
     jitter: dict[str, float] = field(default_factory=dict)  # see `vlagents_ray.robot.pacing.jitter`
     work_p50_ms: float = 0.0  # from the due time of a tick to its applied action
     work_p99_ms: float = 0.0
     apply_p50_ms: float = 0.0  # of `robot.apply` alone
-    safe: dict[Cause, int] = field(default_factory=dict)  # ticks with the safe action or without any, by cause
-    reasons: dict[Cause, str] = field(default_factory=dict)  # the first reason of each cause, in words
+    # Ticks with the safe action or without any, by cause.
+    safe: dict[Cause, int] = field(default_factory=dict)
+    # The first reason of each cause, in words.
+    reasons: dict[Cause, str] = field(default_factory=dict)
     waiting: int = 0  # ticks at which the robot held still, with all rows used up and no new answer
     barks: list[str] = field(default_factory=list)  # reasons of stops by the watchdog or a command
     interventions: int = 0  # ticks at which an operator moved the robot
-    paused: int = 0  # ticks at which the robot was paused (see `vlagents_ray.chunking.control`); not among `safe`
+    # Ticks at which the robot was paused (see `vlagents_ray.chunking.control`); not among `safe`.
+    paused: int = 0
     done: bool = False  # the policy considered its task finished
     means: list[str] = field(default_factory=list)  # the measures taken against jitter
     outcome: str = ""  # "success" or "failure", if it was marked on the live page
@@ -225,7 +278,9 @@ class LoopReport:
 
     @property
     def mostly_safe(self) -> str | None:
-        """A warning with its cure if more than half of the ticks had no action of the policy; else None."""
+        """A warning with its cure if more than half of the ticks had no action of the policy;
+        else None.
+        """
         ticks = int(self.jitter.get("ticks", 0))
         if 2 * self.safe_ticks <= ticks:
             return None
@@ -233,8 +288,10 @@ class LoopReport:
         if self.waiting >= self.safe.get(cause, 0):
             cause = "waiting"
         return (
-            f"the policy hardly drove the robot: {self.safe_ticks} of {ticks} ticks had no action of it, most often: "
-            f"{self.reasons.get(cause, cause)}. If answers come too late, use a lower rate (hz), a policy with longer "
+            f"the policy hardly drove the robot: {self.safe_ticks} of {ticks} ticks had no action "
+            "of it, most often: "
+            f"{self.reasons.get(cause, cause)}. If answers come too late, use a lower rate (hz), a "
+            "policy with longer "
             "chunks, or let a tick wait for its answer (deadline_s, --deadline-ms)"
         )
 
@@ -245,7 +302,8 @@ class LoopReport:
         if self.apply_p50_ms <= tick_ms / 2:
             return None
         return (
-            f"apply takes {self.apply_p50_ms:.3g} ms of a tick of {tick_ms:.3g} ms: send the command and return, do "
+            f"apply takes {self.apply_p50_ms:.3g} ms of a tick of {tick_ms:.3g} ms: send the "
+            "command and return, do "
             "not wait until the arm is there"
         )
 
@@ -285,49 +343,59 @@ def run_loop(
     fit: Fit | None = None,
     report: LoopReport | None = None,
 ) -> LoopReport:
-    """Reset an agent and let it drive a robot at a fixed rate, until it is done or the time is over.
+    """Reset an agent and let it drive a robot at a fixed rate, until it is done or the time is
+    over.
 
-    With the rest pose of `Guard.limits`, the robot goes there slowly after a run that ended without a stop, a pause, a
-    mark or an exception; a mark may come from afar, from where a robot can only be made to stop. A stop ends this
-    motion as it ends any other. The schedule is
-    absolute, so there is no drift; a tick that is over before it could begin is skipped and counted as
-    missed. `robot.stop()` is called however the loop ends. If more than half of the ticks had no action of the policy,
-    `LoopReport.mostly_safe` is logged as a warning. Signals such as SIGTERM end the loop if the caller turns them into
-    an exception.
+    With the rest pose of `Guard.limits`, the robot goes there slowly after a run that ended without
+    a stop, a pause, a mark or an exception; a mark may come from afar, from where a robot can only
+    be made to stop. A stop ends this motion as it ends any other. The schedule is
+    absolute, so there is no drift; a tick that is over before it could begin is skipped and counted
+    as missed. `robot.stop()` is called however the loop ends. If more than half of the ticks had no
+    action of the policy, `LoopReport.mostly_safe` is logged as a warning. Signals such as SIGTERM
+    end the loop if the caller turns them into an exception.
 
     Args:
         robot: The robot.
-        agent: The policy. Its actions must be single rows, (D,); a `ChunkPlayer` turns chunks into rows.
+        agent: The policy. Its actions must be single rows, (D,); a `ChunkPlayer` turns chunks into
+            rows.
         hz: The control rate, Hz.
         seconds: The length of the run, s; None runs until the policy or `until` ends it.
         instruction: The task in words.
         reset_options: Further arguments of `agent.reset`.
-        guard: Checks every action; a refused one ends the loop. The default is the agent's own `check`, such as a chunk
-            player's, which continues with a safe action instead; else a guard of the agent's contract.
-        watchdog: Runs during the loop. Each tick is a sign of life of "loop", and the agent's answers
-            (`act.info["silent_s"]`) are those of "server". After it has stopped the robot, nothing is commanded until
-            motion is restarted, in this run or a later one. A chunk player then has discarded its plan
-            (`ChunkPlayer.interrupt`), so that the first command is computed from new observations; a guard with
-            `measure` compares it with the measured pose.
-        restart: With "manual", `watchdog.restart()` restarts motion; only an operator who sees the robot may call it,
-            and it has no effect while the silence lasts. With "auto" the end of the silence restarts it; a stop by a
-            command still needs the call. The default is "auto" for a simulated robot and "manual" for any other.
-        recorder: Records the run as one episode, also if it ends by an exception. A player with `override` needs a
-            recorder with `interventions=True`.
+        guard: Checks every action; a refused one ends the loop. The default is the agent's own
+            `check`, such as a chunk player's, which continues with a safe action instead; else a
+            guard of the agent's contract.
+        watchdog: Runs during the loop. Each tick is a sign of life of "loop", and the agent's
+            answers (`act.info["silent_s"]`) are those of "server". After it has stopped the robot,
+            nothing is commanded until motion is restarted, in this run or a later one. A chunk
+            player then has discarded its plan (`ChunkPlayer.interrupt`), so that the first command
+            is computed from new observations; a guard with `measure` compares it with the measured
+            pose.
+        restart: With "manual", `watchdog.restart()` restarts motion; only an operator who sees the
+            robot may call it, and it has no effect while the silence lasts. With "auto" the end of
+            the silence restarts it; a stop by a command still needs the call. The default is "auto"
+            for a simulated robot and "manual" for any other.
+        recorder: Records the run as one episode, also if it ends by an exception. A player with
+            `override` needs a recorder with `interventions=True`.
         viewer: Shows the run as one episode (see `vlagents_ray.viewers`).
         real_time: Run the thread with SCHED_FIFO (see `vlagents_ray.robot.pacing.undisturbed`).
-        until: Ends the loop when it returns True; called before each tick, and after the last one. This is not a stop:
+        until: Ends the loop when it returns True; called before each tick, and after the last one.
+            This is not a stop:
             with a rest pose the robot goes there. Use `Watchdog.trip` or `Control.stop` for a stop.
-        commands: The commands of the live page, from `RemoteAgent(url, commands=...)`: pause, stop, mark.
-        fit: The comparison of policy and robot, for misfits that are accepted; default: `fit_of(agent, robot, limits)`.
-        report: A new report, which is also filled if the loop ends by an exception; by default one is made.
+        commands: The commands of the live page, from `RemoteAgent(url, commands=...)`: pause, stop,
+            mark.
+        fit: The comparison of policy and robot, for misfits that are accepted; default:
+            `fit_of(agent, robot, limits)`.
+        report: A new report, which is also filled if the loop ends by an exception; by default one
+            is made.
 
     Returns:
         The timing of the loop, and the reasons of the ticks without an action of the policy.
 
     Raises:
-        ConfigError: `hz`, `seconds` or `restart` has a wrong value, `guard` differs from the agent's own or has limits
-            for another rate, or the recorder has no columns for interventions.
+        ConfigError: `hz`, `seconds` or `restart` has a wrong value, `guard` differs from the
+            agent's own or has limits for another rate, or the recorder has no columns for
+            interventions.
         ContractMismatch: Before the first motion of the policy: it does not fit the robot.
         InvalidAction: An action is a chunk, or the guard refuses it.
     """
@@ -340,7 +408,13 @@ def run_loop(
     # The shared state of this robot: the player's, else the watchdog's, else that of the commands.
     control: Control | None = agent.control
     if control is None:
-        control = watchdog.control if watchdog is not None else commands.control if commands is not None else Control()
+        control = (
+            watchdog.control
+            if watchdog is not None
+            else commands.control
+            if commands is not None
+            else Control()
+        )
     if watchdog is not None:
         watchdog.share(control)
     if commands is not None and commands.control is not control:
@@ -348,19 +422,26 @@ def run_loop(
         commands.control = control
     if control.leader is not None and recorder is not None and not recorder.interventions:
         raise ConfigError(
-            "recorder: got one without interventions for a player with override=; want Recorder(…, interventions=True)"
+            "recorder: got one without interventions for a player with override=; want Recorder(…, "
+            "interventions=True)"
         )
     report = report or LoopReport(hz)
     stops = len(control.stops)
     agent.initialize()
     own = agent.check if isinstance(agent.check, Guard) else None
     if guard is not None and own is not None and own is not guard:
-        raise ConfigError("guard: got one besides the agent's own check=, want one of them; leave one out")
+        raise ConfigError(
+            "guard: got one besides the agent's own check=, want one of them; leave one out"
+        )
     guard = guard or own or Guard(agent.contract)
     if guard.hz not in (None, hz):
-        raise ConfigError(f"guard: got limits for {guard.hz} Hz in a loop of {hz} Hz, want the same rate")
+        raise ConfigError(
+            f"guard: got limits for {guard.hz} Hz in a loop of {hz} Hz, want the same rate"
+        )
     fit = fit or fit_of(agent, robot, guard.limits)
-    run = _Run(robot, agent, control, guard, watchdog, recorder, commands, LoopView(viewer), report, fit)
+    run = _Run(
+        robot, agent, control, guard, watchdog, recorder, commands, LoopView(viewer), report, fit
+    )
     with contextlib.ExitStack() as stack:
         control.begin(auto=restart == "auto")
         try:
@@ -406,7 +487,9 @@ class _Run:
     apply_s: deque[float] = field(default_factory=lambda: deque(maxlen=KEPT_TICKS))
 
     def drive(self, pacer: Pacer, seconds: float | None, until: Callable[[], bool]) -> None:
-        """Run ticks until the policy, `until`, a mark or the time ends it; the report gets the timing in any case."""
+        """Run ticks until the policy, `until`, a mark or the time ends it; the report gets the
+        timing in any case.
+        """
         work_s: deque[float] = deque(maxlen=KEPT_TICKS)
         collected = time.monotonic()
         ticks = None if seconds is None else max(1, round(seconds / pacer.period_s))
@@ -426,7 +509,8 @@ class _Run:
                 act = self.agent.act(obs)
                 if act.action.ndim != 1:
                     raise InvalidAction(
-                        f"action: got {act.action.shape}, want one row; wrap the agent in a ChunkPlayer"
+                        f"action: got {act.action.shape}, want one row; wrap the agent in a "
+                        "ChunkPlayer"
                     )
                 self.report.done = act.done
                 # Before this tick counts as a sign of life: it may be late.
@@ -451,7 +535,12 @@ class _Run:
                     if self.recorder is not None:
                         wanted = act.info.get(WANTED)
                         self.recorder.add(
-                            obs, action, tick=tick, safe=SAFE in act.info, intervention=led, wanted=wanted
+                            obs,
+                            action,
+                            tick=tick,
+                            safe=SAFE in act.info,
+                            intervention=led,
+                            wanted=wanted,
                         )
                     self.view.add(obs, act, action, tick, work_s[-1])
         finally:
@@ -462,7 +551,9 @@ class _Run:
                 self.report.work_p99_ms = float(np.quantile(work_s, 0.99)) * 1e3
 
     def go_to_rest(self, pacer: Pacer) -> None:
-        """Move slowly to the guard's rest pose, unless the robot is held or the episode was marked."""
+        """Move slowly to the guard's rest pose, unless the robot is held or the episode was
+        marked.
+        """
         if (last := self.last) is None or self.standing:
             return
         try:
@@ -470,7 +561,11 @@ class _Run:
                 pacer.wait()
                 _observed(self.robot)  # so that the robot can tell that it must not move (`holds`)
                 self.control.update()
-                if self._held(Act(last)) is not None or self.control.state == "human" or self.control.over:
+                if (
+                    self._held(Act(last)) is not None
+                    or self.control.state == "human"
+                    or self.control.over
+                ):
                     break
                 if self.watchdog is not None:
                     self.watchdog.heard("loop")
@@ -489,11 +584,16 @@ class _Run:
         if held is None and why is not None:
             return Held("robot", str(why))
         # The cause of a safe action may have ended after the player's decision.
-        return safe if held is None and safe is not None and safe.cause in ("stopped", "paused") else held
+        return (
+            safe
+            if held is None and safe is not None and safe.cause in ("stopped", "paused")
+            else held
+        )
 
     def _stop(self, why: Held) -> None:
         if not self.standing:
-            self.robot.stop()  # again, as the watchdog may have stopped it just before the last action
+            # again, as the watchdog may have stopped it just before the last action.
+            self.robot.stop()
         self.standing = True
         self.agent.interrupt()
         self.report.count(why)
@@ -511,7 +611,9 @@ class _Run:
             self.fit.require(None, act.info.get(PLANNED, action[np.newaxis]))
             self.fit = None
         if self.agent.check is not self.guard:  # else it was checked before `act` returned
-            action = self.guard(action, self.guard.reference(obs, self.last) if self.standing else self.last)
+            action = self.guard(
+                action, self.guard.reference(obs, self.last) if self.standing else self.last
+            )
         if (stop := self._command(action)) is not None:
             return None, stop
         if safe is not None:
@@ -519,7 +621,9 @@ class _Run:
         return action, None
 
     def _command(self, action: np.ndarray) -> Held | None:
-        """Apply an action, unless the robot has been stopped since this tick's check; return why it was not applied."""
+        """Apply an action, unless the robot has been stopped since this tick's check; return why
+        it was not applied.
+        """
         with self.control.command() as held:
             if held is not None:
                 return held
@@ -533,7 +637,9 @@ class _Run:
 
 
 def _safe(act: Act) -> Held | None:
-    """Return why the action of an agent is the safe one; None if it is the policy's or an operator's."""
+    """Return why the action of an agent is the safe one; None if it is the policy's or an
+    operator's.
+    """
     return Held(act.info.get(CAUSE, "other"), str(act.info[SAFE])) if SAFE in act.info else None
 
 

@@ -17,9 +17,12 @@ import numpy as np
 from vlagents_ray.errors import ConfigError
 
 SPIN_S = 0.001
-"""The last part of a wait, s, in which the thread spins: a sleeping thread wakes tens of microseconds late or more."""
+"""The last part of a wait, s, in which the thread spins: a sleeping thread wakes tens of
+microseconds late or more.
+"""
 KEPT_TICKS = 200_000  # the number of ticks whose lateness is kept, as a loop may run for days
-_SWITCH_S = 0.0005  # longest time for which another thread keeps the interpreter; Python's default is 5 ms
+# Longest time for which another thread keeps the interpreter; Python's default is 5 ms.
+_SWITCH_S = 0.0005
 _NICE = -10
 _FIFO = 10
 
@@ -36,7 +39,8 @@ class Pacer:
         self.period_s = 1.0 / hz
         self.missed = 0
         self.ticks = 0  # ticks that began
-        self.late_s: deque[float] = deque(maxlen=KEPT_TICKS)  # lateness of the last ticks that began
+        # Lateness of the last ticks that began.
+        self.late_s: deque[float] = deque(maxlen=KEPT_TICKS)
         self._begin = time.perf_counter()
         self._tick = -1
 
@@ -69,10 +73,12 @@ class Pacer:
 
 
 def jitter(late_s: Sequence[float], missed: int, ticks: int | None = None) -> dict[str, float]:
-    """Compute the punctuality of a loop, of whose `ticks` the last ones have a lateness in `late_s`, s.
+    """Compute the punctuality of a loop, of whose `ticks` the last ones have a lateness in
+    `late_s`, s.
 
     Returns:
-        `ticks`, `missed`, the share `on_time` that began within 2 ms, and the lateness `p50_ms`, `p99_ms` and `max_ms`.
+        `ticks`, `missed`, the share `on_time` that began within 2 ms, and the lateness `p50_ms`,
+        `p99_ms` and `max_ms`.
     """
     late_ms = np.array(late_s or [math.nan]) * 1e3
     ticks = len(late_s) if ticks is None else ticks
@@ -88,15 +94,18 @@ def jitter(late_s: Sequence[float], missed: int, ticks: int | None = None) -> di
 
 @contextlib.contextmanager
 def undisturbed(*, real_time: bool = False) -> Iterator[list[str]]:
-    """Reduce the delays of the calling thread by its own process; yields the measures taken, in words.
+    """Reduce the delays of the calling thread by its own process; yields the measures taken, in
+    words.
 
-    Automatic garbage collection is off within the context, as a collection of a large heap takes tens of milliseconds;
-    objects that exist before are excluded from explicit collections. Other threads yield the interpreter within 0.5 ms.
-    If the user may set it (root, or `ulimit -e`), the thread has a higher priority than others on the machine. With
-    `real_time` it has SCHED_FIFO instead, before all threads that are not real-time (`ulimit -r`).
+    Automatic garbage collection is off within the context, as a collection of a large heap takes
+    tens of milliseconds; objects that exist before are excluded from explicit collections. Other
+    threads yield the interpreter within 0.5 ms. If the user may set it (root, or `ulimit -e`), the
+    thread has a higher priority than others on the machine. With `real_time` it has SCHED_FIFO
+    instead, before all threads that are not real-time (`ulimit -r`).
 
-    Lateness, p99, measured on 2 cores at 50 Hz: beside two busy processes 2.8 ms without measures, 0.6 ms with the
-    priority, 0.02 ms with SCHED_FIFO; beside a busy Python thread of the same process 5.3 ms without, 1.3 ms with them.
+    Lateness, p99, measured on 2 cores at 50 Hz: beside two busy processes 2.8 ms without measures,
+    0.6 ms with the priority, 0.02 ms with SCHED_FIFO; beside a busy Python thread of the same
+    process 5.3 ms without, 1.3 ms with them.
     """
     collects, switch_s, frozen = gc.isenabled(), sys.getswitchinterval(), gc.get_freeze_count() > 0
     gc.collect()

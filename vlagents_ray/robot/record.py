@@ -29,38 +29,47 @@ class Recorder:
             with recorder.episode("stack the cups"):
                 recorder.add(obs, action, tick=0)
 
-    `add` copies the frame into a queue and returns; a thread encodes and writes it. If the queue is full, the frame is
-    dropped and counted in `dropped`, and the column `tick` shows the gap. An episode is part of the dataset as soon as
-    it ends, so a crash loses at most the running one. If writing fails, for instance on a full disk, the episode is
-    lost, and `close` raises the error.
+    `add` copies the frame into a queue and returns; a thread encodes and writes it. If the queue is
+    full, the frame is dropped and counted in `dropped`, and the column `tick` shows the gap. An
+    episode is part of the dataset as soon as it ends, so a crash loses at most the running one. If
+    writing fails, for instance on a full disk, the episode is lost, and `close` raises the error.
 
     Args:
         root: The dataset's folder, which is created or continued.
         fps: The rate of the frames, Hz.
         frames: The largest number of frames in the queue.
-        interventions: Whether an operator may take over: frames then also have `intervention` (bool), `policy_action`
-            and `policy_known` (bool), and episodes a label. A dataset that has these columns keeps them in any case.
+        interventions: Whether an operator may take over: frames then also have `intervention`
+            (bool), `policy_action` and `policy_known` (bool), and episodes a label. A dataset that
+            has these columns keeps them in any case.
 
     Raises:
-        ConfigError: The folder cannot be written to, or has other files, or a dataset of another rate or version, or
-            without these columns.
+        ConfigError: The folder cannot be written to, or has other files, or a dataset of another
+            rate or version, or without these columns.
         MissingDependency: The extra "record" is not installed.
     """
 
-    def __init__(self, root: str | Path, fps: float, *, frames: int = 100, interventions: bool = False) -> None:
+    def __init__(
+        self, root: str | Path, fps: float, *, frames: int = 100, interventions: bool = False
+    ) -> None:
         self.dropped = 0
         self.error: Exception | None = None  # the first error in writing
         try:
             self._dataset = Dataset(Path(root), fps, interventions=interventions)
-            Path(root).mkdir(parents=True, exist_ok=True)  # else the error would come with the first frame
-        except (OSError, ValueError, KeyError) as error:  # no such folder, no permission, or damaged files
+            # Else the error would come with the first frame.
+            Path(root).mkdir(parents=True, exist_ok=True)
+        except (OSError, ValueError, KeyError) as error:
+            # no such folder, no permission, or damaged files
             raise ConfigError(
-                f"recorder {root}: {type(error).__name__}: {error}; record into a new folder that can be written to"
+                f"recorder {root}: {type(error).__name__}: {error}; record into a new folder that "
+                "can be written to"
             ) from error
         self._label: Label | None = None
         self._frames = frames
-        # What the thread does next, given the running episode; each returns the one that runs then. None ends it.
-        self._queue: queue.SimpleQueue[Callable[[RunningEpisode | None], RunningEpisode | None] | None]
+        # What the thread does next, given the running episode; each returns the one that runs then.
+        # None ends it.
+        self._queue: queue.SimpleQueue[
+            Callable[[RunningEpisode | None], RunningEpisode | None] | None
+        ]
         self._queue = queue.SimpleQueue()
         self._put = 0  # frames added, counted by the loop's thread
         self._got = 0  # frames taken from the queue, counted by the writing thread
@@ -94,8 +103,8 @@ class Recorder:
         """Label the running episode; the last label counts. May be called from any thread.
 
         Args:
-            label: "success" or "failure", which the dataset keeps in the column `label` of its episodes; "discard"
-                drops the episode.
+            label: "success" or "failure", which the dataset keeps in the column `label` of its
+                episodes; "discard" drops the episode.
 
         Raises:
             ConfigError: The label is unknown, or the dataset has no columns of interventions.
@@ -103,7 +112,9 @@ class Recorder:
         if label not in get_args(Label):
             raise ConfigError(f"label: got {label!r}, want one of {list(get_args(Label))}")
         if label != "discard" and not self.interventions:
-            raise ConfigError(f"label: got {label!r} for a dataset without labels; give interventions=True")
+            raise ConfigError(
+                f"label: got {label!r} for a dataset without labels; give interventions=True"
+            )
         self._label = label
 
     def add(
@@ -136,7 +147,9 @@ class Recorder:
         def write(episode: RunningEpisode | None) -> RunningEpisode | None:
             self._got += 1
             if episode is not None:  # else it was abandoned after an error
-                episode.add(seen, applied, float(seen.info[CAPTURED]), tick, safe, intervention, wanted)
+                episode.add(
+                    seen, applied, float(seen.info[CAPTURED]), tick, safe, intervention, wanted
+                )
             return episode
 
         self._put += 1

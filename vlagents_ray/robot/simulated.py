@@ -1,4 +1,6 @@
-"""Robots without hardware: a simulated arm for trying the control loop, and an environment as a robot."""
+"""Robots without hardware: a simulated arm for trying the control loop, and an environment as a
+robot.
+"""
 
 from __future__ import annotations
 
@@ -20,10 +22,11 @@ _SMOOTHING = 0.5  # share of the distance to its target that a joint moves in a 
 class SimulatedRobot:
     """An arm whose joints follow their commands, shown as a dot on a still image by its cameras.
 
-    Actions are those of the policy's contract: `dim` numbers, deltas of the joints or absolute targets (also if neither
-    is stated), with the grippers of `ActionSpec.gripper_columns`. Observations have the cameras, with their
-    sizes, and the parts of the state, filled with the joints, that the contract names; without a contract they have the
-    cameras `front` and `wrist` and the part `joints`.
+    Actions are those of the policy's contract: `dim` numbers, deltas of the joints or absolute
+    targets (also if neither is stated), with the grippers of `ActionSpec.gripper_columns`.
+    Observations have the cameras, with their sizes, and the parts of the state, filled with the
+    joints, that the contract names; without a contract they have the cameras `front` and `wrist`
+    and the part `joints`.
     """
 
     simulated = True
@@ -31,10 +34,14 @@ class SimulatedRobot:
     def __init__(self, contract: Contract | None = None) -> None:
         contract = contract or Contract()
         self._action: ActionSpec = contract.action
-        self._parts = {name: spec.dim for name, spec in (contract.state or {"joints": StateSpec()}).items()}
+        self._parts = {
+            name: spec.dim for name, spec in (contract.state or {"joints": StateSpec()}).items()
+        }
         # Gradients with a little noise, which codecs compress like a camera's.
         self._pictures: dict[str, np.ndarray] = {}
-        for name, camera in (contract.cameras or {"front": CameraSpec(), "wrist": CameraSpec()}).items():
+        for name, camera in (
+            contract.cameras or {"front": CameraSpec(), "wrist": CameraSpec()}
+        ).items():
             height, width = camera.height or _SIDE, camera.width or _SIDE
             y, x = np.mgrid[:height, :width]
             noise = np.random.default_rng(0).integers(0, 8, (height, width))
@@ -50,7 +57,9 @@ class SimulatedRobot:
         """Return the current state, in new arrays each time."""
         self._joints = self._joints + _SMOOTHING * (self._target - self._joints)
         state = {
-            name: np.resize(self._joints, dim if dim is not None else len(self._joints)).astype(np.float32)
+            name: np.resize(self._joints, dim if dim is not None else len(self._joints)).astype(
+                np.float32
+            )
             for name, dim in self._parts.items()
         }
         opened, closed, opening = self._action.gripper_open, self._action.gripper_closed, 1.0
@@ -84,9 +93,11 @@ class SimulatedRobot:
 
 
 class EnvRobot:
-    """One episode of an environment as a `Robot`: each command is a step; without commands, time does not pass.
+    """One episode of an environment as a `Robot`: each command is a step; without commands, time
+    does not pass.
 
-    The caller closes `env`. With `endless` its step limit is ignored, as an operator takes longer than a policy.
+    The caller closes `env`. With `endless` its step limit is ignored, as an operator takes longer
+    than a policy.
     """
 
     simulated = True

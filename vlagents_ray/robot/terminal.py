@@ -11,15 +11,16 @@ from collections.abc import Callable, Iterator
 
 from vlagents_ray.errors import ConfigError
 
-Consumer = Callable[[str], bool]  # gets a key in lower case; returns whether it has a meaning for that key
+# Gets a key in lower case; returns whether it has a meaning for that key.
+Consumer = Callable[[str], bool]
 
 
 class Terminal:
     """A terminal whose keys go to the newest consumer, such as a keyboard that moves the robot.
 
-    A key without meaning for it goes to the consumer before, and last to one that reads in the background. Two objects
-    of one terminal share its consumers. The default `descriptor` is that of standard input; raises `ConfigError` if it
-    is no terminal.
+    A key without meaning for it goes to the consumer before, and last to one that reads in the
+    background. Two objects of one terminal share its consumers. The default `descriptor` is that of
+    standard input; raises `ConfigError` if it is no terminal.
     """
 
     _consumers: dict[tuple[int, int], list[Consumer]] = {}  # noqa: RUF012 - of all terminals of this process
@@ -27,10 +28,13 @@ class Terminal:
 
     def __init__(self, descriptor: int | None = None) -> None:
         if descriptor is None and sys.stdin is not None:
-            with contextlib.suppress(OSError, ValueError):  # a replacement of standard input need not be a file
+            # A replacement of standard input need not be a file.
+            with contextlib.suppress(OSError, ValueError):
                 descriptor = sys.stdin.fileno()
         if descriptor is None or not os.isatty(descriptor):
-            raise ConfigError("terminal: got no terminal, want one to read keys from; run this in one")
+            raise ConfigError(
+                "terminal: got no terminal, want one to read keys from; run this in one"
+            )
         self.descriptor = descriptor
         about = os.fstat(descriptor)
         self._own = self._consumers.setdefault((about.st_dev, about.st_ino), [])
@@ -53,7 +57,9 @@ class Terminal:
 
     @contextlib.contextmanager
     def consumed_by(self, consumer: Consumer, *, last: bool = False) -> Iterator[None]:
-        """Pass the keys to a consumer within the context, as the newest or, with `last`, after all others."""
+        """Pass the keys to a consumer within the context, as the newest or, with `last`, after
+        all others.
+        """
         with self._lock:
             self._own.insert(0 if last else len(self._own), consumer)
         try:
@@ -63,10 +69,14 @@ class Terminal:
                 self._own.remove(consumer)
 
     def read(self, consumer: Consumer) -> bool:
-        """Pass typed keys to their consumers, if this one is the newest; return whether the terminal is open."""
+        """Pass typed keys to their consumers, if this one is the newest; return whether the
+        terminal is open.
+        """
         with self._lock:
             if consumer not in self._own:
-                raise ConfigError("terminal: this consumer has not begun; want `with` around its use")
+                raise ConfigError(
+                    "terminal: this consumer has not begun; want `with` around its use"
+                )
             if self._own[-1] != consumer:
                 return True
             while self._is_in_foreground() and select.select([self.descriptor], [], [], 0)[0]:
@@ -98,7 +108,9 @@ class Terminal:
                 thread.join()
 
     def _is_in_foreground(self) -> bool:
-        """Return whether this process may read: in the background, reading from the terminal would suspend it."""
+        """Return whether this process may read: in the background, reading from the terminal
+        would suspend it.
+        """
         try:
             return os.tcgetpgrp(self.descriptor) == os.getpgrp()
         except OSError:  # not this process's controlling terminal, so reading suspends nothing
@@ -107,7 +119,8 @@ class Terminal:
 
 @contextlib.contextmanager
 def typed_keys(consumer: Consumer) -> Iterator[bool]:
-    """Pass the keys typed at the terminal to a consumer within the context, unless a newer one has a meaning for them.
+    """Pass the keys typed at the terminal to a consumer within the context, unless a newer one has
+    a meaning for them.
 
     The consumer may be called from a thread. Yields whether there is a terminal.
     """

@@ -12,17 +12,19 @@ from vlagents_ray.errors import ConfigError
 
 
 class Watchdog:
-    """A thread that stops the robot when a source, such as the server or the control loop, is silent for too long.
+    """A thread that stops the robot when a source, such as the server or the control loop, is
+    silent for too long.
 
         Watchdog(robot.stop, {"server": 1.0, "loop": 0.2})  # s
 
-    `stop` is called once for each silence, on the watchdog's own thread, which also detects a control loop that hangs.
-    The time limits begin to run at `start` (or `with`). After a stop, `control.stopped` is true until `restart` is
-    called, also in later runs of the control loop. If `stop` raises an exception, it is kept in `error`, and the
-    watchdog continues.
+    `stop` is called once for each silence, on the watchdog's own thread, which also detects a
+    control loop that hangs. The time limits begin to run at `start` (or `with`). After a stop,
+    `control.stopped` is true until `restart` is called, also in later runs of the control loop. If
+    `stop` raises an exception, it is kept in `error`, and the watchdog continues.
 
     Args:
-        stop: Stops the robot; its argument is the reason as text, which is also appended to `barks`.
+        stop: Stops the robot; its argument is the reason as text, which is also appended to
+            `barks`.
         silent_s: The longest silence of each source by name, s.
 
     Raises:
@@ -84,20 +86,25 @@ class Watchdog:
         """Allow motion again after a stop; may be called from any thread and from a signal handler.
 
         Returns:
-            Whether motion is allowed. While a source is silent (`control.silent`), it is not: call this again later.
+            Whether motion is allowed. While a source is silent (`control.silent`), it is not: call
+            this again later.
         """
         with self._changed:
             return self.control.restart()
 
     def start(self) -> None:
-        """Start the thread and the time limits of all sources, unless they run. Stops and silences persist."""
+        """Start the thread and the time limits of all sources, unless they run. Stops and
+        silences persist.
+        """
         with self._changed:
             if self._thread is not None:
                 return
             self._heard = dict.fromkeys(self._limits, time.monotonic())
             for name in set(self.control.silent) - self._limits.keys():
                 self.control.heard(name)  # no later sign of life would end its silence
-            self._thread = threading.Thread(target=self._watch, name="vlagents-ray-watchdog", daemon=True)
+            self._thread = threading.Thread(
+                target=self._watch, name="vlagents-ray-watchdog", daemon=True
+            )
         self._thread.start()
 
     def close(self) -> None:
@@ -116,14 +123,17 @@ class Watchdog:
         self.close()
 
     def overdue(self) -> tuple[str | None, float | None]:
-        """Record the silence of a source whose time limit is over, and return its reason, for `bark`.
+        """Record the silence of a source whose time limit is over, and return its reason, for
+        `bark`.
 
         Returns:
             The reason, or None; and the time, s, until the next limit may be over, or None.
         """
         with self._changed:
             now, silent = time.monotonic(), self.control.silent
-            waiting = {n: self._heard[n] + s - now for n, s in self._limits.items() if n not in silent}
+            waiting = {
+                n: self._heard[n] + s - now for n, s in self._limits.items() if n not in silent
+            }
             name = min(waiting, key=lambda n: waiting[n]) if waiting else None
             if name is None or waiting[name] > 0:
                 return None, None if name is None else waiting[name]

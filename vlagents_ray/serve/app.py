@@ -26,17 +26,20 @@ from vlagents_ray.settings import wrong_settings
 _FAILURES = 3  # number of consecutive failed health checks after which Serve replaces a replica
 _LEAST_ANSWER_S = 5.0  # minimum time limit of a health check, for a busy machine
 _HEAD = "node:__internal_head__"  # a resource that Ray assigns to the head node of any cluster
-# A replica gets neither these settings nor the dialects of the gateway, and is not restarted when they change.
+# A replica gets neither these settings nor the dialects of the gateway, and is not restarted when
+# they change.
 _OUTSIDE: Any = {"replicas": True, "autoscaling": True, "resources": True}
-_AT_ONCE: Any = {"graceful_shutdown_wait_loop_s": 0.1}  # period at which remaining requests are counted; Serve's: 2 s
+# Period at which remaining requests are counted; Serve's: 2 s.
+_AT_ONCE: Any = {"graceful_shutdown_wait_loop_s": 0.1}
 
 
 def build(args: Mapping[str, Any] | ServerArgs) -> Application:
     """Build the Serve application of one policy from the `args` of a deployment file.
 
     Raises:
-        RayServeException: A setting is wrong, or the policy's environment is missing. `serve status` shows only the
-            text of this exception, but a traceback of forty lines for any other.
+        RayServeException: A setting is wrong, or the policy's environment is missing. `serve
+            status` shows only the text of this exception, but a traceback of forty lines for any
+            other.
     """
     try:
         return application(ServerArgs.model_validate(args))
@@ -58,23 +61,32 @@ def application(args: ServerArgs, *, drains: bool = True) -> Application:
     args = args.model_copy(update={"environment": with_process(args.environment)})
     options: dict[str, Any] = {
         "name": POLICY,
-        "health_check_period_s": 1 if args.environment.process == "child" else 5,  # three failures replace it
-        # A replica that does not reply is frozen, or its policy holds the interpreter's lock: then only these checks
-        # limit the time of a call. Together they take the limit of a call; Serve's default is 95 s for any policy.
+        # Three failures replace it.
+        "health_check_period_s": 1 if args.environment.process == "child" else 5,
+        # A replica that does not reply is frozen, or its policy holds the interpreter's lock: then
+        # only these checks limit the time of a call. Together they take the limit of a call;
+        # Serve's default is 95 s for any policy.
         "health_check_timeout_s": max(_LEAST_ANSWER_S, args.limits.act_s / _FAILURES),
-        # A policy that failed to load once will fail again. While other replicas run, Serve retries forever.
+        # A policy that failed to load once will fail again. While other replicas run, Serve retries
+        # forever.
         "max_constructor_retry_count": 1,
-        "user_config": {},  # settings of the policy that a file states beside `args`; they change without a restart
+        # Settings of the policy that a file states beside `args`; they change without a restart.
+        "user_config": {},
         "ray_actor_options": {
             "num_cpus": args.resources.num_cpus,
             "num_gpus": args.resources.num_gpus,
             "resources": args.resources.custom,
             **({} if args.resources.memory is None else {"memory": args.resources.memory}),
             # Without this setting, Serve applies the application's.
-            **({"runtime_env": environment} if (environment := args.environment.runtime_env()) else {}),
+            **(
+                {"runtime_env": environment}
+                if (environment := args.environment.runtime_env())
+                else {}
+            ),
         },
-        # A WebSocket session counts as a request as long as it lasts, so the limit must allow all sessions and two
-        # batches. It is no protection against overload, since requests wait in the batch queue.
+        # A WebSocket session counts as a request as long as it lasts, so the limit must allow all
+        # sessions and two batches. It is no protection against overload, since requests wait in the
+        # batch queue.
         "max_ongoing_requests": args.sessions.limit + 2 * args.batch.max_size,
         "graceful_shutdown_timeout_s": 20,
         **({} if drains else _AT_ONCE),
@@ -89,7 +101,8 @@ def application(args: ServerArgs, *, drains: bool = True) -> Application:
             request_router_class="vlagents_ray.serve.scaling.router.SessionRouter"
         )
     replica = serve.ingress()(PolicyReplica)
-    with warnings.catch_warnings():  # `metrics_interval_s` is deprecated for a variable that affects a whole cluster
+    # `metrics_interval_s` is deprecated for a variable that affects a whole cluster.
+    with warnings.catch_warnings():
         warnings.simplefilter("ignore", DeprecationWarning)
         policy = serve.deployment(**options)(replica)
     gateways = args.dialects.gateways()
@@ -98,7 +111,9 @@ def application(args: ServerArgs, *, drains: bool = True) -> Application:
 
 
 def _gateway(args: ServerArgs) -> Application:
-    """Build the process of the dialects that have their own port; it runs on the head node, where clients connect."""
+    """Build the process of the dialects that have their own port; it runs on the head node,
+    where clients connect.
+    """
     options: dict[str, Any] = {
         "name": GATEWAY,
         "num_replicas": 1,
@@ -107,5 +122,7 @@ def _gateway(args: ServerArgs) -> Application:
         "health_check_period_s": 5,
         "ray_actor_options": {"num_cpus": 0, "resources": {_HEAD: 0.001}},
     }
-    settings = args.model_dump(mode="json", include={"policy", "dialects", "limits", "sessions", "access"})
+    settings = args.model_dump(
+        mode="json", include={"policy", "dialects", "limits", "sessions", "access"}
+    )
     return serve.deployment(**options)(Gateway).bind(settings)

@@ -25,7 +25,9 @@ from vlagents_ray.serve.sessions import SessionFinder
 _LOOK_S = 0.1  # wait for a checkpoint that another thread loads
 
 
-def build_engine(args: ServerArgs, config: Mapping[str, Any], finder: SessionFinder | None = None) -> Engine:
+def build_engine(
+    args: ServerArgs, config: Mapping[str, Any], finder: SessionFinder | None = None
+) -> Engine:
     """Create the engine of a deployment, without loading its policy.
 
     Args:
@@ -49,8 +51,12 @@ def build_engine(args: ServerArgs, config: Mapping[str, Any], finder: SessionFin
     )
 
 
-def policy_metadata(args: ServerArgs, engine: Engine, code: GitState | None, program: Program) -> dict[str, Any]:
-    """Return the part of a server's metadata that describes its policy; see `ServerArgs.code` for the last two."""
+def policy_metadata(
+    args: ServerArgs, engine: Engine, code: GitState | None, program: Program
+) -> dict[str, Any]:
+    """Return the part of a server's metadata that describes its policy; see `ServerArgs.code`
+    for the last two.
+    """
     contract, models = engine.contract, engine.models
     return {
         "policy": args.policy,
@@ -81,20 +87,35 @@ class LocalAgent(Agent):
         return self.engine.contract
 
     def reset(
-        self, obs: Obs, instruction: str | None, *, contract: dict[str, Any] | None = None, **kwargs: Any
+        self,
+        obs: Obs,
+        instruction: str | None,
+        *,
+        contract: dict[str, Any] | None = None,
+        **kwargs: Any,
     ) -> dict[str, Any]:
-        """Begin an episode; with `contract`, the policy's is compared with it first, as a server does."""
-        [reply] = self._replies([self], [Request("reset", obs, instruction, kwargs, contract, rank="simulation")])
+        """Begin an episode; with `contract`, the policy's is compared with it first, as a server
+        does.
+        """
+        [reply] = self._replies(
+            [self], [Request("reset", obs, instruction, kwargs, contract, rank="simulation")]
+        )
         if reply.error is not None:
             raise reply.error
         return reply.info or {}
 
     def act_batch(self, obs: Sequence[Obs], sessions: Sequence[Agent]) -> list[Act | Exception]:
         acts: list[Act | Exception] = []
-        for reply in self._replies(sessions, [Request("act", one, rank="simulation") for one in obs]):
+        for reply in self._replies(
+            sessions, [Request("act", one, rank="simulation") for one in obs]
+        ):
             if reply.act is not None:
                 reply.act.info["timing"] = reply.timing
-            acts.append(reply.error or reply.act or PolicyFailed("act: the policy answered without an action"))
+            acts.append(
+                reply.error
+                or reply.act
+                or PolicyFailed("act: the policy answered without an action")
+            )
         return acts
 
     def close(self) -> None:
@@ -121,14 +142,16 @@ class LocalAgent(Agent):
 class LocalPolicy(LocalAgent):
     """A deployment's policy as an agent, of which `sessions` opens more sessions."""
 
-    def __init__(self, args: ServerArgs, config: Mapping[str, Any], *, threaded: bool = False) -> None:
+    def __init__(
+        self, args: ServerArgs, config: Mapping[str, Any], *, threaded: bool = False
+    ) -> None:
         """Set the policy; `initialize` loads it.
 
         Args:
             args: The settings; a policy in a Python environment of its own runs in a child process.
             config: The settings of the policy, with those of the deployment's `user_config`.
-            threaded: Whether a thread runs the policy, in batches of sessions that act at once. By default the caller's
-                does, so that a debugger stops in it.
+            threaded: Whether a thread runs the policy, in batches of sessions that act at once. By
+                default the caller's does, so that a debugger stops in it.
         """
         environment = args.environment.model_copy(update={"process": "child"})
         super().__init__(build_engine(args.model_copy(update={"environment": environment}), config))

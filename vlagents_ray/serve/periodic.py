@@ -10,7 +10,9 @@ logger = logging.getLogger(__name__)
 
 
 class Periodic:
-    """Calls the added functions every `period_s` seconds; its thread runs while there is a function to call."""
+    """Calls the added functions every `period_s` seconds; its thread runs while there is a
+    function to call.
+    """
 
     def __init__(self, period_s: float) -> None:
         self._period_s = period_s
@@ -25,13 +27,16 @@ class Periodic:
             self._calls = [*self._calls, call]
             if self._thread is None:
                 self._stop = threading.Event()
-                self._thread = threading.Thread(target=self._loop, args=(self._stop,), name="periodic", daemon=True)
+                self._thread = threading.Thread(
+                    target=self._loop, args=(self._stop,), name="periodic", daemon=True
+                )
                 self._thread.start()
 
     def remove(self, call: Callable[[], None]) -> None:
         """Stop calling `call`; does nothing if it was not added.
 
-        If it was the last function, this waits for a running call, unless it is called by the periodic thread itself.
+        If it was the last function, this waits for a running call, unless it is called by the
+        periodic thread itself.
         """
         with self._lock:
             self._calls = [one for one in self._calls if one != call]

@@ -12,9 +12,11 @@ from vlagents_ray.errors import ConfigError
 from vlagents_ray.protocol.messages import peer_uid
 
 LOOPBACK, EVERYWHERE = "127.0.0.1", "0.0.0.0"  # noqa: S104 - only compared, and bound for a moment
-HOST = "VLAGENTS_RAY_HOST"  # environment variable of a replica: the address of its server, if it is not Serve's
+# Environment variable of a replica: the address of its server, if it is not Serve's.
+HOST = "VLAGENTS_RAY_HOST"
 _BLOCKS = (20_000, 24_000)  # range of the ports for replicas
-_PORTS = (24_000, 32_700)  # range of the ports for HAProxy and others, below the system's ephemeral ports
+# Range of the ports for HAProxy and others, below the system's ephemeral ports.
+_PORTS = (24_000, 32_700)
 _CLAIMS = 256  # maximum number of ports that this process claims at once, the latest ones
 _RELEASE_S = 2.0  # time limit for a server that is being replaced to close its port
 _PROBES = 64  # processes that may read whose a claim is
@@ -25,12 +27,14 @@ _random = random.SystemRandom()
 
 
 def free_port(host: str = LOOPBACK) -> int:
-    """Return a TCP port that is free at the moment, and was neither returned recently nor passed to `keep`.
+    """Return a TCP port that is free at the moment, and was neither returned recently nor passed to
+    `keep`.
 
-    The server for an earlier port may not listen yet, so this process claims each port that it returns. While this
-    process runs, and until it has returned `_CLAIMS` further ports, the function returns that port to no other process
-    on this machine. Ports are drawn with the system's random generator, so that processes with equal seeds for Python's
-    generator do not draw the same ports.
+    The server for an earlier port may not listen yet, so this process claims each port that it
+    returns. While this process runs, and until it has returned `_CLAIMS` further ports, the
+    function returns that port to no other process on this machine. Ports are drawn with the
+    system's random generator, so that processes with equal seeds for Python's generator do not draw
+    the same ports.
     """
     for _ in range(100):
         port = _random.randrange(*_PORTS)
@@ -42,9 +46,10 @@ def free_port(host: str = LOOPBACK) -> int:
 def _claim(port: int) -> bool:
     """Claim a port for this process; False if another process of this user has claimed it.
 
-    The claim is an abstract Unix socket named after the port, which the kernel lets only one process bind, and closes
-    when that process ends. Any account of the machine can bind such names, so claims of other users do not count: they
-    could otherwise claim all ports, and no server of this user would start.
+    The claim is an abstract Unix socket named after the port, which the kernel lets only one
+    process bind, and closes when that process ends. Any account of the machine can bind such names,
+    so claims of other users do not count: they could otherwise claim all ports, and no server of
+    this user would start.
     """
     name = f"\0vlagents-ray-port-{port}"
     claim = socket.socket(socket.AF_UNIX)
@@ -79,12 +84,16 @@ def keep(*ports: int) -> None:
 
 
 def free_block(size: int) -> int:
-    """Return the first of `size` consecutive ports for the replicas; it is free, and Ray skips any others in use."""
+    """Return the first of `size` consecutive ports for the replicas; it is free, and Ray skips
+    any others in use.
+    """
     for _ in range(100):
         base = _random.randrange(*_BLOCKS, size)
         if is_free(LOOPBACK, base):
             return base
-    raise ConfigError(f"no free block of ports between {_BLOCKS[0]} and {_BLOCKS[1]} for the replicas")
+    raise ConfigError(
+        f"no free block of ports between {_BLOCKS[0]} and {_BLOCKS[1]} for the replicas"
+    )
 
 
 def is_free(host: str, port: int) -> bool:
@@ -102,13 +111,16 @@ def reserve(name: str, host: str, port: int, timeout_s: float = _RELEASE_S) -> s
     """Return a socket that is bound to the port for the dialect `name`, and does not listen yet.
 
     Raises:
-        ConfigError: Another process still uses the port after `timeout_s`, or this machine has no such address.
+        ConfigError: Another process still uses the port after `timeout_s`, or this machine has no
+            such address.
     """
     try:
         found = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)
     except OSError as error:
         cure = f"change dialects.{name}.host"
-        raise ConfigError(f"{name}: {host!r} is no address of this machine ({error}); {cure}") from error
+        raise ConfigError(
+            f"{name}: {host!r} is no address of this machine ({error}); {cure}"
+        ) from error
     family, _, _, _, address = found[0]
     deadline = time.monotonic() + timeout_s
     while True:
@@ -122,7 +134,8 @@ def reserve(name: str, host: str, port: int, timeout_s: float = _RELEASE_S) -> s
                 time.sleep(0.1)
                 continue
             raise ConfigError(
-                f"{name}: cannot listen on {host}:{port} ({error.strerror}); choose another port or host "
+                f"{name}: cannot listen on {host}:{port} ({error.strerror}); choose another port "
+                "or host "
                 f"in dialects.{name}"
             ) from error
         return listener

@@ -1,14 +1,17 @@
-"""Requests in flight: the message that contained them, and each request from the endpoint to its answer.
+"""Requests in flight: the message that contained them, and each request from the endpoint to its
+answer.
 
-An endpoint creates a `Message` when the last byte has arrived, decodes it, and passes its requests to a `Sender`, which
-creates a `PendingRequest` for each. The engine finishes each of these once; when the last one is finished, the endpoint
-writes all answers of the message. The decoded `Request` is not modified on the way: the server's decisions are in the
-`PendingRequest`. Only the observations are removed after use, since their memory may belong to the sender.
+An endpoint creates a `Message` when the last byte has arrived, decodes it, and passes its requests
+to a `Sender`, which creates a `PendingRequest` for each. The engine finishes each of these once;
+when the last one is finished, the endpoint writes all answers of the message. The decoded `Request`
+is not modified on the way: the server's decisions are in the `PendingRequest`. Only the
+observations are removed after use, since their memory may belong to the sender.
 
-Requests arrive on the thread that reads the connections (the policy's own, or a reader while a batch runs) or on an
-event loop. The policy's thread runs batches and finishes their requests; another thread may send the answers to
-simulations. Requests that reach no batch are finished by other threads: the event loop at a deadline or if a call
-hangs, the thread that loads a checkpoint, or the one that closes the engine.
+Requests arrive on the thread that reads the connections (the policy's own, or a reader while a
+batch runs) or on an event loop. The policy's thread runs batches and finishes their requests;
+another thread may send the answers to simulations. Requests that reach no batch are finished by
+other threads: the event loop at a deadline or if a call hangs, the thread that loads a checkpoint,
+or the one that closes the engine.
 """
 
 from __future__ import annotations
@@ -39,7 +42,8 @@ Answered = Callable[["Message"], None]
 
 logger = logging.getLogger(__name__)
 
-_TIMES = ("total_ms", "decode_ms", "queue_ms", "inference_ms", "encode_ms")  # after the total as in `STAGES`
+# After the total as in `STAGES`.
+_TIMES = ("total_ms", "decode_ms", "queue_ms", "inference_ms", "encode_ms")
 _NOT_MEASURED = (0.0,) * 4  # stages of a request that failed
 
 
@@ -50,21 +54,27 @@ class Rank(IntEnum):
     SIMULATION = 1
 
 
-RANKS: Mapping[str, Rank] = {"robot": Rank.ROBOT, "simulation": Rank.SIMULATION}  # by their names in the protocol
+# By their names in the protocol.
+RANKS: Mapping[str, Rank] = {"robot": Rank.ROBOT, "simulation": Rank.SIMULATION}
 
 
 @dataclass(frozen=True, slots=True)
 class CheckpointChoice:
     """The checkpoint that a session requested: by default the deployment's own."""
 
-    name: str | None = None  # name of one of the deployment's `choices`; None for the deployment's own
-    step: int | None = None  # training step of the checkpoint; None for the step that the settings name
+    # Name of one of the deployment's `choices`; None for the deployment's own.
+    name: str | None = None
+    # Training step of the checkpoint; None for the step that the settings name.
+    step: int | None = None
 
     def __str__(self) -> str:
         if self == DEFAULT:
             return "the deployment's own checkpoint"
         step = "" if self.step is None else f"step {self.step}"
-        return f"checkpoint {' at '.join(filter(None, ('' if self.name is None else repr(self.name), step)))}"
+        return (
+            "checkpoint "
+            f"{' at '.join(filter(None, ('' if self.name is None else repr(self.name), step)))}"
+        )
 
 
 DEFAULT = CheckpointChoice()
@@ -76,15 +86,17 @@ class Origin:
 
     transport: str = ""  # transport, for the metrics
     owner: str = ""  # connection with which its sessions end; empty without one
-    connection: str = ""  # the sender, whose requests share one turn in the queue; if empty, each session has a turn.
+    # The sender, whose requests share one turn in the queue; if empty, each session has a turn.
+    connection: str = ""
     # It starts with the prefix, so that callers with different keys never share a turn.
     caller: Caller | None = None  # None if no key is required
     prefix: str = ""  # prefix of the session ids of the caller's key
-    # The owner's sessions, by their ids in the engine: the step at which the episode began that the owner last reset or
-    # acted in; None if it has done neither.
+    # The owner's sessions, by their ids in the engine: the step at which the episode began that the
+    # owner last reset or acted in; None if it has done neither.
     sessions: dict[str, int | None] = field(default_factory=dict)
     opened: float = 0.0  # time at which the connection was opened, s, of the engine's clock
-    ended: bool = False  # whether the connection has ended, so that its waiting requests do nothing more
+    # Whether the connection has ended, so that its waiting requests do nothing more.
+    ended: bool = False
 
 
 NOWHERE = Origin()
@@ -104,31 +116,34 @@ class Opening:
 class PendingRequest:
     """One request in flight, from its message to its answer.
 
-    `done` is called with the answer, on any thread: the policy's, one that detects a hanging policy, the one that reads
-    the connection, or an event loop. If two threads answer at once, `done` ignores the second answer.
+    `done` is called with the answer, on any thread: the policy's, one that detects a hanging
+    policy, the one that reads the connection, or an event loop. If two threads answer at once,
+    `done` ignores the second answer.
     """
 
     session_id: str  # the id in the engine
     request: Request
     done: Callable[[Reply], None]
     rank: Rank = Rank.ROBOT
-    arrived: float = field(default_factory=time.perf_counter)  # s, of the engine's clock, by default this one
+    # s, of the engine's clock, by default this one.
+    arrived: float = field(default_factory=time.perf_counter)
     deadline: float = math.inf  # time after which an answer is of no use, s, of the engine's clock
     origin: Origin = NOWHERE
     over: bool = False  # whether it was answered, or its caller no longer waits
     begun: bool = False  # whether a batch has taken it for the policy; set under the queue's lock
     sought: bool = False  # whether other replicas were searched for its session
     session: Any = None  # the `Session` of an act at its arrival
-    # Of an act: the step at which the episode began that it was sent in, once that is known. Of a reset: that of the
-    # connection's episode before, which goes on if the reset is undone.
+    # Of an act: the step at which the episode began that it was sent in, once that is known. Of a
+    # reset: that of the connection's episode before, which goes on if the reset is undone.
     episode: int | None = None
     model: Any = None  # for an act: the `LoadedModel` whose contract it was checked against
     opening: Opening | None = None  # for a reset: the server's settings
-    # If a reset had to wait for its checkpoint: the time at which that was loaded, s. Such a reset runs even if it is
-    # over, to release the checkpoint.
+    # If a reset had to wait for its checkpoint: the time at which that was loaded, s. Such a reset
+    # runs even if it is over, to release the checkpoint.
     loaded: float | None = None
     preparation: Preparation | None = None  # preparation of its observation, on another thread
-    return_s: float | None = None  # recent time from an answer to the session's next request, s, if known
+    # Recent time from an answer to the session's next request, s, if known.
+    return_s: float | None = None
     place: int = 0  # index among the requests of its message
     # For observers: the image files of its message, and the observers' own data until the answer.
     files: DecodedFiles = None  # type: ignore[assignment]
@@ -144,7 +159,9 @@ class PendingRequest:
         try:
             self.done(reply)
         except Exception:
-            logger.exception("request %s: its caller could not take the reply", self.request.request_id)
+            logger.exception(
+                "request %s: its caller could not take the reply", self.request.request_id
+            )
 
     def drop_preparation(self) -> None:
         """Cancel the preparation of the observation, unless it has begun."""
@@ -158,10 +175,12 @@ class PendingRequest:
 
     @property
     def latest_begin(self) -> float:
-        """Latest time at which the episode of an act can have begun that its connection has not been in before, s.
+        """Latest time at which the episode of an act can have begun that its connection has not
+        been in before, s.
 
-        A client that continues an episode has begun it before it opened the connection. A later episode may have begun
-        after the client sent the act, since requests of several connections arrive in any order.
+        A client that continues an episode has begun it before it opened the connection. A later
+        episode may have begun after the client sent the act, since requests of several connections
+        arrive in any order.
         """
         return self.origin.opened if self.origin.owner else self.arrived
 
@@ -170,7 +189,9 @@ class PendingRequest:
         return now > self.deadline
 
     def is_useless(self, now: float) -> bool:
-        """Return whether the deadline has passed at `now`, s, or the connection that sent the request has ended."""
+        """Return whether the deadline has passed at `now`, s, or the connection that sent the
+        request has ended.
+        """
         return self.origin.ended or now > self.deadline
 
     @property
@@ -180,7 +201,8 @@ class PendingRequest:
 
 
 class Message:
-    """The requests of one message, from the arrival of its last byte until their answers are written.
+    """The requests of one message, from the arrival of its last byte until their answers are
+    written.
 
     A message collects the answers, encodes them with their times, and records them for the metrics.
 
@@ -202,7 +224,9 @@ class Message:
         "transport",
     )
 
-    def __init__(self, stats: MetricsBuffer, transport: str, op: str = "unknown", rank: str = "robot") -> None:
+    def __init__(
+        self, stats: MetricsBuffer, transport: str, op: str = "unknown", rank: str = "robot"
+    ) -> None:
         self._stats = stats
         self._asked: list[tuple[str, str]] = [(op, rank)]
         self.transport = transport
@@ -224,12 +248,16 @@ class Message:
             self._asked.insert(place, ("unknown", "robot"))
 
     def decoded_alike(self, requests: int = 1) -> None:
-        """Record that `requests` requests, all of the message's own `op` and `rank`, are decoded."""
+        """Record that `requests` requests, all of the message's own `op` and `rank`, are
+        decoded.
+        """
         self._decoded = time.perf_counter()
         self._asked = [self._asked[0]] * requests
 
     def expect(self, requests: int, then: Answered) -> None:
-        """Expect this number of answers from `put`, and call `then` when the last one has arrived."""
+        """Expect this number of answers from `put`, and call `then` when the last one has
+        arrived.
+        """
         self.replies = [None] * requests  # type: ignore[list-item]  # replaced by `put`
         self._missing = requests
         self._then = then
@@ -247,7 +275,8 @@ class Message:
             self._missing -= 1
             if self._missing:
                 return
-        then, self._then = self._then, None  # it may refer to the requests, which refer to this message
+        # It may refer to the requests, which refer to this message.
+        then, self._then = self._then, None
         if then is not None:
             then(self)
 
@@ -266,14 +295,17 @@ class Message:
         """Encode the replies with complete `timing`; call `record` after they are sent.
 
         Returns:
-            The replies in compact form if they fit into that, otherwise as a frame; and whether they are compact.
+            The replies in compact form if they fit into that, otherwise as a frame; and whether
+            they are compact.
         """
         compact = write_answers(self.replies, arrived=self.arrived)
         data = encode_replies(self.replies, arrived=self.arrived) if compact is None else compact
         return data, compact is not None
 
     def document(self) -> bytes:
-        """Encode and record the only reply, which must not be an error, as JSON with complete `timing`."""
+        """Encode and record the only reply, which must not be an error, as JSON with complete
+        `timing`.
+        """
         begun = time.perf_counter()
         document = reply_to_json(self.replies[0])
         document.pop("timing")
@@ -292,7 +324,9 @@ class Message:
         return data
 
     def record_failure(self, code: str) -> None:
-        """Record all requests as failed with this error code, even if the caller no longer waits."""
+        """Record all requests as failed with this error code, even if the caller no longer
+        waits.
+        """
         total_ms = (time.perf_counter() - self.arrived) * 1e3
         for op, rank in self._asked:
             self._stats.handled((op, self.transport, rank, code), (total_ms, *_NOT_MEASURED))
@@ -305,7 +339,9 @@ class Message:
         self.record()
 
     def record(self) -> None:
-        """Record the requests for the metrics. Call this after sending if possible, so that no client waits."""
+        """Record the requests for the metrics. Call this after sending if possible, so that no
+        client waits.
+        """
         if len(self.replies) != len(self._asked):  # the message was unreadable as a whole
             self._asked = self._asked[:1]
         for (op, rank), reply in zip(self._asked, self.replies, strict=True):
@@ -315,7 +351,9 @@ class Message:
                 self._stats.handled((op, self.transport, rank, "ok"), times)
             else:
                 total_ms = (time.perf_counter() - self.arrived) * 1e3
-                self._stats.handled((op, self.transport, rank, reply.error.code), (total_ms, *_NOT_MEASURED))
+                self._stats.handled(
+                    (op, self.transport, rank, reply.error.code), (total_ms, *_NOT_MEASURED)
+                )
 
 
 def _json(value: dict[str, Any]) -> str:

@@ -1,7 +1,8 @@
 """Sessions: each serves one robot or one env, with private state and shared weights.
 
-The private state of a session is a copy of the loaded agent (`vlagents_ray.serve.models.agent_copies`). A session can
-move to another replica of the same policy, together with that copy.
+The private state of a session is a copy of the loaded agent
+(`vlagents_ray.serve.models.agent_copies`). A session can move to another replica of the same
+policy, together with that copy.
 """
 
 from __future__ import annotations
@@ -21,18 +22,24 @@ from vlagents_ray.serve.weights import WeightsVersion
 M = TypeVar("M")  # type of a loaded model
 
 
-_REMEMBERED = 4096  # number of remembered sessions that left, whose older states are refused (some 500 bytes each)
+# Number of remembered sessions that left, whose older states are refused (some 500 bytes each)
+_REMEMBERED = 4096
 _ANY = 2**63  # number of moves that makes a version newer than any other state of its step
-_UNSEEN = 2**20  # maximum number of acts at other replicas that neither the client nor this replica has seen
+# Maximum number of acts at other replicas that neither the client nor this replica has seen.
+_UNSEEN = 2**20
 _MOST_STEP = 2**62  # steps reported by clients are ignored from here on
 
 
 class Outdated(UnknownSession):
-    """Raised if the replica has, or had, a state of the session that is at least as new as the arriving one."""
+    """Raised if the replica has, or had, a state of the session that is at least as new as the
+    arriving one.
+    """
 
 
 Version = tuple[int, int]
-"""Version of a session's state: its step, and its number of moves. The greater version is the newer one."""
+"""Version of a session's state: its step, and its number of moves. The greater version is the
+newer one.
+"""
 
 
 @dataclass(slots=True)
@@ -41,20 +48,26 @@ class Session(Generic[M]):
 
     id: str
     agent: Agent | None = None  # None until the first `reset` succeeded
-    model: M | None = None  # model of which `agent` is a copy; only the model manager and its cache set it
+    # Model of which `agent` is a copy; only the model manager and its cache set it.
+    model: M | None = None
     weights: WeightsVersion | None = None  # version of the weights that it acts with
     instruction: str = ""  # instruction of its last reset
-    follows: bool = True  # whether it uses the newest version of the weights, otherwise the pinned one
+    # Whether it uses the newest version of the weights, otherwise the pinned one.
+    follows: bool = True
     over: bool = False  # whether the session has ended, so that no table contains it
     resetting: PendingRequest | None = None  # reset that waits for its checkpoint
-    origin: Origin = NOWHERE  # origin of its last request; without an owner it ends when closed or idle for long
-    steps: int = 0  # step of its state: drawn at each reset, above all earlier steps, and incremented by each act
+    # Origin of its last request; without an owner it ends when closed or idle for long.
+    origin: Origin = NOWHERE
+    # Step of its state: drawn at each reset, above all earlier steps, and incremented by each act.
+    steps: int = 0
     first: int = 0  # step drawn at the last reset that was run
     expected: int = 0  # step drawn for the latest reset, which may still be queued
-    began: float = 0.0  # time at which the last reset arrived that was run, s, of the engine's clock
+    # Time at which the last reset arrived that was run, s, of the engine's clock.
+    began: float = 0.0
     last_reset: float = 0.0  # time at which the latest reset arrived, which may still be queued, s
     moves: int = 0  # number of moves between replicas since the last reset
-    announced: bool = False  # whether it was announced to the other replicas, which then keep no older state
+    # Whether it was announced to the other replicas, which then keep no older state.
+    announced: bool = False
     used: float = field(default_factory=time.monotonic)  # time of its last request, s
 
     @property
@@ -65,20 +78,24 @@ class Session(Generic[M]):
     def wrong_step(self, step: int) -> UnknownSession:
         """Return the error for an act at another step, which would repeat or skip an act."""
         return UnknownSession(
-            f"session {self.id!r}: is at step {self.steps} here, at {step} as its client knows; an answer was lost, "
+            f"session {self.id!r}: is at step {self.steps} here, at {step} as its client knows; an "
+            "answer was lost, "
             f"or this is another episode: reset it"
         )
 
     def wrong_episode(self) -> UnknownSession:
         """Return the error for an act that was sent in another episode."""
         return UnknownSession(
-            f"session {self.id!r}: another episode has begun since the act was sent, or the reset before the act was "
+            f"session {self.id!r}: another episode has begun since the act was sent, or the reset "
+            "before the act was "
             f"not executed: reset it, or send the episode's step"
         )
 
 
 class SessionFinder(Protocol):
-    """Fetches sessions from other replicas: `vlagents_ray.serve.scaling.session_migration.SessionMigrator`."""
+    """Fetches sessions from other replicas:
+    `vlagents_ray.serve.scaling.session_migration.SessionMigrator`.
+    """
 
     def fetch(
         self,
@@ -87,10 +104,13 @@ class SessionFinder(Protocol):
         caller: str = "",
         user: Callable[[dict[str, Any], float], Origin | None] = ...,
     ) -> bool:
-        """Fetch a session that has a `user`, then call `then`, found or not; return False if `caller` has too many."""
+        """Fetch a session that has a `user`, then call `then`, found or not; return False if
+        `caller` has too many.
+        """
 
     def announce(self, session_id: str, step: int, then: Callable[[], None]) -> None:
-        """Announce to the other replicas that the session began an episode here at `step`; their states are older.
+        """Announce to the other replicas that the session began an episode here at `step`; their
+        states are older.
 
         `then` is called once the others have dropped those states, or a short time has passed.
         """
@@ -99,9 +119,10 @@ class SessionFinder(Protocol):
 class SessionTable(Generic[M]):
     """The sessions of a replica, by id. Thread-safe.
 
-    A session's state never goes back: a replica keeps the newest state that it has seen, and refuses older ones.
-    Steps are drawn from the wall clock, so that a step drawn at another replica exceeds all steps drawn before. A step
-    is always above those that the session's client and this replica have seen, even if the clocks are wrong.
+    A session's state never goes back: a replica keeps the newest state that it has seen, and
+    refuses older ones. Steps are drawn from the wall clock, so that a step drawn at another replica
+    exceeds all steps drawn before. A step is always above those that the session's client and this
+    replica have seen, even if the clocks are wrong.
     """
 
     def __init__(self, limit: int, idle_s: float, clock: Callable[[], int] = time.time_ns) -> None:
@@ -120,7 +141,8 @@ class SessionTable(Generic[M]):
         self.opened = 0  # number of sessions opened so far
         self._idle_s, self._clock = idle_s, clock
         self._drawn = 0  # latest step drawn
-        self._left: OrderedDict[str, Version] = OrderedDict()  # by session: version up to which its states are refused
+        # By session: version up to which its states are refused.
+        self._left: OrderedDict[str, Version] = OrderedDict()
         self._lock = threading.RLock()
 
     def __len__(self) -> int:
@@ -133,7 +155,8 @@ class SessionTable(Generic[M]):
         """Return the session, and mark it used; raise `UnknownSession` if it is not here."""
         if (session := self._sessions.get(session_id)) is None:
             raise UnknownSession(
-                f"session {session_id!r}: unknown here; it was never reset, idled for {self._idle_s:g} s, "
+                f"session {session_id!r}: unknown here; it was never reset, idled for "
+                f"{self._idle_s:g} s, "
                 f"or its replica was replaced: send a reset first"
             )
         session.used = time.monotonic()
@@ -159,7 +182,9 @@ class SessionTable(Generic[M]):
         return session
 
     def begin(self, session: Session[M], known: int | None) -> int:
-        """Draw the step at which the session's next episode begins, above `known`, the step that its client reports."""
+        """Draw the step at which the session's next episode begins, above `known`, the step that
+        its client reports.
+        """
         with self._lock:
             before = max(session.version, self._left.get(session.id, (0, 0)))[0]
             if known is not None and known < _MOST_STEP:
@@ -169,7 +194,9 @@ class SessionTable(Generic[M]):
             return session.expected
 
     def undo(self, session_id: str, first: int) -> None:
-        """Undo `begin` for a reset that was cancelled: the current episode continues, here or at another replica."""
+        """Undo `begin` for a reset that was cancelled: the current episode continues, here or at
+        another replica.
+        """
         with self._lock:
             session = self._sessions.get(session_id)
             if session is None or session.expected != first or session.steps == first:
@@ -180,13 +207,19 @@ class SessionTable(Generic[M]):
                 self.ended(session)
 
     def is_past(self, session_id: str, first: int) -> bool:
-        """Return whether the session has passed an episode that was to begin at that step, here or elsewhere."""
+        """Return whether the session has passed an episode that was to begin at that step, here
+        or elsewhere.
+        """
         with self._lock:
             session = self._sessions.get(session_id)
-            return self._left.get(session_id, (0, 0))[0] >= first or (session is not None and session.steps > first)
+            return self._left.get(session_id, (0, 0))[0] >= first or (
+                session is not None and session.steps > first
+            )
 
     def require_room(self, session_id: str) -> None:
-        """Raise `PolicyUnavailable` if the session is not here and the replica has reached its limit of sessions."""
+        """Raise `PolicyUnavailable` if the session is not here and the replica has reached its
+        limit of sessions.
+        """
         with self._lock:
             if session_id not in self._sessions and len(self._sessions) >= self.limit:
                 raise self.full()
@@ -218,7 +251,9 @@ class SessionTable(Generic[M]):
         here = self._sessions.get(arriving.id)
         newest = max(self._left.get(arriving.id, (0, 0)), (0, 0) if here is None else here.version)
         if arriving.version <= newest:
-            raise Outdated(f"session {arriving.id!r}: a newer state of it is here, or has been; reset it")
+            raise Outdated(
+                f"session {arriving.id!r}: a newer state of it is here, or has been; reset it"
+            )
 
     def expect(self, arriving: Session[M]) -> None:
         """Count a session that is arriving from another replica for the key of its origin.
@@ -239,14 +274,20 @@ class SessionTable(Generic[M]):
             self._expected = [session for session in self._expected if session is not arriving]
 
     def free(self, session_id: str) -> None:
-        """Forget the states of the session that were here, so that another session may have its id."""
+        """Forget the states of the session that were here, so that another session may have its
+        id.
+        """
         with self._lock:
             self._left.pop(session_id, None)
 
     def held(self, session_ids: Iterable[str]) -> dict[str, Version]:
         """Return the versions of the given sessions that are here and have an episode."""
         with self._lock:
-            here = [self._sessions[session_id] for session_id in session_ids if session_id in self._sessions]
+            here = [
+                self._sessions[session_id]
+                for session_id in session_ids
+                if session_id in self._sessions
+            ]
             return {session.id: session.version for session in here if session.agent is not None}
 
     def versions(self) -> dict[str, Version]:
@@ -255,7 +296,9 @@ class SessionTable(Generic[M]):
             return {session.id: session.version for session in self._sessions.values()}
 
     def drop_older(self, steps: Mapping[str, int]) -> None:
-        """Close sessions with states before `steps`, at which other replicas began episodes, and refuse such states."""
+        """Close sessions with states before `steps`, at which other replicas began episodes, and
+        refuse such states.
+        """
         with self._lock:
             for session_id, step in steps.items():
                 session = self._sessions.get(session_id)
@@ -264,7 +307,9 @@ class SessionTable(Generic[M]):
                 self._remember(session_id, (step - 1, _ANY))
 
     def require_allowed(self, origin: Origin) -> None:
-        """Raise `TooManyRequests` if the key of the origin's caller has reached its limit of sessions."""
+        """Raise `TooManyRequests` if the key of the origin's caller has reached its limit of
+        sessions.
+        """
         if origin.caller is None or origin.caller.sessions is None:
             return
         limit = origin.caller.sessions
@@ -274,7 +319,8 @@ class SessionTable(Generic[M]):
             if self._number_of(origin.prefix) < limit:
                 return
         raise TooManyRequests(
-            f"key {origin.prefix.rstrip('/')!r} holds {limit} sessions here, as many as it allows; close one"
+            f"key {origin.prefix.rstrip('/')!r} holds {limit} sessions here, as many as it allows; "
+            "close one"
         )
 
     def _number_of(self, prefix: str) -> int:
@@ -287,7 +333,9 @@ class SessionTable(Generic[M]):
             self._forget(session_id)
 
     def release(self, session_id: str, version: Version) -> bool:
-        """Release the session to another replica, which has a copy of that version; False if its version differs."""
+        """Release the session to another replica, which has a copy of that version; False if its
+        version differs.
+        """
         with self._lock:
             session = self._sessions.get(session_id)
             if session is None or session.version != version:
@@ -301,12 +349,15 @@ class SessionTable(Generic[M]):
             for session_id in session_ids:
                 session = self._sessions.get(session_id)
                 if session is not None and session.origin.owner == connection:
-                    self._forget(session_id, (max(session.steps, session.expected), _ANY))  # this voids a waiting reset
+                    # This voids a waiting reset.
+                    self._forget(session_id, (max(session.steps, session.expected), _ANY))
 
     def close_those_of(self, model: M) -> None:
         """Close all sessions of that model."""
         with self._lock:
-            for session in [session for session in self._sessions.values() if session.model is model]:
+            for session in [
+                session for session in self._sessions.values() if session.model is model
+            ]:
                 self._forget(session.id)
 
     def all(self) -> list[Session[M]]:
@@ -319,11 +370,17 @@ class SessionTable(Generic[M]):
             return Counter(session.origin.transport for session in self._sessions.values())
 
     def by_connection(self, transports: Container[str], within_s: float) -> Counter[str]:
-        """Return the number of sessions by connection, over these transports and used within the last `within_s`."""
+        """Return the number of sessions by connection, over these transports and used within the
+        last `within_s`.
+        """
         since = time.monotonic() - within_s
         with self._lock:
             sessions = list(self._sessions.values())
-        return Counter(s.origin.connection for s in sessions if s.origin.transport in transports and s.used >= since)
+        return Counter(
+            s.origin.connection
+            for s in sessions
+            if s.origin.transport in transports and s.used >= since
+        )
 
     def ids(self) -> list[str]:
         """Return the ids of all sessions."""
@@ -349,7 +406,8 @@ class SessionTable(Generic[M]):
 
 
 class DrainList:
-    """The connections to move to another replica; each gets the request in its next reply, once. Thread-safe.
+    """The connections to move to another replica; each gets the request in its next reply, once.
+    Thread-safe.
 
     `vlagents_ray.serve.scaling.rebalancer` selects them.
     """

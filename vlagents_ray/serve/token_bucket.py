@@ -19,7 +19,8 @@ class TokenBucket:
         self._refilled = now
 
     def take(self, now: float, number: int = 1) -> float:
-        """Take `number` tokens and return 0 if there are so many; otherwise return the time until there are, s.
+        """Take `number` tokens and return 0 if there are so many; otherwise return the time until
+        there are, s.
 
         The number must not exceed the capacity.
         """

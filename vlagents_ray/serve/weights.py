@@ -1,12 +1,15 @@
-"""The versions of one model's weights: which are held, which one the agent has, and which one each session acts with.
+"""The versions of one model's weights: which are held, which one the agent has, and which one each
+session acts with.
 
-Version 0 is the loaded checkpoint. A learner stages a version, which is checked and held but not used, and commits it
-when all replicas hold it. A commit copies and loads nothing: before a batch, a reset or an observation, the policy's
-thread loads the sessions' version into the agent (`ModelWeights.use`), which takes no time if the agent has it already.
-A version is freed when no session acts with it and it is neither the newest nor the pinned one.
+Version 0 is the loaded checkpoint. A learner stages a version, which is checked and held but not
+used, and commits it when all replicas hold it. A commit copies and loads nothing: before a batch, a
+reset or an observation, the policy's thread loads the sessions' version into the agent
+(`ModelWeights.use`), which takes no time if the agent has it already. A version is freed when no
+session acts with it and it is neither the newest nor the pinned one.
 
-On a GPU, the agent's version is that in its parameters, where another one takes its place. Two versions share its
-memory, the agent's and a staged one; those with which no session acts are in the memory of the host meanwhile.
+On a GPU, the agent's version is that in its parameters, where another one takes its place. Two
+versions share its memory, the agent's and a staged one; those with which no session acts are in the
+memory of the host meanwhile.
 """
 
 from __future__ import annotations
@@ -66,8 +69,10 @@ class PushOptions:
     mode: PushMode = "next_episode"  # when sessions change
     partial: bool = False  # whether names may be missing, whose values are kept
     allow_same: bool = False  # whether all values may equal those of the newest version
-    pin: bool = False  # whether sessions that do not follow the newest version also get it, at their next reset
-    version: int | None = None  # its number, such as the training step; by default the newest one's + 1
+    # Whether sessions that do not follow the newest version also get it, at their next reset.
+    pin: bool = False
+    # Its number, such as the training step; by default the newest one's + 1.
+    version: int | None = None
 
     def __post_init__(self) -> None:
         if self.version is not None and not 1 <= self.version <= _LARGEST:
@@ -98,14 +103,18 @@ class Rest:
     """A step between acting and acting again."""
 
     step: RestStep
-    offload: bool = True  # whether "sleep" moves weights to the memory of the host, and frees CUDA graphs
-    at_most_s: float = 600.0  # time after which a replica wakes by itself, since its learner may have died, s
+    # Whether "sleep" moves weights to the memory of the host, and frees CUDA graphs.
+    offload: bool = True
+    # Time after which a replica wakes by itself, since its learner may have died, s.
+    at_most_s: float = 600.0
 
     def __post_init__(self) -> None:
         if self.step not in get_args(RestStep):
             raise InvalidInput(f"rest: got {self.step!r}, want one of {list(get_args(RestStep))}")
         if not 0 < self.at_most_s <= _LONGEST_REST_S:
-            raise InvalidInput(f"at_most_s: got {self.at_most_s:g}, want seconds in (0, {_LONGEST_REST_S:g}]")
+            raise InvalidInput(
+                f"at_most_s: got {self.at_most_s:g}, want seconds in (0, {_LONGEST_REST_S:g}]"
+            )
 
 
 class FollowingSession(Protocol):
@@ -118,7 +127,13 @@ class FollowingSession(Protocol):
 class ModelWeights:
     """The versions of one model. Thread-safe, except `use`, which runs on the policy's thread."""
 
-    def __init__(self, agent: Agent, busy: threading.Lock, digest: str = "", model: tuple[str, str] = ("", "")) -> None:
+    def __init__(
+        self,
+        agent: Agent,
+        busy: threading.Lock,
+        digest: str = "",
+        model: tuple[str, str] = ("", ""),
+    ) -> None:
         """Make the weights of an initialized agent version 0.
 
         Args:
@@ -131,7 +146,8 @@ class ModelWeights:
         self.gpus: tuple[str, ...] = ()  # see `NewestVersion`
         self._agent, self._busy = agent, busy
         self._device: Any = "cpu"  # the GPU of its values, if they are on one
-        self._live_values: Mapping[str, Any] = {}  # the agent's, if another version takes their place in memory
+        # The agent's, if another version takes their place in memory.
+        self._live_values: Mapping[str, Any] = {}
         self._lock = threading.Lock()
         try:
             values: dict[str, Any] | None = agent.parameters()
@@ -140,27 +156,45 @@ class ModelWeights:
             first, self._in_place, self._swaps = WeightsVersion(0, digest, None), False, False
         else:
             self._refusal = None
-            # An agent with its own `load_parameters` may copy values instead of keeping references to them.
+            # An agent with its own `load_parameters` may copy values instead of keeping references
+            # to them.
             policy: Any = agent
             while type(policy).load_parameters is Wrapper.load_parameters:
                 policy = policy.agent
-            own, copied = type(policy).load_parameters is not Agent.load_parameters, trainable.is_copied(values or {})
-            self._in_place, self._swaps = own or copied, copied and not own and trainable.are_apart(values or {})
-            first = WeightsVersion(0, trainable.fingerprint(values or {}), None if self._in_place else values)
+            own, copied = (
+                type(policy).load_parameters is not Agent.load_parameters,
+                trainable.is_copied(values or {}),
+            )
+            self._in_place, self._swaps = (
+                own or copied,
+                copied and not own and trainable.are_apart(values or {}),
+            )
+            first = WeightsVersion(
+                0, trainable.fingerprint(values or {}), None if self._in_place else values
+            )
             if self._in_place:
                 self._live_values = values or {}
             self.gpus = readable_gpus(gpu_of(values or {}))
-            on_gpu = (value.device for value in (values or {}).values() if getattr(value, "is_cuda", False))
+            on_gpu = (
+                value.device
+                for value in (values or {}).values()
+                if getattr(value, "is_cuda", False)
+            )
             self._device = next(on_gpu, "cpu")
         self.newest = self.pinned = first
-        self.kept = 0  # number of the last version with which all following sessions act, since its mode was "keep"
+        # Number of the last version with which all following sessions act, since its mode was
+        # "keep".
+        self.kept = 0
         self._staged: WeightsVersion | None = None
         self._timer: threading.Timer | None = None
-        self._live: WeightsVersion | None = first  # version in the agent; None if loading one has failed
+        # Version in the agent; None if loading one has failed.
+        self._live: WeightsVersion | None = first
         self._alive = WeakValueDictionary({0: first})
         self._asleep = False
-        self._moved: list[tuple[Any, Any]] = []  # memory of the host with the values of the GPU, while it sleeps
-        # Is increased when another version begins to become the agent's, and when it has: odd in between.
+        # Memory of the host with the values of the GPU, while it sleeps.
+        self._moved: list[tuple[Any, Any]] = []
+        # Is increased when another version begins to become the agent's, and when it has: odd in
+        # between.
         self._switches = 0
 
     def begin(self, session: FollowingSession, *, follows: bool) -> WeightsVersion:
@@ -173,7 +207,8 @@ class ModelWeights:
     def find(self, number: int, digest: str, *, follows: bool = False) -> WeightsVersion:
         """Return the version for a session from another replica, which acts with that number there.
 
-        A session that `follows` the newest version gets a newer one that was pushed since with the mode "keep".
+        A session that `follows` the newest version gets a newer one that was pushed since with the
+        mode "keep".
 
         Raises:
             VersionNotHeld: The version is not held here; see `restore`.
@@ -183,11 +218,14 @@ class ModelWeights:
                 return self._alive.get(self.kept, self.newest)
             version = self._alive.get(number)
         if version is None or version.fingerprint != digest or version is self._staged:
-            raise VersionNotHeld(f"version {number} of the weights ({digest}) is not held here; reset the session")
+            raise VersionNotHeld(
+                f"version {number} of the weights ({digest}) is not held here; reset the session"
+            )
         return version
 
     def restore(self, number: int, digest: str, values: Mapping[str, Any]) -> WeightsVersion:
-        """Hold a version again that was freed here, or never pushed to this replica, as long as a session uses it.
+        """Hold a version again that was freed here, or never pushed to this replica, as long as a
+        session uses it.
 
         Args:
             number: Number of the version.
@@ -200,14 +238,17 @@ class ModelWeights:
         restored = self.make(number, self.newest, values, PushOptions(allow_same=True))
         if restored.fingerprint != digest:
             raise VersionNotHeld(
-                f"version {number} of the weights: got values with fingerprint {restored.fingerprint}, want {digest}; "
+                f"version {number} of the weights: got values with fingerprint "
+                f"{restored.fingerprint}, want {digest}; "
                 f"reset the session"
             )
         with self._lock:
             return self._alive.setdefault(number, restored)
 
     def catch_up(self, session: FollowingSession) -> None:
-        """Change a session that was not in the table of sessions to the last version pushed with the mode "keep"."""
+        """Change a session that was not in the table of sessions to the last version pushed with
+        the mode "keep".
+        """
         with self._lock:
             acts_with = session.weights
             if session.follows and acts_with is not None and acts_with.number < self.kept:
@@ -216,7 +257,8 @@ class ModelWeights:
     def use(self, version: WeightsVersion) -> None:
         """Load a version into the agent. Called with `busy` held, on the policy's thread.
 
-        The memory of freed versions stays torch's, for the next push: its return would wait for the GPU.
+        The memory of freed versions stays torch's, for the next push: its return would wait for the
+        GPU.
         """
         if version is self._live:
             return
@@ -225,7 +267,12 @@ class ModelWeights:
         live = None if outgoing is None else outgoing()  # None if nothing else refers to it
         kept = live if self._in_place and live is not None and live.values is None else None
         with beside_acts(self._device):  # all use of versions' memory is on that stream
-            if kept is not None and version.values is not None and self._swaps and not version.on_host:
+            if (
+                kept is not None
+                and version.values is not None
+                and self._swaps
+                and not version.on_host
+            ):
                 trainable.swap(self._agent.parameters(), version.values)
                 kept.values = version.values
             else:
@@ -244,23 +291,27 @@ class ModelWeights:
         """Check the header of a push, and return the types and shapes of the announced values.
 
         Args:
-            header: The header of a push, as `vlagents_ray.weights.safetensors.header_of` returns it.
+            header: The header of a push, as `vlagents_ray.weights.safetensors.header_of` returns
+                it.
             options: The options of the push.
 
         Raises:
             NotTrainable: The agent names no parameters.
-            MessageTooLarge: The header is twice as long as one with the agent's own names would be. It is not parsed.
+            MessageTooLarge: The header is twice as long as one with the agent's own names would be.
+                It is not parsed.
             MalformedMessage: The header is invalid.
             InvalidWeights: The values do not fit.
         """
         if self._refusal is not None:
             raise self._refusal
         held = self._held(self.newest)
-        # Each entry has its name, a type, numbers of up to 15 digits, and at most 60 further characters of JSON.
+        # Each entry has its name, a type, numbers of up to 15 digits, and at most 60 further
+        # characters of JSON.
         most = 4096 + 2 * sum(len(name) + 90 + 16 * len(held[name].shape) for name in held)
         if len(header) > most:
             raise MessageTooLarge(
-                f"weights: got a header of {len(header)} bytes, want at most {most} for the policy's {len(held)} names"
+                f"weights: got a header of {len(header)} bytes, want at most {most} for the "
+                f"policy's {len(held)} names"
             )
         announced = read_header(header)
         trainable.require_fit(held, announced, partial=options.partial)
@@ -285,7 +336,8 @@ class ModelWeights:
 
         Raises:
             NotTrainable: The agent names no parameters.
-            Overloaded: Another version is staged, or the number is not above that of the newest version.
+            Overloaded: Another version is staged, or the number is not above that of the newest
+                version.
             InvalidWeights: The values do not fit.
             UnchangedWeights: The values equal those of the newest version.
         """
@@ -296,7 +348,8 @@ class ModelWeights:
             newest = self.newest
             if number <= newest.number:
                 raise Overloaded(
-                    f"weights: got version {number}, want one above {newest.number}, the newest here: another push was "
+                    f"weights: got version {number}, want one above {newest.number}, the newest "
+                    "here: another push was "
                     f"faster; push again"
                 )
             if self._staged is not None:
@@ -312,7 +365,9 @@ class ModelWeights:
             raise
         with self._lock:
             if self._staged is not placeholder:
-                raise WeightsNotStaged(f"weights: version {number} was dropped while it was checked; push it again")
+                raise WeightsNotStaged(
+                    f"weights: version {number} was dropped while it was checked; push it again"
+                )
             self._staged = staged
             self._timer = threading.Timer(STAGED_S, self.drop, (number,))
             self._timer.daemon = True
@@ -320,14 +375,25 @@ class ModelWeights:
         return staged.fingerprint
 
     def make(
-        self, number: int, newest: WeightsVersion, pushed: Mapping[str, Any] | SharedValues, options: PushOptions
+        self,
+        number: int,
+        newest: WeightsVersion,
+        pushed: Mapping[str, Any] | SharedValues,
+        options: PushOptions,
     ) -> WeightsVersion:
-        """Return a version of pushed values, which have been checked; missing names have the values of the newest."""
-        with self._uncaptured(), opened(pushed) if isinstance(pushed, SharedValues) else nullcontext(pushed) as named:
+        """Return a version of pushed values, which have been checked; missing names have the
+        values of the newest.
+        """
+        with (
+            self._uncaptured(),
+            opened(pushed) if isinstance(pushed, SharedValues) else nullcontext(pushed) as named,
+        ):
             new = trainable.accepted(self._held(newest), named, partial=options.partial)
 
             def completed(held: Mapping[str, Any]) -> dict[str, Any]:
-                return trainable.completed(held, new, allow_same=options.allow_same, in_place=self._in_place)
+                return trainable.completed(
+                    held, new, allow_same=options.allow_same, in_place=self._in_place
+                )
 
             reads_none = options.allow_same and not options.partial
             values = completed(self._held(newest)) if reads_none else self._read(newest, completed)
@@ -338,14 +404,18 @@ class ModelWeights:
         self._alive[version.number] = version
 
     def act_with(self, version: WeightsVersion, sessions: Iterable[FollowingSession]) -> None:
-        """Act with a version in all sessions and coming episodes, in a child process, whose replica decides on it."""
+        """Act with a version in all sessions and coming episodes, in a child process, whose
+        replica decides on it.
+        """
         with self._lock:
             self.newest = self.pinned = version
             for session in sessions:
                 if session.weights is not None:
                     session.weights = version
 
-    def commit(self, number: int, options: PushOptions, sessions: Callable[[], Iterable[FollowingSession]]) -> None:
+    def commit(
+        self, number: int, options: PushOptions, sessions: Callable[[], Iterable[FollowingSession]]
+    ) -> None:
         """Use a staged version from now on. A repeated commit of the newest version does nothing.
 
         Args:
@@ -361,7 +431,8 @@ class ModelWeights:
                 return
             if self._staged is None or self._staged.number != number or self._staged.values is None:
                 raise WeightsNotStaged(
-                    f"weights: version {number} is not staged here; push it again, and commit within {STAGED_S:g} s"
+                    f"weights: version {number} is not staged here; push it again, and commit "
+                    f"within {STAGED_S:g} s"
                 )
             self.newest = self._alive[number] = self._staged
             if options.pin:
@@ -371,7 +442,11 @@ class ModelWeights:
                 self.kept = number
                 for session in sessions():
                     acts_with = session.weights  # of this model, or of another one
-                    if session.follows and acts_with is not None and self._alive.get(acts_with.number) is acts_with:
+                    if (
+                        session.follows
+                        and acts_with is not None
+                        and self._alive.get(acts_with.number) is acts_with
+                    ):
                         session.weights = self.newest
 
     def drop(self, number: int) -> None:
@@ -391,7 +466,8 @@ class ModelWeights:
             return {name: trainable.portable(value) for name, value in values.items()}
 
     def sleep(self, *, offload: bool) -> None:
-        """Free the memory that torch has cached and, with `offload`, that of all versions and graphs, until `wake`.
+        """Free the memory that torch has cached and, with `offload`, that of all versions and
+        graphs, until `wake`.
 
         The caller keeps the agent from acting meanwhile.
 
@@ -404,7 +480,9 @@ class ModelWeights:
             if offload:
                 self._asleep = True
                 self._agent.sleep()
-                held = [version.values for version in self._alive.values() if version.values is not None]
+                held = [
+                    version.values for version in self._alive.values() if version.values is not None
+                ]
                 trainable.to_host([self._agent.parameters(), *held], self._moved)
         free_memory()
 
@@ -424,17 +502,22 @@ class ModelWeights:
                 if not is_out_of_memory(error):
                     raise
                 raise PolicyUnavailable(
-                    f"wake: the GPU has too little memory for the policy, which still sleeps; free the learner's, "
+                    "wake: the GPU has too little memory for the policy, which still sleeps; free "
+                    "the learner's, "
                     f"with torch.cuda.empty_cache(), and call wake again ({error})"
                 ) from error
             self._asleep = False
 
     @contextmanager
     def _uncaptured(self) -> Iterator[None]:
-        """Work on versions beside the acts, but not beside a capture; raises `PolicyUnavailable` while they sleep."""
+        """Work on versions beside the acts, but not beside a capture; raises `PolicyUnavailable`
+        while they sleep.
+        """
         with CAPTURES.pushes:
             if self._asleep:
-                raise PolicyUnavailable("weights: the policy sleeps; give wake() the new values, or call it first")
+                raise PolicyUnavailable(
+                    "weights: the policy sleeps; give wake() the new values, or call it first"
+                )
             with beside_acts(self._device):
                 yield
 
@@ -445,12 +528,16 @@ class ModelWeights:
             self._timer = None
 
     def _held(self, version: WeightsVersion) -> Mapping[str, Any]:
-        """Return references to values with the types, shapes and devices of the version's, without waiting for acts."""
+        """Return references to values with the types, shapes and devices of the version's,
+        without waiting for acts.
+        """
         values = version.values
         return self._parameters() if values is None or version.on_host else values
 
     def _parameters(self) -> Mapping[str, Any]:
-        """Return the agent's own values. Lazy layers have none before the first act, which has their sizes."""
+        """Return the agent's own values. Lazy layers have none before the first act, which has
+        their sizes.
+        """
         if not self._live_values:
             with self._busy:
                 self._live_values = self._agent.parameters()
@@ -459,8 +546,8 @@ class ModelWeights:
     def _read(self, version: WeightsVersion, read: Callable[[Mapping[str, Any]], T]) -> T:
         """Return the result of a function of a version's values, which may be the agent's.
 
-        It does not wait for acts. If another version becomes the agent's meanwhile, in the same memory, the function is
-        called once more, between two acts.
+        It does not wait for acts. If another version becomes the agent's meanwhile, in the same
+        memory, the function is called once more, between two acts.
         """
 
         def result() -> T:
@@ -488,7 +575,9 @@ class ModelWeights:
         return trainable.mapped(trainable.own_copy, values) if self._in_place else values
 
     def _move_to_host(self, used: set[WeightsVersion | None]) -> None:
-        """Move the pinned and the newest version out of the GPU's memory, unless it is the agent's or one of `used`."""
+        """Move the pinned and the newest version out of the GPU's memory, unless it is the
+        agent's or one of `used`.
+        """
         for version in {self.pinned, self.newest} - used:
             switches, values = self._switches, version.values
             if values is None or version.on_host:
@@ -503,7 +592,9 @@ class HoldsWeights(ABC):
     """An agent that holds the versions of its weights itself, such as one in another process."""
 
     @abstractmethod
-    def model_weights(self, busy: threading.Lock, digest: str, model: tuple[str, str]) -> ModelWeights:
+    def model_weights(
+        self, busy: threading.Lock, digest: str, model: tuple[str, str]
+    ) -> ModelWeights:
         """Return the versions; see `ModelWeights` for the arguments."""
 
 
@@ -521,8 +612,10 @@ class NewestVersion:
     """The newest version of a replica."""
 
     number: int
-    model: tuple[str, str]  # equal in replicas that loaded the same checkpoint with the same settings
-    # UUIDs of the GPUs whose memory it can copy: that of its weights, and its peers; none if there is no single GPU
+    # Equal in replicas that loaded the same checkpoint with the same settings.
+    model: tuple[str, str]
+    # UUIDs of the GPUs whose memory it can copy: that of its weights, and its peers; none if there
+    # is no single GPU
     gpus: tuple[str, ...] = ()
 
 
@@ -555,10 +648,12 @@ class WeightUpdates:
         self.own, self._sessions = own, sessions
         self._acting = acting or threading.Lock()
         self._resting = threading.RLock()  # held during each step of a rest
-        self._asleep: ModelWeights | None = None  # those of the policy that sleeps, for which `acting` is held
+        # Those of the policy that sleeps, for which `acting` is held.
+        self._asleep: ModelWeights | None = None
         self._alarm: threading.Timer | None = None
         self._pushes_ms: deque[float] = deque(maxlen=_COLLECTED)
-        self._given: dict[int, WeightsVersion] = {}  # in a child process: those that its replica refers to
+        # In a child process: those that its replica refers to.
+        self._given: dict[int, WeightsVersion] = {}
 
     def pushed(self, took_ms: float) -> None:
         """Record the duration of a push that this replica coordinated, for the metrics."""
@@ -568,8 +663,12 @@ class WeightUpdates:
         """Return the durations of the pushes since the last call."""
         return [self._pushes_ms.popleft() for _ in range(len(self._pushes_ms))]
 
-    def stage(self, number: int, pushed: Mapping[str, Any] | SharedValues, options: PushOptions) -> str:
-        """Check and hold a new version, and return its fingerprint, as `ModelWeights.stage` does."""
+    def stage(
+        self, number: int, pushed: Mapping[str, Any] | SharedValues, options: PushOptions
+    ) -> str:
+        """Check and hold a new version, and return its fingerprint, as `ModelWeights.stage`
+        does.
+        """
         return self.own().stage(number, pushed, options, self._sessions)
 
     def commit(self, number: int, options: PushOptions) -> None:
@@ -577,11 +676,16 @@ class WeightUpdates:
         self.own().commit(number, options, self._sessions)
 
     def held(self) -> list[HeldVersion]:
-        """Return the pinned and the newest version, the older one first, except for the checkpoint itself."""
+        """Return the pinned and the newest version, the older one first, except for the
+        checkpoint itself.
+        """
         own = self.own()
         pinned, newest = own.pinned, own.newest
         pushed = dict.fromkeys(version for version in (pinned, newest) if version.number)
-        return [HeldVersion(one.number, one is pinned, own.kept, own.portable_values(one)) for one in pushed]
+        return [
+            HeldVersion(one.number, one is pinned, own.kept, own.portable_values(one))
+            for one in pushed
+        ]
 
     def drop(self, number: int) -> None:
         """Drop the staged version."""
@@ -593,7 +697,8 @@ class WeightUpdates:
         Requests wait in the queue meanwhile. "restore" and "wake" do nothing if it is awake.
 
         Raises:
-            PolicyUnavailable: The policy loads, or its GPU has too little memory, so that it still sleeps.
+            PolicyUnavailable: The policy loads, or its GPU has too little memory, so that it still
+                sleeps.
             Overloaded: It sleeps already.
             NotTrainable: See `ModelWeights.sleep`.
         """
@@ -633,18 +738,25 @@ class WeightUpdates:
         with self._resting:
             if self._alarm is not threading.current_thread():
                 return
-            logger.warning("the policy slept for %g s, its limit, and wakes without its learner", seconds)
+            logger.warning(
+                "the policy slept for %g s, its limit, and wakes without its learner", seconds
+            )
             try:
                 self.rest(Rest("wake"))
             except Exception:
                 logger.exception("the policy does not wake; tried again in %g s", seconds)
                 self._set_alarm(seconds)
 
-    # In a child process: its replica decides which version acts, and when one is dropped. It names version 0 as 0, and
-    # others by numbers of its own, as a version may be pushed twice.
+    # In a child process: its replica decides which version acts, and when one is dropped. It names
+    # version 0 as 0, and others by numbers of its own, as a version may be pushed twice.
 
     def make(
-        self, name: int, base: int, number: int, pushed: Mapping[str, Any] | SharedValues, options: PushOptions
+        self,
+        name: int,
+        base: int,
+        number: int,
+        pushed: Mapping[str, Any] | SharedValues,
+        options: PushOptions,
     ) -> str:
         """Make a version from pushed values and those of `base`, and return its fingerprint."""
         own = self.own()
@@ -659,7 +771,9 @@ class WeightUpdates:
         return self._given[name]
 
     def obey(self, use: int | None = None, forget: int | None = None) -> None:
-        """Act with one version from now on, or drop one. Called on the policy's thread, between two batches."""
+        """Act with one version from now on, or drop one. Called on the policy's thread, between
+        two batches.
+        """
         if use is not None:
             self.own().act_with(self.given(use), self._sessions())
         if forget is not None:
@@ -671,7 +785,9 @@ class WeightUpdates:
         return newest.number, newest.fingerprint
 
     def describe(self) -> dict[str, dict[str, Any]] | None:
-        """Return number and fingerprint of the newest and the pinned version, for the metadata; None while it loads."""
+        """Return number and fingerprint of the newest and the pinned version, for the metadata;
+        None while it loads.
+        """
         try:
             own = self.own()
         except PolicyUnavailable:
@@ -693,12 +809,15 @@ class WeightUpdates:
 
 
 def follows(options: dict[str, Any], *, by_default: bool) -> bool:
-    """Remove the option "weights" from the options of a reset, and return whether the episode uses the newest version.
+    """Remove the option "weights" from the options of a reset, and return whether the episode uses
+    the newest version.
 
     Raises:
         InvalidInput: The option has another value than "follow" or "pinned".
     """
     wanted = options.pop(OPTION, _FOLLOW if by_default else _PINNED)
     if not isinstance(wanted, str) or wanted not in (_FOLLOW, _PINNED):
-        raise InvalidInput(f"{OPTION}: got {wanted!r}, want {_FOLLOW!r} (the newest version) or {_PINNED!r}")
+        raise InvalidInput(
+            f"{OPTION}: got {wanted!r}, want {_FOLLOW!r} (the newest version) or {_PINNED!r}"
+        )
     return bool(wanted == _FOLLOW)

@@ -1,7 +1,9 @@
-"""The safetensors format: a header in JSON, with type, shape and place of each value, followed by their bytes.
+"""The safetensors format: a header in JSON, with type, shape and place of each value, followed by
+their bytes.
 
-It contains only numbers, so that reading it executes nothing. A reader checks the whole header before it allocates
-memory for any value. See https://huggingface.co/docs/safetensors for the format.
+It contains only numbers, so that reading it executes nothing. A reader checks the whole header
+before it allocates memory for any value. See https://huggingface.co/docs/safetensors for the
+format.
 """
 
 from __future__ import annotations
@@ -19,8 +21,10 @@ import numpy as np
 from vlagents_ray.errors import InvalidWeights, MalformedMessage, shown
 from vlagents_ray.naming import without_doubles
 
-MESSAGE_BYTES = 2**22  # longest message with weights: a header (about 40,000 values), or a part of their bytes
-PART_BYTES = 2**20  # bytes of a part; while a replica reads longer parts, its acts wait for Python's lock
+# Longest message with weights: a header (about 40,000 values), or a part of their bytes.
+MESSAGE_BYTES = 2**22
+# Bytes of a part; while a replica reads longer parts, its acts wait for Python's lock.
+PART_BYTES = 2**20
 _LENGTH = struct.Struct("<Q")
 _NAME_LENGTH = 512  # characters
 _DIMENSIONS = 32  # as in the oldest supported numpy
@@ -50,13 +54,21 @@ class ValueSpec:
 
 
 def header_of(named: Mapping[str, np.ndarray]) -> bytes:
-    """Return the header of a file with these values; raises `InvalidWeights` for a type that the format lacks."""
+    """Return the header of a file with these values; raises `InvalidWeights` for a type that the
+    format lacks.
+    """
     document, begin = {}, 0
     for name, value in named.items():
         if value.dtype not in _CODES:
-            raise InvalidWeights(f"{name!r}: got {value.dtype}, want one of {', '.join(sorted(_TYPES))}")
+            raise InvalidWeights(
+                f"{name!r}: got {value.dtype}, want one of {', '.join(sorted(_TYPES))}"
+            )
         end = begin + value.nbytes
-        document[name] = {"dtype": _CODES[value.dtype], "shape": list(value.shape), "data_offsets": [begin, end]}
+        document[name] = {
+            "dtype": _CODES[value.dtype],
+            "shape": list(value.shape),
+            "data_offsets": [begin, end],
+        }
         begin = end
     text = json.dumps(document, separators=(",", ":")).encode()
     text += b" " * (-len(text) % 8)
@@ -64,7 +76,9 @@ def header_of(named: Mapping[str, np.ndarray]) -> bytes:
 
 
 def parts_of(named: Mapping[str, np.ndarray], length: int = PART_BYTES) -> Iterator[bytes]:
-    """Yield the bytes of the values, in the header's order, in parts of `length` bytes; the last may be shorter."""
+    """Yield the bytes of the values, in the header's order, in parts of `length` bytes; the last
+    may be shorter.
+    """
     part = bytearray()
     for value in named.values():
         data = memoryview(np.ascontiguousarray(value).reshape(-1).view(np.uint8).data)
@@ -80,24 +94,30 @@ def parts_of(named: Mapping[str, np.ndarray], length: int = PART_BYTES) -> Itera
 
 
 def read_header(data: bytes) -> dict[str, ValueSpec]:
-    """Return the values that a header made by `header_of` announces, by name, in the order of their bytes.
+    """Return the values that a header made by `header_of` announces, by name, in the order of their
+    bytes.
 
     Raises:
-        MalformedMessage: The data are not a header or too long, or the places overlap, leave gaps or do not fit the
-            shapes.
+        MalformedMessage: The data are not a header or too long, or the places overlap, leave gaps
+            or do not fit the shapes.
     """
     announced = _LENGTH.unpack_from(data)[0] if len(data) >= _LENGTH.size else -1
     if announced != len(data) - _LENGTH.size or len(data) > MESSAGE_BYTES:
         raise MalformedMessage(
-            f"safetensors: got {len(data)} bytes that announce a header of {announced}, want 8 bytes with the length "
+            f"safetensors: got {len(data)} bytes that announce a header of {announced}, want 8 "
+            "bytes with the length "
             f"of the header, and the header, at most {MESSAGE_BYTES} together"
         )
     try:
-        document = json.loads(data[_LENGTH.size :], parse_int=_whole, object_pairs_hook=without_doubles)
+        document = json.loads(
+            data[_LENGTH.size :], parse_int=_whole, object_pairs_hook=without_doubles
+        )
     except (ValueError, RecursionError) as error:
         raise MalformedMessage(f"safetensors: the header is no JSON document ({error})") from error
     if not isinstance(document, dict):
-        raise MalformedMessage(f"safetensors: got {type(document).__name__}, want an object with a value for each name")
+        raise MalformedMessage(
+            f"safetensors: got {type(document).__name__}, want an object with a value for each name"
+        )
     document.pop(_METADATA, None)
     placed = sorted((*_read_value(name, entry), name) for name, entry in document.items())
     specs, at = {}, 0
@@ -105,7 +125,8 @@ def read_header(data: bytes) -> dict[str, ValueSpec]:
         spec = ValueSpec(_TYPES[code], shape)
         if begin != at or end - begin != spec.size:
             raise MalformedMessage(
-                f"safetensors: {name!r}: got bytes {begin} to {end}, want {at} to {at + spec.size} for {code} of shape "
+                f"safetensors: {name!r}: got bytes {begin} to {end}, want {at} to {at + spec.size} "
+                f"for {code} of shape "
                 f"{list(shape)}"
             )
         specs[name], at = spec, end
@@ -114,21 +135,29 @@ def read_header(data: bytes) -> dict[str, ValueSpec]:
 
 def _read_value(name: str, entry: Any) -> tuple[int, int, str, tuple[int, ...]]:
     if len(name) > _NAME_LENGTH:
-        raise MalformedMessage(f"safetensors: got a name of {len(name)} characters, the limit is {_NAME_LENGTH}")
+        raise MalformedMessage(
+            f"safetensors: got a name of {len(name)} characters, the limit is {_NAME_LENGTH}"
+        )
     if not isinstance(entry, dict) or entry.keys() != {"dtype", "shape", "data_offsets"}:
         raise MalformedMessage(f"safetensors: {name!r}: want 'dtype', 'shape' and 'data_offsets'")
     code, shape, offsets = entry["dtype"], entry["shape"], entry["data_offsets"]
     if not isinstance(code, str) or code not in _TYPES:
-        raise MalformedMessage(f"safetensors: {name!r}: got type {shown(code, 20)}, want one of {', '.join(_TYPES)}")
+        raise MalformedMessage(
+            f"safetensors: {name!r}: got type {shown(code, 20)}, want one of {', '.join(_TYPES)}"
+        )
     if not _are_whole(shape) or len(shape) > _DIMENSIONS:
-        raise MalformedMessage(f"safetensors: {name!r}: shape: want at most {_DIMENSIONS} whole numbers")
+        raise MalformedMessage(
+            f"safetensors: {name!r}: shape: want at most {_DIMENSIONS} whole numbers"
+        )
     if not _are_whole(offsets) or len(offsets) != 2:
         raise MalformedMessage(f"safetensors: {name!r}: data_offsets: want two whole numbers")
     return offsets[0], offsets[1], code, tuple(shape)
 
 
 def _are_whole(numbers: Any) -> bool:
-    return isinstance(numbers, list) and all(type(number) is int and number >= 0 for number in numbers)
+    return isinstance(numbers, list) and all(
+        type(number) is int and number >= 0 for number in numbers
+    )
 
 
 def _whole(text: str) -> int:
@@ -138,7 +167,9 @@ def _whole(text: str) -> int:
 
 
 class ValuesReader:
-    """Values whose bytes arrive in parts. The memory of a value is allocated when its first byte arrives."""
+    """Values whose bytes arrive in parts. The memory of a value is allocated when its first byte
+    arrives.
+    """
 
     def __init__(self, specs: Mapping[str, ValueSpec]) -> None:
         """Read the values that a header announces, see `read_header`."""
@@ -149,10 +180,13 @@ class ValuesReader:
         self.size = sum(spec.size for spec in specs.values())  # bytes
 
     def add(self, part: bytes) -> None:
-        """Append the next bytes; raises `MalformedMessage` if there are more than the header announced."""
+        """Append the next bytes; raises `MalformedMessage` if there are more than the header
+        announced.
+        """
         if self.received + len(part) > self.size:
             raise MalformedMessage(
-                f"safetensors: got {self.received + len(part)} bytes of values, the header announced {self.size}"
+                f"safetensors: got {self.received + len(part)} bytes of values, the header "
+                f"announced {self.size}"
             )
         self.received += len(part)
         data = np.frombuffer(part, np.uint8)
@@ -173,7 +207,9 @@ class ValuesReader:
             self._begin_next()  # needed for values without elements
         for name, value in self._values.items():
             if value.dtype == np.bool_ and value.size and value.view(np.uint8).max() > 1:
-                raise MalformedMessage(f"safetensors: {name!r}: got other bytes than 0 and 1 for truth values")
+                raise MalformedMessage(
+                    f"safetensors: {name!r}: got other bytes than 0 and 1 for truth values"
+                )
             value.flags.writeable = False
         return self._values
 
@@ -184,14 +220,18 @@ class ValuesReader:
 
 
 def write_values(file: BinaryIO, named: Mapping[str, np.ndarray]) -> None:
-    """Write values into a file, from its place on; raises `InvalidWeights` for a type that the format lacks."""
+    """Write values into a file, from its place on; raises `InvalidWeights` for a type that the
+    format lacks.
+    """
     file.write(header_of(named))
     file.writelines(parts_of(named))
     file.flush()
 
 
 def read_values(file: BinaryIO) -> Mapping[str, np.ndarray]:
-    """Return the values of a file, read-only, as `write_values` wrote them; raises `MalformedMessage`."""
+    """Return the values of a file, read-only, as `write_values` wrote them; raises
+    `MalformedMessage`.
+    """
     length = file.read(_LENGTH.size)
     announced = _LENGTH.unpack(length)[0] if len(length) == _LENGTH.size else 0
     reader = ValuesReader(read_header(length + file.read(min(announced, MESSAGE_BYTES))))
@@ -199,6 +239,7 @@ def read_values(file: BinaryIO) -> Mapping[str, np.ndarray]:
         reader.add(part)
     if reader.received != reader.size:
         raise MalformedMessage(
-            f"safetensors: got {reader.received} bytes of values, the header announced {reader.size}"
+            f"safetensors: got {reader.received} bytes of values, the header announced "
+            f"{reader.size}"
         )
     return reader.values()

@@ -1,8 +1,10 @@
-"""Values on a GPU that another process copies in place, by CUDA's handles for memory of other processes.
+"""Values on a GPU that another process copies in place, by CUDA's handles for memory of other
+processes.
 
-A handle consists of bytes and numbers, which `SharedValues` contains. It is valid in processes of the same node that
-use the same GPU, while the process that made it keeps the memory: see the section on interprocess communication of
-https://docs.nvidia.com/cuda/cuda-c-programming-guide/. As in `trainable`, torch is never imported here.
+A handle consists of bytes and numbers, which `SharedValues` contains. It is valid in processes of
+the same node that use the same GPU, while the process that made it keeps the memory: see the
+section on interprocess communication of https://docs.nvidia.com/cuda/cuda-c-programming-guide/. As
+in `trainable`, torch is never imported here.
 """
 
 from __future__ import annotations
@@ -59,7 +61,9 @@ class SharedValues:
     others: Mapping[str, Any]  # values that are not on a GPU, as returned by `portable`
 
     def to_json(self) -> dict[str, Any]:
-        """Return JSON values of all but `others`, from which `from_json` makes the handles again."""
+        """Return JSON values of all but `others`, from which `from_json` makes the handles
+        again.
+        """
         storages = {
             key: [one.allocation.hex(), one.size, one.begin, one.counters.hex(), one.counter]
             for key, one in self.storages.items()
@@ -71,7 +75,9 @@ class SharedValues:
     def from_json(cls, node: dict[str, Any], others: Mapping[str, Any]) -> SharedValues:
         """Return the handles that `to_json` described, with the other values."""
         storages = {
-            int(key): StorageHandle(bytes.fromhex(allocation), size, begin, bytes.fromhex(counters), counter)
+            int(key): StorageHandle(
+                bytes.fromhex(allocation), size, begin, bytes.fromhex(counters), counter
+            )
             for key, (allocation, size, begin, counters, counter) in node["storages"].items()
         }
         views = {
@@ -88,13 +94,16 @@ def gpu_of(named: Mapping[str, Any]) -> str:
 
 
 def readable_gpus(gpu: str) -> tuple[str, ...]:
-    """Return the UUIDs of the GPUs whose memory this process can copy to `gpu`, which is one; none without it."""
+    """Return the UUIDs of the GPUs whose memory this process can copy to `gpu`, which is one;
+    none without it.
+    """
     return _MEMORY.readable(gpu) if gpu else ()
 
 
 @contextmanager
 def shared(named: Mapping[str, Any]) -> Iterator[SharedValues]:
-    """Yield values by name for another process, those on the GPU as handles; they must not change meanwhile.
+    """Yield values by name for another process, those on the GPU as handles; they must not change
+    meanwhile.
 
     All values on a GPU must be on one, see `gpu_of`.
 
@@ -114,7 +123,9 @@ def shared(named: Mapping[str, Any]) -> Iterator[SharedValues]:
             address, begin = storage.data_ptr(), value.storage_offset()
             if address not in values.storages:  # tied values have one storage
                 values.storages[address] = stack.enter_context(_MEMORY.handed_over(storage))
-            values.views[name] = ValueView(address, dtype_name(value), begin, tuple(value.shape), value.stride())
+            values.views[name] = ValueView(
+                address, dtype_name(value), begin, tuple(value.shape), value.stride()
+            )
         for device in devices:
             _MEMORY.finish(device)
         yield values
@@ -122,20 +133,28 @@ def shared(named: Mapping[str, Any]) -> Iterator[SharedValues]:
 
 @contextmanager
 def opened(values: SharedValues) -> Iterator[Mapping[str, Any]]:
-    """Yield another process's values by name, without copying those on a GPU: copy them within the context.
+    """Yield another process's values by name, without copying those on a GPU: copy them within the
+    context.
 
     Raises:
         NotShared: The memory of the other process cannot be opened.
     """
     torch = sys.modules["torch"]
     try:
-        storages = {address: _MEMORY.opened(values.gpu, handle) for address, handle in values.storages.items()}
+        storages = {
+            address: _MEMORY.opened(values.gpu, handle)
+            for address, handle in values.storages.items()
+        }
     except RuntimeError as error:
-        raise NotShared(f"the learner's memory on GPU {values.gpu} cannot be opened: {error}") from error
+        raise NotShared(
+            f"the learner's memory on GPU {values.gpu} cannot be opened: {error}"
+        ) from error
     devices = {storage.device for storage in storages.values()}
     named = dict(values.others)
     for name, view in values.views.items():
-        empty = torch.empty(0, dtype=getattr(torch, view.dtype), device=storages[view.storage].device)
+        empty = torch.empty(
+            0, dtype=getattr(torch, view.dtype), device=storages[view.storage].device
+        )
         named[name] = empty.set_(storages[view.storage], view.begin, view.shape, view.stride)
         del empty
     del storages
@@ -155,8 +174,9 @@ _FIRST_COUNT, _COUNT = 64, 8  # bytes before the counts in that file, and of eac
 def counted_reads(counters: bytes, counter: int) -> Iterator[None]:
     """Let torch free memory that it has sent after this context, whether and how often it was read.
 
-    Torch keeps such memory as long as its count of readers is not 0. The count is 1 at first, and each reader that ends
-    takes 1 away, so that it is wrong without a reader, and with several; being unsigned, it is then never 0 again.
+    Torch keeps such memory as long as its count of readers is not 0. The count is 1 at first, and
+    each reader that ends takes 1 away, so that it is wrong without a reader, and with several;
+    being unsigned, it is then never 0 again.
 
     Args:
         counters: The name of torch's file of counts, which exists now.
@@ -173,7 +193,9 @@ def counted_reads(counters: bytes, counter: int) -> Iterator[None]:
 
 
 def _count(counters: bytes, counter: int) -> memoryview | None:
-    """Return the bytes of a count; None, with a warning, if the file is not laid out as expected."""
+    """Return the bytes of a count; None, with a warning, if the file is not laid out as
+    expected.
+    """
     begin = _FIRST_COUNT + _COUNT * counter
     try:
         count = memoryview(_counts(counters))[begin : begin + _COUNT]
@@ -191,7 +213,8 @@ def _count(counters: bytes, counter: int) -> memoryview | None:
 @lru_cache(maxsize=16)  # once for each reason, and not for each value
 def _warn_of_counts(reason: str) -> None:
     logger.warning(
-        "torch's counts of readers cannot be set (%s): memory that was pushed to replicas on the same GPU may stay "
+        "torch's counts of readers cannot be set (%s): memory that was pushed to replicas on the "
+        "same GPU may stay "
         "allocated; if it grows, use another version of torch, or other GPUs for the replicas",
         reason,
     )
@@ -213,12 +236,18 @@ class _GpuMemory:
         if torch is None or type(value) not in (torch.Tensor, torch.nn.Parameter):
             return ""
         # An empty tensor has no memory, and a sparse one has several.
-        return self._uuid(value.device) if value.is_cuda and value.layout == torch.strided and value.numel() else ""
+        return (
+            self._uuid(value.device)
+            if value.is_cuda and value.layout == torch.strided and value.numel()
+            else ""
+        )
 
     def finish(self, device: Any) -> None:
-        """Wait for the work that this thread has queued on a GPU, since another process does not wait for it.
+        """Wait for the work that this thread has queued on a GPU, since another process does not
+        wait for it.
 
-        It waits for the current stream; waiting for the device would abort graph captures of other threads.
+        It waits for the current stream; waiting for the device would abort graph captures of other
+        threads.
         """
         sys.modules["torch"].cuda.current_stream(device).synchronize()
 
@@ -226,14 +255,17 @@ class _GpuMemory:
     def handed_over(self, storage: Any) -> Iterator[StorageHandle]:
         """Yield a handle of a torch storage for another process."""
         torch = sys.modules["torch"]
-        # Each call of `_share_cuda_` permanently wraps the memory of the storage once more. It is therefore called on
-        # another storage of the same memory, and the learner's own stays unchanged, however often it is pushed.
+        # Each call of `_share_cuda_` permanently wraps the memory of the storage once more. It is
+        # therefore called on another storage of the same memory, and the learner's own stays
+        # unchanged, however often it is pushed.
         whole = torch.empty(0, dtype=torch.uint8, device=storage.device).set_(storage)
         alias = torch.from_dlpack(whole).untyped_storage()
         try:
             _, allocation, size, begin, counters, counter, _, _ = alias._share_cuda_()
         except RuntimeError as error:
-            raise NotShared(f"this process cannot hand over its memory on {storage.device}: {error}") from error
+            raise NotShared(
+                f"this process cannot hand over its memory on {storage.device}: {error}"
+            ) from error
         with counted_reads(counters, counter):
             yield StorageHandle(allocation, size, begin, counters, counter)
 
@@ -246,21 +278,34 @@ class _GpuMemory:
     def opened(self, gpu: str, handle: StorageHandle) -> Any:
         """Return the storage of another process; raises `RuntimeError` if it cannot be reached."""
         torch = sys.modules["torch"]
-        devices = [device for device in range(torch.cuda.device_count()) if self._uuid(device) == gpu]
+        devices = [
+            device for device in range(torch.cuda.device_count()) if self._uuid(device) == gpu
+        ]
         if not devices:
             raise RuntimeError("this process does not use that GPU")
-        # The last two are an event to wait for, which torch would never free here, and whether there is one. The sender
-        # has already waited, see `finish`.
+        # The last two are an event to wait for, which torch would never free here, and whether
+        # there is one. The sender has already waited, see `finish`.
         return torch.UntypedStorage._new_shared_cuda(
-            devices[0], handle.allocation, handle.size, handle.begin, handle.counters, handle.counter, b"", False
+            devices[0],
+            handle.allocation,
+            handle.size,
+            handle.begin,
+            handle.counters,
+            handle.counter,
+            b"",
+            False,
         )
 
     def readable(self, gpu: str) -> tuple[str, ...]:
-        """Return the UUIDs of the visible GPUs whose memory can be copied to `gpu` without the host."""
+        """Return the UUIDs of the visible GPUs whose memory can be copied to `gpu` without the
+        host.
+        """
         cuda = sys.modules["torch"].cuda
         uuids = [self._uuid(device) for device in range(cuda.device_count())]
         own = uuids.index(gpu)
-        return tuple(uuids[i] for i in range(len(uuids)) if i == own or cuda.can_device_access_peer(own, i))
+        return tuple(
+            uuids[i] for i in range(len(uuids)) if i == own or cuda.can_device_access_peer(own, i)
+        )
 
     @staticmethod
     def _uuid(device: Any) -> str:

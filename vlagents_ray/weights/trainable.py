@@ -1,7 +1,8 @@
-"""The named values of a trainable object: a torch module, or nested dicts and lists of arrays and torch modules.
+"""The named values of a trainable object: a torch module, or nested dicts and lists of arrays and
+torch modules.
 
-The name of a value in a torch module is that in its `state_dict`; in nested dicts it is the keys, joined with "/", and
-then that in a module.
+The name of a value in a torch module is that in its `state_dict`; in nested dicts it is the keys,
+joined with "/", and then that in a module.
 Torch and JAX are never imported here: their objects exist only if they have been imported.
 """
 
@@ -25,16 +26,20 @@ from vlagents_ray.errors import InvalidWeights, NotTrainable, UnchangedWeights
 _BFLOAT16 = np.dtype("V2")
 _SHOWN = 5  # faults in a message
 _THREADS = 4  # threads that compute a fingerprint: numpy releases Python's lock
-_WORDS = 2**20  # 4-byte words of a value that are summed at once for a fingerprint; on a GPU that takes 40 MB
+# 4-byte words of a value that are summed at once for a fingerprint; on a GPU that takes 40 MB.
+_WORDS = 2**20
 _FACTOR = -7046029254386353131  # odd, of a fingerprint's sum before that of the next words
 _AT_ONCE = 2**24  # elements of a tensor for which operations on versions need further memory
 _KINDS = (("float", "bfloat"), ("int", "uint"), ("bool",), ("complex",))
 
 
 def named_values(trainable: Any) -> dict[str, Any]:
-    """Return references to the values of a torch module or nested dicts and lists, by name; raises `NotTrainable`."""
+    """Return references to the values of a torch module or nested dicts and lists, by name;
+    raises `NotTrainable`.
+    """
     if _is_module(trainable):
-        # A module may add state other than tensors (`get_extra_state`), which a learner does not train.
+        # A module may add state other than tensors (`get_extra_state`), which a learner does not
+        # train.
         return {name: value for name, value in trainable.state_dict().items() if is_array(value)}
     found = dict[str, Any]()
     for name, container, key in _leaves(trainable):
@@ -46,16 +51,25 @@ def named_values(trainable: Any) -> dict[str, Any]:
 
 
 def set_values(trainable: Any, named: Mapping[str, Any]) -> None:
-    """Replace values of a trainable object by those of the same shapes, types and devices; other names keep theirs.
+    """Replace values of a trainable object by those of the same shapes, types and devices; other
+    names keep theirs.
 
-    Values on a GPU are copied to the addresses of the old ones, which a CUDA graph may have recorded. All
-    others are replaced by reference, which takes no time and no memory; `named` must not be changed afterwards.
+    Values on a GPU are copied to the addresses of the old ones, which a CUDA graph may have
+    recorded. All others are replaced by reference, which takes no time and no memory; `named` must
+    not be changed afterwards.
     """
     if not _is_module(trainable):
         for name, container, key in list(_leaves(trainable)):
             value, within = container[key], f"{name}/"
             if _is_module(value):
-                set_values(value, {one.removeprefix(within): named[one] for one in named if one.startswith(within)})
+                set_values(
+                    value,
+                    {
+                        one.removeprefix(within): named[one]
+                        for one in named
+                        if one.startswith(within)
+                    },
+                )
             elif name in named and _is_tensor(value) and _on_gpu(value):
                 _overwrite(value, named[name])
             elif name in named:
@@ -80,7 +94,9 @@ def _overwrite(held: Any, value: Any) -> None:
 
 @contextmanager
 def evaluation_mode(trainable: Any) -> Iterator[None]:
-    """Put torch modules into evaluation mode (no dropout, no batch statistics), and restore the mode of each part."""
+    """Put torch modules into evaluation mode (no dropout, no batch statistics), and restore the
+    mode of each part.
+    """
     leaves: Iterable[tuple[str, Any, Any]] = (
         _leaves(trainable) if isinstance(trainable, dict | list) else [("", [trainable], 0)]
     )
@@ -97,14 +113,21 @@ def evaluation_mode(trainable: Any) -> Iterator[None]:
 
 
 def is_copied(trainable: Any) -> bool:
-    """Return whether `set_values` copies into the memory of the old values, so that references to these change."""
-    return any(_is_tensor(value) and value.device.type != "cpu" for value in named_values(trainable).values())
+    """Return whether `set_values` copies into the memory of the old values, so that references
+    to these change.
+    """
+    return any(
+        _is_tensor(value) and value.device.type != "cpu"
+        for value in named_values(trainable).values()
+    )
 
 
 def portable(value: Any) -> np.ndarray:
-    """Convert a value to a numpy array that every process can read, without a copy if it is on the CPU.
+    """Convert a value to a numpy array that every process can read, without a copy if it is on the
+    CPU.
 
-    A bfloat16, which numpy does not have, becomes two bytes of type `V2`, as `converted` and `dtype_name` expect.
+    A bfloat16, which numpy does not have, becomes two bytes of type `V2`, as `converted` and
+    `dtype_name` expect.
     """
     if _is_tensor(value):
         value = on_host(value)
@@ -116,7 +139,9 @@ def portable(value: Any) -> np.ndarray:
 
 
 def on_host(value: Any) -> Any:
-    """Return a tensor in the memory of the host, contiguous; it is copied only if it is on a GPU, or not contiguous."""
+    """Return a tensor in the memory of the host, contiguous; it is copied only if it is on a
+    GPU, or not contiguous.
+    """
     value = value.detach()
     if value.is_cuda:
         return copy(value, sys.modules["torch"].empty(value.shape, dtype=value.dtype))
@@ -124,12 +149,16 @@ def on_host(value: Any) -> Any:
 
 
 def swap(first: Mapping[str, Any], second: Mapping[str, Any]) -> None:
-    """Exchange contiguous tensors of equal names and devices in their memory, within little more than that.
+    """Exchange contiguous tensors of equal names and devices in their memory, within little more
+    than that.
 
-    Names of `first` that share memory (see `are_apart`) must share it in `second`, as in a result of `completed`.
+    Names of `first` that share memory (see `are_apart`) must share it in `second`, as in a result
+    of `completed`.
     """
     with sys.modules["torch"].no_grad():
-        for name, value in {memory_of(name, value): (name, value) for name, value in first.items()}.values():
+        for name, value in {
+            memory_of(name, value): (name, value) for name, value in first.items()
+        }.values():
             parts = [one.view(-1).split(_AT_ONCE) for one in (value, second[name])]
             for one, other in zip(*parts, strict=True):
                 before = one.clone()
@@ -138,14 +167,18 @@ def swap(first: Mapping[str, Any], second: Mapping[str, Any]) -> None:
 
 
 def memory_of(name: str, value: Any) -> Any:
-    """Return a key that is equal for two values of a module that are tied, i.e. are in the same memory."""
+    """Return a key that is equal for two values of a module that are tied, i.e. are in the same
+    memory.
+    """
     if not _is_tensor(value) or value.layout != sys.modules["torch"].strided or not value.numel():
         return name
     return value.device, value.data_ptr(), value.shape, value.stride(), value.dtype
 
 
 def mapped(function: Callable[[Any], Any], named: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the results of a function of values, by name; tied values are passed once, and so are their results."""
+    """Return the results of a function of values, by name; tied values are passed once, and so
+    are their results.
+    """
     values = {memory_of(name, value): value for name, value in named.items()}
     results = {place: function(value) for place, value in values.items()}
     return {name: results[memory_of(name, value)] for name, value in named.items()}
@@ -160,7 +193,8 @@ def own_copy(value: Any) -> Any:
 def converted(value: Any, held: Any) -> Any:
     """Convert `value` to the type, precision and device of `held`, in memory that is not shared.
 
-    Read-only numpy arrays that own read-only memory, such as Ray's objects, are not copied if `held` is on the CPU.
+    Read-only numpy arrays that own read-only memory, such as Ray's objects, are not copied if
+    `held` is on the CPU.
     """
     if _is_tensor(held):
         torch = sys.modules["torch"]
@@ -170,7 +204,8 @@ def converted(value: Any, held: Any) -> Any:
             array = _unchanging(np.asarray(value))
             is_bfloat16 = array.dtype.kind == "V"
             with warnings.catch_warnings():
-                warnings.filterwarnings("ignore", message=".*not writ", category=UserWarning)  # nothing writes into it
+                # Nothing writes into it.
+                warnings.filterwarnings("ignore", message=".*not writ", category=UserWarning)
                 tensor = torch.from_numpy(array.view(np.int16) if is_bfloat16 else array)
             tensor = tensor.view(torch.bfloat16) if is_bfloat16 else tensor
         if held.is_cuda and not tensor.is_cuda:
@@ -199,7 +234,8 @@ def _leaves(tree: Any, path: str = "") -> Iterator[tuple[str, Any, Any]]:
     if not isinstance(tree, dict | list):
         at = f" at {path.rstrip('/')!r}" if path else ""
         raise NotTrainable(
-            f"trainable{at}: got {type(tree).__name__}, want a torch module, or dicts and lists of arrays "
+            f"trainable{at}: got {type(tree).__name__}, want a torch module, or dicts and lists of "
+            "arrays "
             f"and modules; or define parameters() and load_parameters()"
         )
     for key, value in tree.items() if isinstance(tree, dict) else enumerate(tree):
@@ -221,7 +257,9 @@ def _unchanging(array: np.ndarray) -> np.ndarray:
 
 
 def to_numpy(value: Any) -> np.ndarray:
-    """Convert an array or tensor to a type that numpy has: a bfloat16 is the upper half of a float32."""
+    """Convert an array or tensor to a type that numpy has: a bfloat16 is the upper half of a
+    float32.
+    """
     array = portable(value)
     if array.dtype != _BFLOAT16:
         return array
@@ -239,16 +277,28 @@ def _is_module(value: Any) -> bool:
 
 
 def to_host(groups: Iterable[Mapping[str, Any]], moved: list[tuple[Any, Any]]) -> None:
-    """Move torch tensors from GPUs to the host, and append to `moved` their memory, without bytes now, and the host's.
+    """Move torch tensors from GPUs to the host, and append to `moved` their memory, without bytes
+    now, and the host's.
 
-    The tensors stay the same objects, with the same views and ties; until `from_host` they must not be read. After an
-    error, the list has those that were moved.
+    The tensors stay the same objects, with the same views and ties; until `from_host` they must not
+    be read. After an error, the list has those that were moved.
     """
-    tensors = [value for named in groups for value in named.values() if _is_tensor(value) and _on_gpu(value)]
-    storages = {value.untyped_storage().data_ptr(): value.untyped_storage() for value in tensors if value.numel()}
+    tensors = [
+        value
+        for named in groups
+        for value in named.values()
+        if _is_tensor(value) and _on_gpu(value)
+    ]
+    storages = {
+        value.untyped_storage().data_ptr(): value.untyped_storage()
+        for value in tensors
+        if value.numel()
+    }
     for storage in storages.values():
         if storage.resizable():  # otherwise it belongs to another library or process
-            moved.append((storage, sys.modules["torch"].UntypedStorage(storage.nbytes()).copy_(storage)))
+            moved.append(
+                (storage, sys.modules["torch"].UntypedStorage(storage.nbytes()).copy_(storage))
+            )
             storage.resize_(0)
 
 
@@ -257,7 +307,9 @@ def _on_gpu(value: Any) -> bool:
 
 
 def from_host(moved: list[tuple[Any, Any]]) -> None:
-    """Move tensors back, to other addresses; after an error, the list has those that were not moved yet."""
+    """Move tensors back, to other addresses; after an error, the list has those that were not
+    moved yet.
+    """
     while moved:
         storage, host = moved[-1]
         storage.resize_(host.nbytes())
@@ -265,27 +317,34 @@ def from_host(moved: list[tuple[Any, Any]]) -> None:
         moved.pop()
 
 
-# Work on a GPU beside the acts of a policy: on other streams, and with pinned memory that is used again.
+# Work on a GPU beside the acts of a policy: on other streams, and with pinned memory that is used
+# again.
 #
-# All threads share torch's default stream, which has the acts. A wait for one's own work there lasts until the end of
-# all acts that were queued before, and CUDA copies pageable memory in turn with them.
+# All threads share torch's default stream, which has the acts. A wait for one's own work there
+# lasts until the end of all acts that were queued before, and CUDA copies pageable memory in turn
+# with them.
 
 _PART = 2**25  # bytes of each of two parts, one of which is filled while the other one is copied
 _LOCK = threading.Lock()
-# By device: the stream, and two parts of pinned memory, each with the event at the end of its last copy.
+# By device: the stream, and two parts of pinned memory, each with the event at the end of its last
+# copy.
 _USED: dict[Any, tuple[Any, list[tuple[Any, Any]]]] = {}
-_BESIDE: dict[Any, Any] = {}  # the stream of `beside_acts` by device: one, as memory is only used again on its stream
+# The stream of `beside_acts` by device: one, as memory is only used again on its stream.
+_BESIDE: dict[Any, Any] = {}
 
 
 @contextmanager
 def beside_acts(device: Any) -> Iterator[None]:
-    """Run this thread's work on a GPU within this context on another stream than the acts; it is over at the end.
+    """Run this thread's work on a GPU within this context on another stream than the acts; it is
+    over at the end.
 
-    It begins after the work that was queued before. Memory that this context allocates may be used again in the next
-    one as soon as it is freed, so that work of other streams on it must be over then.
+    It begins after the work that was queued before. Memory that this context allocates may be used
+    again in the next one as soon as it is freed, so that work of other streams on it must be over
+    then.
 
     Args:
-        device: The GPU; None: the current one. The context does nothing for "cpu", or while the process uses no GPU.
+        device: The GPU; None: the current one. The context does nothing for "cpu", or while the
+            process uses no GPU.
     """
     torch = sys.modules.get("torch")
     if torch is None or device == "cpu" or not torch.cuda.is_initialized():
@@ -305,8 +364,8 @@ def beside_acts(device: Any) -> Iterator[None]:
 def copy(source: Any, target: Any) -> Any:
     """Copy a tensor into a contiguous one of the same shape, and return that one.
 
-    If only one of them is on a GPU, the copy begins after the work that this thread has queued there, and is over when
-    this returns.
+    If only one of them is on a GPU, the copy begins after the work that this thread has queued
+    there, and is over when this returns.
     """
     torch = sys.modules["torch"]
     with torch.no_grad():
@@ -316,15 +375,21 @@ def copy(source: Any, target: Any) -> Any:
         length = _PART // dtype.itemsize
         with _LOCK, torch.cuda.device(device):
             if device not in _USED:
-                with torch.inference_mode(mode=False):  # otherwise they could not be written outside of that mode
+                # Otherwise they could not be written outside of that mode.
+                with torch.inference_mode(mode=False):
                     empty = [torch.empty(_PART, dtype=torch.uint8).pin_memory() for _ in range(2)]
-                _USED[device] = torch.cuda.Stream(device), [(memory, torch.cuda.Event()) for memory in empty]
+                _USED[device] = (
+                    torch.cuda.Stream(device),
+                    [(memory, torch.cuda.Event()) for memory in empty],
+                )
             stream, parts = _USED[device]
             stream.wait_stream(torch.cuda.current_stream(device))
             places = target.view(-1).split(length)
             try:
                 with torch.cuda.stream(stream):
-                    for number, (part, place) in enumerate(zip(source.reshape(-1).split(length), places, strict=True)):
+                    for number, (part, place) in enumerate(
+                        zip(source.reshape(-1).split(length), places, strict=True)
+                    ):
                         memory, event = parts[number % 2]
                         event.synchronize()
                         pinned = memory[: len(part) * dtype.itemsize].view(dtype)
@@ -336,14 +401,17 @@ def copy(source: Any, target: Any) -> Any:
                             event.synchronize()
                             place.copy_(pinned)
             finally:
-                stream.synchronize()  # the memory may be freed, or used on other streams, from now on
+                # The memory may be freed, or used on other streams, from now on.
+                stream.synchronize()
     return target
 
 
 # Checks that pushed values fit those of a policy, and a digest of values.
 
 
-def accepted(held: Mapping[str, Any], pushed: Mapping[str, Any], *, partial: bool = False) -> dict[str, Any]:
+def accepted(
+    held: Mapping[str, Any], pushed: Mapping[str, Any], *, partial: bool = False
+) -> dict[str, Any]:
     """Return pushed values with the types and devices of those held.
 
     Of those held, only these and the shapes are read, except where pushed ones are not finite.
@@ -356,8 +424,8 @@ def accepted(held: Mapping[str, Any], pushed: Mapping[str, Any], *, partial: boo
         partial: Whether names may be missing, as in a push of adapters alone.
 
     Raises:
-        InvalidWeights: A name is unknown or missing, or a value has another shape or kind of type, or is neither
-            finite nor equal to the one held.
+        InvalidWeights: A name is unknown or missing, or a value has another shape or kind of type,
+            or is neither finite nor equal to the one held.
     """
     require_fit(held, pushed, partial=partial)
     places = {name: memory_of(name, value) for name, value in held.items()}
@@ -367,29 +435,41 @@ def accepted(held: Mapping[str, Any], pushed: Mapping[str, Any], *, partial: boo
     finite = _all_finite_tensors(named)
     finite |= {name: _is_finite(value) for name, value in named.items() if not finite.get(name)}
     finite |= _fetched({name: one for name, one in finite.items() if _is_tensor(one)})
-    # Constants of a module, such as masks of attention, may be infinite: a learner pushes them unchanged.
-    wrong = [name for name, is_so in finite.items() if not is_so and not _is_equal(new[places[name]], held[name])]
+    # Constants of a module, such as masks of attention, may be infinite: a learner pushes them
+    # unchanged.
+    wrong = [
+        name
+        for name, is_so in finite.items()
+        if not is_so and not _is_equal(new[places[name]], held[name])
+    ]
     _refuse([f"{name!r}: got NaN or infinite values, want finite ones" for name in wrong])
     return {name: new[place] for name, place in places.items() if place in new}
 
 
 def completed(
-    held: Mapping[str, Any], new: Mapping[str, Any], *, allow_same: bool = False, in_place: bool = False
+    held: Mapping[str, Any],
+    new: Mapping[str, Any],
+    *,
+    allow_same: bool = False,
+    in_place: bool = False,
 ) -> dict[str, Any]:
-    """Return the values of a new version: the result of `accepted`, and the held values of the missing names.
+    """Return the values of a new version: the result of `accepted`, and the held values of the
+    missing names.
 
     Args:
         held: The current values of the policy, by name.
         new: The new ones.
         allow_same: Whether all may equal those held.
-        in_place: Whether the values held will change in their memory, so that those of missing names are copied.
+        in_place: Whether the values held will change in their memory, so that those of missing
+            names are copied.
 
     Raises:
         UnchangedWeights: All values equal those held, and `allow_same` is not set.
     """
     if not allow_same and all(_is_equal(value, held[name]) for name, value in new.items()):
         raise UnchangedWeights(
-            f"weights: all {len(new)} values equal those that the policy holds; push what the optimizer changes, "
+            f"weights: all {len(new)} values equal those that the policy holds; push what the "
+            "optimizer changes, "
             f"or allow it with allow_same=True"
         )
     missing = {name: value for name, value in held.items() if name not in new}
@@ -398,34 +478,60 @@ def completed(
 
 
 def are_apart(named: Mapping[str, Any]) -> bool:
-    """Return whether tensors share no memory, other than tied ones, so that `swap` can exchange each of them."""
-    values = {memory_of(name, value): value for name, value in named.items() if value.numel()}.values()
-    spans = sorted((str(value.device), value.data_ptr(), value.data_ptr() + value.nbytes) for value in values)
-    apart = all(one[0] != other[0] or one[2] <= other[1] for one, other in itertools.pairwise(spans))
+    """Return whether tensors share no memory, other than tied ones, so that `swap` can exchange
+    each of them.
+    """
+    values = {
+        memory_of(name, value): value for name, value in named.items() if value.numel()
+    }.values()
+    spans = sorted(
+        (str(value.device), value.data_ptr(), value.data_ptr() + value.nbytes) for value in values
+    )
+    apart = all(
+        one[0] != other[0] or one[2] <= other[1] for one, other in itertools.pairwise(spans)
+    )
     return apart and all(value.is_contiguous() for value in values)
 
 
-def require_fit(held: Mapping[str, Any], pushed: Mapping[str, Any], *, partial: bool = False) -> None:
-    """Raise `InvalidWeights` if a name is unknown or missing, or a value has another shape or kind of type.
+def require_fit(
+    held: Mapping[str, Any], pushed: Mapping[str, Any], *, partial: bool = False
+) -> None:
+    """Raise `InvalidWeights` if a name is unknown or missing, or a value has another shape or kind
+    of type.
 
-    `pushed` are values, or their `vlagents_ray.weights.safetensors.ValueSpec`; with `partial`, names may be missing.
+    `pushed` are values, or their `vlagents_ray.weights.safetensors.ValueSpec`; with `partial`,
+    names may be missing.
     """
-    faults = [f"{name!r}: unknown, want one of the policy's {len(held)} names" for name in pushed if name not in held]
+    faults = [
+        f"{name!r}: unknown, want one of the policy's {len(held)} names"
+        for name in pushed
+        if name not in held
+    ]
     if not partial:
-        faults += [f"{name!r}: missing; push it, or set partial=True" for name in held if name not in pushed]
+        faults += [
+            f"{name!r}: missing; push it, or set partial=True"
+            for name in held
+            if name not in pushed
+        ]
     elif not pushed:
         faults += ["no value: push at least one"]
-    # A variable with a value here would keep the learner's memory open as long as the error has this frame.
-    faults += [fault for name in pushed if name in held and (fault := _misfit(name, pushed[name], held[name]))]
+    # A variable with a value here would keep the learner's memory open as long as the error has
+    # this frame.
+    faults += [
+        fault
+        for name in pushed
+        if name in held and (fault := _misfit(name, pushed[name], held[name]))
+    ]
     _refuse(faults)
 
 
 def fingerprint(named: Mapping[str, Any]) -> str:
-    """Return a digest of 32 hexadecimal characters over names, shapes, types and all bytes of values on any device.
+    """Return a digest of 32 hexadecimal characters over names, shapes, types and all bytes of
+    values on any device.
 
-    It detects any accidental difference: each word is multiplied by two odd numbers, which depend on its place, and
-    summed modulo 2**64, on a GPU if the value is there. A cryptographic digest would need all values on the host, and
-    take a few seconds for a large model.
+    It detects any accidental difference: each word is multiplied by two odd numbers, which depend
+    on its place, and summed modulo 2**64, on a GPU if the value is there. A cryptographic digest
+    would need all values on the host, and take a few seconds for a large model.
     """
     found = hashlib.blake2b(digest_size=16)
     on_gpus = {name: value for name, value in named.items() if _is_tensor(value) and value.is_cuda}
@@ -443,7 +549,9 @@ def fingerprint(named: Mapping[str, Any]) -> str:
 def _refuse(faults: list[str]) -> None:
     if faults:
         more = f"; and {len(faults) - _SHOWN} more" if len(faults) > _SHOWN else ""
-        raise InvalidWeights(f"weights, of which nothing was changed: {'; '.join(faults[:_SHOWN])}{more}")
+        raise InvalidWeights(
+            f"weights, of which nothing was changed: {'; '.join(faults[:_SHOWN])}{more}"
+        )
 
 
 def _misfit(name: str, pushed: Any, held: Any) -> str | None:
@@ -457,7 +565,9 @@ def _misfit(name: str, pushed: Any, held: Any) -> str | None:
 
 
 def _kind(dtype: str) -> Any:
-    """Return the kind of a type, such as floating point: precisions are converted, kinds are not."""
+    """Return the kind of a type, such as floating point: precisions are converted, kinds are
+    not.
+    """
     return next((kind for kind in _KINDS if dtype.startswith(kind)), dtype)
 
 
@@ -467,20 +577,22 @@ def _is_finite(value: Any) -> Any:
         return True
     if isinstance(value, np.ndarray):
         with np.errstate(over="ignore", invalid="ignore"):
-            # Minimum and maximum need no array of booleans, which would take a quarter of the value's memory.
+            # Minimum and maximum need no array of booleans, which would take a quarter of the
+            # value's memory.
             return bool(np.isfinite(value.min()) and np.isfinite(value.max()))
     if not _is_tensor(value):
         return bool(sys.modules["jax"].numpy.isfinite(value).all())
     if value.is_complex():
         value = sys.modules["torch"].view_as_real(value)
-    return sys.modules["torch"].stack(value.aminmax()).isfinite().all()  # which needs no memory, as above
+    # Which needs no memory, as above.
+    return sys.modules["torch"].stack(value.aminmax()).isfinite().all()
 
 
 def _all_finite_tensors(named: Mapping[str, Any]) -> dict[str, Any]:
     """Return the names of torch tensors of real numbers that are surely finite, each with True.
 
-    The largest absolute values of all tensors of a device and type are computed together: several operations for each
-    of hundreds of tensors would share the GPU, and Python's lock, with acts.
+    The largest absolute values of all tensors of a device and type are computed together: several
+    operations for each of hundreds of tensors would share the GPU, and Python's lock, with acts.
     """
     groups: dict[Any, list[str]] = {}
     for name, value in named.items():
@@ -502,7 +614,9 @@ def _is_equal(new: Any, held: Any) -> bool:
         return bool((new == held).all())
     parts = zip(new.reshape(-1).split(_AT_ONCE), held.reshape(-1).split(_AT_ONCE), strict=True)
     moved = new.is_cuda and not held.is_cuda
-    return all(bool((one == (converted(other, one) if moved else other)).all()) for one, other in parts)
+    return all(
+        bool((one == (converted(other, one) if moved else other)).all()) for one, other in parts
+    )
 
 
 @functools.cache
@@ -526,10 +640,14 @@ def _sums(value: Any) -> np.ndarray:
 
 
 def _sums_on_gpu(value: Any, keys: dict[Any, Any]) -> Any:
-    """Return those of a tensor on a GPU, as a tensor there; `keys` holds the result of `_keys` by device."""
+    """Return those of a tensor on a GPU, as a tensor there; `keys` holds the result of `_keys`
+    by device.
+    """
     torch, value = sys.modules["torch"], value.detach()
     if value.device not in keys:
-        keys[value.device] = copy(torch.from_numpy(_keys(_WORDS)), value.new_empty((2, _WORDS), dtype=torch.int64))
+        keys[value.device] = copy(
+            torch.from_numpy(_keys(_WORDS)), value.new_empty((2, _WORDS), dtype=torch.int64)
+        )
     data = value.reshape(-1).contiguous().view(torch.uint8)
     if len(data) % 4 or data.storage_offset() % 4:
         data = torch.nn.functional.pad(data, (0, -len(data) % 4))
@@ -540,9 +658,13 @@ def _sums_on_gpu(value: Any, keys: dict[Any, Any]) -> Any:
 
 
 def _fetched(named: Mapping[str, Any]) -> dict[str, np.ndarray]:
-    """Return small tensors of equal shapes as arrays: one copy from each device waits for all of them."""
+    """Return small tensors of equal shapes as arrays: one copy from each device waits for all of
+    them.
+    """
     found: dict[str, np.ndarray] = {}
     for device in {value.device for value in named.values()}:
         own = {name: value for name, value in named.items() if value.device == device}
-        found.update(zip(own, on_host(sys.modules["torch"].stack([*own.values()])).numpy(), strict=True))
+        found.update(
+            zip(own, on_host(sys.modules["torch"].stack([*own.values()])).numpy(), strict=True)
+        )
     return found

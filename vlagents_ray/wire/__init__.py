@@ -1,1 +1,3 @@
-"""Other systems' messages and key mappings, for the dialects of a server and for the policy `upstream`."""
+"""Other systems' messages and key mappings, for the dialects of a server and for the policy
+`upstream`.
+"""

@@ -1,4 +1,6 @@
-"""JSON with arrays in the format of the package `json_numpy`: `{"__numpy__": base64, "dtype", "shape"}`."""
+"""JSON with arrays in the format of the package `json_numpy`: `{"__numpy__": base64, "dtype",
+"shape"}`.
+"""
 
 from __future__ import annotations
 
@@ -19,12 +21,16 @@ _KEYS = {"__numpy__", "dtype", "shape"}
 
 
 def loads(text: str | bytes, limits: Limits, levels: int = 0) -> Any:
-    """Return the value of a document, nested up to `levels` deeper than the limit; arrays are read-only."""
+    """Return the value of a document, nested up to `levels` deeper than the limit; arrays are
+    read-only.
+    """
     if len(text) > limits.body_bytes:
         raise MessageTooLarge(f"document: got {len(text)} bytes, the limit is {limits.body_bytes}")
     marks: tuple[Any, ...] = (",", "[", "{") if isinstance(text, str) else (b",", b"[", b"{")
     if sum(map(text.count, marks)) > limits.items:  # base64 contains none of these characters
-        raise MessageTooLarge(f"document: more than {limits.items} values; send arrays as json-numpy writes them")
+        raise MessageTooLarge(
+            f"document: more than {limits.items} values; send arrays as json-numpy writes them"
+        )
     try:
         value = json.loads(text, object_hook=_hook)
     except MalformedMessage:
@@ -41,10 +47,14 @@ def dumps(value: Any) -> str:
 
 
 def rows(value: list[Any]) -> np.ndarray:
-    """Return the array of a list of numbers, lists or arrays; raise `MalformedMessage` if they make none."""
+    """Return the array of a list of numbers, lists or arrays; raise `MalformedMessage` if they
+    make none.
+    """
     if value and all(isinstance(row, np.ndarray) for row in value):
         if len(shapes := {row.shape for row in value}) != 1:
-            raise MalformedMessage(f"action: got rows of the shapes {sorted(shapes)[:8]}, want the same in all")
+            raise MalformedMessage(
+                f"action: got rows of the shapes {sorted(shapes)[:8]}, want the same in all"
+            )
         return np.stack(value)
     try:
         array = np.asarray(value)
@@ -56,7 +66,9 @@ def rows(value: list[Any]) -> np.ndarray:
 
 
 def decode_base64(data: object, what: str) -> bytes:
-    """Decode base64 in the standard or the URL-safe alphabet; `what` is the name of the data in errors."""
+    """Decode base64 in the standard or the URL-safe alphabet; `what` is the name of the data in
+    errors.
+    """
     if not isinstance(data, str):
         raise MalformedMessage(f"{what}: got {type(data).__name__}, want base64")
     try:

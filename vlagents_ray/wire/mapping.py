@@ -1,7 +1,8 @@
-"""Conversion of another system's observation to an `Obs`, and of our action to theirs: keys, layouts, grippers.
+"""Conversion of another system's observation to an `Obs`, and of our action to theirs: keys,
+layouts, grippers.
 
-A deployment file states a mapping as a preset's name (`presets`), as an object, or as an object that names a preset and
-overrides some of its fields:
+A deployment file states a mapping as a preset's name (`presets`), as an object, or as an object
+that names a preset and overrides some of its fields:
 
     {"cameras": {"front": "observation/image", "wrist": {"key": "images/wrist", "layout": "chw"}},
      "state": {"joints": {"key": "state", "stop": 6}, "pose": ["position", "rotation"]},
@@ -11,13 +12,15 @@ overrides some of its fields:
      "action": {"arm": {"stop": 6}, "hand": {"start": 6}},
      "action_gripper": {"index": 6, "open": -1, "closed": 1}}
 
-The client's keys are paths: `images/wrist` is either that key itself or `wrist` within `images`. `states|state` is the
-first of the two that exists. A name and a key that end with `*` match all keys with that beginning: `"*": "video/*"`.
-Left sides are our names, right sides the client's, except in `action`, whose left sides are the names that the client
-reads, and in `instructions`, which has the text of each integer that a client sends instead of an instruction. Unknown
-fields are errors; a text is short for an entry with that key and no other field.
+The client's keys are paths: `images/wrist` is either that key itself or `wrist` within `images`.
+`states|state` is the first of the two that exists. A name and a key that end with `*` match all
+keys with that beginning: `"*": "video/*"`. Left sides are our names, right sides the client's,
+except in `action`, whose left sides are the names that the client reads, and in `instructions`,
+which has the text of each integer that a client sends instead of an instruction. Unknown fields are
+errors; a text is short for an entry with that key and no other field.
 
-An observation is refused if the mapping reads nothing of it, or none of the cameras or none of the states in it.
+An observation is refused if the mapping reads nothing of it, or none of the cameras or none of the
+states in it.
 """
 
 from __future__ import annotations
@@ -53,10 +56,11 @@ T = TypeVar("T")
 
 @dataclass(frozen=True, slots=True)
 class CameraKey:
-    """The location of an image, (H, W, 3) or (3, H, W) RGB; of (1, T, H, W, 3) the newest image is used, the last of T.
+    """The location of an image, (H, W, 3) or (3, H, W) RGB; of (1, T, H, W, 3) the newest image is
+    used, the last of T.
 
-    Pixels are uint8, or floats in [0, 1]. The layout `any` means channels first if the length of the first axis is 3;
-    of `rgba`, (H, W, 4), alpha is dropped.
+    Pixels are uint8, or floats in [0, 1]. The layout `any` means channels first if the length of
+    the first axis is 3; of `rgba`, (H, W, 4), alpha is dropped.
     """
 
     key: str
@@ -66,7 +70,9 @@ class CameraKey:
 
 @dataclass(frozen=True, slots=True)
 class StateKey:
-    """The location of a vector (D,), from `start` to `stop`; of (1, T, D) the newest vector is used, the last of T."""
+    """The location of a vector (D,), from `start` to `stop`; of (1, T, D) the newest vector is
+    used, the last of T.
+    """
 
     key: str
     start: int | None = None
@@ -76,7 +82,9 @@ class StateKey:
 
 @dataclass(frozen=True, slots=True)
 class GripperKey:
-    """The location of the gripper's opening, and its readings when open and closed, with linear interpolation."""
+    """The location of the gripper's opening, and its readings when open and closed, with linear
+    interpolation.
+    """
 
     key: str
     index: int = 0
@@ -103,7 +111,9 @@ class ActionGripper:
 
 
 def each(top: Mapping[str, Any], name: str, read: Callable[[Any, str], T]) -> dict[str, T]:
-    """Return the entries of `top[name]`, each the result of `read(value, where)`; `where` is its path, for errors."""
+    """Return the entries of `top[name]`, each the result of `read(value, where)`; `where` is its
+    path, for errors.
+    """
     entries = top.get(name) or {}
     if not isinstance(entries, Mapping):
         raise ConfigError(f"mapping.{name}: got {type(entries).__name__}, want an object")
@@ -117,7 +127,9 @@ def entry(cls: type[T], value: Any, where: str) -> T:
     if "key" in known and not values.get("key"):
         raise ConfigError(f"{where}: no key; say where it lies in their observation")
     if values.get("layout", "hwc") not in get_args(Layout):
-        raise ConfigError(f"{where}.layout: got {values['layout']!r}, want one of {get_args(Layout)}")
+        raise ConfigError(
+            f"{where}.layout: got {values['layout']!r}, want one of {get_args(Layout)}"
+        )
     if "*" in (key := values.get("key", "")) and key.index("*") != len(key) - 1:
         raise ConfigError(f"{where}: got key {key!r}, want '*' at its end alone")
     if "open" in known and values.get("open", 1.0) == values.get("closed", 0.0):
@@ -146,7 +158,8 @@ def stated(value: Any) -> Any:
     return [stated(item) for item in value] if isinstance(value, (list, tuple)) else value
 
 
-# Paths into nested observations, such as `images/wrist`: either that key itself, or `wrist` within `images`.
+# Paths into nested observations, such as `images/wrist`: either that key itself, or `wrist` within
+# `images`.
 #
 # `states|state` means the first of the two that exists.
 
@@ -159,7 +172,9 @@ def lookup(nested: Mapping[Any, Any], path: str) -> Any:
     if path in nested:
         return nested[path]
     if "|" in path:
-        return next((value for one in path.split("|") if (value := lookup(nested, one)) is not None), None)
+        return next(
+            (value for one in path.split("|") if (value := lookup(nested, one)) is not None), None
+        )
     end = path.find("/")
     while end >= 0:
         inside = nested.get(path[:end])
@@ -170,7 +185,9 @@ def lookup(nested: Mapping[Any, Any], path: str) -> Any:
 
 
 def keys(nested: Mapping[Any, Any]) -> list[str]:
-    """Return the paths of all values that are not mappings, in order, at most 40, to be listed in an error."""
+    """Return the paths of all values that are not mappings, in order, at most 40, to be listed
+    in an error.
+    """
     return [short_path(path) for path, _ in islice(leaves(nested), _SHOWN)]
 
 
@@ -180,7 +197,9 @@ def short_path(path: str) -> str:
 
 
 def leaves(nested: Mapping[Any, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
-    """Yield the paths and values of all values that are not mappings, in order; see `short_path`."""
+    """Yield the paths and values of all values that are not mappings, in order; see
+    `short_path`.
+    """
     for key, value in nested.items():
         path = f"{prefix}{(key if isinstance(key, str) else shown(key))[:_LONGEST]}"
         if isinstance(value, Mapping):
@@ -195,12 +214,16 @@ def matches(name: str, pattern: str) -> bool:
 
 
 def pick(
-    flat: Mapping[str, Any], name: str, key: str, optional: bool, missing: Callable[..., InvalidObservation]
+    flat: Mapping[str, Any],
+    name: str,
+    key: str,
+    optional: bool,
+    missing: Callable[..., InvalidObservation],
 ) -> list[tuple[str, str, Any]]:
     """Return the values that a key of a mapping matches.
 
-    The `*` of our `name` is replaced by the text that the `*` of the client's `key` matches. `missing` creates the
-    error for a missing value.
+    The `*` of our `name` is replaced by the text that the `*` of the client's `key` matches.
+    `missing` creates the error for a missing value.
 
     Returns:
         For each value, our name, the client's key and the value.
@@ -213,7 +236,11 @@ def pick(
         inside = lookup(flat, folder) if folder else flat
         prefix = last.removesuffix("*")
         there = [
-            (name.replace("*", theirs.removeprefix(prefix)), f"{folder}/{theirs}".removeprefix("/"), value)
+            (
+                name.replace("*", theirs.removeprefix(prefix)),
+                f"{folder}/{theirs}".removeprefix("/"),
+                value,
+            )
             for theirs, value in (inside.items() if isinstance(inside, Mapping) else ())
             if isinstance(theirs, str) and theirs.startswith(prefix) and len(theirs) > len(prefix)
         ]
@@ -230,10 +257,12 @@ def read_image(key: str, value: Any, layout: str, limits: Limits) -> np.ndarray:
     """Return an image as (H, W, 3) uint8 RGB; raise `InvalidObservation` or `MessageTooLarge`."""
     if isinstance(value, np.ndarray):
         value = _newest(key, value, 3)
-        if value.dtype.kind == "f":  # as in openpi's own server (`_parse_image` in its policies): rounded down
+        # As in openpi's own server (`_parse_image` in its policies): rounded down.
+        if value.dtype.kind == "f":
             if value.size and not (value.min() >= 0 and value.max() <= 1):  # also true for NaN
                 raise InvalidObservation(
-                    f"camera {key!r}: got {value.dtype} from {value.min():g} to {value.max():g}, want uint8, or floats "
+                    f"camera {key!r}: got {value.dtype} from {value.min():g} to {value.max():g}, "
+                    "want uint8, or floats "
                     f"in [0, 1]; scale it"
                 )
             value = (255 * value).astype(np.uint8)
@@ -242,7 +271,9 @@ def read_image(key: str, value: Any, layout: str, limits: Limits) -> np.ndarray:
         elif layout in ("chw", "any") and value.ndim == 3 and value.shape[0] == 3:
             value = np.ascontiguousarray(value.transpose(1, 2, 0))
         elif layout == "chw":
-            raise InvalidObservation(f"camera {key!r}: got {value.shape} {value.dtype}, want (3, H, W) uint8 RGB")
+            raise InvalidObservation(
+                f"camera {key!r}: got {value.shape} {value.dtype}, want (3, H, W) uint8 RGB"
+            )
     return as_camera(key, value, limits)
 
 
@@ -260,16 +291,23 @@ def may_be_state(value: Any) -> bool:
 def read_state(
     flat: Mapping[str, Any], name: str, sources: tuple[StateKey, ...], limits: Limits
 ) -> dict[str, np.ndarray]:
-    """Return the state `name`, its parts concatenated, (D,) float32; several states if the name ends with `*`."""
+    """Return the state `name`, its parts concatenated, (D,) float32; several states if the name
+    ends with `*`.
+    """
     joined: dict[str, list[np.ndarray]] = {}
     for part in sources:
         found = pick(flat, name, part.key, part.optional, MissingState)
         for ours, key, value in found:
             vector = read_vector(key, value, limits)
             if part.stop is not None and part.stop > vector.size:
-                raise InvalidObservation(f"state {key!r}: got {vector.size} numbers, want {part.stop} at least")
+                raise InvalidObservation(
+                    f"state {key!r}: got {vector.size} numbers, want {part.stop} at least"
+                )
             joined.setdefault(ours, []).append(vector[part.start : part.stop])
-    return {ours: vectors[0] if len(vectors) == 1 else np.concatenate(vectors) for ours, vectors in joined.items()}
+    return {
+        ours: vectors[0] if len(vectors) == 1 else np.concatenate(vectors)
+        for ours, vectors in joined.items()
+    }
 
 
 def read_vector(key: str, value: Any, limits: Limits) -> np.ndarray:
@@ -283,20 +321,27 @@ def read_vector(key: str, value: Any, limits: Limits) -> np.ndarray:
 
 
 def _newest(key: str, value: np.ndarray, ndim: int) -> np.ndarray:
-    """Remove the batch axis, of length 1, and the time axis that some clients add in front; keep the last time step."""
+    """Remove the batch axis, of length 1, and the time axis that some clients add in front; keep
+    the last time step.
+    """
     if value.ndim > ndim and value.shape[0] != 1:
         raise InvalidObservation(
-            f"{key!r}: got {value.shape}, a batch of {value.shape[0]}, want one; send each by itself"
+            f"{key!r}: got {value.shape}, a batch of {value.shape[0]}, want one; send each by "
+            "itself"
         )
     if value.ndim == ndim + 2 and value.shape[1] > 0:
         value = value[:, -1]
     return value if value.ndim != ndim + 1 else value.reshape(value.shape[1:])
 
 
-def read_text(key: str, value: Any, texts: Mapping[str, str], limits: Limits, *, needed: bool) -> str | None:
-    """Return an instruction: a text, a list or array of one text, or the one of `texts` for an array of one integer.
+def read_text(
+    key: str, value: Any, texts: Mapping[str, str], limits: Limits, *, needed: bool
+) -> str | None:
+    """Return an instruction: a text, a list or array of one text, or the one of `texts` for an
+    array of one integer.
 
-    An integer without a text is an error if the instruction is `needed`; if not, there is no instruction.
+    An integer without a text is an error if the instruction is `needed`; if not, there is no
+    instruction.
     """
     while isinstance(value, (list, tuple)) and len(value) == 1:  # some clients send a batch of one
         value = value[0]
@@ -305,7 +350,8 @@ def read_text(key: str, value: Any, texts: Mapping[str, str], limits: Limits, *,
         if isinstance(value, int):
             if needed and str(value) not in texts:
                 raise InvalidObservation(
-                    f"{key!r}: got {value}, want one of {sorted(texts)}; add its text to mapping.instructions"
+                    f"{key!r}: got {value}, want one of {sorted(texts)}; add its text to "
+                    "mapping.instructions"
                 )
             value = texts.get(str(value))
     if value is not None and not isinstance(value, str):
@@ -323,17 +369,21 @@ class KeyMapping:
     """The key mapping of one system; the module's docstring describes its fields."""
 
     cameras: Mapping[str, CameraKey] = field(default_factory=dict)
-    state: Mapping[str, tuple[StateKey, ...]] = field(default_factory=dict)  # concatenated in this order
+    # Concatenated in this order.
+    state: Mapping[str, tuple[StateKey, ...]] = field(default_factory=dict)
     gripper: GripperKey | None = None
     instruction: str | None = None
-    instructions: Mapping[str, str] = field(default_factory=dict)  # by the integer that is sent in their place
+    # By the integer that is sent in their place.
+    instructions: Mapping[str, str] = field(default_factory=dict)
     info: Mapping[str, str] = field(default_factory=dict)  # all optional
     action: Mapping[str, ActionRange] = field(default_factory=dict)
     action_gripper: tuple[ActionGripper, ...] = ()
 
     @classmethod
     def from_json(cls, data: Mapping[str, Any]) -> KeyMapping:
-        """Read a mapping from plain JSON values; raise `ConfigError` for an unknown key or a wrong type."""
+        """Read a mapping from plain JSON values; raise `ConfigError` for an unknown key or a
+        wrong type.
+        """
         top = closed(cls, data, "mapping", ConfigError)
         instruction = top.get("instruction")
         if instruction is not None and not isinstance(instruction, str):
@@ -355,23 +405,33 @@ class KeyMapping:
         )
 
     def to_json(self) -> dict[str, Any]:
-        """Return the mapping as plain JSON values for `from_json`, without fields that are not set."""
-        return {name: stated(value) for name, value in asdict(self).items() if value not in (None, {}, ())}
+        """Return the mapping as plain JSON values for `from_json`, without fields that are not
+        set.
+        """
+        return {
+            name: stated(value)
+            for name, value in asdict(self).items()
+            if value not in (None, {}, ())
+        }
 
     def obs(
-        self, flat: Mapping[str, Any], limits: Limits = DEFAULT_LIMITS, contract: Contract | None = None
+        self,
+        flat: Mapping[str, Any],
+        limits: Limits = DEFAULT_LIMITS,
+        contract: Contract | None = None,
     ) -> tuple[Obs, str | None]:
         """Convert a client's observation.
 
         An invalid gripper reading is dropped if the policy, by its contract, does not need it.
 
         Returns:
-            Our observation, whose arrays may be views of those of `flat`, and its instruction; None if there is none.
+            Our observation, whose arrays may be views of those of `flat`, and its instruction; None
+            if there is none.
 
         Raises:
             MissingCamera, MissingState: A key is missing.
-            InvalidObservation: A value is invalid, or the mapping reads nothing of the observation, or none of the
-                cameras or none of the states in it.
+            InvalidObservation: A value is invalid, or the mapping reads nothing of the observation,
+                or none of the cameras or none of the states in it.
         """
         cameras: dict[str, np.ndarray] = {}
         for name, camera in self.cameras.items():
@@ -382,19 +442,31 @@ class KeyMapping:
             state |= read_state(flat, name, sources, limits)
         if max(len(cameras), len(state)) > limits.cameras:
             raise MessageTooLarge(
-                f"observation: got {len(cameras)} cameras and {len(state)} states, the limit is {limits.cameras}"
+                f"observation: got {len(cameras)} cameras and {len(state)} states, the limit is "
+                f"{limits.cameras}"
             )
-        info = {name: value for name, key in self.info.items() if (value := lookup(flat, key)) is not None}
-        gripper = self._opening(flat, limits, needed=contract is not None and bool(contract.gripper))
+        info = {
+            name: value
+            for name, key in self.info.items()
+            if (value := lookup(flat, key)) is not None
+        }
+        gripper = self._opening(
+            flat, limits, needed=contract is not None and bool(contract.gripper)
+        )
         obs = Obs(cameras, gripper, state, info)
         if not cameras or not state:
             self._require_read(flat, obs)
         return obs, self.read_instruction(flat, limits, contract)
 
     def read_instruction(
-        self, flat: Mapping[str, Any], limits: Limits = DEFAULT_LIMITS, contract: Contract | None = None
+        self,
+        flat: Mapping[str, Any],
+        limits: Limits = DEFAULT_LIMITS,
+        contract: Contract | None = None,
     ) -> str | None:
-        """Return the instruction of a client's observation, or None without one; raises `InvalidObservation`."""
+        """Return the instruction of a client's observation, or None without one; raises
+        `InvalidObservation`.
+        """
         if self.instruction is None:
             return None
         picked = pick(flat, "", self.instruction, True, MissingState)
@@ -405,10 +477,11 @@ class KeyMapping:
         return read_text(self.instruction, value, self.instructions, limits, needed=is_needed)
 
     def rows(self, action: np.ndarray, spec: ActionSpec | None = None) -> np.ndarray:
-        """Return our action, (D,) or (H, D), as (H, D) float32 with the gripper's commands in the client's convention.
+        """Return our action, (D,) or (H, D), as (H, D) float32 with the gripper's commands in the
+        client's convention.
 
-        `spec`, the action of the policy's contract, states the policy's own convention; without it, the commands stay
-        unchanged.
+        `spec`, the action of the policy's contract, states the policy's own convention; without it,
+        the commands stay unchanged.
         """
         rows = np.atleast_2d(np.asarray(action, np.float32))
         if spec is None or spec.gripper_open is None or spec.gripper_closed is None:
@@ -418,27 +491,39 @@ class KeyMapping:
             if (one.open, one.closed) == (spec.gripper_open, spec.gripper_closed):
                 continue
             if not -rows.shape[1] <= one.index < rows.shape[1]:
-                raise InvalidAction(f"action: got {rows.shape[1]} numbers a row, want a gripper's at {one.index}")
+                raise InvalidAction(
+                    f"action: got {rows.shape[1]} numbers a row, want a gripper's at {one.index}"
+                )
             rows = rows.copy()
             opening = (rows[:, one.index] - spec.gripper_closed) / ours
             rows[:, one.index] = one.closed + opening * (one.open - one.closed)
         return rows
 
     def actions(self, action: np.ndarray, spec: ActionSpec | None = None) -> dict[str, np.ndarray]:
-        """Return `rows` by the names that the client reads, each (H, n); as `action` if the mapping names none."""
+        """Return `rows` by the names that the client reads, each (H, n); as `action` if the
+        mapping names none.
+        """
         rows = self.rows(action, spec)
         return self.columns(rows) or {"action": rows}
 
     def columns(self, rows: np.ndarray) -> dict[str, np.ndarray]:
-        """Return the columns of (H, D) rows, or of a row (D,), by the client's names; none if the mapping has none."""
+        """Return the columns of (H, D) rows, or of a row (D,), by the client's names; none if
+        the mapping has none.
+        """
         return {name: rows[..., one.start : one.stop] for name, one in self.action.items()}
 
     def lacks(self, contract: Contract | None) -> list[str]:
-        """Return the policy's inputs that no observation of this mapping has, each as a sentence with the cure."""
+        """Return the policy's inputs that no observation of this mapping has, each as a sentence
+        with the cure.
+        """
         if contract is None:
             return []
         found = [
-            f"{kind} {name!r}: the policy needs it, the mapping gives {sorted(given)}; add it to mapping.{field_}"
+            (
+                f"{kind} {name!r}: the policy needs it, the mapping gives {sorted(given)}; add it "
+                "to "
+                f"mapping.{field_}"
+            )
             for kind, field_, needs, given in (
                 ("camera", "cameras", contract.cameras or {}, self.cameras),
                 ("state", "state", contract.state or {}, self.state),
@@ -449,28 +534,41 @@ class KeyMapping:
         if contract.gripper and self.gripper is None:
             found.append("gripper: the policy needs it, the mapping has none; add mapping.gripper")
         if contract.instruction and self.instruction is None:
-            found.append("instruction: the policy needs one, the mapping has none; add mapping.instruction")
+            found.append(
+                "instruction: the policy needs one, the mapping has none; add mapping.instruction"
+            )
         dim = contract.action.dim
-        last = max((one.index + 1 if one.index >= 0 else -one.index for one in self.action_gripper), default=0)
+        last = max(
+            (one.index + 1 if one.index >= 0 else -one.index for one in self.action_gripper),
+            default=0,
+        )
         last = max([last, *(max(one.start or 0, one.stop or 0) for one in self.action.values())])
         if dim is not None and last > dim:
             found.append(
-                f"action: the policy gives {dim} numbers a row, the mapping wants {last}; change mapping.action"
+                f"action: the policy gives {dim} numbers a row, the mapping wants {last}; change "
+                "mapping.action"
             )
         return found
 
     def warn_of_unread_cameras(self, flat: Mapping[str, Any], dialect: str) -> None:
-        """Log the cameras of a client's observation that the mapping does not read, and the policy never receives.
+        """Log the cameras of a client's observation that the mapping does not read, and the policy
+        never receives.
 
-        A message is logged once for all clients of a dialect with the same cameras. This looks at each key: call it
-        when a session begins, not for each observation.
+        A message is logged once for all clients of a dialect with the same cameras. This looks at
+        each key: call it when a session begins, not for each observation.
         """
         if unread := self._unread(flat, may_be_camera):
-            _log_unread(dialect, tuple(unread), tuple(camera.key for camera in self.cameras.values()))
+            _log_unread(
+                dialect, tuple(unread), tuple(camera.key for camera in self.cameras.values())
+            )
 
     def _unread(self, flat: Mapping[str, Any], is_one: Callable[[Any], bool]) -> list[str]:
-        """Return the paths of the values for which `is_one` is true and which no key of the mapping matches."""
-        known = [one.key for one in self.cameras.values()] + [one.key for all_ in self.state.values() for one in all_]
+        """Return the paths of the values for which `is_one` is true and which no key of the
+        mapping matches.
+        """
+        known = [one.key for one in self.cameras.values()] + [
+            one.key for all_ in self.state.values() for one in all_
+        ]
         known += [*self.info.values(), *([] if self.gripper is None else [self.gripper.key])]
         patterns = [pattern for key in known for pattern in key.split("|")]
         return [
@@ -480,13 +578,16 @@ class KeyMapping:
         ]
 
     def _require_read(self, flat: Mapping[str, Any], obs: Obs) -> None:
-        """Raise if `obs` has nothing of the client's observation, or none of its cameras or none of its states."""
+        """Raise if `obs` has nothing of the client's observation, or none of its cameras or none
+        of its states.
+        """
         images = [camera.key for camera in self.cameras.values()]
         numbers = [part.key for sources in self.state.values() for part in sources]
         known = [*images, *numbers, *([] if self.gripper is None else [self.gripper.key])]
         if known and not obs.cameras and not obs.state and obs.gripper is None:
             raise InvalidObservation(
-                f"observation: got {keys(flat)}, of which the mapping reads nothing; it looks for {known}: "
+                f"observation: got {keys(flat)}, of which the mapping reads nothing; it looks for "
+                f"{known}: "
                 f"choose the preset of this client, or change the mapping"
             )
         for kind, wanted, found, is_one in (
@@ -495,12 +596,15 @@ class KeyMapping:
         ):
             if wanted and not found and (lost := self._unread(flat, is_one)):
                 raise InvalidObservation(
-                    f"observation: got {lost}, which the mapping does not read, and nothing at {wanted}; add them to "
+                    f"observation: got {lost}, which the mapping does not read, and nothing at "
+                    f"{wanted}; add them to "
                     f"mapping.{kind}, or to mapping.info if the policy does without"
                 )
 
     def _opening(self, flat: Mapping[str, Any], limits: Limits, *, needed: bool) -> float | None:
-        """Return the gripper's opening in [0, 1], 1 = open; None if it is missing, or invalid and not `needed`."""
+        """Return the gripper's opening in [0, 1], 1 = open; None if it is missing, or invalid
+        and not `needed`.
+        """
         if (gripper := self.gripper) is None:
             return None
         if (value := lookup(flat, gripper.key)) is None:
@@ -518,7 +622,8 @@ class KeyMapping:
             if not needed:
                 return None
             raise InvalidObservation(
-                f"{gripper.key!r}: got {reading:g} for the gripper, want {gripper.closed:g} (closed) to "
+                f"{gripper.key!r}: got {reading:g} for the gripper, want {gripper.closed:g} "
+                "(closed) to "
                 f"{gripper.open:g} (open); scale it, or change mapping.gripper"
             )
         return min(1.0, max(0.0, opening))
@@ -527,6 +632,7 @@ class KeyMapping:
 @lru_cache(maxsize=64)  # each message is logged once
 def _log_unread(dialect: str, unread: tuple[str, ...], read: tuple[str, ...]) -> None:
     logger.warning(
-        f"{dialect}: a client sends the cameras {list(unread)}, which the policy does not get: the mapping reads "
+        f"{dialect}: a client sends the cameras {list(unread)}, which the policy does not get: the "
+        "mapping reads "
         f"{list(read)}; if the policy takes them, add them to mapping.cameras"
     )

@@ -13,5 +13,6 @@ def latency(url: str = typer.Argument(help="The server, http://localhost:8000.")
         with urllib.request.urlopen(f"{url}/homing/latency", timeout=10) as answer:
             typer.echo(json.dumps(json.load(answer)))
     except urllib.error.URLError as error:
-        typer.echo(f"{url}: expected a server with the part homing, got {error}; start one", err=True)
+        message = f"{url}: expected a server with the part homing, got {error}; start one"
+        typer.echo(message, err=True)
         raise typer.Exit(1) from error

@@ -1,13 +1,20 @@
-"""What this distribution registers; the entry points of pyproject.toml name these. Import nothing large here."""
+"""What this distribution registers, by the names in the entry points of pyproject.toml.
+
+Import nothing large here.
+"""
 
 from vlagents_ray.registry import RegistryEntry
 
 POLICY = RegistryEntry(
     "homing.policy:Homing",
     about="moves each joint towards zero",
-    needs=("numpy",),  # if one of these cannot be imported, `vlagents-ray policies` says which extra brings it
+    # If one of these cannot be imported, `vlagents-ray policies` says which extra brings it.
+    needs=("numpy",),
     extra="model",
     page="https://example.org/homing",
 )
 LATENCY = RegistryEntry("homing.latency:Latency")
-COMMAND = RegistryEntry("homing.command:latency", about="Print how long calls of a server's policy take.")
+COMMAND = RegistryEntry(
+    "homing.command:latency",
+    about="Print how long calls of a server's policy take.",
+)

@@ -9,7 +9,8 @@ from lerobot.configs.policies import PreTrainedConfig
 from vlagents_ray.errors import ConfigError
 
 TRAINING = (
-    "policy.type=vlagents: got a policy on a server, whose weights are not here; train with the type of the checkpoint "
+    "policy.type=vlagents: got a policy on a server, whose weights are not here; train with the "
+    "type of the checkpoint "
     "that the server loads, or push weights into the server (docs/weights.md)"
 )
 
@@ -17,22 +18,30 @@ TRAINING = (
 @PreTrainedConfig.register_subclass("vlagents")
 @dataclass
 class VlagentsConfig(PreTrainedConfig):
-    """The server, and the mapping of the policy's cameras and states to those of this robot or environment."""
+    """The server, and the mapping of the policy's cameras and states to those of this robot or
+    environment.
+    """
 
     url: str = ""  # http(s)://HOST:PORT[/APP], as of `RemoteAgent`
-    cameras: dict[str, str] = field(default_factory=dict)  # policy's camera -> robot's, where the names differ
-    state: list[str] = field(default_factory=list)  # the policy's parts in `observation.state`, in its order
+    # policy's camera -> robot's, where the names differ.
+    cameras: dict[str, str] = field(default_factory=dict)
+    # The policy's parts in `observation.state`, in its order.
+    state: list[str] = field(default_factory=list)
     instruction: str | None = None  # in place of the task of the dataset or the environment
-    n_action_steps: int | None = None  # rows of each chunk that are executed; None: all that the server returns
+    # Rows of each chunk that are executed; None: all that the server returns.
+    n_action_steps: int | None = None
     checkpoint: str | None = None  # one of those that the server offers; None: its own
-    seed: int | None = None  # of the first session's first episode; each further one has the next number
+    # Of the first session's first episode; each further one has the next number.
+    seed: int | None = None
     key_file: Path | None = None  # holds the API key; without it, VLAGENTS_RAY_API_KEY is the key
     ca: Path | None = None  # https: PEM file of the server's authorities; None: the system's
-    certificate: list[Path] = field(default_factory=list)  # https: PEM files of the client's certificate and its key
+    # https: PEM files of the client's certificate and its key.
+    certificate: list[Path] = field(default_factory=list)
     transport: str = "auto"  # as of `RemoteAgent`
     codec: str = "auto"  # of images, as of `RemoteAgent`: "jpeg", "lossless", "raw", …
     rank: str = "robot"  # "simulation": robots of the same server go first
-    accept_misfit: bool = False  # move a robot although the training's statistics do not fit it; the log shows it
+    # Move a robot although the training's statistics do not fit it; the log shows it.
+    accept_misfit: bool = False
     timeout_s: float = 30.0  # for a request; after it the command ends with an error
     connect_timeout_s: float = 60.0  # for a server that is still loading
     device: str | None = "cpu"  # of observations until they are sent
@@ -42,24 +51,32 @@ class VlagentsConfig(PreTrainedConfig):
         """Check what can be checked without the server; raises `ConfigError`."""
         super().__post_init__()
         if self.n_obs_steps != 1:
-            raise ConfigError(f"policy.n_obs_steps: got {self.n_obs_steps}, want 1: the server keeps the history")
+            raise ConfigError(
+                f"policy.n_obs_steps: got {self.n_obs_steps}, want 1: the server keeps the history"
+            )
         if self.n_action_steps is not None and self.n_action_steps < 1:
-            raise ConfigError(f"policy.n_action_steps: got {self.n_action_steps}, want 1 or more, or null for all")
+            raise ConfigError(
+                f"policy.n_action_steps: got {self.n_action_steps}, want 1 or more, or null for all"
+            )
         if len(self.certificate) not in (0, 2):
             raise ConfigError(
-                f"policy.certificate: got {len(self.certificate)} files, want two, as [cert.pem, key.pem]"
+                f"policy.certificate: got {len(self.certificate)} files, want two, as [cert.pem, "
+                "key.pem]"
             )
 
     @property
     def api_key(self) -> str | None:
-        """The API key in `key_file`; None if no file is set. Raises `ConfigError` if it cannot be read."""
+        """The API key in `key_file`; None if no file is set. Raises `ConfigError` if it cannot
+        be read.
+        """
         if self.key_file is None:
             return None
         try:
             return self.key_file.read_text().strip()
         except OSError as error:
             raise ConfigError(
-                f"policy.key_file: got {str(self.key_file)!r}, want a file with an API key ({error})"
+                f"policy.key_file: got {str(self.key_file)!r}, want a file with an API key "
+                f"({error})"
             ) from error
 
     @property

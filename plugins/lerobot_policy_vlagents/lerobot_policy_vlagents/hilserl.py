@@ -1,7 +1,8 @@
-"""HIL-SERL with the policy on a server: LeRobot's learner trains, and vlagents_ray's control loop is its actor.
+"""HIL-SERL with the policy on a server: LeRobot's learner trains, and vlagents_ray's control loop
+is its actor.
 
-It takes the place of `python -m lerobot.rl.actor`. `python -m lerobot_policy_vlagents.hilserl CONFIG FOLDER` writes the
-checkpoint that the server begins with.
+It takes the place of `python -m lerobot.rl.actor`. `python -m lerobot_policy_vlagents.hilserl
+CONFIG FOLDER` writes the checkpoint that the server begins with.
 """
 
 from __future__ import annotations
@@ -38,7 +39,8 @@ from vlagents_ray.datasets.episode import Label, camera_keys, state_vector
 from vlagents_ray.errors import ConfigError, Overloaded, PolicyUnavailable
 from vlagents_ray.interface import copied
 
-_PARTS = {"policy": "actor", "discrete_critic": "discrete_critic"}  # the learner's names -> the policy's modules
+# The learner's names -> the policy's modules.
+_PARTS = {"policy": "actor", "discrete_critic": "discrete_critic"}
 _SEND_S = 60.0  # time limit for the transitions of an episode
 logger = logging.getLogger(__name__)
 
@@ -54,16 +56,20 @@ class Actor:
     """The recorder of a control loop whose episodes go to LeRobot's HIL-SERL learner.
 
         with Actor("train.json", Publisher("http://gpu-box:8000")) as actor:
-            run_loop(robot, player, hz=10, seconds=20, reset_options={"weights": "follow"}, recorder=actor)
+            run_loop(robot, player, hz=10, seconds=20, reset_options={"weights": "follow"},
+            recorder=actor)
 
-    The learner's parameters are pushed to the server as they come, where the next episode acts with them. An episode is
-    sent when it ends, with the names of a recording by `vlagents_ray.robot.record.Recorder`. The label "success" is a
-    reward of 1 in its last transition. An episode without a label was truncated.
+    The learner's parameters are pushed to the server as they come, where the next episode acts with
+    them. An episode is sent when it ends, with the names of a recording by
+    `vlagents_ray.robot.record.Recorder`. The label "success" is a reward of 1 in its last
+    transition. An episode without a label was truncated.
     """
 
     interventions = True  # frames of an operator are accepted
 
-    def __init__(self, config: str | Path, weights: Weights, *, connect_timeout_s: float = 60.0) -> None:
+    def __init__(
+        self, config: str | Path, weights: Weights, *, connect_timeout_s: float = 60.0
+    ) -> None:
         """Connect to the learner.
 
         Args:
@@ -75,13 +81,16 @@ class Actor:
             PolicyUnavailable: The learner was not ready in time.
         """
         policy = json.loads(Path(config).read_text())["policy"]
-        at = {"learner_host": "127.0.0.1", "learner_port": 50051} | policy.get("actor_learner_config", {})
+        at = {"learner_host": "127.0.0.1", "learner_port": 50051} | policy.get(
+            "actor_learner_config", {}
+        )
         learner = f"{at['learner_host']}:{at['learner_port']}"
         self._inputs = {name: tuple(one["shape"]) for name, one in policy["input_features"].items()}
         self.version: int | None = None  # of the last pushed weights
         self._weights = weights
         self._label: Label | None = None
-        self._frames: list[tuple[Obs, np.ndarray, bool]] = []  # observation, action, whether an operator's
+        # observation, action, whether an operator's.
+        self._frames: list[tuple[Obs, np.ndarray, bool]] = []
         self._steps = 0  # of all episodes
         self._error: Exception | None = None  # of the thread, raised by the next episode or `close`
         self._channel = grpc.insecure_channel(learner, grpc_channel_options())
@@ -91,17 +100,22 @@ class Actor:
         except grpc.RpcError as error:
             self._channel.close()
             raise PolicyUnavailable(
-                f"HIL-SERL: no learner at {learner} within {connect_timeout_s:g} s ({error.code().name}); start it: "
+                f"HIL-SERL: no learner at {learner} within {connect_timeout_s:g} s "
+                f"({error.code().name}); start it: "
                 f"python -m lerobot.rl.learner"
             ) from error
         self._closed = threading.Event()
         self._parameters = self._stub.StreamParameters(services_pb2.Empty())
-        self._thread = threading.Thread(target=self._receive, name="hilserl-parameters", daemon=True)
+        self._thread = threading.Thread(
+            target=self._receive, name="hilserl-parameters", daemon=True
+        )
         self._thread.start()
 
     @contextlib.contextmanager
     def episode(self, instruction: str) -> Iterator[None]:
-        """Make the frames that are added within the context one episode; raise an error of the thread before it."""
+        """Make the frames that are added within the context one episode; raise an error of the
+        thread before it.
+        """
         self._raise()
         self._label, self._frames = None, []
         try:
@@ -147,7 +161,9 @@ class Actor:
     def _receive(self) -> None:
         """Push all parameters of the stream."""
         try:
-            receive_bytes_in_chunks(self._parameters, SimpleNamespace(put=self._push), self._closed, "parameters")
+            receive_bytes_in_chunks(
+                self._parameters, SimpleNamespace(put=self._push), self._closed, "parameters"
+            )
             raise PolicyUnavailable("HIL-SERL: the learner has ended")
         except Exception as error:  # noqa: BLE001 - raised by the caller's next method
             if not self._closed.is_set():
@@ -155,7 +171,11 @@ class Actor:
 
     def _push(self, data: bytes) -> None:
         modules = bytes_to_state_dict(data)  # by torch's loader for weights alone
-        named = {f"{_PARTS[part]}.{name}": value for part, one in modules.items() for name, value in one.items()}
+        named = {
+            f"{_PARTS[part]}.{name}": value
+            for part, one in modules.items()
+            for name, value in one.items()
+        }
         try:
             self.version = self._weights.push(named, partial=True, allow_same=True)
         except Overloaded as error:
@@ -173,20 +193,28 @@ class Actor:
         }
         for method, message, data in (
             (self._stub.SendTransitions, services_pb2.Transition, transitions_to_bytes(done)),
-            (self._stub.SendInteractions, services_pb2.InteractionMessage, python_object_to_bytes(report)),
+            (
+                self._stub.SendInteractions,
+                services_pb2.InteractionMessage,
+                python_object_to_bytes(report),
+            ),
         ):
             try:
                 method(send_bytes_in_chunks(data, message), timeout=_SEND_S)
             except grpc.RpcError as error:
                 raise PolicyUnavailable(
-                    f"HIL-SERL: the learner did not take the episode ({error.code().name}); is it running?"
+                    f"HIL-SERL: the learner did not take the episode ({error.code().name}); is it "
+                    "running?"
                 ) from error
 
 
 def transitions(
-    frames: Sequence[tuple[Obs, np.ndarray, bool]], label: Label | None, inputs: Mapping[str, tuple[int, ...]]
+    frames: Sequence[tuple[Obs, np.ndarray, bool]],
+    label: Label | None,
+    inputs: Mapping[str, tuple[int, ...]],
 ) -> list[dict[str, Any]]:
-    """Return an episode of N frames as N of LeRobot's transitions; the last one has its own state as the next one.
+    """Return an episode of N frames as N of LeRobot's transitions; the last one has its own state
+    as the next one.
 
     Args:
         frames: Observation, action (D,) float32, and whether an operator moved the robot.
@@ -205,25 +233,38 @@ def transitions(
             "next_state": states[min(number + 1, last)],
             "done": number == last and label is not None,
             "truncated": number == last and label is None,
-            "complementary_info": {"discrete_penalty": torch.zeros(1), "is_intervention": intervention},
+            "complementary_info": {
+                "discrete_penalty": torch.zeros(1),
+                "is_intervention": intervention,
+            },
         }
         for number, (_, action, intervention) in enumerate(frames)
     ]
 
 
 def _state(obs: Obs, inputs: Mapping[str, tuple[int, ...]]) -> dict[str, torch.Tensor]:
-    """Return an observation with LeRobot's names: images (1, 3, H, W) in [0, 1], the state (1, D)."""
+    """Return an observation with LeRobot's names: images (1, 3, H, W) in [0, 1], the state (1,
+    D).
+    """
     values, _ = state_vector(obs.state, None if obs.gripper is None else np.array(obs.gripper))
-    seen = {key: np.moveaxis(obs.cameras[name], -1, 0) for name, key in camera_keys(obs.cameras).items()}
+    seen = {
+        key: np.moveaxis(obs.cameras[name], -1, 0) for name, key in camera_keys(obs.cameras).items()
+    }
     seen[OBS_STATE] = values
     if (got := {name: value.shape for name, value in seen.items() if name in inputs}) != inputs:
-        raise ConfigError(f"input_features: got {got} from the robot, want {dict(inputs)}; train the policy on these")
-    found = {name: torch.from_numpy(np.ascontiguousarray(seen[name]))[None].float() for name in inputs}
+        raise ConfigError(
+            f"input_features: got {got} from the robot, want {dict(inputs)}; train the policy on "
+            "these"
+        )
+    found = {
+        name: torch.from_numpy(np.ascontiguousarray(seen[name]))[None].float() for name in inputs
+    }
     return {name: value if name == OBS_STATE else value / 255 for name, value in found.items()}
 
 
 def write_checkpoint(config: Path, folder: Path) -> None:
-    """Write the policy of a learner's configuration, with random weights, for the server to begin with.
+    """Write the policy of a learner's configuration, with random weights, for the server to begin
+    with.
 
     Args:
         config: The learner's JSON file (`--config_path`), whose `policy` has the features.
@@ -233,8 +274,11 @@ def write_checkpoint(config: Path, folder: Path) -> None:
     (folder / "config.json").write_text(json.dumps(json.loads(config.read_text())["policy"]))
     settings: Any = PreTrainedConfig.from_pretrained(folder)
     get_policy_class(settings.type)(settings).save_pretrained(folder)
-    if settings.type == "sac":  # LeRobot 0.4 normalises nothing in HIL-SERL, neither in the learner nor in the actor
-        settings.normalization_mapping = dict.fromkeys(settings.normalization_mapping, NormalizationMode.IDENTITY)
+    # LeRobot 0.4 normalises nothing in HIL-SERL, neither in the learner nor in the actor.
+    if settings.type == "sac":
+        settings.normalization_mapping = dict.fromkeys(
+            settings.normalization_mapping, NormalizationMode.IDENTITY
+        )
     for pipeline in make_pre_post_processors(settings, dataset_stats=settings.dataset_stats):
         pipeline.save_pretrained(folder)
 

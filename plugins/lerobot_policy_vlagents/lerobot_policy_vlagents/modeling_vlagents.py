@@ -27,7 +27,8 @@ from vlagents_ray.errors import ConfigError, ContractMismatch, InvalidAction
 from vlagents_ray.interface import DELAY, LEFTOVER
 from vlagents_ray.robot.fit import Fit, Trained
 
-_GUIDANCE = ("max_guidance_weight", "prefix_attention_schedule")  # of RTCConfig; the server has its own
+# Of RTCConfig; the server has its own.
+_GUIDANCE = ("max_guidance_weight", "prefix_attention_schedule")
 logger = logging.getLogger(__name__)
 
 
@@ -45,7 +46,8 @@ class VlagentsPolicy(PreTrainedPolicy):
 
         Raises:
             ConfigError: An option is missing or wrong.
-            ContractMismatch: The policy needs a missing input, or returns other actions than the robot needs.
+            ContractMismatch: The policy needs a missing input, or returns other actions than the
+                robot needs.
             PolicyUnavailable: The server was not ready within `connect_timeout_s`.
         """
         super().__init__(config)
@@ -58,12 +60,19 @@ class VlagentsPolicy(PreTrainedPolicy):
 
     @classmethod
     def from_pretrained(
-        cls, pretrained_name_or_path: str | Path | None = None, *, config: VlagentsConfig | None = None, **kwargs: Any
+        cls,
+        pretrained_name_or_path: str | Path | None = None,
+        *,
+        config: VlagentsConfig | None = None,
+        **kwargs: Any,
     ) -> VlagentsPolicy:
-        """Return the policy of a configuration; raises `ConfigError` for a checkpoint, which only a server loads."""
+        """Return the policy of a configuration; raises `ConfigError` for a checkpoint, which
+        only a server loads.
+        """
         if pretrained_name_or_path is not None or config is None:
             raise ConfigError(
-                f"policy.path: got {str(pretrained_name_or_path)!r}, want none with policy.type=vlagents: the server "
+                f"policy.path: got {str(pretrained_name_or_path)!r}, want none with "
+                "policy.type=vlagents: the server "
                 f"loads the checkpoint; --policy.checkpoint selects one of those that it offers"
             )
         return cls(config, **{key: value for key, value in kwargs.items() if key == "dataset_meta"})
@@ -73,10 +82,12 @@ class VlagentsPolicy(PreTrainedPolicy):
         self._sessions.reset()
 
     def select_action(self, batch: dict[str, Any], **_: Any) -> torch.Tensor:
-        """Return the next row of each session's chunk, (B, D) float32; after its last row, request a new chunk.
+        """Return the next row of each session's chunk, (B, D) float32; after its last row, request
+        a new chunk.
 
         Args:
-            batch: Images (B, C, H, W) in [0, 1], states (B, D), and the `task`, with LeRobot's names.
+            batch: Images (B, C, H, W) in [0, 1], states (B, D), and the `task`, with LeRobot's
+                names.
         """
         return torch.from_numpy(self._sessions.next_rows(batch))
 
@@ -88,44 +99,56 @@ class VlagentsPolicy(PreTrainedPolicy):
         prev_chunk_left_over: torch.Tensor | None = None,
         **_: Any,
     ) -> torch.Tensor:
-        """Return a new chunk of each session, (B, H, D) float32; it does not affect `select_action`.
+        """Return a new chunk of each session, (B, H, D) float32; it does not affect
+        `select_action`.
 
         Args:
             batch: As of `select_action`.
-            inference_delay: Real-time chunking: the number of rows of the plan that will have been executed.
-            prev_chunk_left_over: Real-time chunking: the plan from this observation on, (H', D) or (B, H', D), which
-                LeRobot pads with rows of zeros.
+            inference_delay: Real-time chunking: the number of rows of the plan that will have been
+                executed.
+            prev_chunk_left_over: Real-time chunking: the plan from this observation on, (H', D) or
+                (B, H', D), which LeRobot pads with rows of zeros.
         """
         rtc = getattr(self.config, "rtc_config", None)
         left = prev_chunk_left_over if rtc is None or rtc.enabled else None
         chunks = self._sessions.chunks(batch, _plans(left, inference_delay, _size(batch)))
         if len(lengths := {len(rows) for rows in chunks}) > 1:
             raise InvalidAction(
-                f"predict_action_chunk: got chunks of {sorted(lengths)} rows, want one length; set a "
+                f"predict_action_chunk: got chunks of {sorted(lengths)} rows, want one length; set "
+                "a "
                 f"length in the server's deployment file, or use select_action"
             )
         return torch.from_numpy(np.stack(chunks))
 
     def supports_rtc(self) -> bool:
-        """Return True; raises `ConfigError` if the server's policy does not continue the executed plan."""
+        """Return True; raises `ConfigError` if the server's policy does not continue the
+        executed plan.
+        """
         if not self._sessions.agent.continues_plans:
             raise ConfigError(
-                "inference.type: got rtc, and the server's policy ignores the plan that is executed, so that its "
-                "chunks would not fit together; use --inference.type=sync, serve a policy with real-time chunking and "
-                "`actions: chunk` (pi0, openpi, or smolvla, pi0 and pi05 of lerobot), or, to keep the robot moving "
-                "while another policy computes, drive it by vlagents_ray's own ChunkPlayer(agent, mode='async')"
+                "inference.type: got rtc, and the server's policy ignores the plan that is "
+                "executed, so that its "
+                "chunks would not fit together; use --inference.type=sync, serve a policy with "
+                "real-time chunking and "
+                "`actions: chunk` (pi0, openpi, or smolvla, pi0 and pi05 of lerobot), or, to keep "
+                "the robot moving "
+                "while another policy computes, drive it by vlagents_ray's own ChunkPlayer(agent, "
+                "mode='async')"
             )
         return True
 
     def init_rtc_processor(self) -> None:
-        """Let all threads share one session, since LeRobot computes chunks and calls `reset` on different threads.
+        """Let all threads share one session, since LeRobot computes chunks and calls `reset` on
+        different threads.
 
-        LeRobot calls this once `config.rtc_config` is set. Raises `ConfigError` for settings that the server has.
+        LeRobot calls this once `config.rtc_config` is set. Raises `ConfigError` for settings that
+        the server has.
         """
         wanted, usual = self.config.rtc_config, RTCConfig()
         if changed := [name for name in _GUIDANCE if getattr(wanted, name) != getattr(usual, name)]:
             raise ConfigError(
-                f"inference.rtc.{changed[0]}: got {getattr(wanted, changed[0])}, want none here: the server guides the "
+                f"inference.rtc.{changed[0]}: got {getattr(wanted, changed[0])}, want none here: "
+                "the server guides the "
                 f"chunks; set it in its deployment file (for lerobot: overrides: {{rtc_config: …}})"
             )
         self._of_all_threads = self._sessions
@@ -163,7 +186,9 @@ class _Robot:
         """Return a connection to the server, which is ready."""
         config = self.config
         if not config.url:
-            raise ConfigError("policy.url: got none, want the server's, as --policy.url=http://gpu-box:8000")
+            raise ConfigError(
+                "policy.url: got none, want the server's, as --policy.url=http://gpu-box:8000"
+            )
         certificate = (config.certificate[0], config.certificate[1]) if config.certificate else None
         agent = RemoteAgent(
             config.url,
@@ -180,27 +205,39 @@ class _Robot:
         return agent
 
     def check_features(self, agent: RemoteAgent) -> None:
-        """Compare the features that are known before the first observation; raises `ContractMismatch`."""
+        """Compare the features that are known before the first observation; raises
+        `ContractMismatch`.
+        """
         shapes = shapes_of_features(self.config.input_features or {})
         if shapes:
             self.mapping(agent, shapes)
         rows = agent.contract.chunk if agent.contract else None
         if rows is not None and (self.config.n_action_steps or 0) > rows:
             raise ConfigError(
-                f"policy.n_action_steps: got {self.config.n_action_steps}, want at most {rows}, the rows "
+                f"policy.n_action_steps: got {self.config.n_action_steps}, want at most {rows}, "
+                "the rows "
                 f"of the server's chunks"
             )
 
-    def mapping(self, agent: RemoteAgent, shapes: Mapping[str, Sequence[int]]) -> ObservationMapping:
-        """Return the mapping of observations of these shapes to the policy's; raises `ContractMismatch`."""
+    def mapping(
+        self, agent: RemoteAgent, shapes: Mapping[str, Sequence[int]]
+    ) -> ObservationMapping:
+        """Return the mapping of observations of these shapes to the policy's; raises
+        `ContractMismatch`.
+        """
         found = ObservationMapping(self.config, agent.contract, shapes, self.names)
         require_fit(agent.contract, found.contract(self.action_dim, self.hz, self.action_names))
         return found
 
     def fit(self, agent: RemoteAgent, mapping: ObservationMapping) -> Fit:
-        """Return the comparison of the policy's numbers with the robot's; an environment is not compared."""
+        """Return the comparison of the policy's numbers with the robot's; an environment is not
+        compared.
+        """
         statistics = agent.statistics if self.config.rank == "robot" else None
-        trained, parts = Trained.from_statistics(statistics or {}), [*itertools.chain(*mapping.parts.values())]
+        trained, parts = (
+            Trained.from_statistics(statistics or {}),
+            [*itertools.chain(*mapping.parts.values())],
+        )
         names = tuple(part for part, _ in parts)
         return Fit(trained, None, tuple(self.action_names), names, self.config.accept_misfit)
 
@@ -214,7 +251,8 @@ class _Sessions:
         self._agents: list[RemoteAgent] = []
         self._rows: list[deque[np.ndarray]] = []
         self._mapping: ObservationMapping | None = None  # None before the first episodes
-        self._fit: Fit | None = None  # of the next chunks with the robot; None once they were compared
+        # Of the next chunks with the robot; None once they were compared.
+        self._fit: Fit | None = None
         self._due = True  # whether the next batch begins episodes
         self._begun = 0  # episodes so far
 
@@ -231,7 +269,9 @@ class _Sessions:
         return np.stack([rows.popleft() for rows in self._rows])
 
     def chunks(self, batch: Mapping[str, Any], plans: Sequence[dict[str, Any]]) -> list[np.ndarray]:
-        """Return a new chunk of each session, (H, D) float32 each, which continues its plan if it has one."""
+        """Return a new chunk of each session, (H, D) float32 each, which continues its plan if
+        it has one.
+        """
         begun = self._begin_if_due(batch)
         return self._act(batch, range(len(self._agents)), () if begun else plans)
 
@@ -251,19 +291,29 @@ class _Sessions:
     def _begin(self, batch: Mapping[str, Any], size: int) -> None:
         mapping = self._robot.mapping(self.agent, shapes_of_batch(batch))
         if mapping.unused and not self._begun:
-            logger.info("cameras that the policy does not take, and that are not sent: %s", mapping.unused)
+            logger.info(
+                "cameras that the policy does not take, and that are not sent: %s", mapping.unused
+            )
         if size != len(self._agents):
             for agent in self._agents:
                 agent.close()
             self._agents = self.agent.sessions(size)
         tasks = self._instructions(batch, size)
-        seeds = None if self._config.seed is None else [self._config.seed + self._begun + row for row in range(size)]
-        options: dict[str, Any] = {} if self._config.checkpoint is None else {"checkpoint": self._config.checkpoint}
+        seeds = (
+            None
+            if self._config.seed is None
+            else [self._config.seed + self._begun + row for row in range(size)]
+        )
+        options: dict[str, Any] = (
+            {} if self._config.checkpoint is None else {"checkpoint": self._config.checkpoint}
+        )
         observations = [mapping.observation(batch, row) for row in range(size)]
         self._fit = fit = self._robot.fit(self.agent, mapping)
         for obs in observations:
             fit.require(obs, None)
-        _successes(self.agent.reset_batch(observations, tasks, self._agents, seeds=seeds, **options))
+        _successes(
+            self.agent.reset_batch(observations, tasks, self._agents, seeds=seeds, **options)
+        )
         self._begun += size
         self._rows = [deque() for _ in range(size)]
         self._mapping = mapping
@@ -275,12 +325,16 @@ class _Sessions:
         observations: list[Obs] = [mapping.observation(batch, row) for row in rows]
         for obs, plan in zip(observations, plans, strict=False):
             obs.info.update(plan)
-        acts = cast(list[Act], _successes(self.agent.act_batch(observations, [self._agents[row] for row in rows])))
+        acts = cast(
+            list[Act],
+            _successes(self.agent.act_batch(observations, [self._agents[row] for row in rows])),
+        )
         chunks = [act.rows().astype(np.float32, copy=False) for act in acts]
         want = self._robot.action_dim
         if odd := [chunk.shape[1] for chunk in chunks if want not in (None, chunk.shape[1])]:
             raise ContractMismatch(
-                f"action: got {odd[0]} numbers a row from the server, want {want} here; is this another robot's policy?"
+                f"action: got {odd[0]} numbers a row from the server, want {want} here; is this "
+                "another robot's policy?"
             )
         if self._fit is not None:
             for chunk in chunks:
@@ -294,7 +348,8 @@ class _Sessions:
         contract = self.agent.contract
         if contract is not None and contract.instruction and not all(tasks):
             raise ConfigError(
-                "task: got none, the policy needs an instruction; set --dataset.single_task, or --policy.instruction "
+                "task: got none, the policy needs an instruction; set --dataset.single_task, or "
+                "--policy.instruction "
                 "where the environment has none"
             )
         return [one or None for one in tasks]
@@ -302,14 +357,17 @@ class _Sessions:
 
 def _size(batch: Mapping[str, Any]) -> int:
     return next(
-        len(value) for key, value in batch.items() if key.startswith("observation.") and hasattr(value, "shape")
+        len(value)
+        for key, value in batch.items()
+        if key.startswith("observation.") and hasattr(value, "shape")
     )
 
 
 def _plans(left: torch.Tensor | None, delay: int, size: int) -> list[dict[str, Any]]:
     """Return the `Obs.info` of real-time chunking of each session; none without a plan.
 
-    LeRobot pads a plan to its execution horizon with rows of zeros. Its rows are actions, not normalised.
+    LeRobot pads a plan to its execution horizon with rows of zeros. Its rows are actions, not
+    normalised.
     """
     if left is None:
         return []
@@ -321,7 +379,9 @@ def _plans(left: torch.Tensor | None, delay: int, size: int) -> list[dict[str, A
 
 
 def _names(names: Any) -> list[str]:
-    """Return the names of a feature's values, which a dataset lists, or maps from a group to a list."""
+    """Return the names of a feature's values, which a dataset lists, or maps from a group to a
+    list.
+    """
     groups = names.values() if isinstance(names, Mapping) else [names or []]
     return [str(name) for group in groups for name in group]
 

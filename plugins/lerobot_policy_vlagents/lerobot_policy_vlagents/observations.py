@@ -19,7 +19,8 @@ from vlagents_ray.dataset_contract import divided_state, state_parts, wanted_par
 from vlagents_ray.errors import ConfigError, ContractMismatch
 from vlagents_ray.naming import did_you_mean
 
-_IMAGE = "observation.image"  # of an environment with one camera; with more, `observation.images.NAME`
+# Of an environment with one camera; with more, `observation.images.NAME`.
+_IMAGE = "observation.image"
 _STATES = (OBS_STATE, OBS_ENV_STATE)
 _STATE_OPTION = "--policy.state='[joints, gripper]'"
 
@@ -28,35 +29,50 @@ class ObservationMapping:
     """The mapping of the observations' features to the policy's cameras and states."""
 
     def __init__(
-        self, config: VlagentsConfig, policy: Contract | None, shapes: Mapping[str, Sequence[int]], names: Sequence[str]
+        self,
+        config: VlagentsConfig,
+        policy: Contract | None,
+        shapes: Mapping[str, Sequence[int]],
+        names: Sequence[str],
     ) -> None:
         """Map features to the policy's inputs.
 
         Args:
             config: The options.
             policy: The contract of the server's policy; None if it states none.
-            shapes: The shape of each feature, without the batch's dimension: images (C, H, W), states (D,).
+            shapes: The shape of each feature, without the batch's dimension: images (C, H, W),
+                states (D,).
             names: The names of the values in `observation.state`; empty if they are unknown.
 
         Raises:
-            ConfigError: The options name a missing camera, or the state cannot be divided into parts.
+            ConfigError: The options name a missing camera, or the state cannot be divided into
+                parts.
         """
         self._shapes = shapes
         robots = {_short(key): key for key in shapes if key.startswith(_IMAGE)}
         if unknown := [name for name in config.cameras.values() if name not in robots]:
             raise ConfigError(
-                f"policy.cameras: got {unknown[0]!r}, want some of the cameras here, {sorted(robots)}"
+                f"policy.cameras: got {unknown[0]!r}, want some of the cameras here, "
+                f"{sorted(robots)}"
                 f"{did_you_mean(unknown[0], robots)}"
             )
         known = {name: key for name, key in robots.items() if name not in config.cameras.values()}
         known |= {name: robots[robot] for name, robot in config.cameras.items()}
         wanted = None if policy is None else policy.cameras
-        self.cameras = {name: key for name, key in known.items() if wanted is None or name in wanted}
-        self.unused = sorted(_short(key) for key in set(robots.values()) - set(self.cameras.values()))
+        self.cameras = {
+            name: key for name, key in known.items() if wanted is None or name in wanted
+        }
+        self.unused = sorted(
+            _short(key) for key in set(robots.values()) - set(self.cameras.values())
+        )
         self._cameras_here = known
-        self.parts = _parts(config, policy, {key: shapes[key][0] for key in _STATES if key in shapes}, names)
+        self.parts = _parts(
+            config, policy, {key: shapes[key][0] for key in _STATES if key in shapes}, names
+        )
 
-    def contract(self, action_dim: int | None, control_hz: float | None, action_names: Sequence[str] = ()) -> Contract:
+    def contract(
+        self, action_dim: int | None, control_hz: float | None, action_names: Sequence[str] = ()
+    ) -> Contract:
         """Return the contract of the robot or the environment, as far as LeRobot states it."""
         sizes = {name: self._shapes[key][1:] for name, key in self._cameras_here.items()}
         listed = [part for parts in self.parts.values() for part in parts]
@@ -70,15 +86,23 @@ class ObservationMapping:
 
     def observation(self, batch: Mapping[str, Any], row: int) -> Obs:
         """Return one row of a batch as an observation."""
-        vectors = {key: batch[key][row].detach().to("cpu", torch.float32).numpy() for key in self.parts}
+        vectors = {
+            key: batch[key][row].detach().to("cpu", torch.float32).numpy() for key in self.parts
+        }
         state, gripper = divided_state(vectors, self.parts)
-        return Obs({name: _image(batch[key][row]) for name, key in self.cameras.items()}, gripper, state)
+        return Obs(
+            {name: _image(batch[key][row]) for name, key in self.cameras.items()}, gripper, state
+        )
 
 
 def shapes_of_batch(batch: Mapping[str, Any]) -> dict[str, Sequence[int]]:
     """Return the shape of each image and each state in a batch, without the batch's dimension."""
     read = {key: value for key, value in batch.items() if key in _STATES or key.startswith(_IMAGE)}
-    return {key: tuple(value.shape[1:]) for key, value in read.items() if isinstance(value, torch.Tensor)}
+    return {
+        key: tuple(value.shape[1:])
+        for key, value in read.items()
+        if isinstance(value, torch.Tensor)
+    }
 
 
 def shapes_of_features(features: Mapping[str, PolicyFeature]) -> dict[str, Sequence[int]] | None:
@@ -86,17 +110,25 @@ def shapes_of_features(features: Mapping[str, PolicyFeature]) -> dict[str, Seque
     states = {key for key, feature in features.items() if feature.type is FeatureType.STATE}
     if states - {OBS_STATE}:
         return None  # LIBERO: LeRobot joins them to `observation.state` at each step
-    return {key: feature.shape for key, feature in features.items() if key in _STATES or key.startswith(_IMAGE)}
+    return {
+        key: feature.shape
+        for key, feature in features.items()
+        if key in _STATES or key.startswith(_IMAGE)
+    }
 
 
 def require_fit(policy: Contract | None, here: Contract) -> None:
-    """Raise `ContractMismatch` with every difference between the server's policy and the robot or environments here."""
+    """Raise `ContractMismatch` with every difference between the server's policy and the robot
+    or environments here.
+    """
     try:
         require_match(policy, here)
     except ContractMismatch as error:
         raise ContractMismatch(
-            f"{error}\nThe env is what this command drives. --policy.cameras='{{POLICY: ROBOT, …}}' renames cameras, "
-            f"{_STATE_OPTION} names the parts of observation.state, --dataset.fps is the control rate."
+            f"{error}\nThe env is what this command drives. --policy.cameras='{{POLICY: ROBOT, "
+            f"…}}' renames cameras, "
+            f"{_STATE_OPTION} names the parts of observation.state, --dataset.fps is the control "
+            "rate."
         ) from error
 
 
@@ -109,17 +141,27 @@ def _parts(
         part = OBS_ENV_STATE.rpartition(".")[2]
         found[OBS_ENV_STATE] = [(part, widths[OBS_ENV_STATE])]
         if policy is not None and policy.state is not None:
-            policy = replace(policy, state={name: spec for name, spec in policy.state.items() if name != part})
+            policy = replace(
+                policy, state={name: spec for name, spec in policy.state.items() if name != part}
+            )
     if OBS_STATE in widths:
         wanted, chosen = wanted_parts(policy), list(config.state)
         if not chosen and len(wanted) > 1:
-            chosen = [part for part, _ in groupby(name.rstrip("0123456789").removesuffix("_") for name in names)]
+            chosen = [
+                part
+                for part, _ in groupby(
+                    name.rstrip("0123456789").removesuffix("_") for name in names
+                )
+            ]
             if sorted(chosen) != sorted(wanted):
                 raise ConfigError(
-                    f"observation.state: got the values {list(names) or 'without names'}, the policy wants the parts "
+                    f"observation.state: got the values {list(names) or 'without names'}, the "
+                    "policy wants the parts "
                     f"{wanted}; name those in the order in which they are in it: {_STATE_OPTION}"
                 )
-        found[OBS_STATE] = state_parts(widths[OBS_STATE], policy, chosen or None, option=_STATE_OPTION)
+        found[OBS_STATE] = state_parts(
+            widths[OBS_STATE], policy, chosen or None, option=_STATE_OPTION
+        )
     return found
 
 
@@ -128,8 +170,12 @@ def _short(key: str) -> str:
 
 
 def _image(tensor: torch.Tensor) -> np.ndarray:
-    """Return an image (C, H, W) in [0, 1], which LeRobot made of bytes, as those bytes, (H, W, C) uint8."""
+    """Return an image (C, H, W) in [0, 1], which LeRobot made of bytes, as those bytes, (H, W,
+    C) uint8.
+    """
     if tensor.is_floating_point():
-        tensor = (tensor.detach().to("cpu", torch.float32) * 255).round().clamp(0, 255).to(torch.uint8)
+        tensor = (
+            (tensor.detach().to("cpu", torch.float32) * 255).round().clamp(0, 255).to(torch.uint8)
+        )
     array: np.ndarray = tensor.cpu().permute(1, 2, 0).contiguous().numpy()
     return array

@@ -26,15 +26,20 @@ def mask_at(rows: slice, columns: slice) -> np.ndarray:
 
 
 def test_pixels_are_connected_by_chains_of_links_alone() -> None:
-    spiral = np.array([[1, 1, 1, 1], [0, 0, 0, 1], [1, 1, 0, 1], [1, 0, 0, 1], [1, 1, 1, 1], [0, 0, 0, 0]], bool)
+    spiral = np.array(
+        [[1, 1, 1, 1], [0, 0, 0, 1], [1, 1, 0, 1], [1, 0, 0, 1], [1, 1, 1, 1], [0, 0, 0, 0]], bool
+    )
     labels = connected(spiral[:, :-1] & spiral[:, 1:], spiral[:-1] & spiral[1:])
     assert len(set(labels[spiral])) == 1
-    assert len(set(labels[~spiral])) == np.count_nonzero(~spiral)  # nothing links what is not in the mask
+    # Nothing links what is not in the mask.
+    assert len(set(labels[~spiral])) == np.count_nonzero(~spiral)
 
 
 def test_a_mask_splits_into_its_regions_without_the_small_ones() -> None:
     mask = (
-        mask_at(slice(0, 10), slice(0, 10)) | mask_at(slice(20, 40), slice(5, 9)) | mask_at(slice(50, 51), slice(5, 6))
+        mask_at(slice(0, 10), slice(0, 10))
+        | mask_at(slice(20, 40), slice(5, 9))
+        | mask_at(slice(50, 51), slice(5, 6))
     )
     assert [int(region.sum()) for region in split(mask, smallest=2)] == [100, 80]
 
@@ -60,9 +65,13 @@ def test_overlap_is_intersection_over_union() -> None:
 
 def test_colours_are_found_by_the_words_of_a_phrase() -> None:
     image = canvas(
-        (RED, slice(10, 20), slice(10, 20)), (RED, slice(40, 45), slice(0, 5)), (BLUE, slice(5, 9), slice(50, 60))
+        (RED, slice(10, 20), slice(10, 20)),
+        (RED, slice(40, 45), slice(0, 5)),
+        (BLUE, slice(5, 9), slice(50, 60)),
     )
-    red, blue = make_part("detector", "colour").detect([image, image], [["put the RED cube down"], ["blue", "a cube"]])
+    red, blue = make_part("detector", "colour").detect(
+        [image, image], [["put the RED cube down"], ["blue", "a cube"]]
+    )
     assert [thing.box.tolist() for thing in red] == [[10, 10, 20, 20], [0, 40, 5, 45]]
     assert [(thing.phrase, thing.box.tolist()) for thing in blue] == [("blue", [50, 5, 60, 9])]
     assert np.array_equal(blue[0].mask, mask_at(slice(5, 9), slice(50, 60)))
@@ -82,7 +91,9 @@ def test_the_gripper_is_what_lies_wholly_in_the_circle() -> None:
     regions = make_part("segmenter", "flat").propose([image])
     [chosen] = make_part("selector", "circle").select([image], regions)
     assert [box_of(regions[0][i]).tolist() for i in chosen] == [[36, 0, 44, 8]]
-    [elsewhere] = make_part("selector", {"circle": {"point": [0.5, 0.6], "radius": 0.2}}).select([image], regions)
+    [elsewhere] = make_part("selector", {"circle": {"point": [0.5, 0.6], "radius": 0.2}}).select(
+        [image], regions
+    )
     assert [box_of(regions[0][i]).tolist() for i in elsewhere] == [[36, 30, 44, 40]]
 
 
@@ -100,7 +111,10 @@ def test_a_segment_is_followed_past_others_of_its_colour() -> None:
 def test_a_segment_that_is_covered_is_lost_and_seen_again_where_it_was() -> None:
     tracker = make_part("tracker", "iou")
     thing = mask_at(slice(10, 20), slice(10, 20))
-    shown, covered = canvas((RED, slice(10, 20), slice(10, 20))), canvas((BLUE, slice(5, 25), slice(5, 25)))
+    shown, covered = (
+        canvas((RED, slice(10, 20), slice(10, 20))),
+        canvas((BLUE, slice(5, 25), slice(5, 25))),
+    )
     [memory] = tracker.begin([shown], [thing[None]])
     [(_, seen)] = tracker.follow([covered], [memory])
     assert not seen.any()
@@ -111,7 +125,9 @@ def test_a_segment_that_is_covered_is_lost_and_seen_again_where_it_was() -> None
 
 def test_a_grid_is_drawn_on_the_colour() -> None:
     mask = np.zeros((60, 80), bool)
-    drawn = Background(BackgroundConfig(colour=(9, 9, 9), grid=(50, 60, 70), spacing=0.5)).behind(canvas(), mask)
+    drawn = Background(BackgroundConfig(colour=(9, 9, 9), grid=(50, 60, 70), spacing=0.5)).behind(
+        canvas(), mask
+    )
     assert {tuple(pixel) for pixel in drawn.reshape(-1, 3).tolist()} == {(9, 9, 9), (50, 60, 70)}
     assert drawn[15].tolist() == [[50, 60, 70]] * 80
 

@@ -17,7 +17,13 @@ from vlagents_ray import Act, Agent, Obs
 from vlagents_ray.cli.listing import policies_and_wrappers
 from vlagents_ray.contract import CameraSpec, Contract
 from vlagents_ray.envs.tabletop import Tabletop
-from vlagents_ray.errors import ConfigError, InvalidObservation, MissingCamera, NotReset, UnknownWrapper
+from vlagents_ray.errors import (
+    ConfigError,
+    InvalidObservation,
+    MissingCamera,
+    NotReset,
+    UnknownWrapper,
+)
 from vlagents_ray.policies.base.checkpoint import find_checkpoint
 from vlagents_ray.policies.base.checkpoint_files import digest
 from vlagents_ray.policies.wrapper import build_agent
@@ -66,7 +72,10 @@ class OwnDetector:
         pass
 
     def detect(self, images: Any, phrases: Any) -> list[list[Detection]]:
-        return [[Detection(asked[0], np.array(box, np.float32), 1.0) for box in self._boxes] for asked in phrases]
+        return [
+            [Detection(asked[0], np.array(box, np.float32), 1.0) for box in self._boxes]
+            for asked in phrases
+        ]
 
 
 def arro(agent: Agent | None = None, **settings: Any) -> Any:
@@ -92,7 +101,10 @@ def test_a_policy_sees_the_things_that_are_named_and_nothing_else() -> None:
     info = policy.reset(view((RED, 10, 10), (BLUE, 40, 60)), "lift the red cube")
     act = policy.act(view((RED, 12, 14), (BLUE, 40, 60)))
     report = {"front": {"seen": ["lift the red cube"], "missing": [], "searched": False}}
-    assert info == {"told": "lift the red cube", "arro": {"front": {**report["front"], "searched": True}}}
+    assert info == {
+        "told": "lift the red cube",
+        "arro": {"front": {**report["front"], "searched": True}},
+    }
     assert act.info == {"own": 1, "arro": report}
     first, second = policy.agent.seen
     for image, row, column in ((first, 10, 10), (second, 12, 14)):
@@ -133,7 +145,9 @@ def test_a_lost_thing_is_shown_where_it_was_for_a_while_then_hidden_and_looked_f
     reports = [policy.act(view()).info["arro"]["front"] for _ in range(4)]
     assert [report["searched"] for report in reports] == [False, False, True, False]
     assert all(report["missing"] == ["red"] and not report["seen"] for report in reports)
-    assert [shown(image) for image in policy.agent.seen[2:]] == 2 * [{BACKGROUND, GREY}] + 2 * [{BACKGROUND}]
+    assert [shown(image) for image in policy.agent.seen[2:]] == 2 * [{BACKGROUND, GREY}] + 2 * [
+        {BACKGROUND}
+    ]
     for _ in range(2):  # it is back, far from where it was: found at the next search
         found = policy.act(view((RED, 45, 65))).info["arro"]["front"]
     assert found == {"seen": ["red"], "missing": [], "searched": True}
@@ -142,7 +156,10 @@ def test_a_lost_thing_is_shown_where_it_was_for_a_while_then_hidden_and_looked_f
 
 def test_an_episode_without_what_is_named_is_refused() -> None:
     policy = arro(objects=["red", "blue"])
-    with pytest.raises(InvalidObservation, match=r"'front' shows none of \['blue'\], found \['red'\].*missing: hide"):
+    with pytest.raises(
+        InvalidObservation,
+        match=r"'front' shows none of \['blue'\], found \['red'\].*missing: hide",
+    ):
         policy.reset(view((RED, 10, 10)), None)
 
 
@@ -150,7 +167,10 @@ def test_or_it_begins_without_and_looks_again() -> None:
     policy = arro(objects=["red", "blue"], missing="hide", keep_lost=0)
     policy.reset(view((RED, 10, 10)), None)
     assert policy.act(view((RED, 10, 10))).info["arro"]["front"]["missing"] == ["blue"]
-    assert policy.act(view((RED, 10, 10), (BLUE, 40, 60))).info["arro"]["front"]["seen"] == ["red", "blue"]
+    assert policy.act(view((RED, 10, 10), (BLUE, 40, 60))).info["arro"]["front"]["seen"] == [
+        "red",
+        "blue",
+    ]
 
 
 def test_without_an_instruction_or_objects_there_is_nothing_to_find() -> None:
@@ -194,13 +214,19 @@ def test_the_contract_asks_for_what_it_is_to_change_and_an_instruction() -> None
         ({"tracker": "kalman"}, "tracker: expected one of .*got 'kalman'"),
     ],
 )
-def test_settings_that_cannot_work_are_refused_before_serving(settings: dict[str, Any], says: str) -> None:
+def test_settings_that_cannot_work_are_refused_before_serving(
+    settings: dict[str, Any], says: str
+) -> None:
     with pytest.raises(ConfigError, match=f"(?s){says}"):
         arro(**settings)
 
 
-def test_the_package_registers_its_wrapper_by_an_entry_point(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    project = tomllib.loads((ROOT / "plugins/vlagents_ray_arro/pyproject.toml").read_text())["project"]
+def test_the_package_registers_its_wrapper_by_an_entry_point(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    project = tomllib.loads((ROOT / "plugins/vlagents_ray_arro/pyproject.toml").read_text())[
+        "project"
+    ]
     [(name, target)] = project["entry-points"]["vlagents_ray.wrappers"].items()
     info = tmp_path / "vlagents_ray_arro-1.dist-info"
     info.mkdir()
@@ -216,7 +242,9 @@ def test_the_package_registers_its_wrapper_by_an_entry_point(tmp_path: Path, mon
 
 
 def test_its_deployment_file_is_right() -> None:
-    [app] = yaml.safe_load((ROOT / "plugins/vlagents_ray_arro/arro.yaml").read_text())["applications"]
+    [app] = yaml.safe_load((ROOT / "plugins/vlagents_ray_arro/arro.yaml").read_text())[
+        "applications"
+    ]
     [entry] = app["args"]["wrappers"]
     assert ArroConfig(**entry["arro"]).detector == "colour"
 

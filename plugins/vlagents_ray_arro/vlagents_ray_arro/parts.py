@@ -1,8 +1,9 @@
-"""The parts of ARRO. Each part is a class that takes an instance of its `Config`, and loads its weights in `load`.
+"""The parts of ARRO. Each part is a class that takes an instance of its `Config`, and loads its
+weights in `load`.
 
-All sessions of a replica share a part, which keeps none of their state; a tracker's memory of one session and camera is
-a separate object, which can be pickled. Each part gets the images of several sessions at once, and its result for one
-must not depend on the others.
+All sessions of a replica share a part, which keeps none of their state; a tracker's memory of one
+session and camera is a separate object, which can be pickled. Each part gets the images of several
+sessions at once, and its result for one must not depend on the others.
 """
 
 from __future__ import annotations
@@ -49,7 +50,8 @@ class Detection:
     phrase: str  # the requested phrase that it was detected for
     box: np.ndarray  # (4,) float32, px: left, top, right, bottom
     score: float
-    mask: np.ndarray | None = None  # (H, W) bool, from a detector that provides masks; else the box is segmented
+    # (H, W) bool, from a detector that provides masks; else the box is segmented.
+    mask: np.ndarray | None = None
 
 
 class Part(Protocol):
@@ -71,7 +73,9 @@ class Segmenter(Part, Protocol):
     """Computes masks of objects."""
 
     def segment(self, images: Images, boxes: Sequence[np.ndarray]) -> list[np.ndarray]:
-        """Return the mask of the object in each box, (N, H, W) bool for boxes (N, 4) px; all False for none."""
+        """Return the mask of the object in each box, (N, H, W) bool for boxes (N, 4) px; all
+        False for none.
+        """
         ...
 
     def propose(self, images: Images) -> list[np.ndarray]:
@@ -83,7 +87,9 @@ class Selector(Part, Protocol):
     """Selects the gripper's fingers."""
 
     def select(self, images: Images, regions: Sequence[np.ndarray]) -> list[list[int]]:
-        """Return the indices of the regions (M, H, W) of each image that make up the gripper; none if it is hidden."""
+        """Return the indices of the regions (M, H, W) of each image that make up the gripper;
+        none if it is hidden.
+        """
         ...
 
 
@@ -91,11 +97,16 @@ class Tracker(Part, Protocol):
     """Tracks segments from frame to frame."""
 
     def begin(self, images: Images, masks: Sequence[np.ndarray]) -> list[Any]:
-        """Return a memory of each image's segments, (N, H, W) bool with N >= 1, from which to track them."""
+        """Return a memory of each image's segments, (N, H, W) bool with N >= 1, from which to
+        track them.
+        """
         ...
 
-    def follow(self, images: Images, memories: Sequence[Any]) -> list[tuple[np.ndarray, np.ndarray]]:
-        """Return, for each next image, its segments (N, H, W) bool, and which of them are visible, (N,) bool.
+    def follow(
+        self, images: Images, memories: Sequence[Any]
+    ) -> list[tuple[np.ndarray, np.ndarray]]:
+        """Return, for each next image, its segments (N, H, W) bool, and which of them are visible,
+        (N,) bool.
 
         Updates the memories. The mask of a segment that is not visible is undefined.
         """
@@ -103,7 +114,9 @@ class Tracker(Part, Protocol):
 
 
 def make_part(kind: str, entry: str | Mapping[str, Mapping[str, Any]]) -> Any:
-    """Create the part of a kind from a registered name or "module:Class", or {name: settings}; raises `ConfigError`."""
+    """Create the part of a kind from a registered name or "module:Class", or {name: settings};
+    raises `ConfigError`.
+    """
     named = {entry: {}} if isinstance(entry, str) else dict(entry)
     if len(named) != 1:
         raise ConfigError(f"{kind}: got {sorted(named)}, want one name with its settings")
@@ -112,7 +125,9 @@ def make_part(kind: str, entry: str | Mapping[str, Mapping[str, Any]]) -> Any:
     target = registered.get(name, name)
     if ":" not in target:
         cure = did_you_mean(name, registered)
-        raise ConfigError(f"{kind}: expected one of {sorted(registered)}, or 'module:Class', got {name!r}{cure}")
+        raise ConfigError(
+            f"{kind}: expected one of {sorted(registered)}, or 'module:Class', got {name!r}{cure}"
+        )
     cls = named_class(target)
     try:
         return cls(cls.Config(**(settings or {})))
@@ -123,8 +138,13 @@ def make_part(kind: str, entry: str | Mapping[str, Mapping[str, Any]]) -> Any:
 class PretrainedConfig(BaseModel, extra="forbid"):
     """The weights, and their device."""
 
-    checkpoint: str = Field(min_length=1, description="a folder as transformers saves it, or a hub id: org/name@COMMIT")
-    device: str = Field(default="auto", description="'auto' (an accelerator if there is one), 'cpu', 'cuda', 'cuda:1'")
+    checkpoint: str = Field(
+        min_length=1, description="a folder as transformers saves it, or a hub id: org/name@COMMIT"
+    )
+    device: str = Field(
+        default="auto",
+        description="'auto' (an accelerator if there is one), 'cpu', 'cuda', 'cuda:1'",
+    )
     dtype: DType = Field(default="float32", description="of the weights")
 
 
@@ -143,7 +163,9 @@ class Pretrained:
         ensure_torchvision()
         transformers, config = require("transformers"), self._config
         model, processor = (getattr(transformers, name) for name in self.classes)
-        path = find_checkpoint(config.checkpoint, needs=("config.json", "*.safetensors", "*processor_config.json"))
+        path = find_checkpoint(
+            config.checkpoint, needs=("config.json", "*.safetensors", "*processor_config.json")
+        )
         device = torch_device(config.device)
         loaded = from_pretrained(model, path, dtype=torch_dtype(config.dtype, device))
         self._model, self._processor = loaded.to(device).eval(), processor.from_pretrained(path)
@@ -165,7 +187,8 @@ def writable(images: Images) -> list[np.ndarray]:
 
 
 def connected(right: np.ndarray, down: np.ndarray) -> np.ndarray:
-    """Label each pixel, (H, W) int; two pixels share a label if a chain of linked neighbours connects them.
+    """Label each pixel, (H, W) int; two pixels share a label if a chain of linked neighbours
+    connects them.
 
     Args:
         right: (H, W - 1) bool, whether a pixel is linked to the next one in its row.
@@ -187,13 +210,17 @@ def connected(right: np.ndarray, down: np.ndarray) -> np.ndarray:
 
 
 def split(mask: np.ndarray, smallest: int = 1) -> list[np.ndarray]:
-    """Return the connected regions of `mask`, (H, W) bool each, of at least `smallest` pixels; the largest first."""
+    """Return the connected regions of `mask`, (H, W) bool each, of at least `smallest` pixels;
+    the largest first.
+    """
     labels = connected(mask[:, :-1] & mask[:, 1:], mask[:-1] & mask[1:])
     return [labels == label for label in largest(labels[mask], smallest)]
 
 
 def flat(image: np.ndarray, tolerance: int) -> np.ndarray:
-    """Label each pixel, (H, W) int; neighbours that differ by at most `tolerance` in all channels share a label."""
+    """Label each pixel, (H, W) int; neighbours that differ by at most `tolerance` in all
+    channels share a label.
+    """
     signed = image.astype(np.int16)
     return connected(*(np.abs(np.diff(signed, axis=axis)).max(-1) <= tolerance for axis in (1, 0)))
 
@@ -207,7 +234,9 @@ def largest(labels: np.ndarray, smallest: int) -> np.ndarray:
 
 
 def box_of(mask: np.ndarray) -> np.ndarray:
-    """Return the smallest box around the true pixels: (4,) float32, px: left, top, right, bottom."""
+    """Return the smallest box around the true pixels: (4,) float32, px: left, top, right,
+    bottom.
+    """
     rows, columns = np.nonzero(mask.any(1))[0], np.nonzero(mask.any(0))[0]
     return np.array([columns[0], rows[0], columns[-1] + 1, rows[-1] + 1], np.float32)
 
@@ -223,12 +252,22 @@ def grown(mask: np.ndarray, pixels: int) -> np.ndarray:
     for axis in (0, 1):
         padding = [(0, 0), (0, 0)]
         padding[axis] = (pixels, pixels)
-        windows = np.lib.stride_tricks.sliding_window_view(np.pad(mask, padding), 2 * pixels + 1, axis)
+        windows = np.lib.stride_tricks.sliding_window_view(
+            np.pad(mask, padding), 2 * pixels + 1, axis
+        )
         mask = np.asarray(windows.any(-1))
     return mask
 
 
-_HUES = {"red": 0.0, "orange": 28.0, "yellow": 48.0, "green": 132.0, "cyan": 180.0, "blue": 216.0, "purple": 275.0}
+_HUES = {
+    "red": 0.0,
+    "orange": 28.0,
+    "yellow": 48.0,
+    "green": 132.0,
+    "cyan": 180.0,
+    "blue": 216.0,
+    "purple": 275.0,
+}
 
 
 class ColourConfig(BaseModel, extra="forbid"):
@@ -238,35 +277,51 @@ class ColourConfig(BaseModel, extra="forbid"):
     tolerance: float = Field(default=20.0, gt=0, le=180, description="degrees on both sides")
     saturation: float = Field(default=0.15, ge=0, le=1, description="the least, in HSV")
     value: float = Field(default=0.2, ge=0, le=1, description="the least, in HSV")
-    smallest: float = Field(default=5e-4, ge=0, le=1, description="of a region, as a share of the image")
+    smallest: float = Field(
+        default=5e-4, ge=0, le=1, description="of a region, as a share of the image"
+    )
 
 
 class ColourDetector(Untrained):
-    """Detects each connected region of the colours in a phrase: all that is red for "lift the red puck"."""
+    """Detects each connected region of the colours in a phrase: all that is red for "lift the
+    red puck".
+    """
 
     Config: ClassVar[type] = ColourConfig
 
     def detect(self, images: Images, phrases: Sequence[Sequence[str]]) -> list[list[Detection]]:
-        return [self._detections(image, asked) for image, asked in zip(images, phrases, strict=True)]
+        return [
+            self._detections(image, asked) for image, asked in zip(images, phrases, strict=True)
+        ]
 
     def _detections(self, image: np.ndarray, phrases: Sequence[str]) -> list[Detection]:
-        hue, saturation, value = np.moveaxis(np.asarray(Image.fromarray(image).convert("HSV"), np.float32), -1, 0)
-        coloured = (saturation >= self._config.saturation * 255) & (value >= self._config.value * 255)
+        hue, saturation, value = np.moveaxis(
+            np.asarray(Image.fromarray(image).convert("HSV"), np.float32), -1, 0
+        )
+        coloured = (saturation >= self._config.saturation * 255) & (
+            value >= self._config.value * 255
+        )
         smallest = max(1, round(self._config.smallest * hue.size))
         found = []
         for phrase in phrases:
             for word in sorted(set(re.findall(r"\w+", phrase.lower())) & set(self._config.hues)):
                 off = np.abs((hue * (360 / 256) - self._config.hues[word] + 180) % 360 - 180)
                 for mask in split(coloured & (off <= self._config.tolerance), smallest):
-                    found.append(Detection(phrase, box_of(mask), np.count_nonzero(mask) / mask.size, mask))
+                    found.append(
+                        Detection(phrase, box_of(mask), np.count_nonzero(mask) / mask.size, mask)
+                    )
         return sorted(found, key=lambda one: -one.score)
 
 
 class FlatConfig(BaseModel, extra="forbid"):
     """The criteria of a region."""
 
-    tolerance: int = Field(default=8, ge=0, le=255, description="of neighbouring pixels, in every channel")
-    smallest: float = Field(default=2e-4, ge=0, le=1, description="of a proposed region, as a share of the image")
+    tolerance: int = Field(
+        default=8, ge=0, le=255, description="of neighbouring pixels, in every channel"
+    )
+    smallest: float = Field(
+        default=2e-4, ge=0, le=1, description="of a proposed region, as a share of the image"
+    )
     most: int = Field(default=256, ge=1, description="regions that are proposed, the largest first")
 
 
@@ -291,7 +346,9 @@ class FlatSegmenter(Untrained):
 
     def _regions(self, image: np.ndarray) -> np.ndarray:
         labels = flat(image, self._config.tolerance)
-        chosen = largest(labels, max(1, round(self._config.smallest * labels.size)))[: self._config.most]
+        chosen = largest(labels, max(1, round(self._config.smallest * labels.size)))[
+            : self._config.most
+        ]
         return np.asarray(labels == chosen[:, None, None])
 
 
@@ -299,13 +356,17 @@ class CircleConfig(BaseModel, extra="forbid"):
     """The position of the gripper at the beginning of an episode."""
 
     point: tuple[float, float] = Field(
-        default=(0.5, 0.0), description="the circle's centre: x in widths of the image, y in its heights, from top left"
+        default=(0.5, 0.0),
+        description="the circle's centre: x in widths of the image, y in its heights, from top "
+        "left",
     )
     radius: float = Field(default=0.25, gt=0, description="in shorter sides of the image")
 
 
 class CircleSelector(Untrained):
-    """Selects regions that lie wholly in a circle: for a fixed camera, and a robot that begins at home."""
+    """Selects regions that lie wholly in a circle: for a fixed camera, and a robot that begins
+    at home.
+    """
 
     Config: ClassVar[type] = CircleConfig
 
@@ -316,7 +377,9 @@ class CircleSelector(Untrained):
             x, y = self._config.point[0] * width, self._config.point[1] * height
             v, u = np.mgrid[:height, :width] + 0.5
             outside = np.hypot(u - x, v - y) > self._config.radius * min(height, width)
-            chosen.append([i for i, mask in enumerate(masks) if mask.any() and not (mask & outside).any()])
+            chosen.append(
+                [i for i, mask in enumerate(masks) if mask.any() and not (mask & outside).any()]
+            )
         return chosen
 
 
@@ -326,30 +389,47 @@ _SHADES = 16  # levels of each channel
 class IouConfig(BaseModel, extra="forbid"):
     """The distance that a segment may move, and the share of it that must remain visible."""
 
-    reach: float = Field(default=0.1, ge=0, le=1, description="to each side a frame, in shorter sides of the image")
-    least: float = Field(default=0.2, gt=0, le=1, description="a region with a smaller share of its first pixels: lost")
-    most: float = Field(default=3.0, ge=1, description="a region with a larger multiple of them: something else")
+    reach: float = Field(
+        default=0.1, ge=0, le=1, description="to each side a frame, in shorter sides of the image"
+    )
+    least: float = Field(
+        default=0.2,
+        gt=0,
+        le=1,
+        description="a region with a smaller share of its first pixels: lost",
+    )
+    most: float = Field(
+        default=3.0, ge=1, description="a region with a larger multiple of them: something else"
+    )
 
 
 @dataclass(slots=True)
 class _Segment:
-    colours: np.ndarray  # (4096,) bool: colours with a greater share in the segment than in the rest of the first frame
+    # (4096,) bool: colours with a greater share in the segment than in the rest of the first frame.
+    colours: np.ndarray
     pixels: int  # on the first frame
     mask: np.ndarray  # (H, W) bool, its last visible position
 
 
 class IouTracker(Untrained):
-    """Tracks the connected region in a segment's colours that best overlaps the segment's last position."""
+    """Tracks the connected region in a segment's colours that best overlaps the segment's last
+    position.
+    """
 
     Config: ClassVar[type] = IouConfig
 
     def begin(self, images: Images, masks: Sequence[np.ndarray]) -> list[Any]:
         return [
-            [_Segment(_own_colours(shades, mask), int(np.count_nonzero(mask)), mask.copy()) for mask in own]
+            [
+                _Segment(_own_colours(shades, mask), int(np.count_nonzero(mask)), mask.copy())
+                for mask in own
+            ]
             for shades, own in zip(map(_shades, images), masks, strict=True)
         ]
 
-    def follow(self, images: Images, memories: Sequence[Any]) -> list[tuple[np.ndarray, np.ndarray]]:
+    def follow(
+        self, images: Images, memories: Sequence[Any]
+    ) -> list[tuple[np.ndarray, np.ndarray]]:
         followed = []
         for image, segments in zip(images, memories, strict=True):
             shades = _shades(image)
@@ -361,15 +441,26 @@ class IouTracker(Untrained):
         """Move the segment to its current position; return False if it is not visible."""
         reach = round(self._config.reach * min(shades.shape))
         left, top, right, bottom = box_of(segment.mask).astype(int)
-        window = slice(max(top - reach, 0), bottom + reach), slice(max(left - reach, 0), right + reach)
+        window = (
+            slice(max(top - reach, 0), bottom + reach),
+            slice(max(left - reach, 0), right + reach),
+        )
         last = segment.mask[window]
-        alike = split(segment.colours[shades[window]], max(1, round(self._config.least * segment.pixels)))
-        regions = [region for region in alike if np.count_nonzero(region) <= self._config.most * segment.pixels]
+        alike = split(
+            segment.colours[shades[window]], max(1, round(self._config.least * segment.pixels))
+        )
+        regions = [
+            region
+            for region in alike
+            if np.count_nonzero(region) <= self._config.most * segment.pixels
+        ]
         if not regions:
             return False
         mask = np.zeros_like(segment.mask)
         # the nearest region where none overlaps: a small object moves by more than its own size
-        mask[window] = max(regions, key=lambda region: (overlap(region, last), -_distance(region, last)))
+        mask[window] = max(
+            regions, key=lambda region: (overlap(region, last), -_distance(region, last))
+        )
         segment.mask = mask
         return True
 

@@ -1,4 +1,6 @@
-"""Pretrained parts of ARRO: Grounding DINO finds objects by words, and SAM 2 segments and tracks them."""
+"""Pretrained parts of ARRO: Grounding DINO finds objects by words, and SAM 2 segments and tracks
+them.
+"""
 
 from __future__ import annotations
 
@@ -10,20 +12,33 @@ import numpy as np
 from pydantic import Field
 
 from vlagents_ray.registry import require
-from vlagents_ray_arro.parts import Detection, Images, Pretrained, PretrainedConfig, overlap, writable
+from vlagents_ray_arro.parts import (
+    Detection,
+    Images,
+    Pretrained,
+    PretrainedConfig,
+    overlap,
+    writable,
+)
 
 
 class GroundingDinoConfig(PretrainedConfig):
     """The weights, and which boxes count."""
 
     checkpoint: str = Field(default="IDEA-Research/grounding-dino-tiny", min_length=1)
-    threshold: float = Field(default=0.35, ge=0, le=1, description="the least score of a box for a word of a phrase")
-    overlap: float = Field(default=0.7, ge=0, le=1, description="intersection over union of two boxes of one thing")
+    threshold: float = Field(
+        default=0.35, ge=0, le=1, description="the least score of a box for a word of a phrase"
+    )
+    overlap: float = Field(
+        default=0.7, ge=0, le=1, description="intersection over union of two boxes of one thing"
+    )
     most: int = Field(default=4, ge=1, description="boxes of a phrase, the best first")
 
 
 class GroundingDinoDetector(Pretrained):
-    """Detects boxes for phrases, or for the objects in an instruction, in one pass for each size of images."""
+    """Detects boxes for phrases, or for the objects in an instruction, in one pass for each size
+    of images.
+    """
 
     Config: ClassVar[type] = GroundingDinoConfig
     classes = ("GroundingDinoForObjectDetection", "GroundingDinoProcessor")
@@ -31,20 +46,26 @@ class GroundingDinoDetector(Pretrained):
     def detect(self, images: Images, phrases: Sequence[Sequence[str]]) -> list[list[Detection]]:
         """Return boxes, the best first; a box belongs to the phrase with the best of its words."""
         found: list[list[Detection]] = [[] for _ in images]
-        for size in {image.shape for image in images}:  # the padding of a mixed batch would change the result
+        # The padding of a mixed batch would change the result.
+        for size in {image.shape for image in images}:
             own = [i for i, image in enumerate(images) if image.shape == size]
-            for i, things in zip(own, self._batch([images[i] for i in own], [phrases[i] for i in own]), strict=True):
+            for i, things in zip(
+                own, self._batch([images[i] for i in own], [phrases[i] for i in own]), strict=True
+            ):
                 found[i] = things
         return found
 
     def _batch(self, images: Images, phrases: Sequence[Sequence[str]]) -> list[list[Detection]]:
         torch = require("torch")
         texts = [_text(asked) for asked in phrases]
-        inputs = self._processor(images=writable(images), text=texts, padding=True, return_tensors="pt")
+        inputs = self._processor(
+            images=writable(images), text=texts, padding=True, return_tensors="pt"
+        )
         with torch.inference_mode():
             outputs = self._model(**inputs.to(self._model.device, self._model.dtype))
         words = outputs.logits.float().sigmoid().cpu().numpy()  # (B, queries, tokens)
-        boxes = outputs.pred_boxes.float().cpu().numpy()  # (B, queries, 4): centre and size, as shares of the image
+        # (B, queries, 4): centre and size, as shares of the image.
+        boxes = outputs.pred_boxes.float().cpu().numpy()
         return [
             self._detections(one, asked, self._scores(scores, asked), own)
             for one, asked, scores, own in zip(images, phrases, words, boxes, strict=True)
@@ -52,7 +73,9 @@ class GroundingDinoDetector(Pretrained):
 
     def _scores(self, words: np.ndarray, phrases: Sequence[str]) -> np.ndarray:
         """Return (queries, phrases): the best score of a phrase's words."""
-        offsets = self._processor.tokenizer(_text(phrases), return_offsets_mapping=True)["offset_mapping"]
+        offsets = self._processor.tokenizer(_text(phrases), return_offsets_mapping=True)[
+            "offset_mapping"
+        ]
         scores, start = [], 0
         for phrase in map(_clean, phrases):
             end = start + len(phrase)
@@ -66,7 +89,9 @@ class GroundingDinoDetector(Pretrained):
     ) -> list[Detection]:
         height, width = image.shape[:2]
         centre, half = boxes[:, :2], boxes[:, 2:] / 2
-        corners = np.concatenate([centre - half, centre + half], 1).clip(0, 1) * np.array([width, height] * 2)
+        corners = np.concatenate([centre - half, centre + half], 1).clip(0, 1) * np.array(
+            [width, height] * 2
+        )
         named = scores.argmax(1)
         found: list[Detection] = []
         for query in np.argsort(-scores.max(1), kind="stable"):
@@ -108,15 +133,23 @@ class Sam2Config(PretrainedConfig):
 
 
 class Sam2SegmenterConfig(Sam2Config):
-    """The proposal of regions: a mask for each point of a grid, without uncertain and repeated ones."""
+    """The proposal of regions: a mask for each point of a grid, without uncertain and repeated
+    ones.
+    """
 
     points: int = Field(default=16, ge=1, description="of the grid, along each side")
-    confidence: float = Field(default=0.8, ge=0, le=1, description="the least intersection over union it expects")
-    same: float = Field(default=0.7, ge=0, le=1, description="intersection over union of two masks of one region")
+    confidence: float = Field(
+        default=0.8, ge=0, le=1, description="the least intersection over union it expects"
+    )
+    same: float = Field(
+        default=0.7, ge=0, le=1, description="intersection over union of two masks of one region"
+    )
 
 
 class Sam2Segmenter(Pretrained):
-    """Computes masks for boxes and for a grid of points; all images in one forward pass of the image encoder."""
+    """Computes masks for boxes and for a grid of points; all images in one forward pass of the
+    image encoder.
+    """
 
     Config: ClassVar[type] = Sam2SegmenterConfig
     classes = ("Sam2Model", "Sam2ImageProcessor")
@@ -125,7 +158,8 @@ class Sam2Segmenter(Pretrained):
         torch = require("torch")
         made = []
         for image, embedded, own in zip(images, self._embedded(images), boxes, strict=True):
-            corners = np.array([image.shape[1], image.shape[0]] * 2, np.float32)  # width, height, width, height
+            # width, height, width, height.
+            corners = np.array([image.shape[1], image.shape[0]] * 2, np.float32)
             scaled = torch.as_tensor(own * (self._side / corners), dtype=self._model.dtype)
             outputs = self._decoded(embedded, input_boxes=scaled[None], multimask_output=False)
             made.append(_upscaled(outputs.pred_masks[0, :, 0], image))
@@ -133,8 +167,12 @@ class Sam2Segmenter(Pretrained):
 
     def propose(self, images: Images) -> list[np.ndarray]:
         torch = require("torch")
-        along = (np.arange(self._config.points, dtype=np.float32) + 0.5) * (self._side / self._config.points)
-        grid = torch.as_tensor(np.stack(np.meshgrid(along, along), -1).reshape(1, -1, 1, 2), dtype=self._model.dtype)
+        along = (np.arange(self._config.points, dtype=np.float32) + 0.5) * (
+            self._side / self._config.points
+        )
+        grid = torch.as_tensor(
+            np.stack(np.meshgrid(along, along), -1).reshape(1, -1, 1, 2), dtype=self._model.dtype
+        )
         proposed = []
         for image, embedded in zip(images, self._embedded(images), strict=True):
             outputs = self._decoded(embedded, input_points=grid, multimask_output=True)
@@ -144,7 +182,9 @@ class Sam2Segmenter(Pretrained):
             for i in np.argsort(-scores, kind="stable"):
                 if scores[i] < self._config.confidence:
                     break
-                if masks[i].any() and all(overlap(masks[i], masks[k]) < self._config.same for k in kept):
+                if masks[i].any() and all(
+                    overlap(masks[i], masks[k]) < self._config.same for k in kept
+                ):
                     kept.append(int(i))
             proposed.append(_upscaled(outputs.pred_masks[0].flatten(0, 1)[kept], image))
         return proposed
@@ -160,7 +200,10 @@ class Sam2Segmenter(Pretrained):
         return [[level[i : i + 1] for level in levels] for i in range(len(images))]
 
     def _decoded(self, embedded: list[Any], **prompts: Any) -> Any:
-        prompts = {key: one.to(self._model.device) if hasattr(one, "to") else one for key, one in prompts.items()}
+        prompts = {
+            key: one.to(self._model.device) if hasattr(one, "to") else one
+            for key, one in prompts.items()
+        }
         with require("torch").inference_mode():
             return self._model(image_embeddings=embedded, **prompts)
 
@@ -169,14 +212,17 @@ class Sam2Segmenter(Pretrained):
 class _TrackMemory:
     """SAM 2's memory of one camera of one session."""
 
-    session: Any  # transformers' session: features and pointers of the last frames, only those that the model uses
+    # transformers' session: features and pointers of the last frames, only those that the model
+    # uses.
+    session: Any
     frame: int = 0
 
 
 class Sam2Tracker(Pretrained):
     """The video model with a memory for each session and camera.
 
-    The image encoder, which takes most of the time, runs once for all images; memory attention runs object by object.
+    The image encoder, which takes most of the time, runs once for all images; memory attention runs
+    object by object.
     """
 
     Config: ClassVar[type] = Sam2Config
@@ -186,7 +232,9 @@ class Sam2Tracker(Pretrained):
         memories = []
         for own in masks:
             memory = _TrackMemory(
-                self._processor.init_video_session(inference_device=self._model.device, dtype=self._model.dtype)
+                self._processor.init_video_session(
+                    inference_device=self._model.device, dtype=self._model.dtype
+                )
             )
             self._processor.add_inputs_to_inference_session(
                 memory.session, frame_idx=0, obj_ids=list(range(len(own))), input_masks=list(own)
@@ -195,8 +243,12 @@ class Sam2Tracker(Pretrained):
         self._advance(images, memories)
         return memories
 
-    def follow(self, images: Images, memories: Sequence[Any]) -> list[tuple[np.ndarray, np.ndarray]]:
-        """Return the masks on the next frame; a segment that the model predicts to be out of sight is not visible."""
+    def follow(
+        self, images: Images, memories: Sequence[Any]
+    ) -> list[tuple[np.ndarray, np.ndarray]]:
+        """Return the masks on the next frame; a segment that the model predicts to be out of
+        sight is not visible.
+        """
         followed = []
         for image, outputs in zip(images, self._advance(images, memories), strict=True):
             seen = (outputs.object_score_logits.flatten() > 0).cpu().numpy()
@@ -212,7 +264,9 @@ class Sam2Tracker(Pretrained):
         for i, memory in enumerate(memories):
             own = {
                 "vision_feats": [level[:, i : i + 1] for level in features.fpn_hidden_states],
-                "vision_pos_embeds": [level[:, i : i + 1] for level in features.fpn_position_encoding],
+                "vision_pos_embeds": [
+                    level[:, i : i + 1] for level in features.fpn_position_encoding
+                ],
             }
             memory.session.cache.cache_vision_features(memory.frame, own)
             outputs.append(self._model(memory.session, frame_idx=memory.frame, frame=pixels[i]))
@@ -220,7 +274,9 @@ class Sam2Tracker(Pretrained):
         return outputs
 
     def _forget(self, memory: _TrackMemory) -> None:
-        """Keep only what the next frame needs: transformers' session would keep all frames with their masks."""
+        """Keep only what the next frame needs: transformers' session would keep all frames with
+        their masks.
+        """
         session = memory.session
         session.cache.clear_all()
         session.processed_frames.clear()
@@ -232,7 +288,9 @@ class Sam2Tracker(Pretrained):
                 if frame <= following - config.num_maskmem:  # only its object pointer is still used
                     tracked[frame].pop("maskmem_features", None)
                     tracked[frame].pop("maskmem_pos_enc", None)
-                if frame <= following - max(config.num_maskmem, config.max_object_pointers_in_encoder):
+                if frame <= following - max(
+                    config.num_maskmem, config.max_object_pointers_in_encoder
+                ):
                     del tracked[frame]
             for output in (*tracked.values(), *outputs["cond_frame_outputs"].values()):
                 output.pop("high_res_masks", None)
@@ -244,7 +302,9 @@ class Sam2Tracker(Pretrained):
 
 def _pixels(processor: Any, images: Images, model: Any) -> Any:
     """Return images of any sizes as one (B, 3, side, side) tensor on the model's device."""
-    return processor(writable(images), return_tensors="pt")["pixel_values"].to(model.device, model.dtype)
+    return processor(writable(images), return_tensors="pt")["pixel_values"].to(
+        model.device, model.dtype
+    )
 
 
 def _upscaled(logits: Any, image: np.ndarray) -> np.ndarray:

@@ -1,4 +1,6 @@
-"""The wrapper that shows the policy segments on a virtual background, and the tracks of these segments."""
+"""The wrapper that shows the policy segments on a virtual background, and the tracks of these
+segments.
+"""
 
 from __future__ import annotations
 
@@ -13,7 +15,13 @@ from pydantic import BaseModel, Field, model_validator
 from typing_extensions import Self
 
 from vlagents_ray.contract import CameraSpec, Contract
-from vlagents_ray.errors import ConfigError, InvalidObservation, MissingCamera, NotReset, VLAgentsError
+from vlagents_ray.errors import (
+    ConfigError,
+    InvalidObservation,
+    MissingCamera,
+    NotReset,
+    VLAgentsError,
+)
 from vlagents_ray.interface import Act, Agent, Obs
 from vlagents_ray.policies.base.checkpoint import used_checkpoints
 from vlagents_ray.policies.base.checkpoint_files import METHOD, digest, weights_of
@@ -38,15 +46,23 @@ class BackgroundConfig(BaseModel, extra="forbid"):
     """A colour, optionally with a grid on it, or an image, as in the policy's training."""
 
     colour: Colour = (0, 0, 0)
-    grid: Colour | None = Field(default=None, description="colour of the grid's lines, one pixel wide; unset: no grid")
-    spacing: float = Field(default=0.1, gt=0, le=1, description="of the grid's lines, in shorter sides of the image")
-    image: Path | None = Field(default=None, description="a file that is stretched to each camera's size")
+    grid: Colour | None = Field(
+        default=None, description="colour of the grid's lines, one pixel wide; unset: no grid"
+    )
+    spacing: float = Field(
+        default=0.1, gt=0, le=1, description="of the grid's lines, in shorter sides of the image"
+    )
+    image: Path | None = Field(
+        default=None, description="a file that is stretched to each camera's size"
+    )
 
     @model_validator(mode="after")
     def _consistent(self) -> Self:
         for colour in (self.colour, self.grid or self.colour):
             if not all(0 <= channel <= 255 for channel in colour):
-                raise ValueError(f"got colour {list(colour)}, want red, green and blue from 0 to 255")
+                raise ValueError(
+                    f"got colour {list(colour)}, want red, green and blue from 0 to 255"
+                )
         if self.image is not None and self.model_fields_set & {"colour", "grid", "spacing"}:
             raise ValueError("image excludes colour, grid and spacing; keep one or the other")
         return self
@@ -64,7 +80,9 @@ class Background:
         self._draw(1, 1)
 
     def behind(self, image: np.ndarray, mask: np.ndarray) -> np.ndarray:
-        """Return a new (H, W, 3) uint8 image: `image` where `mask`, (H, W) bool, is True, else the background."""
+        """Return a new (H, W, 3) uint8 image: `image` where `mask`, (H, W) bool, is True, else
+        the background.
+        """
         height, width = mask.shape
         if (height, width) not in self._drawn:
             self._drawn[height, width] = self._draw(height, width)
@@ -87,7 +105,9 @@ def _read(path: Path, height: int, width: int) -> np.ndarray:
 
     try:
         with Image.open(path.expanduser()) as image:
-            return np.asarray(image.convert("RGB").resize((width, height), Image.Resampling.BILINEAR))
+            return np.asarray(
+                image.convert("RGB").resize((width, height), Image.Resampling.BILINEAR)
+            )
     except (OSError, UnidentifiedImageError) as error:
         raise ConfigError(
             f"background.image {str(path)!r}: cannot be read as an image ({error}); check the path"
@@ -101,30 +121,43 @@ class ArroConfig(BaseModel, extra="forbid"):
     """The cameras, the parts that find objects, and the treatment of missing ones."""
 
     cameras: list[str] | None = Field(
-        default=None, description="the cameras that are changed; unset: those of the policy's contract, or all"
+        default=None,
+        description="the cameras that are changed; unset: those of the policy's contract, or all",
     )
     objects: list[str] | None = Field(
-        default=None, min_length=1, description="phrases of the things to show; unset: those in the instruction"
+        default=None,
+        min_length=1,
+        description="phrases of the things to show; unset: those in the instruction",
     )
     detector: Part = Field(
-        default="grounding_dino", description="'grounding_dino', 'colour' or 'module:Class', or {name: settings}"
+        default="grounding_dino",
+        description="'grounding_dino', 'colour' or 'module:Class', or {name: settings}",
     )
-    segmenter: Part = Field(default="sam2", description="'sam2', 'flat' or 'module:Class', or {name: settings}")
+    segmenter: Part = Field(
+        default="sam2", description="'sam2', 'flat' or 'module:Class', or {name: settings}"
+    )
     selector: Part | None = Field(
-        default="circle", description="of the gripper: 'circle' or 'module:Class', or {name: settings}; null: none"
+        default="circle",
+        description="of the gripper: 'circle' or 'module:Class', or {name: settings}; null: none",
     )
-    tracker: Part = Field(default="sam2", description="'sam2', 'iou' or 'module:Class', or {name: settings}")
+    tracker: Part = Field(
+        default="sam2", description="'sam2', 'iou' or 'module:Class', or {name: settings}"
+    )
     background: BackgroundConfig = BackgroundConfig()
-    grow: int = Field(default=0, ge=0, le=64, description="pixels by which segments are widened on each side")
+    grow: int = Field(
+        default=0, ge=0, le=64, description="pixels by which segments are widened on each side"
+    )
     missing: Literal["refuse", "hide"] = Field(
         default="refuse",
-        description="if the first frame lacks something: refuse the episode, or begin it without, and look again "
+        description="if the first frame lacks something: refuse the episode, or begin it without, "
+        "and look again "
         "as for what is lost",
     )
     keep_lost: int = Field(
         default=5,
         ge=0,
-        description="frames for which a segment that is lost is shown where it was; then, and every so many frames, "
+        description="frames for which a segment that is lost is shown where it was; then, and "
+        "every so many frames, "
         "it is looked for as on the first frame",
     )
 
@@ -140,7 +173,8 @@ class Track:
 
     wanted: tuple[str, ...]  # the phrases, and GRIPPER
     labels: list[str] = field(default_factory=list)  # the label of each segment
-    masks: list[np.ndarray] = field(default_factory=list)  # (H, W) bool each, at its last visible position
+    # (H, W) bool each, at its last visible position.
+    masks: list[np.ndarray] = field(default_factory=list)
     lost: list[int] = field(default_factory=list)  # frames since then, for each segment
     memory: Any = None  # the tracker's memory
     incomplete: int = 0  # number of frames for which a segment has been missing
@@ -157,7 +191,9 @@ class Track:
         return list(dict.fromkeys([*lost, *(one for one in self.wanted if one not in self.labels)]))
 
     def shown(self, shape: tuple[int, int], keep_lost: int, grow: int) -> np.ndarray:
-        """Return the union of the segments, (H, W) bool; one lost for at most `keep_lost` frames is where it was."""
+        """Return the union of the segments, (H, W) bool; one lost for at most `keep_lost` frames
+        is where it was.
+        """
         together = np.zeros(shape, bool)
         for mask, lost in zip(self.masks, self.lost, strict=True):
             if lost <= keep_lost:
@@ -165,8 +201,13 @@ class Track:
         return grown(together, grow)
 
     def move(self, masks: Iterable[np.ndarray], seen: np.ndarray) -> None:
-        self.masks = [new if is_seen else old for new, old, is_seen in zip(masks, self.masks, seen, strict=True)]
-        self.lost = [0 if is_seen else frames + 1 for frames, is_seen in zip(self.lost, seen, strict=True)]
+        self.masks = [
+            new if is_seen else old
+            for new, old, is_seen in zip(masks, self.masks, seen, strict=True)
+        ]
+        self.lost = [
+            0 if is_seen else frames + 1 for frames, is_seen in zip(self.lost, seen, strict=True)
+        ]
 
 
 class Tracking:
@@ -175,7 +216,9 @@ class Tracking:
     def __init__(self, config: ArroConfig) -> None:
         self._detector: Detector = make_part("detector", config.detector)
         self._segmenter: Segmenter = make_part("segmenter", config.segmenter)
-        self._selector: Selector | None = None if config.selector is None else make_part("selector", config.selector)
+        self._selector: Selector | None = (
+            None if config.selector is None else make_part("selector", config.selector)
+        )
         self._tracker: Tracker = make_part("tracker", config.tracker)
         self._keep_lost = config.keep_lost
 
@@ -185,7 +228,9 @@ class Tracking:
                 part.load()
 
     def begin(self, images: Images, phrases: Sequence[str]) -> list[Track]:
-        """Find the requested objects on each image; those not found are in its track's `missing`."""
+        """Find the requested objects on each image; those not found are in its track's
+        `missing`.
+        """
         wanted = tuple(phrases) if self._selector is None else (*phrases, GRIPPER)
         tracks = [Track(wanted) for _ in images]
         self._search(images, tracks)
@@ -193,7 +238,9 @@ class Tracking:
 
     def follow(self, images: Images, tracks: Sequence[Track]) -> None:
         moving = [i for i, track in enumerate(tracks) if track.labels]
-        moved = self._tracker.follow([images[i] for i in moving], [tracks[i].memory for i in moving])
+        moved = self._tracker.follow(
+            [images[i] for i in moving], [tracks[i].memory for i in moving]
+        )
         for i, (masks, seen) in zip(moving, moved, strict=True):
             tracks[i].move(masks, seen)
         for track in tracks:
@@ -204,13 +251,23 @@ class Tracking:
             self._search([images[i] for i in due], [tracks[i] for i in due])
 
     def _search(self, images: Images, tracks: Sequence[Track]) -> None:
-        """Search missing objects; a track that gains some begins again with these and the visible ones."""
-        cut = self._things(images, [[label for label in track.missing if label != GRIPPER] for track in tracks])
+        """Search missing objects; a track that gains some begins again with these and the
+        visible ones.
+        """
+        cut = self._things(
+            images, [[label for label in track.missing if label != GRIPPER] for track in tracks]
+        )
         grippers = self._grippers(images, [GRIPPER in track.missing for track in tracks])
         begun = []
         for i, track in enumerate(tracks):
-            kept = [(label, track.masks[n]) for n, label in enumerate(track.labels) if not track.lost[n]]
-            new = [pair for pair in cut[i] + grippers[i] if all(overlap(pair[1], mask) < _SAME for _, mask in kept)]
+            kept = [
+                (label, track.masks[n]) for n, label in enumerate(track.labels) if not track.lost[n]
+            ]
+            new = [
+                pair
+                for pair in cut[i] + grippers[i]
+                if all(overlap(pair[1], mask) < _SAME for _, mask in kept)
+            ]
             if new:
                 track.labels = [label for label, _ in kept + new]
                 track.masks = [mask for _, mask in kept + new]
@@ -218,15 +275,21 @@ class Tracking:
                 begun.append(i)
         if begun:
             masks = [np.stack(tracks[i].masks) for i in begun]
-            for i, memory in zip(begun, self._tracker.begin([images[i] for i in begun], masks), strict=True):
+            for i, memory in zip(
+                begun, self._tracker.begin([images[i] for i in begun], masks), strict=True
+            ):
                 tracks[i].memory = memory
 
     def _things(self, images: Images, phrases: Sequence[Sequence[str]]) -> list[list[Segment]]:
-        """Return the detected objects; the segmenter computes their masks if the detector does not."""
+        """Return the detected objects; the segmenter computes their masks if the detector does
+        not.
+        """
         found: list[list[Detection]] = [[] for _ in images]
         asked = [i for i, wanted in enumerate(phrases) if wanted]
         if asked:
-            detected = self._detector.detect([images[i] for i in asked], [phrases[i] for i in asked])
+            detected = self._detector.detect(
+                [images[i] for i in asked], [phrases[i] for i in asked]
+            )
             for i, things in zip(asked, detected, strict=True):
                 found[i] = things
         boxed = [i for i, things in enumerate(found) if any(thing.mask is None for thing in things)]
@@ -252,14 +315,17 @@ class Tracking:
         return grippers
 
 
-INFO = "arro"  # in Act.info and what `reset` returns: {camera: {"seen": labels, "missing": labels, "searched": bool}}
+# In Act.info and what `reset` returns: {camera: {"seen": labels, "missing": labels, "searched":
+# bool}}.
+INFO = "arro"
 
 
 class Arro(Wrapper):
     """Paints over all but the gripper and the objects of the task, on the cameras of the config.
 
-    Each session tracks its own objects; detector, segmenter and tracker get the images of all sessions of a batch
-    together. `Obs.info` is not changed, so that an image in it, such as a goal, must already show its own background.
+    Each session tracks its own objects; detector, segmenter and tracker get the images of all
+    sessions of a batch together. `Obs.info` is not changed, so that an image in it, such as a goal,
+    must already show its own background.
     """
 
     Config: ClassVar[type] = ArroConfig
@@ -279,7 +345,9 @@ class Arro(Wrapper):
 
     @property
     def contract(self) -> Contract:
-        """The inner agent's contract, with the cameras of the config, and an instruction that names the objects."""
+        """The inner agent's contract, with the cameras of the config, and an instruction that
+        names the objects.
+        """
         inner = self.agent.contract or Contract()
         needed = {name: CameraSpec() for name in self.config.cameras or ()}
         return replace(
@@ -299,7 +367,8 @@ class Arro(Wrapper):
         idle = sorted(set(self.config.cameras or ()) - set(stated or ())) if stated else []
         if idle:
             raise ConfigError(
-                f"arro: cameras {idle} are none of the policy's, {sorted(stated or ())}; name some of those"
+                f"arro: cameras {idle} are none of the policy's, {sorted(stated or ())}; name some "
+                "of those"
             )
 
     def reset(self, obs: Obs, instruction: str | None, **kwargs: Any) -> dict[str, Any]:
@@ -310,18 +379,24 @@ class Arro(Wrapper):
         names = self._names(obs)
         phrases = self.config.objects or ([instruction] if instruction else [])
         if not phrases:
-            raise InvalidObservation("instruction: got none, want one that names the things to show; or set `objects`")
+            raise InvalidObservation(
+                "instruction: got none, want one that names the things to show; or set `objects`"
+            )
         tracks = self.tracking.begin([obs.cameras[name] for name in names], phrases)
         for name, track in zip(names, tracks, strict=True):
             if track.missing and self.config.missing == "refuse":
                 raise InvalidObservation(
-                    f"arro: camera {name!r} shows none of {track.missing}, found {track.seen}; is it in sight? Else "
-                    f"name it in `objects` in other words, leave the camera out of `cameras`, or set missing: hide"
+                    f"arro: camera {name!r} shows none of {track.missing}, found {track.seen}; is "
+                    "it in sight? Else "
+                    "name it in `objects` in other words, leave the camera out of `cameras`, or "
+                    "set missing: hide"
                 )
         self.tracks = dict(zip(names, tracks, strict=True))
         return self._changed(obs)
 
-    def change_batch(self, obs: Sequence[Obs], sessions: Sequence[Wrapper]) -> list[Obs | Exception]:
+    def change_batch(
+        self, obs: Sequence[Obs], sessions: Sequence[Wrapper]
+    ) -> list[Obs | Exception]:
         results: list[Obs | Exception] = list(obs)
         images: list[np.ndarray] = []
         tracks: list[Track] = []
@@ -363,7 +438,8 @@ class Arro(Wrapper):
             image = obs.cameras[name]
             if len(track.masks) and track.masks[0].shape != image.shape[:2]:
                 raise InvalidObservation(
-                    f"camera {name!r}: got {image.shape[:2]}, want {track.masks[0].shape} as at reset; keep its size"
+                    f"camera {name!r}: got {image.shape[:2]}, want {track.masks[0].shape} as at "
+                    "reset; keep its size"
                 )
             views.append((image, track))
         return views
@@ -392,7 +468,9 @@ class Arro(Wrapper):
 
 
 def with_parts(policy: dict[str, Any] | None, parts: Sequence[Path]) -> dict[str, Any] | None:
-    """Return the `Agent.weights_id` of a policy that acts with files and folders of other models beside its own."""
+    """Return the `Agent.weights_id` of a policy that acts with files and folders of other models
+    beside its own.
+    """
     if not parts:
         return policy
     own = policy or {"digest": None, "revision": None}

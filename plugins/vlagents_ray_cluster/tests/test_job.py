@@ -1,4 +1,6 @@
-"""A job in Slurm: what it makes of Slurm's variables, when it ends, and how its server says that it can be reached."""
+"""A job in Slurm: what it makes of Slurm's variables, when it ends, and how its server says that
+it can be reached.
+"""
 
 from __future__ import annotations
 
@@ -11,9 +13,21 @@ from pathlib import Path
 
 import pytest
 
-from vlagents_ray_cluster.slurm.job import Allocation, Ports, as_text, connection_info, end_of_job, write
+from vlagents_ray_cluster.slurm.job import (
+    Allocation,
+    Ports,
+    as_text,
+    connection_info,
+    end_of_job,
+    write,
+)
 
-ENVIRONMENT = {"SLURM_JOB_ID": "4711", "SLURM_JOB_NUM_NODES": "3", "SLURM_NODEID": "1", "SLURM_CPUS_ON_NODE": "1"}
+ENVIRONMENT = {
+    "SLURM_JOB_ID": "4711",
+    "SLURM_JOB_NUM_NODES": "3",
+    "SLURM_NODEID": "1",
+    "SLURM_CPUS_ON_NODE": "1",
+}
 
 
 def options(**more: str) -> dict[str, str]:
@@ -37,7 +51,9 @@ def test_memory_may_be_counted_by_cpu_or_not_at_all() -> None:
 
 
 def test_a_task_that_is_bound_to_fewer_cpus_counts_those() -> None:
-    assert Allocation.here(ENVIRONMENT | {"SLURM_CPUS_ON_NODE": "9999"}).cpus == len(os.sched_getaffinity(0))
+    assert Allocation.here(ENVIRONMENT | {"SLURM_CPUS_ON_NODE": "9999"}).cpus == len(
+        os.sched_getaffinity(0)
+    )
 
 
 def test_the_first_node_is_the_head_and_the_others_join_it() -> None:
@@ -72,7 +88,9 @@ def squeue_says(text: str, folder: Path, monkeypatch: pytest.MonkeyPatch) -> Non
     monkeypatch.setenv("PATH", f"{folder}{os.pathsep}{os.environ['PATH']}")
 
 
-def test_the_end_of_a_job_is_slurms_local_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_end_of_a_job_is_slurms_local_time(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     squeue_says("2027-01-31T18:30:00", tmp_path, monkeypatch)
     assert end_of_job(1) == datetime.datetime(2027, 1, 31, 18, 30).timestamp()
 
@@ -103,7 +121,9 @@ def test_the_connection_information_has_all_that_a_client_needs() -> None:
     assert (found["job"], found["key"], found["address"]) == (12, "vlr_x", "10.0.0.5")
     assert found["ssh"] == f"ssh -N -L 9000:{host}:9000 me@login1"
     started = Allocation.here(ENVIRONMENT | SERVER).ray_start("10.0.0.5", "folder")
-    [exported] = [word.partition("=")[2] for word in started if word.startswith("--metrics-export-port=")]
+    [exported] = [
+        word.partition("=")[2] for word in started if word.startswith("--metrics-export-port=")
+    ]
     assert found["metrics"] == f"http://{host}:{exported}/metrics"
 
 
@@ -123,7 +143,10 @@ def test_the_log_has_no_key_but_the_command_that_reads_it(tmp_path: Path) -> Non
     assert "vlr_x" not in text
     (command,) = (line.strip() for line in text.splitlines() if "export" in line)
     shown = subprocess.run(
-        ["bash", "-c", f"{command}; echo $VLAGENTS_RAY_API_KEY"], check=True, capture_output=True, text=True
+        ["bash", "-c", f"{command}; echo $VLAGENTS_RAY_API_KEY"],
+        check=True,
+        capture_output=True,
+        text=True,
     )
     assert shown.stdout.strip() == "vlr_x"
 

@@ -19,7 +19,10 @@ def test_silence_and_nonsense_are_errors() -> None:
         pytest.raises(ProcessFailed, match=r"no answer within 0\.1 s"),
     ):
         mute.read(0.1)
-    with LineProcess("talker", ["echo", "hello"]) as talker, pytest.raises(ProcessFailed, match="want a line of JSON"):
+    with (
+        LineProcess("talker", ["echo", "hello"]) as talker,
+        pytest.raises(ProcessFailed, match="want a line of JSON"),
+    ):
         talker.read(10)
 
 

@@ -12,7 +12,8 @@ from eval_fakes import wait_for
 
 from vlagents_ray_cluster.slurm.submission import BODY
 
-# The job's Python: finds the address, or is the command, which writes its results once it has been told to end.
+# The job's Python: finds the address, or is the command, which writes its results once it has been
+# told to end.
 PYTHON = """#!/bin/bash
 case "$*" in
   *address) echo 127.0.0.1:1 ;;
@@ -46,16 +47,26 @@ arguments=(eval)
 
 @pytest.mark.parametrize("status", [0, 1])
 @pytest.mark.parametrize("signals", [1, 2, 5])
-def test_a_job_ends_after_its_command_however_many_signals_it_gets(signals: int, status: int, tmp_path: Path) -> None:
-    """Slurm sends one before the time limit, one at it, and one when somebody cancels the job meanwhile."""
+def test_a_job_ends_after_its_command_however_many_signals_it_gets(
+    signals: int, status: int, tmp_path: Path
+) -> None:
+    """Slurm sends one before the time limit, one at it, and one when somebody cancels the job
+    meanwhile.
+    """
     (tmp_path / "bin").mkdir()
     for name, text in {"python": PYTHON, "srun": SRUN, "scancel": SCANCEL}.items():
         program = tmp_path / "bin" / name
         program.write_text(text.format(folder=tmp_path, status=status))
         program.chmod(0o755)
-    environment = {"SLURM_JOB_ID": "7", "SLURM_JOB_NUM_NODES": "1", "PATH": f"{tmp_path}/bin:{os.environ['PATH']}"}
+    environment = {
+        "SLURM_JOB_ID": "7",
+        "SLURM_JOB_NUM_NODES": "1",
+        "PATH": f"{tmp_path}/bin:{os.environ['PATH']}",
+    }
     script = HEAD.format(folder=tmp_path) + BODY.read_text()
-    with subprocess.Popen(["bash", "-c", script], env=os.environ | environment, start_new_session=True) as job:
+    with subprocess.Popen(
+        ["bash", "-c", script], env=os.environ | environment, start_new_session=True
+    ) as job:
         wait_for((tmp_path / "running").exists)
         wait_for((tmp_path / "ray.pid").exists)
         arrived = tmp_path / "signals"

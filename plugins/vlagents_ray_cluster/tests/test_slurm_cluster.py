@@ -39,8 +39,18 @@ def slurm() -> Iterator[Slurm]:
 
 
 def command(folder: Path, *more: str) -> list[str]:
-    """An evaluation of twelve episodes on both nodes; the two with seeds 6 and 7 wait for `folder/open`."""
-    words = ["slurm", "eval", NOTED, "--policy=noop", "--set=action_dim=1", "--episodes=12", f"--out={folder}/out"]
+    """An evaluation of twelve episodes on both nodes; the two with seeds 6 and 7 wait for
+    `folder/open`.
+    """
+    words = [
+        "slurm",
+        "eval",
+        NOTED,
+        "--policy=noop",
+        "--set=action_dim=1",
+        "--episodes=12",
+        f"--out={folder}/out",
+    ]
     words += [
         f"--env-set=folder={folder}",
         "--env-set=held=[6, 7]",
@@ -86,26 +96,44 @@ def test_a_cancelled_evaluation_is_finished_by_the_same_command_with_each_episod
     assert episodes(tmp_path) == sorted([*before, (6, 2), (7, 2)])
     assert json.loads((tmp_path / "out" / "summary.json").read_text())["state"] == "complete"
     assert all(f"{one.name} (2 CPUs, 1 GPUs)" in log.read_text() for one in slurm.nodes)
-    assert {file.name.partition("-")[0] for file in tmp_path.glob("host*-*")} == {one.name for one in slurm.nodes}
+    assert {file.name.partition("-")[0] for file in tmp_path.glob("host*-*")} == {
+        one.name for one in slurm.nodes
+    }
     logs = tmp_path / "out" / "slurm" / job
     assert {file.name for file in logs.iterdir()} >= {f"ray-{one.name}.log" for one in slurm.nodes}
 
 
-def test_a_job_that_is_out_of_time_queues_itself_again_and_goes_on(slurm: Slurm, tmp_path: Path) -> None:
+def test_a_job_that_is_out_of_time_queues_itself_again_and_goes_on(
+    slurm: Slurm, tmp_path: Path
+) -> None:
     (tmp_path / "open").touch()
     # It has a second: no episode is begun.
-    job = slurm.vlagents_ray(*command(tmp_path, "--nodes=1", "--time=10", "--closing-s=599", "--resubmit=5")).strip()
+    job = slurm.vlagents_ray(
+        *command(tmp_path, "--nodes=1", "--time=10", "--closing-s=599", "--resubmit=5")
+    ).strip()
     requeued = tmp_path / "out" / "slurm" / job / "requeued"
     slurm.wait_for(job, requeued.exists)
     assert episodes(tmp_path) == []
     slurm.wait_for(job, lambda: slurm.state(job) == "PENDING")
     slurm.do("scontrol", "update", f"job={job}", "TimeLimit=30")
-    assert slurm.wait_for_end(job) == "COMPLETED", (tmp_path / "out" / "slurm" / f"{job}.log").read_text()
+    assert slurm.wait_for_end(job) == "COMPLETED", (
+        tmp_path / "out" / "slurm" / f"{job}.log"
+    ).read_text()
     assert [episode for episode, _ in episodes(tmp_path)] == list(range(12))
 
 
-def test_a_server_in_a_job_says_how_to_get_in_and_lets_nobody_else_in(slurm: Slurm, tmp_path: Path) -> None:
-    words = ["slurm", "serve", "noop", "--set=action_dim=3", "--cpus-per-task=2", f"--out={tmp_path}", "--parsable"]
+def test_a_server_in_a_job_says_how_to_get_in_and_lets_nobody_else_in(
+    slurm: Slurm, tmp_path: Path
+) -> None:
+    words = [
+        "slurm",
+        "serve",
+        "noop",
+        "--set=action_dim=3",
+        "--cpus-per-task=2",
+        f"--out={tmp_path}",
+        "--parsable",
+    ]
     job = slurm.vlagents_ray(*words).strip()
     file = tmp_path / job / "server.json"
     slurm.wait_for(job, file.exists)

@@ -42,14 +42,29 @@ def arguments(*words: str) -> list[str]:
 
 def test_an_evaluation_keeps_its_words_and_sbatch_gets_the_others(tmp_path: Path) -> None:
     out = tmp_path / "out"
-    command = [*EVAL, "--out", str(out), "--nodes", "4", "--gpus-per-node=2", "--resubmit", "3", "--seed", "7"]
-    assert {"#SBATCH --nodes=4", "#SBATCH --gpus-per-node=2", "resubmit=3"} <= set(script(*command).splitlines())
+    command = [
+        *EVAL,
+        "--out",
+        str(out),
+        "--nodes",
+        "4",
+        "--gpus-per-node=2",
+        "--resubmit",
+        "3",
+        "--seed",
+        "7",
+    ]
+    assert {"#SBATCH --nodes=4", "#SBATCH --gpus-per-node=2", "resubmit=3"} <= set(
+        script(*command).splitlines()
+    )
     words = ["tabletop", "--policy", "scripted", "--out", str(out), "--seed", "7"]
     assert arguments(*command) == ["eval", "--fill=1", "--closing-s=60", "--", *words]
     assert not out.exists(), "--dry-run writes nothing"
 
 
-def test_workers_fill_a_job_with_the_cpus_of_each_unless_their_number_is_said(tmp_path: Path) -> None:
+def test_workers_fill_a_job_with_the_cpus_of_each_unless_their_number_is_said(
+    tmp_path: Path,
+) -> None:
     file = tmp_path / "runs.yaml"
     file.write_text(RUNS)
     for words in (["eval", str(file), "--dry-run"], [*EVAL, "--workers", "2"]):
@@ -84,7 +99,9 @@ SERVE = ["serve", "noop", "--dry-run"]
         ([*SERVE, "--array=0-3"], "one job"),
     ],
 )
-def test_what_would_end_the_job_as_soon_as_it_began_is_refused_before(words: list[str], text: str) -> None:
+def test_what_would_end_the_job_as_soon_as_it_began_is_refused_before(
+    words: list[str], text: str
+) -> None:
     done = slurm(*words)
     assert done.exit_code == 2, done.output
     assert text in done.stderr

@@ -26,7 +26,11 @@ KNOWN = {"--policy": True, "--resume": False, "--out": True}
 
 
 def test_what_the_command_knows_is_its_own_and_the_rest_is_sbatchs() -> None:
-    words = "env/a --policy p --nodes 4 --resume --time=1:00:00 env/b --out=runs/x --gpus-per-node a100:2 --requeue"
+    words = (
+        "env/a --policy p --nodes 4 --resume --time=1:00:00 env/b --out=runs/x "
+        "--gpus-per-node "
+        "a100:2 --requeue"
+    )
     own, sbatch = split(words.split(), KNOWN)
     assert own == ["env/a", "--policy", "p", "--resume", "env/b", "--out=runs/x"]
     assert sbatch == {"nodes": "4", "time": "1:00:00", "gpus-per-node": "a100:2", "requeue": None}
@@ -46,11 +50,20 @@ def test_an_option_that_stands_alone_leaves_the_next_word_alone() -> None:
 
 def test_sbatchs_short_options_have_their_long_names() -> None:
     _, sbatch = split(["-N4", "-p", "gpu", "-t", "30", "-H", "-d", "afterok:7"], KNOWN)
-    assert sbatch == {"nodes": "4", "partition": "gpu", "time": "30", "hold": None, "dependency": "afterok:7"}
+    assert sbatch == {
+        "nodes": "4",
+        "partition": "gpu",
+        "time": "30",
+        "hold": None,
+        "dependency": "afterok:7",
+    }
 
 
 def test_an_option_that_only_a_newer_sbatch_knows_is_passed_on() -> None:
-    assert split(["--segment=4", "--oom-kill-step=1"], KNOWN)[1] == {"segment": "4", "oom-kill-step": "1"}
+    assert split(["--segment=4", "--oom-kill-step=1"], KNOWN)[1] == {
+        "segment": "4",
+        "oom-kill-step": "1",
+    }
 
 
 @pytest.mark.parametrize(
@@ -86,7 +99,9 @@ env >"{folder}/environment"
 
 
 def script(folder: Path, **more: object) -> Script:
-    return Script("eval", folder, ["eval", "--", "env/*", "--set", "a b=$HOME"], {"nodes": "4"}, **more)  # type: ignore[arg-type]
+    return Script(
+        "eval", folder, ["eval", "--", "env/*", "--set", "a b=$HOME"], {"nodes": "4"}, **more
+    )  # type: ignore[arg-type]
 
 
 def fake_sbatch(folder: Path, end: str, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -101,7 +116,8 @@ def test_the_script_is_one_that_bash_reads(tmp_path: Path) -> None:
     text = script(tmp_path, setup=tmp_path / "it's here").text()
     subprocess.run(["bash", "-n"], input=text, text=True, check=True)
     shown = subprocess.run(
-        ["bash", "-c", text.removesuffix(BODY.read_text()) + 'printf "%s\\n" "${arguments[@]}" "$setup"'],
+        ["bash", "-c", text.removesuffix(BODY.read_text()) + ('printf "%s\\n" "${arguments[@]}" '
+                                                              '"$setup"')],
         check=True, capture_output=True, text=True,
     ).stdout.splitlines()  # fmt: skip
     assert shown == ["eval", "--", "env/*", "--set", "a b=$HOME", str(tmp_path / "it's here")]
@@ -111,18 +127,29 @@ def test_the_script_is_one_that_bash_reads(tmp_path: Path) -> None:
     name=st.text(),
     folder=st.text(min_size=1),
     option=st.text(),
-    arguments=st.lists(st.text(st.characters(exclude_characters="\0", exclude_categories=["Cs"])), max_size=3),
+    arguments=st.lists(
+        st.text(st.characters(exclude_characters="\0", exclude_categories=["Cs"])), max_size=3
+    ),
 )
 @example(name="eval", folder="./runs/x\necho INJECTED\n#", option="", arguments=[])
 @example(name="eval", folder="runs", option="y\necho INJECTED\n#", arguments=[])
-@example(name="eval", folder="runs", option="", arguments=["\necho INJECTED\n#", "$(echo INJECTED)", "'`id`"])
-def test_no_name_path_or_option_becomes_a_command(name: str, folder: str, option: str, arguments: list[str]) -> None:
+@example(
+    name="eval",
+    folder="runs",
+    option="",
+    arguments=["\necho INJECTED\n#", "$(echo INJECTED)", "'`id`"],
+)
+def test_no_name_path_or_option_becomes_a_command(
+    name: str, folder: str, option: str, arguments: list[str]
+) -> None:
     try:
         text = Script(name, Path(folder), arguments, {"comment": option}).text()
     except (ConfigError, ValueError):  # a path with a NUL
         return
     head = text.removesuffix(BODY.read_text()).encode(errors="surrogateescape")
-    commands = [line for line in head.split(b"arguments=(")[0].splitlines() if not line.startswith(b"#")]
+    commands = [
+        line for line in head.split(b"arguments=(")[0].splitlines() if not line.startswith(b"#")
+    ]
     assert [line.partition(b"=")[0] for line in commands] == [b"", *SETTINGS]
     shown = b"".join(one.encode() + b"\0" for one in arguments)
     show = b'printf "%s\\0" "${arguments[@]}"\n' if arguments else b""
@@ -150,7 +177,10 @@ def test_a_job_that_is_submitted_from_within_a_job_does_not_inherit_its_options(
     assert "SLURM_NTASKS" not in seen
     assert "SLURM_CONF=/x\n" in seen
     assert "SBATCH_ACCOUNT=mine\n" in seen
-    assert (tmp_path / "words").read_text().split() == ["--parsable", str(tmp_path / "s" / "eval.sh")]
+    assert (tmp_path / "words").read_text().split() == [
+        "--parsable",
+        str(tmp_path / "s" / "eval.sh"),
+    ]
     assert stat.S_IMODE((tmp_path / "s" / "eval.sh").stat().st_mode) == 0o700
 
 
@@ -170,4 +200,7 @@ def test_without_slurm_the_script_is_there_to_be_taken_elsewhere(
 
 
 def test_only_slurms_own_variables_are_left_out() -> None:
-    assert outside_of_jobs({"SLURM_JOB_ID": "1", "SLURM_CONF": "c", "HOME": "h"}) == {"SLURM_CONF": "c", "HOME": "h"}
+    assert outside_of_jobs({"SLURM_JOB_ID": "1", "SLURM_CONF": "c", "HOME": "h"}) == {
+        "SLURM_CONF": "c",
+        "HOME": "h",
+    }

@@ -36,9 +36,13 @@ def calls(folder: Path) -> int:
     return (folder / "words").read_text().split().count("--parsable")
 
 
-def test_a_checkpoint_is_submitted_once_with_its_path_and_step(tmp_path: Path, python: Path) -> None:
+def test_a_checkpoint_is_submitted_once_with_its_path_and_step(
+    tmp_path: Path, python: Path
+) -> None:
     def call(_number: int) -> str | None:
-        return submit_evaluation(WORDS, checkpoint="/c/20", step=20, record=tmp_path / "record", python=python)
+        return submit_evaluation(
+            WORDS, checkpoint="/c/20", step=20, record=tmp_path / "record", python=python
+        )
 
     with ThreadPoolExecutor(8) as ranks:
         found = list(ranks.map(call, range(8)))
@@ -47,7 +51,12 @@ def test_a_checkpoint_is_submitted_once_with_its_path_and_step(tmp_path: Path, p
     assert "checkpoint=/c/20\n--out\nruns/20\n" in (tmp_path / "words").read_text()
     [mark] = (tmp_path / "record").iterdir()
     assert json.loads(mark.read_text())["job"] == "77"
-    assert submit_evaluation(WORDS, checkpoint="/c/30", step=30, record=tmp_path / "record", python=python) == "77"
+    assert (
+        submit_evaluation(
+            WORDS, checkpoint="/c/30", step=30, record=tmp_path / "record", python=python
+        )
+        == "77"
+    )
     assert calls(tmp_path) == 2
 
 
@@ -56,17 +65,37 @@ def test_a_failure_is_logged_training_goes_on_and_a_later_call_tries_again(
 ) -> None:
     (tmp_path / "broken").touch()
     with caplog.at_level(logging.ERROR):
-        assert submit_evaluation(WORDS, checkpoint="/c", step=5, record=tmp_path / "record", python=python) is None
+        assert (
+            submit_evaluation(
+                WORDS, checkpoint="/c", step=5, record=tmp_path / "record", python=python
+            )
+            is None
+        )
     assert "no partition" in caplog.text
     with pytest.raises(HookFailed, match=r"step 5.*no partition"):
-        submit_evaluation(WORDS, checkpoint="/c", step=5, record=tmp_path / "record", python=python, raise_errors=True)
+        submit_evaluation(
+            WORDS,
+            checkpoint="/c",
+            step=5,
+            record=tmp_path / "record",
+            python=python,
+            raise_errors=True,
+        )
     (tmp_path / "broken").unlink()
-    assert submit_evaluation(WORDS, checkpoint="/c", step=5, record=tmp_path / "record", python=python) == "77"
+    assert (
+        submit_evaluation(WORDS, checkpoint="/c", step=5, record=tmp_path / "record", python=python)
+        == "77"
+    )
 
 
 def call_for(folder: Path, step: int = 20) -> str | None:
     return submit_evaluation(
-        WORDS, checkpoint=f"/c/{step}", step=step, record=folder / "record", python=folder / "python", raise_errors=True
+        WORDS,
+        checkpoint=f"/c/{step}",
+        step=step,
+        record=folder / "record",
+        python=folder / "python",
+        raise_errors=True,
     )
 
 
@@ -110,7 +139,10 @@ def test_the_call_for_a_later_checkpoint_makes_up_for_an_earlier_one(claimed: Pa
 
 def test_a_python_that_is_not_there_does_not_stop_training(tmp_path: Path) -> None:
     gone = tmp_path / "gone"
-    assert submit_evaluation(WORDS, checkpoint="/c", step=5, record=tmp_path / "record", python=gone) is None
+    assert (
+        submit_evaluation(WORDS, checkpoint="/c", step=5, record=tmp_path / "record", python=gone)
+        is None
+    )
 
 
 def test_the_hook_needs_the_light_install_only() -> None:

@@ -1,4 +1,6 @@
-"""`vlagents-ray tune` prints the settings of a file to change, with the figures that they were chosen by."""
+"""`vlagents-ray tune` prints the settings of a file to change, with the figures that they were
+chosen by.
+"""
 
 from __future__ import annotations
 
@@ -61,7 +63,9 @@ def test_the_settings_to_change_are_printed_with_the_figures(file: Path) -> None
 
 @pytest.mark.slow  # each variant is measured in a process of its own
 def test_a_goal_that_nothing_reaches_is_an_error(file: Path) -> None:
-    done = CliRunner().invoke(app, ["tune", str(file), *QUICK, "--for", "robots", "--p99-ms", "0.000001"])
+    done = CliRunner().invoke(
+        app, ["tune", str(file), *QUICK, "--for", "robots", "--p99-ms", "0.000001"]
+    )
     assert done.exit_code == 1
     assert "the shortest p99 of a round trip was" in done.stderr
     assert "\nset " not in done.output
@@ -79,9 +83,13 @@ def test_a_goal_that_nothing_reaches_is_an_error(file: Path) -> None:
         (["FILE", "--frames", "."], "trajectory"),
     ],
 )
-def test_mistakes_are_told_in_a_line(file: Path, words: list[str], text: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_mistakes_are_told_in_a_line(
+    file: Path, words: list[str], text: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.chdir(file.parent)
-    done = CliRunner().invoke(app, ["tune", *(str(file) if word == "FILE" else word for word in words)])
+    done = CliRunner().invoke(
+        app, ["tune", *(str(file) if word == "FILE" else word for word in words)]
+    )
     assert done.exit_code == 2, done.output
     assert text in done.stderr
     assert "Traceback" not in done.output

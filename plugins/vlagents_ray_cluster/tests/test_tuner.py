@@ -25,8 +25,20 @@ def importable(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def tuner(policy: str = "Tunable", *, batch: dict[str, Any] | None = None, **given: Any) -> Tuner:
     plan = {name: given.pop(name) for name in list(given) if name in TunePlan.__dataclass_fields__}
-    args = ServerArgs(policy=f"tuned_policies:{policy}", config=given, batch=batch or {"max_size": 2})
-    return Tuner(TunePlan(**{"args": args, "goal": TuningGoal("throughput"), "max_batch": 2, "seconds": 0.1, **plan}))
+    args = ServerArgs(
+        policy=f"tuned_policies:{policy}", config=given, batch=batch or {"max_size": 2}
+    )
+    return Tuner(
+        TunePlan(
+            **{
+                "args": args,
+                "goal": TuningGoal("throughput"),
+                "max_batch": 2,
+                "seconds": 0.1,
+                **plan,
+            }
+        )
+    )
 
 
 def test_compilation_that_helps_is_chosen() -> None:
@@ -47,7 +59,9 @@ def test_the_largest_batch_of_the_file_is_measured_and_only_useful_sizes_are_com
     own = [one for one in points if not one.variant.changes]
     assert [one.sessions for one in own] == [1, 2, 3]
     best = max(own, key=lambda one: one.actions_per_s).sessions
-    assert {tuple(one.variant.changes["batch_sizes"]) for one in points if one.variant.changes} == {(1, 2, 3)[:best]}
+    assert {tuple(one.variant.changes["batch_sizes"]) for one in points if one.variant.changes} == {
+        (1, 2, 3)[:best]
+    }
 
 
 def test_a_type_whose_actions_differ_is_refused_and_one_whose_process_ends_is_left_out() -> None:
@@ -62,7 +76,9 @@ def test_a_type_whose_actions_differ_is_refused_and_one_whose_process_ends_is_le
 def test_a_type_whose_actions_are_near_enough_passes(name: str) -> None:
     measured = tuner(dtypes=[name], off=5.0, compile=True, tolerance=10.0)
     [(changes, off)] = {
-        (tuple(one.variant.changes.items()), one.difference) for one in measured.measure() if one.variant.changes
+        (tuple(one.variant.changes.items()), one.difference)
+        for one in measured.measure()
+        if one.variant.changes
     }
     assert changes == (("quantization" if name == "int8" else "dtype", name),)
     assert off > 0.01
@@ -78,7 +94,9 @@ def test_a_batch_without_memory_ends_the_sizes_and_smaller_ones_stay() -> None:
 def test_what_is_not_done_in_time_is_left_out() -> None:
     args = ServerArgs(policy="tuned_policies:Tunable")
     late = Tuner(TunePlan(args, TuningGoal("throughput"), minutes=2), began=time.monotonic() - 120)
-    with pytest.raises(VariantFailed, match="own settings: not done within 2 minutes; raise --minutes"):
+    with pytest.raises(
+        VariantFailed, match="own settings: not done within 2 minutes; raise --minutes"
+    ):
         late.measure()
 
 
@@ -86,7 +104,8 @@ def test_variants_that_cannot_be_loaded_leave_the_file_as_it_is() -> None:
     measured = tuner(compiles=False, dtypes=["bfloat16"])
     names = [one.variant.name for one in measured.measure()]
     assert set(names) == {"own settings", "dtype: bfloat16"}
-    assert measured.left_out == ["compile: true: ConfigError: compile: this one has no compiler"]  # nor any with both
+    # Nor any with both.
+    assert measured.left_out == ["compile: true: ConfigError: compile: this one has no compiler"]
 
 
 def test_a_policy_that_is_random_in_itself_cannot_be_compared() -> None:
@@ -96,7 +115,9 @@ def test_a_policy_that_is_random_in_itself_cannot_be_compared() -> None:
 
 def test_recorded_observations_are_acted_on_if_they_fit(tmp_path: Path) -> None:
     record(tmp_path / "ep0.npz", 1.0, part="joints")
-    assert {one.variant.name for one in tuner(frames=tmp_path, compile=True).measure()} == {"own settings"}
+    assert {one.variant.name for one in tuner(frames=tmp_path, compile=True).measure()} == {
+        "own settings"
+    }
     record(tmp_path / "ep0.npz", 1.0)
     with pytest.raises(VariantFailed, match=r"own settings: .*joints"):
         tuner(frames=tmp_path).measure()
@@ -111,7 +132,9 @@ def test_a_policy_without_such_settings_gets_a_batch_size() -> None:
 
 
 def test_fixed_sizes_of_the_file_are_those_that_are_measured() -> None:
-    measured = tuner(batch={"sizes": [2, 3]}, compile=True, max_batch=3, goal=TuningGoal("robots", 60_000.0))
+    measured = tuner(
+        batch={"sizes": [2, 3]}, compile=True, max_batch=3, goal=TuningGoal("robots", 60_000.0)
+    )
     assert [one.sessions for one in measured.measure()] == [2, 3]
     with pytest.raises(ConfigError, match="--max-batch: got 1"):
         tuner(batch={"sizes": [2, 3]}, max_batch=1).measure()
@@ -133,4 +156,6 @@ def test_other_modes_of_compilation_are_tried_unless_the_file_compiles(
     sizes = [1, 2, 4, 8] if own else None  # by default
     ready = {"settings": {"compile": own, "batch_sizes": sizes}, "dtypes": [], "modes": modes}
     found = [variant.changes for variant in tuner()._variants(ready, [1, 2])]
-    assert found == [{"compile": mode} | ({"batch_sizes": [1, 2]} if mode else {}) for mode in tried]
+    assert found == [
+        {"compile": mode} | ({"batch_sizes": [1, 2]} if mode else {}) for mode in tried
+    ]

@@ -31,7 +31,12 @@ def test_they_are_spread_over_episodes_and_their_steps(tmp_path: Path) -> None:
     record(tmp_path / "a" / "ep0.npz", 0.0)
     record(tmp_path / "b" / "ep1.npz", 100.0)
     found = recorded_observations(tmp_path, 4)
-    assert [obs.state["arm/joints"].tolist() for obs in found] == [[0, 0], [5, 5], [100, 100], [105, 105]]
+    assert [obs.state["arm/joints"].tolist() for obs in found] == [
+        [0, 0],
+        [5, 5],
+        [100, 100],
+        [105, 105],
+    ]
     assert [obs.gripper for obs in found] == [0, 1, 0, 1]
     assert [round(obs.cameras["front"].mean() / 20) for obs in found] == [0, 5, 0, 5]
 
@@ -97,12 +102,18 @@ def test_rows_of_a_batch_that_begins_again_belong_to_the_first_episodes() -> Non
     assert largest_difference([*WANTED, WANTED[1]], WANTED) > 0
 
 
-@pytest.mark.parametrize("bad", [np.zeros((3, 2)), np.full((2, 2), np.nan), np.full((2, 2), np.inf)])
+@pytest.mark.parametrize(
+    "bad", [np.zeros((3, 2)), np.full((2, 2), np.nan), np.full((2, 2), np.inf)]
+)
 def test_other_shapes_and_values_that_are_not_finite_never_pass(bad: np.ndarray) -> None:
     assert largest_difference([bad], WANTED) == math.inf
 
 
-OWN, COMPILED, BF16 = Variant(), Variant({"compile": True, "batch_sizes": [1, 2, 4]}), Variant({"dtype": "bfloat16"})
+OWN, COMPILED, BF16 = (
+    Variant(),
+    Variant({"compile": True, "batch_sizes": [1, 2, 4]}),
+    Variant({"dtype": "bfloat16"}),
+)
 THROUGHPUT = TuningGoal("throughput")
 
 
@@ -125,7 +136,12 @@ def test_a_variant_must_be_five_percent_better_than_one_with_fewer_changes() -> 
 
 def test_for_robots_the_most_sessions_within_the_time_are_chosen() -> None:
     goal = TuningGoal("robots", 60.0)
-    points = [point(OWN, 1, 30, 20), point(OWN, 2, 40, 59), point(OWN, 4, 90, 61), point(COMPILED, 2, 50, 40)]
+    points = [
+        point(OWN, 1, 30, 20),
+        point(OWN, 2, 40, 59),
+        point(OWN, 4, 90, 61),
+        point(COMPILED, 2, 50, 40),
+    ]
     assert choose(points[:3], goal) == points[1]
     assert choose(points, goal) == points[3]  # as many, with shorter round trips
     more = point(COMPILED, 4, 80, 60)
@@ -164,8 +180,12 @@ def test_the_settings_are_those_that_differ_from_the_file() -> None:
 
 
 def test_fixed_sizes_of_the_file_end_at_the_chosen_one() -> None:
-    assert chosen_settings(point(OWN, 4, 1), BatchArgs(max_size=4), [1, 4, 16]) == {"config": {"batch_sizes": [1, 4]}}
-    assert chosen_settings(point(OWN, 4, 1), BatchArgs(sizes=[1, 4, 16]), None) == {"batch": {"sizes": [1, 4]}}
+    assert chosen_settings(point(OWN, 4, 1), BatchArgs(max_size=4), [1, 4, 16]) == {
+        "config": {"batch_sizes": [1, 4]}
+    }
+    assert chosen_settings(point(OWN, 4, 1), BatchArgs(sizes=[1, 4, 16]), None) == {
+        "batch": {"sizes": [1, 4]}
+    }
     assert chosen_settings(point(OWN, 16, 1), BatchArgs(sizes=[1, 4, 16]), [1, 4, 16]) == {}
 
 

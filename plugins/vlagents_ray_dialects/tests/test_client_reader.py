@@ -1,4 +1,6 @@
-"""Messages of a gateway's client are complete however they are split, and count as in flight until then."""
+"""Messages of a gateway's client are complete however they are split, and count as in flight
+until then.
+"""
 
 from __future__ import annotations
 
@@ -44,7 +46,9 @@ def read(reader: ClientReader, length: int, silent_s: float = 10.0) -> memoryvie
     st.lists(st.binary(min_size=1, max_size=50), min_size=1, max_size=8),
     st.lists(st.integers(1, 60), min_size=1),
 )
-def test_messages_are_complete_however_they_are_split(messages: list[bytes], sizes: list[int]) -> None:
+def test_messages_are_complete_however_they_are_split(
+    messages: list[bytes], sizes: list[int]
+) -> None:
     admission = Admission(2**20)
     stream = io.BytesIO(b"".join(messages))
     with connected() as (client, connection):

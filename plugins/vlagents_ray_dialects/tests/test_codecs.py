@@ -1,4 +1,6 @@
-"""The codecs of other systems' messages: what goes in comes out, and what is wrong is refused by name."""
+"""The codecs of other systems' messages: what goes in comes out, and what is wrong is refused by
+name.
+"""
 
 from __future__ import annotations
 
@@ -31,14 +33,25 @@ from vlagents_ray_dialects.messages import vla_eval as vla_eval_codec
 from vlagents_ray_dialects.vlagents import SharedMemory
 
 IMAGE = np.random.default_rng(0).integers(0, 256, (6, 8, 3), np.uint8)
-OBS = {"observation/image": IMAGE, "state": np.arange(8.0), "prompt": "lift", "nested": {"a": [1, 2.5, None, True]}}
+OBS = {
+    "observation/image": IMAGE,
+    "state": np.arange(8.0),
+    "prompt": "lift",
+    "nested": {"a": [1, 2.5, None, True]},
+}
 SMALL = Limits(body_bytes=20_000, pixels=64 * 64, items=200, depth=4)
 
 arrays = hnp.arrays(
     dtype=st.sampled_from([np.dtype(t) for t in ("?", "u1", "i2", "i8", "f2", "f4", "f8")]),
     shape=hnp.array_shapes(min_dims=0, max_dims=3, max_side=5),
 )
-plain = st.none() | st.booleans() | st.integers(-(2**53), 2**53) | st.floats(allow_nan=False) | st.text(max_size=8)
+plain = (
+    st.none()
+    | st.booleans()
+    | st.integers(-(2**53), 2**53)
+    | st.floats(allow_nan=False)
+    | st.text(max_size=8)
+)
 names = st.text(max_size=8).filter(lambda name: not name.startswith("__") and name != "encoded")
 messages = st.dictionaries(
     names,
@@ -101,12 +114,18 @@ def read_gr00t(data: bytes, limits: Limits) -> gr00t.Observations:
 
 
 def as_gr00t(encode: Callable[[Any], Any]) -> bytes:
-    seen = {"video": {"ego": IMAGE[None, None]}, "state": {"arm": np.zeros((1, 1, 2))}, "language": {"task": [["go"]]}}
+    seen = {
+        "video": {"ego": IMAGE[None, None]},
+        "state": {"arm": np.zeros((1, 1, 2))},
+        "language": {"task": [["go"]]},
+    }
     return msgpack.packb({"endpoint": "get_action", "data": {"observation": seen}}, default=encode)
 
 
 def read_vlagents(data: bytes, limits: Limits) -> vlagents.ObservationRequest:
-    return vlagents.read_act(data.decode(errors="replace"), Budget(limits), SharedMemory(same_machine=False))
+    return vlagents.read_act(
+        data.decode(errors="replace"), Budget(limits), SharedMemory(same_machine=False)
+    )
 
 
 MESSAGES: dict[str, tuple[bytes, Callable[[bytes, Limits], Any]]] = {
@@ -114,9 +133,18 @@ MESSAGES: dict[str, tuple[bytes, Callable[[bytes, Limits], Any]]] = {
     "gr00t": (as_gr00t(gr00t_client.encode), read_gr00t),
     "gr00t, packed": (as_gr00t(gr00t_client.encode_packed), read_gr00t),
     "vlagents": (document(side=2).encode(), read_vlagents),
-    "rpyc": (call("act", "text", "more")[rpyc.HEADER.size :], lambda data, _: rpyc.read_call(data, False, 2**16)),
-    "rpyc, compressed": (call("x" * 10_000)[rpyc.HEADER.size :], lambda data, _: rpyc.read_call(data, True, 2**16)),
-    "rpyc, reply": (rpyc.reply(1, "text")[rpyc.HEADER.size :], lambda data, _: vlagents.read_result(data, False, 1000)),
+    "rpyc": (
+        call("act", "text", "more")[rpyc.HEADER.size :],
+        lambda data, _: rpyc.read_call(data, False, 2**16),
+    ),
+    "rpyc, compressed": (
+        call("x" * 10_000)[rpyc.HEADER.size :],
+        lambda data, _: rpyc.read_call(data, True, 2**16),
+    ),
+    "rpyc, reply": (
+        rpyc.reply(1, "text")[rpyc.HEADER.size :],
+        lambda data, _: vlagents.read_result(data, False, 1000),
+    ),
     "rpyc, reply, compressed": (
         rpyc.reply(1, "x" * 10_000)[rpyc.HEADER.size :],
         lambda data, _: vlagents.read_result(data, True, 2**16),
@@ -184,7 +212,9 @@ def test_few_bytes_do_not_become_much_memory() -> None:
 def test_few_bytes_do_not_become_many_texts() -> None:
     def said(texts: int, arrays: int = 1) -> bytes:
         data = ("\u4e00" * texts).encode("utf-32-le")
-        return msgpack.packb({f"p{i}": {b"__ndarray__": True, b"data": data, b"dtype": "<U1"} for i in range(arrays)})
+        return msgpack.packb(
+            {f"p{i}": {b"__ndarray__": True, b"data": data, b"dtype": "<U1"} for i in range(arrays)}
+        )
 
     assert len(openpi_codec.decode(said(9_000))["p0"]) == 9_000
     for message in (said(1_000_000), said(900, 20)):
@@ -192,28 +222,43 @@ def test_few_bytes_do_not_become_many_texts() -> None:
             openpi_codec.decode(message)
 
 
-@pytest.mark.parametrize("dtype", ["|O", "|V8", "<c8", "|S4", "<M8[s]", ">f4", "<f1", "O8", "f4,f4", 3, None])
+@pytest.mark.parametrize(
+    "dtype", ["|O", "|V8", "<c8", "|S4", "<M8[s]", ">f4", "<f1", "O8", "f4,f4", 3, None]
+)
 def test_arrays_of_anything_but_numbers_are_refused(dtype: Any) -> None:
     fields = {"data": bytes(8), "dtype": dtype, "shape": [1]}
     with pytest.raises(MalformedMessage):
-        openpi_codec.decode(msgpack.packb({"a": {k.encode(): v for k, v in fields.items()} | {b"__ndarray__": True}}))
+        openpi_codec.decode(
+            msgpack.packb(
+                {"a": {k.encode(): v for k, v in fields.items()} | {b"__ndarray__": True}}
+            )
+        )
     with pytest.raises(MalformedMessage):
         vla_eval_codec.decode(as_vla_eval({"a": fields | {"__ndarray__": True}}))
     with pytest.raises(MalformedMessage):
-        openvla_codec.decode(json.dumps({"a": {"__numpy__": "AAAAAAAAAAA=", "dtype": dtype, "shape": [1]}}).encode())
+        openvla_codec.decode(
+            json.dumps({"a": {"__numpy__": "AAAAAAAAAAA=", "dtype": dtype, "shape": [1]}}).encode()
+        )
 
 
 @pytest.mark.parametrize("shape", [[2], [-1], [2**62, 4], [2**63, 0], [1.0], "1", None, [1] * 9])
 def test_a_shape_must_fit_the_bytes(shape: Any) -> None:
     with pytest.raises(MalformedMessage):
         openpi_codec.decode(
-            msgpack.packb({"a": {b"__ndarray__": True, b"data": bytes(4), b"dtype": "<f4", b"shape": shape}})
+            msgpack.packb(
+                {"a": {b"__ndarray__": True, b"data": bytes(4), b"dtype": "<f4", b"shape": shape}}
+            )
         )
 
 
 def test_openpis_scalars_and_texts_are_read() -> None:
     scalar = {b"__npgeneric__": True, b"data": 3, b"dtype": "<f4"}
-    text = {b"__ndarray__": True, b"data": "lift".encode("utf-32-le"), b"dtype": "<U4", b"shape": []}
+    text = {
+        b"__ndarray__": True,
+        b"data": "lift".encode("utf-32-le"),
+        b"dtype": "<U4",
+        b"shape": [],
+    }
     got = openpi_codec.decode(msgpack.packb({"gripper": scalar, "prompt": text}))
     assert (got["gripper"], got["prompt"]) == (np.float32(3), ["lift"])
     for wrong in (
@@ -229,7 +274,15 @@ def test_openpis_scalars_and_texts_are_read() -> None:
 
 
 def test_extensions_and_keys_that_are_no_text_are_refused() -> None:
-    for value in ({"a": msgpack.ExtType(4, b"x")}, {"a": msgpack.Timestamp(1)}, {1: 2}, {b"a": 1}, {None: 1}, [1], 3):
+    for value in (
+        {"a": msgpack.ExtType(4, b"x")},
+        {"a": msgpack.Timestamp(1)},
+        {1: 2},
+        {b"a": 1},
+        {None: 1},
+        [1],
+        3,
+    ):
         with pytest.raises(MalformedMessage):
             openpi_codec.decode(msgpack.packb(value))
 
@@ -237,12 +290,22 @@ def test_extensions_and_keys_that_are_no_text_are_refused() -> None:
 def test_vla_evals_images_may_be_files() -> None:
     jpeg = {"__image__": True, "format": "jpeg", "data": encode_jpeg(IMAGE, 95), "shape": [6, 8, 3]}
     png = {"__image__": True, "format": "png", "data": encode_png(IMAGE), "shape": [6, 8, 3]}
-    raw = {"__image__": True, "format": "raw", "data": IMAGE.tobytes(), "dtype": "|u1", "shape": [6, 8, 3]}
+    raw = {
+        "__image__": True,
+        "format": "raw",
+        "data": IMAGE.tobytes(),
+        "dtype": "|u1",
+        "shape": [6, 8, 3],
+    }
     got = from_vla_eval(as_vla_eval({"images": {"a": jpeg, "b": png, "c": raw}}))["images"]
     assert got["a"].shape == IMAGE.shape
     np.testing.assert_array_equal(got["b"], IMAGE)
     np.testing.assert_array_equal(got["c"], IMAGE)
-    for wrong in (png | {"data": png["data"][:-40]}, png | {"format": "gif"}, png | {"data": "text"}):  # type: ignore[index]
+    for wrong in (
+        png | {"data": png["data"][:-40]},
+        png | {"format": "gif"},
+        png | {"data": "text"},
+    ):  # type: ignore[index]
         with pytest.raises(MalformedMessage):
             from_vla_eval(as_vla_eval({"a": wrong}))
     with pytest.raises(MessageTooLarge):
@@ -253,7 +316,15 @@ def test_vla_evals_images_may_be_files() -> None:
 
 @pytest.mark.parametrize(
     "change",
-    [{"type": "kill"}, {"type": 3}, {"type": ["hello"]}, {"payload": 3}, {"seq": "1"}, {"seq": -1}, {"seq": True}],
+    [
+        {"type": "kill"},
+        {"type": 3},
+        {"type": ["hello"]},
+        {"payload": 3},
+        {"seq": "1"},
+        {"seq": -1},
+        {"seq": True},
+    ],
 )
 def test_a_vla_eval_message_has_a_type_a_payload_and_a_number(change: dict[str, Any]) -> None:
     good = {"type": "hello", "payload": {}, "seq": 1, "timestamp": 0.0}
@@ -265,7 +336,9 @@ def test_a_vla_eval_message_has_a_type_a_payload_and_a_number(change: dict[str, 
 
 
 def test_openvla_reads_what_is_encoded_twice() -> None:
-    payload, twice = openvla_codec.decode(json.dumps({"encoded": as_openvla(OBS).decode()}).encode())
+    payload, twice = openvla_codec.decode(
+        json.dumps({"encoded": as_openvla(OBS).decode()}).encode()
+    )
     assert twice
     require_equal(OBS, payload)
     assert not openvla_codec.decode(as_openvla(OBS))[1]

@@ -1,4 +1,6 @@
-"""GR00T's clients, of N1.5 and newer, over ZMQ: their messages and sessions, and what a bad client can do."""
+"""GR00T's clients, of N1.5 and newer, over ZMQ: their messages and sessions, and what a bad
+client can do.
+"""
 
 from __future__ import annotations
 
@@ -37,7 +39,9 @@ from vlagents_ray_dialects.messages import gr00t as gr00t_codec
 LIMITS = Limits()
 
 
-def said(endpoint: str, data: Any = None, encode: Callable[[Any], Any] = gr00t_client.encode, **more: Any) -> bytes:
+def said(
+    endpoint: str, data: Any = None, encode: Callable[[Any], Any] = gr00t_client.encode, **more: Any
+) -> bytes:
     """As the client packs it."""
     return msgpack.packb({"endpoint": endpoint, "data": data, **more}, default=encode)
 
@@ -46,12 +50,18 @@ def nested(b: int = 1, t: int = 1, texts: Any = None) -> dict[str, Any]:
     """N1.6 and newer."""
     video = np.arange(b * t, dtype=np.uint8).reshape(b, t, 1, 1, 1) * np.ones((4, 6, 3), np.uint8)
     state = np.arange(b * t, dtype=np.float32).reshape(b, t, 1) * np.ones(2, np.float32)
-    return {"video": {"ego": video}, "state": {"arm": state}, "language": {"task": texts or [["go"]] * b}}
+    return {
+        "video": {"ego": video},
+        "state": {"arm": state},
+        "language": {"task": texts or [["go"]] * b},
+    }
 
 
 @pytest.mark.parametrize("encode", [gr00t_client.encode, gr00t_client.encode_packed])
 def test_arrays_come_as_numpy_writes_them(encode: Callable[[Any], Any]) -> None:
-    for dtype, shape in itertools.product(("|u1", "<f4", "<f8", "<i8", "|b1"), ((), (3,), (2, 0, 3), (1, 2, 3, 4))):
+    for dtype, shape in itertools.product(
+        ("|u1", "<f4", "<f8", "<i8", "|b1"), ((), (3,), (2, 0, 3), (1, 2, 3, 4))
+    ):
         array = np.ones(shape, dtype)
         request = gr00t_codec.read_request(said("get_action", {"a": array}, encode), LIMITS)
         assert request.packed == (encode is gr00t_client.encode_packed)
@@ -61,19 +71,25 @@ def test_arrays_come_as_numpy_writes_them(encode: Callable[[Any], Any]) -> None:
 
 def test_a_fortran_array_and_text_arrays_are_read() -> None:
     array = np.asfortranarray(np.arange(6.0).reshape(2, 3))
-    data = gr00t_codec.read_request(said("get_action", {"a": array, "t": np.array(["go"])}), LIMITS).data
+    data = gr00t_codec.read_request(
+        said("get_action", {"a": array, "t": np.array(["go"])}), LIMITS
+    ).data
     assert np.array_equal(data["a"], array)
     assert data["t"] == ["go"]
 
 
 def test_observations_of_a_batch_are_taken_apart_and_actions_joined() -> None:
-    asked = gr00t_codec.read_observations({"observation": nested(3, 2, [["a"], ["b"], ["c"]]), "options": None})
+    asked = gr00t_codec.read_observations(
+        {"observation": nested(3, 2, [["a"], ["b"], ["c"]]), "options": None}
+    )
     assert (len(asked.each), asked.batched, asked.flat, asked.paired) == (3, True, False, True)
     last = [gr00t_codec.newest(one) for one in asked.each]
     assert [int(one["video"]["ego"].max()) for one in last] == [1, 3, 5]
     assert [one["state"]["arm"].tolist() for one in last] == [[1, 1], [3, 3], [5, 5]]
     assert [one["language"] for one in last] == [{"task": "a"}, {"task": "b"}, {"task": "c"}]
-    action, info = gr00t_codec.write_actions([{"arm": np.full((4, 2), i)} for i in range(3)], asked, {"done": []})
+    action, info = gr00t_codec.write_actions(
+        [{"arm": np.full((4, 2), i)} for i in range(3)], asked, {"done": []}
+    )
     assert action["arm"].shape == (3, 4, 2)
     assert info == {"done": []}
 
@@ -98,7 +114,10 @@ def test_n1_5_sends_flat_keys_and_gets_the_actions_alone(batched: bool) -> None:
     [
         {},
         {"video": {"ego": np.zeros((4, 6, 3), np.uint8)}},
-        {"video": {"ego": np.zeros((1, 1, 4, 6, 3), np.uint8)}, "state": {"arm": np.zeros((2, 1, 2))}},
+        {
+            "video": {"ego": np.zeros((1, 1, 4, 6, 3), np.uint8)},
+            "state": {"arm": np.zeros((2, 1, 2))},
+        },
         {"video": {"ego": np.zeros((1, 0, 4, 6, 3), np.uint8)}},
         {"video": {"ego": "x"}},
         {"video": {"ego": np.zeros((0, 1, 4, 6, 3), np.uint8)}},
@@ -157,7 +176,9 @@ def test_too_many_values_and_too_deep_ones_are_refused() -> None:
     with pytest.raises(VLAgentsError):
         gr00t_codec.read_request(said("get_action", {str(i): {} for i in range(20_000)}), LIMITS)
     with pytest.raises(VLAgentsError):
-        gr00t_codec.read_request(said("get_action", {str(i): [0] * 500 for i in range(100)}), LIMITS)
+        gr00t_codec.read_request(
+            said("get_action", {str(i): [0] * 500 for i in range(100)}), LIMITS
+        )
     with pytest.raises(MalformedMessage):
         gr00t_codec.read_request(b"\x91" * 100_000, LIMITS)
     with pytest.raises(MessageTooLarge):
@@ -169,13 +190,17 @@ def test_a_header_made_to_be_searched_for_long_is_refused_at_once() -> None:
     file = b"\x93NUMPY\x01\x00" + len(header).to_bytes(2, "little") + header
     begun = time.process_time()
     with pytest.raises(MalformedMessage):
-        gr00t_codec.read_request(said("get_action", {"a": {"__ndarray_class__": True, "as_npy": file}}), LIMITS)
+        gr00t_codec.read_request(
+            said("get_action", {"a": {"__ndarray_class__": True, "as_npy": file}}), LIMITS
+        )
     assert time.process_time() - begun < 1.0  # each digit doubled it once, 28 take ten seconds
 
 
 def test_arrays_of_text_count_by_their_texts() -> None:
     with pytest.raises(MessageTooLarge, match="values"):
-        gr00t_codec.read_request(said("get_action", {str(i): np.full((60, 100), "x") for i in range(2)}), LIMITS)
+        gr00t_codec.read_request(
+            said("get_action", {str(i): np.full((60, 100), "x") for i in range(2)}), LIMITS
+        )
 
 
 FRAMES = int(os.environ.get("VLAGENTS_RAY_FUZZ", many(5000)))
@@ -196,7 +221,9 @@ def seen(pixel: int, text: str = "abc", batch: int = 1) -> dict[str, Any]:
 
 
 def so100(pixel: int, text: str) -> dict[str, Any]:
-    """As N1.5's SO-100 client builds it: examples/SO-100/eval_lerobot.py, two cameras, batched by itself."""
+    """As N1.5's SO-100 client builds it: examples/SO-100/eval_lerobot.py, two cameras, batched
+    by itself.
+    """
     return {
         "video.front": np.full((1, 8, 8, 3), pixel, np.uint8),
         "video.wrist": np.zeros((1, 8, 8, 3), np.uint8),
@@ -231,45 +258,85 @@ def test_a_batch_is_as_many_sessions(open_dialect, replicas: Replicas) -> None:
     with PolicyClient(open_dialect("gr00t")) as client:
         for step in (1, 2):
             action, _ = client.get_action(seen(100, batch=4))
-            assert [rows(action, i) for i in range(4)] == [[100 + i, 0.5, -1, 3, step] for i in range(4)]
+            assert [rows(action, i) for i in range(4)] == [
+                [100 + i, 0.5, -1, 3, step] for i in range(4)
+            ]
         assert sessions(replicas) == 4
         assert rows(client.get_action(seen(7))[0]) == [7, 0.5, -1, 3, 3]
         assert sessions(replicas) == 1
 
 
 @pytest.mark.parametrize("preset", ["gr00t", "gr00t-n1.5"])
-def test_each_preset_delivers_what_either_generation_sends(open_dialect, replicas: Replicas, preset: str) -> None:
+def test_each_preset_delivers_what_either_generation_sends(
+    open_dialect, replicas: Replicas, preset: str
+) -> None:
     port = open_dialect(
-        "gr00t", mapping={"preset": preset, "action": {"action.arm": {"stop": 3}, "hand": {"start": 3}}}
+        "gr00t",
+        mapping={"preset": preset, "action": {"action.arm": {"stop": 3}, "hand": {"start": 3}}},
     )
     with PolicyClient(port, n15=True) as client:
         action = client.get_action_n15(so100(9, "abcd"))
-        assert (action["action.arm"][0].tolist(), action["action.hand"][0].tolist()) == ([9, 3, -1], [4, 1])
+        assert (action["action.arm"][0].tolist(), action["action.hand"][0].tolist()) == (
+            [9, 3, -1],
+            [4, 1],
+        )
     with PolicyClient(port) as client:
         action, _ = client.get_action(seen(10))
-        assert (action["arm"][0, 0].tolist(), action["hand"][0, 0].tolist()) == ([10, 0.5, -1], [3, 1])
+        assert (action["arm"][0, 0].tolist(), action["hand"][0, 0].tolist()) == (
+            [10, 0.5, -1],
+            [3, 1],
+        )
 
 
 @pytest.mark.parametrize(
     ("n15", "mapping", "names"),
     [
-        (True, {"preset": "gr00t-n1.5", "cameras": {"front": "video.webcam"}, "state": {"joints": "state.single_arm"}},
-         {"video": ["video.webcam"], "state": ["state.single_arm"], "action": ["action"],
-          "language": ["annotation.human.task_description"]}),
-        (False, {"cameras": {"front": "video/ego_view"}, "state": {"joints": ["state/arm", "state/hand"]}},
-         {"video": ["ego_view"], "state": ["arm", "hand"], "action": ["action"], "language": ["task"]}),
-        (False, "gr00t", {"action": ["action"], "language": ["task"]}),  # the policy states no contract
+        (
+            True,
+            {
+                "preset": "gr00t-n1.5",
+                "cameras": {"front": "video.webcam"},
+                "state": {"joints": "state.single_arm"},
+            },
+            {
+                "video": ["video.webcam"],
+                "state": ["state.single_arm"],
+                "action": ["action"],
+                "language": ["annotation.human.task_description"],
+            },
+        ),
+        (
+            False,
+            {
+                "cameras": {"front": "video/ego_view"},
+                "state": {"joints": ["state/arm", "state/hand"]},
+            },
+            {
+                "video": ["ego_view"],
+                "state": ["arm", "hand"],
+                "action": ["action"],
+                "language": ["task"],
+            },
+        ),
+        # The policy states no contract.
+        (False, "gr00t", {"action": ["action"], "language": ["task"]}),
     ],
-)  # fmt: skip
-def test_a_config_has_the_clients_names_as_its_generation_reads_them(open_dialect, n15, mapping, names) -> None:
+)
+def test_a_config_has_the_clients_names_as_its_generation_reads_them(
+    open_dialect, n15, mapping, names
+) -> None:
     with PolicyClient(open_dialect("gr00t", mapping=mapping), n15=n15) as client:
         config = client.get_modality_config()
     assert {name: one["modality_keys"] for name, one in config.items()} == names
     assert all("delta_indices" in one for one in config.values())
 
 
-def test_cameras_that_the_mapping_does_not_read_are_logged_once(open_dialect, caplog: pytest.LogCaptureFixture) -> None:
-    port = open_dialect("gr00t", mapping={"cameras": {"front": "video/front"}, "state": {"*": "state/*"}})
+def test_cameras_that_the_mapping_does_not_read_are_logged_once(
+    open_dialect, caplog: pytest.LogCaptureFixture
+) -> None:
+    port = open_dialect(
+        "gr00t", mapping={"cameras": {"front": "video/front"}, "state": {"*": "state/*"}}
+    )
     for _ in range(2):
         with PolicyClient(port, n15=True) as client:
             for _ in range(2):
@@ -319,7 +386,8 @@ def test_who_is_over_the_rate_of_its_key_is_not_read_for_a_while(limited: Limite
         for _ in range(2):
             with pytest.raises(RuntimeError, match="too_many_requests"):
                 client.ping()
-        assert time.monotonic() - begun >= 1.0  # a second after each refusal, of which the last one's is to come
+        # A second after each refusal, of which the last one's is to come.
+        assert time.monotonic() - begun >= 1.0
         assert other.ping()["status"] == "ok"
 
 
@@ -358,13 +426,23 @@ def test_sessions_of_a_revoked_key_end_by_themselves(limited: Limited, replicas:
         wait_for(lambda: limited.known.keys._held == {"lab": 1})
 
 
-def test_nothing_of_a_message_is_read_before_its_key(limited: Limited, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_nothing_of_a_message_is_read_before_its_key(
+    limited: Limited, monkeypatch: pytest.MonkeyPatch
+) -> None:
     read: list[bytes] = []
-    monkeypatch.setattr("vlagents_ray_dialects.messages.gr00t.read_request", lambda *_: read.append(b""))
+    monkeypatch.setattr(
+        "vlagents_ray_dialects.messages.gr00t.read_request", lambda *_: read.append(b"")
+    )
     limited.known.add("lab")
     deep = b"\x91" * 100_000
     head = b"\x82\xa9api_token\xa5wrong\xa4data"
-    for message in (deep, head + deep, b"\x82\xa4data" + deep, b"\xdf\xff\xff\xff\xff", b"\x81\xa9api_token" + deep):
+    for message in (
+        deep,
+        head + deep,
+        b"\x82\xa4data" + deep,
+        b"\xdf\xff\xff\xff\xff",
+        b"\x81\xa9api_token" + deep,
+    ):
         assert b"error" in _raw(limited.port, message)
     assert not read
 
@@ -378,11 +456,18 @@ def _raw(port: int, message: bytes) -> bytes:
         return client.recv()
 
 
-@pytest.mark.parametrize("greeting", [b"\x04\x00one\x02\x00x", b"\xff" + bytes(8) + b"\x7f\x01\x05\x00\x00"])
+@pytest.mark.parametrize(
+    "greeting", [b"\x04\x00one\x02\x00x", b"\xff" + bytes(8) + b"\x7f\x01\x05\x00\x00"]
+)
 def test_peers_of_zmqs_first_protocols_are_hung_up_on(open_dialect, greeting: bytes) -> None:
-    """ZMQ kept the dead connections of some of them for ever: about one in 6,000 of the fuzzer's."""
+    """ZMQ kept the dead connections of some of them for ever: about one in 6,000 of the
+    fuzzer's.
+    """
     port = open_dialect("gr00t")
-    with socket.create_connection(("127.0.0.1", port), timeout=30) as peer, contextlib.suppress(ConnectionError):
+    with (
+        socket.create_connection(("127.0.0.1", port), timeout=30) as peer,
+        contextlib.suppress(ConnectionError),
+    ):
         peer.sendall(greeting)
         while peer.recv(4096):
             pass
@@ -397,7 +482,9 @@ def test_a_client_that_says_nothing_is_forgotten(open_dialect, replicas: Replica
         assert rows(client.get_action(seen(2))[0]) == [2, 0.5, -1, 3, 1]
 
 
-def test_one_client_more_than_the_limit_is_told_so_unless_another_has_no_session(open_dialect) -> None:
+def test_one_client_more_than_the_limit_is_told_so_unless_another_has_no_session(
+    open_dialect,
+) -> None:
     port = open_dialect("gr00t", sessions=2)
     with PolicyClient(port) as one, PolicyClient(port) as two, PolicyClient(port) as three:
         one.get_action(seen(1))
@@ -424,7 +511,8 @@ def test_a_slow_and_a_greedy_client_hold_up_nobody(open_dialect) -> None:
                 deaf.send_multipart([b"", message])
             except zmq.Again:
                 break
-        with socket.create_connection(("127.0.0.1", port)), PolicyClient(port) as good:  # one that never greets
+        # One that never greets.
+        with socket.create_connection(("127.0.0.1", port)), PolicyClient(port) as good:
             for step in range(1, 6):
                 assert rows(good.get_action(seen(5))[0]) == [5, 0.5, -1, 3, step]
     finally:
@@ -438,7 +526,10 @@ def test_mutated_messages_get_an_error_or_an_answer(open_dialect, replicas: Repl
     port = open_dialect("gr00t", sessions=16)
     choose = random.Random(3)
     request = {"endpoint": "get_action", "data": {"observation": seen(9), "options": None}}
-    messages = [msgpack.packb(request, default=encode) for encode in (gr00t_client.encode, gr00t_client.encode_packed)]
+    messages = [
+        msgpack.packb(request, default=encode)
+        for encode in (gr00t_client.encode, gr00t_client.encode_packed)
+    ]
     messages.append(msgpack.packb({"endpoint": "ping"}))
     context = zmq.Context()
     bad = context.socket(zmq.REQ)
@@ -453,7 +544,13 @@ def test_mutated_messages_get_an_error_or_an_answer(open_dialect, replicas: Repl
                 message = bytearray(choose.choice(messages))
                 for _ in range(choose.randrange(1, 4)):
                     message[choose.randrange(len(message))] = choose.randrange(256)
-                bad.send(bytes(message[: choose.randrange(1, len(message) + 1)] if number % 4 == 0 else message))
+                bad.send(
+                    bytes(
+                        message[: choose.randrange(1, len(message) + 1)]
+                        if number % 4 == 0
+                        else message
+                    )
+                )
                 msgpack.unpackb(bad.recv())
                 if number % 200 == 0:
                     assert rows(good.get_action(seen(5))[0])[-1] == number // 200 + 1

@@ -1,4 +1,6 @@
-"""What peers without a key choose in the framing of GR00T's gateway costs it no memory, no threads and no places."""
+"""What peers without a key choose in the framing of GR00T's gateway costs it no memory, no
+threads and no places.
+"""
 
 from __future__ import annotations
 
@@ -76,7 +78,9 @@ def gateway(monkeypatch: pytest.MonkeyPatch) -> Iterator[Gateway]:
     keys.add("robot")
     admission = Admission(DEFAULT_LIMITS.in_flight_bytes)
     check = partial(keys.keys.check, app="app")
-    context = GatewayContext("app", _no_replica, DEFAULT_LIMITS, PLACES, 600.0, None, check, admission)
+    context = GatewayContext(
+        "app", _no_replica, DEFAULT_LIMITS, PLACES, 600.0, None, check, admission
+    )
     dialect = gr00t.GR00TDialect("gr00t", gr00t.GR00TDialectConfig(), context)
     listener = reserve("gr00t", LOOPBACK, 0)
     port = listener.getsockname()[1]
@@ -106,7 +110,9 @@ MESSAGES: dict[str, Callable[[], tuple[bytes, list[bytes]]]] = {
     "empty parts": _parts(*[b""] * 10_000, PING),
     "large payload": _parts(b"", LARGE),
     "large key": _parts(b"", msgpack.packb({"endpoint": "ping", "api_token": "x" * 8_000_000})),
-    "large data before the key": _parts(b"", msgpack.packb({"data": LARGE, "api_token": "vlr_wrong"})),
+    "large data before the key": _parts(
+        b"", msgpack.packb({"data": LARGE, "api_token": "vlr_wrong"})
+    ),
     "a part of its own": lambda: (b"", [b"%d" % next(NUMBERS), b"", PING]),
     "an identity of its own": lambda: (b"me %d" % next(NUMBERS), [b"", WRONG]),
     "the longest identity": lambda: (b"%0255d" % next(NUMBERS), [b"", WRONG]),
@@ -135,7 +141,9 @@ def test_a_message_without_a_key_leaves_nothing_behind(gateway: Gateway, name: s
 
 @pytest.mark.parametrize("chooses", ["one part each", "one identity each", "nothing"])
 def test_a_flood_without_keys_takes_no_place_and_no_thread(gateway: Gateway, chooses: str) -> None:
-    """Of which there are eight; a client with a key comes in beside it, and is answered about as fast as alone."""
+    """Of which there are eight; a client with a key comes in beside it, and is answered about as
+    fast as alone.
+    """
     stopped = threading.Event()
 
     def flood() -> None:
@@ -146,7 +154,8 @@ def test_a_flood_without_keys_takes_no_place_and_no_thread(gateway: Gateway, cho
                     added = [b"%d" % number] if chooses == "one part each" else []
                     peer.send_multipart([*added, b"", WRONG])
                     if number % 20 == 0:
-                        time.sleep(0.005)  # as much as s15b of the proofs sends, so that the sender takes no core
+                        # As much as s15b of the proofs sends, so that the sender takes no core.
+                        time.sleep(0.005)
                 peer.poll(20)
 
     def median_ms() -> float:
@@ -199,7 +208,9 @@ def test_a_connection_whose_messages_have_no_key_is_closed_after_some(gateway: G
 
 def test_a_proxy_that_would_mix_the_sessions_of_its_clients_gets_an_error(gateway: Gateway) -> None:
     with gateway.connect() as proxy:
-        proxy.send_multipart([b"client-1", b"", msgpack.packb({"endpoint": "ping", "api_token": "vlr_robot"})])
+        proxy.send_multipart(
+            [b"client-1", b"", msgpack.packb({"endpoint": "ping", "api_token": "vlr_robot"})]
+        )
         *envelope, answer = proxy.recv_multipart()
         assert envelope == [b"client-1", b""]
         assert "without a ZeroMQ proxy" in msgpack.unpackb(answer)["error"]
@@ -219,7 +230,9 @@ def test_a_client_with_a_revoked_key_is_a_stranger_again(gateway: Gateway) -> No
 def test_a_client_that_loses_its_place_keeps_its_connection(
     gateway: Gateway, monkeypatch: pytest.MonkeyPatch, cause: str
 ) -> None:
-    """A request that crosses the end of a connection is lost, and ZeroMQ's clients wait for its answer for ever."""
+    """A request that crosses the end of a connection is lost, and ZeroMQ's clients wait for its
+    answer for ever.
+    """
     with contextlib.ExitStack() as stack:
         robot = stack.enter_context(gateway.connect(zmq.REQ))
         monitor = stack.enter_context(robot.get_monitor_socket(zmq.EVENT_DISCONNECTED))

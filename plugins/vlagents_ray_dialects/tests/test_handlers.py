@@ -1,4 +1,6 @@
-"""Dialects of the server's own port: all of them, OpenVLA, vla-eval; tests/golden has the answers to each request."""
+"""Dialects of the server's own port: all of them, OpenVLA, vla-eval; tests/golden has the
+answers to each request.
+"""
 
 from __future__ import annotations
 
@@ -11,7 +13,20 @@ from typing import Any, ClassVar
 
 import numpy as np
 import pytest
-from dialect_server import ALL, LIMITS, METADATA, body, call, client_of, image, libero, receive, seen, send, serving
+from dialect_server import (
+    ALL,
+    LIMITS,
+    METADATA,
+    body,
+    call,
+    client_of,
+    image,
+    libero,
+    receive,
+    seen,
+    send,
+    serving,
+)
 from in_memory_keys import ChangingKeys
 from in_process_replicas import Replicas
 from served_agents import Mirror
@@ -37,7 +52,10 @@ from vlagents_ray_dialects.openvla import OpenVLADialect
 
 def test_a_replica_that_stops_keeps_no_session_that_nobody_will_ask_for() -> None:
     with serving(Mirror(), ALL) as (client, engine):
-        with client.websocket_connect("/openpi") as pi, client.websocket_connect("/vla-eval") as benchmark:
+        with (
+            client.websocket_connect("/openpi") as pi,
+            client.websocket_connect("/vla-eval") as benchmark,
+        ):
             pi.receive_bytes()
             call(pi, libero(1))
             send(benchmark, "observation", seen(1), 1)
@@ -49,7 +67,10 @@ def test_a_replica_that_stops_keeps_no_session_that_nobody_will_ask_for() -> Non
 
 
 def test_a_connection_that_the_replica_has_no_room_for_is_told_to_come_later() -> None:
-    with serving(Mirror(), ALL, session_limit=1) as (client, _), client.websocket_connect("/openpi") as socket:
+    with (
+        serving(Mirror(), ALL, session_limit=1) as (client, _),
+        client.websocket_connect("/openpi") as socket,
+    ):
         socket.receive_bytes()
         call(socket, libero(1))
         for path in ("/openpi", "/vla-eval"):
@@ -83,7 +104,9 @@ def test_dialects_count_in_the_statistics_by_their_names() -> None:
 
 def test_until_the_policy_is_loaded_every_dialect_answers_503() -> None:
     context = ReplicaContext(Engine(Mirror()), lambda: METADATA, LIMITS)
-    inside = build_http_app(context.engine, lambda: METADATA, LIMITS, more=dialect_routes(DialectArgs(**ALL), context))
+    inside = build_http_app(
+        context.engine, lambda: METADATA, LIMITS, more=dialect_routes(DialectArgs(**ALL), context)
+    )
     with TestClient(AccessMiddleware(inside, None, "app")) as client:
         assert client.get("/health").status_code == 503
         assert client.post("/act", json=body(1)).status_code == 503
@@ -98,14 +121,24 @@ def test_until_the_policy_is_loaded_every_dialect_answers_503() -> None:
     [
         ({"chunk": True, "plain": True}, [[3, 0, 1, 1, 0], [3, 0, 1, 1, 1]]),
         ({"plain": True}, [3, 0, 1, 1, 0]),
-        ({"chunk": True, "mapping": {"preset": "openvla", "action": {"actions": {"stop": 5}}}}, {"actions": (2, 5)}),
         (
-            {"mapping": {"preset": "openvla", "action": {"arm": {"stop": 6}, "hand": {"start": 6}}}},
+            {"chunk": True, "mapping": {"preset": "openvla", "action": {"actions": {"stop": 5}}}},
+            {"actions": (2, 5)},
+        ),
+        (
+            {
+                "mapping": {
+                    "preset": "openvla",
+                    "action": {"arm": {"stop": 6}, "hand": {"start": 6}},
+                }
+            },
             {"arm": (6,), "hand": (1,)},
         ),
     ],
 )
-def test_an_action_over_http_is_lists_or_named_columns_where_clients_read_those(settings: Any, want: Any) -> None:
+def test_an_action_over_http_is_lists_or_named_columns_where_clients_read_those(
+    settings: Any, want: Any
+) -> None:
     with serving(Mirror(chunk=2), {"openvla": settings}) as (client, _):
         answer = client.post("/act", json=body(3))
     if isinstance(want, dict):
@@ -145,7 +178,9 @@ def test_a_dialect_that_is_off_is_not_there() -> None:
         ({"openpi": {"mapping": "openpi-droid"}}, "mapping wants 8"),
     ],
 )
-def test_a_wrong_setting_is_refused_before_anything_starts(dialects: dict[str, Any], said: str) -> None:
+def test_a_wrong_setting_is_refused_before_anything_starts(
+    dialects: dict[str, Any], said: str
+) -> None:
     with pytest.raises(ConfigError, match=said):
         deployment("served_agents:Mirror", dialects=dialects)
 
@@ -154,7 +189,9 @@ def test_a_mapping_that_lacks_what_the_policy_needs_is_refused_at_the_start() ->
     args = DialectArgs(openvla={})  # type: ignore[arg-type]
 
     class Two(Agent):
-        contract = Contract({"front": CameraSpec(), "wrist": CameraSpec()}, action=ActionSpec(dim=7))
+        contract = Contract(
+            {"front": CameraSpec(), "wrist": CameraSpec()}, action=ActionSpec(dim=7)
+        )
 
         def act(self, obs: Obs) -> Act:
             return Act(np.zeros(7))
@@ -188,17 +225,29 @@ def test_what_is_on_stands_in_the_metadata_and_on_the_page() -> None:
 
 
 def test_the_settings_of_dialects_survive_the_way_to_the_replicas_and_to_the_gateway() -> None:
-    args = ServerArgs(policy="noop", dialects=ALL | {"gr00t": {}, "vlagents": {"robots": {"arm": {"stop": 6}}}})
+    args = ServerArgs(
+        policy="noop", dialects=ALL | {"gr00t": {}, "vlagents": {"robots": {"arm": {"stop": 6}}}}
+    )
     assert list(args.dialects.gateways()) == ["gr00t", "vlagents"]
     assert ServerArgs(**args.model_dump(mode="json")) == args
-    replica = ServerArgs(**args.model_dump(mode="json", exclude={"dialects": set(args.dialects.gateways())}))
+    replica = ServerArgs(
+        **args.model_dump(mode="json", exclude={"dialects": set(args.dialects.gateways())})
+    )
     assert list(replica.dialects.on()) == list(ALL)
     assert replica.dialects.gateways() == {}
 
 
-def test_cameras_that_the_mapping_does_not_read_are_logged_once(caplog: pytest.LogCaptureFixture) -> None:
-    """openpi's simple_client in ALOHA mode, of whose four cameras pi0 takes three, was answered without a word."""
-    keyed = {"cameras": {"front": "images/front"}, "state": {"joints": "state"}, "instruction": "task_description"}
+def test_cameras_that_the_mapping_does_not_read_are_logged_once(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    """openpi's simple_client in ALOHA mode, of whose four cameras pi0 takes three, was answered
+    without a word.
+    """
+    keyed = {
+        "cameras": {"front": "images/front"},
+        "state": {"joints": "state"},
+        "instruction": "task_description",
+    }
     odd = json.loads(openvla_codec.encode(image(0), twice=False))
     with serving(Mirror(), ALL | {"vla_eval": {"mapping": keyed}}) as (client, _):
         for _ in range(2):
@@ -207,7 +256,12 @@ def test_cameras_that_the_mapping_does_not_read_are_logged_once(caplog: pytest.L
                 for pixel in range(2):
                     call(socket, libero(pixel, images={"cam_low": image(0)}))
             assert client.post("/act", json=body(1, top=odd)).status_code == 200
-            assert client.post("/act", json=body(1, top=odd), headers={"x-session-id": "a"}).status_code == 200
+            assert (
+                client.post(
+                    "/act", json=body(1, top=odd), headers={"x-session-id": "a"}
+                ).status_code
+                == 200
+            )
             with client.websocket_connect("/vla-eval") as socket:
                 more = seen(1)
                 more["images"] |= {"side": image(0)}
@@ -219,26 +273,35 @@ def test_cameras_that_the_mapping_does_not_read_are_logged_once(caplog: pytest.L
         "openvla: a client sends the cameras ['top']",
         "vla_eval: a client sends the cameras ['images/side']",
     ]
-    assert "the mapping reads ['observation/image', 'observation/wrist_image']; if the policy takes them" in said[0]
+    assert (
+        "the mapping reads ['observation/image', 'observation/wrist_image']; if the policy takes "
+        "them"
+    ) in said[0]
 
 
 def test_each_key_has_openvla_sessions_of_its_own_and_pays_once_a_request() -> None:
     known = ChangingKeys()
-    keys = {name: known.add(name, **allowed) for name, allowed in (("a", {}), ("b", {}), ("slow", {"rate": 1}))}
+    keys = {
+        name: known.add(name, **allowed)
+        for name, allowed in (("a", {}), ("b", {}), ("slow", {"rate": 1}))
+    }
     with serving(Mirror(), {"openvla": {}}, known.keys) as (client, engine):
 
         def act(key: str, pixel: int, **headers: str) -> Any:
             headers["authorization"] = f"Bearer {keys[key]}"
             answer = client.post("/act", json=body(pixel), headers=headers)
             assert answer.status_code == 200, answer.text
-            return openvla_codec.decode(b'{"action": %s}' % answer.content)[0]["action"][:3].tolist()
+            return openvla_codec.decode(b'{"action": %s}' % answer.content)[0]["action"][
+                :3
+            ].tolist()
 
         named = {"x-session-id": "robot"}
         for step in (1, 2, 3):
             assert act("a", 5, **named) == [5, 0, step]
         assert act("b", 6, **named) == [6, 0, 1]
         assert act("a", 7, **named) == [7, 0, 4]
-        assert act("slow", 8) == [8, 0, 1]  # a reset and an act, of the one request that its rate holds
+        # A reset and an act, of the one request that its rate holds.
+        assert act("slow", 8) == [8, 0, 1]
         assert sorted(engine.sessions.ids()) == ["a/robot", "b/robot"]
 
 
@@ -246,10 +309,14 @@ def test_each_key_has_openvla_sessions_of_its_own_and_pays_once_a_request() -> N
 def test_a_session_over_http_goes_on_at_another_replica_with_its_state(stops: bool) -> None:
     with contextlib.ExitStack() as stack:
         replicas = stack.enter_context(contextlib.closing(Replicas([Mirror(), Mirror()])))
-        clients = [stack.enter_context(client_of(engine, {"openvla": {}})) for engine in replicas.engines]
+        clients = [
+            stack.enter_context(client_of(engine, {"openvla": {}})) for engine in replicas.engines
+        ]
 
         def act(replica: int, instruction: str = "task 1") -> Any:
-            answer = clients[replica].post("/act", json=body(5, instruction), headers={"x-session-id": "robot"})
+            answer = clients[replica].post(
+                "/act", json=body(5, instruction), headers={"x-session-id": "robot"}
+            )
             return openvla_codec.decode(b'{"action": %s}' % answer.content)[0]["action"][2]
 
         assert [act(0), act(0), act(0)] == [1, 2, 3]
@@ -280,7 +347,9 @@ def test_a_new_key_of_a_revoked_ones_name_goes_on_with_its_sessions(
         assert (act(old), act(new)) == (401, 200)
 
 
-def test_a_hello_of_another_version_is_refused_and_the_connection_stays(context: tuple[TestClient, Engine]) -> None:
+def test_a_hello_of_another_version_is_refused_and_the_connection_stays(
+    context: tuple[TestClient, Engine],
+) -> None:
     assert context[0].get("/health").json() == {"status": "ok"}
     with context[0].websocket_connect("/vla-eval") as socket:
         for version, kind in ((None, "error"), (np.zeros(2), "error"), (1, "hello")):
@@ -302,16 +371,24 @@ def test_of_observations_that_nobody_waits_for_the_newest_is_acted_on() -> None:
         assert begun.wait(10)
         for seq in range(2, 50):
             send(socket, "observation", seen(seq), seq)
-        send(socket, "hello", {"protocol_version": 1}, 50)  # its answer says that all before it are there
+        # Its answer says that all before it are there.
+        send(socket, "hello", {"protocol_version": 1}, 50)
         gate.set()
         assert [receive(socket).seq for _ in range(3)] == [1, 49, 50]
 
 
 def test_observations_between_two_chunks_need_no_images() -> None:
-    """A benchmark that renders every third observation, as the chunk's other rows are executed in the open."""
-    rendered = {name: value for name, value in seen(3).items() if name != "state"} | {"joint_state": np.ones(3)}
+    """A benchmark that renders every third observation, as the chunk's other rows are executed
+    in the open.
+    """
+    rendered = {name: value for name, value in seen(3).items() if name != "state"} | {
+        "joint_state": np.ones(3)
+    }
     bare = {"task_description": "task 1"}
-    with serving(Mirror(chunk=3), {"vla_eval": {}}) as (client, _), client.websocket_connect("/vla-eval") as socket:
+    with (
+        serving(Mirror(chunk=3), {"vla_eval": {}}) as (client, _),
+        client.websocket_connect("/vla-eval") as socket,
+    ):
 
         def answer(payload: dict[str, Any], seq: int) -> Any:
             send(socket, "observation", payload, seq)
@@ -320,14 +397,18 @@ def test_observations_between_two_chunks_need_no_images() -> None:
         rows = [answer(rendered if seq % 3 == 0 else bare, seq) for seq in range(6)]
         assert [message.kind for message in rows] == ["action"] * 6
         assert [float(message.payload["actions"][4]) for message in rows] == [0, 1, 2, 0, 1, 2]
-        # Where a chunk ends or another task begins, an observation without images is an error again.
+        # Where a chunk ends or another task begins, an observation without images is an error
+        # again.
         assert answer(bare, 6).kind == "error"
         assert answer(rendered, 7).kind == "action"
         assert answer({"task_description": "task 2"}, 8).kind == "error"
 
 
 def test_a_client_that_sends_far_more_than_it_waits_for_is_cut_off() -> None:
-    with serving(Mirror(slow_s=0.1), {"vla_eval": {}}) as (client, _), client.websocket_connect("/") as socket:
+    with (
+        serving(Mirror(slow_s=0.1), {"vla_eval": {}}) as (client, _),
+        client.websocket_connect("/") as socket,
+    ):
         for seq in range(100):
             send(socket, "observation", seen(1), seq)
             send(socket, "hello", {"protocol_version": 1}, seq)

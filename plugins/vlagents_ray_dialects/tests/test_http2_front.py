@@ -31,8 +31,12 @@ Connect = Callable[[], socket.socket]
     st.lists(st.sampled_from([0, 1, 8, 300, 4095, 4096, 16384]), max_size=30),
     st.lists(st.integers(1, 5000), min_size=1, max_size=20),
 )
-def test_small_frames_are_counted_wherever_the_bytes_are_split(sizes: list[int], reads: list[int]) -> None:
-    data = b"".join(size.to_bytes(3, "big") + bytes([0, 0, 0, 0, 0, 1]) + bytes(size) for size in sizes)
+def test_small_frames_are_counted_wherever_the_bytes_are_split(
+    sizes: list[int], reads: list[int]
+) -> None:
+    data = b"".join(
+        size.to_bytes(3, "big") + bytes([0, 0, 0, 0, 0, 1]) + bytes(size) for size in sizes
+    )
     counter, counted, start = FrameCounter(), 0, 0
     while start < len(data):
         for size in reads:
@@ -63,13 +67,17 @@ def read_to_the_end(connection: socket.socket) -> bytes:
 
 
 @pytest.mark.parametrize("first", [b"GET / HTTP/1.1\r\n\r\n", PREFACE[:20] + b"x", b"\x16\x03\x01"])
-def test_a_connection_without_the_preface_of_http2_ends_at_once(connect: Connect, first: bytes) -> None:
+def test_a_connection_without_the_preface_of_http2_ends_at_once(
+    connect: Connect, first: bytes
+) -> None:
     with connect() as connection:
         connection.sendall(first)
         assert read_to_the_end(connection) == b""
 
 
-def test_half_a_preface_ends_after_the_time_of_a_handshake(connect: Connect, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_half_a_preface_ends_after_the_time_of_a_handshake(
+    connect: Connect, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(http2_front, "_HANDSHAKE_S", 0.1)
     with connect() as connection:
         connection.sendall(PREFACE[:10])
@@ -102,14 +110,18 @@ def test_frames_above_the_rate_wait(connect: Connect, monkeypatch: pytest.Monkey
             connection.recv(1)
 
 
-def test_strangers_end_the_oldest_stranger_and_no_client(open_dialect: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_strangers_end_the_oldest_stranger_and_no_client(
+    open_dialect: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(http2_front, "_STRANGERS", 3)
     monkeypatch.setattr(acceptor, "_ACCEPTED_PER_S", 1000.0)
     port = open_dialect("lerobot")
     with AsyncClient(port).begin() as robot, contextlib.ExitStack() as stack:
         strangers = []
         for _ in range(8):
-            stranger = stack.enter_context(socket.create_connection(("127.0.0.1", port), timeout=10))
+            stranger = stack.enter_context(
+                socket.create_connection(("127.0.0.1", port), timeout=10)
+            )
             stranger.sendall(PREFACE + SETTINGS)
             strangers.append(stranger)
         for stranger in strangers[:5]:
@@ -118,7 +130,9 @@ def test_strangers_end_the_oldest_stranger_and_no_client(open_dialect: Any, monk
         assert robot.act(robot_saw(0))
 
 
-def test_a_robot_is_not_slowed_by_the_bound_of_frames(open_dialect: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_robot_is_not_slowed_by_the_bound_of_frames(
+    open_dialect: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Without tokens for more frames than those of 150 requests, they are answered."""
     monkeypatch.setattr(http2_front, "_FRAMES_PER_S", 1e-6)
     monkeypatch.setattr(http2_front, "_FRAMES_AT_ONCE", 150 * 6)
@@ -137,7 +151,8 @@ def test_clients_of_one_server_are_told_apart_and_nothing_is_left() -> None:
     front = Http2Front("test", lambda _: True)
     handler = grpc.unary_unary_rpc_method_handler(answer)
     server = grpc.server(
-        ThreadPoolExecutor(2), handlers=[grpc.method_handlers_generic_handler("Service", {"Method": handler})]
+        ThreadPoolExecutor(2),
+        handlers=[grpc.method_handlers_generic_handler("Service", {"Method": handler})],
     )
     server.add_insecure_port(front.address)
     server.start()
@@ -161,7 +176,9 @@ ANSWER = bytes(range(256)) * 32 * 1024  # more than the kernel's buffers hold
 
 
 class StoppedServer:
-    """A front whose server has written an answer of 8 MiB and ended, which the client has not read; and a stranger."""
+    """A front whose server has written an answer of 8 MiB and ended, which the client has not
+    read; and a stranger.
+    """
 
     def __init__(self, stack: contextlib.ExitStack) -> None:
         self.client_peer = ""
@@ -187,8 +204,12 @@ class StoppedServer:
         return peer == self.client_peer
 
     @staticmethod
-    def _connected(stack: contextlib.ExitStack, front: Http2Front, listener: socket.socket) -> socket.socket:
-        connection = stack.enter_context(socket.create_connection(listener.getsockname(), timeout=10))
+    def _connected(
+        stack: contextlib.ExitStack, front: Http2Front, listener: socket.socket
+    ) -> socket.socket:
+        connection = stack.enter_context(
+            socket.create_connection(listener.getsockname(), timeout=10)
+        )
         front.add(listener.accept()[0])
         return connection
 
@@ -234,4 +255,5 @@ def test_no_stranger_and_no_client_that_does_not_read_delays_a_stop(stopped: Sto
     stranger_s = time.monotonic() - begun
     stopped.join()
     assert stranger_s < (time.monotonic() - begun) / 2
-    assert time.monotonic() - begun < http2_front._HANDSHAKE_S  # after which a stranger is disconnected anyway
+    # After which a stranger is disconnected anyway.
+    assert time.monotonic() - begun < http2_front._HANDSHAKE_S

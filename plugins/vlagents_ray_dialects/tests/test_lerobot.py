@@ -1,4 +1,6 @@
-"""Clients of LeRobot's asynchronous inference over real gRPC: their sessions, and what a bad client can do."""
+"""Clients of LeRobot's asynchronous inference over real gRPC: their sessions, and what a bad
+client can do.
+"""
 
 from __future__ import annotations
 
@@ -16,7 +18,18 @@ import numpy as np
 import pytest
 from eval_fakes import wait_for
 from in_process_replicas import Replicas
-from lerobot_messages import BEGIN, END, FEATURES, MIDDLE, AsyncClient, field_of, parts_of, pickled, robot_saw, setup
+from lerobot_messages import (
+    BEGIN,
+    END,
+    FEATURES,
+    MIDDLE,
+    AsyncClient,
+    field_of,
+    parts_of,
+    pickled,
+    robot_saw,
+    setup,
+)
 from many import many
 
 from vlagents_ray_dialects.gateway_sessions import GatewaySessions
@@ -45,12 +58,17 @@ def test_each_client_has_a_session_and_gets_its_chunks(open_lerobot, replicas: R
     with AsyncClient(port) as red, AsyncClient(port) as blue:
         red.begin(), blue.begin(actions_per_chunk=1)
         answer = red.act(robot_saw(4, pixel=10))
-        # a pixel, the first number of the state, no gripper, the length of the task, and the number of the act
+        # a pixel, the first number of the state, no gripper, the length of the task, and the number
+        # of the act
         assert rows(answer) == [[10, 0.5, -1, 3, 1], [10, 0.5, -1, 3, 2]]
-        assert [(action.timestep, round(action.timestamp, 4)) for action in answer] == [(4, 1004), (5, 1004.0333)]
+        assert [(action.timestep, round(action.timestamp, 4)) for action in answer] == [
+            (4, 1004),
+            (5, 1004.0333),
+        ]
         assert rows(blue.act(robot_saw(0, pixel=20, task="ab"))) == [[20, 0.5, -1, 2, 1]]
         assert rows(red.act(robot_saw(5, pixel=11)))[0] == [11, 0.5, -1, 3, 2]
-        assert rows(red.act(robot_saw(6, pixel=11, task="another")))[0] == [11, 0.5, -1, 7, 1]  # begins an episode
+        # Begins an episode.
+        assert rows(red.act(robot_saw(6, pixel=11, task="another")))[0] == [11, 0.5, -1, 7, 1]
         assert sessions(replicas) == 2
 
 
@@ -74,7 +92,9 @@ def test_who_asks_before_the_observation_gets_its_actions(open_lerobot) -> None:
         assert answer.result()
 
 
-def test_without_an_observation_there_are_no_actions(open_lerobot, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_an_observation_there_are_no_actions(
+    open_lerobot, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr("vlagents_ray_dialects.lerobot._WAIT_S", 0.05)
     with AsyncClient(open_lerobot()).begin() as robot:
         assert robot.actions() == []
@@ -96,9 +116,13 @@ def test_an_observation_in_many_parts(open_lerobot) -> None:
 
 
 def test_a_mapping_gives_the_policys_names(open_lerobot) -> None:
-    mapping = {"cameras": {"top": "observation.images.front"}, "state": {"q": {"key": "observation.state", "start": 1}}}
+    mapping = {
+        "cameras": {"top": "observation.images.front"},
+        "state": {"q": {"key": "observation.state", "start": 1}},
+    }
     with AsyncClient(open_lerobot(mapping=mapping)).begin() as robot:
-        assert rows(robot.act(robot_saw(0, pixel=6)))[0][:4] == [6, 0.25, -1, 0]  # the mapping has no instruction
+        # The mapping has no instruction.
+        assert rows(robot.act(robot_saw(0, pixel=6)))[0][:4] == [6, 0.25, -1, 0]
     mapping["cameras"] = {"top": "observation.images.side"}
     with (
         AsyncClient(open_lerobot(mapping=mapping)).begin() as robot,
@@ -113,8 +137,14 @@ def test_policy_instructions_that_do_not_fit_are_refused(open_lerobot) -> None:
         ({"checkpoint": "you/pi0"}, "this server acts for 'me/act'"),
         ({"rename_map": {"a": "b"}}, "rename_map"),
         ({"actions_per_chunk": 0}, "an integer of 1 or more"),
-        ({"lerobot_features": {"observation.state": {"dtype": "string"}}}, "want 'observation.state' of float32"),
-        ({"lerobot_features": {"observation.state": {"dtype": "float32", "names": None}}}, "want `names`"),
+        (
+            {"lerobot_features": {"observation.state": {"dtype": "string"}}},
+            "want 'observation.state' of float32",
+        ),
+        (
+            {"lerobot_features": {"observation.state": {"dtype": "float32", "names": None}}},
+            "want `names`",
+        ),
         ({"lerobot_features": {"observation.state": None}}, "got NoneType, want a dict"),
         ({"lerobot_features": []}, "got list, dict, want dicts"),
         ({"lerobot_features": many_images}, "17 cameras"),
@@ -153,7 +183,9 @@ def test_a_bad_observation_is_refused_and_the_next_is_acted_on(open_lerobot) -> 
             robot.send(robot_saw(0))
 
 
-def test_nothing_is_done_before_ready_and_the_instructions(open_lerobot, replicas: Replicas) -> None:
+def test_nothing_is_done_before_ready_and_the_instructions(
+    open_lerobot, replicas: Replicas
+) -> None:
     with AsyncClient(open_lerobot()) as robot:
         for attempt in (
             lambda: robot.send(robot_saw(0)),
@@ -183,7 +215,10 @@ def test_messages_that_are_none_are_refused(open_lerobot) -> None:
         (iter([b"\x12\xff"]), "ends too early"),
         (iter([b"\x80" * 20]), "a number that ends too early"),
         (iter([b"\x0b"]), "unknown type"),
-        (itertools.repeat(field_of(1, MIDDLE) + field_of(2, bytes(2**18))), "more than 2097152 bytes"),
+        (
+            itertools.repeat(field_of(1, MIDDLE) + field_of(2, bytes(2**18))),
+            "more than 2097152 bytes",
+        ),
     ]
     with AsyncClient(open_lerobot()).begin() as robot:
         for step, (messages, says) in enumerate(wrong):
@@ -200,7 +235,9 @@ def test_a_compressed_message_is_not_decompressed(open_lerobot) -> None:
         assert status_of(error)[0] in ("UNIMPLEMENTED", "INTERNAL")
 
 
-def test_an_observation_that_takes_too_long_ends(open_lerobot, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_observation_that_takes_too_long_ends(
+    open_lerobot, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr("vlagents_ray_dialects.lerobot._UPLOAD_S", 0.2)
     monkeypatch.setattr("vlagents_ray_dialects.acceptor.TICK_S", 0.05)
     goes_on = threading.Event()
@@ -219,7 +256,9 @@ def test_an_observation_that_takes_too_long_ends(open_lerobot, monkeypatch: pyte
         assert rows(robot.act(robot_saw(0, pixel=3)))[0][0] == 3
 
 
-def test_a_client_that_is_gone_loses_its_session(open_lerobot, replicas: Replicas, monkeypatch) -> None:
+def test_a_client_that_is_gone_loses_its_session(
+    open_lerobot, replicas: Replicas, monkeypatch
+) -> None:
     monkeypatch.setattr("vlagents_ray_dialects.acceptor.TICK_S", 0.05)
     port = open_lerobot(idle_s=0.2)
     with AsyncClient(port).begin() as robot:
@@ -229,7 +268,12 @@ def test_a_client_that_is_gone_loses_its_session(open_lerobot, replicas: Replica
 
 def test_there_are_so_many_clients_and_one_without_a_session_makes_room(open_lerobot) -> None:
     port = open_lerobot(sessions=2)
-    with AsyncClient(port) as idle, AsyncClient(port) as first, AsyncClient(port) as second, AsyncClient(port) as third:
+    with (
+        AsyncClient(port) as idle,
+        AsyncClient(port) as first,
+        AsyncClient(port) as second,
+        AsyncClient(port) as third,
+    ):
         idle.begin()
         first.begin().act(robot_saw(0))
         second.begin().act(robot_saw(0))
@@ -253,15 +297,23 @@ def test_no_other_process_shares_the_port(open_lerobot) -> None:
         server.add_insecure_port(f"127.0.0.1:{port}")
 
 
-def test_what_is_no_error_of_ours_is_logged_and_not_shown(open_lerobot, caplog, monkeypatch) -> None:
+def test_what_is_no_error_of_ours_is_logged_and_not_shown(
+    open_lerobot, caplog, monkeypatch
+) -> None:
     monkeypatch.setattr(lerobot, "frame", lambda *_: 1 / 0)
     with AsyncClient(open_lerobot()).begin() as robot, pytest.raises(grpc.RpcError) as error:
         robot.send(robot_saw(0))
     status, details = status_of(error)
-    assert (status, "ZeroDivisionError" in caplog.text, "division" in details) == ("INTERNAL", True, False)
+    assert (status, "ZeroDivisionError" in caplog.text, "division" in details) == (
+        "INTERNAL",
+        True,
+        False,
+    )
 
 
-def test_a_time_step_whose_action_failed_may_come_again(open_lerobot, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_time_step_whose_action_failed_may_come_again(
+    open_lerobot, monkeypatch: pytest.MonkeyPatch
+) -> None:
     act = GatewaySessions.act
     monkeypatch.setattr(GatewaySessions, "act", lambda *_: 1 / 0)
     with AsyncClient(open_lerobot()).begin() as robot:
@@ -277,9 +329,14 @@ def test_garbage_instead_of_grpc_holds_up_nobody(open_lerobot) -> None:
     with AsyncClient(port).begin() as robot:
         robot.act(robot_saw(0))
         for number in range(many(300)):
-            with contextlib.suppress(OSError), socket.create_connection(("127.0.0.1", port), timeout=10) as connection:
+            with (
+                contextlib.suppress(OSError),
+                socket.create_connection(("127.0.0.1", port), timeout=10) as connection,
+            ):
                 connection.sendall(preface * (number % 3 > 0))
                 if number % 3 == 2:  # a frame of any kind
-                    connection.sendall(b"\0\0" + bytes([9, choose.randrange(11)]) + choose.randbytes(5))
+                    connection.sendall(
+                        b"\0\0" + bytes([9, choose.randrange(11)]) + choose.randbytes(5)
+                    )
                 connection.sendall(choose.randbytes(choose.randrange(200)))
         assert rows(robot.act(robot_saw(1, pixel=4)))[0] == [4, 0.5, -1, 3, 2]

@@ -1,4 +1,6 @@
-"""Pickles as LeRobot's messages have them are read as data; everything else is refused, and nothing is executed."""
+"""Pickles as LeRobot's messages have them are read as data; everything else is refused, and
+nothing is executed.
+"""
 
 from __future__ import annotations
 
@@ -31,7 +33,9 @@ from vlagents_ray_dialects.messages import lerobot
 
 
 class Watch:
-    """Notes what Python's interpreter says of calls, imports, files and the like, while it is on."""
+    """Notes what Python's interpreter says of calls, imports, files and the like, while it is
+    on.
+    """
 
     def __init__(self) -> None:
         self.on = False
@@ -74,13 +78,26 @@ TUPLES = b")" + b"\x85" * 9
 
 
 def mutations(seeds: Sequence[bytes]) -> Callable[[random.Random], bytes]:
-    """Draw a pickle that was changed in a few places, with parts of other programs among its own."""
+    """Draw a pickle that was changed in a few places, with parts of other programs among its
+    own.
+    """
     seeds = [*seeds, pickled({"x": [Command(), (1, 2.0), {"y": None}]})]
     opcodes = [opcode.code.encode("latin-1") for opcode in pickletools.opcodes]
     words = [
-        named("os", "system") + short("exit 3") + b"\x85R", named("builtins", "exec"), b"cos\nsystem\n", OBJECT, ARRAY,
-        SCALAR, TUPLES, b"\x94", b"h\0", b"h\5", b"X\xff\xff\xff\xff", b"B\xff\xff\xff\x7f", b"(",
-    ]  # fmt: skip
+        named("os", "system") + short("exit 3") + b"\x85R",
+        named("builtins", "exec"),
+        b"cos\nsystem\n",
+        OBJECT,
+        ARRAY,
+        SCALAR,
+        TUPLES,
+        b"\x94",
+        b"h\0",
+        b"h\5",
+        b"X\xff\xff\xff\xff",
+        b"B\xff\xff\xff\x7f",
+        b"(",
+    ]
     ends = [_places(seed) for seed in seeds]
 
     def draw(choose: random.Random) -> bytes:
@@ -92,9 +109,14 @@ def mutations(seeds: Sequence[bytes]) -> Callable[[random.Random], bytes]:
             other = choose.randrange(len(seeds))
             cut = sorted(choose.sample(ends[other], 2))
             part = (
-                bytes([choose.randrange(256)]), choose.choice(opcodes), choose.choice(words), b"",
-                choose.randbytes(choose.randrange(9)), seeds[other][cut[0] : cut[1]], bytes(data[at : at + 9]) * 2,
-            )[kind]  # fmt: skip
+                bytes([choose.randrange(256)]),
+                choose.choice(opcodes),
+                choose.choice(words),
+                b"",
+                choose.randbytes(choose.randrange(9)),
+                seeds[other][cut[0] : cut[1]],
+                bytes(data[at : at + 9]) * 2,
+            )[kind]
             data[at : at + choose.choice((0, 0, len(part), choose.randrange(9)))] = part
         return bytes(data)
 
@@ -110,7 +132,8 @@ LIMITS = Limits(body_bytes=2**20)
 MUTATED = int(os.environ.get("VLAGENTS_RAY_FUZZ", many(5000)))
 GROWTH = 64 * 2**20  # bytes, whatever the number of pickles
 
-# What LeRobot 0.4.4's own classes pickle to, with Python 3.11: by the version of numpy, and by the protocol.
+# What LeRobot 0.4.4's own classes pickle to, with Python 3.11: by the version of numpy, and by the
+# protocol.
 SETUP = (
     "gASVqwEAAAAAAACMH2xlcm9ib3QuYXN5bmNfaW5mZXJlbmNlLmhlbHBlcnOUjBJSZW1vdGVQb2xpY3lDb25maWeUk5QpgZR9lCiMC3BvbGljeV"
     "90eXBllIwDYWN0lIwXcHJldHJhaW5lZF9uYW1lX29yX3BhdGiUjAZtZS9hY3SUjBBsZXJvYm90X2ZlYXR1cmVzlH2UKIwRb2JzZXJ2YXRpb24u"
@@ -171,7 +194,9 @@ MAPPING = read_mapping("lerobot")
 
 
 def attempt(data: bytes) -> str:
-    """Read what may be either of the messages, as the dialect does; returns the error's code, or "read"."""
+    """Read what may be either of the messages, as the dialect does; returns the error's code, or
+    "read".
+    """
     said = []
     for reader in (read, lambda data: lerobot.read_instructions(data, LIMITS)):
         try:
@@ -202,7 +227,9 @@ def test_an_observation_of_lerobots_own_client_is_read(name: str) -> None:
 
 def test_policy_instructions_of_lerobots_own_client_are_read() -> None:
     found = lerobot.read_instructions(base64.b64decode(SETUP), LIMITS)
-    want = lerobot.PolicyInstructions("act", "me/act", ("shoulder.pos", "gripper.pos"), ("front", "wrist"), 10)
+    want = lerobot.PolicyInstructions(
+        "act", "me/act", ("shoulder.pos", "gripper.pos"), ("front", "wrist"), 10
+    )
     assert found == want
 
 
@@ -239,7 +266,8 @@ def test_numbers_texts_and_arrays_keep_their_values(value: Any, protocol: int) -
 @settings(max_examples=many(30))
 @given(
     st.dictionaries(
-        st.text(max_size=40), st.text(max_size=300) | st.floats(allow_nan=False) | st.integers(-(2**63), 2**63 - 1)
+        st.text(max_size=40),
+        st.text(max_size=300) | st.floats(allow_nan=False) | st.integers(-(2**63), 2**63 - 1),
     )
 )
 def test_any_observation_of_plain_values_is_read_as_pickle_reads_it(values: dict[str, Any]) -> None:
@@ -295,16 +323,37 @@ def test_what_is_no_number_text_or_array_of_numbers_is_refused(value: Any, says:
 
 
 ODD = [
-    None, True, -1, 1.5, float("nan"), "text", b"bytes", (), (1, "a"), [], ["a"] * 9, {}, {"a": 1}, np.zeros((2, 3)),
-    np.zeros(1), np.float32(1), np.ndarray, np.dtype("f4"), robot_saw(0),
-]  # fmt: skip
+    None,
+    True,
+    -1,
+    1.5,
+    float("nan"),
+    "text",
+    b"bytes",
+    (),
+    (1, "a"),
+    [],
+    ["a"] * 9,
+    {},
+    {"a": 1},
+    np.zeros((2, 3)),
+    np.zeros(1),
+    np.float32(1),
+    np.ndarray,
+    np.dtype("f4"),
+    robot_saw(0),
+]
 
 
 @pytest.mark.parametrize("odd", ODD, ids=lambda odd: type(odd).__name__)
 def test_any_value_at_any_place_is_read_or_refused(odd: Any) -> None:
-    """Where a text, a number or a dict is expected, an array or a class has no truth value and no equal."""
+    """Where a text, a number or a dict is expected, an array or a class has no truth value and
+    no equal.
+    """
     for field in vars(setup()):
-        attempt(pickled(setup(**{"checkpoint" if field == "pretrained_name_or_path" else field: odd})))
+        attempt(
+            pickled(setup(**{"checkpoint" if field == "pretrained_name_or_path" else field: odd}))
+        )
     for name, feature in FEATURES.items():
         attempt(pickled(setup(lerobot_features={**FEATURES, name: odd})))
         for key in feature:
@@ -316,7 +365,9 @@ def test_any_value_at_any_place_is_read_or_refused(odd: Any) -> None:
 
 
 def test_a_class_of_a_listed_module_is_not_listed() -> None:
-    with pytest.raises(MalformedMessage, match=r"names 'lerobot\.async_inference\.helpers' 'FPSTracker'"):
+    with pytest.raises(
+        MalformedMessage, match=r"names 'lerobot\.async_inference\.helpers' 'FPSTracker'"
+    ):
         read(pickled(robot_saw(1)).replace(b"\x10TimedObservation", b"\x0aFPSTracker"))
     with pytest.raises(MalformedMessage, match="got RemotePolicyConfig, want a TimedObservation"):
         read(pickled(setup()))
@@ -335,10 +386,14 @@ def test_a_class_of_a_listed_module_is_not_listed() -> None:
         (named(HELPERS, "TimedObservation") + b")R", "got a call of lerobot"),
         (named("numpy", "ndarray") + b")R", "got a call of numpy.ndarray"),
         (named("numpy", "dtype") + b")\x81", "got an object of numpy.dtype"),
-        (named("numpy", "dtype") + short("O8") + b"\x89\x88\x87R}b", "want the type of plain numbers"),
+        (
+            named("numpy", "dtype") + short("O8") + b"\x89\x88\x87R}b",
+            "want the type of plain numbers",
+        ),
         (named("numpy", "dtype") + short("f4") + b"\x85R", "want the type of plain numbers"),
         (ARRAY + named("numpy", "dtype") + b"K\0\x85C\x01b\x87R", "want a plain array"),
-        (SCALAR + short("<f8") + b"C\x08" + bytes(8) + b"\x86R", "want a plain number"),  # a text is no type
+        # A text is no type.
+        (SCALAR + short("<f8") + b"C\x08" + bytes(8) + b"\x86R", "want a plain number"),
         (OBJECT + b"}b}b", "got the fields"),
         (OBJECT + OBJECT, "more than one object"),
         (OBJECT + b"N", "more than one object"),
@@ -369,7 +424,10 @@ def test_a_class_of_a_listed_module_is_not_listed() -> None:
         (b"N" * 20_000, "more than 10000 values"),
         (b"(" * 20_000, "more than 10000 values"),
         # a tuple of two, twice in the next, and so on: 2**40 values in 200 bytes
-        (b"NN\x86\x94" + b"".join(b"h%c" % i * 2 + b"\x86\x94" for i in range(40)), "values in a message|levels"),
+        (
+            b"NN\x86\x94" + b"".join(b"h%c" % i * 2 + b"\x86\x94" for i in range(40)),
+            "values in a message|levels",
+        ),
     ],
 )
 def test_programs_that_no_client_sends_are_refused(program: bytes, says: str) -> None:
@@ -395,9 +453,12 @@ def test_the_watch_sees_what_pickle_would_do() -> None:
 
 def test_mutated_pickles_execute_nothing_and_cost_little() -> None:
     seeds = [base64.b64decode(text) for text in (SETUP, *OBSERVATIONS.values())]
-    seeds += [pickled(message, protocol) for message in (robot_saw(3), setup()) for protocol in (4, 5)]
+    seeds += [
+        pickled(message, protocol) for message in (robot_saw(3), setup()) for protocol in (4, 5)
+    ]
     draw, choose = mutations(seeds), random.Random(0)
-    said: Counter[str] = Counter(attempt(draw(choose)) for _ in range(MUTATED // 10))  # what is loaded once
+    # What is loaded once.
+    said: Counter[str] = Counter(attempt(draw(choose)) for _ in range(MUTATED // 10))
     gc.collect()
     before, slowest = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss, 0.0
     begun = time.process_time()
@@ -408,7 +469,8 @@ def test_mutated_pickles_execute_nothing_and_cost_little() -> None:
         slowest = max(slowest, time.process_time() - start)
     took_s = time.process_time() - begun
     grown = (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) * 1024
-    print(f"\n{MUTATED} pickles, the last nine tenths in {took_s:.1f} s, the slowest in {1e3 * slowest:.1f} ms, "
+    print(f"\n{MUTATED} pickles, the last nine tenths in {took_s:.1f} s, the slowest in "
+          f"{1e3 * slowest:.1f} ms, "
           f"{grown / 2**20:.1f} MiB more: {dict(said)}")  # fmt: skip
     assert said["read"] > 0
     assert said["malformed"] > MUTATED // 4
@@ -419,5 +481,10 @@ def test_mutated_pickles_execute_nothing_and_cost_little() -> None:
 def test_garbage_is_refused(garbage: bytes, place: int) -> None:
     data = pickled(robot_saw(3))
     at = place % len(data)
-    for changed in (garbage, b"\x80\x04" + garbage, data[:at] + garbage, data[:at] + garbage + data[at:]):
+    for changed in (
+        garbage,
+        b"\x80\x04" + garbage,
+        data[:at] + garbage,
+        data[:at] + garbage + data[at:],
+    ):
         attempt(changed)

@@ -1,4 +1,6 @@
-"""openpi's and RoboArena's clients: sessions, `infer_batch` of openpi's pull request 941, and `reset`."""
+"""openpi's and RoboArena's clients: sessions, `infer_batch` of openpi's pull request 941, and
+`reset`.
+"""
 
 from __future__ import annotations
 
@@ -37,11 +39,20 @@ class Together(Mirror):
 
 def batch(*tasks: tuple[int, str | None]) -> bytes:
     seen = [
-        {"observation/image": image(p), "observation/wrist_image": image(0), "observation/state": STATE}
+        {
+            "observation/image": image(p),
+            "observation/wrist_image": image(0),
+            "observation/state": STATE,
+        }
         for p, _ in tasks
     ]
     return openpi.encode(
-        {"batch": [one | ({"prompt": text} if text else {}) for one, (_, text) in zip(seen, tasks, strict=True)]}
+        {
+            "batch": [
+                one | ({"prompt": text} if text else {})
+                for one, (_, text) in zip(seen, tasks, strict=True)
+            ]
+        }
     )
 
 
@@ -61,12 +72,18 @@ def test_each_observation_of_a_batch_gets_its_own_answer(served_batches: Any) ->
             said = call(socket, asked)
             # pixel, sum of the state, acts of the session, number of its instruction
             assert said["actions"].shape == (3, 2, 7)
-            assert said["actions"][:, 0, :4].tolist() == [[7, 1, acts, 1], [8, 1, acts, 2], [9, 1, acts, 3]]
+            assert said["actions"][:, 0, :4].tolist() == [
+                [7, 1, acts, 1],
+                [8, 1, acts, 2],
+                [9, 1, acts, 3],
+            ]
         assert said["policy_timing"].keys() == {"infer_ms", "batch_size"}
         assert said["policy_timing"]["batch_size"] == 3
         assert said["server_timing"].keys() == {"infer_ms", "prev_total_ms"}
         assert sizes == [3, 3]
-        assert call(socket, batch((7, None), (8, "task 5"), (9, None)))["actions"][:, 0, 2:4].tolist() == [
+        assert call(socket, batch((7, None), (8, "task 5"), (9, None)))["actions"][
+            :, 0, 2:4
+        ].tolist() == [
             [3, 1],
             [1, 5],
             [3, 3],
@@ -97,7 +114,9 @@ def test_a_batch_of_another_size_ends_the_episodes_of_all_its_places(served_batc
 def test_nothing_is_acted_on_if_one_observation_is_wrong(served_batches: Any) -> None:
     client, _, sizes = served_batches
     # One observation alone that is wrong is in tests/golden.
-    wrong = openpi.encode({"batch": [{"observation/image": image(0), "observation/state": STATE, "prompt": "task 1"}]})
+    wrong = openpi.encode(
+        {"batch": [{"observation/image": image(0), "observation/state": STATE, "prompt": "task 1"}]}
+    )
     for asked, said in (
         (batch((1, "task 1"), (2, None)), "instruction"),
         (wrong, "observation/wrist_image"),
@@ -126,7 +145,10 @@ def test_each_observation_of_a_batch_counts_for_its_key_before_any_is_acted_on()
     keys, agent = ChangingKeys(), Together()
     header = {"authorization": f"Bearer {keys.add('slow', rate=4)}"}  # and so many at once
     ask = batch(*[(1, "task 1")] * 3)
-    with serving(agent, ALL, keys.keys) as (client, _), client.websocket_connect("/openpi", headers=header) as socket:
+    with (
+        serving(agent, ALL, keys.keys) as (client, _),
+        client.websocket_connect("/openpi", headers=header) as socket,
+    ):
         socket.receive_bytes()
         assert call(socket, ask)["actions"].shape == (3, 2, 7)
         socket.send_bytes(ask)
@@ -137,7 +159,10 @@ def test_each_observation_of_a_batch_counts_for_its_key_before_any_is_acted_on()
 @pytest.mark.parametrize("answered", [False, True])
 def test_a_reset_begins_the_next_episode_of_every_session(answered: bool) -> None:
     settings = {"openpi": {"mapping": "openpi-libero", "answer_reset": answered}}
-    with serving(Together(), settings) as (client, _), client.websocket_connect("/openpi") as socket:
+    with (
+        serving(Together(), settings) as (client, _),
+        client.websocket_connect("/openpi") as socket,
+    ):
         socket.receive_bytes()
         for _ in range(2):
             assert call(socket, libero(1))["actions"][0, 2] == 1
@@ -165,10 +190,18 @@ def test_openpi_and_roboarena_share_the_root(context: tuple[TestClient, Engine])
     with context[0].websocket_connect("/") as socket:
         config = openpi.decode(socket.receive_bytes())
         assert config.keys() == {
-            *("image_resolution", "needs_wrist_camera", "n_external_cameras", "needs_stereo_camera"),
+            *(
+                "image_resolution",
+                "needs_wrist_camera",
+                "n_external_cameras",
+                "needs_stereo_camera",
+            ),
             *("needs_session_id", "action_space"),
         }
-        counts = [call(socket, libero(1, **more))["actions"][0, 2] for more in ({}, {}, *[{"endpoint": "infer"}] * 2)]
+        counts = [
+            call(socket, libero(1, **more))["actions"][0, 2]
+            for more in ({}, {}, *[{"endpoint": "infer"}] * 2)
+        ]
         assert counts == [1, 2, 1, 2]
         socket.send_bytes(openpi.encode({"endpoint": "reset"}))
         assert socket.receive_text() == "reset successful"
@@ -178,7 +211,10 @@ def test_openpi_and_roboarena_share_the_root(context: tuple[TestClient, Engine])
 
 
 def test_an_old_roboarena_client_gets_the_array_itself() -> None:
-    with serving(Mirror(), {"roboarena": {"mapping": "openpi-libero", "bare": True}}) as (client, _):
+    with serving(Mirror(), {"roboarena": {"mapping": "openpi-libero", "bare": True}}) as (
+        client,
+        _,
+    ):
         with client.websocket_connect("/") as socket:
             socket.receive_bytes()
             socket.send_bytes(libero(3, endpoint="infer"))
@@ -188,12 +224,17 @@ def test_an_old_roboarena_client_gets_the_array_itself() -> None:
 
 def test_the_mapping_names_the_actions_of_a_reply_as_a_client_reads_them() -> None:
     mapping = {"preset": "openpi-libero", "action": {"arm": {"stop": 6}, "hand": {"start": 6}}}
-    with serving(Mirror(), {"openpi": {"mapping": mapping}}) as (client, _), client.websocket_connect("/") as socket:
+    with (
+        serving(Mirror(), {"openpi": {"mapping": mapping}}) as (client, _),
+        client.websocket_connect("/") as socket,
+    ):
         socket.receive_bytes()
         answer = call(socket, libero(3))
         assert (answer["arm"].shape, answer["hand"].shape) == ((1, 6), (1, 1))
         assert answer.keys() == {"arm", "hand", "policy_timing", "server_timing"}
-        batched = call(socket, openpi.encode({"batch": [openpi.decode(libero(3)), openpi.decode(libero(5))]}))
+        batched = call(
+            socket, openpi.encode({"batch": [openpi.decode(libero(3)), openpi.decode(libero(5))]})
+        )
         assert batched["arm"][:, 0, 0].tolist() == [3, 5]
 
 

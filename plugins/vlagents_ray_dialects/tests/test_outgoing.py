@@ -7,7 +7,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from vlagents_ray.errors import ConfigError, InvalidAction, InvalidObservation, MissingCamera, MissingState
+from vlagents_ray.errors import (
+    ConfigError,
+    InvalidAction,
+    InvalidObservation,
+    MissingCamera,
+    MissingState,
+)
 from vlagents_ray.interface import Obs
 from vlagents_ray.serve.config.dialects import presets, read_mapping
 from vlagents_ray.wire.mapping import KeyMapping
@@ -32,11 +38,14 @@ def fitting(mapping: KeyMapping) -> Obs:
 
 
 def test_parts_whose_lengths_nothing_says_are_refused_before_anything_is_sent() -> None:
-    with pytest.raises(ConfigError, match=r"mapping.state.pose: got 2 parts without `stop`, want one at most"):
+    with pytest.raises(
+        ConfigError, match=r"mapping.state.pose: got 2 parts without `stop`, want one at most"
+    ):
         outgoing(state={"pose": ["a", "b"]})
 
 
-@pytest.mark.parametrize("name", sorted(set(presets()) - {"gr00t-n1.5"}))  # its client makes N1.5's keys
+# Its client makes N1.5's keys.
+@pytest.mark.parametrize("name", sorted(set(presets()) - {"gr00t-n1.5"}))
 def test_what_is_written_by_a_preset_is_read_by_it(name: str) -> None:
     mapping = read_mapping(name)
     obs = fitting(mapping)
@@ -55,7 +64,10 @@ def test_vectors_are_joined_by_their_places() -> None:
         state={"joints": {"key": "s", "stop": 2}, "base": {"key": "s", "start": 3, "stop": 4}},
         gripper={"key": "s", "index": 2, "open": 0.08, "closed": 0.0},
     )
-    obs = Obs(gripper=0.5, state={"joints": np.array([1, 2], np.float32), "base": np.array([9], np.float32)})
+    obs = Obs(
+        gripper=0.5,
+        state={"joints": np.array([1, 2], np.float32), "base": np.array([9], np.float32)},
+    )
     np.testing.assert_allclose(mapping.observation(obs, None)["s"], [1, 2, 0.04, 9])
 
 
@@ -67,7 +79,9 @@ def test_one_vector_is_split_over_several_keys() -> None:
 
 
 def test_channels_go_first_where_the_mapping_says_so() -> None:
-    theirs = outgoing(cameras={"front": {"key": "images/a", "layout": "chw"}}).observation(Obs({"front": IMAGE}), None)
+    theirs = outgoing(cameras={"front": {"key": "images/a", "layout": "chw"}}).observation(
+        Obs({"front": IMAGE}), None
+    )
     np.testing.assert_array_equal(theirs["images"]["a"], IMAGE.transpose(2, 0, 1))
 
 
@@ -77,19 +91,35 @@ def test_channels_go_first_where_the_mapping_says_so() -> None:
         ({"cameras": {"front": "image"}}, MissingCamera, "front"),
         ({"state": {"joints": "s"}}, MissingState, "joints"),
         ({"gripper": "g"}, MissingState, "gripper"),
-        ({"state": {"pose": {"key": "s", "stop": 2}}}, InvalidObservation, "got 3 numbers, the mapping says 2"),
-        ({"state": {"pose": {"key": "s", "start": 1, "stop": 4}}}, InvalidObservation, r"numbers at \[0\]"),
-        ({"state": {"pose": {"key": "s", "start": 5000, "stop": 5003}}}, ConfigError, "want 0 to 4096"),
+        (
+            {"state": {"pose": {"key": "s", "stop": 2}}},
+            InvalidObservation,
+            "got 3 numbers, the mapping says 2",
+        ),
+        (
+            {"state": {"pose": {"key": "s", "start": 1, "stop": 4}}},
+            InvalidObservation,
+            r"numbers at \[0\]",
+        ),
+        (
+            {"state": {"pose": {"key": "s", "start": 5000, "stop": 5003}}},
+            ConfigError,
+            "want 0 to 4096",
+        ),
     ],
 )
-def test_what_does_not_fit_is_refused(mapping: dict[str, Any], error: type[Exception], said: str) -> None:
+def test_what_does_not_fit_is_refused(
+    mapping: dict[str, Any], error: type[Exception], said: str
+) -> None:
     with pytest.raises(error, match=said):
         outgoing(**mapping).observation(Obs(state={"pose": np.ones(3, np.float32)}), None)
 
 
 def test_arrays_by_name_become_columns() -> None:
     mapping = outgoing(action={"hand": {"start": 2, "stop": 3}, "arm": {"stop": 2}})
-    rows = mapping.rows({"arm": np.array([[1.0, 2.0], [4.0, 5.0]]), "hand": np.array([[3.0], [6.0]])})
+    rows = mapping.rows(
+        {"arm": np.array([[1.0, 2.0], [4.0, 5.0]]), "hand": np.array([[3.0], [6.0]])}
+    )
     assert rows.dtype == np.float32
     assert rows.tolist() == [[1, 2, 3], [4, 5, 6]]
 
@@ -100,14 +130,20 @@ def test_arrays_by_name_become_columns() -> None:
         ({}, {"arm": np.ones((1, 2)), "hand": np.ones((1, 1))}, "say in mapping.action"),
         ({"arm": {"stop": 2}}, {"hand": np.ones((1, 2))}, r"lacks \['arm'\]"),
         ({"arm": {"stop": 3}}, {"arm": np.ones((1, 2))}, "got 2 columns, mapping.action says 3"),
-        ({"a": {"stop": 1}, "b": {"start": 1}}, {"a": np.ones((2, 1)), "b": np.ones((3, 1))}, "number of rows"),
+        (
+            {"a": {"stop": 1}, "b": {"start": 1}},
+            {"a": np.ones((2, 1)), "b": np.ones((3, 1))},
+            "number of rows",
+        ),
         ({"a": {"start": 1}}, {"a": np.ones((2, 1))}, r"numbers at \[0\]"),
         ({}, np.ones((1, 2, 3)), r"want \(D,\) or \(H, D\)"),
         ({}, np.array(["text"]), r"want \(D,\) or \(H, D\)"),
         ({}, None, "got NoneType"),
     ],
 )
-def test_actions_that_the_mapping_does_not_fit_are_refused(action: Any, theirs: Any, said: str) -> None:
+def test_actions_that_the_mapping_does_not_fit_are_refused(
+    action: Any, theirs: Any, said: str
+) -> None:
     with pytest.raises(InvalidAction, match=said):
         outgoing(action=action).rows(theirs)
 

@@ -1,4 +1,6 @@
-"""Clients of vlagents 0.2 and 0.3 over RPyC: their messages, memory and sessions, and what a bad client can do."""
+"""Clients of vlagents 0.2 and 0.3 over RPyC: their messages, memory and sessions, and what a bad
+client can do.
+"""
 
 from __future__ import annotations
 
@@ -25,7 +27,13 @@ from many import many
 from process_resources import descriptors
 from rpyc_client import LOCAL, REMOTE, ROOT, TUPLE, VALUE, Client, call, document, request
 
-from vlagents_ray.errors import ConfigError, InvalidInput, InvalidObservation, MalformedMessage, MessageTooLarge
+from vlagents_ray.errors import (
+    ConfigError,
+    InvalidInput,
+    InvalidObservation,
+    MalformedMessage,
+    MessageTooLarge,
+)
 from vlagents_ray.images.jpeg_png import encode_jpeg
 from vlagents_ray.interface import GOAL_IMAGE, Act
 from vlagents_ray.protocol.messages import Budget, Limits
@@ -53,7 +61,9 @@ class Memory:
         return bytearray(self.segments[name][:size])
 
 
-def act(value: object, memory: Memory | None = None, limits: Limits = LIMITS) -> vlagents.ObservationRequest:
+def act(
+    value: object, memory: Memory | None = None, limits: Limits = LIMITS
+) -> vlagents.ObservationRequest:
     text = value if isinstance(value, str) else json_numpy.dumps(value)
     return vlagents.read_act(text, Budget(limits), memory or Memory())
 
@@ -68,10 +78,19 @@ def test_one_robot_keeps_its_names() -> None:
 
 
 def test_several_robots_have_their_names_in_front() -> None:
-    arm = {"cameras": {"wrist": np.zeros((4, 4, 3), np.uint8)}, "joints": np.zeros(2, np.float32), "gripper": 1.0}
+    arm = {
+        "cameras": {"wrist": np.zeros((4, 4, 3), np.uint8)},
+        "joints": np.zeros(2, np.float32),
+        "gripper": 1.0,
+    }
     seen = act({"obs": {"left": arm, "right": arm}, "language_instruction": None})
     assert sorted(seen.obs.cameras) == ["left/wrist", "right/wrist"]
-    assert sorted(seen.obs.state) == ["left/gripper", "left/joints", "right/gripper", "right/joints"]
+    assert sorted(seen.obs.state) == [
+        "left/gripper",
+        "left/joints",
+        "right/gripper",
+        "right/joints",
+    ]
     assert seen.obs.gripper is None
 
 
@@ -99,8 +118,16 @@ def test_of_several_frames_the_last_is_taken() -> None:
 
 
 def test_a_reset_of_0_2_brings_instruction_and_options() -> None:
-    old = {"cameras": {}, "camera_data_type": "raw", "gripper": None, "state": np.ones(3), "info": {}}
-    seen, read = vlagents.read_reset(json_numpy.dumps([old, "go", {"seed": 4}]), Budget(LIMITS), Memory())
+    old = {
+        "cameras": {},
+        "camera_data_type": "raw",
+        "gripper": None,
+        "state": np.ones(3),
+        "info": {},
+    }
+    seen, read = vlagents.read_reset(
+        json_numpy.dumps([old, "go", {"seed": 4}]), Budget(LIMITS), Memory()
+    )
     assert (seen.instruction, read, seen.robots) == ("go", {"seed": 4}, ())
     assert seen.obs.state["state"].dtype == np.float32
     for options in ({"obs": 1}, {"contract": {}}, 3):
@@ -131,7 +158,9 @@ def robot(**changes: object) -> dict:
 
 
 def shared(shape: list[int]) -> dict:
-    return robot(cameras={"a": {"shm_name": "psm_9", "shape": shape}}, camera_data_type="shared_memory")
+    return robot(
+        cameras={"a": {"shm_name": "psm_9", "shape": shape}}, camera_data_type="shared_memory"
+    )
 
 
 @pytest.mark.parametrize(
@@ -176,11 +205,17 @@ def test_a_document_of_too_many_values_is_refused() -> None:
 
 
 arrays = st.sampled_from([np.float32, np.float64, np.uint8, np.int64, np.bool_]).flatmap(
-    lambda dtype: st.lists(st.integers(0, 1), max_size=6).map(lambda values: np.array(values, dtype))
+    lambda dtype: st.lists(st.integers(0, 1), max_size=6).map(
+        lambda values: np.array(values, dtype)
+    )
 )
 
 
-@given(st.recursive(arrays | st.none() | st.booleans() | st.integers() | st.text(), st.lists, max_leaves=8))
+@given(
+    st.recursive(
+        arrays | st.none() | st.booleans() | st.integers() | st.text(), st.lists, max_leaves=8
+    )
+)
 def test_json_with_arrays_comes_back(value: object) -> None:
     found = json_numpy.loads(json_numpy.dumps(value), LIMITS)
     assert json_numpy.dumps(found) == json_numpy.dumps(value)
@@ -203,7 +238,12 @@ def read(frame: bytes) -> rpyc.RpycCall | None:
 
 
 values = st.recursive(
-    st.none() | st.booleans() | st.integers(-(10**18), 10**18) | st.floats(allow_nan=False) | st.text() | st.binary(),
+    st.none()
+    | st.booleans()
+    | st.integers(-(10**18), 10**18)
+    | st.floats(allow_nan=False)
+    | st.text()
+    | st.binary(),
     lambda inner: st.lists(inner, max_size=5).map(tuple),
     max_leaves=20,
 )
@@ -218,7 +258,9 @@ def test_values_come_back_as_they_were(value: object) -> None:
 def test_a_call_of_the_root_is_read_and_long_ones_are_compressed() -> None:
     frame = call("act", "x" * 10_000)
     assert len(frame) < 1000
-    assert read(frame) == rpyc.RpycCall(1, Handler.CALLATTR, (rpyc.Reference(rpyc.ROOT), "act", ("x" * 10_000,), ()))
+    assert read(frame) == rpyc.RpycCall(
+        1, Handler.CALLATTR, (rpyc.Reference(rpyc.ROOT), "act", ("x" * 10_000,), ())
+    )
 
 
 @pytest.mark.parametrize(
@@ -255,7 +297,11 @@ def test_a_compressed_message_may_not_grow_over_the_limit() -> None:
 
 def test_nesting_and_long_numbers_are_refused() -> None:
     deep = b"\x10" * 5000 + b"\x00"
-    for message in (deep, b"\x17\xff\xff\xff\xff" + b"9" * 100, b"\x17\x00\x00\x10\x00" + b"9" * 4096):
+    for message in (
+        deep,
+        b"\x17\xff\xff\xff\xff" + b"9" * 100,
+        b"\x17\x00\x00\x10\x00" + b"9" * 4096,
+    ):
         with pytest.raises((MessageTooLarge, MalformedMessage)):
             rpyc.read_call(b"\x01" + message + b"\n", False, LIMIT)
 
@@ -272,7 +318,9 @@ def sessions(replicas: Replicas) -> int:
     return len(replicas.engines[0].sessions)
 
 
-def test_each_client_has_a_session_that_begins_anew_with_another_instruction(open_dialect, replicas: Replicas) -> None:
+def test_each_client_has_a_session_that_begins_anew_with_another_instruction(
+    open_dialect, replicas: Replicas
+) -> None:
     port = open_dialect("vlagents")
     with Client(port) as red, Client(port) as blue:
         assert red.act(document(10, "abc")) == [10, 0.5, 0.25, 3, 1]
@@ -285,7 +333,13 @@ def test_each_client_has_a_session_that_begins_anew_with_another_instruction(ope
 
 
 def test_a_client_of_0_2_resets_and_acts(open_dialect) -> None:
-    old = {"cameras": {}, "camera_data_type": "raw", "gripper": 0.5, "state": np.full(2, 3.0), "info": {}}
+    old = {
+        "cameras": {},
+        "camera_data_type": "raw",
+        "gripper": 0.5,
+        "state": np.full(2, 3.0),
+        "info": {},
+    }
     with Client(open_dialect("vlagents")) as robot:
         robot.send(call("act", json_numpy.dumps(old)))
         kind, _, content = robot.receive()
@@ -300,7 +354,11 @@ def test_a_client_of_0_2_resets_and_acts(open_dialect) -> None:
 
 
 def test_a_mapping_gives_the_policys_names(open_dialect) -> None:
-    mapping = {"cameras": {"cam": "cameras/front"}, "state": {"q": "state/joints"}, "gripper": "gripper"}
+    mapping = {
+        "cameras": {"cam": "cameras/front"},
+        "state": {"q": "state/joints"},
+        "gripper": "gripper",
+    }
     with Client(open_dialect("vlagents", mapping=mapping)) as robot:
         robot.send(call("act", document(5)))
         _, _, (_, text) = robot.receive()
@@ -311,7 +369,9 @@ def test_a_mapping_gives_the_policys_names(open_dialect) -> None:
         assert "missing_camera: camera 'cameras/front'" in content[1][0]
 
 
-def test_cameras_that_the_mapping_does_not_read_are_logged_once(open_dialect, caplog: pytest.LogCaptureFixture) -> None:
+def test_cameras_that_the_mapping_does_not_read_are_logged_once(
+    open_dialect, caplog: pytest.LogCaptureFixture
+) -> None:
     port = open_dialect("vlagents", mapping={"state": {"*": "state/*"}})
     for _ in range(2):
         with Client(port) as robot:
@@ -327,10 +387,26 @@ def test_nothing_but_the_methods_can_be_reached_and_the_client_goes_on(open_dial
         request(1, Handler.GETATTR, (TUPLE, ((LOCAL, ROOT), (VALUE, "_talk")))),
         request(1, Handler.GETATTR, (VALUE, ("text", "__mul__"))),
         request(1, Handler.CALL, (TUPLE, ((LOCAL, ROOT), (VALUE, ()), (VALUE, ())))),
-        request(1, Handler.CALL, (TUPLE, ((LOCAL, ("builtins.method", 2, 40)), (VALUE, ()), (VALUE, ())))),
-        request(1, Handler.CALLATTR, (TUPLE, ((LOCAL, ROOT), (VALUE, "__init__"), (VALUE, ()), (VALUE, ())))),
-        request(1, Handler.CALLATTR, (TUPLE, ((LOCAL, ROOT), (VALUE, "act"), (REMOTE, ("a.b", 1, 2)), (VALUE, ())))),
-        request(1, Handler.CALLATTR, (TUPLE, ((LOCAL, ROOT), (VALUE, "name"), (VALUE, ()), (VALUE, (("a", 1),))))),
+        request(
+            1,
+            Handler.CALL,
+            (TUPLE, ((LOCAL, ("builtins.method", 2, 40)), (VALUE, ()), (VALUE, ()))),
+        ),
+        request(
+            1,
+            Handler.CALLATTR,
+            (TUPLE, ((LOCAL, ROOT), (VALUE, "__init__"), (VALUE, ()), (VALUE, ()))),
+        ),
+        request(
+            1,
+            Handler.CALLATTR,
+            (TUPLE, ((LOCAL, ROOT), (VALUE, "act"), (REMOTE, ("a.b", 1, 2)), (VALUE, ()))),
+        ),
+        request(
+            1,
+            Handler.CALLATTR,
+            (TUPLE, ((LOCAL, ROOT), (VALUE, "name"), (VALUE, ()), (VALUE, (("a", 1),)))),
+        ),
         request(1, 14, (TUPLE, ((LOCAL, ROOT), (VALUE, 5)))),  # pickle
         request(1, 6, (TUPLE, ((LOCAL, ROOT), (VALUE, "name"), (VALUE, "x")))),  # setattr
         request(1, 13, (TUPLE, ((LOCAL, ROOT),))),  # dir
@@ -355,7 +431,11 @@ def test_the_clients_memory_is_read_in_place(open_dialect) -> None:
     try:
         segment.buf[:] = bytes([77]) * segment.size
         payload = {"shm_name": segment.name, "shape": [16, 16, 3], "dtype": "uint8"}
-        arm = {"cameras": {"front": payload}, "camera_data_type": "shared_memory", "joints": np.ones(1)}
+        arm = {
+            "cameras": {"front": payload},
+            "camera_data_type": "shared_memory",
+            "joints": np.ones(1),
+        }
         text = json_numpy.dumps({"obs": {"arm": arm}, "language_instruction": "x"})
         port = open_dialect("vlagents")
         with Client(port) as one:
@@ -373,7 +453,8 @@ def test_the_clients_memory_is_read_in_place(open_dialect) -> None:
 
 
 def test_a_slow_a_dead_and_a_silent_client_hold_up_nobody(open_dialect, replicas: Replicas) -> None:
-    port = open_dialect("vlagents", idle_s=4.0)  # the good one is silent for less, on a busy machine, too
+    # The good one is silent for less, on a busy machine, too.
+    port = open_dialect("vlagents", idle_s=4.0)
     with Client(port) as half, Client(port) as silent, Client(port) as deaf:
         half.send(call("act", document())[:20])  # and no more
         deaf.send(call("act", document()) * 3)  # and does not read
@@ -409,7 +490,9 @@ def _answers(port: int) -> bool:
 def test_a_taken_port_is_named_with_the_cure() -> None:
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
-        with pytest.raises(ConfigError, match=rf"vlagents: cannot listen on 127.0.0.1:{port}.*choose another port"):
+        with pytest.raises(
+            ConfigError, match=rf"vlagents: cannot listen on 127.0.0.1:{port}.*choose another port"
+        ):
             reserve("vlagents", "127.0.0.1", port, timeout_s=0)
     with pytest.raises(ConfigError, match="no address"):
         reserve("vlagents", "no.such.host.invalid", port, timeout_s=0)
@@ -444,7 +527,11 @@ def test_a_readers_end_leaves_the_segment_to_its_client(segment: Segment) -> Non
         "print(SharedMemory(same_machine=True).read(sys.argv[1], 5).decode())"
     )
     done = subprocess.run(
-        [sys.executable, "-c", code, segment.name], capture_output=True, text=True, check=True, timeout=60
+        [sys.executable, "-c", code, segment.name],
+        capture_output=True,
+        text=True,
+        check=True,
+        timeout=60,
     )
     assert (done.stdout, done.stderr) == ("hello\n", "")
     assert Path("/dev/shm", segment.name).exists()
@@ -462,7 +549,17 @@ def test_a_segment_that_shrinks_is_an_error_and_no_crash(segment: Segment) -> No
 
 
 @pytest.mark.parametrize(
-    "name", ["../../etc/passwd", "psm_../x", "/etc/passwd", "", "plasma_123", "psm_", "psm_0123\n", "psm_00000000"]
+    "name",
+    [
+        "../../etc/passwd",
+        "psm_../x",
+        "/etc/passwd",
+        "",
+        "plasma_123",
+        "psm_",
+        "psm_0123\n",
+        "psm_00000000",
+    ],
 )
 def test_only_segments_of_clients_can_be_named(name: str) -> None:
     with pytest.raises(InvalidObservation):
@@ -504,7 +601,10 @@ def test_descriptors_do_not_pile_up(segment: Segment) -> None:
 
 
 def test_the_gripper_is_the_last_column_and_each_robot_has_its_own_rows() -> None:
-    step = {"left": {"action": np.ones(2), "gripper": 0.5, "done": False, "info": {}}, "right": {"action": [3.0]}}
+    step = {
+        "left": {"action": np.ones(2), "gripper": 0.5, "done": False, "info": {}},
+        "right": {"action": [3.0]},
+    }
     found = vlagents.read_actions(json_numpy.dumps({"acts": [step, step]}))
     assert found["left"].tolist() == [[1, 1, 0.5]] * 2
     assert found["right"].tolist() == [[3]] * 2
@@ -530,9 +630,16 @@ def test_what_is_no_action_is_refused(acts: Any) -> None:
         vlagents.read_actions(json.dumps({"acts": acts}))
 
 
-@given(st.recursive(st.none() | st.integers(-(2**60), 2**60) | st.text(max_size=5), lambda one: st.tuples(one, one)))
+@given(
+    st.recursive(
+        st.none() | st.integers(-(2**60), 2**60) | st.text(max_size=5),
+        lambda one: st.tuples(one, one),
+    )
+)
 @settings(max_examples=many(200))
 def test_any_content_is_a_value_or_an_error_of_ours(content: Any) -> None:
     for kind in (2, 3):
         with contextlib.suppress(InvalidInput):
-            vlagents.read_result(bytes([kind]) + rpyc.write_brine((1, content)) + rpyc.END, False, 10_000)
+            vlagents.read_result(
+                bytes([kind]) + rpyc.write_brine((1, content)) + rpyc.END, False, 10_000
+            )

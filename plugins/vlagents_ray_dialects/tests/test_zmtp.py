@@ -1,4 +1,6 @@
-"""ZeroMQ's protocol: garbage raises only `MalformedMessage`, messages survive a round trip through libzmq."""
+"""ZeroMQ's protocol: garbage raises only `MalformedMessage`, messages survive a round trip
+through libzmq.
+"""
 
 from __future__ import annotations
 
@@ -58,7 +60,11 @@ def test_a_greeting_that_is_refused_as_a_whole_is_none_of_zmtp_3(greeting: bytes
     try:
         zmtp.check_greeting(greeting)
     except MalformedMessage:
-        assert greeting[:10] != zmtp.GREETING[:10] or greeting[10] < 3 or greeting[12:32] != zmtp.GREETING[12:32]
+        assert (
+            greeting[:10] != zmtp.GREETING[:10]
+            or greeting[10] < 3
+            or greeting[12:32] != zmtp.GREETING[12:32]
+        )
 
 
 @given(st.integers(1, 64))
@@ -82,8 +88,12 @@ def test_each_part_of_the_properties_of_ready_is_malformed(length: int) -> None:
         zmtp.check_ready(READY[:length])
 
 
-def serve_one(listener: socket.socket, received: list[list[bytes]], number: int, answer_in: int) -> None:
-    """Greet one client as the gateway does, and echo its messages, in pieces of `answer_in` bytes."""
+def serve_one(
+    listener: socket.socket, received: list[list[bytes]], number: int, answer_in: int
+) -> None:
+    """Greet one client as the gateway does, and echo its messages, in pieces of `answer_in`
+    bytes.
+    """
     connection, _ = listener.accept()
     with connection, connection.makefile("rb") as data:
         connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)

@@ -1,1 +1,3 @@
-"""Protocols of other systems: their clients at this project's server, and their servers as policies."""
+"""Protocols of other systems: their clients at this project's server, and their servers as
+policies.
+"""

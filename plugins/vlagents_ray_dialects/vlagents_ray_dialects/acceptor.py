@@ -14,12 +14,15 @@ from vlagents_ray_dialects.client_reader import shut_down
 logger = logging.getLogger(__name__)
 
 TICK_S = 0.5  # period at which a dialect checks its clients
-_ACCEPTED_PER_S = 50.0  # maximum number of connections in a second; each takes a thread and about a millisecond
+# Maximum number of connections in a second; each takes a thread and about a millisecond.
+_ACCEPTED_PER_S = 50.0
 _END_S = 3.0
 
 
 class Acceptor:
-    """Accepts connections until it is closed; those above the rate wait in the listener's backlog."""
+    """Accepts connections until it is closed; those above the rate wait in the listener's
+    backlog.
+    """
 
     def __init__(
         self,
@@ -73,6 +76,7 @@ class Acceptor:
                 except OSError as error:
                     if not self._closing.is_set():
                         logger.warning("%s: cannot accept a client: %s", self._name, error)
-                        time.sleep(0.1)  # other connections must end first if descriptors are exhausted
+                        # Other connections must end first if descriptors are exhausted.
+                        time.sleep(0.1)
                     continue
                 self._add(connection)

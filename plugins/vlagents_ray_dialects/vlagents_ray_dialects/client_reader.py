@@ -1,4 +1,6 @@
-"""Reading from the connections of a gateway's clients: the bytes of incomplete messages count as in flight."""
+"""Reading from the connections of a gateway's clients: the bytes of incomplete messages count as
+in flight.
+"""
 
 from __future__ import annotations
 
@@ -12,14 +14,21 @@ from vlagents_ray.errors import MessageTooLarge, Overloaded
 from vlagents_ray.serve.engine.admission import Admission, ArrivingBytes
 
 _READ_BYTES = 256 * 1024  # maximum size of a read
-# Above this size a message is in a mapping, whose pages are taken when they are written, and are returned when it is
-# freed. The heaps of as many threads as there are clients would keep them.
+# Above this size a message is in a mapping, whose pages are taken when they are written, and are
+# returned when it is freed. The heaps of as many threads as there are clients would keep them.
 _MAPPED_BYTES = 256 * 1024
-_KEEP_ALIVE = (("TCP_KEEPIDLE", 20), ("TCP_KEEPINTVL", 5), ("TCP_KEEPCNT", 3), ("TCP_USER_TIMEOUT", 35_000))
+_KEEP_ALIVE = (
+    ("TCP_KEEPIDLE", 20),
+    ("TCP_KEEPINTVL", 5),
+    ("TCP_KEEPCNT", 3),
+    ("TCP_USER_TIMEOUT", 35_000),
+)
 
 
 def share_of(connection: socket.socket) -> str:
-    """Return the name under which a client without a key has a share of the bytes in flight: that of its address."""
+    """Return the name under which a client without a key has a share of the bytes in flight:
+    that of its address.
+    """
     try:
         peer = connection.getpeername()
     except OSError:  # the client is already gone
@@ -48,13 +57,16 @@ class ClientReader:
         """Prepare to read.
 
         Args:
-            robot: Whether incomplete messages may use the bytes in flight that are reserved for robots.
+            robot: Whether incomplete messages may use the bytes in flight that are reserved for
+                robots.
         """
         self._connection = connection
-        self._lock = threading.Lock()  # guards the fields below, which `_give_up` changes on other threads
+        # Guards the fields below, which `_give_up` changes on other threads.
+        self._lock = threading.Lock()
         self._data = memoryview(b"")
         self._received = 0  # number of bytes of `_data` that have been received
-        self._is_given_up = False  # whether the rest of the message is discarded, as there is no memory for it
+        # Whether the rest of the message is discarded, as there is no memory for it.
+        self._is_given_up = False
         self._arriving = ArrivingBytes(admission, share_of(connection), robot, self._give_up)
 
     def set_sender(self, admission: Admission, key: str, *, robot: bool) -> None:
@@ -62,7 +74,8 @@ class ClientReader:
         self._arriving = ArrivingBytes(admission, key, robot, self._give_up)
 
     def read(self, length: int, silent_s: float, deadline: float) -> memoryview | None:
-        """Read `length` bytes; memory is taken as they arrive, and counts as in flight until they are complete.
+        """Read `length` bytes; memory is taken as they arrive, and counts as in flight until they
+        are complete.
 
         Args:
             silent_s: Maximum time between two parts, s.
@@ -77,7 +90,9 @@ class ClientReader:
             ConnectionResetError: The client disconnected among them.
         """
         with self._lock:
-            self._data = memoryview(mmap.mmap(-1, length) if length > _MAPPED_BYTES else bytearray(length))
+            self._data = memoryview(
+                mmap.mmap(-1, length) if length > _MAPPED_BYTES else bytearray(length)
+            )
             self._received, self._is_given_up = 0, False
         left = length
         try:
@@ -98,7 +113,10 @@ class ClientReader:
         with self._lock:
             data, self._data = self._data, memoryview(b"")
             if self._is_given_up:
-                raise Overloaded("the messages in flight leave no room for one that arrives slowly; send it again")
+                raise Overloaded(
+                    "the messages in flight leave no room for one that arrives slowly; send it "
+                    "again"
+                )
         return data
 
     def _keep(self, received: bytes) -> None:
@@ -115,7 +133,9 @@ class ClientReader:
                 self._received = end
 
     def _give_up(self) -> None:
-        """Free the memory of an incomplete message, as a complete one needs it; called on any thread."""
+        """Free the memory of an incomplete message, as a complete one needs it; called on any
+        thread.
+        """
         with self._lock:
             self._discard()
 

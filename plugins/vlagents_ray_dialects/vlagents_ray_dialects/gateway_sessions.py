@@ -1,8 +1,8 @@
 """The gateway's clients and their sessions, whose episodes begin as in `ImplicitEpisode`.
 
-The gateway enforces the permissions of the client's key, since not every transport to a replica contains a key: each
-observation (with the reset before it) counts towards the key's rate, each session towards its limit of sessions, and
-the key's class applies to all its requests.
+The gateway enforces the permissions of the client's key, since not every transport to a replica
+contains a key: each observation (with the reset before it) counts towards the key's rate, each
+session towards its limit of sessions, and the key's class applies to all its requests.
 """
 
 from __future__ import annotations
@@ -32,12 +32,15 @@ class GatewaySessions:
     """The sessions of one client, all over one connection; not thread-safe."""
 
     def __init__(self, connect: Connect, contract: Contract | None) -> None:
-        """Prepare the sessions; `show` must be called first, with the client. `contract` is the policy's."""
+        """Prepare the sessions; `show` must be called first, with the client. `contract` is the
+        policy's.
+        """
         self._connect, self._contract = connect, contract
         self._caller: Identity | None = None
         self._key: str | None = None
         self._rank: RankName | None = None
-        self._counted = 0  # number of requests of the current message that were counted before it was read
+        # Number of requests of the current message that were counted before it was read.
+        self._counted = 0
         self._held = 0  # number of sessions that are counted for the key
         self._agents: list[RemoteAgent] = []
         self._episodes: list[ImplicitEpisode] = []  # the episode of each of `_agents`
@@ -62,17 +65,23 @@ class GatewaySessions:
         return info
 
     def act(self, obs: Obs, instruction: str | None) -> Act:
-        """Return the next action of the client's only session; a new instruction resets the session first."""
+        """Return the next action of the client's only session; a new instruction resets the
+        session first.
+        """
         return self.act_batch([obs], [instruction])[0]
 
     def act_on(self, obs: Obs) -> Act:
-        """Return the next action of the client's only session, without a reset; raise `NotReset` before the first."""
+        """Return the next action of the client's only session, without a reset; raise `NotReset`
+        before the first.
+        """
         agent = self._sessions(1)[0]
         self._admit(1)
         return agent.act(obs)
 
     def act_batch(self, obs: Sequence[Obs], instructions: Sequence[str | None]) -> list[Act]:
-        """Return the next action of each session, one per observation; raise the first error among them."""
+        """Return the next action of each session, one per observation; raise the first error
+        among them.
+        """
         agents = self._sessions(len(obs))
         self._admit(len(obs))
         texts = [episode.instruction for episode in self._episodes]
@@ -103,17 +112,23 @@ class GatewaySessions:
                 caller.note("let in by", "a gateway")
 
     def refusal(self) -> str | None:
-        """Return the reason why the client's key is no longer valid; None if it is valid or not needed."""
+        """Return the reason why the client's key is no longer valid; None if it is valid or not
+        needed.
+        """
         return self._caller.refusal() if isinstance(self._caller, Caller) else None
 
     def begin(self) -> None:
-        """Count a message for the key before it is read, which includes the first of its requests."""
+        """Count a message for the key before it is read, which includes the first of its
+        requests.
+        """
         self._counted = 0
         self._admit(1)
         self._counted = 1
 
     def throttled_s(self) -> float:
-        """Return the time for which not to read from the client, s; 0 unless its key is over its rate."""
+        """Return the time for which not to read from the client, s; 0 unless its key is over its
+        rate.
+        """
         return self._caller.throttled_s() if isinstance(self._caller, Caller) else 0.0
 
     def restart(self) -> None:
@@ -131,7 +146,8 @@ class GatewaySessions:
     def _sessions(self, number: int) -> list[RemoteAgent]:
         if self._caller is None:
             raise TypeError("a session without a client: call show() first")
-        self._hold(max(number, self._held))  # counts sessions before they exist, and until they have ended
+        # Counts sessions before they exist, and until they have ended.
+        self._hold(max(number, self._held))
         if not self._agents:
             self._agents = [self._connect(self._key, self._rank)]
         for agent in self._agents[number:]:
@@ -140,17 +156,24 @@ class GatewaySessions:
         self._hold(number)
         if missing := number - len(self._agents):
             self._agents += self._agents[0].sessions(missing)
-        self._episodes = [*self._episodes[:number], *(ImplicitEpisode() for _ in range(number - len(self._episodes)))]
+        self._episodes = [
+            *self._episodes[:number],
+            *(ImplicitEpisode() for _ in range(number - len(self._episodes))),
+        ]
         return self._agents
 
     def _hold(self, number: int) -> None:
-        """Set the number of sessions that count for the key; raise `TooManyRequests` over its limit."""
+        """Set the number of sessions that count for the key; raise `TooManyRequests` over its
+        limit.
+        """
         if isinstance(self._caller, Caller) and number != self._held:
             self._caller.hold(number - self._held)
         self._held = number
 
     def _admit(self, number: int) -> None:
-        """Count requests for the key; raise `TooManyRequests` over its rate, before any of them is sent."""
+        """Count requests for the key; raise `TooManyRequests` over its rate, before any of them
+        is sent.
+        """
         counted, self._counted = self._counted, 0
         if isinstance(self._caller, Caller):
             for _ in range(number - counted):
@@ -190,7 +213,9 @@ C = TypeVar("C", bound=GatewayClient)
 
 
 class GatewayClients(Generic[K, C]):
-    """The clients by their identity in the protocol, at most `sessions` of the context. Thread-safe."""
+    """The clients by their identity in the protocol, at most `sessions` of the context.
+    Thread-safe.
+    """
 
     def __init__(self, context: GatewayContext) -> None:
         self._context = context
@@ -204,10 +229,12 @@ class GatewayClients(Generic[K, C]):
     def add(self, key: K, make: Callable[[], C]) -> C:
         """Add a client, in place of one with the same key.
 
-        If there are too many clients, the one without a session that has been idle for the longest is removed.
+        If there are too many clients, the one without a session that has been idle for the longest
+        is removed.
 
         Raises:
-            PolicyUnavailable: There are too many clients, and each has a session or an unanswered request.
+            PolicyUnavailable: There are too many clients, and each has a session or an unanswered
+                request.
         """
         removed = []
         try:
@@ -242,16 +269,24 @@ class GatewayClients(Generic[K, C]):
     def is_gone(self, client: C) -> bool:
         """Return whether a client is idle, or its key is no longer valid."""
         now = time.monotonic()
-        patience_s = self._context.idle_s if client.sessions.begun else min(_QUIET_S, self._context.idle_s)
+        patience_s = (
+            self._context.idle_s if client.sessions.begun else min(_QUIET_S, self._context.idle_s)
+        )
         return client.quiet_s(now) > patience_s or client.sessions.refusal() is not None
 
     def _idlest(self) -> K:
         """Return the key of the client without a session that has been idle for the longest."""
         now = time.monotonic()
-        idle = [(client.quiet_s(now), key) for key, client in self._clients.items() if not client.sessions.begun]
+        idle = [
+            (client.quiet_s(now), key)
+            for key, client in self._clients.items()
+            if not client.sessions.begun
+        ]
         quiet_s, key = max(idle, key=lambda one: one[0], default=(0.0, None))
         if key is None or quiet_s <= 0:
-            raise PolicyUnavailable(f"{len(self._clients)} clients are connected, the limit; try again later")
+            raise PolicyUnavailable(
+                f"{len(self._clients)} clients are connected, the limit; try again later"
+            )
         return key
 
 

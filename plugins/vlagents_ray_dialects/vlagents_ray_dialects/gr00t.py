@@ -16,7 +16,13 @@ from typing import Any
 from pydantic import Field
 
 from vlagents_ray.contract import Contract
-from vlagents_ray.errors import MalformedMessage, MessageTooLarge, Overloaded, PolicyUnavailable, VLAgentsError
+from vlagents_ray.errors import (
+    MalformedMessage,
+    MessageTooLarge,
+    Overloaded,
+    PolicyUnavailable,
+    VLAgentsError,
+)
 from vlagents_ray.protocol.websocket_frames import CONTROL_FRAMES, CONTROL_FRAMES_PER_S
 from vlagents_ray.registry import require
 from vlagents_ray.serve.access.api_keys import Caller, NoKey
@@ -35,10 +41,12 @@ from vlagents_ray_dialects.messages.gr00t import PRESETS, GR00TRequest, Observat
 logger = logging.getLogger(__name__)
 
 _FOLDER = re.compile(r"^(video|state|language)\.")
-# The parts of a message before its payload. A REQ socket adds an empty one, a DEALER socket those of its program.
+# The parts of a message before its payload. A REQ socket adds an empty one, a DEALER socket those
+# of its program.
 Envelope = tuple[bytes, ...]
 _ENVELOPES: tuple[Envelope, ...] = ((), (b"",))  # those of clients that are connected directly
-_MOST_PARTS, _MOST_PART_BYTES = 4, 256  # of an envelope that is answered with an error; others end the connection
+# Of an envelope that is answered with an error; others end the connection.
+_MOST_PARTS, _MOST_PART_BYTES = 4, 256
 _HANDSHAKE_S = 5.0
 _MESSAGE_S = 30.0  # maximum time of a message, from its first byte to its last
 _SEND_S = 10.0  # maximum time for a client to accept an answer
@@ -47,15 +55,18 @@ _LINGER_S = 1.0  # and for refusing those that have arrived by then
 _STRANGERS = 64  # maximum number of connections without a valid key; a further one ends the oldest
 _STRANGER_S = 30.0  # time within which a connection must send a valid key
 _REFUSALS = 64  # messages without a valid key after which a connection is closed
-_REFUSAL_S = 0.1  # time for which a connection is not read after such a message, as reading a key takes time
+# Time for which a connection is not read after such a message, as reading a key takes time.
+_REFUSAL_S = 0.1
 
 
 class GR00TConnection(GatewayClient):
-    """One connection of a client, from its first byte to its last; a thread processes its requests in order.
+    """One connection of a client, from its first byte to its last; a thread processes its requests
+    in order.
 
-    It is a stranger until one of its messages has a valid key, or needs none; then it is one of the dialect's clients.
-    An idle client is a stranger again and has no session, but its connection stays open: a client whose request crosses
-    the end of its connection would wait for an answer for ever.
+    It is a stranger until one of its messages has a valid key, or needs none; then it is one of the
+    dialect's clients. An idle client is a stranger again and has no session, but its connection
+    stays open: a client whose request crosses the end of its connection would wait for an answer
+    for ever.
     """
 
     def __init__(self, dialect: GR00TDialect, connection: socket.socket) -> None:
@@ -67,7 +78,8 @@ class GR00TConnection(GatewayClient):
         self._share = share_of(connection)  # whose share of the bytes in flight its messages take
         self._reader = ClientReader(connection, dialect.of_strangers, robot=True)
         self._commands = TokenBucket(CONTROL_FRAMES_PER_S, time.monotonic(), CONTROL_FRAMES)
-        self._valid_until = time.monotonic() + _STRANGER_S  # time at which a stranger is disconnected, s
+        # Time at which a stranger is disconnected, s.
+        self._valid_until = time.monotonic() + _STRANGER_S
         self._refused = 0  # number of messages without a valid key
         self._sending = threading.Lock()  # guards sending, and the next field
         self._waiting: Envelope | None = None  # the envelope of the request without an answer
@@ -93,13 +105,16 @@ class GR00TConnection(GatewayClient):
     def wait_answered(self, until: float) -> None:
         """Wait until no request is unanswered, or until a time of `time.monotonic()`, s."""
         with self._answered:
-            self._answered.wait_for(lambda: not self._unanswered, max(0.0, until - time.monotonic()))
+            self._answered.wait_for(
+                lambda: not self._unanswered, max(0.0, until - time.monotonic())
+            )
 
     def refuse_waiting(self, error: VLAgentsError) -> None:
-        """Answer a request that is still unanswered with an error, and end the connection; on any thread.
+        """Answer a request that is still unanswered with an error, and end the connection; on any
+        thread.
 
-        The connection's thread waits for the policy and would not read the client's next request: after the end, ZeroMQ
-        keeps that request for the server's successor.
+        The connection's thread waits for the policy and would not read the client's next request:
+        after the end, ZeroMQ keeps that request for the server's successor.
         """
         if self._unanswered and self._send(_error(error)):
             self.cut_off("the server is stopping")
@@ -148,15 +163,17 @@ class GR00TConnection(GatewayClient):
     def _read_command(self, flags: zmtp.FrameFlags, deadline: float) -> tuple[bytes, bytes]:
         size = zmtp.read_size(self._read(flags.size_bytes, _MESSAGE_S, deadline))
         if not flags.is_command or size > zmtp.COMMAND_BYTES:
-            raise MalformedMessage(f"zmtp: expected a command of at most {zmtp.COMMAND_BYTES} bytes, got {size}")
+            raise MalformedMessage(
+                f"zmtp: expected a command of at most {zmtp.COMMAND_BYTES} bytes, got {size}"
+            )
         return zmtp.read_command(self._read(size, _MESSAGE_S, deadline))
 
     def _receive_head(self) -> tuple[Envelope, int, float] | None:
         """Receive a message up to its payload.
 
         Returns:
-            Its envelope, the size of its payload in bytes, and the time at which the payload must have arrived, s; None
-            if the client has disconnected.
+            Its envelope, the size of its payload in bytes, and the time at which the payload must
+            have arrived, s; None if the client has disconnected.
         """
         envelope: list[bytes] = []
         deadline = float("inf")
@@ -180,21 +197,27 @@ class GR00TConnection(GatewayClient):
             if not flags.has_more:
                 if size > self._context.limits.body_bytes:
                     raise MessageTooLarge(
-                        f"gr00t: a message of {size} bytes, the limit is {self._context.limits.body_bytes}"
+                        f"gr00t: a message of {size} bytes, the limit is "
+                        f"{self._context.limits.body_bytes}"
                     )
                 return tuple(envelope), size, deadline
             if len(envelope) == _MOST_PARTS or sum(map(len, envelope)) + size > _MOST_PART_BYTES:
                 raise MalformedMessage(
-                    f"gr00t: expected an envelope of at most {_MOST_PARTS} parts and {_MOST_PART_BYTES} bytes"
+                    f"gr00t: expected an envelope of at most {_MOST_PARTS} parts and "
+                    f"{_MOST_PART_BYTES} bytes"
                 )
             envelope.append(bytes(self._read(size, _MESSAGE_S, deadline)))
 
     def _check_idle(self) -> None:
-        """End the sessions of an idle client or one whose key is no longer valid; raise if a stranger stays one."""
+        """End the sessions of an idle client or one whose key is no longer valid; raise if a
+        stranger stays one.
+        """
         if not self.is_client:
             self.sessions.close()
             if time.monotonic() >= self._valid_until:
-                raise MessageTooLarge(f"gr00t: no message with a valid key within {_STRANGER_S:g} s")
+                raise MessageTooLarge(
+                    f"gr00t: no message with a valid key within {_STRANGER_S:g} s"
+                )
         elif self._dialect.is_gone(self):
             has_valid_key = self.sessions.refusal() is None
             self.sessions.close()
@@ -251,7 +274,8 @@ class GR00TConnection(GatewayClient):
             if envelope not in _ENVELOPES:
                 self._count_refusal()
                 raise MalformedMessage(
-                    f"gr00t: got an envelope of {len(envelope)} parts, want none or an empty one; connect each client "
+                    f"gr00t: got an envelope of {len(envelope)} parts, want none or an empty one; "
+                    "connect each client "
                     f"directly, without a ZeroMQ proxy"
                 )
             self._identify(payload)
@@ -269,7 +293,9 @@ class GR00TConnection(GatewayClient):
             return gr00t.pack({"error": internal_error("gr00t")})
 
     def _identify(self, payload: memoryview) -> None:
-        """Set the sessions' caller by the key of a message; raise an error unless it is valid, or none is needed."""
+        """Set the sessions' caller by the key of a message; raise an error unless it is valid,
+        or none is needed.
+        """
         check = self._context.check
         if isinstance(check, NoKey):
             self.sessions.show(check, None)
@@ -283,7 +309,9 @@ class GR00TConnection(GatewayClient):
             self.sessions.show(caller, key)
             if isinstance(caller, Caller):
                 self._share = caller.name
-                self._is_robot = self._dialect.config.rank == "robot" and caller.rank != "simulation"
+                self._is_robot = (
+                    self._dialect.config.rank == "robot" and caller.rank != "simulation"
+                )
         if not self.is_client:
             self._dialect.admit(self)
         self._reader.set_sender(self._context.admission, self._share, robot=self._is_robot)
@@ -309,7 +337,9 @@ class GR00TConnection(GatewayClient):
     def _act(self, asked: Observations) -> Any:
         mapping, contract = self._mapping, self._context.contract
         self._flat = asked.flat
-        seen = [mapping.obs(gr00t.newest(one), self._context.limits, contract) for one in asked.each]
+        seen = [
+            mapping.obs(gr00t.newest(one), self._context.limits, contract) for one in asked.each
+        ]
         if not self.sessions.begun:
             mapping.warn_of_unread_cameras(gr00t.newest(asked.each[0]), "gr00t")
         acts = self.sessions.act_batch([obs for obs, _ in seen], [text for _, text in seen])
@@ -340,7 +370,9 @@ def _stopping() -> PolicyUnavailable:
 
 
 def _theirs(entries: Iterable[tuple[str, str]], needed: Iterable[str]) -> list[str]:
-    """Return the client's names of the policy's cameras or states; `*` in the mapping keeps the policy's names."""
+    """Return the client's names of the policy's cameras or states; `*` in the mapping keeps the
+    policy's names.
+    """
     found: dict[str, None] = {}
     for ours, key in entries:
         names = needed if "*" in key else [key.rpartition("/")[2]]
@@ -349,7 +381,9 @@ def _theirs(entries: Iterable[tuple[str, str]], needed: Iterable[str]) -> list[s
 
 
 def nested_mapping(mapping: KeyMapping) -> tuple[KeyMapping, bool]:
-    """Return a mapping with the keys of `gr00t.newest`, and whether it had N1.5's flat keys, such as `video.front`."""
+    """Return a mapping with the keys of `gr00t.newest`, and whether it had N1.5's flat keys,
+    such as `video.front`.
+    """
 
     def folders(key: str) -> str:
         return "|".join(_FOLDER.sub(r"\1/", one) for one in key.split("|"))
@@ -357,7 +391,10 @@ def nested_mapping(mapping: KeyMapping) -> tuple[KeyMapping, bool]:
     nested = replace(
         mapping,
         cameras={name: replace(one, key=folders(one.key)) for name, one in mapping.cameras.items()},
-        state={name: tuple(replace(one, key=folders(one.key)) for one in of) for name, of in mapping.state.items()},
+        state={
+            name: tuple(replace(one, key=folders(one.key)) for one in of)
+            for name, of in mapping.state.items()
+        },
         gripper=mapping.gripper and replace(mapping.gripper, key=folders(mapping.gripper.key)),
         instruction=mapping.instruction and f"language/{gr00t.TEXT_KEY}",
         action={name.removeprefix("action."): one for name, one in mapping.action.items()},
@@ -378,7 +415,8 @@ class GR00TDialect(PortDialect):
     Config = GR00TDialectConfig
     clients = "GR00T"
     summary = (
-        "A session is the connection, until it is idle; `reset` begins an episode, and a batch of B is B "
+        "A session is the connection, until it is idle; `reset` begins an episode, and a batch of "
+        "B is B "
         "sessions. `api_token` is the API key. An error is a map with `error`."
     )
     requires = ("msgpack",)
@@ -386,12 +424,14 @@ class GR00TDialect(PortDialect):
 
     def __init__(self, name: str, config: GR00TDialectConfig, context: GatewayContext) -> None:
         super().__init__(name, config, context)
-        # Bytes of strangers' incomplete messages. One address may take half, which is the largest message.
+        # Bytes of strangers' incomplete messages. One address may take half, which is the largest
+        # message.
         self.of_strangers = Admission(2 * context.limits.body_bytes)
         self._clients: GatewayClients[int, GR00TConnection] = GatewayClients(context)  # by `id`
         self._lock = threading.Lock()  # guards the next two fields
         self._connections: set[GR00TConnection] = set()
-        self._strangers: dict[GR00TConnection, None] = {}  # the connections that are no clients, the oldest first
+        # The connections that are no clients, the oldest first.
+        self._strangers: dict[GR00TConnection, None] = {}
         self._stopping = threading.Event()  # whether new requests are refused
         self._key_reader = ThreadPoolExecutor(1, "gr00t-keys")
         self._acceptor: Acceptor | None = None
@@ -409,7 +449,8 @@ class GR00TDialect(PortDialect):
         return self._acceptor is not None and self._acceptor.alive()
 
     def close(self) -> None:
-        self._stopping.set()  # a client of this protocol waits for ever for an answer that does not come
+        # A client of this protocol waits for ever for an answer that does not come.
+        self._stopping.set()
         until = time.monotonic() + _END_S
         with self._lock:
             connections = list(self._connections)
@@ -433,14 +474,17 @@ class GR00TDialect(PortDialect):
     def read_key(self, payload: memoryview, *, of_client: bool) -> str | None:
         """Return the API key in a message; None if it has none.
 
-        Those of strangers are read on one thread: each thread's heap would keep the memory of the largest message.
+        Those of strangers are read on one thread: each thread's heap would keep the memory of the
+        largest message.
         """
         if of_client:
             return gr00t.read_token(payload, self.context.limits)
         return self._key_reader.submit(gr00t.read_token, payload, self.context.limits).result()
 
     def admit(self, connection: GR00TConnection) -> None:
-        """Count a connection with a valid key among the clients; raise `PolicyUnavailable` if there are too many."""
+        """Count a connection with a valid key among the clients; raise `PolicyUnavailable` if
+        there are too many.
+        """
         self._clients.add(id(connection), lambda: connection)
         connection.is_client = True
         with self._lock:
@@ -462,7 +506,9 @@ class GR00TDialect(PortDialect):
             self._connections.discard(connection)
 
     def add_stranger(self, connection: GR00TConnection) -> None:
-        """Count an open connection among those without a valid key; if there are too many, end the oldest."""
+        """Count an open connection among those without a valid key; if there are too many, end
+        the oldest.
+        """
         with self._lock:
             if connection not in self._connections:
                 return

@@ -1,8 +1,10 @@
-"""What stands between the clients of a gRPC dialect and gRPC's server: a bound of connections and of frames.
+"""What stands between the clients of a gRPC dialect and gRPC's server: a bound of connections and
+of frames.
 
-gRPC's library accepts and answers on native threads, as fast as a client sends: eight strangers who connect and send
-pings take both cores of a small machine. The front accepts at a bounded rate, forwards no connection before its HTTP/2
-preface, and reads no further from one that sends more small frames than a robot needs.
+gRPC's library accepts and answers on native threads, as fast as a client sends: eight strangers who
+connect and send pings take both cores of a small machine. The front accepts at a bounded rate,
+forwards no connection before its HTTP/2 preface, and reads no further from one that sends more
+small frames than a robot needs.
 """
 
 from __future__ import annotations
@@ -30,8 +32,8 @@ _HANDSHAKE_S = 5.0
 _SEND_S = 10.0  # maximum time for a client to accept a part of an answer
 _END_S = 3.0
 _READ_BYTES = 64 * 1024
-# A robot sends about four small frames with each request, and at most 7 at once. At 30 Hz, with two requests for each
-# observation, it sends 270 in a second.
+# A robot sends about four small frames with each request, and at most 7 at once. At 30 Hz, with two
+# requests for each observation, it sends 270 in a second.
 _FRAMES_PER_S = 300.0
 _FRAMES_AT_ONCE = 150
 _STRANGERS = 64  # maximum number of connections that are no clients; a further one ends the oldest
@@ -45,7 +47,8 @@ class Http2Front:
 
         Args:
             name: Name of the dialect.
-            is_client: Returns whether gRPC's name of a peer, `ServicerContext.peer()`, is that of a client.
+            is_client: Returns whether gRPC's name of a peer, `ServicerContext.peer()`, is that of a
+                client.
         """
         self.name = name
         self._is_client = is_client
@@ -61,17 +64,25 @@ class Http2Front:
         return f"unix:{self.path}"
 
     def add(self, client: socket.socket) -> None:
-        """Forward a connection on its own threads; end the oldest that is no client if there are too many."""
+        """Forward a connection on its own threads; end the oldest that is no client if there are
+        too many.
+        """
         connection = ForwardedConnection(self, client)
         with self._lock:
-            strangers = [other for other in self._connections if other.is_open and not self._is_client(other.peer)]
+            strangers = [
+                other
+                for other in self._connections
+                if other.is_open and not self._is_client(other.peer)
+            ]
             self._connections[connection] = None
         if len(strangers) >= _STRANGERS:
             strangers[0].end()
         connection.thread.start()
 
     def share_of(self, peer: str) -> str:
-        """Return the name under which a peer has a share of the bytes in flight: that of its address."""
+        """Return the name under which a peer has a share of the bytes in flight: that of its
+        address.
+        """
         with self._lock:
             return self._shares.get(peer, "address unknown")
 
@@ -112,13 +123,16 @@ class ForwardedConnection:
     def __init__(self, front: Http2Front, client: socket.socket) -> None:
         self._front, self._client = front, client
         self._server = socket.socket(socket.AF_UNIX)
-        self._server.bind("")  # the kernel chooses a unique name, by which gRPC's server tells its peers apart
+        # The kernel chooses a unique name, by which gRPC's server tells its peers apart.
+        self._server.bind("")
         self.peer = f"unix-abstract:{self._server.getsockname()[1:].decode()}"
         self._frames = FrameCounter()
         self._allowed_frames = TokenBucket(_FRAMES_PER_S, time.monotonic(), _FRAMES_AT_ONCE)
         self._ended = threading.Event()
         self.thread = threading.Thread(target=self._run, name=f"{front.name}-requests", daemon=True)
-        self._answers = threading.Thread(target=self._forward_answers, name=f"{front.name}-answers", daemon=True)
+        self._answers = threading.Thread(
+            target=self._forward_answers, name=f"{front.name}-answers", daemon=True
+        )
 
     @property
     def is_open(self) -> bool:
@@ -166,17 +180,23 @@ class ForwardedConnection:
             received = self._client.recv(len(PREFACE) - len(preface))
             preface += received
             if not received or not PREFACE.startswith(preface):
-                raise MalformedMessage("expected the preface of HTTP/2, got another one; use a client of gRPC")
+                raise MalformedMessage(
+                    "expected the preface of HTTP/2, got another one; use a client of gRPC"
+                )
         self._client.settimeout(None)
         self._client.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        self._client.setsockopt(socket.SOL_SOCKET, socket.SO_SNDTIMEO, struct.pack("ll", int(_SEND_S), 0))
+        self._client.setsockopt(
+            socket.SOL_SOCKET, socket.SO_SNDTIMEO, struct.pack("ll", int(_SEND_S), 0)
+        )
         set_keep_alive(self._client)
 
     def _forward_requests(self) -> None:
         while data := self._client.recv(_READ_BYTES):
             frames = self._frames.count(data)
             if frames > _FRAMES_AT_ONCE:
-                raise MalformedMessage(f"expected at most {_FRAMES_AT_ONCE} small frames at once, got {frames}")
+                raise MalformedMessage(
+                    f"expected at most {_FRAMES_AT_ONCE} small frames at once, got {frames}"
+                )
             while (wait_s := self._allowed_frames.take(time.monotonic(), frames)) > 0:
                 if self._ended.wait(wait_s):
                     return
@@ -188,7 +208,8 @@ class ForwardedConnection:
         try:
             while data := self._server.recv(_READ_BYTES):
                 self._client.sendall(data)
-        except OSError as error:  # a server that ends with unread requests resets the connection after its answers
+        except OSError as error:
+            # a server that ends with unread requests resets the connection after its answers
             logger.info("%s: disconnected a client: %s", self._front.name, error)
         finally:
             wait_delivered(self._client, time.monotonic() + ANSWERS_S)

@@ -35,18 +35,27 @@ from vlagents_ray_dialects.acceptor import Acceptor
 from vlagents_ray_dialects.gateway_sessions import GatewayClient, GatewayClients, internal_error
 from vlagents_ray_dialects.http2_front import Http2Front
 from vlagents_ray_dialects.messages import lerobot
-from vlagents_ray_dialects.messages.lerobot import PRESETS, PolicyInstructions, RobotObservation, TransferState
+from vlagents_ray_dialects.messages.lerobot import (
+    PRESETS,
+    PolicyInstructions,
+    RobotObservation,
+    TransferState,
+)
 
 logger = logging.getLogger(__name__)
 
-_WAIT_S = 2.0  # time that a request for actions waits for an observation, as at LeRobot's own server
-_HZ = 30.0  # rate of the actions' timestamps if the policy's contract has none, as at LeRobot's own server
+# Time that a request for actions waits for an observation, as at LeRobot's own server.
+_WAIT_S = 2.0
+# Rate of the actions' timestamps if the policy's contract has none, as at LeRobot's own server.
+_HZ = 30.0
 _UPLOAD_S = 30.0  # maximum time from an observation's first part to its last
 _END_S = 3.0
 _REQUESTS = 4  # maximum number of concurrent requests of one client; LeRobot's has two
 _HEARTBEAT_MS = 10_000
-_DETAILS = 500  # maximum number of characters of an error, which gRPC sends in a header of 8 KiB at most
-# HTTP status -> name of gRPC's; clients repeat a request by themselves after UNAVAILABLE or DEADLINE_EXCEEDED
+# Maximum number of characters of an error, which gRPC sends in a header of 8 KiB at most.
+_DETAILS = 500
+# HTTP status -> name of gRPC's; clients repeat a request by themselves after UNAVAILABLE or
+# DEADLINE_EXCEEDED
 _STATUS = {
     400: "INVALID_ARGUMENT",
     403: "PERMISSION_DENIED",
@@ -72,12 +81,17 @@ class _Waiting:
 
 
 class LeRobotConnection(GatewayClient):
-    """One client since its `Ready`. Its requests arrive on several threads, of which one at a time uses the session."""
+    """One client since its `Ready`. Its requests arrive on several threads, of which one at a
+    time uses the session.
+    """
 
-    def __init__(self, context: GatewayContext, mapping: KeyMapping, checkpoint: str | None) -> None:
+    def __init__(
+        self, context: GatewayContext, mapping: KeyMapping, checkpoint: str | None
+    ) -> None:
         super().__init__(context)
         self._mapping, self._checkpoint = mapping, checkpoint
-        self.sessions.show(NoKey.OPEN, None)  # the protocol has no key, and the deployment accepted that
+        # The protocol has no key, and the deployment accepted that.
+        self.sessions.show(NoKey.OPEN, None)
         self._robot: PolicyInstructions | None = None
         self._acted = -1  # time step of the last observation that the policy received
         self._waiting: _Waiting | None = None
@@ -98,20 +112,27 @@ class LeRobotConnection(GatewayClient):
                 self._used = time.monotonic()
 
     def set_up(self, robot: PolicyInstructions) -> None:
-        """Set the policy instructions; raise `InvalidInput` if they name another checkpoint than the deployment."""
+        """Set the policy instructions; raise `InvalidInput` if they name another checkpoint than
+        the deployment.
+        """
         if self._checkpoint not in (None, robot.checkpoint):
             raise InvalidInput(
-                f"pretrained_name_or_path: got {robot.checkpoint[:80]!r}, this server acts for {self._checkpoint!r}; "
+                f"pretrained_name_or_path: got {robot.checkpoint[:80]!r}, this server acts for "
+                f"{self._checkpoint!r}; "
                 "start the client with that"
             )
-        logger.info("lerobot: a client of %r %r begins", robot.policy_type[:80], robot.checkpoint[:80])
+        logger.info(
+            "lerobot: a client of %r %r begins", robot.policy_type[:80], robot.checkpoint[:80]
+        )
         self._robot = robot
 
     def observe(self, data: bytes, admission: MessageAdmission) -> None:
-        """Store an observation for the next act, in place of an earlier one that the policy has not received yet.
+        """Store an observation for the next act, in place of an earlier one that the policy has not
+        received yet.
 
-        An observation of a time step that the policy has received is ignored, unless the client has no action left.
-        The `admission` of the pickle is released when the observation is dropped or acted on.
+        An observation of a time step that the policy has received is ignored, unless the client has
+        no action left. The `admission` of the pickle is released when the observation is dropped or
+        acted on.
         """
         if self._robot is None:
             raise NotReset("SendPolicyInstructions: got none since Ready; start the client again")
@@ -124,19 +145,26 @@ class LeRobotConnection(GatewayClient):
         if not self.sessions.begun:
             self._mapping.warn_of_unread_cameras(theirs, "lerobot")
         with self._arrival:
-            earlier, self._waiting = self._waiting, _Waiting(seen, self._robot, obs, instruction, admission)
+            earlier, self._waiting = (
+                self._waiting,
+                _Waiting(seen, self._robot, obs, instruction, admission),
+            )
             self._arrival.notify()
         if earlier is not None:
             earlier.admission.release()
 
     def actions(self) -> bytes | None:
-        """Return the pickled actions for the newest observation; None if there is none within two seconds."""
+        """Return the pickled actions for the newest observation; None if there is none within
+        two seconds.
+        """
         deadline = time.monotonic() + _WAIT_S
         if not self._acting.acquire(timeout=_WAIT_S):
             return None
         try:
             with self._arrival:
-                self._arrival.wait_for(lambda: self._waiting or self._ended, deadline - time.monotonic())
+                self._arrival.wait_for(
+                    lambda: self._waiting or self._ended, deadline - time.monotonic()
+                )
                 waiting, self._waiting = self._waiting, None
             return None if waiting is None or self._ended else self._act(waiting)
         finally:
@@ -163,13 +191,18 @@ class LeRobotConnection(GatewayClient):
         try:
             act = self.sessions.act(waiting.obs, waiting.instruction)
         except BaseException:
-            self._acted = before  # the client's next observation of this time step must not be ignored
+            # The client's next observation of this time step must not be ignored.
+            self._acted = before
             raise
         finally:
             waiting.admission.release()
-        rows: np.ndarray = self._mapping.rows(act.action, None if contract is None else contract.action)
+        rows: np.ndarray = self._mapping.rows(
+            act.action, None if contract is None else contract.action
+        )
         hz = (contract and contract.control_hz) or _HZ
-        return lerobot.write_chunk(rows[: waiting.robot.actions_per_chunk], seen.timestamp, seen.timestep, 1 / hz)
+        return lerobot.write_chunk(
+            rows[: waiting.robot.actions_per_chunk], seen.timestamp, seen.timestep, 1 / hz
+        )
 
 
 class LeRobotDialectConfig(KeylessPortConfig):
@@ -179,18 +212,22 @@ class LeRobotDialectConfig(KeylessPortConfig):
     port: int = Field(default=8080, ge=1, le=65535)
     checkpoint: str | None = Field(
         default=None,
-        description="the `pretrained_name_or_path` that clients must state; unset: any, as it is not loaded: the "
+        description="the `pretrained_name_or_path` that clients must state; unset: any, as it is "
+        "not loaded: the "
         "policy of the deployment acts",
     )
 
 
 class LeRobotDialect(PortDialect):
-    """LeRobot's gRPC service; gRPC's threads process the requests, which arrive through an `Http2Front`."""
+    """LeRobot's gRPC service; gRPC's threads process the requests, which arrive through an
+    `Http2Front`.
+    """
 
     Config = LeRobotDialectConfig
     clients = "LeRobot"
     summary = (
-        "A session is the connection, until it is idle; an episode begins with `Ready` and with each new task. The "
+        "A session is the connection, until it is idle; an episode begins with `Ready` and with "
+        "each new task. The "
         "newest observation is acted on. Pickles are read as data: numbers, texts and numpy arrays."
     )
     scheme = "grpc"
@@ -201,7 +238,8 @@ class LeRobotDialect(PortDialect):
     def __init__(self, name: str, config: LeRobotDialectConfig, context: GatewayContext) -> None:
         super().__init__(name, config, context)
         self._clients: GatewayClients[str, LeRobotConnection] = GatewayClients(context)
-        self._uploads: dict[Any, float] = {}  # gRPC's context of each observation that is being received -> its start
+        # gRPC's context of each observation that is being received -> its start.
+        self._uploads: dict[Any, float] = {}
         self._server: Any = None
         self._front: Http2Front | None = None
         self._acceptor: Acceptor | None = None
@@ -244,14 +282,17 @@ class LeRobotDialect(PortDialect):
         self._closing.set()
         if self._acceptor is not None:
             self._acceptor.close()
-        stopped = None if self._server is None else self._server.stop(_END_S)  # then it ends the remaining requests
+        # Then it ends the remaining requests.
+        stopped = None if self._server is None else self._server.stop(_END_S)
         self._clients.end_all()
         if stopped is not None:
             stopped.wait()
         if self._front is not None:
             self._front.close()
 
-    def _answer(self, grpc: Any, method: Callable[[Any, Any], bytes | None], request: Any, context: Any) -> bytes:
+    def _answer(
+        self, grpc: Any, method: Callable[[Any, Any], bytes | None], request: Any, context: Any
+    ) -> bytes:
         """Return the reply to a request, or end the request with gRPC's status for the error."""
         try:
             return method(request, context) or lerobot.EMPTY
@@ -308,7 +349,10 @@ class LeRobotDialect(PortDialect):
     def _request(self, context: Any) -> AbstractContextManager[LeRobotConnection]:
         """Return the context of a request, with its client, identified by its connection."""
         if (client := self._clients.get(context.peer())) is None:
-            raise NotReset("Ready: got none over this connection, or it was idle for too long; start the client again")
+            raise NotReset(
+                "Ready: got none over this connection, or it was idle for too long; start the "
+                "client again"
+            )
         return client.request()
 
     def _check_clients(self) -> None:
@@ -334,7 +378,9 @@ def _joined(messages: Iterator[bytes], admission: MessageAdmission) -> bytes:
             raise MalformedMessage("observation: begins twice")
         size += len(data)
         if size > limit:
-            raise MessageTooLarge(f"observation: more than {limit} bytes; send smaller images, or raise `limits`")
+            raise MessageTooLarge(
+                f"observation: more than {limit} bytes; send smaller images, or raise `limits`"
+            )
         admission.receive(len(data))
         parts.append(data)
         if state is TransferState.END:

@@ -1,15 +1,17 @@
-"""openpi's and RoboArena's clients over WebSocket: requests and replies are binary maps; the server sends first.
+"""openpi's and RoboArena's clients over WebSocket: requests and replies are binary maps; the server
+sends first.
 
-RoboArena's clients use nearly the same protocol and also connect to the root. Both dialects may be on: RoboArena's
-requests name an `endpoint`, openpi's do not. The first message is then RoboArena's configuration, which openpi's client
+RoboArena's clients use nearly the same protocol and also connect to the root. Both dialects may be
+on: RoboArena's requests name an `endpoint`, openpi's do not. The first message is then RoboArena's
+    configuration, which openpi's client
 takes for metadata.
 
-An error is a text with a request id, after which the connection is closed (1011) except for 429; openpi's own server
-sends a traceback.
+An error is a text with a request id, after which the connection is closed (1011) except for 429;
+openpi's own server sends a traceback.
 
-A batch, `{"batch": [observation, ...]}`, is that of openpi's pull request 941 (its head 5bdadc8), which was open when
-this was written: the reply is one map, whose `actions` are stacked. openpi's own client sends nothing when it is reset;
-the message `{"reset": True}` is that of its derivatives.
+A batch, `{"batch": [observation, ...]}`, is that of openpi's pull request 941 (its head 5bdadc8),
+which was open when this was written: the reply is one map, whose `actions` are stacked. openpi's
+own client sends nothing when it is reset; the message `{"reset": True}` is that of its derivatives.
 """
 
 from __future__ import annotations
@@ -25,7 +27,13 @@ import numpy as np
 from pydantic import Field
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
-from vlagents_ray.errors import MalformedMessage, PolicyUnavailable, TooManyRequests, VLAgentsError, shown
+from vlagents_ray.errors import (
+    MalformedMessage,
+    PolicyUnavailable,
+    TooManyRequests,
+    VLAgentsError,
+    shown,
+)
 from vlagents_ray.protocol.messages import NAME_CHARACTERS, Reply
 from vlagents_ray.serve.config.dialects import DialectConfig, MappingSetting
 from vlagents_ray.serve.dialects import base
@@ -37,7 +45,9 @@ from vlagents_ray_dialects.messages import openpi
 
 
 class MapDialect(base.RouteDialect):
-    """A dialect whose messages are maps in openpi's encoding; all such dialects share the server's root."""
+    """A dialect whose messages are maps in openpi's encoding; all such dialects share the
+    server's root.
+    """
 
     root = "openpi"
 
@@ -69,14 +79,18 @@ class MapDialect(base.RouteDialect):
         return None
 
     def answer(self, replies: Sequence[Reply], before_ms: float | None, *, batched: bool) -> Any:
-        """Encode the replies in the client's format; `before_ms` is the server's time for the previous message."""
+        """Encode the replies in the client's format; `before_ms` is the server's time for the
+        previous message.
+        """
         inference_ms = max(reply.timing["inference_ms"] for reply in replies)
         infer_ms = max(reply.timing["queue_ms"] + reply.timing["inference_ms"] for reply in replies)
         rows = [self.rows(reply) for reply in replies]
         actions = _stacked(rows) if batched else rows[0]
         return (self.mapping.columns(actions) or {"actions": actions}) | {
-            "policy_timing": {"infer_ms": inference_ms} | ({"batch_size": len(rows)} if batched else {}),
-            "server_timing": {"infer_ms": infer_ms} | ({} if before_ms is None else {"prev_total_ms": before_ms}),
+            "policy_timing": {"infer_ms": inference_ms}
+            | ({"batch_size": len(rows)} if batched else {}),
+            "server_timing": {"infer_ms": infer_ms}
+            | ({} if before_ms is None else {"prev_total_ms": before_ms}),
         }
 
 
@@ -84,7 +98,8 @@ def _stacked(chunks: Sequence[np.ndarray]) -> np.ndarray:
     """Stack the chunks of a batch to (B, H, D)."""
     if len(shapes := {chunk.shape for chunk in chunks}) > 1:
         raise VLAgentsError(
-            f"batch: got chunks of the shapes {sorted(shapes)}, and its reply is one array; send each by itself"
+            f"batch: got chunks of the shapes {sorted(shapes)}, and its reply is one array; send "
+            "each by itself"
         )
     return np.stack(chunks)
 
@@ -94,24 +109,28 @@ class OpenPiDialectConfig(DialectConfig):
 
     mapping: MappingSetting  # each of openpi's robots has different keys, so there is no default
     metadata: dict[str, Any] = Field(
-        default_factory=dict, description="added to what the client is sent first, such as reset_pose"
+        default_factory=dict,
+        description="added to what the client is sent first, such as reset_pose",
     )
     answer_reset: bool = Field(
-        default=False, description='whether {"reset": True} is answered, by the same; clients differ in waiting for it'
+        default=False,
+        description='whether {"reset": True} is answered, by the same; clients differ in waiting '
+        "for it",
     )
 
 
 class OpenPiDialect(MapDialect):
     """openpi's protocol: a session begins with the connection, and an episode with each new prompt.
 
-    The observations of a batch are those of further sessions, in order. A batch of another size ends all their
-    episodes, as the owner of each observation is unknown.
+    The observations of a batch are those of further sessions, in order. A batch of another size
+    ends all their episodes, as the owner of each observation is unknown.
     """
 
     Config = OpenPiDialectConfig
     clients = "openpi"
     summary = (
-        "A session is the connection, or a place in its batches; an episode begins with each new prompt. An error is a "
+        "A session is the connection, or a place in its batches; an episode begins with each new "
+        "prompt. An error is a "
         "text, then close 1011."
     )
     paths: ClassVar[Mapping[str, str]] = {"WS /openpi": "stream"}
@@ -120,7 +139,9 @@ class OpenPiDialect(MapDialect):
 
     def first(self) -> dict[str, Any]:
         known = self.context.metadata()
-        return {key: known.get(key) for key in ("policy", "checkpoint", "version")} | self.config.metadata
+        return {
+            key: known.get(key) for key in ("policy", "checkpoint", "version")
+        } | self.config.metadata
 
     def speaks(self, message: dict[str, Any]) -> bool:
         return "endpoint" not in message
@@ -138,23 +159,31 @@ class OpenPiDialect(MapDialect):
             return None
         batch = message["batch"]
         if not isinstance(batch, list) or not batch:
-            raise MalformedMessage(f"batch: got {shown(batch)}, want a list of one observation or more")
+            raise MalformedMessage(
+                f"batch: got {shown(batch)}, want a list of one observation or more"
+            )
         return batch
 
 
 class RoboArenaDialectConfig(DialectConfig):
-    """The settings of RoboArena's client; except for `bare`, the fields are those of its PolicyServerConfig."""
+    """The settings of RoboArena's client; except for `bare`, the fields are those of its
+    PolicyServerConfig.
+    """
 
     mapping: MappingSetting = "roboarena"
-    image_resolution: tuple[int, int] | None = Field(default=(224, 224), description="height, width; null: any")
+    image_resolution: tuple[int, int] | None = Field(
+        default=(224, 224), description="height, width; null: any"
+    )
     needs_wrist_camera: bool = True
     n_external_cameras: int = Field(default=1, ge=0, le=2)
     needs_stereo_camera: bool = False
     needs_session_id: bool = False
-    action_space: Literal["joint_position", "joint_velocity", "cartesian_position", "cartesian_velocity"] = (
-        "joint_position"
+    action_space: Literal[
+        "joint_position", "joint_velocity", "cartesian_position", "cartesian_velocity"
+    ] = "joint_position"
+    bare: bool = Field(
+        default=False, description="answer the array itself, as older clients want it"
     )
-    bare: bool = Field(default=False, description="answer the array itself, as older clients want it")
 
 
 class RoboArenaDialect(MapDialect):
@@ -163,7 +192,8 @@ class RoboArenaDialect(MapDialect):
     Config = RoboArenaDialectConfig
     clients = "RoboArena"
     summary = (
-        "A session is the connection; `reset` or a new `session_id` begins an episode. An error is a text, "
+        "A session is the connection; `reset` or a new `session_id` begins an episode. An error is "
+        "a text, "
         "then close 1011."
     )
     paths: ClassVar[Mapping[str, str]] = {"WS /roboarena": "stream"}
@@ -184,7 +214,8 @@ class RoboArenaDialect(MapDialect):
             connection.end_episodes()
             return "reset successful"
         if (named := message.get("session_id")) is not None:
-            if isinstance(named, np.ndarray) and named.size == 1:  # the client sends a text, or an array with one text
+            # The client sends a text, or an array with one text.
+            if isinstance(named, np.ndarray) and named.size == 1:
                 named = named.item()
             episode = shown(named, NAME_CHARACTERS)
             if connection.episode not in (None, episode):
@@ -193,7 +224,11 @@ class RoboArenaDialect(MapDialect):
         return None
 
     def answer(self, replies: Sequence[Reply], before_ms: float | None, *, batched: bool) -> Any:
-        return self.rows(replies[0]) if self.config.bare else super().answer(replies, before_ms, batched=batched)
+        return (
+            self.rows(replies[0])
+            if self.config.bare
+            else super().answer(replies, before_ms, batched=batched)
+        )
 
 
 class MapConnection:
@@ -212,8 +247,12 @@ class MapConnection:
         for session in (self.session, *self._batched):
             session.episode.end()
 
-    async def answer(self, message: dict[str, Any], incoming: Message, request_id: str, gate: Sender) -> bytes | str:
-        """Return the reply to one message; `gate` counts the observations of a batch after the first for the key."""
+    async def answer(
+        self, message: dict[str, Any], incoming: Message, request_id: str, gate: Sender
+    ) -> bytes | str:
+        """Return the reply to one message; `gate` counts the observations of a batch after the
+        first for the key.
+        """
         dialect = self.dialect
         if (answer := dialect.begins(message, self)) is not None:
             return answer
@@ -228,12 +267,16 @@ class MapConnection:
         incoming.decoded_alike(len(observations))
         replies = await base.act_together(incoming, seen, request_id)
         before_ms, batched = self._before_ms, batch is not None
-        data = incoming.written(lambda: openpi.encode(dialect.answer(replies, before_ms, batched=batched)))
+        data = incoming.written(
+            lambda: openpi.encode(dialect.answer(replies, before_ms, batched=batched))
+        )
         self._before_ms = (time.perf_counter() - incoming.arrived) * 1e3
         return data
 
     async def _of_batch(self, number: int) -> list[base.ImplicitSession]:
-        """Return the sessions of a batch of that size, in order; a change of the size ends the episodes."""
+        """Return the sessions of a batch of that size, in order; a change of the size ends the
+        episodes.
+        """
         if number != len(self._batched):
             surplus, self._batched = self._batched[number:], self._batched[:number]
             for session in surplus:
@@ -246,7 +289,9 @@ class MapConnection:
 
 
 async def _stream(dialects: Sequence[MapDialect], socket: WebSocket) -> None:
-    """Serve one connection at a path of these dialects, of which the last one sends the first message."""
+    """Serve one connection at a path of these dialects, of which the last one sends the first
+    message.
+    """
     if not await base.accept_or_refuse(socket, dialects[0].context):
         return
     connections: dict[str, MapConnection] = {}
@@ -274,17 +319,22 @@ async def _answer(
     """Reply to one message; return False if the connection was closed."""
     incoming, request_id = dialects[0].arrived(), uuid.uuid4().hex
     try:
-        message = await base.decoded(lambda data, budget: openpi.decode(data, budget.limits), data, admission)
+        message = await base.decoded(
+            lambda data, budget: openpi.decode(data, budget.limits), data, admission
+        )
         dialect = next((dialect for dialect in dialects if dialect.speaks(message)), dialects[0])
         arrived, incoming = incoming.arrived, dialect.arrived()
         incoming.arrived = arrived
-        connection = connections.get(dialect.name) or connections.setdefault(dialect.name, MapConnection(dialect))
+        connection = connections.get(dialect.name) or connections.setdefault(
+            dialect.name, MapConnection(dialect)
+        )
         answer = await connection.answer(message, incoming, request_id, gate)
     except Exception as error:  # noqa: BLE001 - the error is the reply to the client
         problem = public_problem(error, incoming.transport, request_id)
         incoming.record_failure(problem.code)
         await socket.send_text(f"{problem} (request {request_id})")
-        if isinstance(problem, TooManyRequests):  # the connection stays open, as nothing was acted on
+        # The connection stays open, as nothing was acted on.
+        if isinstance(problem, TooManyRequests):
             if gate.refused_too_often:
                 await socket.close(base.POLICY_VIOLATION, REFUSED)
             return not gate.refused_too_often

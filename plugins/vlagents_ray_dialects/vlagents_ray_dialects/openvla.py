@@ -23,11 +23,18 @@ from vlagents_ray_dialects.messages.openvla import PRESETS
 
 
 class OpenVLADialectConfig(DialectConfig):
-    """The settings of the REST clients of OpenVLA, and of its forks that post whole observations."""
+    """The settings of the REST clients of OpenVLA, and of its forks that post whole
+    observations.
+    """
 
     mapping: MappingSetting = "openvla"
-    chunk: bool = Field(default=False, description="answer all rows, as OFT's clients want it, not the first alone")
-    plain: bool = Field(default=False, description="answer lists of numbers, as GO-1's clients read them, not arrays")
+    chunk: bool = Field(
+        default=False, description="answer all rows, as OFT's clients want it, not the first alone"
+    )
+    plain: bool = Field(
+        default=False,
+        description="answer lists of numbers, as GO-1's clients read them, not arrays",
+    )
 
 
 class OpenVLADialect(HttpDialect):
@@ -35,16 +42,24 @@ class OpenVLADialect(HttpDialect):
 
     Config = OpenVLADialectConfig
     clients = "OpenVLA"
-    summary = "An episode is one request, unless that names a session. An error has its status and problem+json."
+    summary = (
+        "An episode is one request, unless that names a session. An error has its status "
+        "and "
+        "problem+json."
+    )
     paths: ClassVar[Mapping[str, str]] = {"POST /act": "act"}
     presets = PRESETS
     config: OpenVLADialectConfig
 
     def read(self, theirs: Any) -> tuple[Obs, str | None]:
-        """Convert a client's observation, which needs an instruction if the mapping has a key for it."""
+        """Convert a client's observation, which needs an instruction if the mapping has a key
+        for it.
+        """
         obs, instruction = super().read(theirs)
         if instruction is None and self.mapping.instruction is not None:
-            raise InvalidObservation("instruction: got none, the policy needs one; send it with the observation")
+            raise InvalidObservation(
+                "instruction: got none, the policy needs one; send it with the observation"
+            )
         return obs, instruction
 
     async def act(self, http: HttpRequest) -> Response:

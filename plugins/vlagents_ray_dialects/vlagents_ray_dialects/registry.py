@@ -12,6 +12,7 @@ LEROBOT = RegistryEntry("vlagents_ray_dialects.lerobot:LeRobotDialect")
 
 UPSTREAM = RegistryEntry(
     "vlagents_ray_dialects.upstream:Upstream",
-    "any model behind openpi, RoboArena, GR00T, OpenVLA, vla-eval, vlagents, SGLang, vLLM-Omni or FlashRT",
+    "any model behind openpi, RoboArena, GR00T, OpenVLA, vla-eval, vlagents, SGLang, vLLM-Omni or "
+    "FlashRT",
     wants="that server",
 )

@@ -1,7 +1,9 @@
-"""vla-eval's benchmarks over WebSocket: they send "hello", the begin and end of episodes, and an observation per step.
+"""vla-eval's benchmarks over WebSocket: they send "hello", the begin and end of episodes, and an
+observation per step.
 
-A benchmark executes one action per step, so each reply holds one row of a chunk. A benchmark that sends observations
-without waiting (its live mode) gets a reply to the newest one; the server does not act on older ones.
+A benchmark executes one action per step, so each reply holds one row of a chunk. A benchmark that
+sends observations without waiting (its live mode) gets a reply to the newest one; the server does
+not act on older ones.
 """
 
 from __future__ import annotations
@@ -22,7 +24,13 @@ from starlette.routing import BaseRoute, Route
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from vlagents_ray.chunking.buffer import ChunkBuffer
-from vlagents_ray.errors import MalformedMessage, MessageTooLarge, PolicyUnavailable, VLAgentsError, shown
+from vlagents_ray.errors import (
+    MalformedMessage,
+    MessageTooLarge,
+    PolicyUnavailable,
+    VLAgentsError,
+    shown,
+)
 from vlagents_ray.protocol.messages import RankName
 from vlagents_ray.serve.config.dialects import DialectConfig, MappingSetting
 from vlagents_ray.serve.dialects import base
@@ -40,7 +48,9 @@ class VlaEvalDialectConfig(DialectConfig):
 
     mapping: MappingSetting = "vla-eval"
     rank: RankName = "simulation"
-    execute: int | None = Field(default=None, ge=1, description="rows of each chunk that are executed; null: all")
+    execute: int | None = Field(
+        default=None, ge=1, description="rows of each chunk that are executed; null: all"
+    )
     observation_params: dict[str, Any] = Field(
         default_factory=dict, description="what benchmarks are asked for, such as send_state: true"
     )
@@ -51,7 +61,10 @@ class VlaEvalDialect(base.RouteDialect):
 
     Config = VlaEvalDialectConfig
     clients = "vla-eval"
-    summary = "A session is the connection, which says where episodes begin and end. An error is an `error` message."
+    summary = (
+        "A session is the connection, which says where episodes begin and end. An error is "
+        "an `error` message."
+    )
     paths: ClassVar[Mapping[str, str]] = {"WS /vla-eval": "stream"}
     root = "vla_eval"
     presets = PRESETS
@@ -112,7 +125,9 @@ class VlaEvalDialect(base.RouteDialect):
     def _hello(self, message: vla_eval.Message) -> vla_eval.Message:
         version = message.payload.get("protocol_version")
         if type(version) is not int or version != vla_eval.PROTOCOL_VERSION:
-            error = MalformedMessage(f"protocol_version: got {shown(version, 20)}, want {vla_eval.PROTOCOL_VERSION}")
+            error = MalformedMessage(
+                f"protocol_version: got {shown(version, 20)}, want {vla_eval.PROTOCOL_VERSION}"
+            )
             return _error(error, message.seq, uuid.uuid4().hex)
         known = self.context.metadata()
         payload: dict[str, Any] = {
@@ -126,13 +141,20 @@ class VlaEvalDialect(base.RouteDialect):
         return vla_eval.Message("hello", payload, message.seq)
 
     async def _act(
-        self, message: vla_eval.Message, admission: MessageAdmission, session: base.ImplicitSession, chunk: ChunkBuffer
+        self,
+        message: vla_eval.Message,
+        admission: MessageAdmission,
+        session: base.ImplicitSession,
+        chunk: ChunkBuffer,
     ) -> vla_eval.Message:
         incoming = self.arrived()
         request_id = uuid.uuid4().hex
         try:
-            # Some benchmarks render only the observations that begin a chunk: those of its other rows are not read.
-            text = self.mapping.read_instruction(message.payload, self.context.limits, self.context.contract)
+            # Some benchmarks render only the observations that begin a chunk: those of its other
+            # rows are not read.
+            text = self.mapping.read_instruction(
+                message.payload, self.context.limits, self.context.contract
+            )
             if chunk.next is None or session.episode.begins(text):
                 payload = await admission.decoded(partial(vla_eval.decode_images, message.payload))
                 obs, instruction = self.read(payload)
@@ -179,14 +201,18 @@ class _Inbox:
         return self._messages.popleft()
 
     async def fill(self, socket: WebSocket, gate: Sender, dialect: VlaEvalDialect) -> None:
-        """Receive messages until the client is gone, or too many of its messages wait for replies."""
+        """Receive messages until the client is gone, or too many of its messages wait for
+        replies.
+        """
         try:
             while not gate.refused_too_often:
                 if (received := await dialect.receive(socket, gate)) is None:
                     return
                 data, admission = received
                 if len(self._messages) >= _WAITING:
-                    self.end = f"{_WAITING} messages wait for answers; send no more than that at once"
+                    self.end = (
+                        f"{_WAITING} messages wait for answers; send no more than that at once"
+                    )
                     self._put(_Received(MessageTooLarge(self.end), admission))
                     return
                 self._put(await self._read(data, admission))
@@ -198,18 +224,29 @@ class _Inbox:
     async def _read(data: bytes | None, admission: MessageAdmission) -> _Received:
         """Decode a message, which counts as a request of the key."""
         try:
-            message = await base.decoded(lambda data, budget: vla_eval.decode(data, budget.limits), data, admission)
+            message = await base.decoded(
+                lambda data, budget: vla_eval.decode(data, budget.limits), data, admission
+            )
             return _Received(message, admission)
         except Exception as error:  # noqa: BLE001 - the error is the reply to the client
-            return _Received(public_problem(error, "vla_eval", "of an unreadable message"), admission)
+            return _Received(
+                public_problem(error, "vla_eval", "of an unreadable message"), admission
+            )
 
     def _put(self, received: _Received | None) -> None:
         last = self._messages[-1] if self._messages else None
-        if last is not None and received is not None and last.is_observation and received.is_observation:
+        if (
+            last is not None
+            and received is not None
+            and last.is_observation
+            and received.is_observation
+        ):
             self._messages.pop()
         self._messages.append(received)
         self._there.set()
 
 
 def _error(error: VLAgentsError, seq: int, request_id: str) -> vla_eval.Message:
-    return vla_eval.Message("error", {"error": f"{error} (request {request_id})", "code": error.code}, seq)
+    return vla_eval.Message(
+        "error", {"error": f"{error} (request {request_id})", "code": error.code}, seq
+    )

@@ -57,16 +57,22 @@ class VlagentsConnection:
         self._context = context = dialect.context
         self._dialect, self._connection = dialect, connection
         self._session = GatewaySessions(context.connect, context.contract)
-        self._session.show(NoKey.OPEN, None)  # the protocol has no key, and the deployment accepted that
+        # The protocol has no key, and the deployment accepted that.
+        self._session.show(NoKey.OPEN, None)
         robot = dialect.config.rank == "robot"
         self._share = share_of(connection)  # whose share of the bytes in flight its messages take
         self._reader = ClientReader(connection, context.admission, robot=robot)
-        self._segments = SharedMemory(same_machine=dialect.config.shared_memory and _is_same_machine(connection))
+        self._segments = SharedMemory(
+            same_machine=dialect.config.shared_memory and _is_same_machine(connection)
+        )
         self._sending = threading.Lock()
-        self._unanswered: int | None = None  # sequence number of the request that is being processed
+        # Sequence number of the request that is being processed.
+        self._unanswered: int | None = None
 
     def run(self) -> None:
-        """Process the client's requests until it disconnects, is silent for too long, or sends an invalid message."""
+        """Process the client's requests until it disconnects, is silent for too long, or sends
+        an invalid message.
+        """
         try:
             self._connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
             while not self._dialect.closing and (frame := self._receive()) is not None:
@@ -106,18 +112,23 @@ class VlagentsConnection:
         return unanswered is not None
 
     def stop_reading(self) -> None:
-        """Read no further requests: the connection ends after the answer to the current one. From any thread."""
+        """Read no further requests: the connection ends after the answer to the current one.
+        From any thread.
+        """
         shut_down(self._connection, socket.SHUT_RD)
 
     def end(self) -> None:
         """Answer the current request with an error, and end the connection. From any thread."""
         error = PolicyUnavailable("the server is stopping; connect again")
-        if self._unanswered is not None:  # else the client may be reading an answer slowly, with the lock held
+        # Else the client may be reading an answer slowly, with the lock held.
+        if self._unanswered is not None:
             with self._sending:
                 sequence, self._unanswered = self._unanswered, None
                 if sequence is not None:
                     with contextlib.suppress(OSError):  # the client is gone, or does not read
-                        self._send(rpyc.exception(sequence, "RuntimeError", f"{error.code}: {error}"))
+                        self._send(
+                            rpyc.exception(sequence, "RuntimeError", f"{error.code}: {error}")
+                        )
         shut_down(self._connection)
 
     def _answer(self, call: RpycCall) -> bytes:
@@ -128,7 +139,10 @@ class VlagentsConnection:
                 return rpyc.reference_reply(call.sequence, _number(call.args))
             return rpyc.reply(call.sequence, self._value(call))
         except VLAgentsError as error:
-            kind = next((one.__name__ for one in (TimeoutError, ValueError) if isinstance(error, one)), "RuntimeError")
+            kind = next(
+                (one.__name__ for one in (TimeoutError, ValueError) if isinstance(error, one)),
+                "RuntimeError",
+            )
             return rpyc.exception(call.sequence, kind, f"{error.code}: {error}")
         except Exception:  # noqa: BLE001 - logged, and answered
             return rpyc.exception(call.sequence, "RuntimeError", internal_error("vlagents"))
@@ -163,7 +177,8 @@ class VlagentsConnection:
         if isinstance(parts, vlagents.Part):
             if len(seen.robots) > 1:
                 raise InvalidInput(
-                    f"got the robots {list(seen.robots)[:8]}; state their columns in dialects.vlagents.robots"
+                    f"got the robots {list(seen.robots)[:8]}; state their columns in "
+                    "dialects.vlagents.robots"
                 )
             parts = dict.fromkeys(seen.robots, parts)
         return vlagents.write_act(act, seen.robots, parts)
@@ -188,7 +203,9 @@ class VlagentsConnection:
         )
 
     def _ours(self, obs: Obs) -> Obs:
-        """Return the observation under the policy's names, converted if the deployment has a mapping."""
+        """Return the observation under the policy's names, converted if the deployment has a
+        mapping.
+        """
         if (mapping := self._dialect.stated_mapping) is None:
             return obs
         theirs: dict[str, Any] = {"cameras": obs.cameras, "state": obs.state, "info": obs.info}
@@ -200,9 +217,13 @@ class VlagentsConnection:
         return ours
 
     def _receive(self) -> tuple[bytearray, bool] | None:
-        """Receive the next message, and whether it is compressed; None if the client disconnected before it."""
+        """Receive the next message, and whether it is compressed; None if the client
+        disconnected before it.
+        """
         header = self._reader.read(
-            rpyc.HEADER.size, self._context.idle_s, time.monotonic() + self._context.idle_s + _FRAME_S
+            rpyc.HEADER.size,
+            self._context.idle_s,
+            time.monotonic() + self._context.idle_s + _FRAME_S,
         )
         if header is None:
             return None
@@ -235,11 +256,17 @@ def _number(args: tuple[Any, ...]) -> int:
 
 
 def _called(call: RpycCall) -> tuple[str, tuple[Any, ...]]:
-    """Return the name of the method that a client calls, by number or by name, and the arguments."""
+    """Return the name of the method that a client calls, by number or by name, and the
+    arguments.
+    """
     match call.handler, call.args:
-        case Handler.CALL, (rpyc.Reference(number), tuple(args), *options) if 0 < number <= len(_METHODS):
+        case Handler.CALL, (rpyc.Reference(number), tuple(args), *options) if (
+            0 < number <= len(_METHODS)
+        ):
             name = _METHODS[number - 1]
-        case Handler.CALLATTR, (rpyc.Reference(rpyc.ROOT), str(name), tuple(args), *options) if name in _METHODS:
+        case Handler.CALLATTR, (rpyc.Reference(rpyc.ROOT), str(name), tuple(args), *options) if (
+            name in _METHODS
+        ):
             pass
         case _:
             raise MalformedMessage(f"rpyc: want a call of one of {list(_METHODS)} of the root")
@@ -249,7 +276,9 @@ def _called(call: RpycCall) -> tuple[str, tuple[Any, ...]]:
 
 
 def _is_same_machine(connection: socket.socket) -> bool:
-    """Return whether the client is on this machine, in which case both ends have the same address."""
+    """Return whether the client is on this machine, in which case both ends have the same
+    address.
+    """
     try:
         return bool(connection.getpeername()[0] == connection.getsockname()[0])
     except OSError:  # the client is already gone
@@ -258,9 +287,9 @@ def _is_same_machine(connection: socket.socket) -> bool:
 
 # Access by name to the shared memory of a client on this machine.
 #
-# Segments are copied, never mapped: if a client shrinks a mapped segment, SIGBUS would end this process. This module
-# neither creates nor removes segments, nor registers them with Python's resource tracker, so that the client alone owns
-# them.
+# Segments are copied, never mapped: if a client shrinks a mapped segment, SIGBUS would end this
+# process. This module neither creates nor removes segments, nor registers them with Python's
+# resource tracker, so that the client alone owns them.
 
 
 class SharedMemory:
@@ -272,19 +301,26 @@ class SharedMemory:
         self._open: dict[str, int] = {}
 
     def read(self, name: str, size: int) -> bytearray:
-        """Return a copy of the first `size` bytes of a segment; raise `InvalidObservation` if that is impossible."""
+        """Return a copy of the first `size` bytes of a segment; raise `InvalidObservation` if
+        that is impossible.
+        """
         if not self._same_machine:
             raise InvalidObservation(
-                "shared memory: the client is not on the server's machine; leave on_same_machine=False"
+                "shared memory: the client is not on the server's machine; leave "
+                "on_same_machine=False"
             )
         descriptor = self._descriptor(name)
         if os.fstat(descriptor).st_size < size:  # checked before memory is allocated
-            raise InvalidObservation(f"shared memory {name[:40]!r}: shorter than the {size} bytes of its shape")
+            raise InvalidObservation(
+                f"shared memory {name[:40]!r}: shorter than the {size} bytes of its shape"
+            )
         data = bytearray(size)
         got = 0
         while got < size:
             if (more := os.preadv(descriptor, [memoryview(data)[got:]], got)) == 0:
-                raise InvalidObservation(f"shared memory {name[:40]!r}: became shorter while it was read")
+                raise InvalidObservation(
+                    f"shared memory {name[:40]!r}: became shorter while it was read"
+                )
             got += more
         return data
 
@@ -296,13 +332,19 @@ class SharedMemory:
 
     def _descriptor(self, name: str) -> int:
         if (match := _NAME.fullmatch(name)) is None:
-            raise InvalidObservation(f"shared memory: got the name {name[:40]!r}, want one like 'psm_01234567'")
+            raise InvalidObservation(
+                f"shared memory: got the name {name[:40]!r}, want one like 'psm_01234567'"
+            )
         if (known := self._open.get(match[1])) is not None:
             return known
         try:
-            descriptor = os.open(f"{_FOLDER}/{match[1]}", os.O_RDONLY | os.O_NOFOLLOW | os.O_CLOEXEC | os.O_NONBLOCK)
+            descriptor = os.open(
+                f"{_FOLDER}/{match[1]}", os.O_RDONLY | os.O_NOFOLLOW | os.O_CLOEXEC | os.O_NONBLOCK
+            )
         except OSError as error:
-            raise InvalidObservation(f"shared memory {name[:40]!r}: cannot be opened ({error.strerror})") from error
+            raise InvalidObservation(
+                f"shared memory {name[:40]!r}: cannot be opened ({error.strerror})"
+            ) from error
         if not stat.S_ISREG(os.fstat(descriptor).st_mode):
             os.close(descriptor)
             raise InvalidObservation(f"shared memory {name[:40]!r}: is none")
@@ -316,8 +358,12 @@ class GripperArgs(BaseModel, extra="forbid"):
     """The column of a robot's gripper in a row of the policy's actions, and its values."""
 
     column: int = Field(default=-1, description="as in Python: -1 is the last")
-    open: float | None = Field(default=None, description="its value for open; default: the policy's contract, or 1")
-    closed: float | None = Field(default=None, description="and for closed; default: the policy's contract, or 0")
+    open: float | None = Field(
+        default=None, description="its value for open; default: the policy's contract, or 1"
+    )
+    closed: float | None = Field(
+        default=None, description="and for closed; default: the policy's contract, or 0"
+    )
 
     @model_validator(mode="after")
     def _two_values(self) -> GripperArgs:
@@ -339,18 +385,25 @@ class RobotArgs(BaseModel, extra="forbid"):
 class VlagentsDialectConfig(KeylessPortConfig):
     """The settings of the RPyC protocol of the package `vlagents`, 0.2 and 0.3.
 
-    A mapping reads cameras/NAME, state/NAME, gripper, info; without one, the client's names stay as they are.
+    A mapping reads cameras/NAME, state/NAME, gripper, info; without one, the client's names stay as
+    they are.
     """
 
     port: int = Field(default=8080, ge=1, le=65535)
     name: str | None = Field(
-        default=None, description="the model's name, which clients must give; default: the application's"
+        default=None,
+        description="the model's name, which clients must give; default: the application's",
     )
     gripper: GripperArgs | None = Field(
-        default=None, description="of the only robot: the column that goes into SingleAct.gripper; unset: none"
+        default=None,
+        description="of the only robot: the column that goes into SingleAct.gripper; unset: none",
     )
-    robots: dict[str, RobotArgs] = Field(default_factory=dict, description="with several, which columns are whose")
-    shared_memory: bool = Field(default=True, description="read the cameras of clients on this machine in place")
+    robots: dict[str, RobotArgs] = Field(
+        default_factory=dict, description="with several, which columns are whose"
+    )
+    shared_memory: bool = Field(
+        default=True, description="read the cameras of clients on this machine in place"
+    )
 
     @model_validator(mode="after")
     def _one_way(self) -> VlagentsDialectConfig:
@@ -365,12 +418,14 @@ class VlagentsDialect(PortDialect):
     Config = VlagentsDialectConfig
     clients = "vlagents"
     summary = (
-        "A session is the connection; an episode begins with `reset` and with each new instruction. An error "
+        "A session is the connection; an episode begins with `reset` and with each new "
+        "instruction. An error "
         "is raised at the client as a built-in exception."
     )
     scheme = "rpyc"
     presets: ClassVar[Mapping[str, Mapping[str, Any]]] = {
-        # this project's own names, for clients that need a mapping but whose protocol defines no names
+        # this project's own names, for clients that need a mapping but whose protocol defines no
+        # names
         "vlagents": {
             "cameras": {"*": "cameras/*"},
             "state": {"*": "state/*"},
@@ -396,7 +451,9 @@ class VlagentsDialect(PortDialect):
 
     @classmethod
     def lacks(cls, config: DialectConfig, contract: Contract | None) -> list[str]:  # noqa: ARG003 - overrides
-        """Return nothing: the instruction is sent beside the observation, and `robots` states each robot's columns."""
+        """Return nothing: the instruction is sent beside the observation, and `robots` states
+        each robot's columns.
+        """
         return []
 
     def serve(self, listener: socket.socket) -> None:
@@ -427,13 +484,18 @@ class VlagentsDialect(PortDialect):
 
     def _add(self, connection: socket.socket) -> None:
         client = VlagentsConnection(self, connection)
-        thread = threading.Thread(target=self._serve, args=(client,), name="vlagents-client", daemon=True)
+        thread = threading.Thread(
+            target=self._serve, args=(client,), name="vlagents-client", daemon=True
+        )
         with self._lock:
             is_full = len(self._clients) >= self.context.sessions
             if not is_full:
                 self._clients[thread] = client
         if is_full:
-            logger.warning("vlagents: %d clients are connected, the limit; one was refused", self.context.sessions)
+            logger.warning(
+                "vlagents: %d clients are connected, the limit; one was refused",
+                self.context.sessions,
+            )
             connection.close()
         else:
             thread.start()
@@ -449,7 +511,10 @@ class VlagentsDialect(PortDialect):
 def _part(robot: RobotArgs, spec: ActionSpec) -> vlagents.Part:
     if (gripper := robot.gripper) is None:
         return vlagents.Part(robot.start, robot.stop)
-    opened, closed = _first(gripper.open, spec.gripper_open, 1.0), _first(gripper.closed, spec.gripper_closed, 0.0)
+    opened, closed = (
+        _first(gripper.open, spec.gripper_open, 1.0),
+        _first(gripper.closed, spec.gripper_closed, 0.0),
+    )
     return vlagents.Part(robot.start, robot.stop, gripper.column, opened, closed)
 
 

@@ -1,4 +1,6 @@
-"""examples/learn/flow.py: the reference policy's flow, improved by GRPO and PPO, at a small size."""
+"""examples/learn/flow.py: the reference policy's flow, improved by GRPO and PPO, at a small
+size.
+"""
 
 from __future__ import annotations
 
@@ -29,7 +31,14 @@ def small(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def plan(method: Method, out: Path, **options: Any) -> FlowPlan:
-    settings = {"method": method, "out": out, "iterations": 1, "episodes": 16, "held_out": 4, "epochs": 1}
+    settings = {
+        "method": method,
+        "out": out,
+        "iterations": 1,
+        "episodes": 16,
+        "held_out": 4,
+        "epochs": 1,
+    }
     return FlowPlan.model_validate(settings | options)
 
 
@@ -39,17 +48,24 @@ def test_the_earlier_a_task_is_solved_the_larger_is_its_advantage() -> None:
     columns = {name: np.array(values) for name, values in found.items()}
     solved = np.array([0.9**2, 1.0, 0.0])
     late, early, never = (solved - solved.mean()) / (solved.std() + 1e-6)
-    np.testing.assert_allclose(group_advantages(columns, 0.9), [late] * 3 + [0, early] + [never] * 4, rtol=1e-5)
+    np.testing.assert_allclose(
+        group_advantages(columns, 0.9), [late] * 3 + [0, early] + [never] * 4, rtol=1e-5
+    )
 
 
 @pytest.mark.parametrize("method", get_args(Method))
 def test_a_run_trains_the_flow_alone_and_writes_results_and_a_checkpoint(
-    method: Method, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    method: Method,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     learned = []
     improve = FlowLearner.improve
     monkeypatch.setattr(
-        FlowLearner, "improve", lambda self, columns: learned.append(improve(self, columns)) or learned[-1]
+        FlowLearner,
+        "improve",
+        lambda self, columns: learned.append(improve(self, columns)) or learned[-1],
     )
     run = FlowRun(plan(method, tmp_path / "run"))
     run.learn()
@@ -61,7 +77,9 @@ def test_a_run_trains_the_flow_alone_and_writes_results_and_a_checkpoint(
     sizes = flow.read_checkpoint(flow.CHECKPOINT).sizes
     old = read_network(sizes, flow.CHECKPOINT).state_dict()
     new = read_network(sizes, tmp_path / "run" / "checkpoint").state_dict()
-    moved = {name.partition(".")[0] for name, value in old.items() if not torch.equal(value, new[name])}
+    moved = {
+        name.partition(".")[0] for name, value in old.items() if not torch.equal(value, new[name])
+    }
     assert moved == set(HEAD)
 
     flow.compare_runs([tmp_path / "run", tmp_path / "run"])
@@ -102,9 +120,20 @@ def test_a_learners_step_makes_good_acts_likelier(tmp_path: Path) -> None:
 @pytest.mark.server
 @pytest.mark.slow
 @pytest.mark.integration
-def test_a_worker_plays_while_the_learner_learns_and_no_episode_is_older_than_the_lag(tmp_path: Path) -> None:
+def test_a_worker_plays_while_the_learner_learns_and_no_episode_is_older_than_the_lag(
+    tmp_path: Path,
+) -> None:
     with ray_folder() as folder:
-        command = [sys.executable, flow.__file__, "learn", "grpo", "--out", str(tmp_path / "run"), "--max-lag", "1"]
+        command = [
+            sys.executable,
+            flow.__file__,
+            "learn",
+            "grpo",
+            "--out",
+            str(tmp_path / "run"),
+            "--max-lag",
+            "1",
+        ]
         command += ["--iterations", "2", "--episodes", "64", "--held-out", "2"]
         done = subprocess.run(
             command,

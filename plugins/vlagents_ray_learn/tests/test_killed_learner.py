@@ -58,7 +58,8 @@ def test_a_killed_learner_leaves_nothing_running_and_goes_on_without_a_lost_or_d
         command = [sys.executable, "-c", LEARNER, str(tmp_path), str(EPISODES), json.dumps(options)]
         with Popen(command, env=environment, start_new_session=True) as learner:
             wait_for(lambda: all((tmp_path / f"gate-{seed}").exists() for seed in (5, 6)))
-            wait_for(lambda: checkpoint.exists() and checkpoint.read_text() == "5")  # both workers are in mid-episode
+            # Both workers are in mid-episode.
+            wait_for(lambda: checkpoint.exists() and checkpoint.read_text() == "5")
             learner.kill()
         wait_for_end(ours, "Rollout")
         wait_for(lambda: not processes(ours))

@@ -19,7 +19,13 @@ from vlagents_ray.errors import InvalidWeights, UnchangedWeights
 from vlagents_ray.serve.scaling.weight_push import WeightPusher
 from vlagents_ray.serve.weights import PushOptions, WeightUpdates
 from vlagents_ray.weights import shared_values
-from vlagents_ray.weights.shared_values import NotShared, SharedValues, opened, readable_gpus, shared
+from vlagents_ray.weights.shared_values import (
+    NotShared,
+    SharedValues,
+    opened,
+    readable_gpus,
+    shared,
+)
 from vlagents_ray.weights.trainable import portable
 from vlagents_ray_learn.publisher import AppTarget
 
@@ -128,7 +134,9 @@ def test_temporary_values_are_freed_after_each_push(
 
 @pytest.mark.parametrize("readers", [0, 1, 2, 3])
 @pytest.mark.parametrize("late", [False, True])
-def test_memory_is_freed_however_often_it_was_read(memory: SharedCpuMemory, readers: int, late: bool) -> None:
+def test_memory_is_freed_however_often_it_was_read(
+    memory: SharedCpuMemory, readers: int, late: bool
+) -> None:
     values = {name: value.detach().clone() for name, value in model("cpu").state_dict().items()}
     with ExitStack() as stack:
         with shared(values) as handles:
@@ -153,11 +161,19 @@ def test_counts_with_another_layout_are_released_by_torch_itself(
 
     monkeypatch.setattr(torch.UntypedStorage, "_release_ipc_counter_cuda", release, raising=False)
     monkeypatch.setattr(shared_values, "_FIRST_COUNT", 64 + 8 * 100)
-    shared_values._warn_of_counts.cache_clear()  # an earlier test may have caused the warning, which comes once
+    # An earlier test may have caused the warning, which comes once.
+    shared_values._warn_of_counts.cache_clear()
     with shared(model("cpu").state_dict()) as handles:
         assert released == []
-    assert [counter for _, counter in released][::-1] == [one.counter for one in handles.storages.values()]
-    assert caplog.text.count("torch's counts of readers cannot be set (got 0 as the first value of one") == 1
+    assert [counter for _, counter in released][::-1] == [
+        one.counter for one in handles.storages.values()
+    ]
+    assert (
+        caplog.text.count(
+            "torch's counts of readers cannot be set (got 0 as the first value of one"
+        )
+        == 1
+    )
     assert memory.counts.limbo == []
 
 
@@ -208,7 +224,10 @@ def test_what_does_not_fit_is_refused_as_ever_and_nothing_stays_open(
 
 
 def test_without_a_gpu_in_common_the_object_store_is_used_and_the_log_says_why(
-    replica: ReplicaProcess, device: str, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+    replica: ReplicaProcess,
+    device: str,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
 ) -> None:
     if device != "cpu":
         pytest.skip("one GPU is enough")
@@ -224,16 +243,24 @@ def test_without_a_gpu_in_common_the_object_store_is_used_and_the_log_says_why(
     assert app.push(learner.state_dict(), PIN) == 1
     np.testing.assert_equal(replica.ask("values"), pushed)
     assert [type(sent) for sent in app.sent] == [SharedValues, list]
-    assert f"replica replica can copy only memory of GPU {GPU}, and the learner's is on GPU GPU-another" in caplog.text
+    assert (
+        f"replica replica can copy only memory of GPU {GPU}, and the learner's is on GPU "
+        "GPU-another"
+    ) in caplog.text
     assert another.handles == 0
 
 
-def test_memory_that_cannot_be_opened_is_said_to_be_so(device: str, memory: SharedCpuMemory | None) -> None:
+def test_memory_that_cannot_be_opened_is_said_to_be_so(
+    device: str, memory: SharedCpuMemory | None
+) -> None:
     if memory is None:
         pytest.skip("one GPU is enough")
     with shared(model(device).state_dict()) as values:
         memory.uuid = "GPU-another"
-        message = f"the learner's memory on GPU {GPU} cannot be opened: this process does not use that GPU"
+        message = (
+            f"the learner's memory on GPU {GPU} cannot be opened: this process does not use "
+            "that GPU"
+        )
         with pytest.raises(NotShared, match=message), opened(values):
             pass
 
@@ -248,10 +275,16 @@ def test_memory_of_a_peer_gpu_is_copied_from_there(monkeypatch: pytest.MonkeyPat
         assert [type(values) for values in app.sent] == [SharedValues]
 
 
-def test_the_gpus_that_can_be_read_are_the_visible_ones_with_access(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_gpus_that_can_be_read_are_the_visible_ones_with_access(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     monkeypatch.setattr(torch.cuda, "device_count", lambda: 3)
-    monkeypatch.setattr(torch.cuda, "get_device_properties", lambda device: SimpleNamespace(uuid=f"GPU-{device}"))
-    monkeypatch.setattr(torch.cuda, "can_device_access_peer", lambda own, other: {own, other} == {0, 1})
+    monkeypatch.setattr(
+        torch.cuda, "get_device_properties", lambda device: SimpleNamespace(uuid=f"GPU-{device}")
+    )
+    monkeypatch.setattr(
+        torch.cuda, "can_device_access_peer", lambda own, other: {own, other} == {0, 1}
+    )
     assert [readable_gpus(gpu) for gpu in ("GPU-0", "GPU-1", "GPU-2", "")] == [
         ("GPU-0", "GPU-1"),
         ("GPU-0", "GPU-1"),

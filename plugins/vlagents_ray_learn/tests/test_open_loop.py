@@ -29,7 +29,13 @@ from vlagents_ray.robot.record import Recorder
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.local_agent import LocalAgent
 from vlagents_ray_learn.open_loop.command import parse_episodes
-from vlagents_ray_learn.open_loop.comparison import OpenLoopPlan, OpenSession, candidate, compare, open_datasets
+from vlagents_ray_learn.open_loop.comparison import (
+    OpenLoopPlan,
+    OpenSession,
+    candidate,
+    compare,
+    open_datasets,
+)
 from vlagents_ray_learn.open_loop.recorded_dataset import Names, RecordedDataset
 from vlagents_ray_live import episodes
 
@@ -39,7 +45,9 @@ class Follow(Agent):
 
     @property
     def contract(self) -> Contract:
-        return Contract(state={"joints": StateSpec(2)}, gripper=True, action=ActionSpec(dim=2), chunk=3)
+        return Contract(
+            state={"joints": StateSpec(2)}, gripper=True, action=ActionSpec(dim=2), chunk=3
+        )
 
     def act(self, obs: Obs) -> Act:
         assert obs.gripper == 0.5
@@ -69,7 +77,11 @@ def demonstrate(folder: Path, frames: int = 6) -> None:
         for _ in range(2):
             with recorder.episode("count"):
                 for i in range(frames):
-                    obs = Obs({"front": seen(i).cameras["front"]}, 0.5, {"joints": np.array([i, 2 * i], np.float32)})
+                    obs = Obs(
+                        {"front": seen(i).cameras["front"]},
+                        0.5,
+                        {"joints": np.array([i, 2 * i], np.float32)},
+                    )
                     recorder.add(obs, np.array([i + 1, 2 * i + 2], np.float32), tick=i)
 
 
@@ -100,7 +112,9 @@ def test_noise_of_the_same_seeds_makes_no_error_and_of_others_it_does(tmp_path: 
         assert compare(open_datasets(tmp_path), open_session, OpenLoopPlan()).to_json()["max"] > 0
 
 
-def test_a_session_of_several_episodes_is_reset_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_session_of_several_episodes_is_reset_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(episodes, "_FRAMES", 3)
     record(tmp_path)
     with loaded(Brightness()) as open_session:
@@ -117,10 +131,15 @@ def test_missing_acts_are_told(tmp_path: Path) -> None:
         server.recorder._held_bytes = held
         robot.act(seen(2))
     with loaded(Brightness()) as open_session:
-        assert compare(open_datasets(tmp_path), open_session, OpenLoopPlan()).to_json()["missing_acts"] == 1
+        assert (
+            compare(open_datasets(tmp_path), open_session, OpenLoopPlan()).to_json()["missing_acts"]
+            == 1
+        )
 
 
-def test_the_actions_of_a_dataset_without_answers_are_those_of_the_frames_ahead(tmp_path: Path) -> None:
+def test_the_actions_of_a_dataset_without_answers_are_those_of_the_frames_ahead(
+    tmp_path: Path,
+) -> None:
     demonstrate(tmp_path)
     with loaded(Follow()) as open_session:
         result = compare(open_datasets(tmp_path), open_session, OpenLoopPlan()).to_json()
@@ -131,13 +150,17 @@ def test_the_actions_of_a_dataset_without_answers_are_those_of_the_frames_ahead(
 def test_every_nth_frame_of_some_episodes_and_a_shorter_horizon(tmp_path: Path) -> None:
     demonstrate(tmp_path)
     with loaded(Follow()) as open_session:
-        result = compare(open_datasets(tmp_path), open_session, OpenLoopPlan([1], horizon=2, every=4)).to_json()
+        result = compare(
+            open_datasets(tmp_path), open_session, OpenLoopPlan([1], horizon=2, every=4)
+        ).to_json()
     assert [one["frames"] for one in result["by_step"]] == [2, 2]
     assert [one["episode"] for one in result["by_episode"]] == [1]
 
 
 def test_a_public_dataset_of_the_older_version_with_other_names(tmp_path: Path) -> None:
-    """Without a contract of ours, with a picture in the table, and with a state of unnamed numbers."""
+    """Without a contract of ours, with a picture in the table, and with a state of unnamed
+    numbers.
+    """
     image = seen(0).cameras["front"]
     rows = {
         "action": [[i + 1.0, 2 * i + 2.0] for i in range(4)],
@@ -148,7 +171,9 @@ def test_a_public_dataset_of_the_older_version_with_other_names(tmp_path: Path) 
     for name in ("data/chunk-000", "meta", "videos/chunk-000/observation.images.side"):
         (tmp_path / name).mkdir(parents=True)
     pq.write_table(pa.table(rows), tmp_path / "data/chunk-000/episode_000000.parquet")
-    video = Mp4(tmp_path / "videos/chunk-000/observation.images.side/episode_000000.mp4", (32, 32, 3), 10)
+    video = Mp4(
+        tmp_path / "videos/chunk-000/observation.images.side/episode_000000.mp4", (32, 32, 3), 10
+    )
     for _ in range(4):
         video.add(np.full((32, 32, 3), 100, np.uint8))
     video.finish()
@@ -159,14 +184,20 @@ def test_a_public_dataset_of_the_older_version_with_other_names(tmp_path: Path) 
         "data_path": "data/chunk-{episode_chunk:03d}/episode_{episode_index:06d}.parquet",
         "video_path": "videos/chunk-{episode_chunk:03d}/{video_key}/episode_{episode_index:06d}.mp4",
         "features": {
-            "action": {"dtype": "float32", "shape": [2], "names": {"motors": ["shoulder", "elbow"]}},
+            "action": {
+                "dtype": "float32",
+                "shape": [2],
+                "names": {"motors": ["shoulder", "elbow"]},
+            },
             "observation.state": {"dtype": "float32", "shape": [3], "names": None},
             "observation.images.top": {"dtype": "image", "shape": [33, 48, 3], "names": None},
             "observation.images.side": {"dtype": "video", "shape": [32, 32, 3], "names": None},
         },
     }
     (tmp_path / "meta/info.json").write_text(json.dumps(info))
-    (tmp_path / "meta/episodes.jsonl").write_text('{"episode_index": 0, "tasks": ["count"], "length": 4}\n')
+    (tmp_path / "meta/episodes.jsonl").write_text(
+        '{"episode_index": 0, "tasks": ["count"], "length": 4}\n'
+    )
     with loaded(Follow()) as open_session:
         result = compare(open_datasets(tmp_path), open_session, OpenLoopPlan()).to_json()
     assert (result["max"], result["by_joint"][1]["joint"]) == (0.0, "elbow")
@@ -193,7 +224,10 @@ def test_a_state_that_cannot_be_divided_names_the_option(tmp_path: Path) -> None
 
 def test_a_policy_of_another_robot_is_refused(tmp_path: Path) -> None:
     demonstrate(tmp_path)
-    with loaded(Random.from_config({"action_dim": 7})) as open_session, pytest.raises(ConfigError, match="7"):
+    with (
+        loaded(Random.from_config({"action_dim": 7})) as open_session,
+        pytest.raises(ConfigError, match="7"),
+    ):
         compare(open_datasets(tmp_path), open_session, OpenLoopPlan())
 
 
@@ -220,7 +254,8 @@ def test_the_command_prints_and_writes_the_errors(tmp_path: Path) -> None:
     demonstrate(tmp_path / "data")
     out = tmp_path / "report"
     done = CliRunner().invoke(
-        app, ["open-loop", str(tmp_path / "data"), "--policy", policy_file(tmp_path), "--out", str(out)]
+        app,
+        ["open-loop", str(tmp_path / "data"), "--policy", policy_file(tmp_path), "--out", str(out)],
     )
     assert done.exit_code == 0, done.output
     assert "mean absolute error 5.25" in done.output
@@ -231,7 +266,12 @@ def test_the_command_prints_and_writes_the_errors(tmp_path: Path) -> None:
 def policy_file(folder: Path) -> str:
     """A policy of zeros with two numbers."""
     args = {"policy": "noop", "config": {"action_dim": 2}}
-    application = {"name": "noop", "route_prefix": "/", "import_path": "vlagents_ray.serve.app:build", "args": args}
+    application = {
+        "name": "noop",
+        "route_prefix": "/",
+        "import_path": "vlagents_ray.serve.app:build",
+        "args": args,
+    }
     path = folder / "policy.yaml"
     path.write_text(json.dumps({"applications": [application]}))
     return str(path)

@@ -15,7 +15,9 @@ from vlagents_ray.errors import MissingDependency
 from vlagents_ray_learn.optional import optional
 
 PACKAGE = Path(vlagents_ray_learn.__file__).parent
-EXTRAS = tomllib.loads((PACKAGE.parent / "pyproject.toml").read_text())["project"]["optional-dependencies"]
+EXTRAS = tomllib.loads((PACKAGE.parent / "pyproject.toml").read_text())["project"][
+    "optional-dependencies"
+]
 
 
 def named_extras() -> Iterator[str]:

@@ -33,7 +33,10 @@ class Linear(Agent):
 def act(engine: Engine, session: str = "s") -> Act:
     """The first act of an episode of a simulation."""
     replies: queue.SimpleQueue[Reply] = queue.SimpleQueue()
-    for request in (Request("reset", Obs(), rank="simulation"), Request("act", Obs(), rank="simulation")):
+    for request in (
+        Request("reset", Obs(), rank="simulation"),
+        Request("act", Obs(), rank="simulation"),
+    ):
         submit(engine, session, request, replies.put)
         reply = replies.get(timeout=30)
     assert reply.act is not None, reply.error

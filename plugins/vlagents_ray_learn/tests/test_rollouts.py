@@ -50,7 +50,9 @@ class Workers(InProcessWorkers):
             if type(self).dying > 0:
                 type(self).dying -= 1
                 self._workers.remove(worker)
-                reports = [Report(failure=Failure("worker", EnvFailed.code, "the worker died"))] * len(jobs)
+                reports = [
+                    Report(failure=Failure("worker", EnvFailed.code, "the worker died"))
+                ] * len(jobs)
             else:
                 self.played.extend(str(job.key) for job in jobs)
             yield from zip(jobs, reports, strict=True)
@@ -64,7 +66,8 @@ def pool(monkeypatch: pytest.MonkeyPatch) -> type[Workers]:
     monkeypatch.setattr(rollout, "FIRST_WAIT_S", 0.001)
 
     def workers_class(config: EvalConfig, _stack: object) -> type[InProcessWorkers]:
-        # Without workers the real class plays, as this one would wait for a worker that it does not start.
+        # Without workers the real class plays, as this one would wait for a worker that it does not
+        # start.
         return Workers if config.workers else InProcessWorkers
 
     monkeypatch.setattr(rollouts, "workers_class", workers_class)
@@ -94,10 +97,15 @@ def keys(batches: Any) -> list[str]:
 
 def planned(episodes: int, env: str = LINE) -> list[str]:
     """The keys of an evaluation."""
-    return [str(job.key) for job in plan(cells(flat_config(envs=[env], episodes=episodes, out="out", seed=0)))]
+    return [
+        str(job.key)
+        for job in plan(cells(flat_config(envs=[env], episodes=episodes, out="out", seed=0)))
+    ]
 
 
-def test_episodes_are_those_of_an_evaluation_in_their_order_whoever_plays_them(pool: type[Workers]) -> None:
+def test_episodes_are_those_of_an_evaluation_in_their_order_whoever_plays_them(
+    pool: type[Workers],
+) -> None:
     with Rollouts(RolloutPlan(LINE, ToZero, workers=3)) as several:
         batches = list(itertools.islice(several, 8))
     assert keys(batches) == planned(8)
@@ -132,7 +140,9 @@ with Rollouts(RolloutPlan(LINE, ToZero, workers=0)) as rollouts:
 def test_without_workers_they_need_no_ray() -> None:
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(path for path in sys.path if path)}
     command = [sys.executable, "-W", "error", "-c", PLAY]
-    told = subprocess.run(command, check=False, capture_output=True, text=True, timeout=60, env=environment)
+    told = subprocess.run(
+        command, check=False, capture_output=True, text=True, timeout=60, env=environment
+    )
     assert told.returncode == 0, told.stderr
     assert told.stdout.strip() == "20"
 
@@ -143,7 +153,9 @@ class Replayed(ToZero):
     def act(self, obs: Obs) -> Act:
         act = super().act(obs)
         if obs.info.get("want") == ["replay"]:
-            act.info["behaviour"] = {"replay": {"tokens": np.rint(100 * act.rows()).astype(np.int64)}}
+            act.info["behaviour"] = {
+                "replay": {"tokens": np.rint(100 * act.rows()).astype(np.int64)}
+            }
         return act
 
 
@@ -187,7 +199,9 @@ def test_a_group_begins_in_one_state_and_differs_in_the_seed_of_the_policy() -> 
 
 
 @pytest.mark.parametrize("collected", [True, False])
-def test_workers_that_die_cost_neither_an_episode_nor_a_second_one(pool: type[Workers], collected: bool) -> None:
+def test_workers_that_die_cost_neither_an_episode_nor_a_second_one(
+    pool: type[Workers], collected: bool
+) -> None:
     pool.dying = 2
     with Rollouts(RolloutPlan(LINE, ToZero, workers=3)) as found:
         batches = found.collect(8).to_batches() if collected else list(itertools.islice(found, 8))
@@ -233,7 +247,9 @@ def test_on_policy_by_default_older_episodes_are_played_again(versioned: type[Ve
         versioned.version = found.version = 1
         rest = list(itertools.islice(found, 5))
     assert keys([first, *rest]) == planned(6)
-    assert [set(batch.column("version").to_pylist()) for batch in [first, *rest]] == [{0}] + [{1}] * 5
+    assert [set(batch.column("version").to_pylist()) for batch in [first, *rest]] == [{0}] + [
+        {1}
+    ] * 5
     assert found.stats.stale > 0
 
 
@@ -241,7 +257,9 @@ def test_a_version_that_no_act_names_is_an_error_and_not_an_endless_repetition()
     with Rollouts(RolloutPlan(LINE, ToZero)) as found:
         next(found)
         found.version += 1
-        with pytest.raises(ConfigError, match=r"set to 1, but its acts name 0; set it to what a push returned"):
+        with pytest.raises(
+            ConfigError, match=r"set to 1, but its acts name 0; set it to what a push returned"
+        ):
             found.collect(4)
 
 
@@ -257,7 +275,8 @@ def test_a_lag_may_be_allowed(versioned: type[Versioned], lag: int | None, stale
     class Pushed(versioned):  # type: ignore[valid-type, misc]
         def act(self, obs: Obs) -> Act:
             act = super().act(obs)
-            type(self).version = versioned.version = 1  # after the first act, in the middle of the first episode
+            # After the first act, in the middle of the first episode.
+            type(self).version = versioned.version = 1
             return act
 
     with Rollouts(RolloutPlan(LINE, Pushed, max_lag=lag)) as found:
@@ -289,7 +308,9 @@ def test_a_simulator_of_many_environments_is_one_worker_with_one_question_a_step
     finally:
         served.close()
     assert [env.num_envs for env in made] == [4]
-    assert served.frames[:22] == [4] * 22, "a reset and 10 acts, twice; sessions are closed one by one"
+    assert served.frames[:22] == [4] * 22, (
+        "a reset and 10 acts, twice; sessions are closed one by one"
+    )
     with Rollouts(RolloutPlan(LINE, ToZero, groups=2)) as alone:
         assert table.drop_columns("key").equals(alone.collect(8).drop_columns("key"))
 
@@ -299,7 +320,10 @@ def test_they_go_on_where_a_learner_that_died_was() -> None:
         found.collect(4)
         batches = list(itertools.islice(found, 3))
     with Rollouts(RolloutPlan(LINE, ToZero, groups=2, first=4)) as again:
-        assert all(one.equals(other) for one, other in zip(batches, itertools.islice(again, 3), strict=True))
+        assert all(
+            one.equals(other)
+            for one, other in zip(batches, itertools.islice(again, 3), strict=True)
+        )
 
 
 def test_closed_and_asked_for_more_they_begin_again_what_was_not_delivered() -> None:
@@ -318,7 +342,9 @@ def test_several_envs_take_turns() -> None:
     assert got == [one[0], other[0], one[1], other[1]]
 
 
-def test_envs_of_different_columns_do_not_fit_into_one_table(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_envs_of_different_columns_do_not_fit_into_one_table(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     class Seven(ToZero):
         @property
         def contract(self) -> None:
@@ -346,7 +372,9 @@ def test_envs_of_different_columns_do_not_fit_into_one_table(monkeypatch: pytest
         ({"first": -1}, "first: expected at least 0, got -1"),
     ],
 )
-def test_wrong_settings_are_errors_before_any_worker_starts(settings: dict[str, Any], message: str) -> None:
+def test_wrong_settings_are_errors_before_any_worker_starts(
+    settings: dict[str, Any], message: str
+) -> None:
     with pytest.raises(ConfigError, match=message):
         Rollouts(RolloutPlan(LINE, ToZero, **settings))
 
@@ -358,7 +386,9 @@ def test_an_env_that_nobody_knows_is_an_error_at_once() -> None:
         Rollouts(RolloutPlan(LINE, ToZero, settings={"wrkers": 3}))
 
 
-def test_workers_play_on_while_the_learner_learns_and_no_further_than_allowed(pool: type[Workers]) -> None:
+def test_workers_play_on_while_the_learner_learns_and_no_further_than_allowed(
+    pool: type[Workers],
+) -> None:
     with Rollouts(RolloutPlan(LINE, ToZero, workers=2)) as found:
         next(found)
         wait_for(lambda: len(pool.played) == 5)  # without a further call: two for each of the two
@@ -387,7 +417,9 @@ def test_at_a_steady_pace_no_episode_is_played_twice(
     assert len(pool.played) == len(set(pool.played)) + found.stats.stale
 
 
-def test_an_error_while_the_learner_learns_is_raised_by_its_next_calls(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_error_while_the_learner_learns_is_raised_by_its_next_calls(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     class Breaks(ToZero):
         broken = False
 

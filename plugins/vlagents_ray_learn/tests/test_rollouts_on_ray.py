@@ -33,7 +33,9 @@ def in_plasma(values: np.ndarray) -> bool:
 
 
 def test_a_learner_on_the_node_maps_what_a_worker_wrote() -> None:
-    with Rollouts(RolloutPlan(LINE, ToZero, workers=2, env_options=IMAGES, settings=SETTINGS)) as rollouts:
+    with Rollouts(
+        RolloutPlan(LINE, ToZero, workers=2, env_options=IMAGES, settings=SETTINGS)
+    ) as rollouts:
         batches = list(itertools.islice(rollouts, 3))
         for got in map(arrays, batches):
             assert in_plasma(got["cameras.front"])
@@ -51,11 +53,15 @@ def test_a_worker_that_is_killed_costs_neither_an_episode_nor_a_second_one(tmp_p
         os.kill(int(mark.read_text()), signal.SIGKILL)
 
     killer = threading.Thread(target=kill)
-    with Rollouts(RolloutPlan(LINE, ToZero, workers=2, env_options=gate, settings=SETTINGS)) as rollouts:
+    with Rollouts(
+        RolloutPlan(LINE, ToZero, workers=2, env_options=gate, settings=SETTINGS)
+    ) as rollouts:
         killer.start()
         table = rollouts.collect(6)
         killer.join()
         keys = arrays(table)["key"]
-        assert [key.partition("@")[0] for key in dict.fromkeys(keys)] == [f"{LINE}#{number}" for number in range(6)]
+        assert [key.partition("@")[0] for key in dict.fromkeys(keys)] == [
+            f"{LINE}#{number}" for number in range(6)
+        ]
         assert table.num_rows == 60
         assert rollouts.stats.retries == 1

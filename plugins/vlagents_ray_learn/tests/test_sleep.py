@@ -1,4 +1,6 @@
-"""A policy that rests while its learner needs the GPU: acts wait, memory is freed, and acts go on."""
+"""A policy that rests while its learner needs the GPU: acts wait, memory is freed, and acts go
+on.
+"""
 
 from __future__ import annotations
 
@@ -35,7 +37,12 @@ def serving() -> Iterator[Callable[..., Engine]]:
     def serve(agent: Agent, **options: Any) -> Engine:
         engines.append(Engine(agent, **options))
         engines[-1].start()
-        assert answered(engines[-1], "s", Request("reset", Obs(), rank="simulation", kwargs={"seed": 3})).error is None
+        assert (
+            answered(
+                engines[-1], "s", Request("reset", Obs(), rank="simulation", kwargs={"seed": 3})
+            ).error
+            is None
+        )
         return engines[-1]
 
     yield serve
@@ -149,7 +156,9 @@ def test_a_replica_that_ends_does_not_wait_for_the_learner(serving: Callable[...
     assert reply.act is not None or isinstance(reply.error, PolicyUnavailable)
 
 
-def test_a_policy_without_parameters_rests_but_moves_nothing(serving: Callable[..., Engine]) -> None:
+def test_a_policy_without_parameters_rests_but_moves_nothing(
+    serving: Callable[..., Engine],
+) -> None:
     class Fixed(Agent):
         def act(self, obs: Obs) -> Act:
             return Act(np.zeros(1))
@@ -183,13 +192,16 @@ def test_all_memory_on_the_gpu_moves_to_the_host_and_back(
             return Act(self.layer(torch.ones(1, 4))[0].numpy().copy())
 
     monkeypatch.setattr(trainable, "_on_gpu", lambda _: True)
-    monkeypatch.setattr(trainable, "portable", lambda value: portable(value.clone()))  # as from a GPU
+    # As from a GPU.
+    monkeypatch.setattr(trainable, "portable", lambda value: portable(value.clone()))
     agent = OnGpu()
     engine = serving(agent)
     weights = Publisher(engine)
     weights.push({"bias": torch.full((4,), 7.0)}, partial=True)  # held beside the version that acts
     own, before = engine.models.own_weights, acted(engine)
-    memories = [one.untyped_storage() for one in (*agent.parameters().values(), *own.newest.values.values())]
+    memories = [
+        one.untyped_storage() for one in (*agent.parameters().values(), *own.newest.values.values())
+    ]
     assert all(memory.nbytes() for memory in memories)
     hosts, made = torch.UntypedStorage, list[int]()
 
@@ -215,7 +227,9 @@ def test_all_memory_on_the_gpu_moves_to_the_host_and_back(
 
     with monkeypatch.context() as patch:
         patch.setattr(trainable, "from_host", full)
-        with pytest.raises(PolicyUnavailable, match="too little memory for the policy, which still sleeps"):
+        with pytest.raises(
+            PolicyUnavailable, match="too little memory for the policy, which still sleeps"
+        ):
             weights.wake()
     assert calls == [3], "weight, bias, and the bias of version 1"
     weights.wake()

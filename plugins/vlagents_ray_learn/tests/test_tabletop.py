@@ -1,4 +1,6 @@
-"""examples/learn: students, teacher and learners in one process, and the whole loop at a small size."""
+"""examples/learn: students, teacher and learners in one process, and the whole loop at a small
+size.
+"""
 
 from __future__ import annotations
 
@@ -41,13 +43,17 @@ class ServedTeacher(Teacher):
         return [ServedTeacher() for _ in range(number)]
 
     def reset_batch(self, obs: list[Obs], texts: list[str], sessions: list[Teacher]) -> list[Any]:
-        return [one.reset(first, text) for one, first, text in zip(sessions, obs, texts, strict=True)]
+        return [
+            one.reset(first, text) for one, first, text in zip(sessions, obs, texts, strict=True)
+        ]
 
     def close(self) -> None:
         """Nothing is held."""
 
 
-def played(seed: int, chosen: Callable[[Obs], Act], agent: Agent) -> tuple[bool, list[Obs], list[np.ndarray], str]:
+def played(
+    seed: int, chosen: Callable[[Obs], Act], agent: Agent
+) -> tuple[bool, list[Obs], list[np.ndarray], str]:
     """An episode: whether it was solved, its observations and actions, and the instruction."""
     env = Tabletop("lift", **ENV_OPTIONS)
     obs, _ = env.reset(seed=seed)
@@ -97,7 +103,9 @@ def test_the_teacher_lifts_the_puck_and_gives_the_same_advice_to_others() -> Non
 def test_a_student_keeps_what_an_agent_promises_and_neighbours_change_no_bit(
     kind: type[Student | TokenStudent],
 ) -> None:
-    check_agent(kind(), instructions=["lift the red puck", "lift the blue puck", "lift the green puck"])
+    check_agent(
+        kind(), instructions=["lift the red puck", "lift the blue puck", "lift the green puck"]
+    )
     first, _ = Tabletop("lift", **ENV_OPTIONS).reset(seed=1)
     others = [kind(), kind()]
     others[0].initialize()
@@ -125,14 +133,20 @@ def test_a_log_probability_is_that_of_the_normal_distribution_that_was_drawn_fro
     student.reset(obs, "lift the red puck", seed=3)
     mean = student.act(obs).action
     drawn = student.act(Obs(obs.cameras, obs.gripper, obs.state, {WANT: ["logprob"]}))
-    normal = torch.distributions.Normal(torch.from_numpy(mean), student.network.log_std.detach().exp())
+    normal = torch.distributions.Normal(
+        torch.from_numpy(mean), student.network.log_std.detach().exp()
+    )
     expected = normal.log_prob(torch.from_numpy(drawn.action)).numpy()
     assert (drawn.action != mean).all()
     np.testing.assert_allclose(drawn.info[BEHAVIOUR]["logprob"][0], expected, rtol=1e-3, atol=1e-3)
 
 
 def test_advantages_are_those_of_the_formula() -> None:
-    found = {"value": [0.5, 0.25, 9.0, 0.75, 0.5], "t": [0, 1, 2, 0, 1], "success": [False, True, True, False, False]}
+    found = {
+        "value": [0.5, 0.25, 9.0, 0.75, 0.5],
+        "t": [0, 1, 2, 0, 1],
+        "success": [False, True, True, False, False],
+    }
     gain, targets = advantages({name: np.array(values) for name, values in found.items()})
     last, limit = 1 - 0.25, 0.98 * 0.5 - 0.5
     first = 0.98 * 0.25 - 0.5 + 0.98 * 0.95 * last
@@ -172,7 +186,9 @@ def test_a_learner_goes_on_from_a_checkpoint_to_the_same_bit(tmp_path: Path) -> 
 
 
 def taught() -> tuple[RPDLearner, dict[str, Any]]:
-    """A learner with the demonstrations of eight episodes, and transitions as if they were the student's own."""
+    """A learner with the demonstrations of eight episodes, and transitions as if they were the
+    student's own.
+    """
     teacher = Teacher()
     found = columns([played(seed, teacher.act, teacher) for seed in range(8)])
     learner = RPDLearner()
@@ -184,7 +200,8 @@ def taught() -> tuple[RPDLearner, dict[str, Any]]:
 
 
 @pytest.mark.parametrize(
-    ("second", "wrong"), [({}, "already has a run"), ({"resume": True, "steps": 7}, r'other settings: .*"steps":7')]
+    ("second", "wrong"),
+    [({}, "already has a run"), ({"resume": True, "steps": 7}, r'other settings: .*"steps":7')],
 )
 def test_a_folder_takes_one_run(tmp_path: Path, second: dict[str, Any], wrong: str) -> None:
     RunCheckpoints(LearnPlan(out=tmp_path))
@@ -200,7 +217,10 @@ EXAMPLES = sorted((Path(__file__).parents[3] / "examples" / "learn").glob("*.yam
 def test_an_example_is_a_plan_and_ends_with_its_method(file: Path) -> None:
     plan = LearnPlan.model_validate(read_run_file(file, "file of settings", "`methods`"))
     assert plan.methods[-1] == file.stem
-    assert f"examples/learn/{file.name}" in (Path(__file__).parents[3] / "docs/tutorials/learn.md").read_text()
+    assert (
+        f"examples/learn/{file.name}"
+        in (Path(__file__).parents[3] / "docs/tutorials/learn.md").read_text()
+    )
 
 
 def test_there_is_an_example_of_each_method() -> None:
@@ -249,8 +269,12 @@ def ready(text: str = "lift the red puck", **kwargs: Any) -> tuple[TokenStudent,
     return student, obs
 
 
-def transitions(students: list[TokenStudent], starts: list[int], solved: list[bool]) -> dict[str, np.ndarray]:
-    """The columns of an episode of each student, of which some are called solved at their last step."""
+def transitions(
+    students: list[TokenStudent], starts: list[int], solved: list[bool]
+) -> dict[str, np.ndarray]:
+    """The columns of an episode of each student, of which some are called solved at their last
+    step.
+    """
     rows: dict[str, list[Any]] = {}
     for number, (student, start) in enumerate(zip(students, starts, strict=True)):
         env = Tabletop("lift", **ENV_OPTIONS)
@@ -285,7 +309,16 @@ def test_a_token_is_the_nearest_bin_of_a_number() -> None:
 
 
 def test_advantages_are_those_of_the_formula_and_groups_of_one_outcome_have_none() -> None:
-    outcomes = [[0, 0, 1], [0, 0, 0], [0, 1, 0], [0, 0, 0], [1, 1, 1], [0, 0, 1], [0, 0, 0], [0, 0, 0]]
+    outcomes = [
+        [0, 0, 1],
+        [0, 0, 0],
+        [0, 1, 0],
+        [0, 0, 0],
+        [1, 1, 1],
+        [0, 0, 1],
+        [0, 0, 0],
+        [0, 0, 0],
+    ]
     columns = {
         "episode": np.repeat([5, 5, 5, 5, 2, 2, 3, 3], 3),
         "t": np.tile([0, 1, 2], 8),
@@ -302,7 +335,10 @@ def test_a_log_probability_is_that_of_the_softmax_which_the_tokens_are_drawn_fro
     student, obs = ready(seed=3)
     learner = GRPOLearner()  # with the network of the same seed
     seen = {"cameras.front": obs.cameras["front"][None], "state.xyzrpy": obs.state["xyzrpy"][None]}
-    seen |= {"gripper": np.array([obs.gripper]), "instruction": np.array(["lift the red puck"], object)}
+    seen |= {
+        "gripper": np.array([obs.gripper]),
+        "instruction": np.array(["lift the red puck"], object),
+    }
     with torch.no_grad():
         logits = learner.network.policy(learner.network.features(torch.from_numpy(inputs_of(seen))))
     softmax = torch.distributions.Categorical(logits=logits.reshape(4, TOKENS))
@@ -311,11 +347,16 @@ def test_a_log_probability_is_that_of_the_softmax_which_the_tokens_are_drawn_fro
     for act, drawn in zip(acts[:20], tokens, strict=False):
         said = act.info[BEHAVIOUR]
         np.testing.assert_array_equal(act.action, actions_of(drawn))
-        np.testing.assert_allclose(said["logprob"][0], softmax.log_prob(torch.from_numpy(drawn)), rtol=1e-4)
+        np.testing.assert_allclose(
+            said["logprob"][0], softmax.log_prob(torch.from_numpy(drawn)), rtol=1e-4
+        )
         assert said["entropy"] == pytest.approx(float(softmax.entropy().sum()), rel=1e-4)
     shares = np.stack([np.bincount(column, minlength=TOKENS) / len(acts) for column in tokens.T])
-    np.testing.assert_allclose(shares, softmax.probs.numpy(), atol=0.04)  # 4 standard deviations of a share of 0.1
-    np.testing.assert_array_equal(student.act(obs).action, actions_of(softmax.probs.argmax(-1).numpy()))
+    # 4 standard deviations of a share of 0.1.
+    np.testing.assert_allclose(shares, softmax.probs.numpy(), atol=0.04)
+    np.testing.assert_array_equal(
+        student.act(obs).action, actions_of(softmax.probs.argmax(-1).numpy())
+    )
 
 
 def test_the_learner_imitates_the_tokens_of_actions() -> None:
@@ -323,8 +364,14 @@ def test_the_learner_imitates_the_tokens_of_actions() -> None:
     obs, _ = env.reset(seed=0)
     teacher.reset(obs, env.instruction)
     action = teacher.act(obs).action
-    columns = {"cameras.front": obs.cameras["front"][None], "state.xyzrpy": obs.state["xyzrpy"][None]}
-    columns |= {"gripper": np.array([obs.gripper]), "instruction": np.array([env.instruction], object)}
+    columns = {
+        "cameras.front": obs.cameras["front"][None],
+        "state.xyzrpy": obs.state["xyzrpy"][None],
+    }
+    columns |= {
+        "gripper": np.array([obs.gripper]),
+        "instruction": np.array([env.instruction], object),
+    }
     learner, student = GRPOLearner(), TokenStudent()
     learner.add_advice(inputs_of(columns), action[None])
     before = learner.imitate(1)
@@ -344,7 +391,9 @@ def test_the_tokens_of_the_better_episodes_of_a_group_become_likelier() -> None:
 
     def logprobs() -> np.ndarray:
         """Of each episode's tokens."""
-        found = learner._logprob(torch.from_numpy(inputs_of(columns)), columns["replay.tokens"][:, 0])
+        found = learner._logprob(
+            torch.from_numpy(inputs_of(columns)), columns["replay.tokens"][:, 0]
+        )
         return np.asarray(found.detach().numpy().sum(-1).reshape(6, STEPS).sum(-1))
 
     before = logprobs()
@@ -354,7 +403,8 @@ def test_the_tokens_of_the_better_episodes_of_a_group_become_likelier() -> None:
     assert min(gained[0], gained[3]) > 0 > max(gained[1], gained[2])
 
 
-# A run that waits when the replica holds the weights of its second iteration, before episodes are played.
+# A run that waits when the replica holds the weights of its second iteration, before episodes are
+# played.
 HELD = """
 import pathlib, time
 from train import LearnRun
@@ -376,15 +426,25 @@ LearnRun._collect = held
 @pytest.mark.slow
 @pytest.mark.integration
 def test_runs_of_the_example_end_with_one_table_whatever_is_killed(tmp_path: Path) -> None:
-    """Of one, the replica and the workers in the second iteration; the other one itself after the first."""
+    """Of one, the replica and the workers in the second iteration; the other one itself after
+    the first.
+    """
     example = yaml.safe_load((Path(__file__).parents[3] / "examples/learn/grpo.yaml").read_text())
-    small = {"iterations": 2, "episodes": 32, "evaluate_every": 1, "held_out": 8}  # with the example's clone
-    whole, resumed, pushed, killed = (tmp_path / name for name in ("whole", "resumed", "pushed", "killed"))
+    # With the example's clone.
+    small = {"iterations": 2, "episodes": 32, "evaluate_every": 1, "held_out": 8}
+    whole, resumed, pushed, killed = (
+        tmp_path / name for name in ("whole", "resumed", "pushed", "killed")
+    )
     with ray_folder() as folder:
         (folder / "plan.yaml").write_text(json.dumps(example | small))
-        with start_run(folder, whole, before=HELD.format(pushed=str(pushed), killed=str(killed))) as run:
+        with start_run(
+            folder, whole, before=HELD.format(pushed=str(pushed), killed=str(killed))
+        ) as run:
             wait_for(lambda: pushed.exists() or run.poll() is not None, timeout_s=400)
-            for pid in [*processes(folder, "ray::ServeReplica:grpo"), *processes(folder, "ray::Rollout")]:
+            for pid in [
+                *processes(folder, "ray::ServeReplica:grpo"),
+                *processes(folder, "ray::Rollout"),
+            ]:
                 with contextlib.suppress(ProcessLookupError):
                     os.kill(pid, signal.SIGKILL)
             killed.touch()
@@ -396,7 +456,8 @@ def test_runs_of_the_example_end_with_one_table_whatever_is_killed(tmp_path: Pat
         end(folder)
         with start_run(folder, resumed, "--resume") as run:
             assert "demonstrations:" not in ended(run, folder)
-    # Each iteration took its steps, pushed them, and was evaluated with other weights than the one before.
+    # Each iteration took its steps, pushed them, and was evaluated with other weights than the one
+    # before.
     found = table(whole)
     assert list(found) == ["grpo@400", "grpo@420", "grpo@440"]
     assert len({weights for weights, _ in found.values()}) == 3

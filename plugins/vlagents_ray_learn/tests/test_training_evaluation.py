@@ -30,7 +30,9 @@ def plan(tmp_path: Path) -> EvalConfig:
 
 
 def plan_in(out: Path, **changes: Any) -> EvalConfig:
-    return flat_config(**{"envs": [LINE], "episodes": 4, "video": "none", "policy": "reach", "out": out} | changes)
+    return flat_config(
+        **{"envs": [LINE], "episodes": 4, "video": "none", "policy": "reach", "out": out} | changes
+    )
 
 
 @pytest.fixture
@@ -67,7 +69,9 @@ def test_each_version_is_a_checkpoint_of_the_results(plan: EvalConfig, agent: Pr
         f"version 20 ({fingerprint({'gain': np.ones(1, np.float32)})})",
     ]
     assert "version of the weights" in (plan.out / "report.html").read_text()
-    assert [(one.key.episode, one.key.seed) for one in episodes(plan.out, "reach@1")] == [(i, i) for i in range(4)]
+    assert [(one.key.episode, one.key.seed) for one in episodes(plan.out, "reach@1")] == [
+        (i, i) for i in range(4)
+    ]
 
 
 def test_versions_are_compared_on_the_same_episodes(plan: EvalConfig, agent: Proportional) -> None:
@@ -133,8 +137,13 @@ def test_an_agent_of_this_process_has_the_results_of_a_served_one(
             version = weights.push(agent.parameters())
             usual = plan_in(tmp_path / f"served {number}", num_envs=num_envs, workers=0)
             evaluate(usual, agent_factory=partial(served.agent, rank="simulation"))
-            TrainingEvaluation(agent, plan_in(tmp_path / f"here {number}", num_envs=num_envs)).play(version)
-            one, other = episodes(usual.out, "reach"), episodes(tmp_path / f"here {number}", f"reach@{version}")
+            TrainingEvaluation(agent, plan_in(tmp_path / f"here {number}", num_envs=num_envs)).play(
+                version
+            )
+            one, other = (
+                episodes(usual.out, "reach"),
+                episodes(tmp_path / f"here {number}", f"reach@{version}"),
+            )
             assert [alike(result) for result in one] == [alike(result) for result in other]
             assert {result.policy_version for result in one} == {version}
             assert len({result.actions_sha256 for result in one}) == 4
@@ -147,7 +156,9 @@ def alike(result: EpisodeResult) -> dict[str, Any]:
     }
 
 
-def test_the_trainers_own_episode_goes_on_as_without_an_evaluation(plan: EvalConfig, agent: Proportional) -> None:
+def test_the_trainers_own_episode_goes_on_as_without_an_evaluation(
+    plan: EvalConfig, agent: Proportional
+) -> None:
     obs = Obs(state={"position": np.ones(1, np.float32)})
     untouched = Proportional()
     untouched.initialize()
@@ -169,7 +180,9 @@ def test_no_results_are_made_again_and_none_are_taken_for_those_of_other_weights
     again.play(1)
     assert Results.load(plan.out).cells == before
     agent.tree["gain"][:] = 2.0
-    with pytest.raises(ConfigError, match=r"pushed_weights: the results have {.*'version': 1}, now"):
+    with pytest.raises(
+        ConfigError, match=r"pushed_weights: the results have {.*'version': 1}, now"
+    ):
         again.play(1)
     assert again.play(2).results.contenders == ["reach@1", "reach@2"]
 
@@ -193,8 +206,12 @@ def test_an_evaluation_that_was_cut_short_goes_on(plan: EvalConfig, agent: Propo
 def test_an_episode_of_other_weights_is_refused(plan: EvalConfig, served: Replicas) -> None:
     wanted = PushedWeights(version=3, fingerprint=fingerprint({"gain": np.ones(1, np.float32)}))
     [policy] = plan.policies
-    config = plan.model_copy(update={"policies": [policy.model_copy(update={"pushed_weights": wanted})], "workers": 0})
-    with pytest.raises(ConfigError, match=r"was played by versions 0 to 0 of the weights \(\w+\), want 3"):
+    config = plan.model_copy(
+        update={"policies": [policy.model_copy(update={"pushed_weights": wanted})], "workers": 0}
+    )
+    with pytest.raises(
+        ConfigError, match=r"was played by versions 0 to 0 of the weights \(\w+\), want 3"
+    ):
         evaluate(config, agent_factory=served.agent)
     assert episodes(plan.out, "reach@3") == []
 
@@ -204,10 +221,16 @@ def test_weights_that_nobody_names_are_refused(plan: EvalConfig) -> None:
         TrainingEvaluation(ToZero(), plan).play(1)
 
 
-def test_an_agent_that_is_not_initialized_and_a_model_without_one_are_refused(plan: EvalConfig) -> None:
-    with pytest.raises(NotTrainable, match=r"trainable: 'Proportional' object has no .*; call initialize\(\) first"):
+def test_an_agent_that_is_not_initialized_and_a_model_without_one_are_refused(
+    plan: EvalConfig,
+) -> None:
+    with pytest.raises(
+        NotTrainable, match=r"trainable: 'Proportional' object has no .*; call initialize\(\) first"
+    ):
         TrainingEvaluation(Proportional(), plan).play(1)
-    with pytest.raises(ConfigError, match="policy: expected an Agent, or the URL of its server, got dict"):
+    with pytest.raises(
+        ConfigError, match="policy: expected an Agent, or the URL of its server, got dict"
+    ):
         TrainingEvaluation({}, plan)  # type: ignore[arg-type]
 
 
@@ -235,7 +258,9 @@ def test_a_module_is_evaluated_without_dropout_and_trained_on_with_it(plan: Eval
         trainable: ClassVar[str | None] = "module"
 
         def initialize(self) -> None:
-            self.module = torch.nn.Sequential(torch.nn.Linear(1, 8), torch.nn.Dropout(0.5), torch.nn.Linear(8, 1))
+            self.module = torch.nn.Sequential(
+                torch.nn.Linear(1, 8), torch.nn.Dropout(0.5), torch.nn.Linear(8, 1)
+            )
 
         def act(self, obs: Obs) -> Act:
             with torch.no_grad():

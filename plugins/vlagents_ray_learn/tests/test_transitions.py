@@ -26,7 +26,9 @@ from vlagents_ray_learn.rollouts import TransitionRecorder
 
 
 class Stating(ToZero):
-    """Says of its actions what a learner wants to know; `rows` as in the contract of an act's log-probability."""
+    """Says of its actions what a learner wants to know; `rows` as in the contract of an act's
+    log-probability.
+    """
 
     def __init__(self, *, chunk: int = 1, stated: Any = None) -> None:
         super().__init__(chunk)
@@ -45,12 +47,19 @@ class Stating(ToZero):
 
 
 def played(
-    agent: Agent, env: str = LINE, key: EpisodeKey | None = None, *, execute: int | None = None, **options: Any
+    agent: Agent,
+    env: str = LINE,
+    key: EpisodeKey | None = None,
+    *,
+    execute: int | None = None,
+    **options: Any,
 ) -> Report:
     settings = {"env_options": options.pop("env_options", {}), "execute": execute}
     [cell] = cells(flat_config(envs=[env], out="out", **settings))
     worker = Rollout(
-        flat_config(envs=[env], out="out"), lambda _: agent, functools.partial(TransitionRecorder, **options)
+        flat_config(envs=[env], out="out"),
+        lambda _: agent,
+        functools.partial(TransitionRecorder, **options),
     )
     [report] = worker.run((Job(key or EpisodeKey(env, 3, 3, cell.fingerprint), cell),))
     worker.close()
@@ -74,17 +83,26 @@ def test_the_rows_are_the_steps_of_the_episode() -> None:
         np.testing.assert_array_equal(got["action"][t], act.rows()[0])
         obs, reward, _, truncated, info = env.step(Act(act.rows()[0]))
         assert got["reward"][t] == np.float32(reward)
-        assert (got["success"][t], got["truncated"][t], got["terminated"][t]) == (info["success"], truncated, False)
+        assert (got["success"][t], got["truncated"][t], got["terminated"][t]) == (
+            info["success"],
+            truncated,
+            False,
+        )
     np.testing.assert_array_equal(got["final.state.position"], [obs.state["position"]])
     assert got["t"].tolist() == list(range(10))
-    assert set(got["key"]) == {str(EpisodeKey(LINE, 3, 3, cells(flat_config(envs=[LINE], out="out"))[0].fingerprint))}
+    assert set(got["key"]) == {
+        str(EpisodeKey(LINE, 3, 3, cells(flat_config(envs=[LINE], out="out"))[0].fingerprint))
+    }
     assert set(got["episode"]) == {3}
     assert got["instruction"][0].startswith("bring ")
     assert set(got["source"]) == {"policy"}
 
 
 def test_episodes_side_by_side_have_the_transitions_of_each_by_itself() -> None:
-    keys, agent = [EpisodeKey(LINE, seed, seed, "x") for seed in (1, 2, 3)], Stating(stated={"value": 1.0})
+    keys, agent = (
+        [EpisodeKey(LINE, seed, seed, "x") for seed in (1, 2, 3)],
+        Stating(stated={"value": 1.0}),
+    )
     config = flat_config(envs=[LINE], out="out")
     recorders = [TransitionRecorder(config, None, want=["value"]) for _ in keys]
     results = run_episodes(
@@ -115,10 +133,14 @@ def test_numbers_and_images_are_views_also_after_a_pickle_that_copies_nothing() 
     batch, got = transitions(ToZero(), env_options={"camera": [32, 32]})
     buffers: list[pickle.PickleBuffer] = []
     message = pickle.dumps(batch, protocol=5, buffer_callback=buffers.append)
-    assert len(message) < 10_000 < batch.nbytes, "the rest are buffers, which Ray puts into plasma as they are"
+    assert len(message) < 10_000 < batch.nbytes, (
+        "the rest are buffers, which Ray puts into plasma as they are"
+    )
     again = arrays(pickle.loads(message, buffers=buffers))  # noqa: S301
     text = {"key", "instruction", "source"}
-    assert [name for name in got.keys() - text if not np.shares_memory(got[name], again[name])] == []
+    assert [
+        name for name in got.keys() - text if not np.shares_memory(got[name], again[name])
+    ] == []
     assert [name for name in text if (got[name] != again[name]).any()] == []
 
 
@@ -156,7 +178,9 @@ def test_log_probabilities_add_up_to_that_of_the_chunk(stated: Any, rows: list[f
 
 
 class Replayable(Stating):
-    """Has the number of the act in the tokens and the chain of its replay; `later` is the replay of the second act."""
+    """Has the number of the act in the tokens and the chain of its replay; `later` is the replay
+    of the second act.
+    """
 
     def __init__(self, *, chunk: int, later: Any = None) -> None:
         super().__init__(chunk=chunk)
@@ -167,7 +191,9 @@ class Replayable(Stating):
         rows = len(act.rows())
         chain = np.full((3, rows, 2), number / 4, np.float32)
         replay = {"tokens": np.full((rows, 1), number), "chain": chain, "noise_level": 0.5}
-        act.info["behaviour"] = {"replay": self._later if self._later is not None and number == 1 else replay}
+        act.info["behaviour"] = {
+            "replay": self._later if self._later is not None and number == 1 else replay
+        }
         return act
 
 
@@ -176,16 +202,31 @@ def test_the_replay_is_of_the_whole_chunk_once_for_each_answer() -> None:
     batch, got = transitions(agent, execute=3, want=["replay"])
     assert agent.asked == [["replay"]] * 4
     numbers = np.arange(4)
-    np.testing.assert_array_equal(got["replay.tokens"], np.broadcast_to(numbers[:, None, None], (4, 5, 1)))
-    np.testing.assert_array_equal(got["replay.chain"], np.broadcast_to(numbers[:, None, None, None] / 4, (4, 3, 5, 2)))
+    np.testing.assert_array_equal(
+        got["replay.tokens"], np.broadcast_to(numbers[:, None, None], (4, 5, 1))
+    )
+    np.testing.assert_array_equal(
+        got["replay.chain"], np.broadcast_to(numbers[:, None, None, None] / 4, (4, 3, 5, 2))
+    )
     np.testing.assert_array_equal(got["replay.noise_level"], [0.5] * 4)
-    assert [got[f"replay.{name}"].dtype for name in ("tokens", "chain", "noise_level")] == [np.int64, np.float32, float]
+    assert [got[f"replay.{name}"].dtype for name in ("tokens", "chain", "noise_level")] == [
+        np.int64,
+        np.float32,
+        float,
+    ]
     stated = batch.column("replay.noise_level").to_pylist()
-    assert stated == [[0.5], [], [], [0.5], [], [], [0.5], [], [], [0.5]], "in the first row of each answer"
-    assert all(np.shares_memory(got[name], arrays(batch)[name]) for name in got if name.startswith("replay."))
+    assert stated == [[0.5], [], [], [0.5], [], [], [0.5], [], [], [0.5]], (
+        "in the first row of each answer"
+    )
+    assert all(
+        np.shares_memory(got[name], arrays(batch)[name])
+        for name in got
+        if name.startswith("replay.")
+    )
 
 
-@pytest.mark.parametrize("chunk", [1, 3, 10])  # one answer a step, the last one cut off, one answer an episode
+# One answer a step, the last one cut off, one answer an episode.
+@pytest.mark.parametrize("chunk", [1, 3, 10])
 def test_each_step_of_several_episodes_finds_its_answer(chunk: int) -> None:
     keys = [EpisodeKey(LINE, seed, seed, "x") for seed in (1, 2)]
     batches = [transitions(Replayable(chunk=chunk), key=key, want=["replay"])[0] for key in keys]
@@ -199,13 +240,21 @@ def test_each_step_of_several_episodes_finds_its_answer(chunk: int) -> None:
 @pytest.mark.parametrize(
     ("later", "message"),
     [
-        ({"tokens": np.zeros((5, 2), np.int64)}, r"expected \{'chain': .*got \{'tokens': 'int64 \(5, 2\)'\}"),
-        ({"tokens": "abc"}, "expected numbers and arrays of numbers by name, got {'tokens': 'abc'}"),
+        (
+            {"tokens": np.zeros((5, 2), np.int64)},
+            r"expected \{'chain': .*got \{'tokens': 'int64 \(5, 2\)'\}",
+        ),
+        (
+            {"tokens": "abc"},
+            "expected numbers and arrays of numbers by name, got {'tokens': 'abc'}",
+        ),
         ([1, 2], r"expected numbers and arrays of numbers by name, got \[1, 2\]"),
         ({}, "expected numbers and arrays of numbers by name, got {}"),
     ],
 )
-def test_a_replay_that_changes_its_shape_or_has_no_names_is_refused(later: Any, message: str) -> None:
+def test_a_replay_that_changes_its_shape_or_has_no_names_is_refused(
+    later: Any, message: str
+) -> None:
     failure = played(Replayable(chunk=5, later=later), want=["replay"]).failure
     assert failure is not None
     assert (failure.cause, failure.code) == ("user", "config")
@@ -236,7 +285,10 @@ def test_an_episode_that_the_policy_broke_off_has_no_transitions() -> None:
 def test_an_observation_of_another_shape_is_the_envs_error() -> None:
     one = TransitionRecorder(flat_config(envs=[LINE], out="out"), None)
     one.add_observation(Obs(state={"position": np.zeros(1, np.float32)}))
-    with pytest.raises(EnvFailed, match=r"expected \{'state.position': \(1,\)\} .* got \{'state.position': \(2,\)\}"):
+    with pytest.raises(
+        EnvFailed,
+        match=r"expected \{'state.position': \(1,\)\} .* got \{'state.position': \(2,\)\}",
+    ):
         one.add_observation(Obs(state={"position": np.zeros(2, np.float32)}))
 
 
@@ -247,7 +299,9 @@ def test_a_key_with_a_seed_of_the_policy_is_another_episode_from_the_same_state(
     np.testing.assert_array_equal(first["state.position"][0], second["state.position"][0])
     assert (first["action"] != second["action"]).any()
     assert (str(one), str(other)) == (f"{LINE}#3@3:x", f"{LINE}#3@3/99:x")
-    assert {job.key.policy_seed for job in plan(cells(flat_config(envs=[LINE], out="out")))} == {None}
+    assert {job.key.policy_seed for job in plan(cells(flat_config(envs=[LINE], out="out")))} == {
+        None
+    }
 
 
 def test_without_pyarrow_the_error_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -19,7 +19,14 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
 from vlagents_ray.contract import CameraSpec, Contract
 from vlagents_ray.envs.base import SequentialBatch
-from vlagents_ray.errors import ConfigError, EnvFailed, InvalidAction, InvalidInput, MissingDependency, NotReset
+from vlagents_ray.errors import (
+    ConfigError,
+    EnvFailed,
+    InvalidAction,
+    InvalidInput,
+    MissingDependency,
+    NotReset,
+)
 from vlagents_ray.interface import Act, Obs
 from vlagents_ray_learn import as_vector_env
 from vlagents_ray_learn.vector_env import BatchVectorEnv, observation_space
@@ -36,15 +43,22 @@ class Ending(Line):
 
 
 class Single(gymnasium.Env[Any, Any]):
-    """One of our environments as an `Env` of Gymnasium, for its own vector env and its own checker."""
+    """One of our environments as an `Env` of Gymnasium, for its own vector env and its own
+    checker.
+    """
 
     metadata = {"render_modes": []}  # noqa: RUF012 - as Gymnasium has it
 
     def __init__(self, venv: BatchVectorEnv) -> None:
         self._venv = venv
-        self.observation_space, self.action_space = venv.single_observation_space, venv.single_action_space
+        self.observation_space, self.action_space = (
+            venv.single_observation_space,
+            venv.single_action_space,
+        )
 
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Any, dict[str, Any]]:
         super().reset(seed=seed)
         obs, infos = self._venv.reset(seed=seed, options=options)
         return first(obs), first(infos)
@@ -62,14 +76,18 @@ def first(rows: Any) -> Any:
 
 
 class Numbered(gymnasium.Env[Any, Any]):
-    """An `Env` that begins a numbered episode where it is given no seed, with the numbers that ours has."""
+    """An `Env` that begins a numbered episode where it is given no seed, with the numbers that
+    ours has.
+    """
 
     def __init__(self, env: Line, numbers: Iterator[int]) -> None:
         self._env, self._numbers = env, numbers
         self.observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (1,), np.float32)
         self.action_space = gymnasium.spaces.Box(-np.inf, np.inf, (1,), np.float32)
 
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Any, dict[str, Any]]:
         seed = next(self._numbers) if seed is None else seed
         obs, _ = self._env.reset(seed=seed, options=options)
         return obs.state["position"], {"instruction": self._env.instruction, "episode_seed": seed}
@@ -79,7 +97,9 @@ class Numbered(gymnasium.Env[Any, Any]):
         return obs.state["position"], reward, terminated, truncated and not terminated, info
 
 
-def of(env: type[Line], number: int, mode: AutoresetMode = AutoresetMode.SAME_STEP) -> BatchVectorEnv:
+def of(
+    env: type[Line], number: int, mode: AutoresetMode = AutoresetMode.SAME_STEP
+) -> BatchVectorEnv:
     return BatchVectorEnv(SequentialBatch([env() for _ in range(number)]), "state", mode)
 
 
@@ -129,12 +149,15 @@ def test_without_autoreset_those_that_are_over_are_reset_by_their_mask() -> None
 
 @pytest.mark.program("Gymnasium's checkers")
 @pytest.mark.parametrize("observation", ["all", "state"])
-@pytest.mark.filterwarnings("ignore:.*A Box observation space m.*imum value is:UserWarning")  # positions have no bounds
-@pytest.mark.filterwarnings("ignore:.*Not able to test alternative render modes:UserWarning")  # as there are none
+# Positions have no bounds.
+@pytest.mark.filterwarnings("ignore:.*A Box observation space m.*imum value is:UserWarning")
+# As there are none.
+@pytest.mark.filterwarnings("ignore:.*Not able to test alternative render modes:UserWarning")
 def test_it_passes_gymnasiums_checkers(observation: Any) -> None:
     with as_vector_env_of_tabletop(1, observation) as venv:
         env_checker.check_env(Single(venv))
-        env_checker.check_returned_data_not_reused(venv)  # of one environment: it asks whether the array is true
+        # Of one environment: it asks whether the array is true.
+        env_checker.check_returned_data_not_reused(venv)
     with as_vector_env_of_tabletop(3, observation) as venv:
         env_checker.check_reset_seed_determinism(venv)
         env_checker.check_reset_options(venv)
@@ -145,7 +168,10 @@ def test_it_passes_gymnasiums_checkers(observation: Any) -> None:
             obs, rewards, terminated, truncated, infos = venv.step(venv.action_space.sample())
             assert obs in venv.observation_space
             assert [part.shape for part in (rewards, terminated, truncated)] == [(3,)] * 3
-            assert infos.get("final_obs") is None or infos["final_obs"][0] in venv.single_observation_space
+            assert (
+                infos.get("final_obs") is None
+                or infos["final_obs"][0] in venv.single_observation_space
+            )
 
 
 class as_vector_env_of_tabletop:  # noqa: N801 - a context manager
@@ -179,7 +205,10 @@ def test_a_list_of_seeds_is_one_for_each_environment_and_later_episodes_go_on_af
 
 def test_spaces_are_those_of_the_contract() -> None:
     with as_vector_env_of_tabletop(2, "all") as venv:
-        shapes = {name: (space.shape, space.dtype) for name, space in venv.single_observation_space.items()}
+        shapes = {
+            name: (space.shape, space.dtype)
+            for name, space in venv.single_observation_space.items()
+        }
         assert shapes == {
             "cameras/front": ((32, 32, 3), np.uint8),
             "gripper": ((1,), np.float32),
@@ -202,7 +231,10 @@ def test_a_size_that_the_contract_leaves_open_is_an_error_that_names_it() -> Non
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        ({"observation": "states"}, r"observation: expected one of \['all', 'state'\], got 'states'"),
+        (
+            {"observation": "states"},
+            r"observation: expected one of \['all', 'state'\], got 'states'",
+        ),
         ({"autoreset": "none"}, "autoreset: expected one of .*'disabled'.*, got 'none'"),
     ],
 )
@@ -267,7 +299,9 @@ def test_a_simulator_that_resets_all_at_once_serves_episodes_that_end_together()
     assert infos["episode_seed"].tolist() == [2, 3]
     apart = BatchVectorEnv(Together([Ending(), Ending()]), "state")
     apart.reset(seed=0)
-    with pytest.raises(ConfigError, match="1 of 2 episodes are over, and this simulator resets all"):
+    with pytest.raises(
+        ConfigError, match="1 of 2 episodes are over, and this simulator resets all"
+    ):
         play(apart, np.array([[-1.0], [0.0]]), 10)
 
 
@@ -303,9 +337,15 @@ SOURCE = "STABLE_BASELINES3_SRC"  # a checkout, or a folder of `pip install --ta
 @pytest.mark.torch
 @pytest.mark.slow
 def test_ppo_learns_to_swing_a_pendulum_up() -> None:
-    environment = {**os.environ, "PYTHONPATH": f"{ROOT}:{os.environ[SOURCE]}", "OMP_NUM_THREADS": "1"}
+    environment = {
+        **os.environ,
+        "PYTHONPATH": f"{ROOT}:{os.environ[SOURCE]}",
+        "OMP_NUM_THREADS": "1",
+    }
     command = [sys.executable, "docs/evaluation/stable_baselines.py"]
-    printed = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, check=True).stdout
+    printed = subprocess.run(
+        command, cwd=ROOT, env=environment, capture_output=True, text=True, check=True
+    ).stdout
     curve = [float(line.split()[1]) for line in printed.splitlines()]
     assert curve[0] < -900, "or the test shows nothing: untrained"
     assert curve[-1] > -400, curve
@@ -334,6 +374,9 @@ print(*played.shape, int(played["next", "done"].sum()))
 def test_torchrl_takes_them_for_its_own_and_resets_each_that_is_over(observation: str) -> None:
     environment = {**os.environ, "PYTHONPATH": f"{ROOT}:{os.environ[TORCHRL]}"}
     command = [sys.executable, "-c", OF_TORCHRL, observation]
-    done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, check=False)
+    done = subprocess.run(
+        command, cwd=ROOT, env=environment, capture_output=True, text=True, check=False
+    )
     assert done.returncode == 0, done.stderr
-    assert done.stdout.splitlines()[-1] == "2 20 6"  # 2 environments, 20 steps, 3 whole episodes of 6 in each
+    # 2 environments, 20 steps, 3 whole episodes of 6 in each.
+    assert done.stdout.splitlines()[-1] == "2 20 6"

@@ -1,7 +1,8 @@
-"""Learning with served policies: new weights, evaluations while they are trained, transitions, vector environments.
+"""Learning with served policies: new weights, evaluations while they are trained, transitions,
+vector environments.
 
-All but `Publisher`, `TrainingEvaluation` and `log_ratio` needs the extra "rollouts" (pyarrow, gymnasium). Modules are
-loaded when their names are first used.
+All but `Publisher`, `TrainingEvaluation` and `log_ratio` needs the extra "rollouts" (pyarrow,
+gymnasium). Modules are loaded when their names are first used.
 """
 
 from __future__ import annotations

@@ -8,5 +8,7 @@ from vlagents_ray.registry import require
 
 
 def optional(module: str, extra: str = "rollouts") -> ModuleType:
-    """Import a module of a package that an extra installs; raises `MissingDependency`, which names the extra."""
+    """Import a module of a package that an extra installs; raises `MissingDependency`, which
+    names the extra.
+    """
     return require(module, extra=extra, distribution="vlagents-ray-learn")

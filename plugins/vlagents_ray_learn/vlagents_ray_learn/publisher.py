@@ -37,13 +37,15 @@ _WINDOW = 16  # parts (MiB) in flight over the network: with one, each would tak
 
 
 class Publisher(AbstractContextManager["Publisher"]):
-    """Pushes new weights from the learner's memory to a served policy, without a checkpoint on disk.
+    """Pushes new weights from the learner's memory to a served policy, without a checkpoint on
+    disk.
 
-        with Publisher("serve://pi0") as weights:  # or "https://gpu:8000", with a key of the scope "weights"
-            version = weights.push(model.state_dict())
+        with Publisher("serve://pi0") as weights:  # or "https://gpu:8000", with a key of the scope
+            "weights" version = weights.push(model.state_dict())
             assert weights.acknowledged(version) == 2  # replicas
 
-    Every replica checks and holds a version before any acts with it, so that a push succeeds everywhere or nowhere.
+    Every replica checks and holds a version before any acts with it, so that a push succeeds
+    everywhere or nowhere.
     """
 
     def __init__(
@@ -57,9 +59,10 @@ class Publisher(AbstractContextManager["Publisher"]):
         """Connect to the policy.
 
         Args:
-            target: "serve://APP", from a process in the Ray cluster; the URL of a server, "http(s)://HOST:PORT"; or an
-                engine in this process.
-            api_key: A key of the scope "weights", for a URL; by default the value of `VLAGENTS_RAY_API_KEY`.
+            target: "serve://APP", from a process in the Ray cluster; the URL of a server,
+                "http(s)://HOST:PORT"; or an engine in this process.
+            api_key: A key of the scope "weights", for a URL; by default the value of
+                `VLAGENTS_RAY_API_KEY`.
             ca: As for `RemoteAgent`.
             certificate: As for `RemoteAgent`.
 
@@ -74,7 +77,9 @@ class Publisher(AbstractContextManager["Publisher"]):
         elif isinstance(target, str) and target.startswith(("http://", "https://")):
             self._target = ServerTarget(target, Credentials(api_key, ca, certificate))
         else:
-            raise ConfigError(f"Publisher: got {target!r}, want 'serve://APP', 'http(s)://HOST:PORT' or an Engine")
+            raise ConfigError(
+                f"Publisher: got {target!r}, want 'serve://APP', 'http(s)://HOST:PORT' or an Engine"
+            )
 
     def push(
         self,
@@ -89,13 +94,18 @@ class Publisher(AbstractContextManager["Publisher"]):
         """Push new weights to the policy, and return their version once all replicas hold them.
 
         Args:
-            named: The values by name, as `Agent.parameters` names them: numpy or JAX arrays or torch tensors, e.g. a
-                `state_dict`. They are copied before this returns, so that the learner can continue.
-            mode: When sessions change: at their next reset ("next_episode"), or between two acts ("keep").
-            partial: Whether names may be missing; their values stay, as when only adapters are trained.
+            named: The values by name, as `Agent.parameters` names them: numpy or JAX arrays or
+                torch tensors, e.g. a `state_dict`. They are copied before this returns, so that the
+                learner can continue.
+            mode: When sessions change: at their next reset ("next_episode"), or between two acts
+                ("keep").
+            partial: Whether names may be missing; their values stay, as when only adapters are
+                trained.
             allow_same: Whether all values may equal those of the policy.
-            pin: Whether robots and other sessions that do not follow also use it from their next reset on.
-            version: The number of the version, such as the step of training; by default the newest one's + 1.
+            pin: Whether robots and other sessions that do not follow also use it from their next
+                reset on.
+            version: The number of the version, such as the step of training; by default the newest
+                one's + 1.
 
         Returns:
             The version, as in `act.info["policy"]["version"]`.
@@ -110,16 +120,20 @@ class Publisher(AbstractContextManager["Publisher"]):
             Forbidden: The API key lacks the scope "weights".
         """
         if not isinstance(named, Mapping):
-            raise InvalidWeights(f"weights: got {type(named).__name__}, want values by name, such as a state_dict")
+            raise InvalidWeights(
+                f"weights: got {type(named).__name__}, want values by name, such as a state_dict"
+            )
         return self._target.push(named, PushOptions(mode, partial, allow_same, pin, version))
 
     def sleep(self, *, offload: bool = True, at_most_s: float = 600.0) -> None:
-        """Let the policy rest while the learner needs the GPU, after the running batches; requests wait until `wake`.
+        """Let the policy rest while the learner needs the GPU, after the running batches; requests
+        wait until `wake`.
 
         Args:
-            offload: Whether weights move to the memory of the host, and CUDA graphs are freed. Otherwise both stay, and
-                only unused memory is freed.
-            at_most_s: Time after which the policy wakes by itself, since its learner may have died, s.
+            offload: Whether weights move to the memory of the host, and CUDA graphs are freed.
+                Otherwise both stay, and only unused memory is freed.
+            at_most_s: Time after which the policy wakes by itself, since its learner may have died,
+                s.
 
         Raises:
             NotTrainable: The policy names no parameters, which `offload` would move.
@@ -129,8 +143,11 @@ class Publisher(AbstractContextManager["Publisher"]):
         """
         self._target.rest(Rest("sleep", offload, at_most_s))
 
-    def wake(self, named: Mapping[str, Any] | None = None, *, mode: PushMode = "keep", **options: Any) -> int | None:
-        """Let the policy act again after `sleep`, with the same weights or new ones; free the learner's memory first.
+    def wake(
+        self, named: Mapping[str, Any] | None = None, *, mode: PushMode = "keep", **options: Any
+    ) -> int | None:
+        """Let the policy act again after `sleep`, with the same weights or new ones; free the
+        learner's memory first.
 
         Args:
             named: New weights, with which all acts from now on are made; None to keep those before.
@@ -141,8 +158,8 @@ class Publisher(AbstractContextManager["Publisher"]):
             The version of the new weights; None without new ones.
 
         Raises:
-            VLAgentsError: Those of `push`: the policy then acts with the weights before. `PolicyUnavailable` if the GPU
-                has too little memory: the policy still sleeps.
+            VLAgentsError: Those of `push`: the policy then acts with the weights before.
+                `PolicyUnavailable` if the GPU has too little memory: the policy still sleeps.
         """
         self._target.rest(Rest("restore"))
         try:
@@ -168,8 +185,8 @@ class Publisher(AbstractContextManager["Publisher"]):
 class EngineTarget:
     """An engine in this process; tensors are copied once, on their device.
 
-    The three targets have the same methods: `push` returns the version, `rest` lets all replicas take a step of a rest,
-    and `versions` returns the newest version of each replica.
+    The three targets have the same methods: `push` returns the version, `rest` lets all replicas
+    take a step of a rest, and `versions` returns the newest version of each replica.
     """
 
     def __init__(self, engine: Engine) -> None:
@@ -191,17 +208,22 @@ class EngineTarget:
 class AppTarget:
     """An application of the Ray cluster that this process is in.
 
-    If the learner and all replicas have their weights on the same GPU, the replicas copy them there. Otherwise the
-    values are put into Ray's object store once. All replicas of this node read them there, without a copy if the policy
-    is on the CPU; Ray transfers them once to each other node.
+    If the learner and all replicas have their weights on the same GPU, the replicas copy them
+    there. Otherwise the values are put into Ray's object store once. All replicas of this node read
+    them there, without a copy if the policy is on the CPU; Ray transfers them once to each other
+    node.
     """
 
     def __init__(self, app: str) -> None:
-        """Push to the application of that name; raises `ConfigError` if this process is in no Ray cluster."""
+        """Push to the application of that name; raises `ConfigError` if this process is in no
+        Ray cluster.
+        """
         import ray
 
         if not ray.is_initialized():
-            raise ConfigError(f"serve://{app}: this process is in no Ray cluster; call ray.init() first")
+            raise ConfigError(
+                f"serve://{app}: this process is in no Ray cluster; call ray.init() first"
+            )
         self._app = app
 
     def push(self, named: Mapping[str, Any], options: PushOptions) -> int:
@@ -210,7 +232,9 @@ class AppTarget:
                 with shared(named) as values:
                     return self._push(values, options)
             except NotShared as error:
-                logger.info("serve://%s: the weights go through Ray's object store: %s", self._app, error)
+                logger.info(
+                    "serve://%s: the weights go through Ray's object store: %s", self._app, error
+                )
         import ray
 
         return self._push([ray.put(_portable(named))], options)
@@ -241,10 +265,14 @@ class AppTarget:
 
 
 class ServerTarget:
-    """A server, also on another machine; each push sends the values in parts over a new WebSocket."""
+    """A server, also on another machine; each push sends the values in parts over a new
+    WebSocket.
+    """
 
     def __init__(self, url: str, credentials: Credentials) -> None:
-        """Push to the server at a URL, "http(s)://HOST:PORT" or one with the path of an application."""
+        """Push to the server at a URL, "http(s)://HOST:PORT" or one with the path of an
+        application.
+        """
         base = http_url(url)
         credentials.use_at(base.geturl())
         self._credentials = credentials
@@ -256,17 +284,27 @@ class ServerTarget:
         values = _portable(named)
         for name, value in values.items():
             if not is_array(value):
-                raise InvalidWeights(f"weights: {name!r}: expected an array, got {type(value).__name__}")
+                raise InvalidWeights(
+                    f"weights: {name!r}: expected an array, got {type(value).__name__}"
+                )
         header = header_of(values)
         if len(header) > MESSAGE_BYTES:
-            raise InvalidWeights(f"weights: {len(values)} names take {len(header)} bytes, the limit is {MESSAGE_BYTES}")
+            raise InvalidWeights(
+                f"weights: {len(values)} names take {len(header)} bytes, the limit is "
+                f"{MESSAGE_BYTES}"
+            )
 
-        query = {name: str(value).lower() for name, value in asdict(options).items() if value is not None}
-        with closing(open_websocket(f"{self._url}?{urlencode(query)}", self._credentials, _ANSWER_S)) as socket:
+        query = {
+            name: str(value).lower() for name, value in asdict(options).items() if value is not None
+        }
+        with closing(
+            open_websocket(f"{self._url}?{urlencode(query)}", self._credentials, _ANSWER_S)
+        ) as socket:
             unanswered = 0
             window = 1  # the header alone is answered before any value is sent
             for message in chain((header,), parts_of(values)):
-                with suppress(ConnectionClosed, OSError):  # the server has refused the push; its answer has the reason
+                # The server has refused the push; its answer has the reason.
+                with suppress(ConnectionClosed, OSError):
                     socket.send(message, _ANSWER_S)
                 unanswered += 1
                 if unanswered >= window:
@@ -303,7 +341,8 @@ def _portable(named: Mapping[str, Any]) -> dict[str, Any]:
 
 def _unknown(url: str, error: Exception) -> PolicyUnavailable:
     return PolicyUnavailable(
-        f"{url}: {str(error) or 'no answer'}; whether it acts with the version is unknown: look at `acknowledged`, and "
+        f"{url}: {str(error) or 'no answer'}; whether it acts with the version is unknown: look at "
+        "`acknowledged`, and "
         f"push again"
     )
 

@@ -40,14 +40,20 @@ class TransitionRecorder(EpisodeRecorder):
     """Keeps the transitions of one episode, as `vlagents_ray_learn.columns` describes them."""
 
     def __init__(
-        self, _config: EvalConfig, _hz: float | None, *, want: Sequence[str] = (), images: bool = True
+        self,
+        _config: EvalConfig,
+        _hz: float | None,
+        *,
+        want: Sequence[str] = (),
+        images: bool = True,
     ) -> None:
         self._pa: Any = optional("pyarrow")
         self._want = tuple(want)
         self._images = images
         self.request_info: Mapping[str, Any] = {WANT: list(want)} if want else {}
         self._observed: dict[str, _Rows] = {}  # the columns of the observations
-        self._rows: list[tuple[np.ndarray, float, bool, int, int, str]] = []  # action, reward, success, act, version …
+        # action, reward, success, act, version ….
+        self._rows: list[tuple[np.ndarray, float, bool, int, int, str]] = []
         self._wanted: dict[str, list[float]] = {name: [] for name in self._want if name != REPLAY}
         self._acts = 0
         self._version, self._source = 0, "policy"
@@ -86,7 +92,8 @@ class TransitionRecorder(EpisodeRecorder):
         missing = [name for name in self._want if name not in behaviour]
         if missing:
             raise ConfigError(
-                f"want: got no {' and no '.join(missing)} in act.info[{BEHAVIOUR!r}], which has {sorted(behaviour)}; "
+                f"want: got no {' and no '.join(missing)} in act.info[{BEHAVIOUR!r}], which has "
+                f"{sorted(behaviour)}; "
                 f"take a policy that returns it, or leave it out of `want`"
             )
         rows = len(act.rows())
@@ -95,7 +102,14 @@ class TransitionRecorder(EpisodeRecorder):
             self._next_replay = self._checked_replay(behaviour[REPLAY])
 
     def add_action(self, action: np.ndarray, reward: float, success: bool) -> None:
-        row = (np.array(action, np.float32), reward, success, self._acts - 1, self._version, self._source)
+        row = (
+            np.array(action, np.float32),
+            reward,
+            success,
+            self._acts - 1,
+            self._version,
+            self._source,
+        )
         self._rows.append(row)
         for name, values in self._wanted.items():
             values.append(self._next[name].pop(0))
@@ -109,7 +123,9 @@ class TransitionRecorder(EpisodeRecorder):
         by_name = sorted(replay.items()) if isinstance(replay, Mapping) else []
         values = {name: np.asarray(value) for name, value in by_name}
         if not values or any(value.dtype.kind not in "iuf" for value in values.values()):
-            raise ConfigError(f"{field}: expected numbers and arrays of numbers by name, got {replay!r}")
+            raise ConfigError(
+                f"{field}: expected numbers and arrays of numbers by name, got {replay!r}"
+            )
 
         if not self._replay:
             self._replay = {name: _Rows(value, value.dtype) for name, value in values.items()}
@@ -120,7 +136,9 @@ class TransitionRecorder(EpisodeRecorder):
         return values
 
     def finish(self, result: EpisodeResult, second_pass: SecondPass) -> Artifacts:
-        """Return the transitions of a whole episode; none of one that an error of the policy ended."""
+        """Return the transitions of a whole episode; none of one that an error of the policy
+        ended.
+        """
         if result.status != "done":
             return Artifacts()
         pa = self._pa
@@ -176,17 +194,19 @@ class _Rows:
 
 
 def _by_row(value: Any, rows: int, name: str) -> list[float]:
-    """Return a number for each row of an act: its own sum, or the act's total in the first and NaN in the others.
+    """Return a number for each row of an act: its own sum, or the act's total in the first and NaN
+    in the others.
 
-    `value` is a number; or (H,) or (H, D) numbers, H rows; or numbers of any other shape, such as one for each token,
-    which are summed.
+    `value` is a number; or (H,) or (H, D) numbers, H rows; or numbers of any other shape, such as
+    one for each token, which are summed.
     """
     values = np.asarray(value, np.float64)
     if values.ndim and len(values) == rows:
         return [float(value) for value in values.reshape(rows, -1).sum(axis=1)]
     if name != "logprob" and values.size != 1:
         raise ConfigError(
-            f"act.info[{BEHAVIOUR!r}][{name!r}]: expected a number, or shape ({rows},), got shape {values.shape}"
+            f"act.info[{BEHAVIOUR!r}][{name!r}]: expected a number, or shape ({rows},), got shape "
+            f"{values.shape}"
         )
     return [float(values.sum()), *[float("nan")] * (rows - 1)]
 
@@ -228,13 +248,19 @@ class RolloutPlan:
     """
 
     env: str | Sequence[str]  # the name, as for an evaluation; several envs take turns
-    policy: str | Callable[[], Agent]  # URL of a server, or a factory that each worker calls to create its own agent
-    workers: int = 1  # 0: in this process and on this thread, without Ray: the quickest for one env and a small policy
-    num_envs: int = 1  # environments that one worker steps together, with one request to the policy for all
-    groups: int = 1  # episodes from one start state, one after another, that differ in the seed of the policy (GRPO)
-    want: Sequence[str] = ()  # what the policy returns for each act: "logprob", "value", "entropy", "replay"
-    # Largest age, in versions, of the weights of any act of a delivered episode; others are played again. 0 is
-    # on-policy; None delivers all.
+    # URL of a server, or a factory that each worker calls to create its own agent.
+    policy: str | Callable[[], Agent]
+    # 0: in this process and on this thread, without Ray: the quickest for one env and a small
+    # policy.
+    workers: int = 1
+    # Environments that one worker steps together, with one request to the policy for all.
+    num_envs: int = 1
+    # Episodes from one start state, one after another, that differ in the seed of the policy (GRPO)
+    groups: int = 1
+    # What the policy returns for each act: "logprob", "value", "entropy", "replay".
+    want: Sequence[str] = ()
+    # Largest age, in versions, of the weights of any act of a delivered episode; others are played
+    # again. 0 is on-policy; None delivers all.
     max_lag: int | None = 0
     seed: int = 0  # of the first start state; state n has `seed` + n
     first: int = 0  # number of the first episode; to continue earlier rollouts, their `position`
@@ -265,7 +291,12 @@ class RolloutPlan:
             "reset_options": self.reset_options,
             "num_envs": self.num_envs,
         }
-        document = {"policies": [policy], "suites": [suite], "workers": self.workers, "out": os.devnull}
+        document = {
+            "policies": [policy],
+            "suites": [suite],
+            "workers": self.workers,
+            "out": os.devnull,
+        }
         return EvalConfig.model_validate({**document, **self.settings})
 
 
@@ -277,12 +308,14 @@ class Rollouts(AbstractContextManager["Rollouts"], Iterator[Any]):
                 columns = arrays(rollouts.collect(64))
                 ...  # learn from them, and push the new weights
 
-    Episodes are numbered from 0 and delivered in this order, each exactly once, whatever the number of workers and even
-    if some die: a broken attempt is repeated, and has no transitions. So the same seeds and weights give the same
-    transitions. The keys are those of an evaluation of these settings.
+    Episodes are numbered from 0 and delivered in this order, each exactly once, whatever the number
+    of workers and even if some die: a broken attempt is repeated, and has no transitions. So the
+    same seeds and weights give the same transitions. The keys are those of an evaluation of these
+    settings.
 
-    A record batch is one whole episode with the columns of `vlagents_ray_learn.columns`. Workers on this node write it
-    into Ray's object store once, and numpy maps it from there; keeping it keeps its memory in the store.
+    A record batch is one whole episode with the columns of `vlagents_ray_learn.columns`. Workers on
+    this node write it into Ray's object store once, and numpy maps it from there; keeping it keeps
+    its memory in the store.
     """
 
     def __init__(self, plan: RolloutPlan) -> None:
@@ -298,31 +331,37 @@ class Rollouts(AbstractContextManager["Rollouts"], Iterator[Any]):
         require_envs(config)
         self._settings, self._config, self._cells = plan, config, cells(config)
         self._factory = agents(config, None if isinstance(plan.policy, str) else plan.policy)
-        self._recorders = functools.partial(TransitionRecorder, want=tuple(plan.want), images=plan.images)
+        self._recorders = functools.partial(
+            TransitionRecorder, want=tuple(plan.want), images=plan.images
+        )
         self._block = math.lcm(plan.groups, plan.num_envs)  # episodes that are queued together
-        self._ahead = self._block * max(2, math.ceil(2 * plan.workers * plan.num_envs / self._block))
+        self._ahead = self._block * max(
+            2, math.ceil(2 * plan.workers * plan.num_envs / self._block)
+        )
         self._position = self._planned = plan.first
         self._queue = JobQueue([])
         self._episodes: dict[EpisodeKey, _PlannedEpisode] = {}  # from number `position` on
         self._attempts = FailedAttempts(config)
         self._resources = ExitStack()
         self._pool: Workers | None = None
-        self._state = threading.Condition()  # held by whoever plays or asks, but not during a wait for reports
+        # Held by whoever plays or asks, but not during a wait for reports.
+        self._state = threading.Condition()
         self._player: threading.Thread | None = None  # plays on while the learner learns
         self._stopping = False
         self._error: BaseException | None = None  # which ended the player
         self._version = self._pushed = 0
         self._allowed = plan.first  # number of the first episode that is not to begin yet
         self._since = plan.first  # the position when the version changed
-        self._pace = 0, 0  # episodes delivered between the last two changes, and their distance in versions
+        # Episodes delivered between the last two changes, and their distance in versions.
+        self._pace = 0, 0
         self.stats = RolloutStats()  # the numbers of episodes so far
 
     @property
     def version(self) -> int:
         """The newest version of the weights, from which the lag is counted.
 
-        It follows the versions of acts. A learner that iterates may set it to the result of a push, so that no episode
-        of older weights is delivered from then on.
+        It follows the versions of acts. A learner that iterates may set it to the result of a push,
+        so that no episode of older weights is delivered from then on.
         """
         return self._version
 
@@ -334,13 +373,16 @@ class Rollouts(AbstractContextManager["Rollouts"], Iterator[Any]):
 
     @property
     def position(self) -> int:
-        """The number of the next episode: keep it in the learner's checkpoint, to continue with `first`."""
+        """The number of the next episode: keep it in the learner's checkpoint, to continue with
+        `first`.
+        """
         return self._position
 
     def __next__(self) -> Any:
         """Return the transitions of the next episode, a `pyarrow.RecordBatch`.
 
-        A thread hands later episodes to the workers meanwhile, also until the next call: two for each environment.
+        A thread hands later episodes to the workers meanwhile, also until the next call: two for
+        each environment.
         """
         delivered: list[Any] = []
         while not delivered:  # an episode may be lost
@@ -354,17 +396,20 @@ class Rollouts(AbstractContextManager["Rollouts"], Iterator[Any]):
             episodes: Their number; whole groups, if there are groups.
 
         Returns:
-            Their transitions in order, a `pyarrow.Table` with a chunk for each episode. Lost episodes are left out; if
-            all are lost, the result has as many of the next ones.
+            Their transitions in order, a `pyarrow.Table` with a chunk for each episode. Lost
+            episodes are left out; if all are lost, the result has as many of the next ones.
 
         Raises:
             ConfigError: The number does not make whole groups, or the envs have different columns.
-            WeightsLost: The policy acts with older weights than `version`, after a restart: push them, and call again.
-            VLAgentsError: The last infrastructure error, after `abort_after` lost episodes in a row.
+            WeightsLost: The policy acts with older weights than `version`, after a restart: push
+                them, and call again.
+            VLAgentsError: The last infrastructure error, after `abort_after` lost episodes in a
+                row.
         """
         if episodes < 1 or episodes % self._settings.groups:
             raise ConfigError(
-                f"collect: expected a multiple of groups, {self._settings.groups}, got {episodes} episodes"
+                f"collect: expected a multiple of groups, {self._settings.groups}, got {episodes} "
+                "episodes"
             )
         batches: list[Any] = []
         while not batches:  # all may be lost
@@ -372,13 +417,15 @@ class Rollouts(AbstractContextManager["Rollouts"], Iterator[Any]):
         try:
             return self._pa.Table.from_batches(batches)
         except (self._pa.ArrowInvalid, ValueError) as error:
-            raise ConfigError(f"collect: the episodes do not fit into one table, iterate over them: {error}") from error
+            raise ConfigError(
+                f"collect: the episodes do not fit into one table, iterate over them: {error}"
+            ) from error
 
     def close(self) -> None:
         """End the workers, and the Ray cluster if it was started for them; safe to call twice.
 
-        Delivered transitions are in Ray's memory: copy those that are needed after the end of Ray. A later request
-        starts workers again, which repeat the episodes that were not delivered.
+        Delivered transitions are in Ray's memory: copy those that are needed after the end of Ray.
+        A later request starts workers again, which repeat the episodes that were not delivered.
         """
         self._stop_player()
         if self._pool is not None:
@@ -402,12 +449,14 @@ class Rollouts(AbstractContextManager["Rollouts"], Iterator[Any]):
     def _limit(self) -> int:
         """Return the number of the first episode that is not to begin yet.
 
-        At the pace of the last push, an episode with a higher number would be too old when it is its turn. Without this
-        limit, learners that once were slow would for ever get episodes that are played twice.
+        At the pace of the last push, an episode with a higher number would be too old when it is
+        its turn. Without this limit, learners that once were slow would for ever get episodes that
+        are played twice.
         """
         limit = (self._position + 1) // self._block * self._block + self._ahead
         episodes, versions = self._pace
-        if self._settings.max_lag is None or self._position >= self._since + episodes:  # slower than at the last push
+        # Slower than at the last push.
+        if self._settings.max_lag is None or self._position >= self._since + episodes:
             return limit
         return min(limit, self._since + episodes * (1 + self._settings.max_lag // versions))
 
@@ -422,7 +471,9 @@ class Rollouts(AbstractContextManager["Rollouts"], Iterator[Any]):
         self._version = version
 
     def _deliver(self, end: int, limit: int | None = None) -> list[Any]:
-        """Play until the episodes before number `end` are over; those before `limit` may also begin, and go on."""
+        """Play until the episodes before number `end` are over; those before `limit` may also
+        begin, and go on.
+        """
         try:
             ahead = limit is not None and self._settings.workers > 0
             if ahead:
@@ -455,7 +506,8 @@ class Rollouts(AbstractContextManager["Rollouts"], Iterator[Any]):
     def _start_player(self) -> None:
         if self._player is None:
             self._stopping = False
-            self._running_pool()  # on this thread, as Ray may be started for it, with handlers of signals
+            # On this thread, as Ray may be started for it, with handlers of signals.
+            self._running_pool()
             self._player = threading.Thread(target=self._play_ahead, name="rollouts", daemon=True)
             self._player.start()
 
@@ -489,10 +541,15 @@ class Rollouts(AbstractContextManager["Rollouts"], Iterator[Any]):
             state, member = divmod(number, self._settings.groups)
             episode, turn = divmod(state, len(self._cells))
             cell = self._cells[turn]
-            # The first of a group is the episode of an evaluation. The policy seeds of the others are above all of
-            # those, so that no two episodes of an environment share their noise.
+            # The first of a group is the episode of an evaluation. The policy seeds of the others
+            # are above all of those, so that no two episodes of an environment share their noise.
             policy_seed = self._settings.seed + _OTHER_MEMBERS + number if member else None
-            job = Job(EpisodeKey(cell.env, episode, self._settings.seed + episode, cell.fingerprint, policy_seed), cell)
+            job = Job(
+                EpisodeKey(
+                    cell.env, episode, self._settings.seed + episode, cell.fingerprint, policy_seed
+                ),
+                cell,
+            )
             self._episodes[job.key] = _PlannedEpisode(job, number)
             self._queue.put(job)
         self._planned, self._allowed = max(self._planned, limit), limit
@@ -509,17 +566,23 @@ class Rollouts(AbstractContextManager["Rollouts"], Iterator[Any]):
                 self._state.notify_all()
 
     def _with_start_state(self, transitions: Any, start_state: int) -> Any:
-        """Return transitions that are numbered by their start state among those of all environments.
+        """Return transitions that are numbered by their start state among those of all
+        environments.
 
-        A worker numbers the states of one environment; episodes of one number would be a group of several tasks.
+        A worker numbers the states of one environment; episodes of one number would be a group of
+        several tasks.
         """
         column = tensors(self._pa, np.full(transitions.num_rows, start_state, np.int64))
-        return transitions.set_column(transitions.schema.get_field_index("episode"), "episode", column)
+        return transitions.set_column(
+            transitions.schema.get_field_index("episode"), "episode", column
+        )
 
     def _running_pool(self) -> Workers:
         if self._pool is None:
             pool_of = workers_class(self._config, self._resources)
-            self._pool = self._resources.enter_context(pool_of(self._config, self._factory, self._recorders))
+            self._pool = self._resources.enter_context(
+                pool_of(self._config, self._factory, self._recorders)
+            )
             self._queue = JobQueue(episode.job for episode in self._episodes.values())
         return self._pool
 
@@ -538,7 +601,9 @@ class Rollouts(AbstractContextManager["Rollouts"], Iterator[Any]):
             self._queue.put_back(job.again())
             return
         if transitions is not None:
-            transitions = self._with_start_state(transitions, episode.number // self._settings.groups)
+            transitions = self._with_start_state(
+                transitions, episode.number // self._settings.groups
+            )
         episode.over = True
         episode.transitions = transitions
         if transitions is None:
@@ -553,15 +618,20 @@ class Rollouts(AbstractContextManager["Rollouts"], Iterator[Any]):
         episode.oldest = int(versions.min())
         self._saw(int(versions.max()))
         max_lag = self._settings.max_lag
-        if max_lag is not None and episode.pushed - episode.oldest > max_lag:  # it would always be too old
+        # It would always be too old.
+        if max_lag is not None and episode.pushed - episode.oldest > max_lag:
             raise WeightsLost(
-                f"version: {job.key} began when rollouts.version had been set to {episode.pushed}, but its acts name "
-                f"{episode.oldest}; set it to what a push returned, after it has (a policy that names none has 0), and "
+                f"version: {job.key} began when rollouts.version had been set to {episode.pushed}, "
+                "but its acts name "
+                f"{episode.oldest}; set it to what a push returned, after it has (a policy that "
+                "names none has 0), and "
                 f"push again if a replica was restarted since then"
             )
 
     def _replay_stale(self) -> None:
-        """Queue episodes again whose acts have outdated weights, or hold them until they may begin."""
+        """Queue episodes again whose acts have outdated weights, or hold them until they may
+        begin.
+        """
         for episode in reversed(self._episodes.values()):
             lag = self._version - episode.oldest if episode.transitions is not None else 0
             if self._settings.max_lag is not None and lag > self._settings.max_lag:

@@ -1,12 +1,17 @@
-"""TorchRL's policies on this server, and served policies as modules of TorchRL; needs the extra "torchrl".
+"""TorchRL's policies on this server, and served policies as modules of TorchRL; needs the extra
+"torchrl".
 
-A program that starts TorchRL's `ProcessInferenceServer` with an `MPTransport` uses this server after one more line:
+A program that starts TorchRL's `ProcessInferenceServer` with an `MPTransport` uses this server
+after one more line:
 
-    from vlagents_ray_learn.torchrl import PolicyServer as ProcessInferenceServer, ServerAddress as MPTransport
+    from vlagents_ray_learn.torchrl import PolicyServer as ProcessInferenceServer, ServerAddress as
+    MPTransport
 
-Collectors are TorchRL's own: `ServedPolicy` is the module that they call (docs/evaluation/torchrl.md has one).
+Collectors are TorchRL's own: `ServedPolicy` is the module that they call
+(docs/evaluation/torchrl.md has one).
 
-Keys are those of `torchrl.data.vla`: of the image (camera "front"), the state (part "state") and the instruction.
+Keys are those of `torchrl.data.vla`: of the image (camera "front"), the state (part "state") and
+the instruction.
 """
 
 from __future__ import annotations
@@ -47,14 +52,17 @@ _LEARNED = ("logprob", REPLAY)  # values of an action that a learner needs
 class ServedPolicy(nn.TensorDictModuleBase):  # type: ignore[misc]
     """A policy on a server as a module of TorchRL.
 
-    It reads images (*B, 3, H, W) uint8, a state (*B, D) float32 and instructions, and adds "chunk" (*B, H, D) float32,
-    or "tokens" (*B, H, D) int64 and "log_probs" in nats, or all, below "vla_action". Tokens are drawn where TorchRL's
-    exploration type is RANDOM. Each row is a session, whose episode begins where "is_init" is true (TorchRL's
-    `InitTracker`) and where the instruction changes. Copies, also in other processes, have their own sessions.
+    It reads images (*B, 3, H, W) uint8, a state (*B, D) float32 and instructions, and adds "chunk"
+    (*B, H, D) float32, or "tokens" (*B, H, D) int64 and "log_probs" in nats, or all, below
+    "vla_action". Tokens are drawn where TorchRL's exploration type is RANDOM. Each row is a
+    session, whose episode begins where "is_init" is true (TorchRL's `InitTracker`) and where the
+    instruction changes. Copies, also in other processes, have their own sessions.
     """
 
     def __init__(self, url: str, **options: Any) -> None:
-        """Set the server, to which the first call connects; the arguments are those of `RemoteAgent`."""
+        """Set the server, to which the first call connects; the arguments are those of
+        `RemoteAgent`.
+        """
         super().__init__()
         self.in_keys = [IMAGE, STATE, TEXT]
         self.out_keys = [vla.ACTION_CHUNK_KEY, "policy_version"]
@@ -94,8 +102,12 @@ class ServedPolicy(nn.TensorDictModuleBase):  # type: ignore[misc]
             self._seeds = np.random.default_rng()
         self._sessions += self._sessions[0].sessions(number - len(self._sessions))
 
-    def _begin_episodes(self, obs: Sequence[Obs], instructions: Sequence[str], is_first: Any) -> None:
-        """Reset the sessions of the rows whose episode begins; `is_first` marks them, and may be None."""
+    def _begin_episodes(
+        self, obs: Sequence[Obs], instructions: Sequence[str], is_first: Any
+    ) -> None:
+        """Reset the sessions of the rows whose episode begins; `is_first` marks them, and may be
+        None.
+        """
         begun = []
         for i, instruction in enumerate(instructions):
             changed = self._instructions.get(i) != instruction
@@ -137,10 +149,12 @@ class ServedPolicy(nn.TensorDictModuleBase):  # type: ignore[misc]
 
 
 class TorchRLPolicy(Agent):
-    """A VLA policy of TorchRL (`VLAWrapperBase`), which returns chunks, or tokens if it has no `action_tokenizer`.
+    """A VLA policy of TorchRL (`VLAWrapperBase`), which returns chunks, or tokens if it has no
+    `action_tokenizer`.
 
-    Tokens are drawn by the session's generator if a learner requests values; else they are the likeliest. `factory`
-    makes the policy: "module:function", or a file with the function by cloudpickle, trusted, as it may run any code.
+    Tokens are drawn by the session's generator if a learner requests values; else they are the
+    likeliest. `factory` makes the policy: "module:function", or a file with the function by
+    cloudpickle, trusted, as it may run any code.
     """
 
     trainable: ClassVar[str | None] = "policy"
@@ -157,17 +171,22 @@ class TorchRLPolicy(Agent):
         has_tokens = policy.action_head == "tokens"
         space = _TOKENS if has_tokens and policy.action_tokenizer is None else None
         action = ActionSpec(policy.action_dim, space)
-        return Contract(action=action, chunk=policy.chunk_size, behaviour=_LEARNED if has_tokens else None)
+        return Contract(
+            action=action, chunk=policy.chunk_size, behaviour=_LEARNED if has_tokens else None
+        )
 
     def initialize(self) -> None:
         from ray import cloudpickle
 
         file = Path(self._factory)
-        make: Any = cloudpickle.loads(file.read_bytes()) if file.is_file() else named_class(self._factory)
+        make: Any = (
+            cloudpickle.loads(file.read_bytes()) if file.is_file() else named_class(self._factory)
+        )
         self.policy = make().eval()
 
     def parameters(self) -> dict[str, Any]:
-        # Lazy layers get their sizes from the first batch; until then there is nothing to push or to compare.
+        # Lazy layers get their sizes from the first batch; until then there is nothing to push or
+        # to compare.
         lazy = any(map(torch.nn.parameter.is_lazy, self.policy.parameters()))
         return {} if lazy else named_values(self.policy)
 
@@ -180,26 +199,46 @@ class TorchRLPolicy(Agent):
         return {}
 
     def act_batch(self, obs: Sequence[Obs], sessions: Sequence[Any]) -> list[Act | Exception]:
-        rows = [attempt(_row, received, session) for received, session in zip(obs, sessions, strict=True)]
+        rows = [
+            attempt(_row, received, session)
+            for received, session in zip(obs, sessions, strict=True)
+        ]
         return of_good(rows, self._acts)
 
     def _acts(self, rows: list[tuple[Any, np.random.Generator | None]]) -> Iterable[Act]:
-        """Compute one batch; each row has an input, and the generator of its draw, or None for the likeliest tokens."""
+        """Compute one batch; each row has an input, and the generator of its draw, or None for
+        the likeliest tokens.
+        """
         policy = self.policy
         device = next(policy.parameters()).device
         batch = torch.stack([row for row, _ in rows]).contiguous().to(device)
         with torch.no_grad():
             if policy.action_head == "continuous":
-                return [Act(chunk) for chunk in policy(batch)[vla.ACTION_CHUNK_KEY].float().cpu().numpy()]
+                return [
+                    Act(chunk)
+                    for chunk in policy(batch)[vla.ACTION_CHUNK_KEY].float().cpu().numpy()
+                ]
             distribution = policy.get_dist(batch)
             logits = getattr(distribution, "base_dist", distribution).logits  # (B, H, D, tokens)
             # The largest logit after Gumbel noise is that of a draw from their softmax.
-            noise = [np.zeros(logits[0].shape) if rng is None else rng.gumbel(size=logits[0].shape) for _, rng in rows]
-            tokens = (logits + torch.from_numpy(np.stack(noise)).to(device, logits.dtype)).argmax(-1)
-            logprobs = distribution.log_prob(tokens)  # (B,), or (B, H, D) with `log_probs_mode="token"`
-            actions = tokens if policy.action_tokenizer is None else policy.action_tokenizer.decode(tokens)
+            noise = [
+                np.zeros(logits[0].shape) if rng is None else rng.gumbel(size=logits[0].shape)
+                for _, rng in rows
+            ]
+            tokens = (logits + torch.from_numpy(np.stack(noise)).to(device, logits.dtype)).argmax(
+                -1
+            )
+            # (B,), or (B, H, D) with `log_probs_mode="token"`.
+            logprobs = distribution.log_prob(tokens)
+            actions = (
+                tokens
+                if policy.action_tokenizer is None
+                else policy.action_tokenizer.decode(tokens)
+            )
         acts = []
-        outputs = zip(_on_host(actions.float()), _on_host(tokens), _on_host(logprobs.float()), strict=True)
+        outputs = zip(
+            _on_host(actions.float()), _on_host(tokens), _on_host(logprobs.float()), strict=True
+        )
         for action, drawn, logprob in outputs:
             behaviour = {"logprob": logprob, REPLAY: {_TOKENS: drawn}}
             acts.append(Act(action, info={BEHAVIOUR: behaviour}))
@@ -207,7 +246,9 @@ class TorchRLPolicy(Agent):
 
 
 class ServerAddress:
-    """The address of a `PolicyServer` that starts later, in the place of TorchRL's `MPTransport`."""
+    """The address of a `PolicyServer` that starts later, in the place of TorchRL's
+    `MPTransport`.
+    """
 
     def __init__(self, **_of_torchrl: Any) -> None:
         self.port = free_port()
@@ -221,17 +262,28 @@ class ServerAddress:
 
 
 class PolicyServer:
-    """A server of a `VLAWrapperBase` on a Ray that it starts, with the arguments of TorchRL's `ProcessInferenceServer`.
+    """A server of a `VLAWrapperBase` on a Ray that it starts, with the arguments of TorchRL's
+    `ProcessInferenceServer`.
 
-    `server_config.max_batch_size` limits its batches, which wait as `batch.patience` of deployment files states. For a
-    `policy_device` "cuda", Ray reserves a GPU. Other arguments have no meaning here.
+    `server_config.max_batch_size` limits its batches, which wait as `batch.patience` of deployment
+    files states. For a `policy_device` "cuda", Ray reserves a GPU. Other arguments have no meaning
+    here.
     """
 
     def __init__(
-        self, *, policy_factory: Any, transport: Any, server_config: Any = None, policy_device: Any = "cpu", **_: Any
+        self,
+        *,
+        policy_factory: Any,
+        transport: Any,
+        server_config: Any = None,
+        policy_device: Any = "cpu",
+        **_: Any,
     ) -> None:
         if not isinstance(transport, ServerAddress):
-            raise ConfigError(f"transport: expected ServerAddress, got {type(transport).__name__}; import both names")
+            raise ConfigError(
+                f"transport: expected ServerAddress, got {type(transport).__name__}; import both "
+                "names"
+            )
         self.transport = transport
         self._factory = policy_factory
         self._running = ExitStack()
@@ -264,9 +316,12 @@ class PolicyServer:
         return self
 
     def update_model_weights(self, weights: Any, **_: Any) -> dict[str, bool]:
-        """Push a tensordict of parameters, all or some, for all later acts; raises the errors of `Publisher.push`."""
+        """Push a tensordict of parameters, all or some, for all later acts; raises the errors of
+        `Publisher.push`.
+        """
         named = dict(weights.flatten_keys(".").items())
-        if all(value.numel() for value in named.values()):  # lazy layers of a learner have none before its first batch
+        # Lazy layers of a learner have none before its first batch.
+        if all(value.numel() for value in named.values()):
             self._publisher.push(named, mode="keep", partial=True, allow_same=True)
         return {"accepted": True}
 

@@ -26,44 +26,60 @@ class TrainingEvaluation:
     """Evaluates a policy while it is trained, in a share of the trainer's time.
 
         plan = EvalConfig(
-            policies=[{"name": "reach"}], suites=[{"envs": ["tabletop/lift"], "episodes": 50}], out="runs/reach"
+            policies=[{"name": "reach"}], suites=[{"envs": ["tabletop/lift"], "episodes": 50}],
+            out="runs/reach"
         )
         evaluation = TrainingEvaluation("serve://reach", plan, share=0.1)
         for _ in range(1000):
             version = weights.push(model.state_dict())
             evaluation.play_if_due(version)
 
-    Results are those of `vlagents_ray.evaluate.evaluate`, with a checkpoint for each version: "reach@3". All versions
-    play the same episodes. The trainer waits for the end, so that nothing is pushed.
+    Results are those of `vlagents_ray.evaluate.evaluate`, with a checkpoint for each version:
+    "reach@3". All versions play the same episodes. The trainer waits for the end, so that nothing
+    is pushed.
     """
 
     def __init__(
-        self, policy: str | Agent, plan: EvalConfig, *, share: float = 0.1, progress: Progress | None = None
+        self,
+        policy: str | Agent,
+        plan: EvalConfig,
+        *,
+        share: float = 0.1,
+        progress: Progress | None = None,
     ) -> None:
         """Check the plan; nothing is played yet.
 
         Args:
-            policy: The URL of the policy's server, to which the versions are pushed; or the agent that this process
-                trains. An agent's episodes are played in this process, each by a copy that shares its weights, as a
-                server makes them; those of a URL by the plan's workers.
-            plan: The suites, the folder of results, and one policy without `steps`: its name and its options. Its `url`
-                and `source` are ignored.
+            policy: The URL of the policy's server, to which the versions are pushed; or the agent
+                that this process trains. An agent's episodes are played in this process, each by a
+                copy that shares its weights, as a server makes them; those of a URL by the plan's
+                workers.
+            plan: The suites, the folder of results, and one policy without `steps`: its name and
+                its options. Its `url` and `source` are ignored.
             share: The part of the time since now that evaluations may take, in (0, 1].
             progress: As for `evaluate`.
 
         Raises:
-            ConfigError: The share or the plan is wrong, or there are results and `plan.resume` is off.
+            ConfigError: The share or the plan is wrong, or there are results and `plan.resume` is
+                off.
             UnknownEnv: There is no such env.
         """
         if not isinstance(policy, str | Agent):
-            raise ConfigError(f"policy: expected an Agent, or the URL of its server, got {type(policy).__name__}")
+            raise ConfigError(
+                f"policy: expected an Agent, or the URL of its server, got {type(policy).__name__}"
+            )
         if not 0 < share <= 1:
-            raise ConfigError(f"share: expected a part of the trainer's time in (0, 1], got {share}")
+            raise ConfigError(
+                f"share: expected a part of the trainer's time in (0, 1], got {share}"
+            )
         if len(plan.policies) != 1 or plan.policies[0].steps:
             names = [configured.name for configured in plan.policies]
             raise ConfigError(f"plan: expected one policy without steps, got {names}")
         if (plan.out / FILE).is_file() and not plan.resume:
-            raise ConfigError(f"{plan.out} already has results: set resume=True in the plan, or choose another folder")
+            raise ConfigError(
+                f"{plan.out} already has results: set resume=True in the plan, or choose another "
+                "folder"
+            )
         require_envs(plan)
         self._policy = policy
         self._plan = plan.model_copy(update={"resume": True})
@@ -74,7 +90,9 @@ class TrainingEvaluation:
 
     @property
     def is_due(self) -> bool:
-        """Whether an evaluation as long as the last one would keep to the share. The first is due at once."""
+        """Whether an evaluation as long as the last one would keep to the share. The first is
+        due at once.
+        """
         elapsed_s = monotonic() - self._began
         return self._spent_s + self._last_s <= self._share * (elapsed_s + self._last_s)
 
@@ -83,18 +101,20 @@ class TrainingEvaluation:
         return self.play(version) if self.is_due else None
 
     def play(self, version: int) -> Summary:
-        """Evaluate the policy now, for example at the end of training. Episodes with a result are not played again.
+        """Evaluate the policy now, for example at the end of training. Episodes with a result are
+        not played again.
 
         Args:
-            version: The result of `Publisher.push`; for an agent of this process an increasing number, such as the step
-                of training.
+            version: The result of `Publisher.push`; for an agent of this process an increasing
+                number, such as the step of training.
 
         Returns:
             The summary of all versions so far; the newest is the last of `totals`.
 
         Raises:
             WeightsLost: The policy acts with another version: push this one, and call again.
-            ConfigError: The results of this version are of other weights, as after a restart of the training.
+            ConfigError: The results of this version are of other weights, as after a restart of the
+                training.
             NotTrainable: The agent names no parameters to train.
             VLAgentsError: As for `evaluate`.
         """
@@ -114,7 +134,8 @@ class TrainingEvaluation:
             newest = (remote.metadata.get("policy_version") or {}).get("newest") or {}
         if newest.get("version") != version:
             raise WeightsLost(
-                f"version: got {version}, but the newest that {url} acts with is {newest.get('version')}; "
+                f"version: got {version}, but the newest that {url} acts with is "
+                f"{newest.get('version')}; "
                 f"use what the last push returned, once `acknowledged` counts all replicas"
             )
         return evaluate(self._plan_for(PushedWeights(**newest), url=url), progress=self._progress)
@@ -130,7 +151,9 @@ class TrainingEvaluation:
 
     def _plan_for(self, pushed: PushedWeights, url: str | None = None) -> EvalConfig:
         """Return the plan of an evaluation of one version."""
-        policy = self._plan.policies[0].model_copy(update={"source": None, "url": url, "pushed_weights": pushed})
+        policy = self._plan.policies[0].model_copy(
+            update={"source": None, "url": url, "pushed_weights": pushed}
+        )
         return self._plan.model_copy(update={"policies": [policy]})
 
 

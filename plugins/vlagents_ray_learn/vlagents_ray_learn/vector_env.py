@@ -1,4 +1,6 @@
-"""Our environments as a `gymnasium.vector.VectorEnv`, for learners that step environments themselves."""
+"""Our environments as a `gymnasium.vector.VectorEnv`, for learners that step environments
+themselves.
+"""
 
 from __future__ import annotations
 
@@ -24,7 +26,9 @@ _RESET_MASK = "reset_mask"  # Gymnasium's name of the option
 
 
 def action_space(contract: Contract) -> Any:
-    """Return Box (D,) float32 within the contract's bounds; raises `ConfigError` if the contract lacks D."""
+    """Return Box (D,) float32 within the contract's bounds; raises `ConfigError` if the contract
+    lacks D.
+    """
     spec = contract.action
     low = -np.inf if spec.low is None else spec.low
     high = np.inf if spec.high is None else spec.high
@@ -33,7 +37,9 @@ def action_space(contract: Contract) -> Any:
 
 
 def observation_space(contract: Contract, observation: Observation) -> Any:
-    """Return the space of `observed`; raises `ConfigError` if the contract does not state a size."""
+    """Return the space of `observed`; raises `ConfigError` if the contract does not state a
+    size.
+    """
     spaces = gymnasium.spaces
     state = {}
     for name, part in sorted((contract.state or {}).items()):
@@ -52,7 +58,8 @@ def observation_space(contract: Contract, observation: Observation) -> Any:
 
     if not state:
         raise ConfigError(
-            "observation: expected 'all', as the env's contract has neither a state nor a gripper, got 'state'"
+            "observation: expected 'all', as the env's contract has neither a state nor a gripper, "
+            "got 'state'"
         )
     low = np.concatenate([space.low for space in state.values()])
     high = np.concatenate([space.high for space in state.values()])
@@ -64,10 +71,12 @@ def observed(obs: Obs, observation: Observation) -> Any:
 
     Args:
         obs: The observation of the environment.
-        observation: "all" is a dict of `cameras/NAME`, `state/NAME` and, with a gripper, `gripper`, (1,). "state" is
-            one vector: the parts of the state by name, then the gripper.
+        observation: "all" is a dict of `cameras/NAME`, `state/NAME` and, with a gripper, `gripper`,
+            (1,). "state" is one vector: the parts of the state by name, then the gripper.
     """
-    state = {f"state/{name}": np.array(part, np.float32) for name, part in sorted(obs.state.items())}
+    state = {
+        f"state/{name}": np.array(part, np.float32) for name, part in sorted(obs.state.items())
+    }
     if obs.gripper is not None:
         state["gripper"] = np.array([obs.gripper], np.float32)
     if observation == "state":
@@ -79,7 +88,9 @@ def observed(obs: Obs, observation: Observation) -> Any:
 def _size(size: int | None, field: str) -> int:
     """Return a size of the contract; raises `ConfigError` if the contract leaves it open."""
     if size is None:
-        raise ConfigError(f"{field}: the env's contract does not state it, but Gymnasium needs it; state it there")
+        raise ConfigError(
+            f"{field}: the env's contract does not state it, but Gymnasium needs it; state it there"
+        )
     return size
 
 
@@ -94,18 +105,18 @@ def as_vector_env(
 ) -> BatchVectorEnv:
     """Make vector environments for learners that use Gymnasium.
 
-    A simulator with many environments, such as ManiSkill on a GPU, steps them at once; other environments are stepped
-    one after another in this process.
+    A simulator with many environments, such as ManiSkill on a GPU, steps them at once; other
+    environments are stepped one after another in this process.
 
     Args:
         env: The name of the env, as for `make_env`.
         num_envs: The number of environments, N.
-        observation: "all" is a dict of `cameras/NAME` (N, H, W, 3) uint8, `state/NAME` (N, D) float32 and `gripper`
-            (N, 1) float32. "state" is all but the images, as one array (N, D) float32: the parts of the state by name,
-            then the gripper.
-        autoreset: What follows the end of an episode (https://farama.org/Vector-Autoreset-Mode). With "same_step", the
-            observation is already that of the next episode, and `infos["final_obs"]` has the last one of the old
-            episode.
+        observation: "all" is a dict of `cameras/NAME` (N, H, W, 3) uint8, `state/NAME` (N, D)
+            float32 and `gripper` (N, 1) float32. "state" is all but the images, as one array (N, D)
+            float32: the parts of the state by name, then the gripper.
+        autoreset: What follows the end of an episode (https://farama.org/Vector-Autoreset-Mode).
+            With "same_step", the observation is already that of the next episode, and
+            `infos["final_obs"]` has the last one of the old episode.
         env_options: The options of the env's constructor.
         reset_options: The options of each reset of an environment.
 
@@ -124,7 +135,9 @@ def as_vector_env(
             raise ConfigError(f"{name}: expected one of {known}, got {choice!r}")
     batch = make_batch(env, num_envs, **(env_options or {}))
     try:
-        return BatchVectorEnv(batch, observation, vector.AutoresetMode[autoreset.upper()], reset_options)
+        return BatchVectorEnv(
+            batch, observation, vector.AutoresetMode[autoreset.upper()], reset_options
+        )
     except BaseException:
         batch.close()
         raise
@@ -133,12 +146,13 @@ def as_vector_env(
 class BatchVectorEnv(vector.VectorEnv):  # type: ignore[misc]
     """The environments of a `BatchEnv` with Gymnasium's interface.
 
-    `reset(seed=S)` begins episodes 0 to N - 1. Episode i has the seed S + i, as in an evaluation; each new episode has
-    the next number. Without a seed, numbers continue; the first S is drawn at random.
+    `reset(seed=S)` begins episodes 0 to N - 1. Episode i has the seed S + i, as in an evaluation;
+    each new episode has the next number. Without a seed, numbers continue; the first S is drawn at
+    random.
 
-    `infos["success"]` states whether the task is solved. `infos["instruction"]` and `infos["episode_seed"]` are set
-    whenever an episode begins, the former also after each step if the episodes have several tasks. A step limit of the
-    environment truncates an episode.
+    `infos["success"]` states whether the task is solved. `infos["instruction"]` and
+    `infos["episode_seed"]` are set whenever an episode begins, the former also after each step if
+    the episodes have several tasks. A step limit of the environment truncates an episode.
     """
 
     def __init__(
@@ -168,7 +182,9 @@ class BatchVectorEnv(vector.VectorEnv):  # type: ignore[misc]
         self.metadata = {"render_modes": [], "autoreset_mode": autoreset}
         self.single_observation_space = observation_space(self._contract, observation)
         self.single_action_space = action_space(self._contract)
-        self.observation_space = vector.utils.batch_space(self.single_observation_space, self.num_envs)
+        self.observation_space = vector.utils.batch_space(
+            self.single_observation_space, self.num_envs
+        )
         self.action_space = vector.utils.batch_space(self.single_action_space, self.num_envs)
         self._seed: int | None = None  # of episode 0
         self._begun = 0  # episodes
@@ -177,15 +193,19 @@ class BatchVectorEnv(vector.VectorEnv):  # type: ignore[misc]
         self._obs: list[Obs] = []  # the current observation of each; none before the first reset
 
     def reset(
-        self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
+        self,
+        *,
+        seed: int | Sequence[int | None] | None = None,
+        options: dict[str, Any] | None = None,
     ) -> tuple[Any, dict[str, Any]]:
         """Begin an episode in each environment.
 
         Args:
-            seed: The seed S of episode 0; None continues with the next numbers. Or, as in Gymnasium, a seed for each
-                environment's episode; later episodes continue after the largest.
-            options: Options of the environments' resets. `reset_mask`, (N,) bool, is Gymnasium's: only these
-                environments begin one.
+            seed: The seed S of episode 0; None continues with the next numbers. Or, as in
+                Gymnasium, a seed for each environment's episode; later episodes continue after the
+                largest.
+            options: Options of the environments' resets. `reset_mask`, (N,) bool, is Gymnasium's:
+                only these environments begin one.
 
         Returns:
             The observations, and the infos.
@@ -205,34 +225,49 @@ class BatchVectorEnv(vector.VectorEnv):  # type: ignore[misc]
         return self._observations(), infos
 
     def _checked_mask(self, mask: Any) -> np.ndarray:
-        """Return which environments a reset begins an episode in, (N,) bool; None is all of them."""
+        """Return which environments a reset begins an episode in, (N,) bool; None is all of
+        them.
+        """
         if mask is None:
             return np.ones(self.num_envs, np.bool_)
         shape = (self.num_envs,)
-        if not isinstance(mask, np.ndarray) or mask.dtype != np.bool_ or mask.shape != shape or not mask.any():
-            raise ConfigError(f"{_RESET_MASK}: expected a bool array of shape {shape}, true somewhere, got {mask!r}")
+        if (
+            not isinstance(mask, np.ndarray)
+            or mask.dtype != np.bool_
+            or mask.shape != shape
+            or not mask.any()
+        ):
+            raise ConfigError(
+                f"{_RESET_MASK}: expected a bool array of shape {shape}, true somewhere, got "
+                f"{mask!r}"
+            )
         return mask
 
-    def step(self, actions: np.ndarray) -> tuple[Any, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
+    def step(
+        self, actions: np.ndarray
+    ) -> tuple[Any, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
         """Execute an action in each environment.
 
         Args:
             actions: One action for each environment, (N, D) float32.
 
         Returns:
-            The observations, rewards (N,) float64, terminated (N,) bool, truncated (N,) bool, and the infos.
+            The observations, rewards (N,) float64, terminated (N,) bool, truncated (N,) bool, and
+            the infos.
         """
         if not self._obs:
             raise NotReset("step before reset; call reset(seed=...) first")
         if self._over.any() and self.autoreset_mode == vector.AutoresetMode.DISABLED:
             raise NotReset(
-                f"environments {np.flatnonzero(self._over).tolist()} are over, and autoreset is disabled; call "
+                f"environments {np.flatnonzero(self._over).tolist()} are over, and autoreset is "
+                "disabled; call "
                 f"reset(options={{'reset_mask': ...}})"
             )
         rows = np.asarray(actions, np.float32)
         if rows.shape != self.action_space.shape:
             raise InvalidAction(
-                f"actions: expected shape {self.action_space.shape}, a row for each environment, got {rows.shape}"
+                f"actions: expected shape {self.action_space.shape}, a row for each environment, "
+                f"got {rows.shape}"
             )
         rewards = np.zeros(self.num_envs)
         terminated = np.zeros(self.num_envs, np.bool_)
@@ -267,7 +302,9 @@ class BatchVectorEnv(vector.VectorEnv):  # type: ignore[misc]
         self._batch.close()
 
     def _moved(self, rows: np.ndarray, moving: np.ndarray) -> list[tuple[int, Any, dict[str, Any]]]:
-        """Step the environments that are `moving`; return the number, the outputs and the info of each."""
+        """Step the environments that are `moving`; return the number, the outputs and the info
+        of each.
+        """
         if not moving.any():
             return []
         images = self._observation == "all"
@@ -282,7 +319,13 @@ class BatchVectorEnv(vector.VectorEnv):  # type: ignore[misc]
         moved = []
         for i in np.flatnonzero(moving).tolist():
             step = checked_step(
-                obs[i], rewards[i], terminated[i], truncated[i], infos[i], self._contract, images=images
+                obs[i],
+                rewards[i],
+                terminated[i],
+                truncated[i],
+                infos[i],
+                self._contract,
+                images=images,
             )
             moved.append((i, step, dict(infos[i])))
         return moved
@@ -299,11 +342,16 @@ class BatchVectorEnv(vector.VectorEnv):  # type: ignore[misc]
         chosen = np.flatnonzero(mask).tolist()
         if not mask.all() and not self._batch.restarts:
             raise ConfigError(
-                f"{len(chosen)} of {self.num_envs} episodes are over, and this simulator resets all its environments "
-                f"together; use one whose episodes end together, as those of a step limit do, or num_envs=1"
+                f"{len(chosen)} of {self.num_envs} episodes are over, and this simulator resets "
+                "all its environments "
+                "together; use one whose episodes end together, as those of a step limit do, or "
+                "num_envs=1"
             )
         if not mask.all() and not self._obs:
-            raise NotReset(f"reset: got a {_RESET_MASK} before the first reset; call reset(seed=...) for all first")
+            raise NotReset(
+                f"reset: got a {_RESET_MASK} before the first reset; call reset(seed=...) for all "
+                "first"
+            )
         numbers = range(self._begun, self._begun + len(chosen))
         seeds = chosen_seeds or [self._seed + number for number in numbers]
         merged = {**self._reset_options, **(env_options or {})}
@@ -326,19 +374,26 @@ class BatchVectorEnv(vector.VectorEnv):  # type: ignore[misc]
         rows = [observed(obs, self._observation) for obs in self._obs]
         if self._observation == "state":
             return np.stack(rows)
-        return {name: np.stack([row[name] for row in rows]) for name in self.single_observation_space}
+        return {
+            name: np.stack([row[name] for row in rows]) for name in self.single_observation_space
+        }
 
 
 def _seeds(seeds: Sequence[int | None], mask: np.ndarray) -> list[int]:
-    """Return the seeds of the environments that begin an episode, from a list for all environments."""
+    """Return the seeds of the environments that begin an episode, from a list for all
+    environments.
+    """
     if len(seeds) != mask.size:
-        raise InvalidInput(f"seed: expected {mask.size} seeds, one for each environment, got {len(seeds)}")
+        raise InvalidInput(
+            f"seed: expected {mask.size} seeds, one for each environment, got {len(seeds)}"
+        )
     chosen = []
     for i in np.flatnonzero(mask).tolist():
         seed = seeds[i]
         if not isinstance(seed, (int, np.integer)) or seed < 0:
             raise InvalidInput(
-                f"seed: expected a whole number for each environment that begins an episode, got {list(seeds)}"
+                "seed: expected a whole number for each environment that begins an episode, got "
+                f"{list(seeds)}"
             )
         chosen.append(int(seed))
     return chosen

@@ -62,12 +62,18 @@ def board() -> Board:
     return Board()
 
 
-def test_a_command_goes_into_one_answer_and_the_next_request_says_what_became_of_it(board: Board) -> None:
+def test_a_command_goes_into_one_answer_and_the_next_request_says_what_became_of_it(
+    board: Board,
+) -> None:
     assert board.answered() is None
     first, second = board.press("pause"), board.press("success")
     assert board.answered() == {"id": first, "do": "pause", "by": "lab"}
     assert board.states == ["sent", "waiting"]
-    assert board.answered(**{COMMANDED: {first: ""}}) == {"id": second, "do": "success", "by": "lab"}
+    assert board.answered(**{COMMANDED: {first: ""}}) == {
+        "id": second,
+        "do": "success",
+        "by": "lab",
+    }
     assert board.answered(**{COMMANDED: {second: "no hands"}}) is None
     assert board.states == ["done", "refused"]
     assert board.board.of("arm")[1]["why"] == "no hands"
@@ -89,11 +95,15 @@ def test_a_command_that_waited_for_too_long_never_reaches_the_robot(board: Board
     assert board.states == ["too late"]
 
 
-@pytest.mark.parametrize("do", ["resume", "instruct", "take over", "restart", "dance", "", "x" * 10_000])
+@pytest.mark.parametrize(
+    "do", ["resume", "instruct", "take over", "restart", "dance", "", "x" * 10_000]
+)
 def test_what_would_make_a_robot_move_is_refused_with_the_cure(board: Board, do: str) -> None:
     with pytest.raises(InvalidInput, match="at the robot") as refused:
         board.press(do)
-    assert f"got {do[:40]!r}, want one of ['pause', 'stop', 'success', 'failure'," in str(refused.value)
+    assert f"got {do[:40]!r}, want one of ['pause', 'stop', 'success', 'failure'," in str(
+        refused.value
+    )
     assert board.answered() is None
 
 
@@ -115,9 +125,13 @@ def test_ended_sessions_are_forgotten(board: Board) -> None:
     assert board.states == []
 
 
-def post(server: LiveServer, stated: object, key: str = "", **headers: str) -> tuple[int, dict[str, Any]]:
+def post(
+    server: LiveServer, stated: object, key: str = "", **headers: str
+) -> tuple[int, dict[str, Any]]:
     data = stated if isinstance(stated, bytes) else json.dumps(stated).encode()
-    given = {"content-type": "application/json", **headers} | ({"authorization": f"Bearer {key}"} if key else {})
+    given = {"content-type": "application/json", **headers} | (
+        {"authorization": f"Bearer {key}"} if key else {}
+    )
     request = urllib.request.Request(f"{server.url}/v1/live/command", data, given)
     try:
         with urllib.request.urlopen(request, timeout=10) as answer:
@@ -154,7 +168,9 @@ def robot(server: LiveServer, *, obeys: bool = True) -> Iterator[tuple[Arm, str,
         player = ChunkPlayer(agent, PlayerSettings(mode="async", deadline_s=0.01, safe="hold"))
         thread = threading.Thread(
             target=lambda: reports.append(
-                run_loop(arm, player, hz=100, instruction="hold", commands=commands, until=over.is_set)
+                run_loop(
+                    arm, player, hz=100, instruction="hold", commands=commands, until=over.is_set
+                )
             )
         )
         thread.start()
@@ -188,7 +204,9 @@ def test_a_robot_pauses_and_is_marked(server: LiveServer) -> None:
         assert reports[0].outcome == "success"
 
 
-def test_nothing_moves_while_it_is_paused_whatever_comes_over_the_network(server: LiveServer) -> None:
+def test_nothing_moves_while_it_is_paused_whatever_comes_over_the_network(
+    server: LiveServer,
+) -> None:
     with robot(server) as (arm, session, reports):
         post(server, {"session": session, "do": "pause"})
         wait_for(lambda: states(server, session) == ["pause done"], 30)
@@ -197,11 +215,14 @@ def test_nothing_moves_while_it_is_paused_whatever_comes_over_the_network(server
             status, said = post(server, {"session": session, "do": do, "text": "go on"})
             assert (status, "at the robot" in said["detail"]) == (400, True)
         steps = server.engine.sessions.get(session).steps
-        wait_for(lambda: server.engine.sessions.get(session).steps > steps + 10, 30)  # the policy goes on
+        # The policy goes on.
+        wait_for(lambda: server.engine.sessions.get(session).steps > steps + 10, 30)
         assert (arm.applied, reports) == (applied, [])
 
 
-def test_a_marked_episode_ends_the_robots_command(server: LiveServer, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_marked_episode_ends_the_robots_command(
+    server: LiveServer, capsys: pytest.CaptureFixture[str]
+) -> None:
     options = ["--hz", "50", "--seconds", "30", "--instruction", "fold", "--operate"]
     status: list[int] = []
     thread = threading.Thread(target=lambda: status.append(main([server.url, *options])))
@@ -236,7 +257,9 @@ def test_viewers_see_the_commands_and_whether_they_may_give_some(server: LiveSer
         assert [(one["do"], one["state"]) for one in shown[0]["commands"]] == [("pause", "waiting")]
 
 
-@pytest.mark.parametrize("body", [b"", b"[]", b"{", b'{"session": 1, "do": "stop"}', b'{"do": "stop"}', b"[" * 10_000])
+@pytest.mark.parametrize(
+    "body", [b"", b"[]", b"{", b'{"session": 1, "do": "stop"}', b'{"do": "stop"}', b"[" * 10_000]
+)
 def test_malformed_commands_are_refused(server: LiveServer, body: bytes) -> None:
     assert post(server, body)[0] == 400
 
@@ -248,7 +271,12 @@ def test_a_long_command_is_not_read(server: LiveServer, monkeypatch: pytest.Monk
 
 @pytest.mark.parametrize(
     "headers",
-    [{"origin": "http://evil.example"}, {"origin": "null"}, {"host": "evil.example"}, {"content-type": "text/plain"}],
+    [
+        {"origin": "http://evil.example"},
+        {"origin": "null"},
+        {"host": "evil.example"},
+        {"content-type": "text/plain"},
+    ],
 )
 def test_another_sites_page_cannot_press(server: LiveServer, headers: dict[str, str]) -> None:
     with RemoteAgent(server.url) as agent:
@@ -270,7 +298,10 @@ def test_a_key_needs_the_scope_and_each_press_is_logged(
 ) -> None:
     monkeypatch.setattr(api_keys, "_CHECK_S", 0.0)
     keys = ChangingKeys()
-    watching, operating = keys.add("watching", scopes=["watch"]), keys.add("lab", scopes=["watch", "operate"])
+    watching, operating = (
+        keys.add("watching", scopes=["watch"]),
+        keys.add("lab", scopes=["watch", "operate"]),
+    )
     with live_server(keys=keys.keys) as server, RemoteAgent(server.url, api_key=watching) as agent:
         agent.reset(Obs())
         [session] = server.engine.sessions.ids()

@@ -25,12 +25,17 @@ pytestmark = [pytest.mark.browser, pytest.mark.slow]
 
 STATE = "document.getElementById('evaluation-state').textContent"
 CARDS = "document.querySelectorAll('#failures article').length"
-PLAYING = "[...document.querySelectorAll('#failures video')].filter((one) => one.videoWidth === 48).length"
+PLAYING = (
+    "[...document.querySelectorAll('#failures video')].filter((one) => one.videoWidth === "
+    "48).length"
+)
 UNFOLD = "document.getElementById('failures').closest('details').open = true"
 SCROLL = "document.getElementById('failures').scrollIntoView()"
-# Videos in view that are still requested: a server that ends before it sent them leaves their files open.
+# Videos in view that are still requested: a server that ends before it sent them leaves their files
+# open.
 LOADING = (
-    "[...document.querySelectorAll('#failures video:not([src])')].map((one) => one.getBoundingClientRect())"
+    "[...document.querySelectorAll('#failures video:not([src])')].map((one) => "
+    "one.getBoundingClientRect())"
     ".filter((box) => box.bottom > 0 && box.top < innerHeight).length"
 )
 POINTS = "document.querySelectorAll('#curve .dot').length"
@@ -44,16 +49,22 @@ def page(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Page]:
 
 @pytest.fixture(scope="module")
 def results(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A sweep of a policy beside another one, with videos of failures, an error and a lost episode."""
+    """A sweep of a policy beside another one, with videos of failures, an error and a lost
+    episode.
+    """
     out = tmp_path_factory.mktemp("results") / "sweep"
     record(runs(out, episodes=5), videos=True, troubles=True)
     return out
 
 
 @contextmanager
-def served(read: Callable[[], dict[str, Any]], videos: Any = {}.get, keys: Keys | None = None) -> Iterator[str]:
+def served(
+    read: Callable[[], dict[str, Any]], videos: Any = {}.get, keys: Keys | None = None
+) -> Iterator[str]:
     """The address of the page of such a document."""
-    with page_server(Fleet(None, more=read), ("127.0.0.1", 0), keys, name="eval", videos=videos) as url:
+    with page_server(
+        Fleet(None, more=read), ("127.0.0.1", 0), keys, name="eval", videos=videos
+    ) as url:
         yield url
 
 
@@ -78,7 +89,9 @@ def begun(out: Path, **options: bool) -> ProgressDocument:
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])
 @pytest.mark.parametrize("width", [360, 1400, 3840])
-def test_it_fits_without_errors_or_requests_outside(page: Page, results: Path, width: int, scheme: str) -> None:
+def test_it_fits_without_errors_or_requests_outside(
+    page: Page, results: Path, width: int, scheme: str
+) -> None:
     document = begun(results)
     with served(document.read, document.video) as url:
         show(page, url, width=width, scheme=scheme)
@@ -91,18 +104,25 @@ def test_it_fits_without_errors_or_requests_outside(page: Page, results: Path, w
         assert all(address.startswith(("blob:", "data:", own)) for address in page.asked)
 
 
-def test_cells_fill_with_their_intervals_and_failures_come_with_video(page: Page, results: Path) -> None:
+def test_cells_fill_with_their_intervals_and_failures_come_with_video(
+    page: Page, results: Path
+) -> None:
     document = begun(results)
     with served(document.read, document.video) as url:
         show(page, url)
         until(page, f"{CARDS} >= 10", want=True)
         page.value(SCROLL)
-        assert page.value(f"{PLAYING} + document.querySelectorAll('#failures video[src]').length") == 0
+        assert (
+            page.value(f"{PLAYING} + document.querySelectorAll('#failures video[src]').length") == 0
+        )
         page.value(UNFOLD)
         page.value(SCROLL)
         until(page, f"{PLAYING} >= 1", want=True)  # those that can be seen
         until(page, LOADING, 0)
-        controls = "((video) => { const before = video.controls; video.click(); return [before, video.controls]; })"
+        controls = (
+            "((video) => { const before = video.controls; video.click(); return [before, "
+            "video.controls]; })"
+        )
         assert page.value(f"{controls}(document.querySelector('#failures video'))") == [False, True]
         assert page.value(f"{PLAYING} < {CARDS} - 1")
         cell = "document.querySelector('#cells .cell').innerText"
@@ -113,7 +133,9 @@ def test_cells_fill_with_their_intervals_and_failures_come_with_video(page: Page
         assert "error of the policy" in text
         assert "policy_failed: </script><img" in text  # as text
         until(page, POINTS, 2)
-        assert "learner: " in page.value("document.getElementById('curve').getAttribute('aria-label')")
+        assert "learner: " in page.value(
+            "document.getElementById('curve').getAttribute('aria-label')"
+        )
         assert page.said == []
 
 
@@ -130,9 +152,15 @@ def test_it_says_how_it_ends_and_keeps_what_was_seen(page: Page, results: Path) 
 
 def test_the_time_left_is_told(page: Page) -> None:
     said = begun(Path("none")).read()["evaluation"]
-    with served(lambda: {"evaluation": said | {"done": 3, "planned": 12, "ends": time.time() + 600}}) as url:
+    with served(
+        lambda: {"evaluation": said | {"done": 3, "planned": 12, "ends": time.time() + 600}}
+    ) as url:
         show(page, url)
-        until(page, "document.getElementById('episode-count').textContent", "3 of 12 episodes, about 10 min left")
+        until(
+            page,
+            "document.getElementById('episode-count').textContent",
+            "3 of 12 episodes, about 10 min left",
+        )
 
 
 def test_videos_are_requested_with_the_key(page: Page, results: Path) -> None:

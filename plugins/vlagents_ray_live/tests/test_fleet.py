@@ -14,7 +14,14 @@ from vlagents_ray.errors import UnknownSession
 from vlagents_ray.policies.noop import Noop
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray_live import live_view
-from vlagents_ray_live.live_view import PICTURES, Fleet, ReplicaView, Snapshot, SnapshotReader, Viewer
+from vlagents_ray_live.live_view import (
+    PICTURES,
+    Fleet,
+    ReplicaView,
+    Snapshot,
+    SnapshotReader,
+    Viewer,
+)
 
 
 class Others:
@@ -58,7 +65,10 @@ def test_pictures_go_to_those_who_show_them(own: ReplicaView) -> None:
     assert [one["name"] for one in first["replicas"]] == ["b", "c", "own"]
     assert [one["sessions"][0]["pictures"] for one in first["replicas"][:2]] == [{}, {"front": 0}]
     assert its_files == [b"c"]
-    assert [one["sessions"][0]["pictures"] for one in second["replicas"][:2]] == [{"front": 0}, {"front": 1}]
+    assert [one["sessions"][0]["pictures"] for one in second["replicas"][:2]] == [
+        {"front": 0},
+        {"front": 1},
+    ]
     assert their_files == [b"b", b"c"]
     assert others.asked[0][2] == {"of b", "of c"}
 
@@ -72,7 +82,9 @@ def test_a_command_reaches_the_replica_that_has_the_session(own: ReplicaView) ->
         asyncio.run(Fleet(own).press("of b", "stop", "lab"))
 
 
-def test_a_replica_that_does_not_answer_is_left_out_and_asked_again_from_where_it_was(own: ReplicaView) -> None:
+def test_a_replica_that_does_not_answer_is_left_out_and_asked_again_from_where_it_was(
+    own: ReplicaView,
+) -> None:
     others = Others("b")
 
     async def watch() -> None:
@@ -104,7 +116,9 @@ def test_nothing_is_gathered_without_viewers(own: ReplicaView) -> None:
     assert asyncio.run(watch()) == 1
 
 
-def test_an_error_of_a_reading_does_not_end_the_next(own: ReplicaView, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_error_of_a_reading_does_not_end_the_next(
+    own: ReplicaView, monkeypatch: pytest.MonkeyPatch
+) -> None:
     read, failures = own.read, iter([True, False, False])
 
     def sometimes(since: int, shown: Collection[str]) -> Snapshot:
@@ -141,7 +155,9 @@ def test_what_is_beside_the_replicas_is_sent_when_it_has_changed() -> None:
     assert first["replicas"] == []
 
 
-@pytest.mark.parametrize(("behind", "size", "sent"), [(2, 1, 4), (None, PICTURES, 100)], ids=["messages", "bytes"])
+@pytest.mark.parametrize(
+    ("behind", "size", "sent"), [(2, 1, 4), (None, PICTURES, 100)], ids=["messages", "bytes"]
+)
 def test_a_slow_viewer_misses_the_oldest(
     monkeypatch: pytest.MonkeyPatch, behind: int | None, size: int, sent: int
 ) -> None:
@@ -154,7 +170,13 @@ def test_a_slow_viewer_misses_the_oldest(
         for number in range(sent):
             session = {"id": "s", "pictures": {"front": 0}}
             viewer.put(
-                [Snapshot(number, {"name": str(number), "sessions": [session]}, [bytes([number]) + bytes(size - 1)])]
+                [
+                    Snapshot(
+                        number,
+                        {"name": str(number), "sessions": [session]},
+                        [bytes([number]) + bytes(size - 1)],
+                    )
+                ]
             )
         return await viewer.next()
 

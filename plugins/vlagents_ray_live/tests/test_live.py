@@ -1,4 +1,6 @@
-"""What is kept for viewers while somebody looks, and the memory and the disk that clients can take by it."""
+"""What is kept for viewers while somebody looks, and the memory and the disk that clients can
+take by it.
+"""
 
 from __future__ import annotations
 
@@ -36,7 +38,11 @@ IMAGE = np.zeros((4, 4, 3), np.uint8)
 
 
 def observe(
-    observer: Observer, session: str, request: Request, reply: Reply, files: DecodedFiles | None = None
+    observer: Observer,
+    session: str,
+    request: Request,
+    reply: Reply,
+    files: DecodedFiles | None = None,
 ) -> None:
     pending = PendingRequest(session, request, lambda _: None, RANKS[request.rank], kept={})
     pending.files = files or {}
@@ -55,7 +61,9 @@ class Watched:
         self.live = LiveObserver(self.observers, clock=self.clock)
         self.replies: list[Reply] = []
 
-    def ask(self, session: str, obs: Obs | None, op: str = "act", files: DecodedFiles | None = None) -> None:
+    def ask(
+        self, session: str, obs: Obs | None, op: str = "act", files: DecodedFiles | None = None
+    ) -> None:
         self.replies.append(Reply(act=Act(np.zeros(2, np.float32))))
         observe(self.live, session, Request(op, obs), self.replies[-1], files)  # type: ignore[arg-type]
 
@@ -93,7 +101,9 @@ def test_observations_are_kept_ten_times_a_second_at_most(watched: Watched) -> N
         watched.ask("a", Obs(gripper=gripper))
     watched.ask("b", Obs(gripper=0.3))
     kept = [watched.live.observation(name) for name in "ab"]
-    assert [float(one.state["gripper"][0]) for one in kept if one is not None] == pytest.approx([0.1, 0.3])
+    assert [float(one.state["gripper"][0]) for one in kept if one is not None] == pytest.approx(
+        [0.1, 0.3]
+    )
     watched.clock.now += 1.01 / RATE
     watched.ask("a", Obs(gripper=0.4))
     assert float(watched.live.observation("a").state["gripper"][0]) == pytest.approx(0.4)  # type: ignore[union-attr]
@@ -106,7 +116,9 @@ def test_states_are_copies_since_their_client_wants_its_memory_back(watched: Wat
     assert watched.live.observation("a").state["joints"].sum() == 7  # type: ignore[union-attr]
 
 
-def test_a_file_is_kept_in_place_of_its_pixels_unless_the_policy_gets_others(watched: Watched) -> None:
+def test_a_file_is_kept_in_place_of_its_pixels_unless_the_policy_gets_others(
+    watched: Watched,
+) -> None:
     turned = IMAGE[::-1].copy()
     files: DecodedFiles = {id(IMAGE): (IMAGE, memoryview(b"jpeg"))}
     watched.ask("a", Obs(cameras={"front": IMAGE, "wrist": turned}), files=files)
@@ -162,7 +174,10 @@ def small_image_of_a_large_message() -> Message:
 MESSAGES: dict[str, Callable[[], Message]] = {
     "a text in info": lambda: (Obs(info={"note": "x" * LARGE}), acted()),
     "a large state": lambda: (Obs(state={"joints": np.zeros(LARGE // 4, np.float32)}), acted()),
-    "many parts of a state": lambda: (Obs(state={str(i): np.zeros(1, np.float32) for i in range(500)}), acted()),
+    "many parts of a state": lambda: (
+        Obs(state={str(i): np.zeros(1, np.float32) for i in range(500)}),
+        acted(),
+    ),
     "a long name": lambda: (Obs(state={"x" * LARGE: np.zeros(1, np.float32)}), acted()),
     "a large image": lambda: (Obs({"front": np.zeros((512, 700, 3), np.uint8)}), acted()),
     "a small image of a large message": small_image_of_a_large_message,
@@ -199,13 +214,17 @@ def budgets(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(live, "OBSERVATION_BYTES", BUDGET)
 
 
-def send(watched: LiveObserver, session: str, message: Message, files: DecodedFiles | None = None) -> None:
+def send(
+    watched: LiveObserver, session: str, message: Message, files: DecodedFiles | None = None
+) -> None:
     obs, reply = message
     observe(watched, session, Request("act", obs), reply, files)
 
 
 @pytest.mark.parametrize("kind", [*MESSAGES, "all in turn"])
-def test_many_messages_of_the_largest_size_leave_bounded_memory_in_the_live_observer(budgets: None, kind: str) -> None:
+def test_many_messages_of_the_largest_size_leave_bounded_memory_in_the_live_observer(
+    budgets: None, kind: str
+) -> None:
     clock, kinds = Clock(), itertools.cycle(MESSAGES if kind == "all in turn" else [kind])
     watched = LiveObserver(Observers(), clock=clock)
     watched.renew()
@@ -229,7 +248,12 @@ def test_the_files_of_observations_are_bounded_and_the_oldest_go_first(budgets: 
     with Kept() as kept:
         for number in range(30):
             image = np.zeros((8, 8, 3), np.uint8)
-            send(watched, str(number), (Obs({"front": image}), acted()), {id(image): (image, memoryview(bytes(LARGE)))})
+            send(
+                watched,
+                str(number),
+                (Obs({"front": image}), acted()),
+                {id(image): (image, memoryview(bytes(LARGE)))},
+            )
         assert kept.bytes() < 1.5 * BUDGET + SLACK
     assert watched.observation("0") is None
     assert watched.observation("29") is not None
@@ -249,7 +273,12 @@ def test_a_snapshot_and_what_is_sent_of_it_are_bounded(monkeypatch: pytest.Monke
     for name in names:
         engine.sessions.open(name)
         image = np.zeros((8, 8, 3), np.uint8)
-        send(view.live, name, (Obs({"front": image}), acted()), {id(image): (image, memoryview(bytes(LARGE)))})
+        send(
+            view.live,
+            name,
+            (Obs({"front": image}), acted()),
+            {id(image): (image, memoryview(bytes(LARGE)))},
+        )
     pictured: set[str] = set()
     for _ in range(6):
         found = view.read(0, names)
@@ -313,7 +342,8 @@ def test_the_ring_holds_no_more_than_its_memory(tmp_path: Path, kind: str) -> No
             send(held.watched, "s", MESSAGES[kind]())
             held.ring.read()
             held.clock.now += 1.05 / live.RATE
-        assert kept.bytes() < 2e6 + 2 * LARGE + SLACK  # the ring, and the last observation that the live observer keeps
+        # The ring, and the last observation that the live observer keeps.
+        assert kept.bytes() < 2e6 + 2 * LARGE + SLACK
         assert held.ring.bytes <= 2e6
 
 

@@ -23,7 +23,13 @@ from websockets.sync.client import connect
 from vlagents_ray import Obs, RemoteAgent
 from vlagents_ray.client.credentials import Credentials
 from vlagents_ray.client.transports.websocket import open_websocket
-from vlagents_ray.errors import ConfigError, Forbidden, PolicyUnavailable, Unauthorized, VLAgentsError
+from vlagents_ray.errors import (
+    ConfigError,
+    Forbidden,
+    PolicyUnavailable,
+    Unauthorized,
+    VLAgentsError,
+)
 from vlagents_ray.images.codecs import JPEG
 from vlagents_ray.images.jpeg_png import decode
 from vlagents_ray.interface import Act, Agent
@@ -46,7 +52,12 @@ class Explains(Agent):
     def act(self, obs: Obs) -> Act:
         if obs.info.get("fail"):
             raise RuntimeError("secret")
-        said = {"subtask": "grasp", "uncertainty": np.float32(0.25), "nothing": float("nan"), "map": np.zeros((9, 9))}
+        said = {
+            "subtask": "grasp",
+            "uncertainty": np.float32(0.25),
+            "nothing": float("nan"),
+            "map": np.zeros((9, 9)),
+        }
         return Act(np.arange(6, dtype=np.float32).reshape(3, 2), info=said)
 
 
@@ -58,7 +69,9 @@ def server() -> Iterator[LiveServer]:
 
 def get(url: str, headers: Mapping[str, str] = {}) -> tuple[int, bytes, Mapping[str, str]]:
     try:
-        with urllib.request.urlopen(urllib.request.Request(url, headers=dict(headers)), timeout=10) as answer:
+        with urllib.request.urlopen(
+            urllib.request.Request(url, headers=dict(headers)), timeout=10
+        ) as answer:
             return answer.status, answer.read(), dict(answer.headers)
     except urllib.error.HTTPError as refused:
         return refused.code, refused.read(), dict(refused.headers)
@@ -108,7 +121,11 @@ def test_errors_and_sessions_that_ended_are_told(server: LiveServer) -> None:
             while not told or not failed:
                 for replica in ask(viewer)[0]["replicas"]:
                     told |= replica["errors"]
-                    failed += [one["last"]["detail"] for one in replica["sessions"] if "error" in one.get("last", {})]
+                    failed += [
+                        one["last"]["detail"]
+                        for one in replica["sessions"]
+                        if "error" in one.get("last", {})
+                    ]
             assert told == {"policy_failed": 1}
             assert "secret" not in failed[0]
         wait_for(lambda: not ask(viewer)[0]["replicas"][-1]["sessions"])
@@ -119,8 +136,12 @@ def test_nothing_is_kept_once_nobody_looks(server: LiveServer) -> None:
     with server.viewer() as viewer:
         ask(viewer)
         assert server.engine.observers.any
-        status, text, _ = get(f"{server.url}/v1/live", {"sec-fetch-site": "same-origin"})  # without a WebSocket
-        assert (status, json.loads(text)["replicas"][0]["waiting"]) == (200, {"robot": 0, "simulation": 0})
+        # Without a WebSocket.
+        status, text, _ = get(f"{server.url}/v1/live", {"sec-fetch-site": "same-origin"})
+        assert (status, json.loads(text)["replicas"][0]["waiting"]) == (
+            200,
+            {"robot": 0, "simulation": 0},
+        )
     wait_for(lambda: server.engine.observers.any is False)
 
 
@@ -139,7 +160,9 @@ def test_the_scripts_of_the_page_share_no_name_since_they_share_one_scope() -> N
     assert {name for name in names if names.count(name) > 1} == set()
 
 
-@pytest.mark.parametrize("message", [b"", b"[]", b'{"shown": [1]}', b'{"shown": 3}', b"{", b"[" * 10_000])
+@pytest.mark.parametrize(
+    "message", [b"", b"[]", b'{"shown": [1]}', b'{"shown": 3}', b"{", b"[" * 10_000]
+)
 def test_a_malformed_question_ends_that_viewer_alone(server: LiveServer, message: bytes) -> None:
     with server.viewer() as viewer, server.viewer() as other:
         viewer.send(message, 10)
@@ -147,7 +170,9 @@ def test_a_malformed_question_ends_that_viewer_alone(server: LiveServer, message
         assert ask(other)[0]["replicas"]
 
 
-def test_more_viewers_than_allowed_are_refused(server: LiveServer, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_more_viewers_than_allowed_are_refused(
+    server: LiveServer, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(live_page, "_VIEWERS", 1)
     with server.viewer() as viewer:
         ask(viewer)
@@ -155,7 +180,9 @@ def test_more_viewers_than_allowed_are_refused(server: LiveServer, monkeypatch: 
             pass
 
 
-def test_a_viewer_who_asks_for_nothing_is_let_go(server: LiveServer, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_viewer_who_asks_for_nothing_is_let_go(
+    server: LiveServer, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(live_page, "_SILENT_S", 0.1)
     with server.viewer() as viewer:
         assert "within 0.1 s" in json.loads(viewer.recv(10))["detail"]
@@ -165,7 +192,8 @@ def test_a_viewer_who_asks_for_nothing_is_let_go(server: LiveServer, monkeypatch
     "headers",
     [
         {"origin": "http://evil.example"},
-        {"sec-fetch-site": "cross-site", "sec-fetch-mode": "no-cors"},  # as an image: without an origin
+        # As an image: without an origin.
+        {"sec-fetch-site": "cross-site", "sec-fetch-mode": "no-cors"},
         {"sec-fetch-site": "cross-site", "sec-fetch-mode": "navigate"},
         {"sec-fetch-site": "same-site"},  # another port of this machine
     ],
@@ -215,11 +243,15 @@ def test_a_key_wants_the_scope(keys: ChangingKeys) -> None:
                 break
 
 
-def test_a_browser_states_its_key_as_a_subprotocol_that_is_not_sent_back(keys: ChangingKeys) -> None:
+def test_a_browser_states_its_key_as_a_subprotocol_that_is_not_sent_back(
+    keys: ChangingKeys,
+) -> None:
     token = keys.add("watching", scopes=["watch"])
     with live_server(keys=keys.keys) as server:
         offered = ["vlagents.live", f"vlagents.key.{token}"]
-        with connect(f"ws://127.0.0.1:{server.port}/v1/live", subprotocols=offered, proxy=None) as stream:  # type: ignore[arg-type]
+        with connect(
+            f"ws://127.0.0.1:{server.port}/v1/live", subprotocols=offered, proxy=None
+        ) as stream:  # type: ignore[arg-type]
             assert stream.subprotocol == "vlagents.live"
             stream.send('{"shown": []}')
             message = stream.recv(10)
@@ -264,7 +296,9 @@ def test_it_is_there_until_the_end_of_the_context() -> None:
 
 def test_a_viewer_does_not_keep_it_from_ending() -> None:
     with page_server(fleet(), ("127.0.0.1", 0), None, name="eval", videos={}.get) as url:
-        viewer = open_websocket(url.replace("http", "ws").replace("/live", "/v1/live"), Credentials(""), 10)
+        viewer = open_websocket(
+            url.replace("http", "ws").replace("/live", "/v1/live"), Credentials(""), 10
+        )
     viewer.close()
 
 

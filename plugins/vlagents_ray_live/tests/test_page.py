@@ -30,7 +30,9 @@ from vlagents_ray.serve.access import api_keys
 pytestmark = [pytest.mark.browser, pytest.mark.slow]
 
 CARDS = "document.querySelectorAll('article').length"
-PICTURES = "[...document.querySelectorAll('article img')].filter((one) => one.naturalWidth === 48).length"
+PICTURES = (
+    "[...document.querySelectorAll('article img')].filter((one) => one.naturalWidth === 48).length"
+)
 STATUS = "document.getElementById('connection').textContent"
 
 
@@ -46,7 +48,9 @@ def server() -> Iterator[LiveServer]:
         yield one
 
 
-def show(page: Page, server: LiveServer, *, width: int = 1400, scheme: str = "light", height: int = 900) -> None:
+def show(
+    page: Page, server: LiveServer, *, width: int = 1400, scheme: str = "light", height: int = 900
+) -> None:
     page.said.clear()
     page.asked.clear()
     page.open(Address(f"{server.url}/live"), width=width, scheme=scheme, height=height)  # type: ignore[arg-type]
@@ -58,7 +62,9 @@ def until(page: Page, expression: str, want: object) -> None:
 
 
 @contextmanager
-def acting(server: LiveServer, number: int, rank: RankName = "robot", key: str | None = None) -> Iterator[None]:
+def acting(
+    server: LiveServer, number: int, rank: RankName = "robot", key: str | None = None
+) -> Iterator[None]:
     """So many robots or simulations that act until the end of the context."""
     over = threading.Event()
 
@@ -94,7 +100,9 @@ def test_it_fits_without_errors_or_requests_outside(
         until(page, PICTURES, robots)
         assert page.value("document.documentElement.scrollWidth") <= width
         assert page.said == []
-        assert [url for url in page.asked if not url.startswith(("blob:", "data:"))] == [f"{server.url}/live"]
+        assert [url for url in page.asked if not url.startswith(("blob:", "data:"))] == [
+            f"{server.url}/live"
+        ]
         assert page.value("document.getElementById('nothing').hidden") == (robots > 0)
 
 
@@ -102,7 +110,8 @@ def test_a_card_says_what_its_session_does(page: Page, server: LiveServer) -> No
     with acting(server, 1):
         show(page, server)
         until(page, PICTURES, 1)
-        until(page, "document.querySelectorAll('article polyline').length >= 15", True)  # state, gripper and plan
+        # state, gripper and plan.
+        until(page, "document.querySelectorAll('article polyline').length >= 15", True)
         text = page.value("document.querySelector('article').innerText")
         assert "push cube 0" in text
         assert "robot, websocket" in text
@@ -110,8 +119,12 @@ def test_a_card_says_what_its_session_does(page: Page, server: LiveServer) -> No
         assert len(page.value(f"{name}.title")) == 32
         assert page.value(f"{name}.title.startsWith({name}.textContent.split(',')[0])")
         assert page.value(f"{name}.textContent.indexOf(',')") == 8
-        first = "[...document.querySelectorAll('main section')].find((one) => one.checkVisibility())"
-        assert page.value(f"{first}.contains(document.querySelector('article'))"), "what happens now comes first"
+        first = (
+            "[...document.querySelectorAll('main section')].find((one) => one.checkVisibility())"
+        )
+        assert page.value(f"{first}.contains(document.querySelector('article'))"), (
+            "what happens now comes first"
+        )
         assert "plan: 8 rows" in text
         assert page.value("document.querySelectorAll('#fleet tr').length") == 1
         until(page, "document.getElementById('percentiles').innerText.includes(' ms')", True)
@@ -140,18 +153,27 @@ def test_an_error_is_its_code_until_it_is_unfolded(page: Page) -> None:
 
 
 def test_the_buttons_of_a_robot_are_in_one_row_on_a_phone(page: Page, server: LiveServer) -> None:
-    tops = "new Set([...document.querySelectorAll('article .row:first-child button')].map((one) => one.offsetTop)).size"
+    tops = (
+        "new Set([...document.querySelectorAll('article .row:first-child button')].map((one) "
+        "=> "
+        "one.offsetTop)).size"
+    )
     with operated(server):
         show(page, server, width=360)
         until(page, CARDS, 1)
         until(page, tops, 1)
 
 
-PRESS = "(text) => [...document.querySelectorAll('article button')].find((one) => one.textContent === text).click()"
+PRESS = (
+    "(text) => [...document.querySelectorAll('article button')].find((one) => one.textContent "
+    "=== text).click()"
+)
 
 
 @contextmanager
-def operated(server: LiveServer, key: str | None = None, cameras: int = 0) -> Iterator[list[LoopReport]]:
+def operated(
+    server: LiveServer, key: str | None = None, cameras: int = 0
+) -> Iterator[list[LoopReport]]:
     """A simulated robot that obeys the page."""
     specs = {f"camera{number}": CameraSpec(480, 480) for number in range(cameras)}
     commands, over, reports = CommandInbox(), threading.Event(), []
@@ -162,7 +184,14 @@ def operated(server: LiveServer, key: str | None = None, cameras: int = 0) -> It
         )
         thread = threading.Thread(
             target=lambda: reports.append(
-                run_loop(robot, player, hz=50, instruction="wipe the table", commands=commands, until=over.is_set)
+                run_loop(
+                    robot,
+                    player,
+                    hz=50,
+                    instruction="wipe the table",
+                    commands=commands,
+                    until=over.is_set,
+                )
             )
         )
         thread.start()
@@ -200,7 +229,10 @@ def test_stop_is_in_sight_without_scrolling_whatever_the_cameras(
     page: Page, server: LiveServer, width: int, height: int, cameras: int
 ) -> None:
     wait_for(lambda: len(server.engine.sessions) == 0, 30)
-    loaded = "[...document.querySelectorAll('article img')].filter((one) => one.naturalWidth === 480).length"
+    loaded = (
+        "[...document.querySelectorAll('article img')].filter((one) => one.naturalWidth === "
+        "480).length"
+    )
     with operated(server, cameras=cameras):
         show(page, server, width=width, height=height)
         until(page, loaded, cameras)
@@ -219,7 +251,9 @@ def test_a_card_of_a_stopped_robot_says_so(page: Page, server: LiveServer) -> No
         assert page.value(stopped) is False
         page.value(f"({PRESS})('Stop')")
         until(page, stopped, True)
-        assert page.value("document.querySelector('article .stopped').textContent").startswith("Stopped by ")
+        assert page.value("document.querySelector('article .stopped').textContent").startswith(
+            "Stopped by "
+        )
         assert page.said == []
 
 
@@ -240,12 +274,17 @@ def test_it_asks_for_a_key_and_watches_with_one(page: Page) -> None:
         assert "plain/" in page.value("document.querySelector('article .name').textContent")
 
 
-def test_a_key_without_the_scope_sees_no_buttons(page: Page, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_key_without_the_scope_sees_no_buttons(
+    page: Page, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(api_keys, "_CHECK_S", 0.0)
     keys = ChangingKeys()
     for name, scopes, buttons in (("watching", ["watch"], 0), ("lab", ["watch", "operate"], 4)):
         key = keys.add(name, scopes=scopes)
-        with live_server(Noop.from_config({"action_dim": 7}), keys=keys.keys) as server, operated(server, key):
+        with (
+            live_server(Noop.from_config({"action_dim": 7}), keys=keys.keys) as server,
+            operated(server, key),
+        ):
             show(page, server)
             until(page, "document.getElementById('key').hidden", want=False)
             page.value(
@@ -254,7 +293,10 @@ def test_a_key_without_the_scope_sees_no_buttons(page: Page, monkeypatch: pytest
             )
             until(page, STATUS, "Live")
             until(page, CARDS, 1)
-            shown = "[...document.querySelectorAll('article button')].filter((one) => one.checkVisibility()).length"
+            shown = (
+                "[...document.querySelectorAll('article button')].filter((one) => "
+                "one.checkVisibility()).length"
+            )
             until(page, shown, buttons)
 
 
@@ -315,7 +357,13 @@ def every_place(value: object, path: tuple[str | int, ...] = ()) -> Iterator[tup
     """The path of each value of a document, of lists the first ones."""
     if path:
         yield path
-    parts = value.items() if isinstance(value, dict) else enumerate(value[:1]) if isinstance(value, list) else ()
+    parts = (
+        value.items()
+        if isinstance(value, dict)
+        else enumerate(value[:1])
+        if isinstance(value, list)
+        else ()
+    )
     for key, part in parts:
         yield from every_place(part, (*path, key))
 
@@ -327,7 +375,10 @@ def test_a_page_goes_on_whatever_a_message_says(page: Page, server: LiveServer) 
             said, _ = ask(viewer)
             for one in said["replicas"][0]["sessions"]:
                 session = {**session, **one}
-    session |= {"pictures": {}, "commands": [{"id": "a-1", "do": "stop", "by": "", "state": "done", "why": ""}]}
+    session |= {
+        "pictures": {},
+        "commands": [{"id": "a-1", "do": "stop", "by": "", "state": "done", "why": ""}],
+    }
     said["replicas"][0]["sessions"] = [session | {"id": name} for name in ("first", "second")]
     changes = [
         (list(path), removed, value)

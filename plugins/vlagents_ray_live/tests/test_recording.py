@@ -30,7 +30,9 @@ from vlagents_ray_live.recording import SessionRecorder, Worker
 
 
 def rows(root: Path, episode: int = 0) -> dict[str, list]:
-    found: dict[str, list] = pq.read_table(root / f"data/chunk-000/file-{episode:03d}.parquet").to_pydict()
+    found: dict[str, list] = pq.read_table(
+        root / f"data/chunk-000/file-{episode:03d}.parquet"
+    ).to_pydict()
     return found
 
 
@@ -60,15 +62,25 @@ def test_each_act_is_a_frame_with_its_whole_chunk(tmp_path: Path) -> None:
     assert frames["policy_version"] == [0] * 5
     assert all(ms > 0 for ms in frames["inference_ms"])
     budget = Budget(DEFAULT_LIMITS)
-    assert [from_text(text, budget) for text in frames["request"]] == [{"offset": i / 4} for i in range(5)]
+    assert [from_text(text, budget) for text in frames["request"]] == [
+        {"offset": i / 4} for i in range(5)
+    ]
     assert {from_text(text, budget)["subtask"] for text in frames["answer"]} == {"reach"}
-    assert [from_text(text, budget) if text else None for text in frames["reset"]] == [{"seed": 7}, *[None] * 4]
+    assert [from_text(text, budget) if text else None for text in frames["reset"]] == [
+        {"seed": 7},
+        *[None] * 4,
+    ]
     acting = {"weights": "sampled-sha256:9f2c", "revision": "c0ffee"}  # in this episode
-    assert [from_text(text, budget) if text else None for text in frames["weights"]] == [acting, *[None] * 4]
+    assert [from_text(text, budget) if text else None for text in frames["weights"]] == [
+        acting,
+        *[None] * 4,
+    ]
     [file] = folder.rglob("*.mp4")
     with av.open(str(file)) as video:
         for i, frame in enumerate(video.decode(video=0)):
-            np.testing.assert_array_equal(frame.to_ndarray(format="rgb24"), seen(i).cameras["front"])
+            np.testing.assert_array_equal(
+                frame.to_ndarray(format="rgb24"), seen(i).cameras["front"]
+            )
     info = json.loads((root / "meta/info.json").read_text())
     assert info["trace"]["policy"] == "brightness"
     assert info["vlagents_ray"]["contract"]["action"]["space"] == "joint"
@@ -100,7 +112,9 @@ def test_sessions_at_once_have_episodes_of_their_own(tmp_path: Path) -> None:
     both = [rows(only(tmp_path), i) for i in range(2)]
     assert [one["tick"] for one in both] == [[0, 1, 2, 3]] * 2
     assert {one["session"][0]: one["observation.state"][2][0] for one in both} == {0: 2, 1: 12}
-    assert not (only(tmp_path) / "unfinished").exists() or not any((only(tmp_path) / "unfinished").iterdir())
+    assert not (only(tmp_path) / "unfinished").exists() or not any(
+        (only(tmp_path) / "unfinished").iterdir()
+    )
 
 
 def test_other_cameras_go_into_a_dataset_of_their_own(tmp_path: Path) -> None:
@@ -112,10 +126,14 @@ def test_other_cameras_go_into_a_dataset_of_their_own(tmp_path: Path) -> None:
     assert [name.name[-2:] for name in names] == ["-0", "-1"]
     assert [rows(name)["tick"] for name in names] == [[0], [1]]
     with av.open(str(next(tmp_path.rglob("*.mp4")))) as video:
-        assert video.streams.video[0].codec_context.pix_fmt == "yuv420p", "small ones are ordinary videos"
+        assert video.streams.video[0].codec_context.pix_fmt == "yuv420p", (
+            "small ones are ordinary videos"
+        )
 
 
-def test_a_long_session_goes_on_in_the_next_episode(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_long_session_goes_on_in_the_next_episode(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(episodes, "_FRAMES", 3)
     with recorded(tmp_path) as server:
         server.robot().play(7)
@@ -159,7 +177,9 @@ def test_a_share_of_the_episodes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     assert tasks["__index_level_0__"] == ["kept"]
 
 
-def test_a_session_that_ends_while_its_acts_wait_is_whole(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_session_that_ends_while_its_acts_wait_is_whole(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     go_on = threading.Event()
     add = episodes.EpisodeWriter.add
 
@@ -191,12 +211,15 @@ def test_an_observation_that_cannot_be_kept_is_a_gap(tmp_path: Path) -> None:
     with recorded(tmp_path) as server:
         robot = server.robot()
         robot.play(1)
-        robot.act(replace(seen(1), info={"object": object()}))  # as only a caller in this process may send it
+        # As only a caller in this process may send it.
+        robot.act(replace(seen(1), info={"object": object()}))
         robot.act(seen(2))
     assert rows(only(tmp_path))["tick"] == [0, 2]
 
 
-def test_more_sessions_than_there_are_encoders_for_are_counted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_more_sessions_than_there_are_encoders_for_are_counted(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(episodes, "_SESSIONS", 1)
     with recorded(tmp_path) as server:
         server.robot().play(2)
@@ -208,12 +231,18 @@ def test_more_sessions_than_there_are_encoders_for_are_counted(tmp_path: Path, m
 @pytest.mark.parametrize(
     ("room", "obs", "kept"),
     [
-        (2 * recording._OTHER_BYTES, Obs(state={"joints": np.zeros(2, np.float32)}), [True, True, False]),
+        (
+            2 * recording._OTHER_BYTES,
+            Obs(state={"joints": np.zeros(2, np.float32)}),
+            [True, True, False],
+        ),
         (10**6, Obs(info={"a": [{"b": bytes(600_000)}], "c": np.zeros(10)}), [True, False, False]),
     ],
     ids=["without pictures", "bytes beside pictures"],
 )
-def test_requests_that_wait_are_bounded(tmp_path: Path, room: int, obs: Obs, kept: list[bool]) -> None:
+def test_requests_that_wait_are_bounded(
+    tmp_path: Path, room: int, obs: Obs, kept: list[bool]
+) -> None:
     with recorded(tmp_path) as server:
         server.recorder._held_bytes = room
         waiting = [pending(Request("act", obs)) for _ in range(3)]
@@ -237,7 +266,9 @@ def test_what_does_not_fit_into_memory_is_dropped_and_counted(tmp_path: Path) ->
     assert rows(only(tmp_path))["tick"] == [0, 2]
 
 
-def test_a_full_folder_ends_the_recording_and_no_session(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_full_folder_ends_the_recording_and_no_session(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(episodes, "_LOOK_S", 0.0)
     with recorded(tmp_path, most_gb=1e-9) as server:
         robot = server.robot()

@@ -80,7 +80,11 @@ def test_a_press_makes_an_episode(server: LiveServer, settings: LiveConfig, code
     info = json.loads((root / "meta" / "info.json").read_text())
     assert (info["total_episodes"], info["fps"]) == (2, 10)
     assert info["features"]["observation.images.front"]["shape"] == [64, 96, 3]
-    rows = [table for path in sorted((root / "data").rglob("*.parquet")) for table in pq.read_table(path).to_pylist()]
+    rows = [
+        table
+        for path in sorted((root / "data").rglob("*.parquet"))
+        for table in pq.read_table(path).to_pylist()
+    ]
     first = [row for row in rows if row["episode_index"] == 0]
     assert len(first) >= 4
     for row in first:
@@ -116,7 +120,9 @@ def test_old_frames_are_dropped(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("settings", "why"), [(None, "live: {folder"), ("file", "")])
-def test_where_nothing_can_be_saved_a_press_says_why(tmp_path: Path, settings: str | None, why: str) -> None:
+def test_where_nothing_can_be_saved_a_press_says_why(
+    tmp_path: Path, settings: str | None, why: str
+) -> None:
     """Without the setting nothing is held either; a file cannot be a folder."""
     (tmp_path / "file").write_text("")
     args = None if settings is None else LiveConfig(folder=str(tmp_path / settings))

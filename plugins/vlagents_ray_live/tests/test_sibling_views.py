@@ -44,7 +44,9 @@ def views_of(*replicas: Answering) -> SiblingViews:
         ([], None),
     ],
 )
-def test_a_command_reaches_the_replica_that_has_the_session(answers: list[Any], pressed: dict[str, str] | None) -> None:
+def test_a_command_reaches_the_replica_that_has_the_session(
+    answers: list[Any], pressed: dict[str, str] | None
+) -> None:
     replicas = [Answering(str(number), answer) for number, answer in enumerate(answers)]
     assert asyncio.run(views_of(*replicas).press("arm", "stop", "lab")) == pressed
     for replica in replicas:

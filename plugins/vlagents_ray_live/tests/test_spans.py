@@ -42,12 +42,18 @@ def exporter(monkeypatch: pytest.MonkeyPatch) -> Iterator[InMemorySpanExporter]:
 
 
 def children(spans: list[ReadableSpan], parent: ReadableSpan) -> list[ReadableSpan]:
-    found = [one for one in spans if one.parent is not None and one.parent.span_id == parent.context.span_id]
+    found = [
+        one
+        for one in spans
+        if one.parent is not None and one.parent.span_id == parent.context.span_id
+    ]
     return sorted(found, key=lambda one: one.start_time)
 
 
 @pytest.mark.parametrize("transport", ["http", "websocket"])
-def test_a_request_is_one_trace_from_the_program_to_the_batch(exporter: InMemorySpanExporter, transport: str) -> None:
+def test_a_request_is_one_trace_from_the_program_to_the_batch(
+    exporter: InMemorySpanExporter, transport: str
+) -> None:
     with (
         live_server(Picky()) as server,
         RemoteAgent(server.url, transport=transport) as agent,

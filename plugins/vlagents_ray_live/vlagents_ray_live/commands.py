@@ -1,9 +1,11 @@
-"""Commands to the sessions of a replica, from the holders of keys that may operate them on the live page.
+"""Commands to the sessions of a replica, from the holders of keys that may operate them on the live
+page.
 
-Over a network a robot can only be stopped: it is paused, stopped, or its episode is marked. Commands that make it move
-(resuming, another instruction, an operator's motion) are given at the robot. A command is sent in the answer to the
-robot's next request, within `_WAITS_S` or never, since a late one could stop the robot unexpectedly; a later request
-reports the outcome. The server itself executes `SAVE`.
+Over a network a robot can only be stopped: it is paused, stopped, or its episode is marked.
+Commands that make it move (resuming, another instruction, an operator's motion) are given at the
+robot. A command is sent in the answer to the robot's next request, within `_WAITS_S` or never,
+since a late one could stop the robot unexpectedly; a later request reports the outcome. The server
+itself executes `SAVE`.
 """
 
 from __future__ import annotations
@@ -32,7 +34,8 @@ COMMANDS = (*TO_ROBOT, SAVE)
 TRACKED_S = 15.0  # time for which the outcome of a command is awaited
 _WAITS_S = 5.0  # time within which a command must reach the robot
 _SHOWN = 5  # number of commands shown per session, the latest ones
-_UNANSWERED = 3  # number of requests without the outcome of a command after which it counts as ignored
+# Number of requests without the outcome of a command after which it counts as ignored.
+_UNANSWERED = 3
 _REFUSAL = 200  # maximum length of a reason
 
 State = Literal["waiting", "sent", "saving", "done", "refused", "ignored", "too late"]
@@ -66,14 +69,16 @@ class CommandBoard:
     ) -> None:
         """Create a board without commands.
 
-        `save` writes the last seconds of a session and returns the path; it may be slow, and may raise errors.
+        `save` writes the last seconds of a session and returns the path; it may be slow, and may
+        raise errors.
         """
         self._save, self._sessions, self._clock = save, sessions, clock
         self._presses: dict[str, list[Press]] = {}  # by session, oldest first
         self._lock = threading.Lock()
 
     def press(self, session_id: str, do: str, by: str) -> dict[str, Any]:
-        """Accept the command `do`, one of `COMMANDS`, from the holder of the key `by`, and describe it as `of` does.
+        """Accept the command `do`, one of `COMMANDS`, from the holder of the key `by`, and describe
+        it as `of` does.
 
         Raises:
             UnknownSession: The session is not here.
@@ -82,11 +87,14 @@ class CommandBoard:
         """
         if do not in COMMANDS:
             raise InvalidInput(
-                f"do: got {do[:40]!r}, want one of {list(COMMANDS)}; resume a robot, change its instruction or move "
+                f"do: got {do[:40]!r}, want one of {list(COMMANDS)}; resume a robot, change its "
+                "instruction or move "
                 f"it at the robot"
             )
         if session_id not in self._sessions:
-            raise UnknownSession(f"session {session_id[:80]!r}: is not here; it ended, or has begun again elsewhere")
+            raise UnknownSession(
+                f"session {session_id[:80]!r}: is not here; it ended, or has begun again elsewhere"
+            )
         pressed = Press(uuid.uuid4().hex, do, by, self._clock())
         self.forget_others(self._sessions.ids())
         with self._lock:
@@ -95,9 +103,14 @@ class CommandBoard:
             if len(held) == _SHOWN:
                 over = next((one for one in held if one.state not in ("waiting", "saving")), None)
                 if over is None and do == "stop":  # a "stop" replaces a less important command
-                    over = next((one for one in held if one.state == "waiting" and one.do != "stop"), None)
+                    over = next(
+                        (one for one in held if one.state == "waiting" and one.do != "stop"), None
+                    )
                 if over is None:
-                    raise Overloaded(f"session {session_id!r}: {_SHOWN} commands wait already for its robot's request")
+                    raise Overloaded(
+                        f"session {session_id!r}: {_SHOWN} commands wait already for its robot's "
+                        "request"
+                    )
                 held.remove(over)
             held.append(pressed)
         if do == SAVE:
@@ -134,7 +147,9 @@ class CommandBoard:
                     return
 
     def of(self, session_id: str) -> list[dict[str, Any]]:
-        """Describe the last commands to a session, oldest first: `id`, `do`, `by`, `state` and `why` of each."""
+        """Describe the last commands to a session, oldest first: `id`, `do`, `by`, `state` and
+        `why` of each.
+        """
         with self._lock:
             held = self._presses.get(session_id, [])
             self._expire(held)

@@ -23,12 +23,15 @@ from vlagents_ray.interface import Obs
 
 logger = logging.getLogger(__name__)
 
-_FRAMES = 2000  # maximum number of frames of an episode, whose numbers are in memory; then another episode begins
+# Maximum number of frames of an episode, whose numbers are in memory; then another episode begins.
+_FRAMES = 2000
 _BYTES = 16 * 2**20  # maximum size of these numbers
-_SESSIONS = 32  # maximum number of sessions that are recorded at once; each has an encoder per camera
+# Maximum number of sessions that are recorded at once; each has an encoder per camera.
+_SESSIONS = 32
 _FREE_BYTES = 2**30  # space that the recording leaves free on its disk
 _LOOK_S = 10.0  # interval of the checks of the folder's size
-_STATED = ("policy", "checkpoint", "weights", "policy_version", "contract", "version", "code")  # of the metadata
+# Of the metadata.
+_STATED = ("policy", "checkpoint", "weights", "policy_version", "contract", "version", "code")
 
 
 class RecordingEnded(Exception):
@@ -82,7 +85,8 @@ class _Running:
 class EpisodeWriter:
     """Writes the episodes of one replica. Not thread-safe.
 
-    Frames with other cameras, states or actions are written to another dataset: `FOLDER/NAME-0`, `FOLDER/NAME-1`, …
+    Frames with other cameras, states or actions are written to another dataset: `FOLDER/NAME-0`,
+    `FOLDER/NAME-1`, …
     """
 
     def __init__(
@@ -101,7 +105,8 @@ class EpisodeWriter:
             fps: The rate of frames that timestamps assume, Hz.
             lossless: Whether videos are encoded without loss.
             most_bytes: Maximum size of the folder, over which recording ends.
-            describe: Returns the metadata of the policy, for a trace; None if the frames make no trace.
+            describe: Returns the metadata of the policy, for a trace; None if the frames make no
+                trace.
         """
         self.saved = 0  # number of frames in complete episodes
         self.lost = 0  # number of frames in episodes that could not be written
@@ -115,7 +120,8 @@ class EpisodeWriter:
     def begin(self, session: str, instruction: str, reset: str = "", weights: str = "") -> None:
         """Begin to record a session, and end its previous episode.
 
-        The options of the `reset`, and the checkpoint and `weights` that act, are texts; empty if unknown.
+        The options of the `reset`, and the checkpoint and `weights` that act, are texts; empty if
+        unknown.
         """
         self.end(session)
         if len(self._running) >= _SESSIONS:
@@ -141,7 +147,9 @@ class EpisodeWriter:
             self.require_room()
         if running.shelf is None or running.episode is None:
             running.shelf = self._shelf(frame)
-            running.episode = running.shelf.dataset.begin(running.instruction, running.shelf.meaning)
+            running.episode = running.shelf.dataset.begin(
+                running.instruction, running.shelf.meaning
+            )
         missing = running.shelf.rows - len(frame.chunk)
         columns = {
             **frame.columns,
@@ -149,15 +157,22 @@ class EpisodeWriter:
             "weights": running.weights,
             SESSION: running.number,
             ROWS: len(frame.chunk),
-            CHUNK: np.pad(frame.chunk, ((0, missing), (0, 0)), mode="edge").ravel(),  # repeats the last row
+            # Repeats the last row.
+            CHUNK: np.pad(frame.chunk, ((0, missing), (0, 0)), mode="edge").ravel(),
         }
-        running.episode.add(frame.obs, frame.chunk[0], frame.captured_at, frame.tick, False, more=columns)
+        running.episode.add(
+            frame.obs, frame.chunk[0], frame.captured_at, frame.tick, False, more=columns
+        )
         running.reset = running.weights = ""
         running.frames += 1
-        running.size += columns[CHUNK].nbytes + sum(len(text) for text in columns.values() if isinstance(text, str))
+        running.size += columns[CHUNK].nbytes + sum(
+            len(text) for text in columns.values() if isinstance(text, str)
+        )
 
     def end(self, session: str) -> Path | None:
-        """End the session's episode, and return the folder of the dataset that contains it; None without an episode."""
+        """End the session's episode, and return the folder of the dataset that contains it; None
+        without an episode.
+        """
         running = self._running.pop(session, None)
         return None if running is None else self._save(running)
 
@@ -174,7 +189,9 @@ class EpisodeWriter:
             try:
                 self.end(session)
             except (OSError, VLAgentsError) as error:
-                logger.warning("recording: the last episode of session %s is lost: %s", session, error)
+                logger.warning(
+                    "recording: the last episode of session %s is lost: %s", session, error
+                )
 
     def require_room(self) -> None:
         """Raise `RecordingEnded` if the folder, or its disk, is full."""
@@ -186,7 +203,9 @@ class EpisodeWriter:
                 with suppress(OSError):  # renamed a moment ago
                     size += os.stat(os.path.join(root, name)).st_size
         if size > self._most_bytes:
-            raise RecordingEnded(f"{self._folder} holds {size / 1e9:.3g} GB, want {self._most_bytes / 1e9:g} at most")
+            raise RecordingEnded(
+                f"{self._folder} holds {size / 1e9:.3g} GB, want {self._most_bytes / 1e9:g} at most"
+            )
         if (free := shutil.disk_usage(self._folder).free) < _FREE_BYTES:
             raise RecordingEnded(f"the disk of {self._folder} has {free / 1e9:.1f} GB left")
 

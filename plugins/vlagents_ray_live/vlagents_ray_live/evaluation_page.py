@@ -1,4 +1,6 @@
-"""The live page of an evaluation, which the process that runs it serves: `eval --live` and `report --live`."""
+"""The live page of an evaluation, which the process that runs it serves: `eval --live` and
+`report --live`.
+"""
 
 from __future__ import annotations
 
@@ -22,7 +24,11 @@ class LiveEvaluationPage(EvaluationPage):
 
     @contextmanager
     def serve(
-        self, document: ResultsDocument, apps: Collection[str], address: tuple[str, int], keys: Keys | None
+        self,
+        document: ResultsDocument,
+        apps: Collection[str],
+        address: tuple[str, int],
+        keys: Keys | None,
     ) -> Iterator[str]:
         """Serve the page on a thread; see `EvaluationPage.serve`."""
         others = _views(apps) if apps else None

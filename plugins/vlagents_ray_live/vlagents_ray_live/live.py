@@ -1,8 +1,10 @@
-"""The latest answers and observations of a replica's sessions, kept only while a reader renews its lease.
+"""The latest answers and observations of a replica's sessions, kept only while a reader renews its
+lease.
 
-Clients determine the data, so all of it is bounded in bytes: answers keep numbers and short texts; observations are the
-latest of each session, at most `RATE` per second; and of both, the oldest are dropped beyond `ANSWER_BYTES` and
-`OBSERVATION_BYTES`. The live page, the last seconds of each session and the viewers read the data on their own threads.
+Clients determine the data, so all of it is bounded in bytes: answers keep numbers and short texts;
+observations are the latest of each session, at most `RATE` per second; and of both, the oldest are
+dropped beyond `ANSWER_BYTES` and `OBSERVATION_BYTES`. The live page, the last seconds of each
+session and the viewers read the data on their own threads.
 """
 
 from __future__ import annotations
@@ -28,7 +30,8 @@ ENCODING_SHARE = 0.04  # share of a core for encoding pictures
 RATE = 10.0  # maximum rate of kept observations per session, Hz
 LEASE_S = 2.0  # time after the last reading for which data are kept
 ANSWER_BYTES = 2**25  # maximum size of the kept answers
-OBSERVATION_BYTES = 2**28  # maximum size of the observations: 70 sessions of four unencoded VGA cameras
+# Maximum size of the observations: 70 sessions of four unencoded VGA cameras.
+OBSERVATION_BYTES = 2**28
 VALUES = 64  # maximum number of values of one part of a state, or of one action
 ROWS = 128  # maximum number of actions of a chunk
 TEXT = 200  # maximum length of a text
@@ -36,9 +39,11 @@ SHOWN_OPS = ("act", "reset")
 _ACTION = 4096  # maximum number of values of an action that is kept with its observation
 _PARTS = 64  # maximum number of cameras, and of parts of the state, of a kept observation
 _INFO = 24  # maximum number of entries of an act's info
-_OWN = ("timing", "policy", "behaviour", "distribution")  # entries of an act's info: shown elsewhere, or internal
+# Entries of an act's info: shown elsewhere, or internal.
+_OWN = ("timing", "policy", "behaviour", "distribution")
 _MOST = 2**53  # largest integer that JSON represents exactly
-_OBJECTS = 1000  # estimated size of an answer or an observation besides its arrays, files and texts, bytes
+# Estimated size of an answer or an observation besides its arrays, files and texts, bytes.
+_OBJECTS = 1000
 _ENCODING = threading.Lock()
 _KEPT_S = 1.0  # time for which pixels are kept for a reader
 
@@ -54,9 +59,11 @@ class Answer(NamedTuple):
     error: str = ""  # error code; empty without an error
     detail: str = ""
     rows: int = 0  # number of rows of the chunk
-    action: np.ndarray | None = None  # (rows, D) float32, truncated to `ROWS` and `VALUES`; None without an act
+    # (rows, D) float32, truncated to `ROWS` and `VALUES`; None without an act.
+    action: np.ndarray | None = None
     done: bool = False
-    info: Mapping[str, Any] = MappingProxyType({})  # the numbers and short texts in the policy's info
+    # The numbers and short texts in the policy's info.
+    info: Mapping[str, Any] = MappingProxyType({})
 
     @property
     def size(self) -> int:
@@ -74,19 +81,30 @@ class KeptObservation:
     time: float  # s, of `time.monotonic`
     state: dict[str, np.ndarray]  # (D,) float32, with the gripper as a part
     cameras: dict[str, np.ndarray]  # (H, W, 3) uint8 RGB; empty after they are encoded
-    files: dict[str, bytes]  # JPEG or PNG files by camera: those of the client, or those encoded for the reader
-    action: np.ndarray | None = None  # (D,) float32, the first row of its answer, after that was sent
+    # JPEG or PNG files by camera: those of the client, or those encoded for the reader.
+    files: dict[str, bytes]
+    # (D,) float32, the first row of its answer, after that was sent.
+    action: np.ndarray | None = None
     counted: int = 0  # size that is included in the observer's sum, bytes
 
     @property
     def size(self) -> int:
         """The size of its memory, bytes."""
-        arrays = sum(part.nbytes for part in self.state.values()) + (0 if self.action is None else self.action.nbytes)
+        arrays = sum(part.nbytes for part in self.state.values()) + (
+            0 if self.action is None else self.action.nbytes
+        )
         pixels = {id(owner): size for owner, size in map(_owner, self.cameras.values())}
-        return _OBJECTS + arrays + sum(pixels.values()) + sum(len(file) for file in self.files.values())
+        return (
+            _OBJECTS
+            + arrays
+            + sum(pixels.values())
+            + sum(len(file) for file in self.files.values())
+        )
 
     def pictures(self) -> dict[str, bytes]:
-        """Return the files of all cameras; raw pixels are encoded first, which may take milliseconds."""
+        """Return the files of all cameras; raw pixels are encoded first, which may take
+        milliseconds.
+        """
         with _ENCODING:  # there may be several readers
             for camera, image in self.cameras.items():
                 self.files[camera] = JPEG.file(image)
@@ -95,12 +113,19 @@ class KeptObservation:
 
 
 class LiveObserver(Observer):
-    """Keeps the latest answers and observations of a replica, from `renew` to the end of the lease. Thread-safe."""
+    """Keeps the latest answers and observations of a replica, from `renew` to the end of the
+    lease. Thread-safe.
+    """
 
     def __init__(
-        self, observers: Observers, commands: CommandBoard | None = None, clock: Callable[[], float] = time.monotonic
+        self,
+        observers: Observers,
+        commands: CommandBoard | None = None,
+        clock: Callable[[], float] = time.monotonic,
     ) -> None:
-        """Create an inactive observer, which `renew` adds to `observers`; `commands` are sent in the answers."""
+        """Create an inactive observer, which `renew` adds to `observers`; `commands` are sent in
+        the answers.
+        """
         self._observers, self._commands, self._clock = observers, commands, clock
         self._until = float("-inf")  # end of the lease, s
         self._active = False
@@ -118,7 +143,9 @@ class LiveObserver(Observer):
             self._observers.add(self)
 
     def expire(self) -> None:
-        """Drop all data after the last lease, and pixels that were not read; called every half second."""
+        """Drop all data after the last lease, and pixels that were not read; called every half
+        second.
+        """
         if self._active and self._clock() >= self._until:
             self.close()
         with self._lock:
@@ -151,7 +178,11 @@ class LiveObserver(Observer):
     def on_answer(self, pending: PendingRequest, reply: Reply) -> None:
         """Add the answer to its session's observation."""
         observation = pending.kept.pop(self, None)
-        if observation is not None and reply.act is not None and (row := reply.act.rows()[0]).size <= _ACTION:
+        if (
+            observation is not None
+            and reply.act is not None
+            and (row := reply.act.rows()[0]).size <= _ACTION
+        ):
             observation.action = np.array(row)
         answer = _answer(next(self._numbers), pending, reply)
         with self._lock:
@@ -189,7 +220,11 @@ class LiveObserver(Observer):
         if obs.gripper is not None:
             state["gripper"] = np.array([obs.gripper], np.float32)
         files = pending.files or {}
-        sent = {name: bytes(files[id(image)][1]) for name, image in obs.cameras.items() if id(image) in files}
+        sent = {
+            name: bytes(files[id(image)][1])
+            for name, image in obs.cameras.items()
+            if id(image) in files
+        }
         cameras = {name: image for name, image in obs.cameras.items() if name not in sent}
         kept = KeptObservation(next(self._numbers), now, state, cameras, sent)
         kept.counted = kept.size
@@ -199,7 +234,9 @@ class LiveObserver(Observer):
             self._observations[session] = kept
             self._observation_bytes += kept.counted
             while self._observation_bytes > OBSERVATION_BYTES:
-                self._observation_bytes -= self._observations.pop(next(iter(self._observations))).counted
+                self._observation_bytes -= self._observations.pop(
+                    next(iter(self._observations))
+                ).counted
         return kept
 
 
@@ -218,7 +255,9 @@ def _answer(number: int, pending: PendingRequest, reply: Reply) -> Answer:
 def _info(info: Mapping[str, Any]) -> dict[str, Any]:
     """Return the entries of an act's info that are numbers or texts; texts are truncated."""
     stated = ((name[:TEXT], value) for name, value in info.items() if name not in _OWN)
-    plain = ((name, value.item() if isinstance(value, np.generic) else value) for name, value in stated)
+    plain = (
+        (name, value.item() if isinstance(value, np.generic) else value) for name, value in stated
+    )
     shown = (
         (name, value[:TEXT] if isinstance(value, str) else value)
         for name, value in plain
@@ -228,12 +267,16 @@ def _info(info: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _owner(image: np.ndarray) -> tuple[object, int]:
-    """Return the object whose memory an image keeps alive, and its size: a small image may be part of a large message.
+    """Return the object whose memory an image keeps alive, and its size: a small image may be part
+    of a large message.
 
-    Of memory shared by a client only the image itself counts, as the rest belongs to the client in any case.
+    Of memory shared by a client only the image itself counts, as the rest belongs to the client in
+    any case.
     """
     owner: Any = image
-    while (further := getattr(owner, "base" if isinstance(owner, np.ndarray) else "obj", None)) is not None:
+    while (
+        further := getattr(owner, "base" if isinstance(owner, np.ndarray) else "obj", None)
+    ) is not None:
         owner = further
     size = len(owner) if isinstance(owner, (bytes, bytearray)) else getattr(owner, "nbytes", 0)
     return owner, max(size, image.nbytes)

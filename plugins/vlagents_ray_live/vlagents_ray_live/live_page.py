@@ -1,20 +1,23 @@
 """The live page, and the WebSocket that delivers its data.
 
     GET /live      the page: it holds no data, and needs no key
-    GET /v1/live   the current state of the replicas, as JSON without pictures; keys need the scope "watch"
-    WS  /v1/live   the same with pictures, at most ten times a second
-    POST /v1/live/command   {"session": …, "do": "pause"}: see `CommandBoard.press`; keys need the scope "operate"
+    GET /v1/live   the current state of the replicas, as JSON without pictures; keys need the scope
+    "watch" WS  /v1/live   the same with pictures, at most ten times a second
+    POST /v1/live/command   {"session": …, "do": "pause"}: see `CommandBoard.press`; keys need the
+    scope "operate"
 
-A process other than a replica, such as the driver of an evaluation, serves them by `page_server`. Its page has no
-commands, but videos:
+A process other than a replica, such as the driver of an evaluation, serves them by `page_server`.
+Its page has no commands, but videos:
 
     GET /v1/live/videos/7   a video to which the document refers by its number
 
-The viewer requests each message, with the sessions whose pictures it shows: {"shown": ["arm-1", …]}. So a slow viewer
-misses old messages, and delays no other. The answer is the length of a JSON document (32 bits, little-endian), the
-document, and the files to which it refers by their index in `files`, the list of their lengths.
+The viewer requests each message, with the sessions whose pictures it shows: {"shown": ["arm-1",
+…]}. So a slow viewer misses old messages, and delays no other. The answer is the length of a JSON
+document (32 bits, little-endian), the document, and the files to which it refers by their index in
+`files`, the list of their lengths.
 
-A page in a browser cannot set a header: it sends its key among the WebSocket's subprotocols, as "vlagents.key.KEY".
+A page in a browser cannot set a header: it sends its key among the WebSocket's subprotocols, as
+"vlagents.key.KEY".
 """
 
 from __future__ import annotations
@@ -41,7 +44,13 @@ from starlette.responses import FileResponse, JSONResponse, Response
 from starlette.routing import BaseRoute, Route, WebSocketRoute
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
-from vlagents_ray.errors import ConfigError, MalformedMessage, MessageTooLarge, Overloaded, VLAgentsError
+from vlagents_ray.errors import (
+    ConfigError,
+    MalformedMessage,
+    MessageTooLarge,
+    Overloaded,
+    VLAgentsError,
+)
 from vlagents_ray.page_protocol import BACKLOG, PageProtocol
 from vlagents_ray.protocol.json_messages import problem
 from vlagents_ray.serve.access.api_keys import (
@@ -74,16 +83,20 @@ _LAST_S = 0.5  # time in which viewers are sent the end of an evaluation
 _END_S = 1  # time limit for their connections to close, s
 _LEAVE_S = 5.0  # time limit for the whole shutdown
 
-VideoFiles = Callable[[int], Path | None]  # returns the file of the video with a number; None if there is none
+# Returns the file of the video with a number; None if there is none.
+VideoFiles = Callable[[int], Path | None]
 
 
-def live_routes(fleet: Fleet, *, open_to_network: bool, videos: VideoFiles | None = None) -> list[BaseRoute]:
+def live_routes(
+    fleet: Fleet, *, open_to_network: bool, videos: VideoFiles | None = None
+) -> list[BaseRoute]:
     """Return the routes of the live page.
 
     Args:
-        open_to_network: Whether other machines reach this server without a key. Watching is then refused, since the
-            pictures of all robots would be public.
-        videos: Finds the videos that the document of an evaluation refers to; None on a policy's server.
+        open_to_network: Whether other machines reach this server without a key. Watching is then
+            refused, since the pictures of all robots would be public.
+        videos: Finds the videos that the document of an evaluation refers to; None on a policy's
+            server.
     """
     endpoint = _LiveEndpoint(fleet, open_to_network, videos)
     routes: list[BaseRoute] = [
@@ -112,7 +125,11 @@ class _LiveEndpoint:
     async def video(self, http: HttpRequest) -> Response:
         self._require_watch(http)
         path = None if self._videos is None else self._videos(http.path_params["number"])
-        return Response(status_code=404) if path is None else FileResponse(path, media_type="video/mp4")
+        return (
+            Response(status_code=404)
+            if path is None
+            else FileResponse(path, media_type="video/mp4")
+        )
 
     def _require_watch(self, http: HttpRequest) -> None:
         require_same_origin(http.headers)
@@ -149,7 +166,9 @@ class _LiveEndpoint:
                     document, files = await viewer.next()
                     self._scopes.require(_WATCH)
                     may_operate = self._videos is None and self._scopes.may(_OPERATE)
-                    await socket.send_bytes(_message({**document, "may_operate": may_operate}, files))
+                    await socket.send_bytes(
+                        _message({**document, "may_operate": may_operate}, files)
+                    )
         except WebSocketDisconnect:
             return
         except VLAgentsError as error:
@@ -163,14 +182,18 @@ class _LiveEndpoint:
         try:
             message = await asyncio.wait_for(socket.receive(), _SILENT_S)
         except asyncio.TimeoutError:
-            raise MalformedMessage(f"live: asked for nothing within {_SILENT_S:g} s; watch again") from None
+            raise MalformedMessage(
+                f"live: asked for nothing within {_SILENT_S:g} s; watch again"
+            ) from None
         if message["type"] == "websocket.disconnect":
             raise WebSocketDisconnect(message["code"])
         text = message.get("text") or (message.get("bytes") or b"").decode(errors="replace")
         try:
             return _Viewed.model_validate_json(text[:_CHARACTERS]).shown
         except ValidationError as error:
-            raise MalformedMessage(f'live: got {text[:80]!r}, want {{"shown": ["SESSION", ...]}}') from error
+            raise MalformedMessage(
+                f'live: got {text[:80]!r}, want {{"shown": ["SESSION", ...]}}'
+            ) from error
 
 
 class _Viewed(BaseModel):
@@ -185,7 +208,8 @@ class _Command(BaseModel):
 async def _command(http: HttpRequest) -> _Command:
     """Return the command in a body; a body that is too long is not read completely."""
     kind = http.headers.get("content-type", "").partition(";")[0].strip().lower()
-    if kind != "application/json":  # no other site's page can send this type without the server's permission
+    # No other site's page can send this type without the server's permission.
+    if kind != "application/json":
         raise MalformedMessage(f"content-type: got {kind or 'none'!r}, want application/json")
     body = b""
     async for part in http.stream():
@@ -195,11 +219,15 @@ async def _command(http: HttpRequest) -> _Command:
     try:
         return _Command.model_validate_json(body)
     except ValidationError as error:
-        raise MalformedMessage(f'live: got {body[:80]!r}, want {{"session": ..., "do": ...}}') from error
+        raise MalformedMessage(
+            f'live: got {body[:80]!r}, want {{"session": ..., "do": ...}}'
+        ) from error
 
 
 def _message(document: dict[str, Any], files: list[bytes]) -> bytes:
-    text = json.dumps({**document, "files": [len(file) for file in files]}, allow_nan=False, separators=(",", ":"))
+    text = json.dumps(
+        {**document, "files": [len(file) for file in files]}, allow_nan=False, separators=(",", ":")
+    )
     data = text.encode()
     return b"".join([struct.pack("<I", len(data)), data, *files])
 
@@ -214,7 +242,9 @@ async def _page(_: HttpRequest) -> Response:
 def live_page() -> list[str]:
     """Return the page with its style and scripts included, then the style, then the scripts."""
     folder = package_files(__package__) / "page"
-    parts = {name: folder.joinpath(name).read_text(encoding="utf-8") for name in ("live.css", *_SCRIPTS)}
+    parts = {
+        name: folder.joinpath(name).read_text(encoding="utf-8") for name in ("live.css", *_SCRIPTS)
+    }
     html = folder.joinpath("live.html").read_text(encoding="utf-8")
     for name, part in parts.items():
         html = html.replace(f"/* {name} */", part)
@@ -225,7 +255,8 @@ def live_page() -> list[str]:
 def page_server(
     fleet: Fleet, address: tuple[str, int], keys: Keys | None, *, name: str, videos: VideoFiles
 ) -> Iterator[str]:
-    """Serve the live page of an evaluation on a thread for the length of the context, and yield its URL.
+    """Serve the live page of an evaluation on a thread for the length of the context, and yield its
+    URL.
 
     Args:
         address: Host and port to listen on; port 0 selects a free one.
@@ -244,7 +275,10 @@ def page_server(
         raise ConfigError(
             f"live page: cannot listen on {host}:{port} ({error.strerror}); choose another port"
         ) from error
-    routes, handlers = live_routes(fleet, open_to_network=False, videos=videos), {VLAgentsError: answer_error}
+    routes, handlers = (
+        live_routes(fleet, open_to_network=False, videos=videos),
+        {VLAgentsError: answer_error},
+    )
     inside = Starlette(routes=routes, exception_handlers=handlers)
     app = FrontMiddleware(AccessMiddleware(inside, keys, name, public=[PAGE]))
     config = uvicorn.Config(
@@ -258,7 +292,9 @@ def page_server(
         timeout_graceful_shutdown=_END_S,
     )
     server = uvicorn.Server(config)
-    thread = threading.Thread(target=lambda: asyncio.run(server.serve([listening])), name="live-page", daemon=True)
+    thread = threading.Thread(
+        target=lambda: asyncio.run(server.serve([listening])), name="live-page", daemon=True
+    )
     thread.start()
     try:
         yield f"http://{f'[{host}]' if ':' in host else host}:{listening.getsockname()[1]}{PAGE}"

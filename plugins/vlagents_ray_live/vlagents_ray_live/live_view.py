@@ -1,4 +1,5 @@
-"""The data for viewers: the snapshots of a replica, as a JSON document and picture files, and those of a fleet.
+"""The data for viewers: the snapshots of a replica, as a JSON document and picture files, and those
+of a fleet.
 
 The snapshots of all replicas, and the other data of a page, are gathered once for all its viewers.
 """
@@ -36,7 +37,8 @@ _SESSIONS = 256  # maximum number of sessions that a replica's snapshot describe
 _INSTRUCTION = 1000  # maximum length of an instruction
 PICTURES = 2**24  # maximum size of the pictures in a snapshot; further sessions have none
 _STATE_S = 0.5  # time for which data that are slow to collect are reused
-_BEHIND = 20  # maximum number of gathered snapshots that wait for a slow viewer; it misses the oldest
+# Maximum number of gathered snapshots that wait for a slow viewer; it misses the oldest.
+_BEHIND = 20
 _WAITING_BYTES = 2**26  # maximum size of the pictures that wait for it
 
 
@@ -50,7 +52,9 @@ class Snapshot:
 
 
 class ReplicaView:
-    """Makes the snapshots of one replica; each viewer in another process states its last snapshot."""
+    """Makes the snapshots of one replica; each viewer in another process states its last
+    snapshot.
+    """
 
     def __init__(
         self,
@@ -60,13 +64,18 @@ class ReplicaView:
         metadata: Callable[[], Mapping[str, Any]],
         settings: LiveConfig | None = None,
     ) -> None:
-        """Create the view of a replica, `name` on `node`; `metadata` returns the metadata of its policy.
+        """Create the view of a replica, `name` on `node`; `metadata` returns the metadata of its
+        policy.
 
         With a folder in its `settings`, the last seconds of each session are kept from `open` on.
         """
         settings = settings or LiveConfig()
         self._engine = engine
-        self._about = {"name": name, "node": node, "ring_s": None if settings.folder is None else settings.ring_s}
+        self._about = {
+            "name": name,
+            "node": node,
+            "ring_s": None if settings.folder is None else settings.ring_s,
+        }
         self._metadata = metadata
         self.commands = CommandBoard(engine.sessions, self._save)
         self.live = live.LiveObserver(engine.observers, self.commands)
@@ -76,7 +85,8 @@ class ReplicaView:
         self._meter = LoadMeter(engine.queue)
         self._slow: dict[str, Any] = {}
         self._measured = float("-inf")
-        self._pictured: dict[str, int] = {}  # number of the observation whose pictures were read last, by session
+        # Number of the observation whose pictures were read last, by session.
+        self._pictured: dict[str, int] = {}
 
     def open(self) -> None:
         """Start to end leases that viewers no longer renew."""
@@ -92,7 +102,8 @@ class ReplicaView:
         self.live.close()
 
     def press(self, session: str, do: str, by: str) -> dict[str, Any] | None:
-        """Give a command to a session and await its outcome for a limited time; see `CommandBoard.press`.
+        """Give a command to a session and await its outcome for a limited time; see
+        `CommandBoard.press`.
 
         Returns:
             The description of the command; None if the session is not at this replica.
@@ -105,7 +116,8 @@ class ReplicaView:
         return pressed
 
     def read(self, since: int, shown: Collection[str]) -> Snapshot:
-        """Return the events since the snapshot with the number `since`, with pictures of the sessions `shown`.
+        """Return the events since the snapshot with the number `since`, with pictures of the
+        sessions `shown`.
 
         This may take milliseconds, too long for an event loop or the policy's thread.
         """
@@ -121,13 +133,16 @@ class ReplicaView:
         sessions = {one.id: _session(one, last.get(one.id)) for one in held}
         begun = time.thread_time()
         self._pictured = {name: self._pictured.get(name, 0) for name in sessions}
-        for name in sorted(sessions, key=self._pictured.__getitem__):  # the session first whose pictures are the oldest
+        # The session first whose pictures are the oldest.
+        for name in sorted(sessions, key=self._pictured.__getitem__):
             kept, described = self.live.observation(name), sessions[name]
             described["commands"] = self.commands.of(name)
             if kept is None or kept.number <= since:
                 continue
             snapshot.number = max(snapshot.number, kept.number)
-            described["state"] = {part: _numbers(values[: live.VALUES]) for part, values in kept.state.items()}
+            described["state"] = {
+                part: _numbers(values[: live.VALUES]) for part, values in kept.state.items()
+            }
             if name in shown and time.thread_time() - begun < live.ENCODING_SHARE / live.RATE:
                 described["pictures"] = _pictures(kept, snapshot.files)
                 if described["pictures"]:
@@ -136,7 +151,9 @@ class ReplicaView:
             **self._about,
             **self._state(),
             **_counted(answers),
-            "waiting": {rank.name.lower(): depth for rank, depth in engine.queue.depth_by_rank().items()},
+            "waiting": {
+                rank.name.lower(): depth for rank, depth in engine.queue.depth_by_rank().items()
+            },
             "sessions": list(sessions.values()),
             "sessions_held": len(engine.sessions),
         }
@@ -145,7 +162,8 @@ class ReplicaView:
     def _save(self, session: str) -> str:
         if self.ring is None:
             raise ConfigError(
-                "save: this server keeps nothing; set `parts: {live: {folder: ...}}` in its deployment file"
+                "save: this server keeps nothing; set `parts: {live: {folder: ...}}` in its "
+                "deployment file"
             )
         return self.ring.save(session)
 
@@ -215,14 +233,19 @@ def _numbers(values: np.ndarray) -> list[Any]:
 
 
 def _counted(answers: list[live.Answer]) -> dict[str, Any]:
-    """Return the numbers of acts and errors among the answers, the batch sizes of the acts, and their times, ms."""
+    """Return the numbers of acts and errors among the answers, the batch sizes of the acts, and
+    their times, ms.
+    """
     acts = [one.timing for one in answers if one.op == "act" and not one.error]
     sample = acts[:: max(1, len(acts) // SAMPLE)]
     return {
         "acts": len(acts),
         "errors": dict(Counter(one.error for one in answers if one.error)),
         "batch_sizes": [int(timing.get("batch_size", 1)) for timing in sample],
-        "ms": {name: [round(timing.get(f"{name}_ms", 0.0), 3) for timing in sample] for name in (*STAGES, "total")},
+        "ms": {
+            name: [round(timing.get(f"{name}_ms", 0.0), 3) for timing in sample]
+            for name in (*STAGES, "total")
+        },
     }
 
 
@@ -237,7 +260,9 @@ class OtherReplicas(Protocol):
         """Return the readers of the replicas' snapshots, by name."""
 
     async def press(self, session: str, do: str, by: str) -> dict[str, Any] | None:
-        """Give a command to a session, see `CommandBoard.press`; return None if no replica has the session."""
+        """Give a command to a session, see `CommandBoard.press`; return None if no replica has
+        the session.
+        """
 
 
 class Viewer:
@@ -251,20 +276,28 @@ class Viewer:
         self._sent = self._more
 
     def put(self, snapshots: list[Snapshot], more: dict[str, Any] | None = None) -> None:
-        """Queue data to be sent, and drop the oldest if there are too many; `more` is sent only if it has changed."""
+        """Queue data to be sent, and drop the oldest if there are too many; `more` is sent only
+        if it has changed.
+        """
         self._waiting.append(snapshots)
         self._came.set()
-        while len(self._waiting) > 1 and (len(self._waiting) > _BEHIND or self._waiting_bytes() > _WAITING_BYTES):
+        while len(self._waiting) > 1 and (
+            len(self._waiting) > _BEHIND or self._waiting_bytes() > _WAITING_BYTES
+        ):
             self._waiting.popleft()
         self._more = more or self._more
 
     async def next(self) -> tuple[dict[str, Any], list[bytes]]:
-        """Wait for snapshots; return all waiting ones as one document, with the files to which it refers."""
+        """Wait for snapshots; return all waiting ones as one document, with the files to which
+        it refers.
+        """
         await self._came.wait()
         self._came.clear()
         gathered, self._waiting = self._waiting, deque()
         files: list[bytes] = []
-        replicas = [_with_files(one, files, self.shown) for snapshots in gathered for one in snapshots]
+        replicas = [
+            _with_files(one, files, self.shown) for snapshots in gathered for one in snapshots
+        ]
         document = {"time": time.time(), "replicas": replicas}
         if self._more is not self._sent:
             self._sent = self._more
@@ -272,7 +305,9 @@ class Viewer:
         return document, files
 
     def _waiting_bytes(self) -> int:
-        return sum(len(file) for snapshots in self._waiting for one in snapshots for file in one.files)
+        return sum(
+            len(file) for snapshots in self._waiting for one in snapshots for file in one.files
+        )
 
 
 class Fleet:
@@ -286,7 +321,8 @@ class Fleet:
     ) -> None:
         """Gather snapshots of `own`, if this process is a replica, and of the `others`.
 
-        `more` returns further entries of the document; if nothing has changed, it returns the same object as before.
+        `more` returns further entries of the document; if nothing has changed, it returns the same
+        object as before.
         """
         self._own, self._others, self._more = own, others, more
         self.viewers: set[Viewer] = set()
@@ -295,7 +331,9 @@ class Fleet:
 
     @contextmanager
     def viewer(self) -> Iterator[Viewer]:
-        """Yield a viewer, for which snapshots are gathered within the context; without viewers nothing is gathered."""
+        """Yield a viewer, for which snapshots are gathered within the context; without viewers
+        nothing is gathered.
+        """
         viewer = Viewer()
         self.viewers.add(viewer)
         if self._gathering is None:
@@ -309,7 +347,9 @@ class Fleet:
                 self._gathering = None
 
     async def press(self, session: str, do: str, by: str) -> dict[str, Any]:
-        """Give a command to a session of any replica, and describe it, as `CommandBoard.press` does."""
+        """Give a command to a session of any replica, and describe it, as `CommandBoard.press`
+        does.
+        """
         pressed = None if self._own is None else self._own.press(session, do, by)
         if pressed is None and self._others is not None:
             pressed = await self._others.press(session, do, by)
@@ -332,21 +372,33 @@ class Fleet:
 
     async def _snapshots(self) -> list[Snapshot]:
         shown = frozenset[str]().union(*(viewer.shown for viewer in self.viewers))
-        readers: dict[str, SnapshotReader] = {} if self._others is None else dict(await self._others.views())
+        readers: dict[str, SnapshotReader] = (
+            {} if self._others is None else dict(await self._others.views())
+        )
         if (own := self._own) is not None:
             readers[""] = lambda since, shown: asyncio.to_thread(own.read, since, shown)
         results = await asyncio.gather(
-            *(read(self._read.get(name, 0), shown) for name, read in readers.items()), return_exceptions=True
+            *(read(self._read.get(name, 0), shown) for name, read in readers.items()),
+            return_exceptions=True,
         )
-        found = {name: one for name, one in zip(readers, results, strict=True) if isinstance(one, Snapshot)}
-        self._read = {name: found[name].number if name in found else self._read.get(name, 0) for name in readers}
+        found = {
+            name: one
+            for name, one in zip(readers, results, strict=True)
+            if isinstance(one, Snapshot)
+        }
+        self._read = {
+            name: found[name].number if name in found else self._read.get(name, 0)
+            for name in readers
+        }
         if own is not None and isinstance(error := results[-1], BaseException):
             raise error
         return list(found.values())
 
 
 def _with_files(snapshot: Snapshot, files: list[bytes], shown: Collection[str]) -> dict[str, Any]:
-    """Return the document of a snapshot, which refers to the collected `files`, with pictures of `shown` only."""
+    """Return the document of a snapshot, which refers to the collected `files`, with pictures of
+    `shown` only.
+    """
     sessions = []
     for session in snapshot.document["sessions"]:
         pictures: dict[str, int] = {}

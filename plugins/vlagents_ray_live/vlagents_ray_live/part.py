@@ -1,6 +1,8 @@
-"""The live page as a part of a replica: its routes, the data of this replica, and that of the others.
+"""The live page as a part of a replica: its routes, the data of this replica, and that of the
+others.
 
-It is on by default. A deployment file adds the last seconds of each session: `parts: {live: {folder: /data/kept}}`.
+It is on by default. A deployment file adds the last seconds of each session: `parts: {live:
+{folder: /data/kept}}`.
 """
 
 from __future__ import annotations
@@ -17,7 +19,8 @@ from vlagents_ray_live.ring import LiveConfig
 from vlagents_ray_live.sibling_views import METHODS, SiblingViews
 
 _SUMMARY = (
-    "A page that shows what the sessions do now. With keys, it asks for one with the scope `watch`, and has buttons "
+    "A page that shows what the sessions do now. With keys, it asks for one with the scope "
+    "`watch`, and has buttons "
     "for one that also has the scope `operate`. Robots that offer it are stopped there."
 )
 
@@ -31,11 +34,15 @@ class LivePart(ReplicaPart):
 
     def __init__(self, settings: LiveConfig, context: PartContext) -> None:
         super().__init__(settings, context)
-        self.view = ReplicaView(context.engine, context.short_name, context.node, context.metadata, settings)
+        self.view = ReplicaView(
+            context.engine, context.short_name, context.node, context.metadata, settings
+        )
         self.fleet = Fleet(self.view, SiblingViews(self.siblings))
 
     def open(self) -> None:
-        """Start to end leases that viewers no longer renew, and to keep the last seconds if there is a folder."""
+        """Start to end leases that viewers no longer renew, and to keep the last seconds if
+        there is a folder.
+        """
         self.view.open()
 
     def close(self) -> None:

@@ -1,10 +1,11 @@
-"""Records requests and answers of sessions as LeRobotDatasets; other threads copy, encode and write them.
+"""Records requests and answers of sessions as LeRobotDatasets; other threads copy, encode and write
+them.
 
 A deployment file turns it on: `parts: {record: {folder: /data/traces}}`.
 
-The thread that handles a message only puts references into a queue. A second thread copies the observations, since
-their memory may belong to the client, and a third one encodes and writes. If these are too slow, or the disk is full,
-frames are dropped and counted; they delay no answer.
+The thread that handles a message only puts references into a queue. A second thread copies the
+observations, since their memory may belong to the client, and a third one encodes and writes. If
+these are too slow, or the disk is full, frames are dropped and counted; they delay no answer.
 """
 
 from __future__ import annotations
@@ -49,7 +50,8 @@ logger = logging.getLogger(__name__)
 
 NO_VERSION = -1  # version of the weights for answers without one
 _HELD_BYTES = 256 * 2**20  # maximum size of the observations that wait to be written
-_OTHER_BYTES = 16 * 2**10  # estimated size of an act besides its pictures and the bytes in its `info`
+# Estimated size of an act besides its pictures and the bytes in its `info`.
+_OTHER_BYTES = 16 * 2**10
 _NICE = 5  # lower priority than the policy's thread
 _CLOSING_S = 30.0  # time for the threads to write the waiting frames
 
@@ -58,19 +60,29 @@ class RecordConfig(PartConfig):
     """The settings of a recording."""
 
     folder: AbsolutePath = Field(
-        description="folder of the datasets, on each replica's own node or shared; each replica writes its own below it"
+        description="folder of the datasets, on each replica's own node or shared; each replica "
+        "writes its own below it"
     )
-    share: float = Field(default=1.0, gt=0, le=1, description="share of the episodes, drawn at each reset")
+    share: float = Field(
+        default=1.0, gt=0, le=1, description="share of the episodes, drawn at each reset"
+    )
     pictures: Literal["exact", "small"] = Field(
         default="exact",
-        description="exact: each pixel as the policy got it, in lossless H.264; small: as videos for training, some "
+        description="exact: each pixel as the policy got it, in lossless H.264; small: as videos "
+        "for training, some "
         "twenty times smaller, on which the same policy acts a little differently",
     )
     fps: float = Field(
-        default=10.0, gt=0, le=10_000, description="rate of the frames, one for each act, that the videos assume"
+        default=10.0,
+        gt=0,
+        le=10_000,
+        description="rate of the frames, one for each act, that the videos assume",
     )
     most_gb: float = Field(
-        default=50.0, gt=0, le=1_000_000, description="size of the folder at which the recording ends, GB"
+        default=50.0,
+        gt=0,
+        le=1_000_000,
+        description="size of the folder at which the recording ends, GB",
     )
 
 
@@ -82,7 +94,9 @@ class Recording(ReplicaPart):
     def open(self) -> None:
         """Start to record; raises `ConfigError` or `MissingDependency` as `open_recorder` does."""
         context = self.context
-        self.recorder = open_recorder(context.engine.sessions, self.settings, context.replica, context.metadata)
+        self.recorder = open_recorder(
+            context.engine.sessions, self.settings, context.replica, context.metadata
+        )
         self._metrics = RecordingMetrics(self.recorder, context.metric_tags)
         self._metrics.start()
 
@@ -129,7 +143,9 @@ class RecordingMetrics:
 
 
 class Worker:
-    """A thread for scheduled calls, at a lower priority than the policy's; its user bounds their number."""
+    """A thread for scheduled calls, at a lower priority than the policy's; its user bounds their
+    number.
+    """
 
     def __init__(self, name: str) -> None:
         """Start the thread with the given name."""
@@ -138,7 +154,9 @@ class Worker:
         self._thread.start()
 
     def put(self, call: Callable[[], None]) -> None:
-        """Schedule `call` to run on the thread; its errors are logged, and do not end the thread."""
+        """Schedule `call` to run on the thread; its errors are logged, and do not end the
+        thread.
+        """
         self._calls.put(call)
 
     def close(self, timeout_s: float) -> None:
@@ -167,7 +185,8 @@ class _Recorded:
     at: float  # s since 1970
     obs: Obs | None  # of an act
     instruction: str
-    options: Any  # options of the reset, before the queue removes some of them; converted to text by `_copy`
+    # Options of the reset, before the queue removes some of them; converted to text by `_copy`.
+    options: Any
     size: int  # size of its memory, bytes
     info: str = ""  # the observation's info, as text
 
@@ -178,17 +197,26 @@ class _Recorded:
 class SessionRecorder(Observer):
     """Records a share of the sessions of one replica until `close`."""
 
-    def __init__(self, writer: EpisodeWriter, sessions: SessionTable[LoadedModel], *, share: float = 1.0) -> None:
-        """Create a recorder, and start its threads; `share` of the episodes, in [0, 1], is drawn at each reset."""
-        self.dropped = 0  # number of acts that exceeded the memory, or whose episode could not be written
+    def __init__(
+        self, writer: EpisodeWriter, sessions: SessionTable[LoadedModel], *, share: float = 1.0
+    ) -> None:
+        """Create a recorder, and start its threads; `share` of the episodes, in [0, 1], is drawn
+        at each reset.
+        """
+        # Number of acts that exceeded the memory, or whose episode could not be written.
+        self.dropped = 0
         self.ended: str | None = None  # reason why nothing more is recorded
         self._writer, self._sessions = writer, sessions
         self._share, self._held_bytes = share, _HELD_BYTES
         self._held = 0
-        self._lock = threading.RLock()  # guards `_held`, which the garbage collector may reduce at any time
-        self._looking = False  # whether a comparison of the current sessions with `_first` is scheduled
-        self._missing: set[str] = set()  # sessions in `_first` that were not here when they were looked up
-        self._first: dict[str, int | None] = {}  # step at the reset of each session; None if it is not recorded
+        # Guards `_held`, which the garbage collector may reduce at any time.
+        self._lock = threading.RLock()
+        # Whether a comparison of the current sessions with `_first` is scheduled.
+        self._looking = False
+        # Sessions in `_first` that were not here when they were looked up.
+        self._missing: set[str] = set()
+        # Step at the reset of each session; None if it is not recorded.
+        self._first: dict[str, int | None] = {}
         self._copier, self._worker = Worker("record-copy"), Worker("record-write")
         each_half_second.add(self._look)
 
@@ -210,12 +238,23 @@ class SessionRecorder(Observer):
         obs, size = None, 0
         if request.op == "act" and request.obs is not None:
             obs = request.obs
-            size = _OTHER_BYTES + sum(image.nbytes for image in obs.cameras.values()) + _bytes_in(obs.info)
+            size = (
+                _OTHER_BYTES
+                + sum(image.nbytes for image in obs.cameras.values())
+                + _bytes_in(obs.info)
+            )
             if not self._hold(size):
                 self.dropped += 1
                 return
         recorded = pending.kept[self] = _Recorded(
-            self, pending.session_id, request.op, time.time(), obs, request.instruction or "", request.kwargs, size
+            self,
+            pending.session_id,
+            request.op,
+            time.time(),
+            obs,
+            request.instruction or "",
+            request.kwargs,
+            size,
         )
         self._copier.put(partial(self._copy, recorded))
 
@@ -258,7 +297,9 @@ class SessionRecorder(Observer):
             recorded.size += texts
             self.count_held(texts)
         except Exception as error:  # noqa: BLE001 - an error of this request only
-            logger.warning("recording: an act of session %s is left out: %s", recorded.session, error)
+            logger.warning(
+                "recording: an act of session %s is left out: %s", recorded.session, error
+            )
             self.dropped += 1
             recorded.obs, recorded.options = None, ""
 
@@ -291,7 +332,9 @@ class SessionRecorder(Observer):
                 self._writer.end(session)
             elif recorded.obs is not None and self._records(session):
                 if session in self._writer:
-                    self._writer.add(session, _frame(recorded, recorded.obs, reply, self._first[session] or 0))
+                    self._writer.add(
+                        session, _frame(recorded, recorded.obs, reply, self._first[session] or 0)
+                    )
                 else:  # too many sessions at once
                     self.dropped += 1
         except (OSError, RecordingEnded):
@@ -304,7 +347,9 @@ class SessionRecorder(Observer):
             self._writer.drop(session)
 
     def _records(self, session: str) -> bool:
-        """Return whether the session is recorded; for one from another replica this is drawn here."""
+        """Return whether the session is recorded; for one from another replica this is drawn
+        here.
+        """
         if session not in self._first:
             self._first[session] = None
             if random.random() < self._share:
@@ -330,7 +375,10 @@ class SessionRecorder(Observer):
 
 
 def open_recorder(
-    sessions: SessionTable[LoadedModel], args: RecordConfig, replica: str, metadata: Callable[[], Mapping[str, Any]]
+    sessions: SessionTable[LoadedModel],
+    args: RecordConfig,
+    replica: str,
+    metadata: Callable[[], Mapping[str, Any]],
 ) -> SessionRecorder:
     """Create a recorder of the sessions of a replica.
 
@@ -345,7 +393,9 @@ def open_recorder(
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
         tempfile.TemporaryFile(dir=folder).close()
     except OSError as error:
-        raise ConfigError(f"parts.record.folder: {folder} cannot be written to ({error})") from error
+        raise ConfigError(
+            f"parts.record.folder: {folder} cannot be written to ({error})"
+        ) from error
     name = re.sub(r"[^A-Za-z0-9]+", "-", replica.removeprefix("SERVE_REPLICA::"))
     writer = EpisodeWriter(
         folder,
@@ -372,7 +422,9 @@ def _frame(recorded: _Recorded, obs: Obs, reply: Reply, first: int) -> RecordedA
         "request": recorded.info,
         "answer": to_text(info) if info else "",
     }
-    return RecordedAct(obs, act.rows(), float(obs.info[CAPTURED]), (reply.step or 0) - first - 1, columns)
+    return RecordedAct(
+        obs, act.rows(), float(obs.info[CAPTURED]), (reply.step or 0) - first - 1, columns
+    )
 
 
 def _bytes_in(value: Any) -> int:

@@ -1,4 +1,6 @@
-"""What this distribution registers: an entry for each part of a replica, and one for the page of evaluations."""
+"""What this distribution registers: an entry for each part of a replica, and one for the page of
+evaluations.
+"""
 
 from vlagents_ray.registry import RegistryEntry
 

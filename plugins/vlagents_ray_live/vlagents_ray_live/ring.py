@@ -1,9 +1,10 @@
-"""The last seconds of each session, which a button of the live page saves as an episode of a LeRobotDataset.
+"""The last seconds of each session, which a button of the live page saves as an episode of a
+LeRobotDataset.
 
-A thread reads the live observer ten times a second, as a viewer does, and keeps pictures as files: those of clients
-unchanged, others encoded with at most 4 % of a core, by omitting frames. All sessions together hold at most
-`memory_mb`; beyond that the oldest frames are dropped. One session is saved at a time, and one frame of it decoded at a
-time, until the folder holds `most_gb`.
+A thread reads the live observer ten times a second, as a viewer does, and keeps pictures as files:
+those of clients unchanged, others encoded with at most 4 % of a core, by omitting frames. All
+sessions together hold at most `memory_mb`; beyond that the oldest frames are dropped. One session
+is saved at a time, and one frame of it decoded at a time, until the folder holds `most_gb`.
 """
 
 from __future__ import annotations
@@ -33,14 +34,19 @@ _PIXELS = 2**25  # maximum number of pixels of all pictures of a frame
 
 
 class LiveConfig(PartConfig):
-    """The settings of the live page: the last seconds of each session, which a button of the page saves."""
+    """The settings of the live page: the last seconds of each session, which a button of the
+    page saves.
+    """
 
     folder: AbsolutePath | None = Field(
         default=None,
-        description="folder of the datasets, on each replica's own node or shared; each replica writes its own below "
+        description="folder of the datasets, on each replica's own node or shared; each replica "
+        "writes its own below "
         "it. Unset: nothing is kept",
     )
-    ring_s: float = Field(default=30.0, gt=0, le=600, description="how much of each session is held, s")
+    ring_s: float = Field(
+        default=30.0, gt=0, le=600, description="how much of each session is held, s"
+    )
     memory_mb: float = Field(
         default=256.0,
         gt=0,
@@ -48,15 +54,25 @@ class LiveConfig(PartConfig):
         description="memory that all sessions of a replica take at most, MB; the oldest goes first",
     )
     most_gb: float = Field(
-        default=50.0, gt=0, le=1_000_000, description="size of the folder at which nothing more is saved, GB"
+        default=50.0,
+        gt=0,
+        le=1_000_000,
+        description="size of the folder at which nothing more is saved, GB",
     )
 
     @model_validator(mode="after")
     def _with_a_folder(self) -> LiveConfig:
         if self.folder is None:
-            changed = [name for name, field in type(self).model_fields.items() if getattr(self, name) != field.default]
+            changed = [
+                name
+                for name, field in type(self).model_fields.items()
+                if getattr(self, name) != field.default
+            ]
             if changed:
-                raise ValueError(f"got {', '.join(changed)} without `folder`, so that nothing is kept; name a folder")
+                raise ValueError(
+                    f"got {', '.join(changed)} without `folder`, so that nothing is kept; name a "
+                    "folder"
+                )
         return self
 
 
@@ -82,7 +98,9 @@ class Ring:
             require(module)
         self.bytes = 0  # size of the held frames
         self._live, self._sessions, self._settings = live, sessions, settings
-        self._writer = EpisodeWriter(folder, name, RATE, lossless=False, most_bytes=settings.most_gb * 1e9)
+        self._writer = EpisodeWriter(
+            folder, name, RATE, lossless=False, most_bytes=settings.most_gb * 1e9
+        )
         self._frames: dict[str, deque[KeptObservation]] = {}  # by session
         self._lock = threading.Lock()  # guards `_frames`
         self._saving = threading.Lock()  # guards `_writer`
@@ -97,7 +115,9 @@ class Ring:
         self._periodic.remove(self.read)
 
     def read(self) -> None:
-        """Keep the live observer's latest observations, and drop those that are too old or too many."""
+        """Keep the live observer's latest observations, and drop those that are too old or too
+        many.
+        """
         self._live.renew()
         held = self._sessions.ids()
         self._live.forget_others(held)
@@ -131,7 +151,9 @@ class Ring:
             with self._lock:
                 frames = deque(self._frames.get(session, ()))
             if not frames:
-                raise InvalidInput(f"session {session!r}: nothing to save yet; it has acted on nothing")
+                raise InvalidInput(
+                    f"session {session!r}: nothing to save yet; it has acted on nothing"
+                )
             found = next((one for one in self._sessions.all() if one.id == session), None)
             self._writer.begin(session, "" if found is None else found.instruction)
             while frames:
@@ -148,7 +170,9 @@ class Ring:
         return frames[-1].number if frames else 0
 
     def _drop(self, held: list[str]) -> None:
-        """Drop ended sessions, old frames, and the oldest ones over the memory limit; the caller holds the lock."""
+        """Drop ended sessions, old frames, and the oldest ones over the memory limit; the caller
+        holds the lock.
+        """
         for name in self._frames.keys() - set(held):
             self.bytes -= sum(frame.size for frame in self._frames.pop(name))
         oldest = time.monotonic() - self._settings.ring_s
@@ -156,7 +180,10 @@ class Ring:
             while frames and frames[0].time < oldest:
                 self.bytes -= frames.popleft().size
         while self.bytes > self._settings.memory_mb * 1e6:
-            first = min((frames for frames in self._frames.values() if frames), key=lambda frames: frames[0].time)
+            first = min(
+                (frames for frames in self._frames.values() if frames),
+                key=lambda frames: frames[0].time,
+            )
             self.bytes -= first.popleft().size
 
 

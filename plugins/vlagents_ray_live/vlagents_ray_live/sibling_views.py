@@ -1,4 +1,6 @@
-"""The data for viewers of the other replicas: their snapshots, and the way of a command to the session's replica."""
+"""The data for viewers of the other replicas: their snapshots, and the way of a command to the
+session's replica.
+"""
 
 from __future__ import annotations
 
@@ -15,7 +17,8 @@ from vlagents_ray_live.live_view import OtherReplicas, ReplicaView, SnapshotRead
 
 logger = logging.getLogger(__name__)
 
-# The methods that the live page calls at other replicas, and the time limit of each, s; a late replica is asked again.
+# The methods that the live page calls at other replicas, and the time limit of each, s; a late
+# replica is asked again.
 METHODS = {"read": 0.3, "press": 3.0}
 _VIEW_S = 2.0  # time for which the list of replicas is reused
 
@@ -24,7 +27,9 @@ class SiblingViews(OtherReplicas):
     """The views of other replicas, through their live parts."""
 
     def __init__(self, siblings: Callable[[], Awaitable[Sequence[SiblingPart]]]) -> None:
-        """`siblings` returns the live part of each other replica; they may change between two calls."""
+        """`siblings` returns the live part of each other replica; they may change between two
+        calls.
+        """
         self._siblings = siblings
         self._views: dict[str, SnapshotReader] = {}  # result of the last lookup
         self._looked_up = float("-inf")
@@ -34,16 +39,21 @@ class SiblingViews(OtherReplicas):
         if time.monotonic() - self._looked_up > _VIEW_S:
             self._looked_up = time.monotonic()
             siblings = await self._siblings()
-            self._views = {sibling.name: partial(sibling.call, ReplicaView.read) for sibling in siblings}
+            self._views = {
+                sibling.name: partial(sibling.call, ReplicaView.read) for sibling in siblings
+            }
         return self._views
 
     async def press(self, session: str, do: str, by: str) -> dict[str, Any] | None:
-        """Give a command to a session, see `CommandBoard.press`; return None if no replica has the session.
+        """Give a command to a session, see `CommandBoard.press`; return None if no replica has the
+        session.
 
         Raises:
             VLAgentsError: The replica that has the session refused the command.
         """
-        calls = [sibling.call(ReplicaView.press, session, do, by) for sibling in await self._siblings()]
+        calls = [
+            sibling.call(ReplicaView.press, session, do, by) for sibling in await self._siblings()
+        ]
         for answer in asyncio.as_completed(calls):
             try:
                 pressed: dict[str, Any] | None = await answer

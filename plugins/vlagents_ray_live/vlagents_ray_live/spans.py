@@ -1,4 +1,6 @@
-"""OpenTelemetry spans of the requests of a replica: from arrival to answer, decoding, queue, and batch."""
+"""OpenTelemetry spans of the requests of a replica: from arrival to answer, decoding, queue, and
+batch.
+"""
 
 from __future__ import annotations
 
@@ -16,7 +18,8 @@ from vlagents_ray.serve.replica.part import ReplicaPart
 from vlagents_ray.serve.requests import PendingRequest
 
 _KEPT = 4096  # maximum number of answers per half second; older ones get no spans
-_STAGES = {"queue": "queue", "inference": "batch"}  # stages in order, after decoding, and names of their spans
+# Stages in order, after decoding, and names of their spans.
+_STAGES = {"queue": "queue", "inference": "batch"}
 _OPS = ("act", "reset")
 _TEXT = 200  # maximum length of an error, or of a client's text
 
@@ -65,7 +68,9 @@ class RequestSpans(Observer):
         if begun is not None:
             about = pending.session_id, pending.request.op, pending.rank.name.lower()
             error = "" if reply.error is None else f"{reply.error.code}: {reply.error}"[:_TEXT]
-            self._answered.append(_ServedRequest(*about, *begun, reply.timing, error, time.time_ns()))
+            self._answered.append(
+                _ServedRequest(*about, *begun, reply.timing, error, time.time_ns())
+            )
 
     def export(self) -> None:
         """Create the spans of the answers since the last call, whose timing is complete by now."""
@@ -75,12 +80,22 @@ class RequestSpans(Observer):
     def _make(self, one: _ServedRequest) -> None:
         timing = one.timing
         begun_ns = one.decoded_ns - _ns(timing.get("decode_ms", 0.0))
-        about: dict[str, str | int] = {"replica": self._replica, "session": one.session, "rank": one.rank}
+        about: dict[str, str | int] = {
+            "replica": self._replica,
+            "session": one.session,
+            "rank": one.rank,
+        }
         if "batch_size" in timing:
             about["batch_size"] = int(timing["batch_size"])
-        parent = self._propagator.extract({tracing.TRACEPARENT: one.traceparent}) if one.traceparent else None
+        parent = (
+            self._propagator.extract({tracing.TRACEPARENT: one.traceparent})
+            if one.traceparent
+            else None
+        )
         name, kind = f"vlagents {one.op}", self._trace.SpanKind.SERVER
-        whole = self._tracer.start_span(name, parent, kind=kind, attributes=about, start_time=begun_ns)
+        whole = self._tracer.start_span(
+            name, parent, kind=kind, attributes=about, start_time=begun_ns
+        )
         if one.error:
             whole.set_status(self._trace.StatusCode.ERROR, one.error)
         inside = self._trace.set_span_in_context(whole, parent)
@@ -100,7 +115,9 @@ class RequestSpans(Observer):
 
 
 class Spans(ReplicaPart):
-    """Creates spans of requests if the environment of the replica enables traces, see `vlagents_ray.tracing`."""
+    """Creates spans of requests if the environment of the replica enables traces, see
+    `vlagents_ray.tracing`.
+    """
 
     def observer(self) -> RequestSpans | None:
         """Return the observer of requests; None without traces."""

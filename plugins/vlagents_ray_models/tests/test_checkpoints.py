@@ -1,4 +1,6 @@
-"""Checkpoints of the families: asked for by their commit, and unpickled only where that is allowed."""
+"""Checkpoints of the families: asked for by their commit, and unpickled only where that is
+allowed.
+"""
 
 from __future__ import annotations
 
@@ -15,7 +17,11 @@ from vlagents_ray.errors import ConfigError
 from vlagents_ray.policies.base.checkpoint import used_checkpoints
 from vlagents_ray.policies.base.checkpoint_files import weights_of
 from vlagents_ray.registry import entries, named_class
-from vlagents_ray_models.diffusion_policy import DiffusionPolicy, DiffusionPolicyConfig, checkpoint_file
+from vlagents_ray_models.diffusion_policy import (
+    DiffusionPolicy,
+    DiffusionPolicyConfig,
+    checkpoint_file,
+)
 
 COMMIT = "0123456789abcdef0123456789abcdef01234567"
 NAMED = f"org/name@{COMMIT}"
@@ -34,7 +40,10 @@ def families() -> list[Any]:
         for name, one in POLICIES.items()
         if "checkpoint" in getattr(named_class(one.target).Config, "model_fields", ())
     ]
-    return [pytest.param(name, marks=pytest.mark.torch if name == "vjepa2_ac" else ()) for name in with_checkpoints]
+    return [
+        pytest.param(name, marks=pytest.mark.torch if name == "vjepa2_ac" else ())
+        for name in with_checkpoints
+    ]
 
 
 @pytest.mark.parametrize("family", families())
@@ -44,8 +53,12 @@ def test_a_family_asks_for_the_commit(family: str, monkeypatch: pytest.MonkeyPat
         monkeypatch.setattr(function, lambda *_args, **_options: None)
     cls = named_class(POLICIES[family].target)
     fields = cls.Config.model_fields
-    settings = {name: "any" for name, field in fields.items() if field.is_required()} | {"checkpoint": NAMED}
-    policy = cls.from_config(settings | ({"trust_checkpoint": True} if "trust_checkpoint" in fields else {}))
+    settings = {name: "any" for name, field in fields.items() if field.is_required()} | {
+        "checkpoint": NAMED
+    }
+    policy = cls.from_config(
+        settings | ({"trust_checkpoint": True} if "trust_checkpoint" in fields else {})
+    )
     with pytest.raises(ConfigError, match="nor to be had from the hub"):
         policy.initialize()
     assert asked == [("org/name", COMMIT)]
@@ -70,10 +83,14 @@ def test_a_repository_with_one_file_of_diffusion_policy_is_enough(
     assert weights is not None
     assert weights["revision"] == COMMIT
     branch = DiffusionPolicyConfig(checkpoint="org/name@main", trust_checkpoint=True)
-    with pytest.raises(ConfigError, match=rf"pickle of the hub, .* want the commit that you trust, such as {NAMED}"):
+    with pytest.raises(
+        ConfigError, match=rf"pickle of the hub, .* want the commit that you trust, such as {NAMED}"
+    ):
         checkpoint_file(branch)
     (snapshot / "other.ckpt").touch()
-    with pytest.raises(ConfigError, match=r"\['checkpoints/latest.ckpt', 'other.ckpt'\], want one \.ckpt file"):
+    with pytest.raises(
+        ConfigError, match=r"\['checkpoints/latest.ckpt', 'other.ckpt'\], want one \.ckpt file"
+    ):
         checkpoint_file(config)
 
 
@@ -90,7 +107,9 @@ class Touch:
 def test_nothing_is_unpickled_unless_it_is_trusted(tmp_path: Path) -> None:
     checkpoint, trace = tmp_path / "latest.ckpt", tmp_path / "trace"
     checkpoint.write_bytes(pickle.dumps(Touch(trace)))
-    with pytest.raises(ConfigError, match="runs whatever code its author put in; set trust_checkpoint: true"):
+    with pytest.raises(
+        ConfigError, match="runs whatever code its author put in; set trust_checkpoint: true"
+    ):
         DiffusionPolicy.from_config({"checkpoint": str(checkpoint)}).initialize()
     assert not trace.exists()
     pickle.loads(checkpoint.read_bytes())  # noqa: S301 - the danger, shown on our own file

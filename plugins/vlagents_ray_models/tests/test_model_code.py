@@ -1,4 +1,6 @@
-"""Where model code comes from that is no package: installed, a checkout that is named, or one of the environment."""
+"""Where model code comes from that is no package: installed, a checkout that is named, or one of
+the environment.
+"""
 
 from __future__ import annotations
 
@@ -26,7 +28,9 @@ def checkout(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 @pytest.mark.parametrize("by", ["setting", "variable"])
-def test_a_checkout_is_imported_from(checkout: Path, monkeypatch: pytest.MonkeyPatch, by: str) -> None:
+def test_a_checkout_is_imported_from(
+    checkout: Path, monkeypatch: pytest.MonkeyPatch, by: str
+) -> None:
     if by == "variable":
         monkeypatch.setenv(VARIABLE, str(checkout))
     use_source(NAME, VARIABLE, str(checkout) if by == "setting" else None, within=["src"])
@@ -39,7 +43,9 @@ def test_a_checkout_is_imported_from(checkout: Path, monkeypatch: pytest.MonkeyP
 def test_a_checkout_that_is_named_is_taken_though_a_folder_elsewhere_has_the_packages_name(
     checkout: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """As the checkout itself has, seen from the folder that it lies in; Python takes any folder for a package."""
+    """As the checkout itself has, seen from the folder that it lies in; Python takes any folder
+    for a package.
+    """
     (checkout / "here" / NAME).mkdir(parents=True)
     monkeypatch.syspath_prepend(str(checkout / "here"))
     monkeypatch.setenv(VARIABLE, str(checkout))
@@ -54,7 +60,9 @@ def test_what_is_installed_needs_no_checkout() -> None:
 
 
 def test_nothing_to_import_from_is_said_with_both_ways_to_name_it(checkout: Path) -> None:
-    with pytest.raises(ConfigError, match=rf"\${VARIABLE}, which is not set.*source_dir or in {VARIABLE}"):
+    with pytest.raises(
+        ConfigError, match=rf"\${VARIABLE}, which is not set.*source_dir or in {VARIABLE}"
+    ):
         use_source(NAME, VARIABLE)
     with pytest.raises(ConfigError, match=r"neither installed nor in .*source_dir"):
         use_source(NAME, VARIABLE, str(checkout))

@@ -1,4 +1,6 @@
-"""What a checkpoint of LeRobot or of Octo has made is decided from its JSON, before anything of it is imported."""
+"""What a checkpoint of LeRobot or of Octo has made is decided from its JSON, before anything of
+it is imported.
+"""
 
 from __future__ import annotations
 
@@ -88,9 +90,12 @@ REGISTERED = {"registry_name": "normalizer_processor", "config": {"class": "subp
     ],
 )
 def test_a_step_that_is_not_lerobots_is_refused_with_the_cure(name: object, tmp_path: Path) -> None:
-    file = pipeline(tmp_path, REGISTERED, {"class": name, "config": {"args": ["/bin/sh", "-c", "exit"]}})
+    file = pipeline(
+        tmp_path, REGISTERED, {"class": name, "config": {"args": ["/bin/sh", "-c", "exit"]}}
+    )
     with pytest.raises(
-        ConfigError, match=r"policy_preprocessor\.json: got a step of the class .* trust_remote_code: true"
+        ConfigError,
+        match=r"policy_preprocessor\.json: got a step of the class .* trust_remote_code: true",
     ):
         require_known_steps(file)
 
@@ -110,7 +115,9 @@ def test_registered_steps_and_lerobots_own_pass(tmp_path: Path) -> None:
     require_known_steps(pipeline(tmp_path))
     # LeRobot looks at the class only where there is no registered name.
     both = {"registry_name": "device_processor", "class": "subprocess.Popen"}
-    require_known_steps(pipeline(tmp_path, REGISTERED, both, {"class": "lerobot.processor.Unregistered"}))
+    require_known_steps(
+        pipeline(tmp_path, REGISTERED, both, {"class": "lerobot.processor.Unregistered"})
+    )
 
 
 def spec(module: object, name: object, **kwargs: Any) -> dict[str, Any]:
@@ -124,7 +131,10 @@ TEXT = spec("octo.data.utils.text_processing", "HFTokenizer", tokenizer_name="t5
 
 def config(folder: Path, text: Any = TEXT, encoder: Any = STEM, **more: Any) -> Path:
     file = folder / "config.json"
-    model = {"observation_tokenizers": {"primary": IMAGES | {"kwargs": {"encoder": encoder}}}, "heads": {}}
+    model = {
+        "observation_tokenizers": {"primary": IMAGES | {"kwargs": {"encoder": encoder}}},
+        "heads": {},
+    }
     file.write_text(json.dumps({"model": model, "text_processor": text, **more}))
     return file
 
@@ -152,9 +162,16 @@ FOREIGN = [
 
 
 @pytest.mark.parametrize("foreign", FOREIGN, ids=lambda one: f"{one['module']}:{one['name']}")
-def test_anything_else_is_refused_at_every_depth_with_the_cure(foreign: dict[str, Any], tmp_path: Path) -> None:
+def test_anything_else_is_refused_at_every_depth_with_the_cure(
+    foreign: dict[str, Any], tmp_path: Path
+) -> None:
     deep = STEM | {"kwargs": {"norm": [{"here": foreign}]}}
-    for changed in ({"text": foreign}, {"encoder": foreign}, {"encoder": deep}, {"text": TEXT | {"args": [foreign]}}):
+    for changed in (
+        {"text": foreign},
+        {"encoder": foreign},
+        {"encoder": deep},
+        {"text": TEXT | {"args": [foreign]}},
+    ):
         with pytest.raises(ConfigError, match=r"config\.json: names .* trust_remote_code: true"):
             require_own_classes(config(tmp_path, **changed))
 
@@ -173,7 +190,9 @@ def test_what_is_no_configuration_is_said(text: str, tmp_path: Path) -> None:
         require_own_classes(tmp_path / "config.json")
 
 
-def test_octo_loads_nothing_before_the_look(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_octo_loads_nothing_before_the_look(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Unless it is told to trust the checkpoint."""
     loaded: list[str] = []
 
@@ -192,7 +211,12 @@ def test_octo_loads_nothing_before_the_look(tmp_path: Path, monkeypatch: pytest.
     with used_checkpoints() as used, pytest.raises(ConfigError, match="names 'system' of 'os'"):
         OctoNetwork.load(OctoConfig(checkpoint=str(folder)))
     assert loaded == []
-    assert [path.name for path in used] == ["config.json", "example_batch.msgpack", "dataset_statistics.json", "7"]
+    assert [path.name for path in used] == [
+        "config.json",
+        "example_batch.msgpack",
+        "dataset_statistics.json",
+        "7",
+    ]
     with pytest.raises(ConfigError, match="the stand-in has no model"):
         OctoNetwork.load(OctoConfig(checkpoint=str(folder), trust_remote_code=True))
     assert loaded == [f"{folder}/7"]

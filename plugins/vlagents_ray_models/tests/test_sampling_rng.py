@@ -33,7 +33,10 @@ def test_each_row_has_the_numbers_that_it_has_alone(model: Any) -> None:
     with RowDraws(rngs(1, 2), model):
         noise, chosen = model.draw(4)  # two rows of each session
     generator = generator_of(np.random.default_rng(2))
-    wanted = torch.randn(2, 3, generator=generator).bfloat16().float(), torch.randn(2, 2, generator=generator)
+    wanted = (
+        torch.randn(2, 3, generator=generator).bfloat16().float(),
+        torch.randn(2, 2, generator=generator),
+    )
     assert torch.equal(noise[2:], torch.cat(wanted, 1))
     assert torch.equal(chosen[2:], torch.multinomial(torch.ones(2, 50), 1, generator=generator))
     with RowDraws(rngs(2), model):
@@ -52,9 +55,12 @@ def test_only_the_models_own_draws_in_the_context_are_the_rows(model: Any) -> No
 
     found: list[bool] = []
     with RowDraws(rngs(1, 2), model):
-        assert torch.overrides._get_current_function_mode() is None  # which each call of torch would pass through
+        # Which each call of torch would pass through.
+        assert torch.overrides._get_current_function_mode() is None
         assert of_torch(lambda: torch.randn((2, 3), dtype=torch.bfloat16).float())
-        thread = threading.Thread(target=lambda: found.append(of_torch(lambda: model.draw(2)[0][:, :3])))
+        thread = threading.Thread(
+            target=lambda: found.append(of_torch(lambda: model.draw(2)[0][:, :3]))
+        )
         thread.start()
         thread.join()
         assert not of_torch(lambda: model.draw(2)[0][:, :3])
@@ -66,11 +72,20 @@ def test_only_the_models_own_draws_in_the_context_are_the_rows(model: Any) -> No
 def test_draws_that_are_no_rows_own_are_refused(model: Any) -> None:
     from vlagents_ray_models.sampling_rng import RowDraws, RowNoise
 
-    with RowDraws(rngs(1, 2), model), pytest.raises(PolicyFailed, match="drew from rand: its actions would depend"):
+    with (
+        RowDraws(rngs(1, 2), model),
+        pytest.raises(PolicyFailed, match="drew from rand: its actions would depend"),
+    ):
         model.draw_otherwise()
-    with pytest.raises(PolicyFailed, match="drew no numbers for its rows"), RowDraws(rngs(1), model):
+    with (
+        pytest.raises(PolicyFailed, match="drew no numbers for its rows"),
+        RowDraws(rngs(1), model),
+    ):
         pass
-    with RowNoise([Row((), "", rng) for rng in rngs(1, 2)], 1, model), pytest.raises(PolicyFailed, match="one row for"):
+    with (
+        RowNoise([Row((), "", rng) for rng in rngs(1, 2)], 1, model),
+        pytest.raises(PolicyFailed, match="one row for"),
+    ):
         model.draw(3)
 
 

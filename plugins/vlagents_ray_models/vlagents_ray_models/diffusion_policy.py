@@ -31,30 +31,39 @@ class DiffusionPolicyConfig(ModelConfig):
 
     checkpoint: str = Field(
         min_length=1,
-        description="a .ckpt file, or a folder or org/name@COMMIT of the hub, with only one; `{step}` stands for "
+        description="a .ckpt file, or a folder or org/name@COMMIT of the hub, with only one; "
+        "`{step}` stands for "
         "checkpoint_step",
     )
     trust_checkpoint: bool = Field(
         default=False,
-        description="these checkpoints are pickles, and loading one runs the code that its author put in: set true if "
+        description="these checkpoints are pickles, and loading one runs the code that its author "
+        "put in: set true if "
         "you trust its origin",
     )
     source_dir: str | None = Field(
         default=None,
-        description="a checkout of Diffusion Policy; unset: the installed one, or that of DIFFUSION_POLICY_SRC",
+        description="a checkout of Diffusion Policy; unset: the installed one, or that of "
+        "DIFFUSION_POLICY_SRC",
     )
-    dtype: Literal["auto", "float32"] = Field(default="auto", description="float32, as its authors compute")
+    dtype: Literal["auto", "float32"] = Field(
+        default="auto", description="float32, as its authors compute"
+    )
     actions: Literal["chunk", "queue", "ensemble"] = Field(
         default="queue",
-        description="as in all models; 'queue' because the model sees the last frames, those within a chunk too, "
+        description="as in all models; 'queue' because the model sees the last frames, those "
+        "within a chunk too, "
         "which arrive here only if each of them is sent",
     )
     state: list[str] | None = Field(
         default=None,
-        description="parts that follow each other as the checkpoint's low_dim keys do; unset: parts of their names, "
+        description="parts that follow each other as the checkpoint's low_dim keys do; unset: "
+        "parts of their names, "
         "'state' for a checkpoint without cameras",
     )
-    steps: int | None = Field(default=None, ge=1, description="denoising steps; unset: those of the checkpoint")
+    steps: int | None = Field(
+        default=None, ge=1, description="denoising steps; unset: those of the checkpoint"
+    )
 
 
 USUAL_CAMERAS = {  # of the authors' tasks
@@ -66,7 +75,9 @@ _POSE_NUMBERS = 10  # position, rotation in six numbers, gripper
 
 
 class DiffusionPolicy(ModelPolicy):
-    """The policy of a Diffusion Policy checkpoint, which calls the module's `predict_action` for a whole batch."""
+    """The policy of a Diffusion Policy checkpoint, which calls the module's `predict_action` for
+    a whole batch.
+    """
 
     Config: ClassVar[type] = DiffusionPolicyConfig
     config: DiffusionPolicyConfig
@@ -86,7 +97,9 @@ class DiffusionPolicy(ModelPolicy):
         state = {"state": own} if self.config.state is None else {}
         action = _action(network.module.action_dim, absolute=network.absolute)
         horizon = network.module.n_action_steps
-        return self.stated(self._cameras(network), parts, horizon, instruction=False, action=action, **state)
+        return self.stated(
+            self._cameras(network), parts, horizon, instruction=False, action=action, **state
+        )
 
     @property
     def state_dim(self) -> int | None:
@@ -108,7 +121,9 @@ class DiffusionPolicy(ModelPolicy):
         }
         vector = state_vector(obs, self._parts(network), self.state_dim)
         ends = np.cumsum([0, *network.vectors.values()])
-        parts = {name: vector[a:b] for name, (a, b) in zip(network.vectors, pairwise(ends), strict=True)}
+        parts = {
+            name: vector[a:b] for name, (a, b) in zip(network.vectors, pairwise(ends), strict=True)
+        }
         return network.staging.stage(seen | parts)
 
     def predict(self, rows: Sequence[Row]) -> list[Prediction]:
@@ -121,7 +136,8 @@ class DiffusionPolicy(ModelPolicy):
             inputs[name] = inputs[name].movedim(-1, 2).float() / 255
         from vlagents_ray_models.sampling_rng import RowNoise
 
-        own = network.module, require("diffusers.utils.torch_utils")  # the scheduler's steps draw in the latter
+        # The scheduler's steps draw in the latter.
+        own = network.module, require("diffusers.utils.torch_utils")
         with torch.inference_mode(), RowNoise(rows, network.draws, *own):
             actions = network.module.predict_action(inputs)["action"]
         return [Prediction(chunk) for chunk in fetch(actions.float())]
@@ -136,7 +152,9 @@ class DiffusionPolicy(ModelPolicy):
 
 
 def _resized(image: np.ndarray, height: int, width: int) -> np.ndarray:
-    """Scale an image, and crop its centre to the model's aspect ratio, as in the authors' get_real_obs_dict."""
+    """Scale an image, and crop its centre to the model's aspect ratio, as in the authors'
+    get_real_obs_dict.
+    """
     if image.shape[:2] == (height, width):
         return image.copy()
     transform = require("diffusion_policy.common.cv2_util").get_image_transform
@@ -144,7 +162,9 @@ def _resized(image: np.ndarray, height: int, width: int) -> np.ndarray:
 
 
 def _action(dim: int, *, absolute: bool) -> ActionSpec:
-    """Describe the actions; with `abs_action` they are one or two poses in the base frame, with 6D rotations."""
+    """Describe the actions; with `abs_action` they are one or two poses in the base frame, with
+    6D rotations.
+    """
     if not absolute or dim % _POSE_NUMBERS:
         return ActionSpec(dim=dim)
     return ActionSpec(dim=dim, space="ee_pose", delta=False, rotation="rot6d", frame="base")
@@ -167,11 +187,15 @@ class DiffusionNetwork:
 
     @classmethod
     def load(cls, config: DiffusionPolicyConfig) -> DiffusionNetwork:
-        """Read the checkpoint; raises `ConfigError` if it is not trusted, incomplete, or of another family."""
+        """Read the checkpoint; raises `ConfigError` if it is not trusted, incomplete, or of
+        another family.
+        """
         if not config.trust_checkpoint:
             raise ConfigError(
-                f"checkpoint {config.checkpoint!r}: this family's checkpoints are pickles, and loading one runs "
-                f"whatever code its author put in; set trust_checkpoint: true if you trust its origin"
+                f"checkpoint {config.checkpoint!r}: this family's checkpoints are pickles, and "
+                "loading one runs "
+                "whatever code its author put in; set trust_checkpoint: true if you trust its "
+                "origin"
             )
         path = checkpoint_file(config)
         ensure_torchvision()
@@ -181,13 +205,16 @@ class DiffusionNetwork:
         try:
             module.load_state_dict(state)
         except RuntimeError as error:
-            raise ConfigError(f"checkpoint {path}: does not fill its own policy: {error}") from error
+            raise ConfigError(
+                f"checkpoint {path}: does not fill its own policy: {error}"
+            ) from error
         require_loaded(module, state)
         images, vectors = _inputs(module, settings)
         absent = sorted({"action", *images, *vectors} - set(module.normalizer.params_dict.keys()))
         if absent:
             raise ConfigError(
-                f"checkpoint {path}: its normalizer has nothing for {absent}, so its numbers have no units; save it "
+                f"checkpoint {path}: its normalizer has nothing for {absent}, so its numbers have "
+                "no units; save it "
                 f"after the workspace has called set_normalizer"
             )
         if config.steps is not None:
@@ -199,13 +226,16 @@ class DiffusionNetwork:
 
 
 def checkpoint_file(config: DiffusionPolicyConfig) -> Path:
-    """Find the .ckpt file; raises `ConfigError` also for a hub id without a commit, whose pickle may change."""
+    """Find the .ckpt file; raises `ConfigError` also for a hub id without a commit, whose pickle
+    may change.
+    """
     path = find_checkpoint(config.checkpoint, config.checkpoint_step)
     commit = revision(path)
     if commit is not None and commit not in config.checkpoint:
         repository = config.checkpoint.partition("@")[0]
         raise ConfigError(
-            f"checkpoint {config.checkpoint!r}: a pickle of the hub, whose branches and tags may become others; want "
+            f"checkpoint {config.checkpoint!r}: a pickle of the hub, whose branches and tags may "
+            "become others; want "
             f"the commit that you trust, such as {repository}@{commit}, which it is now"
         )
     if path.is_file():
@@ -213,24 +243,37 @@ def checkpoint_file(config: DiffusionPolicyConfig) -> Path:
     found = sorted(path.rglob("*.ckpt"))
     if len(found) != 1:
         names = [str(file.relative_to(path)) for file in found[:10]]
-        raise ConfigError(f"checkpoint {path}: a folder with {names}, want one .ckpt file, or a folder with only one")
+        raise ConfigError(
+            f"checkpoint {path}: a folder with {names}, want one .ckpt file, or a folder with only "
+            "one"
+        )
     return find_checkpoint(str(found[0]))
 
 
 def _read(path: Path) -> tuple[Any, Mapping[str, Any]]:
-    """Return the settings of the training and the weights, averaged ones if the training computed them."""
+    """Return the settings of the training and the weights, averaged ones if the training
+    computed them.
+    """
     torch, dill = require("torch"), require("dill")
     try:
         payload = torch.load(path, map_location="cpu", pickle_module=dill, weights_only=False)
         settings, states = payload["cfg"], payload["state_dicts"]
     except Exception as error:  # unpickling can raise any exception
         raise ConfigError(
-            f"checkpoint {path}: got no payload of a Diffusion Policy workspace ({type(error).__name__}: {error}); "
+            f"checkpoint {path}: got no payload of a Diffusion Policy workspace "
+            f"({type(error).__name__}: {error}); "
             f"want a .ckpt that its save_checkpoint wrote"
         ) from error
-    name = "ema_model" if require("omegaconf").OmegaConf.select(settings, "training.use_ema") else "model"
+    name = (
+        "ema_model"
+        if require("omegaconf").OmegaConf.select(settings, "training.use_ema")
+        else "model"
+    )
     if name not in states:
-        raise ConfigError(f"checkpoint {path}: has no {name!r}, which its training.use_ema needs; has {sorted(states)}")
+        raise ConfigError(
+            f"checkpoint {path}: has no {name!r}, which its training.use_ema needs; has "
+            f"{sorted(states)}"
+        )
     return settings, states[name]
 
 
@@ -242,14 +285,17 @@ def _made(path: Path, settings: Any) -> Any:
     module = require("hydra.utils").instantiate(settings.policy)
     if not hasattr(module, "noise_scheduler"):
         raise ConfigError(
-            f"checkpoint {path}: {type(module).__name__} is no diffusion policy; want one of diffusion_policy.policy's "
+            f"checkpoint {path}: {type(module).__name__} is no diffusion policy; want one of "
+            "diffusion_policy.policy's "
             f"Diffusion…Policy"
         )
     if any(
-        type(part).__name__ == "CropRandomizer" and "robomimic" in type(part).__module__ for part in module.modules()
+        type(part).__name__ == "CropRandomizer" and "robomimic" in type(part).__module__
+        for part in module.modules()
     ):
         raise ConfigError(
-            f"checkpoint {path}: its encoder crops at random while it acts, so actions would depend on neighbours; "
+            f"checkpoint {path}: its encoder crops at random while it acts, so actions would "
+            "depend on neighbours; "
             f"want one trained with eval_fixed_crop: true"
         )
     return module
@@ -267,22 +313,36 @@ def _inputs(module: Any, settings: Any) -> tuple[dict[str, tuple[int, int]], dic
 
 
 def _draws(module: Any, device: Any) -> int:
-    """Have the module denoise without waiting for its device, and return how often it then draws noise."""
+    """Have the module denoise without waiting for its device, and return how often it then draws
+    noise.
+    """
     scheduler = module.noise_scheduler
     scheduler.set_timesteps(module.num_inference_steps)
-    if type(module).conditional_sample.__module__.startswith("diffusion_policy."):  # else the loop may be another
-        module.conditional_sample = partial(_conditional_sample, module, scheduler.timesteps.to(device))
+    # Else the loop may be another.
+    if type(module).conditional_sample.__module__.startswith("diffusion_policy."):
+        module.conditional_sample = partial(
+            _conditional_sample, module, scheduler.timesteps.to(device)
+        )
     noisy = "variance_type" in scheduler.config  # DDPM's steps add noise, except the last one
     return 1 + noisy * int((scheduler.timesteps > 0).sum())
 
 
 def _conditional_sample(
-    module: Any, times: Any, data: Any, known: Any, *, generator: Any = None, cond: Any = None, **options: Any
+    module: Any,
+    times: Any,
+    data: Any,
+    known: Any,
+    *,
+    generator: Any = None,
+    cond: Any = None,
+    **options: Any,
 ) -> Any:
-    """Return numbers (B, T, D), denoised as the module's `conditional_sample` does, without waiting for a GPU.
+    """Return numbers (B, T, D), denoised as the module's `conditional_sample` does, without waiting
+    for a GPU.
 
-    Theirs copies the time to it, and indexes by truth values, at each step. `times` are on the device; the scheduler
-    branches on its own, on the CPU. `data` (B, T, D) are not denoised where `known`.
+    Theirs copies the time to it, and indexes by truth values, at each step. `times` are on the
+    device; the scheduler branches on its own, on the CPU. `data` (B, T, D) are not denoised where
+    `known`.
     """
     torch, scheduler = require("torch"), module.noise_scheduler
     names = [name for name in ("local_cond", "global_cond") if name in options]
@@ -297,22 +357,34 @@ def _conditional_sample(
     return numbers
 
 
-_CONDITIONS = {"obs_as_cond": "cond", "obs_as_local_cond": "local_cond", "obs_as_global_cond": "global_cond"}
+_CONDITIONS = {
+    "obs_as_cond": "cond",
+    "obs_as_local_cond": "local_cond",
+    "obs_as_global_cond": "global_cond",
+}
 
 
 def compile_with(network: DiffusionNetwork, compilation: Compilation) -> None:
-    """Compile a module's denoising network and its image encoder, both of which `predict_action` calls."""
+    """Compile a module's denoising network and its image encoder, both of which `predict_action`
+    calls.
+    """
     module = network.module
     _without_branches_on_values(module, network.staging.device)
-    condition = next((name for flag, name in _CONDITIONS.items() if getattr(module, flag, False)), "")
+    condition = next(
+        (name for flag, name in _CONDITIONS.items() if getattr(module, flag, False)), ""
+    )
     module.model.forward = _denoising(module.model.forward, condition, compilation)
     if (encoder := getattr(module, "obs_encoder", None)) is not None:
         names = [*network.images, *network.vectors]
         encoder.forward = _looking(encoder.forward, names, module.n_obs_steps, compilation)
 
 
-def _denoising(forward: Callable[..., Any], condition: str, compilation: Compilation) -> Callable[..., Any]:
-    """Return the denoising network as its loop calls it; `condition` is the name of its argument for observations."""
+def _denoising(
+    forward: Callable[..., Any], condition: str, compilation: Compilation
+) -> Callable[..., Any]:
+    """Return the denoising network as its loop calls it; `condition` is the name of its argument
+    for observations.
+    """
 
     def denoise(sample: Any, times: Any, *seen: Any) -> Any:
         return forward(sample, times, **dict(zip([condition], seen, strict=False)))
@@ -329,7 +401,9 @@ def _denoising(forward: Callable[..., Any], condition: str, compilation: Compila
 def _looking(
     forward: Callable[..., Any], names: list[str], steps: int, compilation: Compilation
 ) -> Callable[[Mapping[str, Any]], Any]:
-    """Return the encoder of frames (B * steps, …) by name, whose compiled core takes rows of `steps` frames."""
+    """Return the encoder of frames (B * steps, …) by name, whose compiled core takes rows of
+    `steps` frames.
+    """
 
     def encode_images(*frames: Any) -> Any:
         seen = {name: frame.flatten(0, 1) for name, frame in zip(names, frames, strict=True)}
@@ -344,13 +418,19 @@ def _looking(
 
 
 def _without_branches_on_values(module: Any, device: Any) -> None:
-    """Replace parts of torch that branch on values of tensors, which compiled programs cannot do."""
+    """Replace parts of torch that branch on values of tensors, which compiled programs cannot
+    do.
+    """
     torch, transforms = require("torch"), require("torchvision.transforms")
     for part in module.modules():
         if isinstance(part, transforms.Normalize):  # refuses a std of 0
-            mean, std = (torch.tensor(numbers, device=device).view(-1, 1, 1) for numbers in (part.mean, part.std))
+            mean, std = (
+                torch.tensor(numbers, device=device).view(-1, 1, 1)
+                for numbers in (part.mean, part.std)
+            )
             part.forward = partial(_normalised, mean, std)
-        elif isinstance(part, torch.nn.TransformerDecoder):  # tests whether its mask is causal, for a faster kernel
+        elif isinstance(part, torch.nn.TransformerDecoder):
+            # tests whether its mask is causal, for a faster kernel
             part.forward = partial(part.forward, tgt_is_causal=False)
         elif isinstance(part, torch.nn.TransformerEncoder):
             part.forward = partial(part.forward, is_causal=False)

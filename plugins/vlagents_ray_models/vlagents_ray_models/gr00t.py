@@ -21,16 +21,27 @@ from vlagents_ray.contract import ActionSpec, Contract, StateSpec
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.interface import Obs
 from vlagents_ray.policies.base import ModelConfig, ModelPolicy, Prediction, Row
-from vlagents_ray.policies.base.accelerator import ensure_torchvision, fetch, torch_device, torch_dtype
+from vlagents_ray.policies.base.accelerator import (
+    ensure_torchvision,
+    fetch,
+    torch_device,
+    torch_dtype,
+)
 from vlagents_ray.policies.base.checkpoint import SavedTensors, find_checkpoint, require_loaded
-from vlagents_ray.policies.base.model_inputs import GRIPPER, camera_images, choose_cameras, state_vector
+from vlagents_ray.policies.base.model_inputs import (
+    GRIPPER,
+    camera_images,
+    choose_cameras,
+    state_vector,
+)
 from vlagents_ray.policies.compilation import Compilation
 from vlagents_ray.policies.outcomes import attempt, of_good
 from vlagents_ray.registry import require
 from vlagents_ray_models.model_code import remote_code, use_source
 
 CONFIG, STATISTICS = "processor_config.json", "statistics.json"
-_CONVERTED = {"RELATIVE": False, "DELTA": True}  # representations of actions -> whether decoded ones are deltas
+# Representations of actions -> whether decoded ones are deltas.
+_CONVERTED = {"RELATIVE": False, "DELTA": True}
 _SPACES = {"NON_EEF": "joint", "EEF": "ee_pose"}
 _ROTATIONS = {"XYZ_ROT6D": "rot6d", "XYZ_ROTVEC": "axis_angle"}
 _CURE = "save the checkpoint's processor with its dataset's statistics, as GR00T's training does"
@@ -44,10 +55,12 @@ class Embodiment:
     cameras: tuple[str, ...]
     state: Mapping[str, int]  # groups and their widths, in the model's order
     action: Mapping[str, int]
-    moments: Mapping[str, tuple[int, ...]]  # of "video" and "state": offsets of the observations read, 0 for the newest
+    # Of "video" and "state": offsets of the observations read, 0 for the newest.
+    moments: Mapping[str, tuple[int, ...]]
     horizon: int  # rows of a chunk
     spec: ActionSpec
-    ranges: Mapping[str, Any]  # of the training: "state" and "action", by group, in the robot's units
+    # Of the training: "state" and "action", by group, in the robot's units.
+    ranges: Mapping[str, Any]
 
     @property
     def history(self) -> int:
@@ -56,7 +69,9 @@ class Embodiment:
 
     @classmethod
     def of(cls, folder: Path, name: str | None) -> Embodiment:
-        """Read an embodiment from a processor's folder, by default the only one; raises `ConfigError`."""
+        """Read an embodiment from a processor's folder, by default the only one; raises
+        `ConfigError`.
+        """
         try:
             settings = json.loads((folder / CONFIG).read_text(encoding="utf-8"))["processor_kwargs"]
             statistics = json.loads((folder / STATISTICS).read_text(encoding="utf-8"))
@@ -68,7 +83,8 @@ class Embodiment:
             ) from error
         except (ValueError, KeyError, TypeError) as error:
             raise ConfigError(
-                f"checkpoint {folder}: {CONFIG} and {STATISTICS} are not those of GR00T's processor "
+                f"checkpoint {folder}: {CONFIG} and {STATISTICS} are not those of GR00T's "
+                "processor "
                 f"({type(error).__name__}: {error}); {_CURE}"
             ) from error
         known = sorted(set(configs) & set(statistics))
@@ -82,10 +98,16 @@ class Embodiment:
         config, numbers = configs[chosen], statistics[chosen]
         names = ("q01", "q99") if settings.get("use_percentiles") else ("min", "max")
         ranges = {
-            kind: {group: _range(folder, numbers, kind, group, names) for group in config[kind]["modality_keys"]}
+            kind: {
+                group: _range(folder, numbers, kind, group, names)
+                for group in config[kind]["modality_keys"]
+            }
             for kind in ("state", "action")
         }
-        widths = {kind: {group: len(one[names[0]]) for group, one in groups.items()} for kind, groups in ranges.items()}
+        widths = {
+            kind: {group: len(one[names[0]]) for group, one in groups.items()}
+            for kind, groups in ranges.items()
+        }
         return cls(
             chosen,
             tuple(config["video"]["modality_keys"]),
@@ -102,7 +124,9 @@ class Embodiment:
         )
 
     def require_fits(self, config: Any) -> None:
-        """Raise `ConfigError` unless the model of `config` has room for the state, the actions and the chunk's rows."""
+        """Raise `ConfigError` unless the model of `config` has room for the state, the actions
+        and the chunk's rows.
+        """
         for what, got, most in (
             ("state", sum(self.state.values()), config.max_state_dim),
             ("action", sum(self.action.values()), config.max_action_dim),
@@ -110,33 +134,48 @@ class Embodiment:
         ):
             if got > most:
                 raise ConfigError(
-                    f"embodiment {self.value!r}: its {what} has {got} {'rows' if what == 'chunk' else 'numbers'}, the "
+                    f"embodiment {self.value!r}: its {what} has {got} "
+                    f"{'rows' if what == 'chunk' else 'numbers'}, the "
                     f"model at most {most}: is the processor that of another checkpoint?"
                 )
 
 
-def _range(folder: Path, numbers: Mapping[str, Any], kind: str, group: str, names: tuple[str, str]) -> dict[str, Any]:
+def _range(
+    folder: Path, numbers: Mapping[str, Any], kind: str, group: str, names: tuple[str, str]
+) -> dict[str, Any]:
     """Return the bounds of a group of the state or of actions, which are finite."""
-    bounds = [np.asarray(numbers.get(kind, {}).get(group, {}).get(name, ()), np.float64) for name in names]
+    bounds = [
+        np.asarray(numbers.get(kind, {}).get(group, {}).get(name, ()), np.float64) for name in names
+    ]
     if bounds[0].ndim != 1 or not bounds[0].size or bounds[0].shape != bounds[1].shape:
         raise ConfigError(
-            f"checkpoint {folder}: {STATISTICS} has no {list(names)} of {kind} {group!r}, has those of "
+            f"checkpoint {folder}: {STATISTICS} has no {list(names)} of {kind} {group!r}, has "
+            "those of "
             f"{sorted(numbers.get(kind, {}))}; without them its numbers have no units: {_CURE}"
         )
     if not np.isfinite(bounds).all():
-        raise ConfigError(f"checkpoint {folder}: {list(names)} of {kind} {group!r} are not all finite; {_CURE}")
+        raise ConfigError(
+            f"checkpoint {folder}: {list(names)} of {kind} {group!r} are not all finite; {_CURE}"
+        )
     return dict(zip(names, (bound.tolist() for bound in bounds), strict=True))
 
 
 def _action(groups: Any, dim: int, *, converted: bool) -> ActionSpec:
     """Describe the actions by their relative groups.
 
-    Checkpoints call all other groups absolute, even displacements such as LIBERO's, so the contract does not state it.
-    GR00T converts relative groups to absolute ones if the processor has `use_relative_action`.
+    Checkpoints call all other groups absolute, even displacements such as LIBERO's, so the contract
+    does not state it. GR00T converts relative groups to absolute ones if the processor has
+    `use_relative_action`.
     """
     stated = [group for group in groups if converted and group["rep"] in _CONVERTED]
-    tables: Any = {"delta": (_CONVERTED, "rep"), "space": (_SPACES, "type"), "rotation": (_ROTATIONS, "format")}
-    found = {name: {table.get(group[key]) for group in stated} for name, (table, key) in tables.items()}
+    tables: Any = {
+        "delta": (_CONVERTED, "rep"),
+        "space": (_SPACES, "type"),
+        "rotation": (_ROTATIONS, "format"),
+    }
+    found = {
+        name: {table.get(group[key]) for group in stated} for name, (table, key) in tables.items()
+    }
     return ActionSpec(dim=dim, **{name: one.pop() for name, one in found.items() if len(one) == 1})
 
 
@@ -145,29 +184,39 @@ class Gr00tConfig(ModelConfig):
 
     checkpoint: str = Field(
         min_length=1,
-        description="folder of GR00T's training, such as outputs/checkpoint-{step}, or hub id: org/name, "
+        description="folder of GR00T's training, such as outputs/checkpoint-{step}, or hub id: "
+        "org/name, "
         "org/name@COMMIT",
     )
     source_dir: str | None = Field(
-        default=None, description="a checkout of Isaac-GR00T; unset: the variable GR00T_SRC, or what is installed"
+        default=None,
+        description="a checkout of Isaac-GR00T; unset: the variable GR00T_SRC, or what is "
+        "installed",
     )
     embodiment: str | None = Field(
-        default=None, description="the checkpoint's name of the robot, such as new_embodiment; unset: its only one"
+        default=None,
+        description="the checkpoint's name of the robot, such as new_embodiment; unset: its only "
+        "one",
     )
     backbone: str | None = Field(
         default=None,
-        description="N1.7: folder of the vision-language model that the checkpoint names, nvidia/Cosmos-Reason2-2B, "
+        description="N1.7: folder of the vision-language model that the checkpoint names, "
+        "nvidia/Cosmos-Reason2-2B, "
         "whose path must contain that name; unset: from the hub or its cache",
     )
-    steps: int | None = Field(default=None, ge=1, description="steps of the flow; unset: the checkpoint's, usually 4")
+    steps: int | None = Field(
+        default=None, ge=1, description="steps of the flow; unset: the checkpoint's, usually 4"
+    )
     spare_tokens: int = Field(
         default=32,
         ge=0,
-        description="compiled: tokens that a prompt may have beyond two words; a longer one runs without",
+        description="compiled: tokens that a prompt may have beyond two words; a longer one runs "
+        "without",
     )
     trust_remote_code: bool = Field(
         default=False,
-        description="run Python code in the checkpoint or its backbone: write access to them then gives all rights "
+        description="run Python code in the checkpoint or its backbone: write access to them then "
+        "gives all rights "
         "of this process",
     )
 
@@ -183,15 +232,19 @@ class Gr00tNetwork:
     model: Any
     processor: Any
     embodiment: Embodiment
-    # Held while a thread's processor reads an observation: its transforms store their parameters, and it changes the
-    # warning filters of the whole process.
+    # Held while a thread's processor reads an observation: its transforms store their parameters,
+    # and it changes the warning filters of the whole process.
     reading: threading.Lock = field(default_factory=threading.Lock, repr=False, compare=False)
 
     @classmethod
     def load(cls, config: Gr00tConfig) -> Gr00tNetwork:
-        """Read a checkpoint; raises `ConfigError` if a part of it is missing, unknown or randomly initialised."""
+        """Read a checkpoint; raises `ConfigError` if a part of it is missing, unknown or
+        randomly initialised.
+        """
         code = _use_checkout(config.source_dir)
-        folder = find_checkpoint(config.checkpoint, config.checkpoint_step, needs=[_MODEL, "*.safetensors"])
+        folder = find_checkpoint(
+            config.checkpoint, config.checkpoint_step, needs=[_MODEL, "*.safetensors"]
+        )
         _require_version(folder)
         beside = folder / "processor"  # where N1.7's training saves it
         about = folder if (folder / CONFIG).is_file() or not beside.is_dir() else beside
@@ -200,7 +253,8 @@ class Gr00tNetwork:
         dtype = torch_dtype(config.dtype, device)
         other = {} if config.backbone is None else {"model_name": config.backbone}
         transformers = require("transformers")
-        computes = device.type == "cuda" and dtype.itemsize == 2  # flash-attention, if it is installed
+        # flash-attention, if it is installed.
+        computes = device.type == "cuda" and dtype.itemsize == 2
         flash = computes and bool(require("transformers.utils").is_flash_attn_2_available())
         with (
             remote_code(allowed=config.trust_remote_code, source=code),
@@ -211,10 +265,18 @@ class Gr00tNetwork:
                 processor = transformers.AutoProcessor.from_pretrained(about, **other)
             except ConfigError:
                 raise
-            except (OSError, ValueError, KeyError, RuntimeError, AssertionError, TypeError) as error:
+            except (
+                OSError,
+                ValueError,
+                KeyError,
+                RuntimeError,
+                AssertionError,
+                TypeError,
+            ) as error:
                 raise ConfigError(
                     f"checkpoint {folder}: GR00T's code could not load it ({type(error).__name__}: "
-                    f"{str(error).strip()[:500]}); is it complete, of this checkout's version, and its backbone on the "
+                    f"{str(error).strip()[:500]}); is it complete, of this checkout's version, and "
+                    "its backbone on the "
                     f"hub, in the cache, or in a folder that `backbone` names?"
                 ) from error
         if not flash:
@@ -226,7 +288,8 @@ class Gr00tNetwork:
         if embodiment.value not in processor.embodiment_id_mapping:
             raise ConfigError(
                 f"embodiment {embodiment.value!r}: has no number in embodiment_id.json, which has "
-                f"{sorted(processor.embodiment_id_mapping)}; save the checkpoint's processor with it"
+                f"{sorted(processor.embodiment_id_mapping)}; save the checkpoint's processor with "
+                "it"
             )
         if config.steps is not None:
             model.action_head.num_inference_timesteps = config.steps
@@ -235,18 +298,24 @@ class Gr00tNetwork:
 
     @cached_property
     def masks_padding(self) -> bool:
-        """Whether all layers above the language model mask padding, as N1.6's usual transformer does."""
+        """Whether all layers above the language model mask padding, as N1.6's usual transformer
+        does.
+        """
         over = getattr(self.model.action_head, "vl_self_attention", None)
         plain = over is None or not list(over.parameters())
         return plain and bool(self.model.config.use_alternate_vl_dit)
 
     def inputs(
-        self, images: Sequence[dict[str, np.ndarray]], states: Sequence[dict[str, np.ndarray]], instruction: str
+        self,
+        images: Sequence[dict[str, np.ndarray]],
+        states: Sequence[dict[str, np.ndarray]],
+        instruction: str,
     ) -> dict[str, Any]:
         """Return the model's inputs for one row, to be passed to `chunks`.
 
         Args:
-            images: For each moment of the embodiment's video, oldest first, (H, W, 3) uint8 by camera.
+            images: For each moment of the embodiment's video, oldest first, (H, W, 3) uint8 by
+                camera.
             states: For each moment of its state, (D,) float32 by group.
             instruction: The task in words.
         """
@@ -260,11 +329,16 @@ class Gr00tNetwork:
             embodiment=robot,
         )
         with self.reading:
-            processed = self.processor([{"type": types.MessageType.EPISODE_STEP.value, "content": step}])
+            processed = self.processor(
+                [{"type": types.MessageType.EPISODE_STEP.value, "content": step}]
+            )
         return {"processed": processed, "raw": raw}
 
-    def chunks(self, rngs: Sequence[np.random.Generator], inputs: Sequence[dict[str, Any]]) -> list[np.ndarray]:
-        """Compute the chunks of rows, (horizon, D) float32 each, in one pass, or in one for each length of prompts.
+    def chunks(
+        self, rngs: Sequence[np.random.Generator], inputs: Sequence[dict[str, Any]]
+    ) -> list[np.ndarray]:
+        """Compute the chunks of rows, (horizon, D) float32 each, in one pass, or in one for each
+        length of prompts.
 
         Args:
             rngs: The generator of each row's noise.
@@ -292,28 +366,45 @@ class Gr00tNetwork:
 
         with require("torch").inference_mode(), RowDraws(rngs, self.model.action_head):
             drawn = fetch(self.model.get_action(**collated)["action_pred"].float())
-        raw = {group: np.stack([one["raw"][group] for one in inputs]) for group in self.embodiment.state}
+        raw = {
+            group: np.stack([one["raw"][group] for one in inputs])
+            for group in self.embodiment.state
+        }
         decoded = self.processor.decode_action(drawn, self.embodiment, raw)
-        return list(np.concatenate([decoded[group] for group in self.embodiment.action], axis=-1).astype(np.float32))
+        return list(
+            np.concatenate([decoded[group] for group in self.embodiment.action], axis=-1).astype(
+                np.float32
+            )
+        )
 
 
 def _use_checkout(source_dir: str | None) -> Path:
-    """Make GR00T's code importable; return the folder of its models, which hold code that transformers imports."""
+    """Make GR00T's code importable; return the folder of its models, which hold code that
+    transformers imports.
+    """
     use_source("gr00t", SOURCE, source_dir)
     if importlib.util.find_spec("gr00t.policy") is None:
         raise ConfigError(
-            f"{source_dir or os.environ.get(SOURCE) or 'gr00t'}: is GR00T's code of N1.5 or before, want that of N1.6 "
+            f"{source_dir or os.environ.get(SOURCE) or 'gr00t'}: is GR00T's code of N1.5 or "
+            "before, want that of N1.6 "
             f"or N1.7; serve N1.5 by its own server, and the policy `upstream` in front of it"
         )
-    os.environ.setdefault("NO_ALBUMENTATIONS_UPDATE", "1")  # otherwise its import queries PyPI for a newer version
+    # Otherwise its import queries PyPI for a newer version.
+    os.environ.setdefault("NO_ALBUMENTATIONS_UPDATE", "1")
     ensure_torchvision()
     return Path(str(require("gr00t.model").__file__)).parent
 
 
 def _converted(model: Any, saved: SavedTensors, device: Any, dtype: Any) -> Any:
-    """Move a model to a device and a dtype; N1.6's backbone is always read in bfloat16, which rounds."""
+    """Move a model to a device and a dtype; N1.6's backbone is always read in bfloat16, which
+    rounds.
+    """
     rounded, held = require("torch").bfloat16, set(saved)
-    names = {name for name, one in model.state_dict().items() if one.dtype == rounded != dtype and name in held}
+    names = {
+        name
+        for name, one in model.state_dict().items()
+        if one.dtype == rounded != dtype and name in held
+    }
     model = model.to(device=device, dtype=dtype)
     for name, tensor in model.state_dict().items():
         if name in names:
@@ -326,17 +417,24 @@ def _require_version(folder: Path) -> None:
     try:
         kind = json.loads((folder / _MODEL).read_text(encoding="utf-8")).get("model_type")
     except (ValueError, AttributeError) as error:
-        raise ConfigError(f"checkpoint {folder}: {_MODEL} cannot be read ({error}); copy it again") from error
+        raise ConfigError(
+            f"checkpoint {folder}: {_MODEL} cannot be read ({error}); copy it again"
+        ) from error
     known = sorted(one.model_type for one in require("gr00t.model").MODEL_REGISTRY)
     if kind not in known:
         cure = (
-            "N1.5's code is another: serve it by its own server, and the policy `upstream` in front of it"
+            (
+                "N1.5's code is another: serve it by its own server, and the policy `upstream` in "
+                "front of it"
+            )
             if "n1_5" in str(kind).lower()
             else "one that LeRobot saved is served by the policy `lerobot`"
             if kind is None
             else "name the checkout of its version"
         )
-        raise ConfigError(f"checkpoint {folder}: got model_type {kind!r}, this checkout has {known}; {cure}")
+        raise ConfigError(
+            f"checkpoint {folder}: got model_type {kind!r}, this checkout has {known}; {cure}"
+        )
 
 
 _FLASH, _PACKED = "flash_attention_2", "packed_sdpa"
@@ -345,7 +443,9 @@ _CHECK = "_check_and_enable_flash_attn_2"  # a method of transformers' models, u
 
 @contextlib.contextmanager
 def built_without_flash_attention() -> Iterator[None]:
-    """Allow models that require flash-attention, such as N1.6's backbone, to be built without it in this context."""
+    """Allow models that require flash-attention, such as N1.6's backbone, to be built without it
+    in this context.
+    """
     base: Any = require("transformers").PreTrainedModel
     check = vars(base).get(_CHECK)
     if check is None:  # newer: N1.7's, which falls back to another attention
@@ -359,7 +459,9 @@ def built_without_flash_attention() -> Iterator[None]:
 
 
 def use_torch_attention(model: Any) -> None:
-    """Replace flash-attention by torch's attention; N1.6's vision tower attends within each image."""
+    """Replace flash-attention by torch's attention; N1.6's vision tower attends within each
+    image.
+    """
     transformers = require("transformers.modeling_utils")
     for module in model.modules():
         config: Any = getattr(module, "config", None)
@@ -370,7 +472,15 @@ def use_torch_attention(model: Any) -> None:
 
 
 def packed_attention(
-    _: Any, query: Any, key: Any, value: Any, __: Any = None, *, scaling: float, seq_len_list: Sequence[int], **___: Any
+    _: Any,
+    query: Any,
+    key: Any,
+    value: Any,
+    __: Any = None,
+    *,
+    scaling: float,
+    seq_len_list: Sequence[int],
+    **___: Any,
 ) -> tuple[Any, None]:
     """Attend within each of several concatenated sequences.
 
@@ -386,20 +496,26 @@ def packed_attention(
     """
     attention = require("torch.nn.functional").scaled_dot_product_attention
     if len(set(seq_len_list)) == 1:  # equal lengths: one call, with a row for each sequence
-        rows = [one[0].unflatten(1, (-1, seq_len_list[0])).transpose(0, 1) for one in (query, key, value)]
+        rows = [
+            one[0].unflatten(1, (-1, seq_len_list[0])).transpose(0, 1)
+            for one in (query, key, value)
+        ]
         return attention(*rows, scale=scaling).transpose(1, 2).flatten(0, 1)[None], None
     parts = zip(*(one.split(list(seq_len_list), dim=2) for one in (query, key, value)), strict=True)
-    return require("torch").cat([attention(*part, scale=scaling) for part in parts], dim=2).transpose(1, 2), None
+    return require("torch").cat(
+        [attention(*part, scale=scaling) for part in parts], dim=2
+    ).transpose(1, 2), None
 
 
-_MASKS = ("image_mask", "backbone_attention_mask")  # of tokens (B, S), arguments of N1.6's usual transformer and N1.7's
+# Of tokens (B, S), arguments of N1.6's usual transformer and N1.7's.
+_MASKS = ("image_mask", "backbone_attention_mask")
 
 
 def compile_with(transformer: Any, spare: int, compilation: Compilation) -> None:
     """Compile the transformer that a GR00T network calls in each step of the flow.
 
-    If it masks padding, prompts with up to `spare` tokens more than those of the first call, the warm-up's, are padded
-    to one shape.
+    If it masks padding, prompts with up to `spare` tokens more than those of the first call, the
+    warm-up's, are padded to one shape.
     """
     functional, forward = require("torch.nn.functional"), transformer.forward
 
@@ -410,11 +526,16 @@ def compile_with(transformer: Any, spare: int, compilation: Compilation) -> None
     core, length = compilation.core("denoise", denoise), 0
 
     def call(hidden_states: Any, encoder_hidden_states: Any, timestep: Any, **given: Any) -> Any:
-        """Return the core's result; the cache of keys and values is not used, as it is of this act alone."""
+        """Return the core's result; the cache of keys and values is not used, as it is of this
+        act alone.
+        """
         nonlocal length
         if not compilation.mode:
             return forward(hidden_states, encoder_hidden_states, timestep, **given)
-        seen, masks = encoder_hidden_states, [given[name] for name in _MASKS if given.get(name) is not None]
+        seen, masks = (
+            encoder_hidden_states,
+            [given[name] for name in _MASKS if given.get(name) is not None],
+        )
         length = length or seen.shape[1] + spare
         if masks and (missing := length - seen.shape[1]) > 0:
             seen = functional.pad(seen, (0, 0, 0, missing))
@@ -424,13 +545,17 @@ def compile_with(transformer: Any, spare: int, compilation: Compilation) -> None
     transformer.forward = call
 
 
-USUAL_CAMERAS = {"image": "front", "wrist_image": "wrist"}  # of LIBERO; other embodiments use the checkpoint's names
-GRIPPER_QPOS = "gripper_qpos"  # the part of the state for a group `gripper` with several numbers, as in LIBERO
+# Of LIBERO; other embodiments use the checkpoint's names.
+USUAL_CAMERAS = {"image": "front", "wrist_image": "wrist"}
+# The part of the state for a group `gripper` with several numbers, as in LIBERO.
+GRIPPER_QPOS = "gripper_qpos"
 
 
 @dataclass(frozen=True)
 class SeenByGr00t:
-    """An observation by the embodiment's names, and the model's inputs if they need no other observation."""
+    """An observation by the embodiment's names, and the model's inputs if they need no other
+    observation.
+    """
 
     images: dict[str, np.ndarray]  # (H, W, 3) uint8
     state: dict[str, np.ndarray]  # (D,) float32
@@ -455,35 +580,50 @@ class Gr00t(ModelPolicy):
 
     @property
     def contract(self) -> Contract:
-        """The contract of the embodiment; before the checkpoint is loaded it states only the instruction."""
+        """The contract of the embodiment; before the checkpoint is loaded it states only the
+        instruction.
+        """
         if self.model is None:
             return Contract(instruction=True)
         robot = self.model.embodiment
         parts = self._parts(robot)
         own = {part: StateSpec(width) for part, width in parts.items() if part != GRIPPER}
         state = {"state": own} if self.config.state is None else {}
-        return self.stated(self._cameras(robot), list(parts), robot.horizon, action=robot.spec, **state)
+        return self.stated(
+            self._cameras(robot), list(parts), robot.horizon, action=robot.spec, **state
+        )
 
     def load(self) -> Gr00tNetwork:
         """Read the checkpoint; raises `ConfigError` for settings that do not fit it."""
         network = Gr00tNetwork.load(self.config)
         self._cameras(network.embodiment)
-        self.statistics = {"parts": list(self._parts(network.embodiment)), **network.embodiment.ranges}
+        self.statistics = {
+            "parts": list(self._parts(network.embodiment)),
+            **network.embodiment.ranges,
+        }
         compile_with(network.model.action_head.model, self.config.spare_tokens, self.compilation)
         return network
 
     def perceive(self, obs: Obs) -> SeenByGr00t:
-        """Return the images and the state by the embodiment's names, and, without a history, the model's inputs."""
+        """Return the images and the state by the embodiment's names, and, without a history, the
+        model's inputs.
+        """
         network = self.loaded()
         robot = network.embodiment
-        images = {name: image.copy() for name, image in camera_images(obs, self._cameras(robot)).items()}
+        images = {
+            name: image.copy() for name, image in camera_images(obs, self._cameras(robot)).items()
+        }
         vector = state_vector(obs, list(self._parts(robot)), self.state_dim)
         ends = np.cumsum([0, *robot.state.values()])
-        state = {group: vector[a:b] for group, (a, b) in zip(robot.state, pairwise(ends), strict=True)}
+        state = {
+            group: vector[a:b] for group, (a, b) in zip(robot.state, pairwise(ends), strict=True)
+        }
         if self.history > 1:
             return SeenByGr00t(images, state)
         moments = (len(robot.moments["video"]), len(robot.moments["state"]))
-        inputs = network.inputs([images] * moments[0], [state] * moments[1], self._begun().instruction)
+        inputs = network.inputs(
+            [images] * moments[0], [state] * moments[1], self._begun().instruction
+        )
         return SeenByGr00t(images, state, inputs)
 
     def predict(self, rows: Sequence[Row]) -> list[Prediction | Exception]:
@@ -511,7 +651,8 @@ class Gr00t(ModelPolicy):
         if self.config.state is not None:
             return dict.fromkeys(self.config.state)
         return {
-            GRIPPER_QPOS if group == GRIPPER and width > 1 else group: width for group, width in robot.state.items()
+            GRIPPER_QPOS if group == GRIPPER and width > 1 else group: width
+            for group, width in robot.state.items()
         }
 
     def _cameras(self, robot: Embodiment) -> dict[str, str]:

@@ -1,4 +1,6 @@
-"""Keys and values of a transformers cache as one tensor, which a compiled core can take and return."""
+"""Keys and values of a transformers cache as one tensor, which a compiled core can take and
+return.
+"""
 
 from __future__ import annotations
 
@@ -7,14 +9,18 @@ from typing import Any
 
 
 def layers_of(cache: Any) -> list[tuple[Any, Any]]:
-    """Return keys and values of each layer of a transformers `DynamicCache`; its versions differ in where they are."""
+    """Return keys and values of each layer of a transformers `DynamicCache`; its versions differ
+    in where they are.
+    """
     if hasattr(cache, "layers"):
         return [(layer.keys, layer.values) for layer in cache.layers]
     return [cache[number] for number in range(len(cache))]
 
 
 def stack_of(layers: Sequence[tuple[Any, Any]]) -> Any:
-    """Return the keys and values (B, heads, L, E) of each layer in one tensor (B, layers, 2, heads, L, E)."""
+    """Return the keys and values (B, heads, L, E) of each layer in one tensor (B, layers, 2,
+    heads, L, E).
+    """
     import torch  # the compiler follows a statement, and not `require`
 
     return torch.stack([torch.stack(layer, 1) for layer in layers], 1)
@@ -22,7 +28,8 @@ def stack_of(layers: Sequence[tuple[Any, Any]]) -> Any:
 
 def cache_of(layers: Sequence[Any]) -> Any:
     """Return a transformers `DynamicCache` with these keys and values, (B, 2, …) for each layer."""
-    # The compiler follows a statement, and not `require`; nor does it follow the lazy module `transformers` itself.
+    # The compiler follows a statement, and not `require`; nor does it follow the lazy module
+    # `transformers` itself.
     from transformers.cache_utils import DynamicCache
 
     cache = DynamicCache()

@@ -1,4 +1,5 @@
-"""Python code of models from elsewhere: a checkout of their repository, or code in or named by a checkpoint.
+"""Python code of models from elsewhere: a checkout of their repository, or code in or named by a
+checkpoint.
 
 The code of a checkpoint runs with all rights of this process.
 """
@@ -19,11 +20,14 @@ from vlagents_ray.registry import require
 CURE = "if you trust everyone with write access to it, set trust_remote_code: true"
 
 
-def use_source(package: str, variable: str, source_dir: str | None = None, within: Sequence[str] = (".",)) -> None:
-    """Make `package` importable: from `source_dir`, from the checkout that `variable` names, or from an installation.
+def use_source(
+    package: str, variable: str, source_dir: str | None = None, within: Sequence[str] = (".",)
+) -> None:
+    """Make `package` importable: from `source_dir`, from the checkout that `variable` names, or
+    from an installation.
 
-    A named checkout has priority, since Python would import any folder with the package's name, such as a checkout in
-    the working directory.
+    A named checkout has priority, since Python would import any folder with the package's name,
+    such as a checkout in the working directory.
 
     Args:
         package: The name of the package.
@@ -37,11 +41,16 @@ def use_source(package: str, variable: str, source_dir: str | None = None, withi
     checkout = source_dir or os.environ.get(variable)
     if not checkout and importlib.util.find_spec(package) is not None:
         return
-    folders = [] if not checkout else [Path(checkout).expanduser().resolve() / folder for folder in within]
+    folders = (
+        []
+        if not checkout
+        else [Path(checkout).expanduser().resolve() / folder for folder in within]
+    )
     if not folders or not (folders[0] / package).is_dir():
         where = f"${variable}, which is not set" if not checkout else f"{checkout!r}"
         raise ConfigError(
-            f"{package!r}: neither installed nor in {where}; check out its repository, and name that folder as the "
+            f"{package!r}: neither installed nor in {where}; check out its repository, and name "
+            "that folder as the "
             f"policy's source_dir or in {variable}"
         )
     sys.path[:0] = [str(folder) for folder in folders if str(folder) not in sys.path]
@@ -49,33 +58,40 @@ def use_source(package: str, variable: str, source_dir: str | None = None, withi
 
 @contextlib.contextmanager
 def remote_code(*, allowed: bool, source: Path | None = None) -> Iterator[None]:
-    """Keep transformers from importing code of a checkpoint or hub repository in this context, unless it is allowed.
+    """Keep transformers from importing code of a checkpoint or hub repository in this context,
+    unless it is allowed.
 
-    This also holds if a library requests such code: some pass `trust_remote_code=True` with a name that they read from
-    the checkpoint. A model that needs the code fails with a `ConfigError`.
+    This also holds if a library requests such code: some pass `trust_remote_code=True` with a name
+    that they read from the checkpoint. A model that needs the code fails with a `ConfigError`.
 
     Args:
         allowed: Whether all code may be imported.
-        source: The folder of a family's own code, which may be imported: some load a part of it in this way.
+        source: The folder of a family's own code, which may be imported: some load a part of it in
+            this way.
     """
     if allowed or importlib.util.find_spec("transformers") is None:
         yield
         return
     dynamic: Any = require("transformers.dynamic_module_utils")
-    # All imports of such code pass through these three: the first finds it and calls the second, which copies it to the
-    # cache; the third executes it.
+    # All imports of such code pass through these three: the first finds it and calls the second,
+    # which copies it to the cache; the third executes it.
     names = ("get_cached_module_file", "create_dynamic_module", "get_class_in_module")
     find, create, execute = ways = [getattr(dynamic, name) for name in names]
     own: set[str] = set()  # copies of the source's files
     finding_own = False
 
     def refuse(name: Any) -> NoReturn:
-        raise ConfigError(f"{str(name)!r}: is Python code of the checkpoint, or of what it names on the hub; {CURE}")
+        raise ConfigError(
+            f"{str(name)!r}: is Python code of the checkpoint, or of what it names on the hub; "
+            f"{CURE}"
+        )
 
     def find_own(folder: Any, *args: Any, **options: Any) -> Any:
         nonlocal finding_own
         place = Path(folder)
-        finding_own = source is not None and place.is_dir() and source.resolve() in place.resolve().parents
+        finding_own = (
+            source is not None and place.is_dir() and source.resolve() in place.resolve().parents
+        )
         try:
             copy = find(folder, *args, **options)
             own.update([copy] if finding_own else [])

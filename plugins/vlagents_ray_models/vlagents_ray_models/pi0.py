@@ -1,7 +1,8 @@
 """π0 in Hugging Face transformers: PaliGemma and an action expert with flow matching.
 
-A checkpoint is the folder of `PI0ForConditionalGeneration.save_pretrained` and `PI0Processor.save_pretrained`.
-Physical Intelligence's own code and checkpoints are `vlagents_ray_models.openpi`.
+A checkpoint is the folder of `PI0ForConditionalGeneration.save_pretrained` and
+`PI0Processor.save_pretrained`. Physical Intelligence's own code and checkpoints are
+`vlagents_ray_models.openpi`.
 """
 
 from __future__ import annotations
@@ -23,7 +24,12 @@ from vlagents_ray.policies.base import ModelConfig, ModelPolicy, Prediction, Row
 from vlagents_ray.policies.base.accelerator import ensure_torchvision, torch_device, torch_dtype
 from vlagents_ray.policies.base.checkpoint import find_checkpoint, from_pretrained
 from vlagents_ray.policies.base.config import Guidance, NoiseLevel
-from vlagents_ray.policies.base.model_inputs import camera_images, choose_cameras, resize_with_pad, state_vector
+from vlagents_ray.policies.base.model_inputs import (
+    camera_images,
+    choose_cameras,
+    resize_with_pad,
+    state_vector,
+)
 from vlagents_ray.policies.base.staging import StagedRow, Staging
 from vlagents_ray.policies.compilation import Compilation
 from vlagents_ray.policies.flow import OFFERED, FlowPasses
@@ -32,7 +38,8 @@ from vlagents_ray_models.key_value_cache import cache_of, layers_of, stack_of
 
 logger = logging.getLogger(__name__)
 
-CAMERAS = ("base_0_rgb", "left_wrist_0_rgb", "right_wrist_0_rgb")  # openpi's names, in the order of the image tokens
+# openpi's names, in the order of the image tokens.
+CAMERAS = ("base_0_rgb", "left_wrist_0_rgb", "right_wrist_0_rgb")
 USUAL_CAMERAS = {"base_0_rgb": "front", "left_wrist_0_rgb": "wrist"}
 USUAL_STATE = ("xyz_axis_angle", "gripper_qpos")  # LIBERO
 _ROUNDING = 1e-5  # of float32, for pixels of about 1
@@ -50,15 +57,21 @@ class Pi0Config(ModelConfig):
 
     cameras: dict[str, str] | None = Field(
         default=None,
-        description=f"those of {', '.join(CAMERAS)} that it was trained with -> ours; unset: {USUAL_CAMERAS}",
+        description=f"those of {', '.join(CAMERAS)} that it was trained with -> ours; unset: "
+        f"{USUAL_CAMERAS}",
     )
     images: InputStyle | None = Field(
         default=None,
-        description="whose code prepared images and instructions in training: openpi for weights converted from there; "
+        description="whose code prepared images and instructions in training: openpi for weights "
+        "converted from there; "
         "unset: transformers, unless its image processor resizes bilinearly or does not pad",
     )
-    steps: int | None = Field(default=None, ge=1, description="steps of the flow; unset: the checkpoint's, usually 10")
-    max_tokens: int = Field(default=48, ge=1, description="tokens of an instruction, as in training; more are refused")
+    steps: int | None = Field(
+        default=None, ge=1, description="steps of the flow; unset: the checkpoint's, usually 10"
+    )
+    max_tokens: int = Field(
+        default=48, ge=1, description="tokens of an instruction, as in training; more are refused"
+    )
     guidance: Guidance = 5.0
     noise_level: NoiseLevel = 0.0
 
@@ -82,7 +95,9 @@ class LoadedPi0:
         return replace(row, leftover=(row.leftover - mean) / std)
 
     def actions(self, flow: np.ndarray) -> np.ndarray:
-        """Convert the model's output, (..., max_action_dim), to actions (..., D) in the robot's units."""
+        """Convert the model's output, (..., max_action_dim), to actions (..., D) in the robot's
+        units.
+        """
         mean, std = self._statistics()
         return np.asarray(flow[..., : len(mean)] * std + mean)
 
@@ -130,7 +145,9 @@ class Pi0(ModelPolicy):
         device = torch_device(self.config.device)
         dtype = torch_dtype(self.config.dtype, device)
         ensure_torchvision()
-        network = from_pretrained(require("transformers").PI0ForConditionalGeneration, path, dtype=dtype)
+        network = from_pretrained(
+            require("transformers").PI0ForConditionalGeneration, path, dtype=dtype
+        )
         network = network.eval().requires_grad_(False).to(device)
         passes = Pi0HfPasses(network, self.compilation)
         passes.adapters = self.adapters
@@ -145,16 +162,20 @@ class Pi0(ModelPolicy):
         try:
             saved = dict(json.loads(file.read_text(encoding="utf-8"))) if file.is_file() else {}
         except (TypeError, ValueError) as error:
-            raise ConfigError(f"{file}: is no processor's config ({error}); copy it again") from error
+            raise ConfigError(
+                f"{file}: is no processor's config ({error}); copy it again"
+            ) from error
         base = {name: list(getattr(self.loaded().processor, name)) for name in _STATISTICS}
         if other := [name for name in _STATISTICS if saved.get(name) not in (None, base[name])]:
             raise ConfigError(
-                f"{file}: got other {other} than the base has, want the same; merge the adapter into its base, and "
+                f"{file}: got other {other} than the base has, want the same; merge the adapter "
+                "into its base, and "
                 f"serve that as a checkpoint of its own"
             )
 
     def perceive(self, obs: Obs) -> StagedRow:
-        """Return the model's inputs for one row: resized images, normalised state, and the episode's tokens.
+        """Return the model's inputs for one row: resized images, normalised state, and the
+        episode's tokens.
 
         Several threads call it, so it never uses the tokenizer, whose padding is mutable state.
         """
@@ -164,22 +185,29 @@ class Pi0(ModelPolicy):
         state = np.zeros(processor.max_state_dim, np.float32)
         values = state_vector(obs, self.state, self.state_dim)
         state[: len(values)] = processor.normalize(torch.from_numpy(values), "state")
-        staged: StagedRow = self.loaded().staging.stage({**self._begun().prompt, **images, "state": state})
+        staged: StagedRow = self.loaded().staging.stage(
+            {**self._begun().prompt, **images, "state": state}
+        )
         return staged
 
     def _style(self, processor: Any) -> InputStyle:
         """Return whose preparation of images and instructions the checkpoint was trained with."""
         images = processor.image_processor
         resizes_as_openpi = images.resample is not None and int(images.resample) == _BILINEAR
-        usual: InputStyle = "transformers" if images.do_resize and images.do_pad and not resizes_as_openpi else "openpi"
+        usual: InputStyle = (
+            "transformers"
+            if images.do_resize and images.do_pad and not resizes_as_openpi
+            else "openpi"
+        )
         return self.config.images or usual
 
     def _resized(self, images: Sequence[np.ndarray]) -> dict[str, np.ndarray]:
         """Resize the images (H, W, 3) of all cameras, and pad them with zeros.
 
         Returns:
-            "images" (cameras, S, S, 3) uint8; as in transformers, also "sizes" (cameras, 2) int64, in pixels: those of
-            the resized images at the upper left, since transformers pads them after it has scaled the colours.
+            "images" (cameras, S, S, 3) uint8; as in transformers, also "sizes" (cameras, 2) int64,
+            in pixels: those of the resized images at the upper left, since transformers pads them
+            after it has scaled the colours.
         """
         processor = self.loaded().processor.image_processor
         height, width = processor.pad_size["height"], processor.pad_size["width"]
@@ -201,7 +229,9 @@ class Pi0(ModelPolicy):
         return {"images": padded, "sizes": sizes}
 
     def _begin(self, instruction: str, seed: int, adapter: str = "") -> None:
-        """Begin an episode and tokenize its instruction; one longer than in training is refused, not truncated."""
+        """Begin an episode and tokenize its instruction; one longer than in training is refused,
+        not truncated.
+        """
         super()._begin(instruction, seed, adapter)
         if self.model is None:
             return
@@ -217,12 +247,14 @@ class Pi0(ModelPolicy):
         )
         if (got := int(tokens["attention_mask"].sum()) - patches) > most:
             raise InvalidObservation(
-                f"instruction: got {got} tokens, want at most {most}, as in training; shorten it, or set the policy's "
+                f"instruction: got {got} tokens, want at most {most}, as in training; shorten it, "
+                "or set the policy's "
                 f"max_tokens"
             )
         if int((tokens["input_ids"] == processor.image_token_id).sum()) != patches:
             raise InvalidObservation(
-                f"instruction: got {processor.image_token!r} in {instruction!r}, want words; it stands for an image"
+                f"instruction: got {processor.image_token!r} in {instruction!r}, want words; it "
+                "stands for an image"
             )
         self._begun().prompt = {name: array[0] for name, array in tokens.items()}
 
@@ -237,39 +269,59 @@ class Pi0(ModelPolicy):
                 [model.planned(row) for row in rows],
                 [[inputs["pixel_values"]], cameras, *others],
                 owners,
-                noise=np.stack([row.noise(settings.chunk_size, settings.max_action_dim) for row in rows]),
+                noise=np.stack(
+                    [row.noise(settings.chunk_size, settings.max_action_dim) for row in rows]
+                ),
                 steps=self.config.steps or settings.num_inference_steps,
                 config=self.config,
                 dim=len(model.processor.actions_mean),
                 convert=model.staging.upload,
             )
-        return [Prediction(model.actions(flow), behaviour=stated.get(i, {})) for i, flow in enumerate(flows)]
+        return [
+            Prediction(model.actions(flow), behaviour=stated.get(i, {}))
+            for i, flow in enumerate(flows)
+        ]
 
     def _inputs(self, rows: Sequence[Row]) -> Mapping[str, Any]:
-        """Stack the last frames of rows, with their images scaled on the device as the image processor does."""
+        """Stack the last frames of rows, with their images scaled on the device as the image
+        processor does.
+        """
         model, torch = self.loaded(), require("torch")
         inputs = model.staging.stack([row.frames[-1] for row in rows])
         images = inputs.pop("images").movedim(-1, 2)  # (P, cameras, 3, S, S)
         factor, summand, padding = model.scale
-        pixels = images.to(torch.float32, memory_format=torch.contiguous_format).mul_(factor).add_(summand)
+        pixels = (
+            images.to(torch.float32, memory_format=torch.contiguous_format)
+            .mul_(factor)
+            .add_(summand)
+        )
         if (sizes := inputs.pop("sizes", None)) is not None:
             height, width = images.shape[-2:]
-            rows_inside = torch.arange(height, device=images.device) < sizes[..., :1]  # (P, cameras, S)
+            # (P, cameras, S)
+            rows_inside = torch.arange(height, device=images.device) < sizes[..., :1]
             columns_inside = torch.arange(width, device=images.device) < sizes[..., 1:]
             inside = rows_inside[..., :, None] & columns_inside[..., None, :]
             pixels = torch.where(inside[:, :, None], pixels, padding)
         return {
             **inputs,
             "pixel_values": pixels.to(model.dtype),
-            "pixel_attention_mask": torch.ones(images.shape[:2], dtype=torch.bool, device=images.device),
+            "pixel_attention_mask": torch.ones(
+                images.shape[:2], dtype=torch.bool, device=images.device
+            ),
             "state": inputs["state"].to(model.dtype),
         }
 
 
 def _cameras(chosen: Mapping[str, str] | None) -> dict[str, str]:
-    """Sort the cameras by the model's image tokens; a checkpoint may be trained without some of them."""
+    """Sort the cameras by the model's image tokens; a checkpoint may be trained without some of
+    them.
+    """
     asked = USUAL_CAMERAS if chosen is None else chosen
-    known = [name for name in CAMERAS if name in asked] if asked and set(asked) <= set(CAMERAS) else CAMERAS
+    known = (
+        [name for name in CAMERAS if name in asked]
+        if asked and set(asked) <= set(CAMERAS)
+        else CAMERAS
+    )
     return choose_cameras(chosen, USUAL_CAMERAS, known)
 
 
@@ -282,14 +334,16 @@ def _processor(path: Path) -> Any:
     processor = require("transformers").PI0Processor.from_pretrained(path, local_files_only=True)
     if absent := [name for name in _STATISTICS if getattr(processor, name) is None]:
         raise ConfigError(
-            f"checkpoint {path}: {_PROCESSOR} has no {absent}; want those of the dataset it was trained on: "
+            f"checkpoint {path}: {_PROCESSOR} has no {absent}; want those of the dataset it was "
+            "trained on: "
             f"PI0Processor(…, {absent[0]}=[…]).save_pretrained(folder) writes them"
         )
     return processor
 
 
 def _scale(processor: Any, staging: Staging) -> tuple[Any, Any, Any]:
-    """Return the factor and the summand by which a processor converts pixels, and the colour with which it pads them.
+    """Return the factor and the summand by which a processor converts pixels, and the colour with
+    which it pads them.
 
     They are (3, 1, 1) float32 on the device.
 
@@ -299,27 +353,43 @@ def _scale(processor: Any, staging: Staging) -> tuple[Any, Any, Any]:
     side = processor.image_processor.pad_size
     levels = np.resize(np.arange(256, dtype=np.uint8), (side["height"], side["width"]))
     image = np.repeat(levels[..., None], 3, axis=2)
-    found = np.asarray(processor.image_processor([image], return_tensors="np")["pixel_values"][0], np.float32)
+    found = np.asarray(
+        processor.image_processor([image], return_tensors="np")["pixel_values"][0], np.float32
+    )
     summand = found[:, :1, :1]  # of black, the first pixel
     factor = (found[:, levels == 255][:, :1, None] - summand) / np.float32(255)
-    if found.shape != (3, *levels.shape) or not np.allclose(levels * factor + summand, found, atol=_ROUNDING):
+    if found.shape != (3, *levels.shape) or not np.allclose(
+        levels * factor + summand, found, atol=_ROUNDING
+    ):
         raise ConfigError(
-            f"{_PROCESSOR}: its image processor changes an image of {levels.shape} by more than a factor and a summand "
+            f"{_PROCESSOR}: its image processor changes an image of {levels.shape} by more than a "
+            "factor and a summand "
             f"for each channel, want do_rescale and do_normalize alone; images are resized before"
         )
-    wide = processor.image_processor([image[: len(image) // 2]], return_tensors="np")["pixel_values"][0]
-    padding = np.asarray(wide[:, -1:, -1:], np.float32) if wide.shape == found.shape else np.zeros_like(summand)
+    wide = processor.image_processor([image[: len(image) // 2]], return_tensors="np")[
+        "pixel_values"
+    ][0]
+    padding = (
+        np.asarray(wide[:, -1:, -1:], np.float32)
+        if wide.shape == found.shape
+        else np.zeros_like(summand)
+    )
     return staging.upload(factor), staging.upload(summand), staging.upload(padding)
 
 
 class Pi0HfPasses(FlowPasses):
     """The passes of a `PI0ForConditionalGeneration`.
 
-    As in openpi, actions stay in float32 between the steps even if the model computes in another type.
+    As in openpi, actions stay in float32 between the steps even if the model computes in another
+    type.
     """
 
-    def encode(self, tokens: Any, mask: Any, cameras: Any, state: Any, *images: Any) -> tuple[Any, Any]:
-        """Return keys and values (P, layers, 2, heads, L, E), and the mask; `images` is one (P, cameras, 3, S, S)."""
+    def encode(
+        self, tokens: Any, mask: Any, cameras: Any, state: Any, *images: Any
+    ) -> tuple[Any, Any]:
+        """Return keys and values (P, layers, 2, heads, L, E), and the mask; `images` is one (P,
+        cameras, 3, S, S).
+        """
         cache = self.model.model.vlm(
             inputs_embeds=self.model.model.embed_prefix(tokens, images[0], cameras),
             attention_mask=mask,
@@ -332,18 +402,22 @@ class Pi0HfPasses(FlowPasses):
     def velocity(self, encoded: Any, seen: Any, state: Any, actions: Any, times: Any) -> Any:
         cache = cache_of(encoded.unbind(1))  # of this step alone: later ones must not attend to it
         noise = actions.to(state.dtype)
-        output = self.model(state=state, noise=noise, timestep=times, attention_mask=seen, past_key_values=cache)
+        output = self.model(
+            state=state, noise=noise, timestep=times, attention_mask=seen, past_key_values=cache
+        )
         return output.logits.float()
 
 
 def flow_velocity(
     network: Any, inputs: Mapping[str, Any], dtype: Any, owners: Sequence[int] | None = None
 ) -> Callable[[Any, float], Any]:
-    """Return the velocity for a learner, as a function of noisy actions (B, H, D) and time; inputs are encoded once.
+    """Return the velocity for a learner, as a function of noisy actions (B, H, D) and time; inputs
+    are encoded once.
 
     Args:
         network: The `PI0ForConditionalGeneration`.
-        inputs: Tokens, images and states of P observations, as `PI0Processor` returns them, on the network's device.
+        inputs: Tokens, images and states of P observations, as `PI0Processor` returns them, on the
+            network's device.
         dtype: The type in which the network computes.
         owners: The observation of each of the B rows; None: row i belongs to observation i.
 

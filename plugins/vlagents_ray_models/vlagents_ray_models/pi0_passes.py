@@ -13,16 +13,25 @@ class Pi0Passes(FlowPasses):
     """The passes of openpi's PyTorch port of π0 and π0.5, which LeRobot has copied."""
 
     def __init__(self, model: Any, compilation: Compilation, *, stated: bool = True) -> None:
-        """Use the passes of a `PI0Pytorch` or `PI05Pytorch`; `stated`: whether its `denoise_step` takes the state."""
+        """Use the passes of a `PI0Pytorch` or `PI05Pytorch`; `stated`: whether its
+        `denoise_step` takes the state.
+        """
         self._stated = stated
-        model.paligemma_with_expert.paligemma.model.language_model.config._attn_implementation = "eager"
+        model.paligemma_with_expert.paligemma.model.language_model.config._attn_implementation = (
+            "eager"
+        )
         super().__init__(model, compilation)
-        own = getattr(model, "_prepare_attention_masks_4d", None)  # a function in newer versions of LeRobot
+        # A function in newer versions of LeRobot.
+        own = getattr(model, "_prepare_attention_masks_4d", None)
         self._mask_4d = own or self.module.prepare_attention_masks_4d
 
-    def encode(self, tokens: Any, mask: Any, cameras: Any, state: Any, *images: Any) -> tuple[Any, Any]:
+    def encode(
+        self, tokens: Any, mask: Any, cameras: Any, state: Any, *images: Any
+    ) -> tuple[Any, Any]:
         """Return keys and values, and which tokens are there; the state is not read."""
-        embedded, seen, causal = self.model.embed_prefix(list(images), list(cameras.unbind(1)), tokens, mask)
+        embedded, seen, causal = self.model.embed_prefix(
+            list(images), list(cameras.unbind(1)), tokens, mask
+        )
         _, cache = self.model.paligemma_with_expert.forward(
             attention_mask=self._mask_4d(self.module.make_att_2d_masks(seen, causal)),
             position_ids=seen.cumsum(1) - 1,
@@ -35,5 +44,9 @@ class Pi0Passes(FlowPasses):
         cache = cache_of(encoded.unbind(1))  # of this step alone
         stated = {"state": state} if self._stated else {}
         return self.model.denoise_step(
-            prefix_pad_masks=seen.bool(), past_key_values=cache, x_t=actions, timestep=times, **stated
+            prefix_pad_masks=seen.bool(),
+            past_key_values=cache,
+            x_t=actions,
+            timestep=times,
+            **stated,
         )

@@ -1,4 +1,6 @@
-"""V-JEPA 2-AC (arXiv 2506.09985): plans to a goal image in a learned world model, by the cross-entropy method."""
+"""V-JEPA 2-AC (arXiv 2506.09985): plans to a goal image in a learned world model, by the
+cross-entropy method.
+"""
 
 from __future__ import annotations
 
@@ -17,10 +19,21 @@ from vlagents_ray.contract import ActionSpec, Contract
 from vlagents_ray.errors import ConfigError, InvalidObservation, MissingDependency
 from vlagents_ray.interface import GOAL_IMAGE, Obs
 from vlagents_ray.policies.base import ModelPolicy, Prediction, Row
-from vlagents_ray.policies.base.accelerator import ensure_torchvision, fetch, torch_device, torch_dtype
+from vlagents_ray.policies.base.accelerator import (
+    ensure_torchvision,
+    fetch,
+    torch_device,
+    torch_dtype,
+)
 from vlagents_ray.policies.base.checkpoint import find_checkpoint, from_pretrained, require_loaded
 from vlagents_ray.policies.base.config import ModelConfig
-from vlagents_ray.policies.base.model_inputs import GRIPPER, camera_images, choose_cameras, state_specs, state_vector
+from vlagents_ray.policies.base.model_inputs import (
+    GRIPPER,
+    camera_images,
+    choose_cameras,
+    state_specs,
+    state_vector,
+)
 from vlagents_ray.policies.compilation import Compilation
 from vlagents_ray.policies.outcomes import of_good
 from vlagents_ray.registry import require
@@ -28,45 +41,70 @@ from vlagents_ray_models.model_code import use_source
 
 
 class VJepa2AcConfig(ModelConfig):
-    """Settings of V-JEPA 2-AC: its checkpoint and the search for plans, in addition to the settings of all models."""
+    """Settings of V-JEPA 2-AC: its checkpoint and the search for plans, in addition to the
+    settings of all models.
+    """
 
     encoder: str | None = Field(
         default=None,
-        description="folder or hub id (org/name@COMMIT) of a `VJEPA2Model` instead of the encoder in the checkpoint",
+        description="folder or hub id (org/name@COMMIT) of a `VJEPA2Model` instead of the encoder "
+        "in the checkpoint",
     )
     source_dir: str | None = Field(
         default=None,
-        description="checkout of vjepa2, for the predictor's code; unset: that of VJEPA2_SRC, or installed",
+        description="checkout of vjepa2, for the predictor's code; unset: that of VJEPA2_SRC, or "
+        "installed",
     )
     encoder_heads: int | None = Field(
-        default=None, ge=1, description="attention heads of the checkpoint's encoder; unset: those of ViT-L, -H or -g"
+        default=None,
+        ge=1,
+        description="attention heads of the checkpoint's encoder; unset: those of ViT-L, -H or -g",
     )
     predictor_heads: int = Field(default=16, ge=1, description="attention heads of the predictor")
-    image_size: int = Field(default=256, ge=16, description="pixels of a side, as the model was trained")
-    normalize: bool = Field(default=True, description="normalise features, as the model was trained")
+    image_size: int = Field(
+        default=256, ge=16, description="pixels of a side, as the model was trained"
+    )
+    normalize: bool = Field(
+        default=True, description="normalise features, as the model was trained"
+    )
 
-    execute: int | None = Field(default=1, ge=1, description="steps of a plan that are executed; in the paper one")
+    execute: int | None = Field(
+        default=1, ge=1, description="steps of a plan that are executed; in the paper one"
+    )
     rollout: int = Field(default=2, ge=1, description="steps of a plan")
     samples: int = Field(default=400, ge=2, description="plans sampled in an iteration")
-    topk: int = Field(default=10, ge=2, description="number of best plans that determine the next distribution")
+    topk: int = Field(
+        default=10, ge=2, description="number of best plans that determine the next distribution"
+    )
     iterations: int = Field(default=10, ge=1)
-    momentum_mean: float = Field(default=0.15, ge=0, lt=1, description="share of the last iteration's mean position")
+    momentum_mean: float = Field(
+        default=0.15, ge=0, lt=1, description="share of the last iteration's mean position"
+    )
     momentum_std: float = Field(default=0.15, ge=0, lt=1)
     momentum_mean_gripper: float = Field(default=0.15, ge=0, lt=1)
     momentum_std_gripper: float = Field(default=0.15, ge=0, lt=1)
     maxnorm: float = Field(default=0.05, gt=0, description="largest step along each axis, m")
-    close_gripper: int | None = Field(default=None, ge=0, description="step of a plan from which on the gripper closes")
-    pass_size: int = Field(default=400, ge=1, description="largest number of plans in a forward pass of the predictor")
+    close_gripper: int | None = Field(
+        default=None, ge=0, description="step of a plan from which on the gripper closes"
+    )
+    pass_size: int = Field(
+        default=400, ge=1, description="largest number of plans in a forward pass of the predictor"
+    )
 
     @property
     def plans_a_pass(self) -> int:
-        """The largest number of plans in a forward pass of the predictor; compiled, full passes have this number."""
+        """The largest number of plans in a forward pass of the predictor; compiled, full passes
+        have this number.
+        """
         return min(self.samples, self.pass_size) if self.compile else self.pass_size
 
     @model_validator(mode="after")
     def _chosen_from_more(self) -> Self:
         if self.topk > self.samples:
-            raise ValueError(f"topk {self.topk} is over samples {self.samples}; want it to be a small part of them")
+            raise ValueError(
+                f"topk {self.topk} is over samples {self.samples}; want it to be a small part of "
+                "them"
+            )
         return self
 
 
@@ -77,13 +115,19 @@ _PATCHES = "encoder.embeddings.patch_embeddings.proj.weight"
 
 
 def to_pixels(image: np.ndarray, side: int) -> np.ndarray:
-    """Crop, resize and normalise an (H, W, 3) uint8 image as upstream does, to (3, side, side) float32."""
+    """Crop, resize and normalise an (H, W, 3) uint8 image as upstream does, to (3, side, side)
+    float32.
+    """
     torch = require("torch")
     height, width = image.shape[:2]
     edge = min(height, width)
     top, left = (height - edge) // 2, (width - edge) // 2
-    square = torch.tensor(image[top : top + edge, left : left + edge], dtype=torch.float32).permute(2, 0, 1)[None]
-    resized = torch.nn.functional.interpolate(square, size=(side, side), mode="bilinear", align_corners=False)[0]
+    square = torch.tensor(image[top : top + edge, left : left + edge], dtype=torch.float32).permute(
+        2, 0, 1
+    )[None]
+    resized = torch.nn.functional.interpolate(
+        square, size=(side, side), mode="bilinear", align_corners=False
+    )[0]
     mean, std = (torch.tensor(values)[:, None, None] * 255 for values in (_MEAN, _STD))
     return np.asarray(((resized - mean) / std).numpy())
 
@@ -97,13 +141,15 @@ def load_encoder(config: VJepa2AcConfig, saved: Mapping[str, Any] | None) -> Any
         model = from_pretrained(transformers.VJEPA2Model, path)
         if model.config.crop_size != config.image_size:
             raise ConfigError(
-                f"encoder {path}: made for images of {model.config.crop_size} px, want {config.image_size} as in "
+                f"encoder {path}: made for images of {model.config.crop_size} px, want "
+                f"{config.image_size} as in "
                 f"image_size; give that of the checkpoint's predictor"
             )
         return model
     if saved is None:
         raise ConfigError(
-            f"checkpoint {config.checkpoint!r}: it has no 'encoder'; name a folder with a VJEPA2Model as the policy's "
+            f"checkpoint {config.checkpoint!r}: it has no 'encoder'; name a folder with a "
+            "VJEPA2Model as the policy's "
             f"`encoder`, or a checkpoint with both, such as vjepa2-ac-vitg.pt"
         )
     return from_upstream(saved, config)
@@ -115,14 +161,18 @@ def from_upstream(saved: Mapping[str, Any], config: VJepa2AcConfig) -> Any:
     tensors = _renamed(saved)
     width, _, tubelet, patch, _ = tensors[_PATCHES].shape
     if (heads := config.encoder_heads or _HEADS.get(width)) is None:
-        raise ConfigError(f"encoder_heads: unset, and {width} is the width of none of {sorted(_HEADS)}; set it")
+        raise ConfigError(
+            f"encoder_heads: unset, and {width} is the width of none of {sorted(_HEADS)}; set it"
+        )
     settings = transformers.VJEPA2Config(
         patch_size=patch,
         crop_size=config.image_size,
         tubelet_size=tubelet,
         hidden_size=width,
         num_attention_heads=heads,
-        num_hidden_layers=len({name.split(".")[2] for name in tensors if name.startswith("encoder.layer.")}),
+        num_hidden_layers=len(
+            {name.split(".")[2] for name in tensors if name.startswith("encoder.layer.")}
+        ),
         mlp_ratio=tensors["encoder.layer.0.mlp.fc1.weight"].shape[0] / width,
         pred_num_hidden_layers=1,  # V-JEPA 2's own predictor of masked patches is not used
     )
@@ -130,17 +180,23 @@ def from_upstream(saved: Mapping[str, Any], config: VJepa2AcConfig) -> Any:
     model.predictor = require("torch").nn.Identity()
     missing, _ = model.load_state_dict(tensors, strict=False)
     if missing:
-        raise ConfigError(f"the checkpoint's encoder lacks {missing[:8]}; is it upstream's, and whole?")
+        raise ConfigError(
+            f"the checkpoint's encoder lacks {missing[:8]}; is it upstream's, and whole?"
+        )
     require_loaded(model, tensors)
     return model
 
 
 def _renamed(saved: Mapping[str, Any]) -> dict[str, Any]:
-    """Rename upstream's tensors to transformers' names; upstream stores query, key and value in one matrix."""
+    """Rename upstream's tensors to transformers' names; upstream stores query, key and value in
+    one matrix.
+    """
     tensors: dict[str, Any] = {}
     for name, tensor in saved.items():
         new = (
-            f"encoder.{name}".replace("encoder.patch_embed.", "encoder.embeddings.patch_embeddings.")
+            f"encoder.{name}".replace(
+                "encoder.patch_embed.", "encoder.embeddings.patch_embeddings."
+            )
             .replace("encoder.norm.", "encoder.layernorm.")
             .replace("encoder.blocks.", "encoder.layer.")
             .replace(".attn.", ".attention.")
@@ -150,32 +206,40 @@ def _renamed(saved: Mapping[str, Any]) -> dict[str, Any]:
             tensors[new.replace("qkv", kind)] = share
     if _PATCHES not in tensors or "encoder.layer.0.mlp.fc1.weight" not in tensors:
         raise ConfigError(
-            f"the checkpoint's encoder: got {sorted(saved)[:4]}, want names as 'patch_embed.proj.weight', upstream's"
+            f"the checkpoint's encoder: got {sorted(saved)[:4]}, want names as "
+            "'patch_embed.proj.weight', upstream's"
         )
     return tensors
 
 
-_PREFIXES = re.compile(r"module\.|backbone\.")  # added by distributed training and upstream's wrapper
+# Added by distributed training and upstream's wrapper.
+_PREFIXES = re.compile(r"module\.|backbone\.")
 
 
 def read_checkpoint(config: VJepa2AcConfig) -> dict[str, dict[str, Any]]:
-    """Read the tensors of the parts "encoder" and "predictor" of upstream's file; nothing is unpickled."""
+    """Read the tensors of the parts "encoder" and "predictor" of upstream's file; nothing is
+    unpickled.
+    """
     torch = require("torch")
     path = find_checkpoint(config.checkpoint, config.checkpoint_step, needs=("*.pt",))
     files = [path] if path.is_file() else sorted(path.glob("*.pt"))
     if len(files) != 1:
-        raise ConfigError(f"checkpoint {path}: got {[file.name for file in files]}, want one .pt file; name it")
+        raise ConfigError(
+            f"checkpoint {path}: got {[file.name for file in files]}, want one .pt file; name it"
+        )
     [file] = files
     try:
         parts = torch.load(file, map_location="cpu", weights_only=True)
     except Exception as error:  # the file may not be a zip file, or may be a pickle of other types
         raise ConfigError(
-            f"checkpoint {file}: not a file of tensors ({type(error).__name__}); want upstream's .pt"
+            f"checkpoint {file}: not a file of tensors ({type(error).__name__}); want upstream's "
+            ".pt"
         ) from error
     if not isinstance(parts, Mapping) or not isinstance(parts.get("predictor"), Mapping):
         got = sorted(map(str, parts))[:8] if isinstance(parts, Mapping) else type(parts).__name__
         raise ConfigError(
-            f"checkpoint {file}: got {got}, want 'predictor' among them; is it V-JEPA 2-AC's, and not V-JEPA 2's?"
+            f"checkpoint {file}: got {got}, want 'predictor' among them; is it V-JEPA 2-AC's, and "
+            "not V-JEPA 2's?"
         )
     return {
         name: {_PREFIXES.sub("", str(key)): tensor for key, tensor in part.items()}
@@ -185,25 +249,32 @@ def read_checkpoint(config: VJepa2AcConfig) -> dict[str, dict[str, Any]]:
 
 
 def load_predictor(config: VJepa2AcConfig, saved: Mapping[str, Any], width: int) -> Any:
-    """Load the predictor; raises `ConfigError` if its code or a weight is missing, or if the encoder does not fit."""
+    """Load the predictor; raises `ConfigError` if its code or a weight is missing, or if the
+    encoder does not fit.
+    """
     use_source("src", "VJEPA2_SRC", config.source_dir)
     try:
         module = importlib.import_module("src.models.ac_predictor")
     except ModuleNotFoundError as error:
         raise MissingDependency(
-            f"the predictor's code cannot be imported: no module {error.name!r}; is `src` vjepa2's, and timm installed?"
+            f"the predictor's code cannot be imported: no module {error.name!r}; is `src` "
+            "vjepa2's, and timm installed?"
         ) from error
     embedding = saved.get("predictor_embed.weight")
     if embedding is None or embedding.shape[1] != width:
         got = (
-            "no 'predictor_embed.weight'" if embedding is None else f"a predictor of features {embedding.shape[1]} wide"
+            "no 'predictor_embed.weight'"
+            if embedding is None
+            else f"a predictor of features {embedding.shape[1]} wide"
         )
         raise ConfigError(
-            f"checkpoint {config.checkpoint!r}: got {got}, want {width}, the encoder's; they belong together"
+            f"checkpoint {config.checkpoint!r}: got {got}, want {width}, the encoder's; they "
+            "belong together"
         )
     model = module.vit_ac_predictor(
         img_size=(config.image_size, config.image_size),
-        num_frames=2 * config.rollout,  # tubelets have two frames; this sets only the size of the mask
+        # Tubelets have two frames; this sets only the size of the mask.
+        num_frames=2 * config.rollout,
         tubelet_size=2,
         embed_dim=width,
         predictor_embed_dim=embedding.shape[0],
@@ -222,7 +293,9 @@ def load_predictor(config: VJepa2AcConfig, saved: Mapping[str, Any], width: int)
 
 @contextmanager
 def usual_attention() -> Iterator[None]:
-    """Make upstream's attention use torch's choice of a kernel; upstream's own switch cannot be compiled."""
+    """Make upstream's attention use torch's choice of a kernel; upstream's own switch cannot be
+    compiled.
+    """
     backend = require("torch").backends.cuda
     setter, backend.sdp_kernel = backend.sdp_kernel, nullcontext
     try:
@@ -233,7 +306,9 @@ def usual_attention() -> Iterator[None]:
 
 Tensor = Any  # torch's
 World = Callable[[Tensor, Tensor, Tensor], Tensor]
-"""Predicts the next frame's features (M, N, F) from features (M, T, N, F), actions (M, T, 7) and poses (M, T, 7)."""
+"""Predicts the next frame's features (M, N, F) from features (M, T, N, F), actions (M, T, 7) and
+poses (M, T, 7).
+"""
 
 DRAWN = 4  # sampled components of an action: x, y, z and the gripper
 _GRIPPER_RANGE = 0.75  # largest change of the gripper in a step
@@ -249,7 +324,14 @@ class Plans:
     energy: Tensor  # (B,), distance of the last iteration's best plan from the goal
 
 
-def plan(world: World, features: Tensor, poses: Tensor, goals: Tensor, noise: Tensor, config: VJepa2AcConfig) -> Plans:
+def plan(
+    world: World,
+    features: Tensor,
+    poses: Tensor,
+    goals: Tensor,
+    noise: Tensor,
+    config: VJepa2AcConfig,
+) -> Plans:
     """Search for plans by the cross-entropy method, with I iterations of S samples of H actions.
 
     Args:
@@ -269,13 +351,17 @@ def plan(world: World, features: Tensor, poses: Tensor, goals: Tensor, noise: Te
     energy = torch.zeros(len(poses), 0)
     for draws in noise.unbind(1):
         tried = _bounded(draws * std[:, :, None] + mean[:, :, None], config)  # (B, H, S, 4)
-        energy = _energies(world, features, poses, goals, _actions(tried.transpose(1, 2)), config.plans_a_pass)
+        energy = _energies(
+            world, features, poses, goals, _actions(tried.transpose(1, 2)), config.plans_a_pass
+        )
         best = energy.topk(config.topk, largest=False).indices  # (B, K)
         chosen = tried.gather(2, best[:, None, :, None].expand(-1, config.rollout, -1, DRAWN))
         mean = chosen.mean(2) * (1 - keep_mean) + mean * keep_mean
         std = chosen.std(2) * (1 - keep_std) + std * keep_std
     gripper = mean[..., 3:]
-    rested = torch.cat([mean[..., :3], torch.where(gripper.abs() < _GRIPPER_REST, 0.0, gripper)], -1)
+    rested = torch.cat(
+        [mean[..., :3], torch.where(gripper.abs() < _GRIPPER_REST, 0.0, gripper)], -1
+    )
     return Plans(_actions(rested), _actions(std), energy.min(1).values)
 
 
@@ -295,8 +381,12 @@ def _actions(drawn: Tensor) -> Tensor:
     return torch.cat([drawn[..., :3], torch.zeros_like(drawn[..., :3]), drawn[..., 3:]], -1)
 
 
-def _energies(world: World, features: Tensor, poses: Tensor, goals: Tensor, actions: Tensor, most: int) -> Tensor:
-    """Compute the mean absolute difference (B, S) between the goal and the prediction for actions (B, S, H, 7)."""
+def _energies(
+    world: World, features: Tensor, poses: Tensor, goals: Tensor, actions: Tensor, most: int
+) -> Tensor:
+    """Compute the mean absolute difference (B, S) between the goal and the prediction for
+    actions (B, S, H, 7).
+    """
     torch = require("torch")
     sessions, samples, horizon = actions.shape[:3]
     flat = actions.flatten(0, 1)
@@ -330,7 +420,9 @@ class Goal:
     def __init__(self, pixels: np.ndarray, features: Any = None) -> None:
         self.pixels = pixels  # (3, side, side) float32
         self.features = (
-            features  # (N, F) float32, a tensor on the model's device, or an array of a pickle; None: not yet
+            # (N, F) float32, a tensor on the model's device, or an array of a pickle; None: not
+            # yet.
+            features
         )
 
     def __deepcopy__(self, memo: object) -> Goal:
@@ -353,10 +445,17 @@ class Frame:
 
 
 class WorldModel:
-    """The encoder and the predictor; weights and features are float32, but computations may use another type."""
+    """The encoder and the predictor; weights and features are float32, but computations may use
+    another type.
+    """
 
     def __init__(
-        self, encoder: Any, predictor: Any, config: VJepa2AcConfig, dtype: Any, compilation: Compilation
+        self,
+        encoder: Any,
+        predictor: Any,
+        config: VJepa2AcConfig,
+        dtype: Any,
+        compilation: Compilation,
     ) -> None:
         self._encoder, self._predictor = encoder, predictor
         self._encode = compilation.core("encode", self._features)
@@ -365,11 +464,15 @@ class WorldModel:
             for frames in range(1, config.rollout + 1)
         ]
         layer_norm = require("torch").nn.functional.layer_norm
-        self._normalized: Any = lambda found: layer_norm(found, found.shape[-1:]) if config.normalize else found
+        self._normalized: Any = lambda found: (
+            layer_norm(found, found.shape[-1:]) if config.normalize else found
+        )
         self._device, self._dtype = encoder.device.type, dtype
 
     def autocast(self) -> Any:
-        """Return a context that computes in `dtype`, as in upstream's training; attention needs weights of one type."""
+        """Return a context that computes in `dtype`, as in upstream's training; attention needs
+        weights of one type.
+        """
         torch = require("torch")
         return torch.autocast(self._device, self._dtype, enabled=self._dtype != torch.float32)
 
@@ -380,7 +483,9 @@ class WorldModel:
 
     def _features(self, images: Tensor) -> Tensor:
         clip = images[:, None].repeat(1, 2, 1, 1, 1)  # the two frames of one step of the encoder
-        return self._normalized(self._encoder(pixel_values_videos=clip, skip_predictor=True).last_hidden_state.float())
+        return self._normalized(
+            self._encoder(pixel_values_videos=clip, skip_predictor=True).last_hidden_state.float()
+        )
 
     def __call__(self, features: Tensor, actions: Tensor, poses: Tensor) -> Tensor:
         """Predict the next frame's features (see `World`)."""
@@ -388,13 +493,16 @@ class WorldModel:
 
     def _predict(self, features: Tensor, actions: Tensor, poses: Tensor) -> Tensor:
         tokens = features.shape[2]
-        return self._normalized(self._predictor(features.flatten(1, 2), actions, poses)[:, -tokens:].float())
+        return self._normalized(
+            self._predictor(features.flatten(1, 2), actions, poses)[:, -tokens:].float()
+        )
 
 
 class VJepa2Ac(ModelPolicy):
     """Moves the gripper so that the camera's image becomes `info["goal_image"]`.
 
-    The goal image is in the observation of `reset` or any later one, and remains valid until the next one.
+    The goal image is in the observation of `reset` or any later one, and remains valid until the
+    next one.
     """
 
     Config: ClassVar[type] = VJepa2AcConfig
@@ -428,17 +536,35 @@ class VJepa2Ac(ModelPolicy):
     def load(self) -> WorldModel:
         saved = read_checkpoint(self.config)
         device = torch_device(self.config.device)
-        dtype = torch_dtype(self.config.dtype, device, preferred="float32")  # upstream plans in float32
+        # Upstream plans in float32.
+        dtype = torch_dtype(self.config.dtype, device, preferred="float32")
         encoder = load_encoder(self.config, saved.get("encoder"))
         predictor = load_predictor(self.config, saved["predictor"], encoder.config.hidden_size)
-        return WorldModel(encoder.to(device).eval(), predictor.to(device).eval(), self.config, dtype, self.compilation)
+        return WorldModel(
+            encoder.to(device).eval(),
+            predictor.to(device).eval(),
+            self.config,
+            dtype,
+            self.compilation,
+        )
 
     def notice(self, obs: Obs) -> None:
-        """Set the goal to that of an observation, if it has one; the features of an unchanged image are kept."""
+        """Set the goal to that of an observation, if it has one; the features of an unchanged
+        image are kept.
+        """
         if (image := obs.info.get(GOAL_IMAGE)) is None:
             return
-        if not isinstance(image, np.ndarray) or image.ndim != 3 or image.shape[2] != 3 or image.dtype != np.uint8:
-            got = f"{image.shape} {image.dtype}" if isinstance(image, np.ndarray) else type(image).__name__
+        if (
+            not isinstance(image, np.ndarray)
+            or image.ndim != 3
+            or image.shape[2] != 3
+            or image.dtype != np.uint8
+        ):
+            got = (
+                f"{image.shape} {image.dtype}"
+                if isinstance(image, np.ndarray)
+                else type(image).__name__
+            )
             raise InvalidObservation(f"info[{GOAL_IMAGE!r}]: got {got}, want (H, W, 3) uint8 RGB")
         pixels, memory = to_pixels(image, self.config.image_size), self._begun().memory
         if _GOAL not in memory or not np.array_equal(pixels, memory[_GOAL].pixels):
@@ -452,7 +578,8 @@ class VJepa2Ac(ModelPolicy):
 
     def predict(self, rows: Sequence[Row]) -> list[Prediction | Exception]:
         no_goal = InvalidObservation(
-            f"info[{GOAL_IMAGE!r}]: got none since the reset, want an image of the goal, (H, W, 3) uint8"
+            f"info[{GOAL_IMAGE!r}]: got none since the reset, want an image of the goal, (H, W, 3) "
+            "uint8"
         )
         return of_good([row if _GOAL in row.memory else no_goal for row in rows], self._plans)
 
@@ -460,7 +587,8 @@ class VJepa2Ac(ModelPolicy):
         torch = require("torch")
         config, world = self.config, self.model
         goals = [row.memory[_GOAL] for row in rows]
-        new_goals = [goal for goal in dict.fromkeys(goals) if goal.features is None]  # each once, for all its samples
+        # Each once, for all its samples.
+        new_goals = [goal for goal in dict.fromkeys(goals) if goal.features is None]
         shape = (config.iterations, config.rollout, config.samples, DRAWN)
         with torch.inference_mode(), world.autocast(), usual_attention():
             features = world.encode([row.frames[-1].pixels for row in rows])
@@ -468,10 +596,15 @@ class VJepa2Ac(ModelPolicy):
             for goal, goal_features in zip(new_goals, features_of_new, strict=True):
                 goal.features = goal_features.clone()
             for goal in goals:
-                goal.features = torch.as_tensor(goal.features).to(features.device, non_blocking=True)
+                goal.features = torch.as_tensor(goal.features).to(
+                    features.device, non_blocking=True
+                )
             poses, noise = (
                 torch.as_tensor(np.stack(parts)).to(features.device, non_blocking=True)
-                for parts in ([row.frames[-1].pose for row in rows], [row.noise(*shape) for row in rows])
+                for parts in (
+                    [row.frames[-1].pose for row in rows],
+                    [row.noise(*shape) for row in rows],
+                )
             )
             goal_features = torch.stack([goal.features for goal in goals])
             plans = plan(world, features, poses, goal_features, noise, config)
@@ -479,7 +612,9 @@ class VJepa2Ac(ModelPolicy):
         predictions = []
         for i, row in enumerate(rows):
             steps = _openings(actions[i], row.frames[-1].pose[6])
-            predictions.append(Prediction(steps, mean=steps, std=std[i], info={"energy": float(energy[i])}))
+            predictions.append(
+                Prediction(steps, mean=steps, std=std[i], info={"energy": float(energy[i])})
+            )
         return predictions
 
     def _example(self, seed: int, instruction: str = "warm up") -> Row:
@@ -488,7 +623,9 @@ class VJepa2Ac(ModelPolicy):
 
 
 def _openings(actions: np.ndarray, closedness: float) -> np.ndarray:
-    """Replace the last column of plans (H, 7), the change of the gripper, by its opening after each step."""
+    """Replace the last column of plans (H, 7), the change of the gripper, by its opening after
+    each step.
+    """
     opened = actions.copy()
     for row in opened:
         closedness = float(np.clip(closedness + row[6], 0, 1))

@@ -1,4 +1,6 @@
-"""A bundle: what is checked holds for an honest one, is contradicted by a changed one, and a hostile one is refused."""
+"""A bundle: what is checked holds for an honest one, is contradicted by a changed one, and a
+hostile one is refused.
+"""
 
 from __future__ import annotations
 
@@ -46,7 +48,12 @@ def tabletop(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Two recorded episodes of the tabletop."""
     out = tmp_path_factory.mktemp("tabletop") / "run"
     options = {"max_steps": 8}
-    play(flat_config(envs=["tabletop"], env_options=options, episodes=2, record="all", video="all", out=out), Still)
+    play(
+        flat_config(
+            envs=["tabletop"], env_options=options, episodes=2, record="all", video="all", out=out
+        ),
+        Still,
+    )
     return out
 
 
@@ -79,14 +86,19 @@ def details(found: Verification, subject: str) -> str:
     return next(one.detail for one in found.findings if one.subject == subject)
 
 
-def rewritten(bundle: Path, target: Path, changes: dict[str, bytes], *, honest: bool = False) -> Path:
-    """The bundle with other files; `honest` writes their digests into its manifest, as its author could."""
+def rewritten(
+    bundle: Path, target: Path, changes: dict[str, bytes], *, honest: bool = False
+) -> Path:
+    """The bundle with other files; `honest` writes their digests into its manifest, as its
+    author could.
+    """
     with zipfile.ZipFile(bundle) as source:
         files = {name: source.read(name) for name in source.namelist()} | changes
     if honest:
         manifest = json.loads(files["bundle.json"])
         manifest["files"] |= {
-            name: {"sha256": hashlib.sha256(text).hexdigest(), "size": len(text)} for name, text in changes.items()
+            name: {"sha256": hashlib.sha256(text).hexdigest(), "size": len(text)}
+            for name, text in changes.items()
         }
         files["bundle.json"] = json.dumps(manifest).encode()
     with zipfile.ZipFile(target, "w") as out:
@@ -109,7 +121,10 @@ def test_an_honest_bundle_holds_and_plays_again_to_the_bit(bundle: Path) -> None
         "digests", "database", "episodes", "trajectories", "versions",
         "replay of tabletop#0@0", "replay of tabletop#1@1",
     }  # fmt: skip
-    assert details(found, "replay of tabletop#1@1") == "8 actions, every state, reward and success to the bit"
+    assert (
+        details(found, "replay of tabletop#1@1")
+        == "8 actions, every state, reward and success to the bit"
+    )
 
 
 def test_the_same_results_give_the_same_bytes_and_the_digest_stands_for_them(
@@ -121,7 +136,9 @@ def test_the_same_results_give_the_same_bytes_and_the_digest_stands_for_them(
     assert sorted(path.name for path in tmp_path.iterdir()) == ["again.zip"]
 
 
-def test_videos_are_in_it_if_that_is_asked_for(bundle: Path, tabletop: Path, tmp_path: Path) -> None:
+def test_videos_are_in_it_if_that_is_asked_for(
+    bundle: Path, tabletop: Path, tmp_path: Path
+) -> None:
     write_bundle(tabletop, tmp_path / "with.zip", videos=True)
     assert verify(tmp_path / "with.zip", into=tmp_path / "kept", replay=0).holds
     videos = sorted((tmp_path / "kept").rglob("*.mp4"))
@@ -139,14 +156,18 @@ def test_results_of_several_bundles_are_pooled(bundle: Path, line: Path, tmp_pat
         verify(bundle, into=tmp_path / "a")
 
 
-def test_other_actions_than_were_executed_have_another_outcome(tabletop: Path, tmp_path: Path) -> None:
+def test_other_actions_than_were_executed_have_another_outcome(
+    tabletop: Path, tmp_path: Path
+) -> None:
     shutil.copytree(tabletop, tmp_path / "copy")
     path = next((tmp_path / "copy").rglob("ep0000*.npz"))
     path.write_bytes(other_actions(path))
     write_bundle(tmp_path / "copy", tmp_path / "changed.zip")
     found = verify(tmp_path / "changed.zip")
     assert not found.holds
-    assert "the recorded actions are not those of the table's digest" in details(found, "trajectories")
+    assert "the recorded actions are not those of the table's digest" in details(
+        found, "trajectories"
+    )
     assert verdicts(found)["replay of tabletop#0@0"] == "other here"
     assert "the numbers differ from step 4 of 8 on" in details(found, "replay of tabletop#0@0")
 
@@ -164,13 +185,19 @@ def recording(bundle: Path) -> str:
         return next(name for name in file.namelist() if name.endswith(".npz"))
 
 
-def test_a_file_changed_afterwards_is_told_by_its_digest(bundle: Path, tabletop: Path, tmp_path: Path) -> None:
+def test_a_file_changed_afterwards_is_told_by_its_digest(
+    bundle: Path, tabletop: Path, tmp_path: Path
+) -> None:
     name = recording(bundle)
-    found = verify(rewritten(bundle, tmp_path / "b.zip", {name: other_actions(tabletop / name)}), replay=0)
+    found = verify(
+        rewritten(bundle, tmp_path / "b.zip", {name: other_actions(tabletop / name)}), replay=0
+    )
     assert (found.holds, details(found, "digests")) == (False, f"{name} has another digest")
 
 
-def test_summary_and_report_are_written_from_the_database(bundle: Path, tabletop: Path, tmp_path: Path) -> None:
+def test_summary_and_report_are_written_from_the_database(
+    bundle: Path, tabletop: Path, tmp_path: Path
+) -> None:
     verify(bundle, into=tmp_path / "run", replay=0)
     said = json.loads((tmp_path / "run/summary.json").read_text())
     assert said["totals"] == [group.to_json() for group in summarize(Results.load(tabletop)).totals]
@@ -181,15 +208,23 @@ def test_summary_and_report_are_written_from_the_database(bundle: Path, tabletop
     ("sql", "subject"),
     [
         (
-            "UPDATE episodes SET success_once = 1, success_at_end = 1, first_success = 2 WHERE episode = 0",
+            (
+                "UPDATE episodes SET success_once = 1, success_at_end = 1, first_success = 2 WHERE "
+                "episode = 0"
+            ),
             "trajectories",
         ),
         ("UPDATE episodes SET episode_return = episode_return + 1", "trajectories"),
         ("UPDATE episodes SET seed = seed + 100", "database"),
-        ("UPDATE cells SET settings = replace(settings, '\"execute\":null', '\"execute\":1')", "database"),
+        (
+            "UPDATE cells SET settings = replace(settings, '\"execute\":null', '\"execute\":1')",
+            "database",
+        ),
     ],
 )
-def test_a_changed_database_contradicts_the_rest(changed: Callable[[Change], Path], sql: str, subject: str) -> None:
+def test_a_changed_database_contradicts_the_rest(
+    changed: Callable[[Change], Path], sql: str, subject: str
+) -> None:
     def change(folder: Path) -> None:
         with closing(sqlite3.connect(folder / "results.db")) as db, db:
             db.execute(sql)
@@ -226,7 +261,10 @@ def test_options_that_could_name_files_or_code_are_not_taken_from_a_stranger(
     verify(bundle, into=tmp_path / "run", replay=0)
     with closing(sqlite3.connect(tmp_path / "run/results.db")) as db, db:
         [settings] = db.execute("SELECT settings FROM cells").fetchone()
-        db.execute("UPDATE cells SET settings = ?", (json.dumps(json.loads(settings) | {"env_options": options}),))
+        db.execute(
+            "UPDATE cells SET settings = ?",
+            (json.dumps(json.loads(settings) | {"env_options": options}),),
+        )
     write_bundle(tmp_path / "run", tmp_path / "b.zip")
     assert "which could name files or code; --trust takes them" in details(
         verify(tmp_path / "b.zip"), "replay of tabletop#0@0"
@@ -245,14 +283,18 @@ def test_options_that_could_name_files_or_code_are_not_taken_from_a_stranger(
         "report.html",
     ],
 )
-def test_a_path_that_no_bundle_has_is_refused_and_nothing_is_written(bundle: Path, tmp_path: Path, name: str) -> None:
+def test_a_path_that_no_bundle_has_is_refused_and_nothing_is_written(
+    bundle: Path, tmp_path: Path, name: str
+) -> None:
     hostile = rewritten(bundle, tmp_path / "b.zip", {name: b"x"}, honest=True)
     with pytest.raises(ConfigError, match=r"got the file .*do not trust the author of this bundle"):
         verify(hostile, into=tmp_path / "deep" / "kept")
     assert not list((tmp_path / "deep").iterdir())
 
 
-def test_links_duplicates_and_archives_that_unpack_to_too_much_are_refused(bundle: Path, tmp_path: Path) -> None:
+def test_links_duplicates_and_archives_that_unpack_to_too_much_are_refused(
+    bundle: Path, tmp_path: Path
+) -> None:
     link = zipfile.ZipInfo("videos/a/b.mp4")
     link.external_attr = (stat.S_IFLNK | 0o777) << 16
     for name, member, text, why in (
@@ -265,12 +307,15 @@ def test_links_duplicates_and_archives_that_unpack_to_too_much_are_refused(bundl
             file.writestr(member, text)
         with pytest.raises(ConfigError, match=why):
             verify(hostile)
-    with pytest.raises(ConfigError, match=r"unpacks to \d+ bytes, want at most 1000; allow more with --max-gb"):
+    with pytest.raises(
+        ConfigError, match=r"unpacks to \d+ bytes, want at most 1000; allow more with --max-gb"
+    ):
         verify(bundle, most_bytes=1000)
 
 
 @pytest.mark.parametrize(
-    ("text", "why"), [(b"", "cannot be read as a bundle"), (b"PK\5\6" + 18 * b"\0", "has no bundle.json")]
+    ("text", "why"),
+    [(b"", "cannot be read as a bundle"), (b"PK\5\6" + 18 * b"\0", "has no bundle.json")],
 )
 def test_what_is_no_bundle_is_said_to_be_none(tmp_path: Path, text: bytes, why: str) -> None:
     (tmp_path / "b.zip").write_bytes(text)
@@ -284,7 +329,9 @@ def test_half_a_bundle_is_refused(bundle: Path, tmp_path: Path) -> None:
     text = bytearray(bundle.read_bytes())
     text[database.header_offset + 60 : database.header_offset + 90] = bytes(30)
     (tmp_path / "b.zip").write_bytes(text)
-    with pytest.raises(ConfigError, match=r"cannot be read as a bundle \(.*copy it again from its source"):
+    with pytest.raises(
+        ConfigError, match=r"cannot be read as a bundle \(.*copy it again from its source"
+    ):
         verify(tmp_path / "b.zip")
 
 
@@ -295,7 +342,10 @@ def test_a_database_of_views_or_of_odd_values_is_refused(
     for sql, why in (
         ("CREATE VIEW x AS SELECT 1", "got 'x', which is a view that no evaluation makes"),
         ("UPDATE cells SET seeds = '[]'", "its database holds values that no evaluation writes"),
-        ("UPDATE runs SET config = '{\"policies\": 1}'", "its database holds values that no evaluation writes"),
+        (
+            "UPDATE runs SET config = '{\"policies\": 1}'",
+            "its database holds values that no evaluation writes",
+        ),
         ("UPDATE episodes SET trajectory = '../x.npz'", "want a path below the folder of results"),
     ):
         shutil.copy(tmp_path / "run/results.db", tmp_path / "other.db")
@@ -320,7 +370,9 @@ def test_a_recording_that_states_more_than_it_has_is_refused(bundle: Path, tmp_p
         verify(rewritten(bundle, tmp_path / "b.zip", {name: npz.read_bytes()}, honest=True))
 
 
-def test_an_evaluation_that_is_written_to_is_bundled_as_it_stands(line: Path, tmp_path: Path) -> None:
+def test_an_evaluation_that_is_written_to_is_bundled_as_it_stands(
+    line: Path, tmp_path: Path
+) -> None:
     shutil.copytree(line, tmp_path / "run")
     with closing(sqlite3.connect(tmp_path / "run/results.db")) as db:
         db.execute("UPDATE episodes SET seconds = 99")
@@ -330,7 +382,9 @@ def test_an_evaluation_that_is_written_to_is_bundled_as_it_stands(line: Path, tm
     assert all(one.result.seconds < 99 for one in Results.load(tmp_path / "kept").cells[0].episodes)
 
 
-def test_the_commands_say_what_to_cite_and_end_with_1_if_something_differs(tabletop: Path, tmp_path: Path) -> None:
+def test_the_commands_say_what_to_cite_and_end_with_1_if_something_differs(
+    tabletop: Path, tmp_path: Path
+) -> None:
     def run(*words: object) -> tuple[int, str]:
         done = CliRunner().invoke(app, [*map(str, words)], env={"COLUMNS": "300"})
         return done.exit_code, " ".join(done.output.split())
@@ -341,7 +395,9 @@ def test_the_commands_say_what_to_cite_and_end_with_1_if_something_differs(table
     assert (code, len(digest)) == (0, 64)
     code, said = run("verify", file, "--replay", 0, "--out", tmp_path / "kept")
     assert code == 0
-    assert f"bundle sha256:{digest}: holds; not checked: replay results: {tmp_path / 'kept'}" in said
+    assert (
+        f"bundle sha256:{digest}: holds; not checked: replay results: {tmp_path / 'kept'}" in said
+    )
     name = recording(file)
     forged = rewritten(file, tmp_path / "c.zip", {name: other_actions(tabletop / name)})
     code, said = run("verify", forged, "--replay", 0)

@@ -27,7 +27,9 @@ def played(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return out
 
 
-def test_cameras_parts_successes_and_ends_of_a_dataset_are_chosen(played: Path, tmp_path: Path) -> None:
+def test_cameras_parts_successes_and_ends_of_a_dataset_are_chosen(
+    played: Path, tmp_path: Path
+) -> None:
     chosen = ["cameras=[wrist]", "state=[joints, gripper]", "successes=true", "cut_idle=true"]
     done = to_lerobot(played, tmp_path / "d", *chosen)
     assert done.exit_code == 0, done.output
@@ -38,7 +40,9 @@ def test_cameras_parts_successes_and_ends_of_a_dataset_are_chosen(played: Path, 
     assert [key for key in info["features"] if "images" in key] == ["observation.images.wrist"]
 
 
-def test_a_dataset_without_cameras_has_a_state_of_the_environment(played: Path, tmp_path: Path) -> None:
+def test_a_dataset_without_cameras_has_a_state_of_the_environment(
+    played: Path, tmp_path: Path
+) -> None:
     done = to_lerobot(played, tmp_path / "d", "cameras=[]", "environment_state=[joints]")
     assert done.exit_code == 0, done.output
     features = json.loads((tmp_path / "d/meta/info.json").read_text())["features"]

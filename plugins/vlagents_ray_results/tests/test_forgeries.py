@@ -1,4 +1,6 @@
-"""A forged bundle is contradicted: each column and each recording is changed alone, as its author could."""
+"""A forged bundle is contradicted: each column and each recording is changed alone, as its
+author could.
+"""
 
 # ruff: noqa: S608 (the SQL is made of constants)
 
@@ -32,7 +34,9 @@ FAILED = "episode = (SELECT min(episode) FROM episodes WHERE NOT success_once)"
 class Versioned(ToZero):
     """States its checkpoint, weights and version, as a served policy does."""
 
-    def reset(self, obs: Obs, instruction: str | None = None, **kwargs: object) -> dict[str, object]:
+    def reset(
+        self, obs: Obs, instruction: str | None = None, **kwargs: object
+    ) -> dict[str, object]:
         super().reset(obs, instruction, **kwargs)
         return {"checkpoint": "a", "weights": "sha256:5711", "revision": "0a1b"}
 
@@ -49,10 +53,20 @@ FORGERIES: dict[str, list[tuple[str, str]]] = {
     "env": [("'tabletop'", SOLVED)],
     "episode": [("episode + 100", SOLVED)],
     "seed": [("seed + 100", SOLVED)],
-    "status": [("'infra_failed'", FAILED), ("'policy_error'", FAILED), ("'infra_failed'", SOLVED), ("'x'", FAILED)],
+    "status": [
+        ("'infra_failed'", FAILED),
+        ("'policy_error'", FAILED),
+        ("'infra_failed'", SOLVED),
+        ("'x'", FAILED),
+    ],
     "success_once": [("1", FAILED), ("0", SOLVED), ("NULL", FAILED)],
     "success_at_end": [("1", FAILED), ("1 - success_at_end", SOLVED), ("NULL", FAILED)],
-    "first_success": [("3", FAILED), ("NULL", SOLVED), ("first_success - 1", SOLVED), ("0", SOLVED)],
+    "first_success": [
+        ("3", FAILED),
+        ("NULL", SOLVED),
+        ("first_success - 1", SOLVED),
+        ("0", SOLVED),
+    ],
     "steps": [("steps - 1", SOLVED), ("steps + 1", FAILED)],
     "episode_return": [("episode_return + 1", SOLVED)],
     "ending": [("'terminated'", SOLVED), ("'policy_done'", FAILED), ("'error'", FAILED)],
@@ -76,10 +90,16 @@ FORGERIES: dict[str, list[tuple[str, str]]] = {
     "policy_program": [("'0123456789abcdef'", SOLVED)],
     "run": [("7", SOLVED)],
 }
-_OF_THE_MACHINE = "a time or a count of that machine, which nothing else records; in no success rate"
+_OF_THE_MACHINE = (
+    "a time or a count of that machine, which nothing else records; in no success rate"
+)
 UNKNOWN = {
-    **dict.fromkeys(("seconds", "reset_ms", "env_step_ms", "env_seconds", "finished"), _OF_THE_MACHINE),
-    **dict.fromkeys(("policy_ms", "policy_p95_ms", "policy_seconds", "timing_ms", "attempts"), _OF_THE_MACHINE),
+    **dict.fromkeys(
+        ("seconds", "reset_ms", "env_step_ms", "env_seconds", "finished"), _OF_THE_MACHINE
+    ),
+    **dict.fromkeys(
+        ("policy_ms", "policy_p95_ms", "policy_seconds", "timing_ms", "attempts"), _OF_THE_MACHINE
+    ),
     "acts": "the recording has actions, not the answers that they came in; in no success rate",
     "transport": "the way of the observations, which nothing else records; in no success rate",
     "revision": "known only on machines with the weights in the hub's cache; in no success rate",
@@ -109,7 +129,9 @@ def honest(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def forged(honest: Path, tmp_path: Path) -> Forge:
-    """Verify a bundle in which something was changed, with a new manifest, as its author can write it."""
+    """Verify a bundle in which something was changed, with a new manifest, as its author can
+    write it.
+    """
 
     def make(change: Callable[[Path], None], replay: int = EPISODES) -> Verification:
         write_bundle(honest, tmp_path / "honest.zip")
@@ -178,7 +200,9 @@ def test_all_columns_of_an_outcome_that_are_changed_together_contradict_the_reco
     assert {one.subject for one in found.findings if one.verdict == "differs"} >= {"trajectories"}
 
 
-@pytest.mark.parametrize("name", [field.name for field in fields(Trajectory) if field.name != "cameras"])
+@pytest.mark.parametrize(
+    "name", [field.name for field in fields(Trajectory) if field.name != "cameras"]
+)
 def test_a_recording_that_is_changed_alone_contradicts_the_bundle(forged: Forge, name: str) -> None:
     def change(folder: Path) -> None:
         path = min(folder.rglob("*.npz"))
@@ -188,23 +212,39 @@ def test_a_recording_that_is_changed_alone_contradicts_the_bundle(forged: Forge,
     assert not forged(change).holds
 
 
-OUTCOME = ("success_once", "success_at_end", "first_success", "steps", "episode_return", "ending", "actions_sha256")
+OUTCOME = (
+    "success_once",
+    "success_at_end",
+    "first_success",
+    "steps",
+    "episode_return",
+    "ending",
+    "actions_sha256",
+)
 
 
-def test_a_failure_with_outcome_and_recording_of_a_success_is_found_by_its_replay(forged: Forge) -> None:
+def test_a_failure_with_outcome_and_recording_of_a_success_is_found_by_its_replay(
+    forged: Forge,
+) -> None:
     """Table and recordings agree with each other, and every value is one that was measured."""
 
     def copy(folder: Path) -> None:
         with closing(sqlite3.connect(folder / "results.db")) as db, db:
-            [success] = db.execute(f"SELECT trajectory, {', '.join(OUTCOME)} FROM episodes WHERE {SOLVED}").fetchall()
+            [success] = db.execute(
+                f"SELECT trajectory, {', '.join(OUTCOME)} FROM episodes WHERE {SOLVED}"
+            ).fetchall()
             [[failure]] = db.execute(f"SELECT trajectory FROM episodes WHERE {FAILED}").fetchall()
             values = ", ".join(f"{column} = ?" for column in OUTCOME)
-            db.execute(f"UPDATE episodes SET {values} WHERE trajectory = ?", [*success[1:], failure])
+            db.execute(
+                f"UPDATE episodes SET {values} WHERE trajectory = ?", [*success[1:], failure]
+            )
         (folder / failure).write_bytes((folder / success[0]).read_bytes())
 
     found = forged(copy)
     assert not found.holds
-    assert next(one.subject for one in found.findings if one.verdict == "differs").startswith("replay of")
+    assert next(one.subject for one in found.findings if one.verdict == "differs").startswith(
+        "replay of"
+    )
 
 
 def test_a_recording_of_an_episode_that_was_left_out_is_named(forged: Forge) -> None:
@@ -224,11 +264,15 @@ def test_a_recording_of_an_episode_that_was_left_out_is_named(forged: Forge) -> 
         "UPDATE cells SET policy = 'another'",
     ],
 )
-def test_a_changed_cell_that_would_leave_episodes_out_contradicts_the_bundle(forged: Forge, sql: str) -> None:
+def test_a_changed_cell_that_would_leave_episodes_out_contradicts_the_bundle(
+    forged: Forge, sql: str
+) -> None:
     assert not forged(update(sql)).holds
 
 
-def test_replayed_episodes_are_drawn_by_a_seed_and_each_can_be(honest: Path, tmp_path: Path) -> None:
+def test_replayed_episodes_are_drawn_by_a_seed_and_each_can_be(
+    honest: Path, tmp_path: Path
+) -> None:
     write_bundle(honest, tmp_path / "run.zip")
 
     def replayed(seed: int | None) -> str:

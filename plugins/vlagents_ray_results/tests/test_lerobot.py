@@ -40,21 +40,28 @@ def results(tmp_path_factory: pytest.TempPathFactory) -> Results:
     return play(flat_config(envs=[ROLLER], episodes=2, record="all", out=out, video="none"), Turner)
 
 
-def test_frames_states_actions_rewards_and_success_are_those_of_the_episodes(config: Config, tmp_path: Path) -> None:
+def test_frames_states_actions_rewards_and_success_are_those_of_the_episodes(
+    config: Config, tmp_path: Path
+) -> None:
     results = play(config(episodes=3, record="all", env_options=CAMERA | {"state_dim": 2}))
     root = tmp_path / "dataset"
     assert to_lerobot(results, root) == 3
     for number, episode in enumerate(results.cells[0].episodes):
         trajectory = Trajectory.load(results.out / str(episode.trajectory))
         rows = pq.read_table(root / f"data/chunk-000/file-{number:03d}.parquet").to_pydict()
-        assert rows["action"] == trajectory.actions[:, 0].tolist()  # LeRobot wants no lists of one number
+        # LeRobot wants no lists of one number.
+        assert rows["action"] == trajectory.actions[:, 0].tolist()
         assert rows["observation.state.position"] == trajectory.state["position"][:-1].tolist()
         assert rows["observation.state"] == rows["observation.state.position"]
         assert rows["next.reward"] == trajectory.rewards.astype(np.float32).tolist()
         assert rows["next.success"] == trajectory.success.tolist()
         assert rows["next.done"] == [False] * 9 + [True]
-        with av.open(str(root / f"videos/observation.images.front/chunk-000/file-{number:03d}.mp4")) as video:
-            red = [frame.to_ndarray(format="rgb24")[..., 0].mean() for frame in video.decode(video=0)]
+        with av.open(
+            str(root / f"videos/observation.images.front/chunk-000/file-{number:03d}.mp4")
+        ) as video:
+            red = [
+                frame.to_ndarray(format="rgb24")[..., 0].mean() for frame in video.decode(video=0)
+            ]
         assert red[:10] == pytest.approx([20 * i for i in range(10)], abs=6)
     tasks = pq.read_table(root / "meta/tasks.parquet").column("__index_level_0__").to_pylist()
     assert tasks == [episode.result.instruction for episode in results.cells[0].episodes]
@@ -68,21 +75,30 @@ def test_the_trajectories_stay_as_they_are(config: Config, tmp_path: Path) -> No
 
 
 def test_envs_that_differ_are_exported_one_by_one(config: Config, tmp_path: Path) -> None:
-    suites = [{"envs": [LINE], "episodes": 1}, {"envs": [OTHER_LINE], "episodes": 1, "env_options": CAMERA}]
+    suites = [
+        {"envs": [LINE], "episodes": 1},
+        {"envs": [OTHER_LINE], "episodes": 1, "env_options": CAMERA},
+    ]
     settings = EvalConfig.model_validate(config(record="all").model_dump() | {"suites": suites})
     results = play(settings)
     with pytest.raises(ConfigError, match=r"has other features.*images.front.*--env"):
         to_lerobot(results, tmp_path / "both")
-    assert list(tmp_path.glob("both*")) == [], "the first env was written, and is no dataset of both"
+    assert list(tmp_path.glob("both*")) == [], (
+        "the first env was written, and is no dataset of both"
+    )
     assert to_lerobot(results.only(env=OTHER_LINE), tmp_path / "one") == 1
 
 
 @pytest.mark.parametrize("end", ["npz", "mp4"])
-def test_a_file_that_is_gone_is_said_in_one_sentence(config: Config, tmp_path: Path, end: str) -> None:
+def test_a_file_that_is_gone_is_said_in_one_sentence(
+    config: Config, tmp_path: Path, end: str
+) -> None:
     results = play(config(episodes=2, record="all", env_options=CAMERA))
     [gone] = (results.out / "trajectories").rglob(f"ep0001_*.{end}")
     gone.unlink()
-    with pytest.raises(ConfigError, match=rf"{gone.name}: got no file, want .*; copy the folder again"):
+    with pytest.raises(
+        ConfigError, match=rf"{gone.name}: got no file, want .*; copy the folder again"
+    ):
         to_lerobot(results, tmp_path / "dataset")
     assert list(tmp_path.glob("dataset*")) == []
 
@@ -118,7 +134,8 @@ def test_trajectories_are_in_memory_one_at_a_time(
     def counted(path: Path) -> Trajectory:
         trajectory = load(path)
         actions = trajectory.actions
-        loaded.append(weakref.ref(actions if actions.base is None else actions.base))  # views keep the base alive
+        # Views keep the base alive.
+        loaded.append(weakref.ref(actions if actions.base is None else actions.base))
         alive.append(sum(one() is not None for one in loaded))
         return trajectory
 
@@ -144,12 +161,16 @@ def rows(root: Path, number: int) -> dict[str, Any]:
     return dict(pq.read_table(root / f"data/chunk-000/file-{number:03d}.parquet").to_pydict())
 
 
-def test_cameras_and_parts_of_the_state_are_chosen_in_that_order(results: Results, tmp_path: Path) -> None:
+def test_cameras_and_parts_of_the_state_are_chosen_in_that_order(
+    results: Results, tmp_path: Path
+) -> None:
     to_lerobot(results, tmp_path / "d", cameras=["wrist"], state=["gripper", "joints"])
     features = info(tmp_path / "d")["features"]
     assert [key for key in features if "images" in key] == ["observation.images.wrist"]
     assert features["observation.state"]["names"] == ["gripper", "joints_0", "joints_1"]
-    assert {key for key in features if key.startswith("observation.state.")} == {"observation.state.joints"}
+    assert {key for key in features if key.startswith("observation.state.")} == {
+        "observation.state.joints"
+    }
     assert rows(tmp_path / "d", 0)["observation.state"][0] == pytest.approx([1.0, 0.1, 0.0])
     assert not (tmp_path / "d/videos/observation.images.base").exists()
 
@@ -179,9 +200,15 @@ def test_parts_of_the_environments_state_are_apart_and_need_no_camera(
     [
         (
             {"cameras": ["wrst"]},
-            r"cameras: .*Roller has no 'wrst', want some of \['base', 'wrist'\]; did you mean 'wrist'",
+            (
+                r"cameras: .*Roller has no 'wrst', want some of \['base', 'wrist'\]; did you mean "
+                r"'wrist'"
+            ),
         ),
-        ({"state": ["joints", "torque"]}, "state: .*Roller has no 'torque', want some of .*'gripper', 'joints'"),
+        (
+            {"state": ["joints", "torque"]},
+            "state: .*Roller has no 'torque', want some of .*'gripper', 'joints'",
+        ),
         ({"state": ["joints", "joints"]}, "each of them once"),
         (
             {"environment_state": ["gripper"]},
@@ -202,12 +229,16 @@ def test_only_what_was_solved_goes_into_it(config: Config, tmp_path: Path) -> No
     assert to_lerobot(results, tmp_path / "all") == 4
     assert to_lerobot(results, tmp_path / "solved", successes=True) == 2
     assert all(any(rows(tmp_path / "solved", number)["next.success"]) for number in range(2))
-    unsolved = play(config(envs=[ROLLER], episodes=1, seed=1, record="all", out=tmp_path / "unsolved"), Turner)
+    unsolved = play(
+        config(envs=[ROLLER], episodes=1, seed=1, record="all", out=tmp_path / "unsolved"), Turner
+    )
     with pytest.raises(ConfigError, match="in none of the 1 recorded episodes was the task solved"):
         to_lerobot(unsolved, tmp_path / "none", successes=True)
 
 
-def test_an_episode_ends_where_nothing_moves_any_more_after_it_was_solved(results: Results, tmp_path: Path) -> None:
+def test_an_episode_ends_where_nothing_moves_any_more_after_it_was_solved(
+    results: Results, tmp_path: Path
+) -> None:
     to_lerobot(results, tmp_path / "d", cut_idle=True)
     first, second = rows(tmp_path / "d", 0), rows(tmp_path / "d", 1)
     assert [action[0] for action in first["action"]] == pytest.approx([Roller.TURN] * 6 + [0.0])
@@ -221,7 +252,9 @@ class Pushed(ToZero):
 
     def act(self, obs: Obs) -> Act:
         self.acts = getattr(self, "acts", 2) + 1
-        return replace(super().act(obs), info={"policy": {"version": self.acts, "fingerprint": "of a test"}})
+        return replace(
+            super().act(obs), info={"policy": {"version": self.acts, "fingerprint": "of a test"}}
+        )
 
 
 def test_a_frame_names_the_weights_that_chose_its_action(config: Config, tmp_path: Path) -> None:
@@ -236,8 +269,12 @@ def test_a_frame_names_the_weights_that_chose_its_action(config: Config, tmp_pat
     assert "policy_version" not in info(tmp_path / "none")["features"]
 
 
-def test_angles_are_written_without_jumps_and_info_says_about_what(results: Results, tmp_path: Path) -> None:
-    recorded = Trajectory.load(results.out / str(results.cells[0].episodes[0].trajectory)).state["xyzrpy"][:-1]
+def test_angles_are_written_without_jumps_and_info_says_about_what(
+    results: Results, tmp_path: Path
+) -> None:
+    recorded = Trajectory.load(results.out / str(results.cells[0].episodes[0].trajectory)).state[
+        "xyzrpy"
+    ][:-1]
     assert np.abs(np.diff(recorded[:, 3])).max() > np.pi
     to_lerobot(results, tmp_path / "d")
     angles = info(tmp_path / "d")[INFO]["angles"]
@@ -248,31 +285,45 @@ def test_angles_are_written_without_jumps_and_info_says_about_what(results: Resu
     assert np.abs(roll - angles["5"]).max() < np.pi / 2
     np.testing.assert_array_equal(np.array(written["observation.state.xyzrpy"])[:, 3], roll)
     about = DatasetContract.from_json(info(tmp_path / "d")[INFO])
-    np.testing.assert_allclose(about.wrapped(np.insert(recorded, 0, [[0], [0]], axis=1))[:, 5], roll, atol=1e-6)
+    np.testing.assert_allclose(
+        about.wrapped(np.insert(recorded, 0, [[0], [0]], axis=1))[:, 5], roll, atol=1e-6
+    )
 
 
-def test_rotation_vectors_are_written_without_jumps_and_are_the_same_rotations(config: Config, tmp_path: Path) -> None:
+def test_rotation_vectors_are_written_without_jumps_and_are_the_same_rotations(
+    config: Config, tmp_path: Path
+) -> None:
     results = play(config(envs=[TILTED_ROLLER], episodes=2, record="all"), Turner)
-    recorded = Trajectory.load(results.out / str(results.cells[0].episodes[0].trajectory)).state["xyz_axis_angle"][:-1]
+    recorded = Trajectory.load(results.out / str(results.cells[0].episodes[0].trajectory)).state[
+        "xyz_axis_angle"
+    ][:-1]
     assert np.linalg.norm(np.diff(recorded[:, 3:], axis=0), axis=1).max() > np.pi
     to_lerobot(results, tmp_path / "d")
     about = DatasetContract.from_json(info(tmp_path / "d")[INFO])
     assert list(about.angles) == [5]
     written = rows(tmp_path / "d", 0)
     vectors = np.array(written["observation.state"])[:, 5:8]
-    assert np.linalg.norm(np.diff(vectors, axis=0), axis=1).max() == pytest.approx(Roller.TURN, abs=1e-5)
+    assert np.linalg.norm(np.diff(vectors, axis=0), axis=1).max() == pytest.approx(
+        Roller.TURN, abs=1e-5
+    )
     np.testing.assert_allclose(
-        Rotation.from_rotvec(vectors).as_matrix(), Rotation.from_rotvec(recorded[:, 3:]).as_matrix(), atol=1e-5
+        Rotation.from_rotvec(vectors).as_matrix(),
+        Rotation.from_rotvec(recorded[:, 3:]).as_matrix(),
+        atol=1e-5,
     )
     served = about.wrapped(
-        np.concatenate([np.zeros((len(recorded), 2)), recorded, np.ones((len(recorded), 1))], axis=1)
+        np.concatenate(
+            [np.zeros((len(recorded), 2)), recorded, np.ones((len(recorded), 1))], axis=1
+        )
     )
     np.testing.assert_allclose(served[:, 5:8], vectors, atol=1e-6)
     alone = np.array(written["observation.state.xyz_axis_angle"])
     np.testing.assert_array_equal(alone, np.array(written["observation.state"])[:, 2:8])
 
 
-def test_the_contract_of_a_policy_goes_along_in_info_and_in_the_statistics(results: Results, tmp_path: Path) -> None:
+def test_the_contract_of_a_policy_goes_along_in_info_and_in_the_statistics(
+    results: Results, tmp_path: Path
+) -> None:
     to_lerobot(results, tmp_path / "d", cameras=["wrist"], state=["joints", "gripper"])
     features = info(tmp_path / "d")["features"]
     assert features["action"]["spec"]["space"] == "joint"

@@ -1,4 +1,6 @@
-"""Results of several folders in one: each episode once, nothing that contradicts, and a folder like any other."""
+"""Results of several folders in one: each episode once, nothing that contradicts, and a folder
+like any other.
+"""
 
 from __future__ import annotations
 
@@ -48,7 +50,9 @@ def part(config: Config, tmp_path: Path) -> Callable[..., Path]:
 
 
 def outcomes(results: Results) -> dict[str, object]:
-    return {str(one.result.key): one.result.outcome for cell in results.cells for one in cell.episodes}
+    return {
+        str(one.result.key): one.result.outcome for cell in results.cells for one in cell.episodes
+    }
 
 
 def test_parts_that_overlap_make_the_whole_each_episode_as_the_first_has_it(
@@ -68,7 +72,9 @@ def test_parts_that_overlap_make_the_whole_each_episode_as_the_first_has_it(
         merge(a, [a, b])
 
 
-def test_a_merged_folder_is_resumed_like_any_other(part: Callable[..., Path], config: Config, tmp_path: Path) -> None:
+def test_a_merged_folder_is_resumed_like_any_other(
+    part: Callable[..., Path], config: Config, tmp_path: Path
+) -> None:
     a, b = part("a", 2, 3, 4, 5), part("b", 0, 1, 4, 5)
     merge(tmp_path / "out", [a, b])
     results = play(config(out=tmp_path / "out", resume=True))
@@ -85,7 +91,10 @@ def test_other_envs_and_seeds_join_the_table_also_of_a_suite_that_was_renamed(
     play(renamed.model_copy(update={"suites": [suite]}))
     merge(tmp_path / "out", [part("a"), tmp_path / "b", part("c", envs=[OTHER_LINE])])
     cells = Results.load(tmp_path / "out").cells
-    assert [(cell.env, cell.planned, len(cell.counted)) for cell in cells] == [(LINE, 12, 12), (OTHER_LINE, 6, 6)]
+    assert [(cell.env, cell.planned, len(cell.counted)) for cell in cells] == [
+        (LINE, 12, 12),
+        (OTHER_LINE, 6, 6),
+    ]
 
 
 @pytest.mark.parametrize(
@@ -102,11 +111,18 @@ def test_seeds_that_play_an_episode_twice_and_other_settings_are_refused(
         merge(tmp_path / "out", [part("a"), part("b", **changes)])
 
 
-def test_different_outcomes_are_listed_and_nothing_is_written(part: Callable[..., Path], tmp_path: Path) -> None:
+def test_different_outcomes_are_listed_and_nothing_is_written(
+    part: Callable[..., Path], tmp_path: Path
+) -> None:
     a, b = part("a"), part("b")
     with closing(sqlite3.connect(b / "results.db")) as db, db:
-        db.execute("UPDATE episodes SET success_once = 1 - success_once, seconds = 99 WHERE episode IN (2, 3)")
-    with pytest.raises(ConfigError, match=r"2 episodes have different outcomes:\n.*Line#2@2.*success_once is") as told:
+        db.execute(
+            "UPDATE episodes SET success_once = 1 - success_once, seconds = 99 WHERE episode IN "
+            "(2, 3)"
+        )
+    with pytest.raises(
+        ConfigError, match=r"2 episodes have different outcomes:\n.*Line#2@2.*success_once is"
+    ) as told:
         merge(tmp_path / "out", [a, b])
     assert "seconds" not in str(told.value)
     assert not (tmp_path / "out").exists()
@@ -150,7 +166,9 @@ def test_a_policy_with_another_checkpoint_or_other_weights_is_named(
         merge(tmp_path / "out", folders)
 
 
-def test_in_a_sweep_each_server_may_have_begun_with_another_checkpoint(tmp_path: Path, config: Config) -> None:
+def test_in_a_sweep_each_server_may_have_begun_with_another_checkpoint(
+    tmp_path: Path, config: Config
+) -> None:
     folders = [tmp_path / step for step in ("10", "20")]
     for folder in folders:
         play(config(out=folder, steps=[int(folder.name)]), functools.partial(Served, folder.name))
@@ -158,7 +176,9 @@ def test_in_a_sweep_each_server_may_have_begun_with_another_checkpoint(tmp_path:
     assert [cell.step for cell in Results.load(tmp_path / "out").cells] == [10, 20]
 
 
-def test_videos_and_trajectories_go_along_without_taking_room(part: Callable[..., Path], tmp_path: Path) -> None:
+def test_videos_and_trajectories_go_along_without_taking_room(
+    part: Callable[..., Path], tmp_path: Path
+) -> None:
     options = {"env_options": {"camera": [32, 32]}, "record": "all", "video": "all"}
     a, b = part("a", 1, 2, 3, 4, 5, **options), part("b", 0, 2, 3, 4, 5, **options)
     merge(tmp_path / "out", [a, b])
@@ -176,7 +196,9 @@ def test_a_file_of_an_episode_that_is_gone_is_said_in_one_sentence_and_nothing_i
     a = part("a", env_options={"camera": [32, 32]}, record="all", video="all")
     [gone] = (a / kind).rglob("ep0003_*.mp4" if kind == "videos" else "ep0003_*.npz")
     gone.unlink()
-    with pytest.raises(ConfigError, match=rf"{gone.name}: got no file, want .*; copy the folder again"):
+    with pytest.raises(
+        ConfigError, match=rf"{gone.name}: got no file, want .*; copy the folder again"
+    ):
         merge(tmp_path / "out", [a])
     assert not list((tmp_path / "out").rglob("*.*"))
     write_report(Results.load(a), tmp_path / "report.html")
@@ -191,10 +213,20 @@ def named(folder: Path, column: str, path: str) -> Path:
 
 
 @pytest.mark.parametrize(
-    "path", ["/etc/hostname", "../secret/key.mp4", "videos/../../secret/key.mp4", "..", "", "videos/\0.mp4"]
+    "path",
+    [
+        "/etc/hostname",
+        "../secret/key.mp4",
+        "videos/../../secret/key.mp4",
+        "..",
+        "",
+        "videos/\0.mp4",
+    ],
 )
 def test_a_path_out_of_a_folder_of_results_is_refused(path: str) -> None:
-    with pytest.raises(ConfigError, match="as a file of an episode, want a path below the folder of results"):
+    with pytest.raises(
+        ConfigError, match="as a file of an episode, want a path below the folder of results"
+    ):
         require_below(path)
 
 
@@ -223,7 +255,10 @@ def test_symbolic_links_lead_no_further_than_their_folder(
     else:
         (theirs / "v").mkdir()
         (theirs / "v" / "key.mp4").symlink_to(tmp_path / "secret" / "key.mp4")
-    with pytest.raises(ConfigError, match=r"v/key.mp4: is a symbolic link out of the folder .* copy what it leads to"):
+    with pytest.raises(
+        ConfigError,
+        match=r"v/key.mp4: is a symbolic link out of the folder .* copy what it leads to",
+    ):
         merge(tmp_path / "out", [theirs])
     other = part("other", execute=2)  # beside the secret
     for results in (Results.load(theirs), combined([Results.load(theirs), Results.load(other)])):
@@ -234,7 +269,9 @@ def test_symbolic_links_lead_no_further_than_their_folder(
         assert base64.b64encode(b"secret").decode() not in page
 
 
-def test_a_difference_from_a_commit_that_is_a_link_is_not_copied(part: Callable[..., Path], tmp_path: Path) -> None:
+def test_a_difference_from_a_commit_that_is_a_link_is_not_copied(
+    part: Callable[..., Path], tmp_path: Path
+) -> None:
     theirs = part("theirs")
     (theirs / "provenance").mkdir(exist_ok=True)
     (theirs / "provenance" / "x.diff").symlink_to("/etc/hostname")
@@ -242,7 +279,9 @@ def test_a_difference_from_a_commit_that_is_a_link_is_not_copied(part: Callable[
         merge(tmp_path / "out", [theirs])
 
 
-def test_links_within_a_folder_and_to_it_are_followed(part: Callable[..., Path], tmp_path: Path) -> None:
+def test_links_within_a_folder_and_to_it_are_followed(
+    part: Callable[..., Path], tmp_path: Path
+) -> None:
     a = named(part("a"), "videos", "v/key.mp4")
     (a / "w").mkdir()
     (a / "w" / "key.mp4").write_text("mine")
@@ -261,13 +300,22 @@ def with_weights(folder: Path, weights: str) -> Path:
     return folder
 
 
-def test_other_weights_under_the_same_name_are_not_merged(part: Callable[..., Path], tmp_path: Path) -> None:
+def test_other_weights_under_the_same_name_are_not_merged(
+    part: Callable[..., Path], tmp_path: Path
+) -> None:
     a, b = with_weights(part("a", 3, 4, 5), "x"), with_weights(part("b", 0, 1, 2), "y")
     elsewhere = with_weights(part("c", envs=[OTHER_LINE]), "y")
     for other in (b, elsewhere):
-        with pytest.raises(ConfigError, match=r"was played by several weights under one name: .*'x'.*'y'.*merge those"):
+        with pytest.raises(
+            ConfigError,
+            match=r"was played by several weights under one name: .*'x'.*'y'.*merge those",
+        ):
             merge(tmp_path / "out", [a, other])
     with_weights(b, "x")
     merge(tmp_path / "same", [a, b])
-    found = {one.result.weights for cell in Results.load(tmp_path / "same").cells for one in cell.episodes}
+    found = {
+        one.result.weights
+        for cell in Results.load(tmp_path / "same").cells
+        for one in cell.episodes
+    }
     assert found == {"x"}

@@ -28,8 +28,16 @@ def test_parquet_has_a_typed_row_an_episode(results: Results, tmp_path: Path) ->
     assert to_parquet(results, tmp_path / "episodes.parquet") == 5
     table = pq.read_table(tmp_path / "episodes.parquet")
     assert table.column_names == [column.name for column in COLUMNS]
-    types = {name: str(table.schema.field(name).type) for name in ("success_once", "steps", "return", "finished")}
-    assert types == {"success_once": "bool", "steps": "int64", "return": "double", "finished": "timestamp[us, tz=UTC]"}
+    types = {
+        name: str(table.schema.field(name).type)
+        for name in ("success_once", "steps", "return", "finished")
+    }
+    assert types == {
+        "success_once": "bool",
+        "steps": "int64",
+        "return": "double",
+        "finished": "timestamp[us, tz=UTC]",
+    }
     rows = table.to_pylist()
     assert [(row["env"], row["episode"], row["seed"]) for row in rows] == [
         (LINE, 0, 0), (LINE, 1, 1), (LINE, 2, 2), (OTHER_LINE, 0, 0), (OTHER_LINE, 1, 1)
@@ -43,7 +51,9 @@ def test_parquet_has_a_typed_row_an_episode(results: Results, tmp_path: Path) ->
 
 def test_parquet_holds_the_values_of_each_episode(results: Results, tmp_path: Path) -> None:
     to_parquet(results, tmp_path / "a.parquet")
-    for read, row in zip(pq.read_table(tmp_path / "a.parquet").to_pylist(), rows(results), strict=True):
+    for read, row in zip(
+        pq.read_table(tmp_path / "a.parquet").to_pylist(), rows(results), strict=True
+    ):
         for column in COLUMNS:
             value = read[column.name]
             if column.type == "json":

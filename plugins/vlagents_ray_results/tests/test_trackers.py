@@ -26,7 +26,9 @@ Config = Callable[..., EvalConfig]
 
 @pytest.fixture
 def told(config: Config) -> Callable[..., Results]:
-    """An evaluation of two checkpoints, told to one tracker, and told again by a run that resumes it."""
+    """An evaluation of two checkpoints, told to one tracker, and told again by a run that
+    resumes it.
+    """
 
     def tell(tracker: str, **changes: Any) -> Results:
         options = {"episodes": 3, "video": "all", "env_options": {"camera": [32, 32]}} | changes
@@ -49,7 +51,9 @@ def rates(results: Results) -> list[float]:
 
 @pytest.fixture(scope="module", autouse=True)
 def _no_service_left() -> Iterator[None]:
-    """wandb's own process lives as long as the one that wanted it, which here goes on with other tests."""
+    """wandb's own process lives as long as the one that wanted it, which here goes on with other
+    tests.
+    """
     yield
     import wandb
 
@@ -96,24 +100,35 @@ def read_wandb(out: Path) -> ReadRun:
     for record in [one for file in sorted(files) for one in wandb_records(file)]:
         if record.HasField("history"):
             items = record.history.item
-            read.rows.append({item.key or "/".join(item.nested_key): json.loads(item.value_json) for item in items})
+            read.rows.append(
+                {
+                    item.key or "/".join(item.nested_key): json.loads(item.value_json)
+                    for item in items
+                }
+            )
         for update in [*record.run.config.update, *record.config.update]:
             read.config[update.key or update.nested_key[0]] = json.loads(update.value_json)
         for update in record.summary.update:
             read.summary[update.key or update.nested_key[0]] = json.loads(update.value_json)
         for artifact in [record.artifact] if record.HasField("artifact") else []:
-            read.artifacts.append((artifact.type, [entry.path for entry in artifact.manifest.contents]))
+            read.artifacts.append(
+                (artifact.type, [entry.path for entry in artifact.manifest.contents])
+            )
     return read
 
 
 def wandb_records(file: Path) -> list[Any]:
     from wandb.proto.wandb_internal_pb2 import Record
 
-    return [Record.FromString(data) for data in log_records(file.read_bytes()[WANDB_HEADER:])] or [Record()]
+    return [Record.FromString(data) for data in log_records(file.read_bytes()[WANDB_HEADER:])] or [
+        Record()
+    ]
 
 
 def log_records(log: bytes) -> Iterator[bytes]:
-    """Of a file in LevelDB's log format: records in pieces, none of which crosses the end of a block."""
+    """Of a file in LevelDB's log format: records in pieces, none of which crosses the end of a
+    block.
+    """
     at, record = 0, b""
     while at + 7 <= len(log):
         if (left := LOG_BLOCK - (at + WANDB_HEADER) % LOG_BLOCK) < 7:
@@ -140,7 +155,10 @@ def test_wandb_keeps_a_policy_without_steps_in_the_summary(
 
 
 def test_trackio_keeps_curves_and_videos(
-    told: Callable[..., Results], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+    told: Callable[..., Results],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
 ) -> None:
     monkeypatch.setenv("TRACKIO_DIR", str(tmp_path / "trackio"))
     import trackio
@@ -150,7 +168,9 @@ def test_trackio_keeps_curves_and_videos(
     assert not [one for one in caplog.records if one.levelno >= logging.WARNING]
     [run] = trackio.Api().runs("tests")
     logs = SQLiteStorage.get_logs("tests", run.name)
-    points = [(row["step"], row[f"{LINE}/success_once"]) for row in logs if f"{LINE}/success_once" in row]
+    points = [
+        (row["step"], row[f"{LINE}/success_once"]) for row in logs if f"{LINE}/success_once" in row
+    ]
     assert points == list(zip([10, 20], rates(results), strict=True))
     assert [row["step"] for row in logs if "total/return" in row] == [10, 20]
     assert len(list((tmp_path / "trackio").rglob("*.mp4"))) == 6
@@ -167,9 +187,13 @@ def test_tensorboard_reads_the_curves_and_the_config(
     found = EventAccumulator(str(results.out / "tensorboard" / "policy"))
     found.Reload()
     points = [(one.step, one.value) for one in found.Scalars(f"{LINE}/success_once")]
-    assert points == [(step, pytest.approx(rate)) for step, rate in zip([10, 20], rates(results), strict=True)]
+    assert points == [
+        (step, pytest.approx(rate)) for step, rate in zip([10, 20], rates(results), strict=True)
+    ]
     assert [one.step for one in found.Scalars("total/return")] == [10, 20]
     [config] = [one.tensor_proto.string_val[0].decode() for one in found.Tensors("config")]
     assert '"episodes": 3' in config
-    [first, _] = [one.tensor_proto.string_val[0].decode() for one in found.Tensors(f"{LINE}/videos")]
+    [first, _] = [
+        one.tensor_proto.string_val[0].decode() for one in found.Tensors(f"{LINE}/videos")
+    ]
     assert len(first.splitlines()) == 3

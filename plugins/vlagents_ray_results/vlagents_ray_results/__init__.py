@@ -1,1 +1,3 @@
-"""Results of evaluations for others: bundles and their checks, merged folders, exports, and trackers."""
+"""Results of evaluations for others: bundles and their checks, merged folders, exports, and
+trackers.
+"""

@@ -1,9 +1,11 @@
-"""An evaluation in one file, which others can cite, check, replay in part, and merge with their own.
+"""An evaluation in one file, which others can cite, check, replay in part, and merge with their
+own.
 
-The file is a ZIP archive whose first member lists the others with their digests. An archive may come from a stranger.
-Its list of members is checked before any is read: `pack` could have written every name, so that none leads out of the
-folder; no member is a link; the sizes are bounded, and no member yields more bytes than it states. Nothing is unpickled
-or imported. `verification` compares the content.
+The file is a ZIP archive whose first member lists the others with their digests. An archive may
+come from a stranger. Its list of members is checked before any is read: `pack` could have written
+every name, so that none leads out of the folder; no member is a link; the sizes are bounded, and no
+member yields more bytes than it states. Nothing is unpickled or imported. `verification` compares
+the content.
 """
 
 from __future__ import annotations
@@ -34,7 +36,8 @@ MOST_BYTES = 16 * 10**9  # of all members, unpacked
 _MOST_MEMBERS = 200_000
 _MOST_MANIFEST = 64 * 2**20  # bytes
 _CHUNK = 2**20
-_PART = r"[\w@-][\w.@-]{0,200}"  # of a path, as `naming.plain` leaves names: it neither is nor begins with a dot
+# Of a path, as `naming.plain` leaves names: it neither is nor begins with a dot.
+_PART = r"[\w@-][\w.@-]{0,200}"
 _KNOWN = re.compile(
     rf"{re.escape(MANIFEST)}|{re.escape(DATABASE)}|{storage.PROVENANCE}/[0-9a-f]{{64}}\.diff"
     rf"|{storage.TRAJECTORIES}/({_PART}/){{1,3}}{_PART}\.(npz|mp4)|{storage.VIDEOS}/({_PART}/){{1,3}}{_PART}\.mp4"
@@ -72,7 +75,8 @@ def digest_of(path: Path) -> FileDigest:
 
 
 def pack(folder: Path, archive: Path) -> str:
-    """Write all files of `folder` into the bundle `archive`, whole or not at all; the same files give the same bytes.
+    """Write all files of `folder` into the bundle `archive`, whole or not at all; the same files
+    give the same bytes.
 
     Returns:
         The SHA-256 of the manifest, which identifies the content of the bundle.
@@ -80,14 +84,21 @@ def pack(folder: Path, archive: Path) -> str:
     paths = sorted(path for path in folder.rglob("*") if path.is_file())
     names = {path.relative_to(folder).as_posix(): path for path in paths}
     if unknown := [name for name in names if not _KNOWN.fullmatch(name) or name == MANIFEST]:
-        raise ConfigError(f"{folder}: got the files {unknown[:5]}, which a bundle may not hold; rename or remove them")
+        raise ConfigError(
+            f"{folder}: got the files {unknown[:5]}, which a bundle may not hold; rename or remove "
+            "them"
+        )
     manifest = Manifest(files={name: digest_of(path) for name, path in names.items()})
     text = (manifest.model_dump_json(indent=1) + "\n").encode()
     with storage.whole(archive) as part, zipfile.ZipFile(part, "w", zipfile.ZIP_DEFLATED) as file:
         file.writestr(_member(MANIFEST), text, zipfile.ZIP_DEFLATED)
         for name, path in names.items():
-            how = zipfile.ZIP_STORED if path.suffix in (".mp4", ".npz") else zipfile.ZIP_DEFLATED  # already compressed
-            with path.open("rb") as source, file.open(_member(name, how), "w", force_zip64=True) as target:
+            # Already compressed.
+            how = zipfile.ZIP_STORED if path.suffix in (".mp4", ".npz") else zipfile.ZIP_DEFLATED
+            with (
+                path.open("rb") as source,
+                file.open(_member(name, how), "w", force_zip64=True) as target,
+            ):
                 shutil.copyfileobj(source, target, _CHUNK)
     return hashlib.sha256(text).hexdigest()
 
@@ -101,21 +112,28 @@ def _member(name: str, how: int = zipfile.ZIP_DEFLATED) -> zipfile.ZipInfo:
 def require_file(archive: Path) -> None:
     if (archive / DATABASE).is_file():
         raise ConfigError(
-            f"{archive}: expected a bundle, got a folder of results; `vlagents-ray bundle {archive}` writes its bundle"
+            f"{archive}: expected a bundle, got a folder of results; `vlagents-ray bundle "
+            f"{archive}` writes its bundle"
         )
     if not archive.is_file():
         what = "a folder" if archive.is_dir() else "no file"
-        raise ConfigError(f"{archive}: expected a bundle, a file that `vlagents-ray bundle` wrote, got {what}")
+        raise ConfigError(
+            f"{archive}: expected a bundle, a file that `vlagents-ray bundle` wrote, got {what}"
+        )
 
 
-def unpack(archive: Path, folder: Path, *, most_bytes: int = MOST_BYTES) -> tuple[Manifest, str, list[str]]:
+def unpack(
+    archive: Path, folder: Path, *, most_bytes: int = MOST_BYTES
+) -> tuple[Manifest, str, list[str]]:
     """Write the files of a bundle into `folder`, without its manifest.
 
     Returns:
-        The manifest, its SHA-256, and the differences between the manifest and the files, a sentence each.
+        The manifest, its SHA-256, and the differences between the manifest and the files, a
+        sentence each.
 
     Raises:
-        ConfigError: The file is no bundle, or is larger than allowed, or has a name that leads out of `folder`.
+        ConfigError: The file is no bundle, or is larger than allowed, or has a name that leads out
+            of `folder`.
     """
     require_file(archive)
     try:
@@ -131,12 +149,16 @@ def unpack(archive: Path, folder: Path, *, most_bytes: int = MOST_BYTES) -> tupl
     except ConfigError:
         raise
     except _BROKEN as error:
-        raise ConfigError(f"{archive}: cannot be read as a bundle ({error}); copy it again from its source") from error
+        raise ConfigError(
+            f"{archive}: cannot be read as a bundle ({error}); copy it again from its source"
+        ) from error
     listed = manifest.files
     differences = [f"{name} is not in the bundle" for name in listed.keys() - digests.keys()]
     differences += [f"{name} is not in the manifest" for name in digests.keys() - listed.keys()]
     differences += [
-        f"{name} has another digest" for name in listed.keys() & digests.keys() if listed[name] != digests[name]
+        f"{name} has another digest"
+        for name in listed.keys() & digests.keys()
+        if listed[name] != digests[name]
     ]
     return manifest, sha256, sorted(differences)
 
@@ -145,32 +167,49 @@ def _checked(archive: Path, file: zipfile.ZipFile, most_bytes: int) -> dict[str,
     """Return the members by their names, after all checks that need not read them."""
     listed = file.infolist()
     if len(listed) > _MOST_MEMBERS:
-        raise ConfigError(f"{archive}: got {len(listed)} files, want at most {_MOST_MEMBERS}; {_DISTRUST}")
+        raise ConfigError(
+            f"{archive}: got {len(listed)} files, want at most {_MOST_MEMBERS}; {_DISTRUST}"
+        )
     members: dict[str, zipfile.ZipInfo] = {}
     for member in listed:
         name = member.orig_filename
         kind = stat.S_IFMT(member.external_attr >> 16)
         if not _KNOWN.fullmatch(name) or member.filename != name:
-            raise ConfigError(f"{archive}: got the file {name!r}, want those of a folder of results; {_DISTRUST}")
+            raise ConfigError(
+                f"{archive}: got the file {name!r}, want those of a folder of results; {_DISTRUST}"
+            )
         if name in members:
             raise ConfigError(f"{archive}: got {name!r} twice; {_DISTRUST}")
         if kind not in (0, stat.S_IFREG):
             raise ConfigError(f"{archive}: {name!r} is a link or another special file; {_DISTRUST}")
-        if member.flag_bits & 0x1 or member.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
-            raise ConfigError(f"{archive}: {name!r} is encrypted, or packed in another way than a bundle; {_DISTRUST}")
+        if member.flag_bits & 0x1 or member.compress_type not in (
+            zipfile.ZIP_STORED,
+            zipfile.ZIP_DEFLATED,
+        ):
+            raise ConfigError(
+                f"{archive}: {name!r} is encrypted, or packed in another way than a bundle; "
+                f"{_DISTRUST}"
+            )
         members[name] = member
     if (total := sum(member.file_size for member in listed)) > most_bytes:
         raise ConfigError(
-            f"{archive}: unpacks to {total} bytes, want at most {most_bytes}; allow more with --max-gb if you trust it"
+            f"{archive}: unpacks to {total} bytes, want at most {most_bytes}; allow more with "
+            "--max-gb if you trust it"
         )
     return members
 
 
-def _manifest(archive: Path, file: zipfile.ZipFile, member: zipfile.ZipInfo | None) -> tuple[Manifest, str]:
+def _manifest(
+    archive: Path, file: zipfile.ZipFile, member: zipfile.ZipInfo | None
+) -> tuple[Manifest, str]:
     if member is None:
-        raise ConfigError(f"{archive}: has no {MANIFEST}, want a bundle that `vlagents-ray bundle` wrote")
+        raise ConfigError(
+            f"{archive}: has no {MANIFEST}, want a bundle that `vlagents-ray bundle` wrote"
+        )
     if member.file_size > _MOST_MANIFEST:
-        raise ConfigError(f"{archive}: {MANIFEST} has {member.file_size} bytes, want at most {_MOST_MANIFEST}")
+        raise ConfigError(
+            f"{archive}: {MANIFEST} has {member.file_size} bytes, want at most {_MOST_MANIFEST}"
+        )
     with file.open(member) as opened:
         text = opened.read(_MOST_MANIFEST + 1)
     try:
@@ -179,17 +218,22 @@ def _manifest(archive: Path, file: zipfile.ZipFile, member: zipfile.ZipInfo | No
         first = error.errors(include_url=False, include_input=False)[0]
         where = ".".join(map(str, first["loc"]))
         raise ConfigError(
-            f"{archive}: {MANIFEST} is not one of version 1: {where}: {first['msg']}; read it with the version of "
+            f"{archive}: {MANIFEST} is not one of version 1: {where}: {first['msg']}; read it with "
+            "the version of "
             f"vlagents-ray that wrote it"
         ) from error
 
 
-def _copy(archive: Path, source: IO[bytes], target: IO[bytes], member: zipfile.ZipInfo) -> FileDigest:
+def _copy(
+    archive: Path, source: IO[bytes], target: IO[bytes], member: zipfile.ZipInfo
+) -> FileDigest:
     sha256, size = hashlib.sha256(), 0
     while chunk := source.read(_CHUNK):
         size += len(chunk)
         if size > member.file_size:
-            raise ConfigError(f"{archive}: {member.filename!r} has more bytes than it states; {_DISTRUST}")
+            raise ConfigError(
+                f"{archive}: {member.filename!r} has more bytes than it states; {_DISTRUST}"
+            )
         sha256.update(chunk)
         target.write(chunk)
     return FileDigest(sha256=sha256.hexdigest(), size=size)
@@ -198,13 +242,15 @@ def _copy(archive: Path, source: IO[bytes], target: IO[bytes], member: zipfile.Z
 def write_bundle(folder: Path, archive: Path, *, videos: bool = False) -> str:
     """Write the results in `folder` as one file that others can check (`verify`).
 
-    It holds the present results.db, the differences from the commits, and the trajectories, by which episodes are
-    played again, but nothing that is computed from these. The database names only files in the bundle, so that its
-    results can be merged with others.
+    It holds the present results.db, the differences from the commits, and the trajectories, by
+    which episodes are played again, but nothing that is computed from these. The database names
+    only files in the bundle, so that its results can be merged with others.
 
     Args:
-        folder: A folder of results, to which an evaluation may be writing; nothing in it is changed.
-        videos: Whether the bundle also holds the videos: those of the report, and of the policy's images.
+        folder: A folder of results, to which an evaluation may be writing; nothing in it is
+            changed.
+        videos: Whether the bundle also holds the videos: those of the report, and of the policy's
+            images.
 
     Returns:
         The SHA-256 of its manifest, which identifies its content.
@@ -215,7 +261,9 @@ def write_bundle(folder: Path, archive: Path, *, videos: bool = False) -> str:
     """
     with storage.storing(archive.parent):
         archive.parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(prefix=f"{archive.name}.part-", dir=archive.parent) as temporary:
+        with tempfile.TemporaryDirectory(
+            prefix=f"{archive.name}.part-", dir=archive.parent
+        ) as temporary:
             stage = Path(temporary)
             # One consistent state, even while an evaluation writes to it.
             with reading(folder) as source, closing(sqlite3.connect(stage / DATABASE)) as target:
@@ -223,10 +271,18 @@ def write_bundle(folder: Path, archive: Path, *, videos: bool = False) -> str:
             _link_files(folder, stage, Results.load(stage), videos=videos)
             # Remove the names of files that are not in the bundle.
             with closing(sqlite3.connect(stage / DATABASE)) as db, db:
-                for key, shown, numbers in db.execute("SELECT key, videos, trajectory FROM episodes").fetchall():
+                for key, shown, numbers in db.execute(
+                    "SELECT key, videos, trajectory FROM episodes"
+                ).fetchall():
                     there = [path for path in json.loads(shown) if (stage / path).is_file()]
-                    values = canonical(there), numbers if numbers and (stage / numbers).is_file() else None, key
-                    db.execute("UPDATE episodes SET videos = ?, trajectory = ? WHERE key = ?", values)
+                    values = (
+                        canonical(there),
+                        numbers if numbers and (stage / numbers).is_file() else None,
+                        key,
+                    )
+                    db.execute(
+                        "UPDATE episodes SET videos = ?, trajectory = ? WHERE key = ?", values
+                    )
             return pack(stage, archive)
 
 
@@ -241,7 +297,10 @@ def _link_files(folder: Path, stage: Path, results: Results, *, videos: bool) ->
                     episode.trajectory,
                     *(storage.trajectory_videos(folder, episode.trajectory) if videos else ()),
                 ]
-    paths += [f"{storage.PROVENANCE}/{path.name}" for path in sorted((folder / storage.PROVENANCE).glob("*.diff"))]
+    paths += [
+        f"{storage.PROVENANCE}/{path.name}"
+        for path in sorted((folder / storage.PROVENANCE).glob("*.diff"))
+    ]
     for path in dict.fromkeys(paths):
         source = storage.inside(folder, path)
         if source.is_file():  # a folder that was copied without its videos can be bundled

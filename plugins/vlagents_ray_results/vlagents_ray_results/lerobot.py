@@ -65,46 +65,57 @@ def to_lerobot(
     successes: bool = False,
     cut_idle: bool = False,
 ) -> int:
-    """Write the recorded episodes as a LeRobotDataset v3.0 into the new folder `path`, or write nothing.
+    """Write the recorded episodes as a LeRobotDataset v3.0 into the new folder `path`, or write
+    nothing.
 
     One episode at a time is in memory.
 
-    A frame is an observation and the action after it; the last observation of an episode is left out. Angles and
-    rotation vectors of the state that jump by a full turn are written about another centre. The dataset's contract
-    (`vlagents_ray.dataset_contract`) names it, so that the policy's server does the same. If a policy named the version
-    of its weights, each frame has that of its action, or -1 if it is unknown.
+    A frame is an observation and the action after it; the last observation of an episode is left
+    out. Angles and rotation vectors of the state that jump by a full turn are written about another
+    centre. The dataset's contract (`vlagents_ray.dataset_contract`) names it, so that the policy's
+    server does the same. If a policy named the version of its weights, each frame has that of its
+    action, or -1 if it is unknown.
 
     Args:
         cameras: The cameras of the dataset; by default all.
-        state: The parts of `observation.state` in this order, "gripper" for `Obs.gripper`; by default all that are not
-            in `environment_state`, sorted, the gripper last.
-        environment_state: The parts of `observation.environment_state` in this order: LeRobot's policies need it if
-            they get no camera.
+        state: The parts of `observation.state` in this order, "gripper" for `Obs.gripper`; by
+            default all that are not in `environment_state`, sorted, the gripper last.
+        environment_state: The parts of `observation.environment_state` in this order: LeRobot's
+            policies need it if they get no camera.
         successes: Leave out episodes in which the task was never solved.
-        cut_idle: End each episode when, after the task was solved, neither state nor action changes any more.
+        cut_idle: End each episode when, after the task was solved, neither state nor action changes
+            any more.
 
     Returns:
         The number of episodes in the dataset.
 
     Raises:
-        ConfigError: There is no such trajectory, a file is missing, a camera or part is unknown, or the episodes do not
-            fit one dataset.
+        ConfigError: There is no such trajectory, a file is missing, a camera or part is unknown, or
+            the episodes do not fit one dataset.
     """
     recorded = []
     for cell in results.cells:
         recorded += [(cell, episode) for episode in cell.episodes if episode.trajectory is not None]
     if not recorded:
-        raise ConfigError(f"{results.out}: has no trajectories; evaluate with --record all (`record: all` in its file)")
+        raise ConfigError(
+            f"{results.out}: has no trajectories; evaluate with --record all (`record: all` in its "
+            "file)"
+        )
     if successes:
         solved = [(cell, episode) for cell, episode in recorded if episode.result.success_once]
         if not solved:
-            raise ConfigError(f"{results.out}: in none of the {len(recorded)} recorded episodes was the task solved")
+            raise ConfigError(
+                f"{results.out}: in none of the {len(recorded)} recorded episodes was the task "
+                "solved"
+            )
         recorded = solved
     if path.exists() and any(path.iterdir()):
         raise ConfigError(f"{path}: is there, and not empty; export into a new folder")
     rates = {_fps(cell) for cell, _ in recorded}
     if len(rates) > 1:
-        raise ConfigError(f"the envs run at {sorted(rates)} Hz, and a dataset has one rate; {_CURE}")
+        raise ConfigError(
+            f"the envs run at {sorted(rates)} Hz, and a dataset has one rate; {_CURE}"
+        )
     with_versions = any(episode.result.policy_version is not None for _, episode in recorded)
     selection = _Selection(results, cameras, state, environment_state, cut_idle, with_versions)
     angles = _angles(selection.demonstrations(recorded))
@@ -114,18 +125,26 @@ def to_lerobot(
             finished = _finished(demonstration, angles, root / UNFINISHED)
             features = dataset.info["features"]
             if dataset.episodes and finished.features != features:
-                differing = sorted(key for key, value in finished.features.items() if features.get(key) != value)
+                differing = sorted(
+                    key for key, value in finished.features.items() if features.get(key) != value
+                )
                 env = demonstration.cell.env
-                raise ConfigError(f"{env}: has other features than envs before ({', '.join(differing)}); {_CURE}")
+                raise ConfigError(
+                    f"{env}: has other features than envs before ({', '.join(differing)}); {_CURE}"
+                )
             dataset.save(finished)
         if not dataset.episodes:
-            raise ConfigError(f"{results.out}: in none of the {len(recorded)} recorded episodes did the policy act")
+            raise ConfigError(
+                f"{results.out}: in none of the {len(recorded)} recorded episodes did the policy "
+                "act"
+            )
         shutil.rmtree(root / UNFINISHED, ignore_errors=True)
         return dataset.episodes
 
 
 _CURE = "export env by env (--env)"
-# At rest, changes between frames are below this share of the range of a part of the state, or of the action.
+# At rest, changes between frames are below this share of the range of a part of the state, or of
+# the action.
 _STILL = 0.01
 
 
@@ -143,7 +162,8 @@ class _Demonstration:
     environment: tuple[str, ...]  # parts of `observation.environment_state`
     state: dict[str, np.ndarray]  # (N, D) each
     gripper: np.ndarray | None  # (N,)
-    versions: np.ndarray | None  # (N,) of the weights that chose each action; None if no episode's policy named them
+    # (N,) of the weights that chose each action; None if no episode's policy named them.
+    versions: np.ndarray | None
     videos: dict[str, Path]  # by camera
 
 
@@ -158,11 +178,14 @@ class _Selection:
     cut_idle: bool
     with_versions: bool  # of the weights
 
-    def demonstrations(self, recorded: Iterable[tuple[CellResults, Episode]]) -> Iterator[_Demonstration]:
+    def demonstrations(
+        self, recorded: Iterable[tuple[CellResults, Episode]]
+    ) -> Iterator[_Demonstration]:
         """Read one recorded episode after the other; an episode without frames is left out."""
         for cell, episode in recorded:
             demonstration = self._read(cell, episode)
-            if len(demonstration.actions):  # a policy that failed before it acted leaves an empty episode
+            # A policy that failed before it acted leaves an empty episode.
+            if len(demonstration.actions):
                 yield demonstration
 
     def _read(self, cell: CellResults, episode: Episode) -> _Demonstration:
@@ -206,7 +229,8 @@ class _Selection:
 
 @contextmanager
 def _new_folder(path: Path) -> Iterator[Path]:
-    """Yield a folder for writing, which becomes `path`, missing or empty so far, when it is complete.
+    """Yield a folder for writing, which becomes `path`, missing or empty so far, when it is
+    complete.
 
     It is beside `path` until then, and removed if writing fails.
     """
@@ -238,7 +262,8 @@ def _chosen(option: str, named: Sequence[str] | None, known: Sequence[str], env:
 
 
 def _frames_until_rest(success: np.ndarray, moving: Sequence[np.ndarray]) -> int:
-    """Return the number of frames until the robot is at rest after success; all frames without success.
+    """Return the number of frames until the robot is at rest after success; all frames without
+    success.
 
     One frame at rest is kept, so that the policy learns to stop.
     """
@@ -254,7 +279,9 @@ def _frames_until_rest(success: np.ndarray, moving: Sequence[np.ndarray]) -> int
 
 
 def _angles(demonstrations: Iterable[_Demonstration]) -> dict[int, Centre]:
-    """Return the indices in `observation.state` of angles and rotation vectors that jump, with their centres."""
+    """Return the indices in `observation.state` of angles and rotation vectors that jump, with
+    their centres.
+    """
     angles: dict[int, list[np.ndarray]] = {}  # by place; each (N,)
     vectors: dict[int, list[np.ndarray]] = {}  # by their first place; each (N, 3)
     for demonstration in demonstrations:
@@ -269,18 +296,25 @@ def _angles(demonstrations: Iterable[_Demonstration]) -> dict[int, Centre]:
                 if (first := rotation_vector_in(part, spec.unit, dim)) is not None:
                     vectors.setdefault(index + first, []).append(values[:, first : first + 3])
             index += 1 if values is None else values.shape[1]
-    centres: dict[int, Centre | None] = {index: centre_of(episodes) for index, episodes in angles.items()}
+    centres: dict[int, Centre | None] = {
+        index: centre_of(episodes) for index, episodes in angles.items()
+    }
     centres |= {index: rotation_centre_of(episodes) for index, episodes in vectors.items()}
     return {index: centre for index, centre in centres.items() if centre is not None}
 
 
-def _finished(demonstration: _Demonstration, angles: Mapping[int, Centre], folder: Path) -> FinishedEpisode:
+def _finished(
+    demonstration: _Demonstration, angles: Mapping[int, Centre], folder: Path
+) -> FinishedEpisode:
     """Return the episode in the dataset's form, after putting its videos into `folder`."""
     keys = camera_keys(demonstration.videos)
     names = {key: camera for camera, key in keys.items()}
     env, specs = demonstration.contract, demonstration.contract.state or {}
-    contract = Contract(  # of a policy that is trained on the dataset: its actions are the env's, without bounds
-        cameras={camera: (env.cameras or {}).get(camera, CameraSpec()) for camera in demonstration.videos},
+    # Of a policy that is trained on the dataset: its actions are the env's, without bounds.
+    contract = Contract(
+        cameras={
+            camera: (env.cameras or {}).get(camera, CameraSpec()) for camera in demonstration.videos
+        },
         state={
             part: replace(specs.get(part, StateSpec()), dim=values.shape[1])
             for part, values in demonstration.state.items()
@@ -305,26 +339,42 @@ def _finished(demonstration: _Demonstration, angles: Mapping[int, Centre], folde
             features[key] = video_feature(stream.height, stream.width, _fps(demonstration.cell))
         videos[key] = folder / f"{key}.mp4"
         link_or_copy(video, videos[key])
-    return FinishedEpisode(demonstration.episode.result.instruction, features, rows, images, videos, about)
+    return FinishedEpisode(
+        demonstration.episode.result.instruction, features, rows, images, videos, about
+    )
 
 
-def _numbers(demonstration: _Demonstration, about: DatasetContract) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-    """Return rows and features: the state in one vector and part by part, the action, and its outcome."""
+def _numbers(
+    demonstration: _Demonstration, about: DatasetContract
+) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+    """Return rows and features: the state in one vector and part by part, the action, and its
+    outcome.
+    """
     dim = demonstration.actions.shape[1]
     together, names = state_vector(demonstration.state, demonstration.gripper, demonstration.parts)
     together = about.wrapped(together)
-    rows: dict[str, Any] = {ACTION: demonstration.actions, **outcome_rows(demonstration.rewards, demonstration.success)}
-    features = {ACTION: vector_feature([f"action_{i}" for i in range(dim)]), **number_features(OUTCOMES | INDEX)}
+    rows: dict[str, Any] = {
+        ACTION: demonstration.actions,
+        **outcome_rows(demonstration.rewards, demonstration.success),
+    }
+    features = {
+        ACTION: vector_feature([f"action_{i}" for i in range(dim)]),
+        **number_features(OUTCOMES | INDEX),
+    }
     features[ACTION]["spec"] = demonstration.cell.contract.get("action")
     if names:
         rows[STATE], features[STATE] = together, vector_feature(names)
     if demonstration.environment:
-        rows[ENVIRONMENT], names = state_vector(demonstration.state, None, demonstration.environment)
+        rows[ENVIRONMENT], names = state_vector(
+            demonstration.state, None, demonstration.environment
+        )
         features[ENVIRONMENT] = vector_feature(names)
     if demonstration.versions is not None:
         rows[VERSION] = demonstration.versions
         features |= number_features({VERSION: "int64"})
-    keys = distinct([part for part in demonstration.parts if part in demonstration.state], without_slash)
+    keys = distinct(
+        [part for part in demonstration.parts if part in demonstration.state], without_slash
+    )
     index = 0
     for part in demonstration.parts:
         if part not in demonstration.state:
@@ -336,6 +386,8 @@ def _numbers(demonstration: _Demonstration, about: DatasetContract) -> tuple[dic
         key = f"{STATE}.{keys[part]}"
         rows[key] = together[:, index : index + width]
         features[key] = vector_feature([f"{part}_{i}" for i in range(width)])
-        features[key]["unit"] = getattr((demonstration.contract.state or {}).get(part), "unit", None)
+        features[key]["unit"] = getattr(
+            (demonstration.contract.state or {}).get(part), "unit", None
+        )
         index += width
     return rows, features

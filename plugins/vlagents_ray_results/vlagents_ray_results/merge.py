@@ -47,30 +47,36 @@ class _Merged:
     home: dict[str, Path] = field(default_factory=dict)
 
 
-def merge(out: Path, folders: Sequence[Path], *, keep_first: bool = False, accept_changes: bool = False) -> Summary:
+def merge(
+    out: Path, folders: Sequence[Path], *, keep_first: bool = False, accept_changes: bool = False
+) -> Summary:
     """Merge the results of `folders` into the new folder `out`, which can be resumed.
 
-    An episode with the same outcome in several folders is taken from the first; a played one replaces one that failed
-    by infrastructure.
+    An episode with the same outcome in several folders is taken from the first; a played one
+    replaces one that failed by infrastructure.
 
     Args:
         out: A folder without results; it is made if it is missing.
         folders: Folders of results.
         keep_first: Whether the first folder wins for an episode with different outcomes.
-        accept_changes: Merge although files of a policy or an env, weights, or the description or the contract of an
-            env differ; the report shows it.
+        accept_changes: Merge although files of a policy or an env, weights, or the description or
+            the contract of an env differ; the report shows it.
 
     Returns:
         The summary of the merged results.
 
     Raises:
-        ConfigError: Cells of one name have different settings, a policy or the files of an env are not the same
-            everywhere and `accept_changes` is off, an episode has different outcomes and `keep_first` is off, or an
-            episode's file is missing or outside of its folder, by its path or by a symbolic link.
+        ConfigError: Cells of one name have different settings, a policy or the files of an env are
+            not the same everywhere and `accept_changes` is off, an episode has different outcomes
+            and `keep_first` is off, or an episode's file is missing or outside of its folder, by
+            its path or by a symbolic link.
         StorageFailed: The disk is full, or cannot be written to.
     """
     if (out / FILE).exists():
-        raise ConfigError(f"{out}: has results; merge into a new folder, and name this one among those to be merged")
+        raise ConfigError(
+            f"{out}: has results; merge into a new folder, and name this one among those to be "
+            "merged"
+        )
     require_distinct(folders)
     merged = _Merged()
     conflicts: list[str] = []
@@ -79,7 +85,8 @@ def merge(out: Path, folders: Sequence[Path], *, keep_first: bool = False, accep
             changes = _add_policies(merged, folder, db) + _add_cells(merged, folder, db)
             if changes and not accept_changes:
                 raise ConfigError(
-                    f"{folder} was not played with the same program as the folders before it:\n{listed(changes)}\n"
+                    f"{folder} was not played with the same program as the folders before "
+                    f"it:\n{listed(changes)}\n"
                     f"merge them apart, or mix them and have the report say so (--accept-changes)"
                 )
             conflicts += _add_episodes(merged, folder, db)
@@ -92,7 +99,8 @@ def merge(out: Path, folders: Sequence[Path], *, keep_first: bool = False, accep
         shown = "\n".join(f"- {text}" for text in conflicts[:_SHOWN])
         raise ConfigError(
             f"{len(conflicts)} episodes have different outcomes:\n{shown}\n"
-            f"find out why (vlagents-ray replay), or keep those of the folders named first (--keep-first)"
+            "find out why (vlagents-ray replay), or keep those of the folders named first "
+            "(--keep-first)"
         )
     with storage.storing(out):
         _link_files(merged, out, folders)
@@ -117,7 +125,9 @@ def merge(out: Path, folders: Sequence[Path], *, keep_first: bool = False, accep
 
 def _add_policies(merged: _Merged, folder: Path, db: sqlite3.Connection) -> list[Change]:
     changes = []
-    swept = {name for (name,) in db.execute("SELECT DISTINCT policy FROM cells WHERE step IS NOT NULL")}
+    swept = {
+        name for (name,) in db.execute("SELECT DISTINCT policy FROM cells WHERE step IS NOT NULL")
+    }
     for row in table(db, "policies"):
         known = merged.policies.setdefault(row["name"], row)
         before, now = json.loads(known["metadata"]), json.loads(row["metadata"])
@@ -125,7 +135,8 @@ def _add_policies(merged: _Merged, folder: Path, db: sqlite3.Connection) -> list
         changes += policy_changes(f"policy {row['name']}", before, now, swept=is_swept)
         if (what := changed(before, now, swept=is_swept)) in ("policy", "checkpoint"):
             raise ConfigError(
-                f"{folder}: policy {row['name']!r} has {what} {now.get(what)!r}, that of the folders before it "
+                f"{folder}: policy {row['name']!r} has {what} {now.get(what)!r}, that of the "
+                "folders before it "
                 f"{before.get(what)!r}; give one of them another name in its evaluation"
             )
     return changes
@@ -135,23 +146,36 @@ def _add_cells(merged: _Merged, folder: Path, db: sqlite3.Connection) -> list[Ch
     changes: dict[Change, None] = {}
     names = {_name(row): row for row in merged.cells.values()}
     for row in table(db, "cells"):
-        known = merged.cells.get(row["cell"]) or names.setdefault(_name(row), row)  # a suite may have a new name
+        # A suite may have a new name.
+        known = merged.cells.get(row["cell"]) or names.setdefault(_name(row), row)
         if known["cell"] != row["cell"]:
             before, now = json.loads(known["settings"]), json.loads(row["settings"])
-            differing = [f"{k}: {before.get(k)!r} and {now.get(k)!r}" for k in now if before.get(k) != now.get(k)]
+            differing = [
+                f"{k}: {before.get(k)!r} and {now.get(k)!r}"
+                for k in now
+                if before.get(k) != now.get(k)
+            ]
             raise ConfigError(
-                f"{folder}: {' '.join(filter(None, _name(row)))} has other settings: {'; '.join(differing)}"
+                f"{folder}: {' '.join(filter(None, _name(row)))} has other settings: "
+                f"{'; '.join(differing)}"
             )
         if known is row:
             merged.cells[row["cell"]] = row
             continue
         if known["stop"] != row["stop"]:
             where = " ".join(filter(None, _name(row)))
-            raise ConfigError(f"{folder}: {where} stops early by {row['stop']}, that before it by {known['stop']}")
-        programs = [None if cell["program"] is None else json.loads(cell["program"]) for cell in (known, row)]
+            raise ConfigError(
+                f"{folder}: {where} stops early by {row['stop']}, that before it by {known['stop']}"
+            )
+        programs = [
+            None if cell["program"] is None else json.loads(cell["program"])
+            for cell in (known, row)
+        ]
         changes |= dict.fromkeys(program_changes(f"env {row['env']}", *programs))
         statements = [
-            EnvStatement(json.loads(cell["described"] or "{}"), json.loads(cell["contract"] or "{}"))
+            EnvStatement(
+                json.loads(cell["described"] or "{}"), json.loads(cell["contract"] or "{}")
+            )
             for cell in (known, row)
         ]
         changes |= dict.fromkeys(env_changes(row["env"], *statements))
@@ -167,21 +191,26 @@ def _name(cell: Row) -> tuple[str, str, str, str]:
 
 
 def _extend(cell: Row, other: Row, folder: Path) -> None:
-    """Plan the seeds of both cells, with the larger of the two numbers of episodes for each seed."""
+    """Plan the seeds of both cells, with the larger of the two numbers of episodes for each
+    seed.
+    """
     seeds, added = json.loads(cell["seeds"]), json.loads(other["seeds"])
     episodes = max(cell["planned"] // len(seeds), other["planned"] // len(added))
     seeds += [seed for seed in added if seed not in seeds]
     ordered = sorted(seeds)
     if any(high - low < episodes for low, high in itertools.pairwise(ordered)):
         raise ConfigError(
-            f"{folder}: {cell['env']} has the seeds {added}; together they are {ordered}, and with {episodes} episodes "
+            f"{folder}: {cell['env']} has the seeds {added}; together they are {ordered}, and with "
+            f"{episodes} episodes "
             f"of each some would be played twice; want them {episodes} or more apart"
         )
     cell |= {"seeds": canonical(seeds), "planned": episodes * len(seeds)}
 
 
 def _add_episodes(merged: _Merged, folder: Path, db: sqlite3.Connection) -> list[str]:
-    """Add episodes, runs, attempts and workers under new numbers; returns contradictions to earlier folders."""
+    """Add episodes, runs, attempts and workers under new numbers; returns contradictions to
+    earlier folders.
+    """
     offset = len(merged.runs)
     runs = {row["run"]: offset + i for i, row in enumerate(table(db, "runs"), 1)}
     merged.runs += [row | {"run": runs[row["run"]]} for row in table(db, "runs")]
@@ -196,30 +225,46 @@ def _add_episodes(merged: _Merged, folder: Path, db: sqlite3.Connection) -> list
         elif row["status"] != "infra_failed":
             before, now = (episode_of(dict(episode)).result.outcome for episode in (known, row))
             differing = [
-                f"{name} is {before[name]!r} and {now[name]!r}" for name in before if before[name] != now[name]
+                f"{name} is {before[name]!r} and {now[name]!r}"
+                for name in before
+                if before[name] != now[name]
             ]
             if differing:
-                conflicts.append(f"{row['key']}: {', '.join(differing)} in {merged.home[row['key']]} and {folder}")
+                conflicts.append(
+                    f"{row['key']}: {', '.join(differing)} in {merged.home[row['key']]} and "
+                    f"{folder}"
+                )
     return conflicts
 
 
 def _require_one_checkpoint(merged: _Merged, *, weights_may_differ: bool) -> None:
-    """Raise `ConfigError` for a cell of several checkpoints, or a policy's checkpoint of several weights."""
+    """Raise `ConfigError` for a cell of several checkpoints, or a policy's checkpoint of several
+    weights.
+    """
     checkpoints: dict[str, dict[str, str]] = {}  # the key of an episode of each, by cell
-    weights: dict[tuple[str, int | None, str | None], dict[str, str]] = {}  # by policy, step and checkpoint
+    # By policy, step and checkpoint.
+    weights: dict[tuple[str, int | None, str | None], dict[str, str]] = {}
     for row in merged.episodes.values():
         cell, checkpoint = merged.cells[row["cell"]], row["checkpoint"]
         if checkpoint is not None:
             checkpoints.setdefault(row["cell"], {}).setdefault(checkpoint, row["key"])
         if (found := row["weights"]) is not None:
-            weights.setdefault((cell["policy"], cell["step"], checkpoint), {}).setdefault(found, row["key"])
-    several = [(merged.cells[cell]["env"], "checkpoints", found) for cell, found in checkpoints.items()]
+            weights.setdefault((cell["policy"], cell["step"], checkpoint), {}).setdefault(
+                found, row["key"]
+            )
+    several = [
+        (merged.cells[cell]["env"], "checkpoints", found) for cell, found in checkpoints.items()
+    ]
     named = {} if weights_may_differ else weights
-    several += [(f"{policy} {name!r}", "weights under one name", found) for (policy, _, name), found in named.items()]
+    several += [
+        (f"{policy} {name!r}", "weights under one name", found)
+        for (policy, _, name), found in named.items()
+    ]
     for where, what, found_keys in several:
         if len(found_keys) > 1:
             raise ConfigError(
-                f"{where}: was played by several {what}: {found_keys}; merge those apart, or give one of them another "
+                f"{where}: was played by several {what}: {found_keys}; merge those apart, or give "
+                "one of them another "
                 f"policy's `name` in its evaluation"
             )
 

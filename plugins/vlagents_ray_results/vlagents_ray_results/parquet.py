@@ -19,8 +19,13 @@ def to_parquet(results: Results, path: Path) -> int:
         "string": pa.string(), "integer": pa.int64(), "number": pa.float64(), "boolean": pa.bool_(),
         "time": pa.timestamp("us", "UTC"), "json": pa.string(),
     }  # fmt: skip
-    fields = [pa.field(column.name, types[column.type], metadata={"meaning": column.meaning}) for column in COLUMNS]
+    fields = [
+        pa.field(column.name, types[column.type], metadata={"meaning": column.meaning})
+        for column in COLUMNS
+    ]
     table_rows = list(rows(results, flat=True))
     with whole(path) as unfinished:
-        require("pyarrow.parquet").write_table(pa.Table.from_pylist(table_rows, pa.schema(fields)), unfinished)
+        require("pyarrow.parquet").write_table(
+            pa.Table.from_pylist(table_rows, pa.schema(fields)), unfinished
+        )
     return len(table_rows)

@@ -2,21 +2,33 @@
 
 from vlagents_ray.registry import RegistryEntry
 
-MERGE = RegistryEntry("vlagents_ray_results.commands:merge_command", "Merge results: each episode once, by its key.")
+MERGE = RegistryEntry(
+    "vlagents_ray_results.commands:merge_command", "Merge results: each episode once, by its key."
+)
 BUNDLE = RegistryEntry(
-    "vlagents_ray_results.commands:bundle_command", "Write an evaluation as one file that others can verify."
+    "vlagents_ray_results.commands:bundle_command",
+    "Write an evaluation as one file that others can verify.",
 )
 VERIFY = RegistryEntry(
-    "vlagents_ray_results.commands:verify_command", "Check a bundle, and print what is equal or differs."
+    "vlagents_ray_results.commands:verify_command",
+    "Check a bundle, and print what is equal or differs.",
 )
 
 PARQUET = RegistryEntry("vlagents_ray_results.parquet:to_parquet", "a typed row for each episode")
 LEROBOT = RegistryEntry(
-    "vlagents_ray_results.lerobot:to_lerobot", "a LeRobotDataset v3.0 of the observations and actions, in a new folder"
+    "vlagents_ray_results.lerobot:to_lerobot",
+    "a LeRobotDataset v3.0 of the observations and actions, in a new folder",
 )
 
-WANDB = RegistryEntry("vlagents_ray_results.trackers:WandbRun", "Weights & Biases", needs=("wandb",), extra="wandb")
-TRACKIO = RegistryEntry("vlagents_ray_results.trackers:TrackioRun", "Trackio", needs=("trackio",), extra="trackio")
+WANDB = RegistryEntry(
+    "vlagents_ray_results.trackers:WandbRun", "Weights & Biases", needs=("wandb",), extra="wandb"
+)
+TRACKIO = RegistryEntry(
+    "vlagents_ray_results.trackers:TrackioRun", "Trackio", needs=("trackio",), extra="trackio"
+)
 TENSORBOARD = RegistryEntry(
-    "vlagents_ray_results.trackers:TensorboardRun", "TensorBoard", needs=("tensorboard",), extra="tensorboard"
+    "vlagents_ray_results.trackers:TensorboardRun",
+    "TensorBoard",
+    needs=("tensorboard",),
+    extra="tensorboard",
 )

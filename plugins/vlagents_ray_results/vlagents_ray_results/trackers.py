@@ -17,13 +17,17 @@ FOLDER = "tensorboard"  # of its event files, in the folder of results
 
 
 class WandbRun:
-    """A run of wandb whose curves are drawn against `training_step`; values without a step are in its summary."""
+    """A run of wandb whose curves are drawn against `training_step`; values without a step are
+    in its summary.
+    """
 
     def __init__(self, subject: TrackedPolicy) -> None:
         self._wandb: Any = require("wandb")
         self._id = subject.id
         # Code is in the config and in an artifact, as wandb would only read the driver's folder.
-        quiet = self._wandb.Settings(silent=True, console="off", disable_git=True, disable_code=True)
+        quiet = self._wandb.Settings(
+            silent=True, console="off", disable_git=True, disable_code=True
+        )
         self._run = self._wandb.init(
             project=subject.project,
             group=subject.group,
@@ -62,7 +66,9 @@ class WandbRun:
 
 
 class TrackioRun(WandbRun):
-    """A run as in wandb, without a summary and artifacts. Its name has the id, as trackio identifies runs by name."""
+    """A run as in wandb, without a summary and artifacts. Its name has the id, as trackio
+    identifies runs by name.
+    """
 
     def __init__(self, subject: TrackedPolicy) -> None:
         self._trackio: Any = require("trackio")
@@ -92,28 +98,40 @@ class TensorboardRun:
         self._event: Any = require("tensorboard.compat.proto.event_pb2").Event
         self._summary: Any = require("tensorboard.compat.proto.summary_pb2").Summary
         self._tensor: Any = require("tensorboard.compat.proto.tensor_pb2").TensorProto
-        self._text_metadata: Any = require("tensorboard.plugins.text.metadata").create_summary_metadata
+        self._text_metadata: Any = require(
+            "tensorboard.plugins.text.metadata"
+        ).create_summary_metadata
         writer = require("tensorboard.summary.writer.event_file_writer").EventFileWriter
         self._writer = writer(str(subject.out / FOLDER / plain(subject.name)))
         self._out = subject.out
         self._text("config", json.dumps(subject.config, indent=1, default=str), 0)
 
     def log(self, metrics: Mapping[str, float], step: int | None) -> None:
-        values = [self._summary.Value(tag=name, simple_value=value) for name, value in metrics.items()]
+        values = [
+            self._summary.Value(tag=name, simple_value=value) for name, value in metrics.items()
+        ]
         self._add(values, step or 0)
 
     def videos(self, label: str, paths: Sequence[Path], step: int | None) -> None:
-        self._text(f"{label}/videos", "\n".join(str(path.relative_to(self._out)) for path in paths), step or 0)
+        self._text(
+            f"{label}/videos",
+            "\n".join(str(path.relative_to(self._out)) for path in paths),
+            step or 0,
+        )
 
     def finish(self) -> None:
         self._writer.close()
 
     def _text(self, tag: str, text: str, step: int) -> None:
-        indented = "\n".join(f"    {line}" for line in text.splitlines())  # Markdown for preformatted text
+        # Markdown for preformatted text.
+        indented = "\n".join(f"    {line}" for line in text.splitlines())
         tensor = self._tensor(
             dtype="DT_STRING", string_val=[indented.encode()], tensor_shape={"dim": [{"size": 1}]}
         )  # fmt: skip
-        self._add([self._summary.Value(tag=tag, metadata=self._text_metadata(tag, ""), tensor=tensor)], step)
+        self._add(
+            [self._summary.Value(tag=tag, metadata=self._text_metadata(tag, ""), tensor=tensor)],
+            step,
+        )
 
     def _add(self, values: Sequence[Any], step: int) -> None:
         event = self._event(step=step, wall_time=time.time(), summary=self._summary(value=values))

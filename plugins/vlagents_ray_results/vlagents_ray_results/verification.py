@@ -52,8 +52,8 @@ _LENGTH = 80  # characters of a value in a finding
 class Finding:
     """One check.
 
-    "differs" means that the bundle contradicts itself, or that a replay had another outcome; "other here" means other
-    software or numbers here, which alone is no fault of the bundle.
+    "differs" means that the bundle contradicts itself, or that a replay had another outcome; "other
+    here" means other software or numbers here, which alone is no fault of the bundle.
     """
 
     subject: str
@@ -86,15 +86,16 @@ def verify(
 ) -> Verification:
     """Check a bundle, which may come from a stranger.
 
-    None of its text is run, imported or unpickled. Its environments are only made if they are registered here and their
-    options are numbers and words, unless `trust` is set.
+    None of its text is run, imported or unpickled. Its environments are only made if they are
+    registered here and their options are numbers and words, unless `trust` is set.
 
     Args:
         bundle: The file.
-        into: A new folder for its results, which can be read, merged and exported as any others; None: they are
-            removed. Summary and report in it are written from the database.
+        into: A new folder for its results, which can be read, merged and exported as any others;
+            None: they are removed. Summary and report in it are written from the database.
         replay: The number of episodes whose recorded actions are played again.
-        seed: The seed by which these episodes are drawn; None: a new one, which the author of the bundle cannot know.
+        seed: The seed by which these episodes are drawn; None: a new one, which the author of the
+            bundle cannot know.
         trust: Whether its environments may name any code and files.
         most_bytes: The most bytes that its files may have together.
 
@@ -102,7 +103,8 @@ def verify(
         The findings.
 
     Raises:
-        ConfigError: The file is no bundle, is larger than allowed, or its database cannot be read; or `into` exists.
+        ConfigError: The file is no bundle, is larger than allowed, or its database cannot be read;
+            or `into` exists.
         StorageFailed: The disk is full, or cannot be written to.
     """
     if into is not None and into.exists():
@@ -124,9 +126,17 @@ def verify(
                 findings += _check(folder, replay, seed, trust=trust)
             except (VLAgentsError, sqlite3.Error):
                 raise
-            except (ArithmeticError, LookupError, RecursionError, TypeError, ValueError, AttributeError) as error:
+            except (
+                ArithmeticError,
+                LookupError,
+                RecursionError,
+                TypeError,
+                ValueError,
+                AttributeError,
+            ) as error:
                 raise ConfigError(
-                    f"{bundle}: its database holds values that no evaluation writes ({type(error).__name__}: {error}); "
+                    f"{bundle}: its database holds values that no evaluation writes "
+                    f"({type(error).__name__}: {error}); "
                     f"do not trust its author"
                 ) from error
             if into is not None:
@@ -137,7 +147,9 @@ def verify(
 def _check(folder: Path, replay: int, seed: int, *, trust: bool) -> Iterator[Finding]:
     """Yield all findings except that of the digests; also write summary and report."""
     if not (folder / DATABASE).is_file():
-        raise ConfigError(f"got no {DATABASE} in the bundle; want one that `vlagents-ray bundle` wrote")
+        raise ConfigError(
+            f"got no {DATABASE} in the bundle; want one that `vlagents-ray bundle` wrote"
+        )
     results = Results.load(folder)
     if not results.runs or not results.cells:
         raise ConfigError(f"{DATABASE}: has no run, or no cell; want the results of an evaluation")
@@ -153,17 +165,22 @@ def _check(folder: Path, replay: int, seed: int, *, trust: bool) -> Iterator[Fin
     drawn = ((*pair, _recorded(results, pair[1])) for pair in _drawn(results, seed))
     chosen = list(islice((candidate for candidate in drawn if candidate[2] is not None), replay))
     if not chosen:
-        yield Finding("replay", "not checked", "no finished episode has a recording (eval --record all)")
+        yield Finding(
+            "replay", "not checked", "no finished episode has a recording (eval --record all)"
+        )
     for cell, episode, trajectory in chosen:
         if trajectory is not None:
             yield _replay(cell, episode, trajectory, trust=trust)
 
 
 def _drawn(results: Results, seed: int) -> Iterator[tuple[CellResults, Episode]]:
-    """Yield the finished episodes in a random order: one of each cell in turns, so that each cell is checked."""
+    """Yield the finished episodes in a random order: one of each cell in turns, so that each
+    cell is checked.
+    """
     draw = random.Random(seed)
     cells = [
-        [(cell, episode) for episode in cell.episodes if episode.result.status == "done"] for cell in results.cells
+        [(cell, episode) for episode in cell.episodes if episode.result.status == "done"]
+        for cell in results.cells
     ]
     draw.shuffle(cells)
     for episodes in cells:
@@ -173,7 +190,9 @@ def _drawn(results: Results, seed: int) -> Iterator[tuple[CellResults, Episode]]
 
 
 def _check_cells(results: Results) -> Finding:
-    """Check that cells and keys of episodes are those of their settings, and that nothing was mixed or left out."""
+    """Check that cells and keys of episodes are those of their settings, and that nothing was
+    mixed or left out.
+    """
     contradictions = []
     rules = {json.dumps(run.config.get("stop"), sort_keys=True) for run in results.runs}
     for cell in results.cells:
@@ -185,25 +204,33 @@ def _check_cells(results: Results) -> Finding:
         if json.dumps(rule, sort_keys=True) not in rules:
             contradictions.append(f"{name}: no run stopped early by its rule")
         keys_of_cell = [episode.result.key for episode in cell.episodes]
-        contradictions += [f"{key}: is of another cell or env" for key in keys_of_cell if key.env != cell.env]
+        contradictions += [
+            f"{key}: is of another cell or env" for key in keys_of_cell if key.env != cell.env
+        ]
         contradictions += [f"{name}: {text}" for text in _mixtures(results, cell)]
     known_keys = {str(episode.result.key) for cell in results.cells for episode in cell.episodes}
     with reading(results.out) as db:
         keys = {row["key"] for row in table(db, "episodes")}
     contradictions += [
-        f"{key}: its key does not match its columns, or it has no cell" for key in sorted(keys - known_keys)
+        f"{key}: its key does not match its columns, or it has no cell"
+        for key in sorted(keys - known_keys)
     ]
     return _finding(
-        "database", contradictions, f"{len(results.cells)} cells and {len(keys)} episodes have their settings' keys"
+        "database",
+        contradictions,
+        f"{len(results.cells)} cells and {len(keys)} episodes have their settings' keys",
     )
 
 
-# Of all episodes of a cell. A run whose change was accepted may have added another one; checkpoints are never mixed.
+# Of all episodes of a cell. A run whose change was accepted may have added another one; checkpoints
+# are never mixed.
 _ONE_OF_A_CELL = ("checkpoint", "weights", "env_program", "policy_program")
 
 
 def _mixtures(results: Results, cell: CellResults) -> Iterator[str]:
-    """Yield what the episodes of a cell do not have in common, although an evaluation would have refused to add it."""
+    """Yield what the episodes of a cell do not have in common, although an evaluation would have
+    refused to add it.
+    """
     for column in _ONE_OF_A_CELL:
         if results.accepted_changes and column != "checkpoint":
             continue
@@ -212,18 +239,29 @@ def _mixtures(results: Results, cell: CellResults) -> Iterator[str]:
         else:  # unknown for an episode that failed in the policy's reset
             values = {getattr(episode.result, column) for episode in cell.episodes} - {None}
         if len(values) > 1:
-            yield f"its episodes have {len(values)} values of {column}, and no accepted change says so"
+            yield (
+                f"its episodes have {len(values)} values of {column}, and no accepted change "
+                "says so"
+            )
     fingerprints: dict[int, set[str]] = {}
     for episode in cell.episodes:
-        if episode.result.policy_version is not None and episode.result.policy_fingerprint is not None:
-            fingerprints.setdefault(episode.result.policy_version, set()).add(episode.result.policy_fingerprint)
+        if (
+            episode.result.policy_version is not None
+            and episode.result.policy_fingerprint is not None
+        ):
+            fingerprints.setdefault(episode.result.policy_version, set()).add(
+                episode.result.policy_fingerprint
+            )
     for version, several in fingerprints.items():
         if len(several) > 1:
             yield f"version {version} of the weights has {len(several)} fingerprints"
     if any(episode.unplanned for episode in cell.episodes) and not any(
         change.subject == "plan" for change in results.accepted_changes
     ):
-        yield "it has episodes beyond its plan, in no rate, and no accepted change says that the plan became smaller"
+        yield (
+            "it has episodes beyond its plan, in no rate, and no accepted change says that the "
+            "plan became smaller"
+        )
 
 
 def _check_episodes(results: Results) -> Finding:
@@ -242,11 +280,18 @@ def _check_episodes(results: Results) -> Finding:
             if episode.trajectory is not None:
                 recordings[episode.trajectory] = recordings.get(episode.trajectory, 0) + 1
     contradictions += [
-        f"{path}: is the recording of {times} episodes" for path, times in recordings.items() if times > 1
+        f"{path}: is the recording of {times} episodes"
+        for path, times in recordings.items()
+        if times > 1
     ]
-    there = (path.relative_to(results.out) for path in (results.out / storage.TRAJECTORIES).rglob("*.npz"))
+    there = (
+        path.relative_to(results.out)
+        for path in (results.out / storage.TRAJECTORIES).rglob("*.npz")
+    )
     contradictions += [
-        f"{path}: is the recording of no episode" for path in sorted(map(str, there)) if path not in recordings
+        f"{path}: is the recording of no episode"
+        for path in sorted(map(str, there))
+        if path not in recordings
     ]
     return _finding("episodes", contradictions, f"{number} have outcomes without contradiction")
 
@@ -256,8 +301,13 @@ def _inconsistencies(cell: CellResults, episode: Episode) -> Iterator[str]:
     result = episode.result
     outcome = (result.success_once, result.success_at_end, result.first_success)
     if result.status not in get_args(Status) or result.ending not in get_args(Ending):
-        yield f"got the status {result.status!r} and the ending {result.ending!r}, which no evaluation writes"
-    if (result.status == "done") != (result.error is None) or (result.status == "done") != (result.ending != "error"):
+        yield (
+            f"got the status {result.status!r} and the ending {result.ending!r}, which no "
+            "evaluation writes"
+        )
+    if (result.status == "done") != (result.error is None) or (result.status == "done") != (
+        result.ending != "error"
+    ):
         yield f"its error or ending ({result.ending}) contradicts its status {result.status!r}"
     if result.status == "infra_failed":
         if outcome != (None, None, None) or result.steps or result.actions_sha256 is not None:
@@ -281,16 +331,24 @@ def _inconsistencies(cell: CellResults, episode: Episode) -> Iterator[str]:
     if pushed and result.policy_version is not None:
         expected = (pushed["version"], pushed["version"], pushed["fingerprint"])
         if acted != expected:
-            yield f"versions {acted[0]} to {acted[1]} ({acted[2]}) acted, not {expected[0]} ({expected[2]})"
+            yield (
+                f"versions {acted[0]} to {acted[1]} ({acted[2]}) acted, not {expected[0]} "
+                f"({expected[2]})"
+            )
     waited = (result.ticks_waited, result.ticks_held, result.latency_ms)
     if cell.settings.get("clock") is None and waited != (0, 0, None):
         yield "it waited for answers, but its environment stood still meanwhile"
     if not 0 <= result.ticks_held <= result.ticks_waited <= result.steps:
-        yield f"{result.ticks_held} ticks without an action, {result.ticks_waited} waited, of {result.steps} steps"
+        yield (
+            f"{result.ticks_held} ticks without an action, {result.ticks_waited} waited, of "
+            f"{result.steps} steps"
+        )
 
 
 def _check_trajectories(results: Results) -> Finding:
-    """Check that each recording has the actions, steps, rewards and success of its episode in the table."""
+    """Check that each recording has the actions, steps, rewards and success of its episode in
+    the table.
+    """
     contradictions: list[str] = []
     checked, missing = 0, 0
     for cell in results.cells:
@@ -307,55 +365,82 @@ def _check_trajectories(results: Results) -> Finding:
                 for text in _contradictions(episode, trajectory, synchronous=synchronous)
             ]
     if not checked and not contradictions:
-        return Finding("trajectories", "not checked", f"the bundle has none of {missing} episodes (eval --record all)")
-    rest = f"; {missing} others have none, so that their outcomes are only stated" if missing else ""
+        return Finding(
+            "trajectories",
+            "not checked",
+            f"the bundle has none of {missing} episodes (eval --record all)",
+        )
+    rest = (
+        f"; {missing} others have none, so that their outcomes are only stated" if missing else ""
+    )
     return _finding(
-        "trajectories", contradictions, f"{checked} have the actions, rewards and outcomes of the table{rest}"
+        "trajectories",
+        contradictions,
+        f"{checked} have the actions, rewards and outcomes of the table{rest}",
     )
 
 
 def _recorded(results: Results, episode: Episode) -> Trajectory | None:
-    """Return the recording of an episode; None if the bundle has none. Raises `ConfigError` if it cannot be read."""
+    """Return the recording of an episode; None if the bundle has none. Raises `ConfigError` if
+    it cannot be read.
+    """
     if episode.trajectory is None or not (path := results.file(episode.trajectory)).is_file():
         return None
     try:
         with zipfile.ZipFile(path) as file:
             size = sum(member.file_size for member in file.infolist())
     except (OSError, zipfile.BadZipFile) as error:
-        raise ConfigError(f"{episode.trajectory}: cannot be read as a trajectory ({error})") from error
+        raise ConfigError(
+            f"{episode.trajectory}: cannot be read as a trajectory ({error})"
+        ) from error
     if size > MOST_TRAJECTORY:
-        raise ConfigError(f"{episode.trajectory}: unpacks to {size} bytes, want at most {MOST_TRAJECTORY}")
+        raise ConfigError(
+            f"{episode.trajectory}: unpacks to {size} bytes, want at most {MOST_TRAJECTORY}"
+        )
     try:
         return Trajectory.load(path)
     except MemoryError as error:  # its header states a wrong size
-        raise ConfigError(f"{episode.trajectory}: states a size that does not fit into memory") from error
+        raise ConfigError(
+            f"{episode.trajectory}: states a size that does not fit into memory"
+        ) from error
 
 
-def _contradictions(episode: Episode, trajectory: Trajectory, *, synchronous: bool) -> Iterator[str]:
+def _contradictions(
+    episode: Episode, trajectory: Trajectory, *, synchronous: bool
+) -> Iterator[str]:
     result, steps = episode.result, len(trajectory.actions)
     if not _has_one_length(trajectory) or result.steps != steps:
         yield f"{result.steps} steps in the table, other lengths in the recording"
         return
-    if hashlib.sha256(np.ascontiguousarray(trajectory.actions, "<f4").tobytes()).hexdigest() != result.actions_sha256:
+    if (
+        hashlib.sha256(np.ascontiguousarray(trajectory.actions, "<f4").tobytes()).hexdigest()
+        != result.actions_sha256
+    ):
         yield "the recorded actions are not those of the table's digest"
     total = float(sum(trajectory.rewards.tolist()))
     if not math.isclose(total, result.episode_return, rel_tol=_TOLERANCE, abs_tol=1e-12):
         yield "the recorded rewards have another sum"
-    if result.status != "done":  # an error of the policy ended it: it counts as no success, whatever was recorded
+    # An error of the policy ended it: it counts as no success, whatever was recorded.
+    if result.status != "done":
         return
     outcome = (result.success_once, result.success_at_end, result.first_success)
     if _outcome(trajectory.success.astype(bool).tolist()) != outcome:
         yield "the recorded success is not that of the table"
     versions = [int(version) for version in trajectory.versions if version != NO_VERSION]
     acted = (versions[0], versions[-1]) if versions else (None, None)
-    if synchronous and acted != (result.first_policy_version, result.policy_version):  # else an answer may be unused
+    # Else an answer may be unused.
+    if synchronous and acted != (result.first_policy_version, result.policy_version):
         yield "the recorded versions of the weights are not those of the table"
 
 
 def _has_one_length(trajectory: Trajectory) -> bool:
-    """Return whether each step has its action, reward, success and version, and each observation its numbers."""
+    """Return whether each step has its action, reward, success and version, and each observation
+    its numbers.
+    """
     steps = len(trajectory.actions)
-    of_steps = [values.shape for values in (trajectory.rewards, trajectory.success, trajectory.versions)]
+    of_steps = [
+        values.shape for values in (trajectory.rewards, trajectory.success, trajectory.versions)
+    ]
     of_observations = [len(values) for values in trajectory.state.values()]
     if trajectory.gripper is not None:
         of_observations.append(trajectory.gripper.size)
@@ -363,7 +448,9 @@ def _has_one_length(trajectory: Trajectory) -> bool:
 
 
 def _outcome(success: list[bool]) -> tuple[bool, bool, int | None]:
-    """Return success once, success at the end, and the number of steps after which it was first solved."""
+    """Return success once, success at the end, and the number of steps after which it was first
+    solved.
+    """
     first = next((number for number, solved in enumerate(success, 1) if solved), None)
     return first is not None, bool(success and success[-1]), first
 
@@ -378,12 +465,18 @@ def _finding(subject: str, contradictions: list[str], fine: str) -> Finding:
 def _check_versions(results: Results) -> Finding:
     """Compare the software of the last run with that here."""
     there, here = results.runs[-1].versions, storage.versions()
-    compared = {name: (there.get(name), version) for name, version in here.items() if name != "code"}
+    compared = {
+        name: (there.get(name), version) for name, version in here.items() if name != "code"
+    }
     compared |= {"commit": (_commit(there), _commit(here))}
-    differences = [f"{name} {was} there, {now} here" for name, (was, now) in compared.items() if was != now]
+    differences = [
+        f"{name} {was} there, {now} here" for name, (was, now) in compared.items() if was != now
+    ]
     if differences:
         return Finding("versions", "other here", "; ".join(differences))
-    return Finding("versions", "equal", ", ".join(f"{name} {now}" for name, (_, now) in compared.items()))
+    return Finding(
+        "versions", "equal", ", ".join(f"{name} {now}" for name, (_, now) in compared.items())
+    )
 
 
 def _commit(versions: Mapping[str, Any]) -> str:
@@ -394,7 +487,8 @@ def _commit(versions: Mapping[str, Any]) -> str:
     return f"{state['commit']} with changes" if state.get("diff_sha256") else str(state["commit"])
 
 
-_CODE = re.compile("trust.*|module|source_dir")  # options that choose code, although they may be words
+# Options that choose code, although they may be words.
+_CODE = re.compile("trust.*|module|source_dir")
 _WORD = re.compile(r"\w[\w.+-]{0,63}")  # a value that is text, and no path, URL or "module:Class"
 
 
@@ -405,18 +499,25 @@ class Replayed:
     success: list[bool]  # after each step
     ending: Ending
     instruction: str  # several are joined with semicolons
-    differences: dict[int, float]  # by the step that differs, 0 is the reset: the largest of a number
+    # By the step that differs, 0 is the reset: the largest of a number.
+    differences: dict[int, float]
     described: Mapping[str, Any]  # by the environment here
 
 
 def _difference(recorded: Trajectory, number: int, obs: Obs, step: EnvStep | None) -> float | None:
-    """Return the largest difference of a step's numbers, or of those of the reset; None if they are equal to the bit.
+    """Return the largest difference of a step's numbers, or of those of the reset; None if they are
+    equal to the bit.
 
     It is infinite if there are other numbers, and 0 if only the success differs.
     """
-    if obs.state.keys() != recorded.state.keys() or (obs.gripper is None) != (recorded.gripper is None):
+    if obs.state.keys() != recorded.state.keys() or (obs.gripper is None) != (
+        recorded.gripper is None
+    ):
         return float("inf")
-    pairs = [(recorded.state[part][number], np.asarray(values, np.float32)) for part, values in obs.state.items()]
+    pairs = [
+        (recorded.state[part][number], np.asarray(values, np.float32))
+        for part, values in obs.state.items()
+    ]
     if recorded.gripper is not None:
         pairs.append((recorded.gripper[number], np.asarray(obs.gripper, np.float32)))
     if step is not None:
@@ -426,7 +527,9 @@ def _difference(recorded: Trajectory, number: int, obs: Obs, step: EnvStep | Non
         if then.shape != now.shape:
             differences.append(float("inf"))
         elif then.tobytes() != now.tobytes():
-            differences.append(float(np.max(np.abs(np.asarray(then, np.float64) - np.asarray(now, np.float64)))))
+            differences.append(
+                float(np.max(np.abs(np.asarray(then, np.float64) - np.asarray(now, np.float64))))
+            )
     if step is not None and bool(recorded.success[number - 1]) != step.success:
         differences.append(0.0)
     return max(differences, default=None)
@@ -435,17 +538,26 @@ def _difference(recorded: Trajectory, number: int, obs: Obs, step: EnvStep | Non
 def require_harmless(cell: CellResults) -> None:
     """Raise `ConfigError` unless making this environment runs no code but that of a registered one.
 
-    A bundle may come from a stranger: "module:Class" would be imported, and an option that is a path or a nested value
-    could name files or code of this machine. `trust_remote_code` from a bundle is refused: only the local user
-    can grant it.
+    A bundle may come from a stranger: "module:Class" would be imported, and an option that is a
+    path or a nested value could name files or code of this machine. `trust_remote_code` from a
+    bundle is refused: only the local user can grant it.
     """
     if env_suite(cell.env) not in names("envs") or ":" in cell.env:
-        raise ConfigError(f"{cell.env}: is no registered environment; --trust makes it, and runs its code")
+        raise ConfigError(
+            f"{cell.env}: is no registered environment; --trust makes it, and runs its code"
+        )
     for kind in ("env_options", "reset_options"):
         options = cell.settings.get(kind) or {}
-        risky = {name: value for name, value in options.items() if _CODE.fullmatch(name) or not _is_plain(value)}
+        risky = {
+            name: value
+            for name, value in options.items()
+            if _CODE.fullmatch(name) or not _is_plain(value)
+        }
         if risky:
-            raise ConfigError(f"{cell.env}: got the {kind} {risky}, which could name files or code; --trust takes them")
+            raise ConfigError(
+                f"{cell.env}: got the {kind} {risky}, which could name files or code; --trust "
+                "takes them"
+            )
 
 
 def replay_actions(cell: CellResults, episode: Episode, trajectory: Trajectory) -> Replayed:
@@ -454,7 +566,8 @@ def replay_actions(cell: CellResults, episode: Episode, trajectory: Trajectory) 
     Images are neither rendered nor compared. State, gripper, rewards and success are, bit by bit.
 
     Raises:
-        ConfigError: The environment refuses these options, or is unknown here; also `MissingDependency`.
+        ConfigError: The environment refuses these options, or is unknown here; also
+            `MissingDependency`.
         EnvFailed: The simulator failed.
     """
     key = episode.result.key
@@ -467,7 +580,9 @@ def replay_actions(cell: CellResults, episode: Episode, trajectory: Trajectory) 
         instructions: list[str] = []
         differences: dict[int, float] = {}
         last: EnvStep | None = None
-        for number, (obs, step) in enumerate(play_actions(env, key.seed, begin, trajectory.actions, images=False)):
+        for number, (obs, step) in enumerate(
+            play_actions(env, key.seed, begin, trajectory.actions, images=False)
+        ):
             if (largest := _difference(trajectory, number, obs, step)) is not None:
                 differences[number] = largest
             last = step
@@ -475,7 +590,9 @@ def replay_actions(cell: CellResults, episode: Episode, trajectory: Trajectory) 
             with env_side("step"):
                 [instruction] = env.instructions
             is_over = number == len(trajectory.actions)
-            if not instructions or (env.several_tasks and not is_over and instruction != instructions[-1]):
+            if not instructions or (
+                env.several_tasks and not is_over and instruction != instructions[-1]
+            ):
                 instructions.append(instruction)
         ending = _ending(last, len(success), env.max_steps)
         with env_side("describe"):
@@ -507,7 +624,11 @@ def _replay(cell: CellResults, episode: Episode, trajectory: Trajectory, *, trus
     if cell.settings.get("robot") is not None:
         return Finding(subject, "not checked", "it was played on a real robot")
     if not _has_one_length(trajectory):
-        return Finding(subject, "differs", "its recording has actions and observations of different numbers of steps")
+        return Finding(
+            subject,
+            "differs",
+            "its recording has actions and observations of different numbers of steps",
+        )
     try:
         if not trust:
             require_harmless(cell)
@@ -515,7 +636,10 @@ def _replay(cell: CellResults, episode: Episode, trajectory: Trajectory, *, trus
     except VLAgentsError as error:
         return Finding(subject, "not checked", str(error))
     result, outcome, steps = episode.result, _outcome(played.success), len(played.success)
-    first, largest = min(played.differences, default=None), max(played.differences.values(), default=0.0)
+    first, largest = (
+        min(played.differences, default=None),
+        max(played.differences.values(), default=0.0),
+    )
     differs = f"the numbers differ from step {first} of {steps} on, by at most {largest:.3g}"
     if first is None:
         differs = "every number is equal to the bit"
@@ -525,16 +649,25 @@ def _replay(cell: CellResults, episode: Episode, trajectory: Trajectory, *, trus
     }
     for name, (here, there) in compared.items():
         if here != there:
-            return Finding(subject, "differs", f"its {name} is {here[:_LENGTH]!r} here, {there[:_LENGTH]!r} there")
+            return Finding(
+                subject,
+                "differs",
+                f"its {name} is {here[:_LENGTH]!r} here, {there[:_LENGTH]!r} there",
+            )
     if outcome != (result.success_once, result.success_at_end, result.first_success):
-        now, then = ("solved" if solved else "not solved" for solved in (outcome[0], result.success_once))
+        now, then = (
+            "solved" if solved else "not solved" for solved in (outcome[0], result.success_once)
+        )
         return Finding(subject, "differs", f"{now} here, {then} there; {differs}")
     detail = f"{steps} actions, every state, reward and success to the bit"
     if first is not None:
         detail = f"the same outcome, other numbers; {differs}"
     described, described_here = cell.described, played.described
     differing = [
-        f"{name} {str(described_here.get(name))[:_LENGTH]}, there {str(described.get(name))[:_LENGTH]}"
+        (
+            f"{name} {str(described_here.get(name))[:_LENGTH]}, there "
+            f"{str(described.get(name))[:_LENGTH]}"
+        )
         for name in sorted(described.keys() | described_here.keys())
         if described.get(name) != described_here.get(name)
     ]

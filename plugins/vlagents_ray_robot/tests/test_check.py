@@ -132,7 +132,9 @@ class Counting(FaultyArm):
 def test_nothing_is_commanded_unless_the_operator_agrees() -> None:
     with closing(simulated_arm("franka")) as arm:
         counting = Counting(arm)
-        assert examine(counting, clock=arm.clock).skipped["order"] == "no operator agreed to a motion"
+        assert (
+            examine(counting, clock=arm.clock).skipped["order"] == "no operator agreed to a motion"
+        )
         operator = Reluctant(arm, 0)
         report = examine(counting, operator=operator, clock=arm.clock)
         assert counting.commands == 0
@@ -153,7 +155,9 @@ def test_the_report_has_pictures_and_no_links(tmp_path: Path) -> None:
     assert "http" not in page
 
 
-def test_joints_in_another_order_than_that_of_the_policy_are_found_by_name_before_any_motion() -> None:
+def test_joints_in_another_order_than_that_of_the_policy_are_found_by_name_before_any_motion() -> (
+    None
+):
     with closing(simulated_arm("franka", cameras=())) as arm:
         names = list(arm.joint_names)
         names[2], names[3] = names[3], names[2]
@@ -186,9 +190,14 @@ def test_the_command_checks_a_simulated_arm_without_a_person(
 ) -> None:
     page = tmp_path / "report.html"
     name = f"mujoco:{model_file('franka')}" if status == 0 else "mujoco:missing.xml"
-    assert main([name, "--robot-set", "like=franka", "--robot-set", "fps=5", "--out", str(page)]) == status
+    assert (
+        main([name, "--robot-set", "like=franka", "--robot-set", "fps=5", "--out", str(page)])
+        == status
+    )
     said = capsys.readouterr()
-    assert ("ok gripper" in said.out, page.exists(), "ConfigError" in said.err) == ((status == 0,) * 2 + (status == 2,))
+    assert ("ok gripper" in said.out, page.exists(), "ConfigError" in said.err) == (
+        (status == 0,) * 2 + (status == 2,)
+    )
 
 
 def test_a_person_is_asked_before_each_motion(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,4 +1,6 @@
-"""The check of a robot that declares nothing, and what is found without a person and without a contract."""
+"""The check of a robot that declares nothing, and what is found without a person and without a
+contract.
+"""
 
 from __future__ import annotations
 
@@ -56,7 +58,9 @@ class InPlace(Own):
 
 
 class Declared(Own):
-    contract = Contract(state={"joints": StateSpec(3, "rad")}, action=ActionSpec(dim=3, space="joint", delta=False))
+    contract = Contract(
+        state={"joints": StateSpec(3, "rad")}, action=ActionSpec(dim=3, space="joint", delta=False)
+    )
 
 
 class Partly(Own):
@@ -64,10 +68,15 @@ class Partly(Own):
 
 
 @pytest.mark.parametrize(
-    ("kind", "status"), [("Own", 3), ("Partly", 3), ("Declared", 0), ("Repeating", 1), ("InPlace", 3)]
+    ("kind", "status"),
+    [("Own", 3), ("Partly", 3), ("Declared", 0), ("Repeating", 1), ("InPlace", 3)],
 )
 def test_the_status_tells_a_check_that_checked_nothing_from_a_passed_one(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path, kind: str, status: int
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    tmp_path: Path,
+    kind: str,
+    status: int,
 ) -> None:
     monkeypatch.setitem(sys.modules, "own_arm", sys.modules[__name__])
     monkeypatch.setattr("sys.stdin", io.StringIO())  # no person answers
@@ -107,7 +116,9 @@ def test_checks_that_were_not_made_have_not_passed() -> None:
 
 
 @pytest.mark.parametrize("blocks", [False, True])
-def test_an_apply_that_blocks_is_reported_by_the_loop(caplog: pytest.LogCaptureFixture, *, blocks: bool) -> None:
+def test_an_apply_that_blocks_is_reported_by_the_loop(
+    caplog: pytest.LogCaptureFixture, *, blocks: bool
+) -> None:
     hz = 20.0
 
     class Still(Agent):

@@ -14,7 +14,14 @@ OPEN, CLOSED = 1.0, -1.0
 def spec_of(delta: bool, arms: int) -> ActionSpec:
     """Return actions of three joints and a gripper for each arm."""
     names = tuple(f"arm{i}" for i in range(arms)) if arms > 1 else None
-    return ActionSpec(dim=4 * arms, space="joint", delta=delta, gripper_open=OPEN, gripper_closed=CLOSED, arms=names)
+    return ActionSpec(
+        dim=4 * arms,
+        space="joint",
+        delta=delta,
+        gripper_open=OPEN,
+        gripper_closed=CLOSED,
+        arms=names,
+    )
 
 
 class Device(AxesDevice):
@@ -49,6 +56,8 @@ def test_a_leader_moves_the_gripper_at_a_press_alone_and_refuses_several(delta: 
 
 
 def test_arms_that_do_not_share_the_numbers_equally_are_an_error() -> None:
-    unequal = ActionSpec(dim=15, delta=True, gripper_open=1.0, gripper_closed=0.0, arms=("left", "right"))
+    unequal = ActionSpec(
+        dim=15, delta=True, gripper_open=1.0, gripper_closed=0.0, arms=("left", "right")
+    )
     with pytest.raises(ConfigError, match="2 arms"):
         AxesLeader(Contract(action=unequal), Device(), step=0.1)

@@ -1,4 +1,6 @@
-"""The plug-in is as light as the robot's install: none of its modules imports more than that has."""
+"""The plug-in is as light as the robot's install: none of its modules imports more than that
+has.
+"""
 
 from __future__ import annotations
 
@@ -15,14 +17,29 @@ MODULES = [
     ".".join(path.relative_to(PACKAGE.parent).with_suffix("").parts).removesuffix(".__init__")
     for path in sorted(PACKAGE.rglob("*.py"))
 ]
-HEAVY = {"ray", "torch", "pydantic", "jinja2", "starlette", "gymnasium", "PIL", "yaml", "typer", "rich", "av", "mujoco"}
+HEAVY = {
+    "ray",
+    "torch",
+    "pydantic",
+    "jinja2",
+    "starlette",
+    "gymnasium",
+    "PIL",
+    "yaml",
+    "typer",
+    "rich",
+    "av",
+    "mujoco",
+}
 HEAVY |= {"lerobot", "pyarrow", "pyspacemouse", "rclpy"}
 
 
 @pytest.mark.parametrize("module", MODULES)
 def test_no_module_imports_anything_heavy(module: str) -> None:
     code = f"import sys, {module}; print(*sys.modules)"
-    done = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True, timeout=300)
+    done = subprocess.run(
+        [sys.executable, "-c", code], check=True, capture_output=True, text=True, timeout=300
+    )
     loaded = {name.partition(".")[0] for name in done.stdout.split()}
     assert "vlagents_ray_robot" in loaded
     assert loaded & HEAVY == set()

@@ -25,14 +25,18 @@ def test_an_arm_gives_what_its_contract_states_and_goes_where_it_is_sent(name: s
     with closing(simulated_arm(name, cameras=())) as arm:
         obs = arm.observe()
         check_observation(obs, arm.contract)
-        assert arm.contract.action.dim == len(arm.joint_names) + (obs.gripper is not None) * len(arm.arms)
+        assert arm.contract.action.dim == len(arm.joint_names) + (obs.gripper is not None) * len(
+            arm.arms
+        )
         assert (arm.joint_limits[:, 0] < arm.joints()).all()
         assert (arm.joints() < arm.joint_limits[:, 1]).all()
         action = np.array(arm._goal, np.float32)
         action[0] += 0.2
         arm.apply(action)
         arm.clock.sleep(0.02)
-        assert np.allclose(arm.joints()[0], obs.state[next(iter(obs.state))][0], atol=2e-3), "before the latency"
+        assert np.allclose(arm.joints()[0], obs.state[next(iter(obs.state))][0], atol=2e-3), (
+            "before the latency"
+        )
         arm.clock.sleep(2.0)
         assert arm.joints()[0] == pytest.approx(action[0], abs=0.02)
 
@@ -54,7 +58,9 @@ def test_a_stop_ends_a_motion_and_forgets_commands() -> None:
 
 
 def test_a_name_gives_an_arm_with_its_settings() -> None:
-    make = robot_named("--robot", f"mujoco:{model_file('ur5e')}", ["like=ur5e", "cameras=[]", "speed=0.5"])
+    make = robot_named(
+        "--robot", f"mujoco:{model_file('ur5e')}", ["like=ur5e", "cameras=[]", "speed=0.5"]
+    )
     arm = make(clock=SimulatedClock())
     assert isinstance(arm, MujocoArm)
     assert arm.speed == 0.5
@@ -69,7 +75,9 @@ def test_a_joint_without_limits_has_those_of_two_turns(tmp_path: Path) -> None:
     )
 
 
-def test_a_wrong_model_is_an_error_with_its_cure(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_wrong_model_is_an_error_with_its_cure(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     with pytest.raises(ConfigError, match="want a file that exists"):
         MujocoArm("missing.xml")
     torque = tmp_path / "torque.xml"
@@ -86,5 +94,7 @@ def test_a_wrong_model_is_an_error_with_its_cure(tmp_path: Path, monkeypatch: py
 def test_the_module_chooses_the_renderer_before_a_package_of_models_imports_mujoco() -> None:
     script = "import os, vlagents_ray_robot.mujoco_arm; print(os.environ['MUJOCO_GL'])"
     environment = {"PYTHONPATH": os.pathsep.join(sys.path)}  # no display
-    done = subprocess.run([sys.executable, "-c", script], env=environment, capture_output=True, text=True, check=True)
+    done = subprocess.run(
+        [sys.executable, "-c", script], env=environment, capture_output=True, text=True, check=True
+    )
     assert done.stdout == "egl\n"

@@ -1,4 +1,6 @@
-"""The contract of `stop` for every arm: at rest where it is, with its grasp, whatever sensor is broken."""
+"""The contract of `stop` for every arm: at rest where it is, with its grasp, whatever sensor is
+broken.
+"""
 
 from __future__ import annotations
 
@@ -60,7 +62,9 @@ class Bus:
 class FakeFollower:
     """An arm as LeRobot's `SOFollower`: the bus is read first, then each camera."""
 
-    observation_features: dict[str, Any] = {f"{motor}.pos": float for motor in MOTORS} | {"wrist": (4, 4, 3)}
+    observation_features: dict[str, Any] = {f"{motor}.pos": float for motor in MOTORS} | {
+        "wrist": (4, 4, 3)
+    }
     action_features: dict[str, Any] = {f"{motor}.pos": float for motor in MOTORS}  # noqa: RUF012
 
     def __init__(self, *, has_bus: bool = True, max_relative_target: float | None = None) -> None:
@@ -73,7 +77,9 @@ class FakeFollower:
 
     def get_observation(self) -> dict[str, Any]:
         bus = getattr(self, "bus", self.wire)
-        positions = {f"{motor}.pos": value for motor, value in bus.sync_read("Present_Position").items()}
+        positions = {
+            f"{motor}.pos": value for motor, value in bus.sync_read("Present_Position").items()
+        }
         self.camera()
         if self.camera_broken:
             raise TimeoutError("Timed out waiting for frame from camera wrist after 200 ms.")
@@ -83,7 +89,9 @@ class FakeFollower:
         bus = getattr(self, "bus", self.wire)
         if self.max_relative_target is not None:
             bus.sync_read("Present_Position")
-        bus.sync_write("Goal_Position", {name.removesuffix(".pos"): goal for name, goal in action.items()})
+        bus.sync_write(
+            "Goal_Position", {name.removesuffix(".pos"): goal for name, goal in action.items()}
+        )
 
 
 def robot_of(follower: FakeFollower) -> LeRobotRobot:
@@ -117,7 +125,9 @@ def test_a_lerobot_arm_stops_where_it_is_and_keeps_its_grasp(kind: str, broken: 
 
 @pytest.mark.parametrize("broken", ["camera", "encoders", "camera and encoders"])
 @pytest.mark.parametrize("kind", FOLLOWERS)
-def test_a_lerobot_arm_that_was_neither_seen_nor_commanded_stays_as_it_is(kind: str, broken: str) -> None:
+def test_a_lerobot_arm_that_was_neither_seen_nor_commanded_stays_as_it_is(
+    kind: str, broken: str
+) -> None:
     follower = FOLLOWERS[kind]()
     robot = robot_of(follower)
     follower.camera_broken = "camera" in broken
@@ -220,7 +230,9 @@ def last_goal(wire: Finger) -> list[float]:
 
 @pytest.mark.parametrize("commanded", [False, True])
 @pytest.mark.parametrize("topic", ROS_TOPICS)
-def test_a_robot_behind_topics_stops_where_it_is_and_keeps_its_grasp(topic: str, *, commanded: bool) -> None:
+def test_a_robot_behind_topics_stops_where_it_is_and_keeps_its_grasp(
+    topic: str, *, commanded: bool
+) -> None:
     robot, wire = ros_robot(topic)
     with robot:
         robot.observe()
@@ -254,7 +266,11 @@ def test_an_arm_in_mujoco_stops_where_it_is_and_keeps_its_grasp(name: str, delta
         spec = arm.contract.action
         dim = spec.dim or 0
         grippers = spec.gripper_columns(dim)
-        action = np.full(dim, 0.5, np.float32) if delta else np.array(arm._goal, np.float32) + np.float32(0.5)
+        action = (
+            np.full(dim, 0.5, np.float32)
+            if delta
+            else np.array(arm._goal, np.float32) + np.float32(0.5)
+        )
         action[grippers] = 0.4
         arm.apply(action)
         arm.clock.sleep(0.1)
@@ -267,5 +283,7 @@ def test_an_arm_in_mujoco_stops_where_it_is_and_keeps_its_grasp(name: str, delta
 
 
 def test_each_robot_that_this_distribution_registers_is_stopped_here() -> None:
-    registered = {name for name, entry in entries("robots").items() if entry.distribution == DISTRIBUTION}
+    registered = {
+        name for name, entry in entries("robots").items() if entry.distribution == DISTRIBUTION
+    }
     assert registered == {"lerobot", "mujoco", "ros"}

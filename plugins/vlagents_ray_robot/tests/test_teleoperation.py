@@ -15,7 +15,16 @@ import numpy as np
 import pytest
 from eval_fakes import Clock
 
-from vlagents_ray import Act, ActionSpec, Agent, ChunkPlayer, ConfigError, Contract, Obs, PlayerSettings
+from vlagents_ray import (
+    Act,
+    ActionSpec,
+    Agent,
+    ChunkPlayer,
+    ConfigError,
+    Contract,
+    Obs,
+    PlayerSettings,
+)
 from vlagents_ray.envs import make_env
 from vlagents_ray.errors import MissingDependency, MissingState
 from vlagents_ray.policies.noop import Noop, NoopConfig
@@ -25,7 +34,8 @@ from vlagents_ray.robot.simulated import EnvRobot
 from vlagents_ray_robot.teleoperation import AxesLeader, Keyboard, SpaceMouse
 
 DELTAS = Contract(
-    action=ActionSpec(dim=4, delta=True, gripper_open=1.0, gripper_closed=-1.0, low=-1.0, high=1.0), gripper=True
+    action=ActionSpec(dim=4, delta=True, gripper_open=1.0, gripper_closed=-1.0, low=-1.0, high=1.0),
+    gripper=True,
 )
 JOINTS = Contract(action=ActionSpec(dim=3, delta=False, low=-1.0, high=1.0))
 
@@ -55,7 +65,9 @@ def terminal() -> Iterator[Terminal]:
     os.close(made.its)
 
 
-def test_keys_move_along_their_axes_while_they_are_pressed(clock: Clock, terminal: Terminal) -> None:
+def test_keys_move_along_their_axes_while_they_are_pressed(
+    clock: Clock, terminal: Terminal
+) -> None:
     before = termios.tcgetattr(terminal.its)
     with Keyboard(terminal=terminal.its) as device:
         assert not termios.tcgetattr(terminal.its)[3] & termios.ECHO
@@ -75,7 +87,9 @@ def test_keys_move_along_their_axes_while_they_are_pressed(clock: Clock, termina
     assert termios.tcgetattr(terminal.its) == before
 
 
-def test_enter_takes_over_and_gives_back_and_other_keys_do_what_was_said(terminal: Terminal) -> None:
+def test_enter_takes_over_and_gives_back_and_other_keys_do_what_was_said(
+    terminal: Terminal,
+) -> None:
     pressed: list[str] = []
     with Keyboard({"y": lambda: pressed.append("y")}, terminal=terminal.its) as device:
         engaged = []
@@ -83,7 +97,9 @@ def test_enter_takes_over_and_gives_back_and_other_keys_do_what_was_said(termina
             terminal.type(keys)
             engaged.append(device.engaged())
         assert engaged == [True, False, True, False, False, True]
-        assert device.axes().tolist() == [0] * 6, "a robot given back is not moved by keys of before"
+        assert device.axes().tolist() == [0] * 6, (
+            "a robot given back is not moved by keys of before"
+        )
         assert (pressed, device.gripper_presses(), device.gripper_presses()) == (["y"], 1, 0)
 
 
@@ -126,7 +142,9 @@ def test_axes_become_relative_actions_within_half_of_the_bound() -> None:
     stick.at[:3] = (1, -0.5, 0)
     assert leader.engaged()
     assert leader.action(Obs(gripper=1.0)).tolist() == [0.5, -0.25, 0, 1]
-    assert AxesLeader(DELTAS, stick, step=0.1).action(Obs(gripper=1.0))[:2] == pytest.approx([0.1, -0.05])
+    assert AxesLeader(DELTAS, stick, step=0.1).action(Obs(gripper=1.0))[:2] == pytest.approx(
+        [0.1, -0.05]
+    )
 
 
 def test_a_gripper_that_may_hold_something_stays_closed_until_its_button_is_pressed() -> None:
@@ -192,7 +210,9 @@ FORWARDS, TICKS, STEP = 60, 100, 0.01
 REFUSALS = {
     "a bound": Guard(JOINTS, high=0.2),
     "a bound of a file": Guard(JOINTS, limits=Limits(high=(0.2, 9.0, 9.0)), hz=200.0),
-    "a measured pose": Guard(JOINTS, high=0.2, max_step=0.05, measure=lambda obs: obs.state["joints"]),
+    "a measured pose": Guard(
+        JOINTS, high=0.2, max_step=0.05, measure=lambda obs: obs.state["joints"]
+    ),
     "the contract": Guard(Contract(action=replace(JOINTS.action, high=0.2))),
     "a robot that holds": Guard(JOINTS),
     "a check of one's own": Guard(JOINTS, high=0.2, max_step=0.011),
@@ -201,14 +221,20 @@ REFUSALS = {
 
 @pytest.mark.parametrize("measured", [False, True])
 @pytest.mark.parametrize("refusal", REFUSALS)
-def test_an_operators_target_does_not_run_on_while_the_arm_does_not_follow(refusal: str, *, measured: bool) -> None:
+def test_an_operators_target_does_not_run_on_while_the_arm_does_not_follow(
+    refusal: str, *, measured: bool
+) -> None:
     stick, arm = Stick(), Obedient()
     stick.at[0] = 1.0
 
     def over() -> bool:
         tick = len(arm.path)
         stick.at[0] = 1.0 if tick < FORWARDS else -1.0
-        arm.holds = "the camera hangs" if refusal == "a robot that holds" and 20 <= tick < FORWARDS else None
+        arm.holds = (
+            "the camera hangs"
+            if refusal == "a robot that holds" and 20 <= tick < FORWARDS
+            else None
+        )
         return tick >= TICKS
 
     measure = (lambda obs: obs.state["joints"]) if measured else None
@@ -218,9 +244,13 @@ def test_an_operators_target_does_not_run_on_while_the_arm_does_not_follow(refus
         run_loop(arm, player, hz=200.0, until=over)
     at_turn = arm.path[FORWARDS - 1]
     assert at_turn == pytest.approx(0.2, abs=2 * STEP), "it stood against the bound, or held"
-    moved = [number for number, place in enumerate(arm.path[FORWARDS:]) if place < at_turn - STEP / 2]
+    moved = [
+        number for number, place in enumerate(arm.path[FORWARDS:]) if place < at_turn - STEP / 2
+    ]
     assert moved[0] <= 3, "ticks of the way back without motion"
-    assert arm.path[-1] < at_turn - 0.8 * STEP * (TICKS - FORWARDS - 5), "it obeys each tick of the way back"
+    assert arm.path[-1] < at_turn - 0.8 * STEP * (TICKS - FORWARDS - 5), (
+        "it obeys each tick of the way back"
+    )
 
 
 class Mouse:
@@ -250,11 +280,18 @@ def mouse(monkeypatch: pytest.MonkeyPatch) -> Mouse:
     return made
 
 
-def test_a_spacemouse_takes_over_when_it_is_moved_and_gives_back_by_its_last_button(mouse: Mouse) -> None:
+def test_a_spacemouse_takes_over_when_it_is_moved_and_gives_back_by_its_last_button(
+    mouse: Mouse,
+) -> None:
     with SpaceMouse() as device:
         mouse.reports = [{"x": 0.05}]
         assert not device.engaged(), "the cap never rests exactly in the middle"
-        mouse.reports = [{"x": 0.9}, {"x": 0.4, "yaw": -2.0}, {"buttons": [1, 0]}, {"buttons": [0, 0]}]
+        mouse.reports = [
+            {"x": 0.9},
+            {"x": 0.4, "yaw": -2.0},
+            {"buttons": [1, 0]},
+            {"buttons": [0, 0]},
+        ]
         assert device.engaged()
         assert device.axes() == pytest.approx([0.4, 0, 0, 0, 0, -1])
         assert mouse.reports == [], "what was sent since the last tick has been read"
@@ -264,7 +301,9 @@ def test_a_spacemouse_takes_over_when_it_is_moved_and_gives_back_by_its_last_but
     assert mouse.closed
 
 
-def test_without_a_spacemouse_or_its_library_the_cure_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_a_spacemouse_or_its_library_the_cure_is_named(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     monkeypatch.setitem(sys.modules, "pyspacemouse", None)
     with pytest.raises(MissingDependency, match="spacemouse"):
         SpaceMouse()
@@ -289,7 +328,12 @@ def test_a_human_drives_an_environment_through_the_same_loop() -> None:
         report = run_loop(robot, agent, hz=200.0, until=lambda: robot.ended)
         moved = robot.observe().state["xyzrpy"] - before
         assert moved[0] == pytest.approx(4 * 0.5 * 0.03, abs=1e-5)
-        assert (robot.steps, robot.ended, robot.success, report.interventions) == (4, True, False, 4)
+        assert (robot.steps, robot.ended, robot.success, report.interventions) == (
+            4,
+            True,
+            False,
+            4,
+        )
         robot.apply(np.zeros(4, np.float32))
         assert robot.steps == 4
         endless = EnvRobot(env, 0, endless=True)

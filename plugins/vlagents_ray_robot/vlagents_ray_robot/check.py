@@ -1,4 +1,6 @@
-"""A conformance suite for `observe`, `apply` and `stop` of a robot: what to know of an arm before a policy moves it."""
+"""A conformance suite for `observe`, `apply` and `stop` of a robot: what to know of an arm
+before a policy moves it.
+"""
 
 from __future__ import annotations
 
@@ -22,13 +24,19 @@ CHECKS = {  # in the order in which they run
     "observation": "observations fit the contract",
     "clock": "time stamps are of now and do not go back",
     "rate": "observe returns within a part of a tick, and gives new readings at the control rate",
-    "units": "joints are in the unit of the contract, positions in m, openings in [0, 1], quaternions of length 1",
+    "units": (
+        "joints are in the unit of the contract, positions in m, openings in [0, 1], "
+        "quaternions of length 1"
+    ),
     "limits": "the arm is within its limits",
     "stop": "stop returns at once, twice and from another thread, and ends a motion",
     "cameras": "names, colours and orientation of the cameras are right, and no picture is frozen",
     "place": "the hand is where its pose says",
     "blocking": "apply does not wait for the motion",
-    "meaning": "the command of the present pose moves nothing: targets are absolute, as the contract states, or deltas",
+    "meaning": (
+        "the command of the present pose moves nothing: targets are absolute, as the "
+        "contract states, or deltas"
+    ),
     "order": "each number of an action moves its own joint, and it alone",
     "sign": "each joint moves to the side of its command",
     "size": "each joint moves as far as its command",
@@ -53,7 +61,8 @@ _DECLARE = "the robot's contract does not declare what this check needs"
 class Operator:
     """The person at the robot, who is asked at the terminal; a subclass answers otherwise.
 
-    An answer None means that they cannot tell: the check is listed as not made. Without `move` they agree to no motion.
+    An answer None means that they cannot tell: the check is listed as not made. Without `move` they
+    agree to no motion.
     """
 
     def __init__(self, *, move: bool = True) -> None:
@@ -61,25 +70,38 @@ class Operator:
 
     def agrees(self, motion: str) -> bool:
         """Return whether the robot may make this motion now."""
-        return self._move and _asked(f"The robot will do this: {motion}. Is its space free?") is True
+        return (
+            self._move and _asked(f"The robot will do this: {motion}. Is its space free?") is True
+        )
 
     def holds_card(self, camera: str | None) -> bool:
-        """Hold something red in the upper left quarter of what a camera sees; None: take it away. False: no card."""
+        """Hold something red in the upper left quarter of what a camera sees; None: take it
+        away. False: no card.
+        """
         where = f"Hold something red in the upper left quarter of what camera {camera!r} sees"
         return _asked(f"{'Take the card away' if camera is None else where}. Done?") is True
 
     def saw_joint(self, name: str, side: int) -> bool | None:
-        """Return whether this joint alone has moved since `agrees`, towards its positive (1) or negative (-1) side."""
-        return _asked(f"Did {name} alone move, to the side that its manual calls {'+' if side > 0 else '-'}?")
+        """Return whether this joint alone has moved since `agrees`, towards its positive (1) or
+        negative (-1) side.
+        """
+        return _asked(
+            f"Did {name} alone move, to the side that its manual calls {'+' if side > 0 else '-'}?"
+        )
 
     def saw_closing(self) -> bool | None:
         """Return whether the gripper is closed now."""
         return _asked("Is the gripper closed?")
 
     def sees_hand(self, pose: np.ndarray, arm: int = 0) -> bool | None:
-        """Return whether an arm's hand is at a pose, (7,): m from its base, x forwards, z up, and quaternion xyzw."""
+        """Return whether an arm's hand is at a pose, (7,): m from its base, x forwards, z up,
+        and quaternion xyzw.
+        """
         x, y, z, *quaternion = np.round(pose, 2).tolist()
-        place = f"{x} m in front of the base, {y} m to its left, {z} m above it, with the quaternion xyzw {quaternion}"
+        place = (
+            f"{x} m in front of the base, {y} m to its left, {z} m above it, with the "
+            f"quaternion xyzw {quaternion}"
+        )
         return _asked(f"Is the hand of arm {arm + 1} there: {place}?")
 
 
@@ -112,7 +134,8 @@ class RobotReport:
     skipped: dict[str, str] = field(default_factory=dict)  # check: the reason
     figures: dict[str, float] = field(default_factory=dict)  # measured, with the unit in the name
     pictures: dict[str, np.ndarray] = field(default_factory=dict)  # (H, W, 3) uint8 by title
-    undeclared: str = ""  # what the robot has to declare before its motion can be checked; "" if nothing is missing
+    # What the robot has to declare before its motion can be checked; "" if nothing is missing.
+    undeclared: str = ""
     robot: str = ""  # its name
     at: float = field(default_factory=time.time)  # s since 1970
 
@@ -151,13 +174,17 @@ class RobotReport:
         colour = "#b00020" if self.findings else "#8a5a00" if self.undeclared else "#1b6e1b"
         style = "body{font:16px/1.5 sans-serif;max-width:60em;margin:2em auto;padding:0 1em}"
         style += f"h2{{color:{colour}}}figure{{display:inline-block;margin:8px}}img{{height:240px}}"
-        page = f"<!doctype html><meta charset=utf-8><title>Check of {html.escape(self.robot)}</title>"
+        page = (
+            f"<!doctype html><meta charset=utf-8><title>Check of {html.escape(self.robot)}</title>"
+        )
         page += f"<style>{style}</style><h1>Check of {html.escape(self.robot)}</h1>"
         page += f"<h2>{html.escape(self.verdict)}</h2><p>{date}</p>"
         page += f"<ul>{''.join(f'<li>{html.escape(line)}</li>' for line in self.lines()[:-1])}</ul>"
         for title, picture in self.pictures.items():
             url = data_url("image/jpeg", encode_jpeg(picture))
-            page += f'<figure><img src="{url}"><figcaption>{html.escape(title)}</figcaption></figure>'
+            page += (
+                f'<figure><img src="{url}"><figcaption>{html.escape(title)}</figcaption></figure>'
+            )
         Path(file).write_text(page, encoding="utf-8")
 
 
@@ -170,14 +197,15 @@ def examine(
     latency_s: float = 0.4,
     clock: Any = time,
 ) -> RobotReport:
-    """Check a robot, first at rest, then by small moves of one joint at a time to which the operator agrees.
+    """Check a robot, first at rest, then by small moves of one joint at a time to which the
+    operator agrees.
 
     A finding at rest prevents all motion, one in motion stops the robot and ends the check.
 
     Args:
         robot: The robot, at rest and away from the limits of its joints.
-        contract: What the robot provides and accepts; by default its own. Moves need `action.dim`, and whether actions
-            are relative.
+        contract: What the robot provides and accepts; by default its own. Moves need `action.dim`,
+            and whether actions are relative.
         operator: The person at the robot; None: nothing moves.
         hz: The control rate, Hz; by default the contract's, else 50.
         latency_s: The longest time from a command to its measured motion, s.
@@ -188,17 +216,27 @@ def examine(
     """
     contract = contract or contract_of(robot)
     report = RobotReport(robot=type(robot).__name__)
-    suite = _Suite(robot, contract, operator, 1 / (hz or contract.control_hz or 50.0), latency_s, clock, report)
+    suite = _Suite(
+        robot, contract, operator, 1 / (hz or contract.control_hz or 50.0), latency_s, clock, report
+    )
     try:
         suite.at_rest()
         suite.in_motion()
     except _FoundInMotionError:
         pass
     except InvalidObservation as error:
-        suite.find("observation", str(error), "an observation that fits the contract", "correct observe", ends=False)
+        suite.find(
+            "observation",
+            str(error),
+            "an observation that fits the contract",
+            "correct observe",
+            ends=False,
+        )
     finally:
         robot.stop()
-    suite.skip_others("an earlier check found something" if suite.report.findings else "nothing moved")
+    suite.skip_others(
+        "an earlier check found something" if suite.report.findings else "nothing moved"
+    )
     return suite.report
 
 
@@ -245,7 +283,12 @@ class _Suite:
         names = getattr(self._robot, "joint_names", ())
         for number, ours, theirs in reordered(names, self._contract.action.names or ())[:1]:
             cure = "give actions and state the contract's order of joints"
-            self.find("order", f"{ours!r} as joint {number} of the arm", f"{theirs!r}, as the contract states", cure)
+            self.find(
+                "order",
+                f"{ours!r} as joint {number} of the arm",
+                f"{theirs!r}, as the contract states",
+                cure,
+            )
         last = first
         for _ in range(20):
             self._clock.sleep(self._period_s)
@@ -256,7 +299,12 @@ class _Suite:
         self.report.figures |= {"observe p50, ms": median_ms, "observe p99, ms": most_ms}
         if median_ms > 500 * self._period_s:
             limit = f"at most {500 * self._period_s:.3g} ms, half of a tick"
-            self.find("rate", f"{median_ms:.3g} ms for observe", limit, "read cameras and bus in threads of their own")
+            self.find(
+                "rate",
+                f"{median_ms:.3g} ms for observe",
+                limit,
+                "read cameras and bus in threads of their own",
+            )
         self._check_units(last)
         self._check_limits(last)
         self._check_stop()
@@ -265,7 +313,9 @@ class _Suite:
         self._check_place(last)
 
     def in_motion(self) -> None:
-        """Move one joint at a time, then the grippers, unless there is a finding or a reason against it."""
+        """Move one joint at a time, then the grippers, unless there is a finding or a reason
+        against it.
+        """
         layout = self._layout
         if self.report.findings:
             return
@@ -298,12 +348,16 @@ class _Suite:
         self._when = motion if self._operator is not None and self._operator.agrees(motion) else ""
         if not self._when:
             refused = f"the operator did not agree to {motion}"
-            self.skip_others("no operator agreed to a motion" if self._operator is None else refused)
+            self.skip_others(
+                "no operator agreed to a motion" if self._operator is None else refused
+            )
         return bool(self._when)
 
     def _passes(self, *checks: str) -> None:
         found = {finding.check for finding in self.report.findings} | self.report.skipped.keys()
-        self.report.passed += [one for one in checks if one not in found and one not in self.report.passed]
+        self.report.passed += [
+            one for one in checks if one not in found and one not in self.report.passed
+        ]
 
     def _observe(self) -> Obs:
         began_s = self._clock.monotonic()
@@ -317,8 +371,15 @@ class _Suite:
             back_s, self._stamp_s = self._stamp_s - stamp_s, stamp_s
             if back_s > 0 or not _SKEW_S[0] <= ahead_s <= _SKEW_S[1]:
                 self._stamped = False
-                got = f"a time stamp {back_s:.3g} s before the last one" if back_s > 0 else f"one {ahead_s:+.3g} s off"
-                cure = "use time.time() of this machine when the first sensor is read, or synchronize the clocks"
+                got = (
+                    f"a time stamp {back_s:.3g} s before the last one"
+                    if back_s > 0
+                    else f"one {ahead_s:+.3g} s off"
+                )
+                cure = (
+                    "use time.time() of this machine when the first sensor is read, or "
+                    "synchronize the clocks"
+                )
                 self.find("clock", got, "the time at which the first sensor was read", cure)
         return obs
 
@@ -339,14 +400,26 @@ class _Suite:
             unit, kind = spec.unit if spec else None, name.rpartition("/")[2]
             if kind == "joints" and unit in (None, "rad") and np.abs(part).max() > 2.1 * np.pi:
                 got = f"{np.abs(part).max():.4g} in {name!r}, more than a full turn"
-                self.find("units", got, "rad", "convert degrees by np.deg2rad, in observe and in apply")
+                self.find(
+                    "units", got, "rad", "convert degrees by np.deg2rad, in observe and in apply"
+                )
             if kind in ("tquat", "xyzrpy") and np.abs(part[:3]).max() > _MOST_M:
-                self.find("units", f"{np.abs(part[:3]).max():.4g} in {name!r}", "m", "divide millimetres by 1000")
+                self.find(
+                    "units",
+                    f"{np.abs(part[:3]).max():.4g} in {name!r}",
+                    "m",
+                    "divide millimetres by 1000",
+                )
             if kind == "tquat" and abs(np.linalg.norm(part[3:]) - 1) > 0.01:
                 got = f"a quaternion of length {np.linalg.norm(part[3:]):.3g} in {name!r}"
                 self.find("units", got, "1", "give position and then quaternion xyzw")
         if obs.gripper is not None and not 0 <= obs.gripper <= 1:
-            self.find("units", f"a gripper of {obs.gripper:.3g}", "[0, 1], 1 = open", "scale it by its closed and open")
+            self.find(
+                "units",
+                f"a gripper of {obs.gripper:.3g}",
+                "[0, 1], 1 = open",
+                "scale it by its closed and open",
+            )
         self._passes("units")
 
     def _check_limits(self, obs: Obs) -> None:
@@ -354,12 +427,21 @@ class _Suite:
         if any(finding.check == "units" for finding in self.report.findings):
             return
         if layout is None or np.isinf(layout.limits).all():
-            self.report.skipped["limits"] = "the robot has no `joint_limits`, or no state of its joints"
+            self.report.skipped["limits"] = (
+                "the robot has no `joint_limits`, or no state of its joints"
+            )
             return
-        for name, measured, (low, high) in zip(layout.names, layout.measured(obs), layout.limits, strict=True):
+        for name, measured, (low, high) in zip(
+            layout.names, layout.measured(obs), layout.limits, strict=True
+        ):
             if not low <= measured <= high:
                 got, want = f"{name} at {measured:.4g}", f"[{low:.4g}, {high:.4g}]"
-                self.find("limits", got, want, "give the limits of this arm, in the order and unit of its joints")
+                self.find(
+                    "limits",
+                    got,
+                    want,
+                    "give the limits of this arm, in the order and unit of its joints",
+                )
                 break
         self._passes("limits")
 
@@ -368,19 +450,35 @@ class _Suite:
             with ThreadPoolExecutor(1) as thread:
                 thread.submit(self._robot.stop).result()
 
-        for place, call in (("", self._robot.stop), (" again", self._robot.stop), (" from a thread", in_thread)):
+        for place, call in (
+            ("", self._robot.stop),
+            (" again", self._robot.stop),
+            (" from a thread", in_thread),
+        ):
             began_s = self._clock.monotonic()
             try:
                 call()
             except Exception as error:  # noqa: BLE001 - any error of the robot is a finding
-                self.find("stop", f"{error!r} from stop{place}", "no error in any state", "make stop safe to repeat")
+                self.find(
+                    "stop",
+                    f"{error!r} from stop{place}",
+                    "no error in any state",
+                    "make stop safe to repeat",
+                )
                 return
             if (took_s := self._clock.monotonic() - began_s) > _STOP_S:
-                self.find("stop", f"{took_s:.3g} s for stop{place}", f"at most {_STOP_S} s", "send it and return")
+                self.find(
+                    "stop",
+                    f"{took_s:.3g} s for stop{place}",
+                    f"at most {_STOP_S} s",
+                    "send it and return",
+                )
                 return
 
     def _check_new_pictures(self) -> None:
-        """Find cameras that repeat one picture; the noise of a sensor changes each picture, also of a still scene."""
+        """Find cameras that repeat one picture; the noise of a sensor changes each picture, also
+        of a still scene.
+        """
         if getattr(self._robot, "simulated", False):
             return
         if getattr(self._robot, "dates_pictures", False):
@@ -391,23 +489,35 @@ class _Suite:
         while still and self._clock.monotonic() - began_s < _FROZEN_S:
             self._clock.sleep(self._period_s)
             pictures = self._observe().cameras
-            still = {name for name in still if name in pictures and np.array_equal(pictures[name], first[name])}
+            still = {
+                name
+                for name in still
+                if name in pictures and np.array_equal(pictures[name], first[name])
+            }
         for name in sorted(still):
             got = f"the same picture of {name!r}, to the bit, for {_FROZEN_S:g} s"
             cure = (
-                "the camera hangs, or observe returns a stored picture: restart it, and read each frame once; a "
+                "the camera hangs, or observe returns a stored picture: restart it, and read each "
+                "frame once; a "
                 "simulated robot declares `simulated = True`"
             )
             self.find("cameras", got, "new pictures, which differ by the noise of the sensor", cure)
 
     def _check_new_dates(self) -> None:
-        """Find a sensor that gives nothing new, by the time stamps; a simulation may render one picture repeatedly."""
+        """Find a sensor that gives nothing new, by the time stamps; a simulation may render one
+        picture repeatedly.
+        """
         began_s = self._clock.monotonic()
         began_at = self._clock.time()
         while self._observe().info[CAPTURED] < began_at:
             if self._clock.monotonic() - began_s > _FROZEN_S:
-                got = getattr(self._robot, "holds", None) or f"nothing newer than {_FROZEN_S:g} s from a sensor"
-                self.find("cameras", got, "new pictures and states", "restart the driver of this sensor")
+                got = (
+                    getattr(self._robot, "holds", None)
+                    or f"nothing newer than {_FROZEN_S:g} s from a sensor"
+                )
+                self.find(
+                    "cameras", got, "new pictures and states", "restart the driver of this sensor"
+                )
                 return
             self._clock.sleep(self._period_s)
 
@@ -432,27 +542,62 @@ class _Suite:
 
     def _judge_card(self, camera: str, found: dict[str, _Card | None]) -> None:
         card, want = found[camera], f"the card, red, in the upper left of {camera!r}"
-        others = [name for name, other in found.items() if name != camera and other is not None and other.share > 0.004]
+        others = [
+            name
+            for name, other in found.items()
+            if name != camera and other is not None and other.share > 0.004
+        ]
         if card is None and others:
-            self.find("cameras", f"the card of {camera!r} in {others[0]!r}", want, "exchange the names of the cameras")
+            self.find(
+                "cameras",
+                f"the card of {camera!r} in {others[0]!r}",
+                want,
+                "exchange the names of the cameras",
+            )
         elif card is None:
             cure = "the camera hangs or gives old pictures; restart it, and read each frame once"
             self.find("cameras", f"no change in {camera!r}, a frozen picture", want, cure)
         elif not card.red:
-            self.find("cameras", f"a blue card in {camera!r}", want, "give RGB: image[..., ::-1] of OpenCV's BGR")
+            self.find(
+                "cameras",
+                f"a blue card in {camera!r}",
+                want,
+                "give RGB: image[..., ::-1] of OpenCV's BGR",
+            )
         elif card.x > 0.5 or card.y > 0.5:
-            side = f"the card at {100 * card.x:.0f} % from the left and {100 * card.y:.0f} % from the top of {camera!r}"
-            self.find("cameras", side, want, "rotate or flip the picture in observe: it must be upright, not mirrored")
+            side = (
+                f"the card at {100 * card.x:.0f} % from the left and {100 * card.y:.0f} % from "
+                f"the top of {camera!r}"
+            )
+            self.find(
+                "cameras",
+                side,
+                want,
+                "rotate or flip the picture in observe: it must be upright, not mirrored",
+            )
 
     def _check_place(self, obs: Obs) -> None:
         for number, arm in enumerate(self._contract.action.arms or ("",)):
             pose = obs.state.get(arm_part(arm, "tquat"))
-            sees = None if pose is None or self._operator is None else self._operator.sees_hand(pose, number)
+            sees = (
+                None
+                if pose is None or self._operator is None
+                else self._operator.sees_hand(pose, number)
+            )
             if pose is None or sees is None:
-                self.report.skipped["place"] = "observations have no 'tquat', or the operator cannot tell"
+                self.report.skipped["place"] = (
+                    "observations have no 'tquat', or the operator cannot tell"
+                )
             elif not sees and not self.report.findings:
-                got = f"the hand at {np.round(pose[:3], 2)} m with the quaternion {np.round(pose[3:], 2)}, as it is not"
-                cure = "give the pose in the frame of the arm's base, x forwards and z up, and the quaternion as xyzw"
+                got = (
+                    f"the hand at {np.round(pose[:3], 2)} m with the quaternion "
+                    f"{np.round(pose[3:], 2)}, as it is not"
+                )
+                cure = (
+                    "give the pose in the frame of the arm's base, x forwards and z up, and "
+                    "the "
+                    "quaternion as xyzw"
+                )
                 self.find("place", got, "the pose that the operator sees", cure)
         self._passes("place")
 
@@ -464,7 +609,9 @@ class _Suite:
         spec = self._contract.action
         if layout.grippers and spec.gripper_open is not None and spec.gripper_closed is not None:
             opening = 1.0 if obs.gripper is None else obs.gripper
-            action[layout.grippers] = spec.gripper_closed + opening * (spec.gripper_open - spec.gripper_closed)
+            action[layout.grippers] = spec.gripper_closed + opening * (
+                spec.gripper_open - spec.gripper_closed
+            )
         return action
 
     def _check_meaning(self, layout: _Layout) -> None:
@@ -478,11 +625,16 @@ class _Suite:
                 most = int(np.argmax(np.abs(moved)))
                 got = f"a motion of {layout.names[most]} by {moved[most]:+.3g} and more"
                 kind = "absolute targets" if layout.relative else "deltas"
-                cure = f"the arm takes {kind}, or other units: correct apply, or action.delta of the contract"
+                cure = (
+                    f"the arm takes {kind}, or other units: correct apply, or action.delta of "
+                    "the contract"
+                )
                 self.find("meaning", got, "none at the command of the present pose", cure)
 
     def _ramp(self, layout: _Layout, joint: int, change: float) -> list[tuple[float, np.ndarray]]:
-        """Move a joint by `change`; return times and measured joints during the move and until it is over."""
+        """Move a joint by `change`; return times and measured joints during the move and until
+        it is over.
+        """
         base = layout.measured(self._observe())
         ticks = max(1, round(_RAMP_S / self._period_s))
         seen = []
@@ -505,9 +657,15 @@ class _Suite:
         after = self._observe()
         moved = layout.measured(after) - base
         self._judge_move(layout, joint, change, moved)
-        saw = self._operator.saw_joint(name, 1 if room else -1) if self._operator is not None else None
+        saw = (
+            self._operator.saw_joint(name, 1 if room else -1)
+            if self._operator is not None
+            else None
+        )
         if saw is None:
-            reason = f"command and reading agree, but the operator could not tell whether {name} moved"
+            reason = (
+                f"command and reading agree, but the operator could not tell whether {name} moved"
+            )
             self.report.skipped |= {"order": reason, "sign": reason}
         if saw is False:
             cure = "correct the order or the sign of the joints, in observe and in apply"
@@ -517,14 +675,18 @@ class _Suite:
         self._lags_s.append((half[0] if half else np.inf) - began_s - _RAMP_S / 2)
         if self._lags_s[-1] > self._latency_s:
             got = f"{self._lags_s[-1]:.3g} s from the command of {name} to its measured motion"
-            cure = "read the newest state, without a queue; if the arm itself is slow, give latency_s"
+            cure = (
+                "read the newest state, without a queue; if the arm itself is slow, give latency_s"
+            )
             self.find("latency", got, f"at most {self._latency_s} s", cure)
         values = [measured[joint] for _, measured in seen]
         ticks = round(_RAMP_S / self._period_s)
         fresh = int(np.count_nonzero(np.abs(np.diff(values)) > 1e-3 * layout.step))
         if fresh < ticks / 2:
             got = f"{fresh} new readings of {name} in a move of {ticks} ticks"
-            cure = "run the arm's own loop, and read it, at the control rate, or lower the rate (hz)"
+            cure = (
+                "run the arm's own loop, and read it, at the control rate, or lower the rate (hz)"
+            )
             self.find("rate", got, f"one a tick, {1 / self._period_s:.3g} Hz", cure)
         self._judge_pose(layout, joint, before, after)
         self._ramp(layout, joint, -change)
@@ -535,28 +697,43 @@ class _Suite:
 
     def _judge_move(self, layout: _Layout, joint: int, change: float, moved: np.ndarray) -> None:
         """Compare the measured changes of all joints, (D,), with the commanded change of one."""
-        most, name, ratio = int(np.argmax(np.abs(moved))), layout.names[joint], float(moved[joint] / change)
+        most, name, ratio = (
+            int(np.argmax(np.abs(moved))),
+            layout.names[joint],
+            float(moved[joint] / change),
+        )
         if np.abs(moved).max() < 0.3 * layout.step:
             cure = "check that torque is on, and that apply sends each command"
             self.find("size", f"no motion of any joint for {name}", f"{change:+g}", cure)
         elif most != joint:
             got = f"{layout.names[most]} moved by {moved[most]:+.3g} when {name} was commanded"
-            self.find("order", got, f"{name} alone", "give actions and state the same order of joints")
+            self.find(
+                "order", got, f"{name} alone", "give actions and state the same order of joints"
+            )
         elif ratio < 0:
             got = f"{name} moved by {moved[joint]:+.3g} for {change:+g}"
-            self.find("sign", got, "the same sign", "invert the joint in observe or in apply, as the policy's data do")
+            self.find(
+                "sign",
+                got,
+                "the same sign",
+                "invert the joint in observe or in apply, as the policy's data do",
+            )
         elif not 0.5 < ratio < 1.5:
             got = f"{name} moved by {moved[joint]:+.3g} for {change:+g}"
             cure = "check the units of both, and that each command is executed once"
             self.find("size", got, f"{change:+g}", cure)
 
     def _judge_pose(self, layout: _Layout, joint: int, before: Obs, after: Obs) -> None:
-        """Check that the pose turned by the joint's angle and moved about the same axis, as one joint moves a hand."""
+        """Check that the pose turned by the joint's angle and moved about the same axis, as one
+        joint moves a hand.
+        """
         key = layout.pose_of[joint]
         if key is None or layout.unit not in ("rad", "deg"):
             self.report.skipped["pose"] = "observations have no 'tquat', the pose of the hand"
             return
-        (p0, q0), (p1, q1) = ((obs.state[key][:3], obs.state[key][3:].astype(float)) for obs in (before, after))
+        (p0, q0), (p1, q1) = (
+            (obs.state[key][:3], obs.state[key][3:].astype(float)) for obs in (before, after)
+        )
         # The quaternion of the turn: q1 times the inverse of q0.
         axis = q0[3] * q1[:3] - q1[3] * q0[:3] - np.cross(q1[:3], q0[:3])
         sine = np.linalg.norm(axis)
@@ -565,12 +742,24 @@ class _Suite:
         change = np.deg2rad(change) if layout.unit == "deg" else change
         along = abs(float((p1 - p0) @ axis)) / max(1e-9, float(sine))
         if abs(angle - change) > 0.3 * change + 0.01:
-            got = f"the hand turned by {angle:.3g} rad for {change:.3g} rad of {layout.names[joint]}"
-            self.find("pose", got, "the same angle", "correct the rotation of the pose, or the unit of the joints")
+            got = (
+                f"the hand turned by {angle:.3g} rad for {change:.3g} rad of {layout.names[joint]}"
+            )
+            self.find(
+                "pose",
+                got,
+                "the same angle",
+                "correct the rotation of the pose, or the unit of the joints",
+            )
         # The tolerance is for what other joints give way: 1 mm, and a sixth of the hand's way.
         if along > 0.001 + float(np.linalg.norm(p1 - p0)) / 6:
             got = f"a hand that moved {1e3 * along:.2g} mm along the axis about which it turned"
-            self.find("pose", got, "a motion about the joint's axis", "give the quaternion as xyzw, not as wxyz")
+            self.find(
+                "pose",
+                got,
+                "a motion about the joint's axis",
+                "give the quaternion as xyzw, not as wxyz",
+            )
 
     def _check_single_commands(self, layout: _Layout, name: str) -> None:
         half = layout.step / 2
@@ -580,7 +769,12 @@ class _Suite:
             self._clock.sleep(2 * self._latency_s)
             if abs(layout.measured(self._observe())[0] - before) < 0.4 * half:
                 got = f"no motion of {name} at command {number + 1} of 6 single ones"
-                self.find("commands", got, "a motion at each", "commands are dropped: check bus and network")
+                self.find(
+                    "commands",
+                    got,
+                    "a motion at each",
+                    "commands are dropped: check bus and network",
+                )
 
     def _check_stop_in_motion(self, layout: _Layout, name: str) -> None:
         before = layout.measured(self._observe())[0]
@@ -590,7 +784,12 @@ class _Suite:
         moved = abs(layout.measured(self._observe())[0] - before)
         if moved > layout.step / 2:
             got = f"{name} went on by {moved:.3g} after stop"
-            self.find("stop", got, "rest at once", "make the measured pose the target in stop, and drop commands")
+            self.find(
+                "stop",
+                got,
+                "rest at once",
+                "make the measured pose the target in stop, and drop commands",
+            )
         self._command = self._hold_command(layout, self._observe())
 
     def _check_grippers(self, layout: _Layout) -> None:
@@ -614,7 +813,10 @@ class _Suite:
             self.report.skipped["gripper"] = "the operator could not tell whether it closed"
         if after > before - 0.3 or saw is False:
             got = f"an opening of {before:.2g} before and {after:.2g} after the command to close"
-            cure = "exchange gripper_open and gripper_closed of the contract, and give 1 for open in observe"
+            cure = (
+                "exchange gripper_open and gripper_closed of the contract, and give 1 for open "
+                "in observe"
+            )
             self.find("gripper", got, "a gripper that closes, and a smaller opening", cure)
         opening(spec.gripper_open)
         self._passes("gripper")
@@ -630,8 +832,10 @@ def _undeclared(contract: Contract) -> str:
         what = "its state has no `joints` of the size of an action, or its actions are not joints"
     return (
         f"the motion cannot be checked, as {what}. Give the class a `contract`, such as "
-        f"Contract(state={{'joints': StateSpec(6, 'rad')}}, action=ActionSpec(dim=6, space='joint', delta=False)), "
-        f"or check by the contract of a policy (--policy URL); topics of ROS state only targets, by a measured pose as "
+        f"Contract(state={{'joints': StateSpec(6, 'rad')}}, action=ActionSpec(dim=6, "
+        "space='joint', delta=False)), "
+        "or check by the contract of a policy (--policy URL); topics of ROS state only targets, "
+        "by a measured pose as "
         f"their `stop`; see docs/arms.md"
     )
 
@@ -655,21 +859,33 @@ class _Layout:
         action: ActionSpec = contract.action
         if action.space not in (None, "joint") or action.dim is None:
             return None
-        parts = [key for arm in action.arms or ("",) if (key := arm_part(arm, "joints")) in obs.state]
+        parts = [
+            key for arm in action.arms or ("",) if (key := arm_part(arm, "joints")) in obs.state
+        ]
         counts = [len(obs.state[part]) for part in parts]
         each = (action.dim - sum(counts)) // max(1, len(parts))
         if not parts or each not in (0, 1) or sum(counts) + each * len(parts) != action.dim:
             return None
-        grippers = [int(end) - 1 for end in np.cumsum(counts) + each * np.arange(1, len(parts) + 1)] if each else []
+        grippers = (
+            [int(end) - 1 for end in np.cumsum(counts) + each * np.arange(1, len(parts) + 1)]
+            if each
+            else []
+        )
         joints = [number for number in range(action.dim) if number not in grippers]
-        hands = [pose if (pose := part.replace("joints", "tquat")) in obs.state else None for part in parts]
+        hands = [
+            pose if (pose := part.replace("joints", "tquat")) in obs.state else None
+            for part in parts
+        ]
         poses = [hand for hand, count in zip(hands, counts, strict=True) for _ in range(count)]
         names = list(getattr(robot, "joint_names", ()))
         if len(names) != len(joints):
             names = [f"joint {number}" for number in range(len(joints))]
         limits = np.asarray(getattr(robot, "joint_limits", [(-np.inf, np.inf)] * len(joints)))
         if limits.shape != (len(joints), 2):
-            raise ConfigError(f"joint_limits: got {limits.shape}, want ({len(joints)}, 2), a low and a high for each")
+            raise ConfigError(
+                f"joint_limits: got {limits.shape}, want ({len(joints)}, 2), a low and a high for "
+                "each"
+            )
         unit = ((contract.state or {}).get(parts[0]) or StateSpec()).unit or "rad"
         return cls(names, limits, joints, grippers, parts, poses, unit, bool(action.relative))
 
@@ -679,7 +895,9 @@ class _Layout:
         return _STEPS.get(self.unit, _OTHER_STEP)
 
     def changed(self, last: np.ndarray, joint: int, change: float) -> np.ndarray:
-        """Return the action that moves one joint by `change` from where the `last` action, (dim,), put it."""
+        """Return the action that moves one joint by `change` from where the `last` action,
+        (dim,), put it.
+        """
         action = last.copy()
         if self.relative:
             action[self.joints] = 0
@@ -702,16 +920,23 @@ class _Card:
 
 
 def _card(before: np.ndarray, after: np.ndarray) -> _Card | None:
-    """Find the pixels of (H, W, 3) uint8 pictures that became red, or blue where red and blue are exchanged."""
+    """Find the pixels of (H, W, 3) uint8 pictures that became red, or blue where red and blue
+    are exchanged.
+    """
     red, green, blue = np.moveaxis(after.astype(int), -1, 0)
     changed = np.abs(after.astype(int) - before).max(-1) > _RED
-    masks = [changed & (one - np.maximum(green, other) > _RED) for one, other in ((red, blue), (blue, red))]
+    masks = [
+        changed & (one - np.maximum(green, other) > _RED)
+        for one, other in ((red, blue), (blue, red))
+    ]
     larger = max(masks, key=np.count_nonzero)
     if np.count_nonzero(larger) < 1e-3 * larger.size:
         return None
     rows, columns = np.nonzero(larger)
     height, width = larger.shape
-    return _Card(larger is masks[0], columns.mean() / width, rows.mean() / height, len(rows) / larger.size)
+    return _Card(
+        larger is masks[0], columns.mean() / width, rows.mean() / height, len(rows) / larger.size
+    )
 
 
 def arm_part(arm: str, name: str) -> str:

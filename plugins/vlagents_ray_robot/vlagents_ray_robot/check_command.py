@@ -1,10 +1,11 @@
-"""Check a robot before a policy moves it: readings, pictures and `stop` at rest, then small moves, joint by joint.
+"""Check a robot before a policy moves it: readings, pictures and `stop` at rest, then small moves,
+joint by joint.
 
-Nothing moves without --move, and then each motion only after a person at the robot has agreed. A simulated arm,
-"mujoco:ARM", is checked without a person.
+Nothing moves without --move, and then each motion only after a person at the robot has agreed. A
+simulated arm, "mujoco:ARM", is checked without a person.
 
-Exit status: 0 if no check found anything, 1 if one did, 2 if it could not run, 3 if the robot does not declare what the
-checks of its motion need.
+Exit status: 0 if no check found anything, 1 if one did, 2 if it could not run, 3 if the robot does
+not declare what the checks of its motion need.
 """
 
 from __future__ import annotations
@@ -34,7 +35,8 @@ def main(arguments: Sequence[str]) -> int:
     options = parse_all(parser, arguments, {"--report": "the page is written by --out FILE"})
     try:
         with contextlib.ExitStack() as stack:
-            if options.json:  # standard output is for the document alone, without the questions to the operator
+            # Standard output is for the document alone, without the questions to the operator.
+            if options.json:
                 stack.enter_context(contextlib.redirect_stdout(sys.stderr))
             report = _checked(options, stack)
         report.robot = options.robot
@@ -42,7 +44,11 @@ def main(arguments: Sequence[str]) -> int:
         print(f"{type(error).__name__}: {error}", file=sys.stderr)  # noqa: T201
         return 2
     if options.json:
-        document = {"ok": report.ok, "verdict": report.verdict, **asdict(replace(report, pictures={}))}
+        document = {
+            "ok": report.ok,
+            "verdict": report.verdict,
+            **asdict(replace(report, pictures={})),
+        }
         print(json.dumps(document, indent=2))  # noqa: T201
     else:
         print("\n".join(report.lines()))  # noqa: T201
@@ -63,22 +69,50 @@ def _checked(options: argparse.Namespace, stack: contextlib.ExitStack) -> RobotR
     if options.policy is not None:
         with RemoteAgent(options.policy) as agent:
             contract = agent.contract
-    operator, clock = getattr(robot, "operator", None) or Operator(move=options.move), getattr(robot, "clock", time)
+    operator, clock = (
+        getattr(robot, "operator", None) or Operator(move=options.move),
+        getattr(robot, "clock", time),
+    )
     latency_s = options.latency_ms / 1e3
-    return examine(robot, contract=contract, operator=operator, hz=options.hz, latency_s=latency_s, clock=clock)
+    return examine(
+        robot, contract=contract, operator=operator, hz=options.hz, latency_s=latency_s, clock=clock
+    )
 
 
 def command_parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
-        prog="vlagents-ray robot check", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+        prog="vlagents-ray robot check",
+        description=__doc__,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     add = parser.add_argument
-    names = "my_arm:MyArm, lerobot:so101_follower, mujoco:so101, mujoco:PATH of an MJCF or URDF file, or ros:FILE"
+    names = (
+        "my_arm:MyArm, lerobot:so101_follower, mujoco:so101, mujoco:PATH of an MJCF or URDF "
+        "file, or ros:FILE"
+    )
     add("robot", help=names)
-    add("--robot-set", metavar="KEY=VALUE", action="append", default=[], help="an argument of the robot, repeatable")
-    add("--move", action="store_true", help="make small moves, each after a question at the terminal")
-    add("--policy", metavar="URL", help="check by the contract of the policy of this server, not by the robot's own")
-    add("--hz", type=number(above=True, most=10_000.0), help="control rate (default: the contract's, or 50)")
+    add(
+        "--robot-set",
+        metavar="KEY=VALUE",
+        action="append",
+        default=[],
+        help="an argument of the robot, repeatable",
+    )
+    add(
+        "--move",
+        action="store_true",
+        help="make small moves, each after a question at the terminal",
+    )
+    add(
+        "--policy",
+        metavar="URL",
+        help="check by the contract of the policy of this server, not by the robot's own",
+    )
+    add(
+        "--hz",
+        type=number(above=True, most=10_000.0),
+        help="control rate (default: the contract's, or 50)",
+    )
     add(
         "--latency-ms",
         type=number(most=60_000.0),

@@ -25,8 +25,9 @@ logger = logging.getLogger(__name__)
 class OneAtATime:
     """A bus of motors whose methods run one at a time.
 
-    LeRobot's buses have no lock, and the watchdog's thread stops a robot while the loop may be in a transfer. Each
-    call is locked by itself, so that a stop waits for a transfer and not for the cameras that are read after it.
+    LeRobot's buses have no lock, and the watchdog's thread stops a robot while the loop may be in a
+    transfer. Each call is locked by itself, so that a stop waits for a transfer and not for the
+    cameras that are read after it.
     """
 
     def __init__(self, bus: Any) -> None:
@@ -49,14 +50,17 @@ class OneAtATime:
 class LeRobotRobot:
     """Any robot that LeRobot drives, by the name that its configuration registers.
 
-    Joints stay in LeRobot's order and units, which are those of its datasets and of policies that were trained on
-    them. The part `joints`, (D,), of an observation and an action have the same numbers, the gripper among them. The
-    motors whose name contains "gripper" keep their goal at a stop, and with it what they hold.
+    Joints stay in LeRobot's order and units, which are those of its datasets and of policies that
+    were trained on them. The part `joints`, (D,), of an observation and an action have the same
+    numbers, the gripper among them. The motors whose name contains "gripper" keep their goal at a
+    stop, and with it what they hold.
 
     Args:
         kind: The registered name, such as "so101_follower".
-        unit: The unit of the joints; by default "deg", or "%" of the calibrated range, as its `use_degrees` says.
-        settings: The fields of its configuration, such as `port="/dev/ttyACM0"`, `id="my_arm"` and `cameras`.
+        unit: The unit of the joints; by default "deg", or "%" of the calibrated range, as its
+            `use_degrees` says.
+        settings: The fields of its configuration, such as `port="/dev/ttyACM0"`, `id="my_arm"` and
+            `cameras`.
 
     Raises:
         ConfigError: LeRobot has no such robot, a setting is wrong, or the robot is not calibrated.
@@ -71,28 +75,39 @@ class LeRobotRobot:
         for folder in (package, require("lerobot.cameras")):
             for module in pkgutil.iter_modules(folder.__path__):
                 with contextlib.suppress(ImportError):  # of a robot whose driver is not installed
-                    importlib.import_module(f"{folder.__name__}.{module.name}")  # registers its configurations
+                    # Registers its configurations.
+                    importlib.import_module(f"{folder.__name__}.{module.name}")
         require("lerobot.utils.import_utils").register_third_party_plugins()
         try:
-            config = importlib.import_module("draccus").decode(package.RobotConfig, {"type": kind, **settings})
+            config = importlib.import_module("draccus").decode(
+                package.RobotConfig, {"type": kind, **settings}
+            )
             self._robot = require("lerobot.robots.utils").make_robot_from_config(config)
         except Exception as error:
             near = did_you_mean(kind, package.RobotConfig.get_known_choices())
-            raise ConfigError(f"lerobot:{kind}: LeRobot refuses the settings {settings} ({error}){near}") from error
+            raise ConfigError(
+                f"lerobot:{kind}: LeRobot refuses the settings {settings} ({error}){near}"
+            ) from error
         others = [name for name in self._robot.action_features if not name.endswith(".pos")]
         if others:
-            raise ConfigError(f"lerobot:{kind}: got actions {others}, want positions of joints, NAME.pos")
+            raise ConfigError(
+                f"lerobot:{kind}: got actions {others}, want positions of joints, NAME.pos"
+            )
         self._robot.connect(calibrate=False)
         if not self._robot.is_calibrated:
             self._robot.disconnect()
-            raise ConfigError(f"lerobot:{kind}: not calibrated; run lerobot-calibrate --robot.type={kind} with its id")
+            raise ConfigError(
+                f"lerobot:{kind}: not calibrated; run lerobot-calibrate --robot.type={kind} with "
+                "its id"
+            )
         self._unit = unit or ("deg" if getattr(config, "use_degrees", False) else "%")
         self._keys = list(self._robot.action_features)
         self._lock_buses()
 
     def _lock_buses(self) -> None:
         """Let the methods of the robot's buses run one at a time."""
-        for part in (self._robot, *vars(self._robot).values()):  # a robot with two arms has a bus in each of them
+        # A robot with two arms has a bus in each of them.
+        for part in (self._robot, *vars(self._robot).values()):
             if hasattr(part, "bus"):
                 part.bus = OneAtATime(part.bus)
 
@@ -103,11 +118,15 @@ class LeRobotRobot:
 
     @property
     def joint_limits(self) -> np.ndarray:
-        """The limits of the motors by LeRobot's settings and calibration, (D, 2) in their unit; infinite if unknown."""
+        """The limits of the motors by LeRobot's settings and calibration, (D, 2) in their unit;
+        infinite if unknown.
+        """
         return np.array([self._limits_of(name) for name in self.joint_names])
 
     def _limits_of(self, name: str) -> tuple[float, float]:
-        if name in (stated := getattr(getattr(self._robot, "config", None), "joint_limits", None) or {}):
+        if name in (
+            stated := getattr(getattr(self._robot, "config", None), "joint_limits", None) or {}
+        ):
             return stated[name]  # type: ignore[no-any-return]
         bus: Any = getattr(self._robot, "bus", None)
         motor: Any
@@ -115,15 +134,25 @@ class LeRobotRobot:
         motor, ends = (getattr(bus, table, {}).get(name) for table in ("motors", "calibration"))
         mode = getattr(getattr(motor, "norm_mode", None), "name", "")
         if mode == "DEGREES" and ends is not None and hasattr(bus, "model_resolution_table"):
-            half = 180 * (ends.range_max - ends.range_min) / (bus.model_resolution_table[motor.model] - 1)
+            half = (
+                180
+                * (ends.range_max - ends.range_min)
+                / (bus.model_resolution_table[motor.model] - 1)
+            )
             return -half, half
-        return {"RANGE_M100_100": (-100.0, 100.0), "RANGE_0_100": (0.0, 100.0)}.get(mode, (-np.inf, np.inf))
+        return {"RANGE_M100_100": (-100.0, 100.0), "RANGE_0_100": (0.0, 100.0)}.get(
+            mode, (-np.inf, np.inf)
+        )
 
     @property
     def contract(self) -> Contract:
         """The cameras, the joints and the actions, by LeRobot's features."""
         features = self._robot.observation_features
-        cameras = {name: CameraSpec(*shape[:2]) for name, shape in features.items() if isinstance(shape, tuple)}
+        cameras = {
+            name: CameraSpec(*shape[:2])
+            for name, shape in features.items()
+            if isinstance(shape, tuple)
+        }
         return Contract(
             cameras=cameras,
             state={"joints": StateSpec(len(self._keys), self._unit)},
@@ -143,25 +172,32 @@ class LeRobotRobot:
     def apply(self, action: np.ndarray) -> None:
         """Send the goal positions."""
         if np.shape(action) != (len(self._keys),):
-            raise InvalidAction(f"action: got {np.shape(action)}, want ({len(self._keys)},): {self._keys}")
+            raise InvalidAction(
+                f"action: got {np.shape(action)}, want ({len(self._keys)},): {self._keys}"
+            )
         self._goal = np.array(action, np.float32)
         self._robot.send_action(dict(zip(self._keys, map(float, action), strict=True)))
 
     def stop(self) -> None:
         """Make the measured positions the goal; torque stays on, so that the arm does not fall.
 
-        No camera is read. Without a bus, or if it cannot be read, the goal is the pose of the last observation. The
-        grippers keep their goal.
+        No camera is read. Without a bus, or if it cannot be read, the goal is the pose of the last
+        observation. The grippers keep their goal.
 
         Raises:
-            Exception: The motors cannot be reached, or the robot was commanded and no pose is known.
+            Exception: The motors cannot be reached, or the robot was commanded and no pose is
+                known.
         """
         try:
             held = self._present().copy()
         except Exception as error:
             if self._goal is not None:
                 raise
-            logger.warning("stop: no pose of the robot is known (%s); it was not commanded, and stays as it is", error)
+            logger.warning(
+                "stop: no pose of the robot is known (%s); it was not commanded, and stays as "
+                "it is",
+                error,
+            )
             return
         if self._goal is not None:
             grippers = ["gripper" in name for name in self.joint_names]
@@ -174,7 +210,9 @@ class LeRobotRobot:
             if bus is None:
                 raise
             # With max_relative_target, LeRobot reads the positions before it sends a goal.
-            bus.sync_write("Goal_Position", {key.removesuffix(".pos"): goal for key, goal in goals.items()})
+            bus.sync_write(
+                "Goal_Position", {key.removesuffix(".pos"): goal for key, goal in goals.items()}
+            )
 
     def _present(self) -> np.ndarray:
         """Return the joints without reading a camera if possible, (D,)."""
@@ -186,7 +224,10 @@ class LeRobotRobot:
             except Exception as error:
                 if self._measured is None:
                     raise
-                logger.warning("stop: the motors' positions cannot be read (%s); the last ones are the goal", error)
+                logger.warning(
+                    "stop: the motors' positions cannot be read (%s); the last ones are the goal",
+                    error,
+                )
         if self._measured is None:
             return self.observe().state["joints"]
         return self._measured

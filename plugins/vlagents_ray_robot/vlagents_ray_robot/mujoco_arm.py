@@ -1,4 +1,6 @@
-"""Arms in MuJoCo as robots: SO-101, Franka, ALOHA, UR5e, xArm7, and any other MJCF or URDF file; extra "arms"."""
+"""Arms in MuJoCo as robots: SO-101, Franka, ALOHA, UR5e, xArm7, and any other MJCF or URDF file;
+extra "arms".
+"""
 
 from __future__ import annotations
 
@@ -35,7 +37,8 @@ class ArmModel:
     """What a model file does not state of an arm."""
 
     menagerie: str  # folder of the model in the MuJoCo Menagerie
-    rest: tuple[float, ...] = ()  # of each joint without the gripper, rad; the file's first keyframe if empty
+    # Of each joint without the gripper, rad; the file's first keyframe if empty.
+    rest: tuple[float, ...] = ()
     open_high: bool = True  # whether the gripper opens towards the upper end of its range
     arms: tuple[str, ...] = ()  # the names of several arms, in the order of the file
 
@@ -45,7 +48,9 @@ ARMS = {
     "franka": ArmModel("franka_emika_panda", rest=(0.0, -0.3, 0.0, -1.9, 0.0, 1.6, 0.8)),
     "aloha": ArmModel("aloha", rest=2 * (0.0, -0.96, 1.16, 0.0, -0.3, 0.0), arms=("left", "right")),
     "ur5e": ArmModel("universal_robots_ur5e"),
-    "xarm7": ArmModel("ufactory_xarm7", rest=(0.0, -0.25, 0.0, 0.9, 0.0, 1.1, 0.0), open_high=False),
+    "xarm7": ArmModel(
+        "ufactory_xarm7", rest=(0.0, -0.25, 0.0, 0.9, 0.0, 1.1, 0.0), open_high=False
+    ),
 }
 
 
@@ -71,29 +76,36 @@ class SimulatedClock:
 
 @dataclass(slots=True)
 class _Drive:
-    """The actuators that one number of an action moves, and their ends: of a joint, or of a gripper's fingers."""
+    """The actuators that one number of an action moves, and their ends: of a joint, or of a
+    gripper's fingers.
+    """
 
     name: str
     actuators: list[int] = field(default_factory=list)
-    low: list[float] = field(default_factory=list)  # of each actuator: its control at 0; of a joint its lower limit
-    high: list[float] = field(default_factory=list)  # at 1, which is open; of a joint its upper limit
+    # Of each actuator: its control at 0; of a joint its lower limit.
+    low: list[float] = field(default_factory=list)
+    # At 1, which is open; of a joint its upper limit.
+    high: list[float] = field(default_factory=list)
     gripper: bool = False
 
 
 class MujocoArm:
     """A simulated arm with a position controller, cameras, latency and measured joints.
 
-    An action has the target of each joint, rad, and then the gripper's opening in [0, 1], 1 = open, for each arm in
-    turn. An observation has the part `joints`, (D,) rad, and `tquat`, (7,) the pose of the hand in the frame of the
-    arm's base, m and quaternion xyzw; with two arms `left/joints` and so on. `contract`, `joint_names`, `joint_limits`
-    and `operator` describe the arm to the loop and to the check of a robot. Physics advance with `clock` whenever a
-    method is called. `simulated` is True, so that a stop ends by itself.
+    An action has the target of each joint, rad, and then the gripper's opening in [0, 1], 1 = open,
+    for each arm in turn. An observation has the part `joints`, (D,) rad, and `tquat`, (7,) the pose
+    of the hand in the frame of the arm's base, m and quaternion xyzw; with two arms `left/joints`
+    and so on. `contract`, `joint_names`, `joint_limits` and `operator` describe the arm to the loop
+    and to the check of a robot. Physics advance with `clock` whenever a method is called.
+    `simulated` is True, so that a stop ends by itself.
 
     Args:
-        model: A name of `ARMS` or of the MuJoCo Menagerie, or the path of an MJCF or URDF file. Names need the package
-            `mujoco-menagerie`, which downloads a model at its first use, or finds it in the folder MENAGERIE_ROOT.
+        model: A name of `ARMS` or of the MuJoCo Menagerie, or the path of an MJCF or URDF file.
+            Names need the package `mujoco-menagerie`, which downloads a model at its first use, or
+            finds it in the folder MENAGERIE_ROOT.
         like: A name of `ARMS` whose rest pose, gripper and arms a file has.
-        cameras: Names of the cameras. "front" looks at the arm; any other is on the hand of an arm in turn.
+        cameras: Names of the cameras. "front" looks at the arm; any other is on the hand of an arm
+            in turn.
         size: Height and width of the pictures, px.
         fps: The rate of the cameras, Hz.
         delta: Whether actions are relative to the joints' last targets.
@@ -127,7 +139,8 @@ class MujocoArm:
         self.arms = stated.arms or ("",)
         self._latency_s, self._size, self._frame_s = latency_s, size, 1 / fps
         self._queue: deque[tuple[float, np.ndarray]] = deque()
-        self._goal = self._target = np.zeros(0)  # the commanded targets, and those on the way to them at `speed`
+        # The commanded targets, and those on the way to them at `speed`.
+        self._goal = self._target = np.zeros(0)
         self._renderer: Any = None
         self._pictures: dict[str, np.ndarray] = {}
         self._card: str | None = None  # the camera before which the operator holds the red card
@@ -145,7 +158,9 @@ class MujocoArm:
         self.operator = SimulatedOperator(self)
         state = {}
         for arm, drives in zip(self.arms, self._drives, strict=True):
-            state[arm_part(arm, "joints")] = StateSpec(sum(not drive.gripper for drive in drives), "rad")
+            state[arm_part(arm, "joints")] = StateSpec(
+                sum(not drive.gripper for drive in drives), "rad"
+            )
             state[arm_part(arm, "tquat")] = StateSpec(7, "m+quat_xyzw")
         grips = len(joints) < len(self._flat)
         self.contract = Contract(
@@ -182,7 +197,9 @@ class MujocoArm:
         """Set the targets, which the controller reads after the latency."""
         action = np.asarray(action, np.float64)
         if action.shape != (len(self._flat),):
-            raise InvalidAction(f"action: got {action.shape}, want ({len(self._flat)},); see the contract")
+            raise InvalidAction(
+                f"action: got {action.shape}, want ({len(self._flat)},); see the contract"
+            )
         self._advance()
         self._queue.append((self._now() + self._latency_s, action))
 
@@ -190,7 +207,10 @@ class MujocoArm:
         """Make the measured positions the targets; the gripper keeps its grasp."""
         self._advance()
         self._queue.clear()
-        held = [self._goal[i] if drive.gripper else self._measured(drive) for i, drive in enumerate(self._flat)]
+        held = [
+            self._goal[i] if drive.gripper else self._measured(drive)
+            for i, drive in enumerate(self._flat)
+        ]
         self._goal = self._target = np.array(held)
 
     def close(self) -> None:
@@ -206,7 +226,9 @@ class MujocoArm:
     def opening(self) -> float:
         """Return the true opening of the grippers in [0, 1]."""
         self._advance()
-        return float(np.mean([self._measured(drive) for drive in self._flat if drive.gripper] or [1.0]))
+        return float(
+            np.mean([self._measured(drive) for drive in self._flat if drive.gripper] or [1.0])
+        )
 
     def hand_pose(self, number: int = 0) -> np.ndarray:
         """Return the pose of an arm's hand in the frame of its base, (7,) m and quaternion xyzw."""
@@ -214,7 +236,9 @@ class MujocoArm:
         base, turned = self._pose(self._bases[number])
         quaternion = np.zeros(4)
         self._mujoco.mju_mat2Quat(quaternion, (turned.T @ rotation).ravel())
-        return np.array([*(turned.T @ (position - base)), *quaternion[1:], quaternion[0]], np.float32)
+        return np.array(
+            [*(turned.T @ (position - base)), *quaternion[1:], quaternion[0]], np.float32
+        )
 
     def hold_card(self, camera: str | None) -> None:
         """Show something red in the upper left of what a camera sees; None takes it away."""
@@ -224,7 +248,8 @@ class MujocoArm:
         """Return the present pictures of all cameras, (H, W, 3) uint8 RGB."""
         if self._renderer is None and self._cameras:
             self._renderer = self._mujoco.Renderer(self.model, *self._size)
-            self._renderer.scene.flags[self._mujoco.mjtRndFlag.mjRND_SHADOW] = False  # half of the time of a picture
+            # Half of the time of a picture.
+            self._renderer.scene.flags[self._mujoco.mjtRndFlag.mjRND_SHADOW] = False
         pictures = {}
         for name, index in self._cameras.items():
             self._renderer.update_scene(self.data, index)
@@ -245,7 +270,10 @@ class MujocoArm:
                 _, action = self._queue.popleft()
                 relative = [self.delta and not drive.gripper for drive in self._flat]
                 goal = np.where(relative, self._goal + action, action)
-                ends = [(0.0, 1.0) if drive.gripper else (drive.low[0], drive.high[0]) for drive in self._flat]
+                ends = [
+                    (0.0, 1.0) if drive.gripper else (drive.low[0], drive.high[0])
+                    for drive in self._flat
+                ]
                 self._goal = np.clip(goal, *np.transpose(ends))
             most = self.speed * step_s
             self._target = self._target + np.clip(self._goal - self._target, -most, most)
@@ -262,7 +290,9 @@ class MujocoArm:
         length = float(self.data.actuator_length[actuator])
         if not drive.gripper:
             return length
-        control = -length * float(self.model.actuator_biasprm[actuator, 1] / self.model.actuator_gainprm[actuator, 0])
+        control = -length * float(
+            self.model.actuator_biasprm[actuator, 1] / self.model.actuator_gainprm[actuator, 0]
+        )
         return (control - low) / (high - low)
 
     def _compile(self, spec: Any, stated: ArmModel) -> None:
@@ -271,7 +301,9 @@ class MujocoArm:
         self._drives = self._read_drives(stated)
         self._flat = [drive for drives in self._drives for drive in drives]
         if not all(any(not drive.gripper for drive in drives) for drives in self._drives):
-            raise ConfigError(f"{stated.menagerie}: got an arm without joints that move, want the file of an arm")
+            raise ConfigError(
+                f"{stated.menagerie}: got an arm without joints that move, want the file of an arm"
+            )
         last = [[drive for drive in drives if not drive.gripper][-1] for drives in self._drives]
         joints = [int(self.model.actuator_trnid[drive.actuators[0], 0]) for drive in last]
         self._hands = [int(self.model.jnt_bodyid[joint]) for joint in joints]
@@ -287,8 +319,14 @@ class MujocoArm:
         floor = {"size": [3, 3, 0.1], "pos": [0, 0, -0.01], "contype": 1 << 20, "conaffinity": 0}
         world.add_geom(type=self._mujoco.mjtGeom.mjGEOM_PLANE, rgba=[0.45, 0.45, 0.42, 1], **floor)
         hands = [self._pose(hand) for hand in self._hands]
-        centre = np.mean([position for position, _ in hands] + [self.data.xpos[base] for base in self._bases], axis=0)
-        reach = max(np.linalg.norm(p - self.data.xpos[b]) for (p, _), b in zip(hands, self._bases, strict=True))
+        centre = np.mean(
+            [position for position, _ in hands] + [self.data.xpos[base] for base in self._bases],
+            axis=0,
+        )
+        reach = max(
+            np.linalg.norm(p - self.data.xpos[b])
+            for (p, _), b in zip(hands, self._bases, strict=True)
+        )
         number = 0
         for name in cameras:
             if name == "front":
@@ -306,12 +344,16 @@ class MujocoArm:
             spec.body(self.model.body(hand).name).add_camera(name=_PREFIX + name, fovy=75, **camera)
 
     def _looking(self, view: np.ndarray, frame: np.ndarray) -> np.ndarray:
-        """Return the rotation, wxyz in a frame, of a camera that looks into a direction of the world."""
+        """Return the rotation, wxyz in a frame, of a camera that looks into a direction of the
+        world.
+        """
         back = -view / np.linalg.norm(view)
         right = np.cross([0.0, 0.0, 1.0], back)
         right /= np.linalg.norm(right)
         quaternion = np.zeros(4)
-        self._mujoco.mju_mat2Quat(quaternion, (frame.T @ np.stack([right, np.cross(back, right), back], 1)).ravel())
+        self._mujoco.mju_mat2Quat(
+            quaternion, (frame.T @ np.stack([right, np.cross(back, right), back], 1)).ravel()
+        )
         return quaternion
 
     def _rest(self, stated: ArmModel) -> None:
@@ -336,17 +378,28 @@ class MujocoArm:
         grippers = [_Drive("gripper", gripper=True) for _ in self.arms]
         for index in range(self.model.nu):
             of_joint = self.model.actuator_trntype[index] == self._mujoco.mjtTrn.mjTRN_JOINT
-            joint = self.model.joint(int(self.model.actuator_trnid[index, 0])).name if of_joint else ""
+            joint = (
+                self.model.joint(int(self.model.actuator_trnid[index, 0])).name if of_joint else ""
+            )
             name = self.model.actuator(index).name or joint
-            number = next((i for i, arm in enumerate(self.arms) if arm and arm in f"{name} {joint}"), 0)
+            number = next(
+                (i for i, arm in enumerate(self.arms) if arm and arm in f"{name} {joint}"), 0
+            )
             if self.model.actuator_biasprm[index, 1] == 0:
-                raise ConfigError(f"{stated.menagerie}: actuator {name!r} has no position controller, want one each")
+                raise ConfigError(
+                    f"{stated.menagerie}: actuator {name!r} has no position controller, want one "
+                    "each"
+                )
             low, high = (float(end) for end in self.model.actuator_ctrlrange[index])
             if of_joint and low >= high:  # not limited
                 joint_range = self.model.jnt_range[self.model.actuator_trnid[index, 0]]
-                low, high = map(float, joint_range if joint_range[0] < joint_range[1] else (-2 * np.pi, 2 * np.pi))
+                low, high = map(
+                    float,
+                    joint_range if joint_range[0] < joint_range[1] else (-2 * np.pi, 2 * np.pi),
+                )
             if _GRIPPER.search(name) or _GRIPPER.search(joint) or not of_joint:
-                # Of two fingers that move against each other, one has its open end where its number is small.
+                # Of two fingers that move against each other, one has its open end where its number
+                # is small.
                 rising = stated.open_high if abs(high) >= abs(low) else not stated.open_high
                 drive = grippers[number]
                 drive.low.append(low if rising else high)
@@ -355,7 +408,10 @@ class MujocoArm:
                 drive = _Drive(name, low=[low], high=[high])
                 arms[number].append(drive)
             drive.actuators.append(index)
-        return [[*drives, *([grip] if grip.actuators else [])] for drives, grip in zip(arms, grippers, strict=True)]
+        return [
+            [*drives, *([grip] if grip.actuators else [])]
+            for drives, grip in zip(arms, grippers, strict=True)
+        ]
 
     def _pose(self, body: int) -> tuple[np.ndarray, np.ndarray]:
         return self.data.xpos[body], self.data.xmat[body].reshape(3, 3)
@@ -369,14 +425,18 @@ def _read(mujoco: Any, stated: ArmModel, model: str) -> Any:
         known = menagerie.names()
         if stated.menagerie not in known:
             raise ConfigError(
-                f"arm: got {model!r}, want one of {list(ARMS)}, a model of the MuJoCo Menagerie, or the path of an "
+                f"arm: got {model!r}, want one of {list(ARMS)}, a model of the MuJoCo Menagerie, "
+                "or the path of an "
                 f"MJCF or URDF file{did_you_mean(model, [*ARMS, *known])}"
             )
         robot = menagerie.get(stated.menagerie)
         try:
             return robot.spec(robot.default_model)
         except menagerie.MenagerieError as error:
-            cure = "without a network, MENAGERIE_ROOT names a folder with the models, or give the path of a file"
+            cure = (
+                "without a network, MENAGERIE_ROOT names a folder with the models, or give the "
+                "path of a file"
+            )
             raise ConfigError(
                 f"arm {model!r}: the MuJoCo Menagerie has no file of it here ({error}); {cure}"
             ) from error
@@ -384,13 +444,17 @@ def _read(mujoco: Any, stated: ArmModel, model: str) -> Any:
         raise ConfigError(f"arm: got {model!r}, want a file that exists")
     if file.suffix != ".urdf":
         return mujoco.MjSpec.from_file(str(file))
-    compiler = f'<compiler meshdir="{file.absolute().parent}" strippath="false" fusestatic="false"/>'
+    compiler = (
+        f'<compiler meshdir="{file.absolute().parent}" strippath="false" fusestatic="false"/>'
+    )
     text = re.sub(r"(<robot[^>]*>)", rf"\1<mujoco>{compiler}</mujoco>", file.read_text(), count=1)
     return mujoco.MjSpec.from_string(text.replace("package://", ""))
 
 
 def _add_actuators(mujoco: Any, spec: Any) -> None:
-    """Give each joint of a model without actuators, such as a URDF, a position controller that carries its weight."""
+    """Give each joint of a model without actuators, such as a URDF, a position controller that
+    carries its weight.
+    """
     if spec.actuators:
         return
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
@@ -399,10 +463,15 @@ def _add_actuators(mujoco: Any, spec: Any) -> None:
     for joint in spec.joints:
         joint.armature = 0.1
         spec.add_actuator(
-            name=joint.name, target=joint.name, trntype=mujoco.mjtTrn.mjTRN_JOINT,
-            biastype=mujoco.mjtBias.mjBIAS_AFFINE, gainprm=[_KP, *[0] * 9], biasprm=[0, -_KP, -_KV, *[0] * 7],
-            ctrlrange=joint.range if joint.range[0] < joint.range[1] else [-np.pi, np.pi], ctrllimited=True,
-        )  # fmt: skip
+            name=joint.name,
+            target=joint.name,
+            trntype=mujoco.mjtTrn.mjTRN_JOINT,
+            biastype=mujoco.mjtBias.mjBIAS_AFFINE,
+            gainprm=[_KP, *[0] * 9],
+            biasprm=[0, -_KP, -_KV, *[0] * 7],
+            ctrlrange=joint.range if joint.range[0] < joint.range[1] else [-np.pi, np.pi],
+            ctrllimited=True,
+        )
 
 
 class SimulatedOperator(Operator):
@@ -429,6 +498,8 @@ class SimulatedOperator(Operator):
         return self._arm.opening() < 0.5
 
     def sees_hand(self, pose: np.ndarray, arm: int = 0) -> bool | None:
-        """Return whether the hand is within 10 cm and about 25° of a pose in the frame of its base."""
+        """Return whether the hand is within 10 cm and about 25° of a pose in the frame of its
+        base.
+        """
         true = self._arm.hand_pose(arm)
         return bool(np.linalg.norm(true[:3] - pose[:3]) < 0.1 and abs(true[3:] @ pose[3:]) > 0.975)

@@ -43,28 +43,33 @@ class AxesDevice(ABC):
         return presses
 
     def help(self, *, joints: bool) -> str:
-        """Return a line that explains the device to the operator; `joints`: whether its axes are joints."""
+        """Return a line that explains the device to the operator; `joints`: whether its axes are
+        joints.
+        """
         return ""
 
 
 class AxesLeader:
     """A leader that turns the axes of a device into actions.
 
-    Axis i moves number i of the action: for relative actions of an end effector x, y, z and, if the action has them,
-    rotations; else the first six joints. The gripper is that of `ActionSpec.gripper_columns`. At a takeover it stays
-    open if it is fully open; else it is closed, as it may hold something.
+    Axis i moves number i of the action: for relative actions of an end effector x, y, z and, if the
+    action has them, rotations; else the first six joints. The gripper is that of
+    `ActionSpec.gripper_columns`. At a takeover it stays open if it is fully open; else it is
+    closed, as it may hold something.
 
     Args:
-        contract: The policy's contract, which states `action.dim`, and whether actions are relative.
+        contract: The policy's contract, which states `action.dim`, and whether actions are
+            relative.
         device: The device.
-        step: The change of a number at a tick with the axis at its end, in the action's units; default: half of the
-            action's bound, if actions are relative and bounded.
-        measure: Returns the robot's pose in an observation, (D,) in the action's order and units, from which absolute
-            targets begin; default: the state's part `joints`, with the gripper's command after it.
+        step: The change of a number at a tick with the axis at its end, in the action's units;
+            default: half of the action's bound, if actions are relative and bounded.
+        measure: Returns the robot's pose in an observation, (D,) in the action's order and units,
+            from which absolute targets begin; default: the state's part `joints`, with the
+            gripper's command after it.
 
     Raises:
-        ConfigError: The contract is incomplete, or has several grippers, which one button cannot keep; or `step` is
-            missing or not above 0.
+        ConfigError: The contract is incomplete, or has several grippers, which one button cannot
+            keep; or `step` is missing or not above 0.
     """
 
     def __init__(
@@ -78,14 +83,17 @@ class AxesLeader:
         spec = None if contract is None else contract.action
         if spec is None or spec.dim is None or spec.relative is None:
             raise ConfigError(
-                f"teleoperation: got {spec} as the contract's action, want `dim`, and `delta` (whether actions are "
-                f"relative): state them in the policy's contract; with noop, serve it with `--set delta=false`"
+                f"teleoperation: got {spec} as the contract's action, want `dim`, and `delta` "
+                "(whether actions are "
+                "relative): state them in the policy's contract; with noop, serve it with `--set "
+                "delta=false`"
             )
         if step is None and spec.relative and spec.low is not None and spec.high is not None:
             step = min(abs(spec.low), abs(spec.high)) / 2
         if step is None or not step > 0:
             raise ConfigError(
-                f"step: got {step}, want the change of a number at a tick, above 0; the contract has no bounds of "
+                f"step: got {step}, want the change of a number at a tick, above 0; the contract "
+                "has no bounds of "
                 f"relative actions to compute it from"
             )
         self._spec, self._device, self._step = spec, device, step
@@ -93,14 +101,18 @@ class AxesLeader:
         self._grippers = spec.gripper_columns(spec.dim)
         if len(self._grippers) > 1:
             raise ConfigError(
-                f"teleoperation: expected at most one gripper, got the columns {self._grippers} of the arms "
-                f"{spec.arms}; the device has one button, and would move a gripper that the operator does not see to; "
+                f"teleoperation: expected at most one gripper, got the columns {self._grippers} of "
+                "the arms "
+                f"{spec.arms}; the device has one button, and would move a gripper that the "
+                "operator does not see to; "
                 "write a leader for both arms"
             )
         if self._grippers and (spec.gripper_open is None or spec.gripper_closed is None):
             raise ConfigError(
-                "teleoperation: expected both `gripper_open` and `gripper_closed` in the contract's action, got "
-                f"{spec.gripper_open} and {spec.gripper_closed}; state both in the policy's contract"
+                "teleoperation: expected both `gripper_open` and `gripper_closed` in the "
+                "contract's action, got "
+                f"{spec.gripper_open} and {spec.gripper_closed}; state both in the policy's "
+                "contract"
             )
         self._measure = measure
         self._engaged = False
@@ -110,7 +122,9 @@ class AxesLeader:
     @property
     def help(self) -> str:
         """A line that explains the device to the operator; "" if it needs none."""
-        return self._device.help(joints=self._spec.space in (None, "joint") and not self._spec.relative)
+        return self._device.help(
+            joints=self._spec.space in (None, "joint") and not self._spec.relative
+        )
 
     def engaged(self) -> bool:
         """Read the device, and return whether the operator moves the robot."""
@@ -121,7 +135,9 @@ class AxesLeader:
         return engaged
 
     def rebase(self, last: np.ndarray | None) -> None:
-        """Begin the next absolute target at the last command, (D,), or at the measured pose if `last` is None."""
+        """Begin the next absolute target at the last command, (D,), or at the measured pose if
+        `last` is None.
+        """
         self._target = None if last is None else np.array(last, np.float32)
 
     def action(self, obs: Obs) -> np.ndarray:
@@ -143,7 +159,9 @@ class AxesLeader:
             elif self._target is None:
                 if "joints" not in obs.state:
                     raise MissingState("joints", obs.state)
-                self._target = np.array([*obs.state["joints"], *([] if command is None else [command])], np.float32)
+                self._target = np.array(
+                    [*obs.state["joints"], *([] if command is None else [command])], np.float32
+                )
             moved = self._target + moved
             if spec.low is not None or spec.high is not None:
                 moved = np.clip(moved, spec.low, spec.high)
@@ -155,12 +173,14 @@ class AxesLeader:
 
 # A keyboard as a device with axes, read from the terminal so that it also works over SSH.
 
-HOLD_S = 0.2  # how long a key counts as pressed: terminals report no release, and repeat a key that is held
+# How long a key counts as pressed: terminals report no release, and repeat a key that is held.
+HOLD_S = 0.2
 AXES = {"w": (0, 1), "s": (0, -1), "a": (1, 1), "d": (1, -1), "r": (2, 1), "f": (2, -1)}
 AXES |= {"o": (3, 1), "u": (3, -1), "i": (4, 1), "k": (4, -1), "j": (5, 1), "l": (5, -1)}
 GRIPPER, TAKE = " ", "\n"
 HELP = (
-    "w/s a/d r/f move along x, y, z and take over; u/o i/k j/l turn; space opens and closes the gripper; "
+    "w/s a/d r/f move along x, y, z and take over; u/o i/k j/l turn; space opens and closes the "
+    "gripper; "
     "Enter takes over and gives back"
 )
 JOINTS_HELP = (
@@ -183,12 +203,15 @@ class Keyboard(AxesDevice):
         ConfigError: A key is used twice, or there is no terminal.
     """
 
-    def __init__(self, keys: Mapping[str, Callable[[], object]] | None = None, *, terminal: int | None = None) -> None:
+    def __init__(
+        self, keys: Mapping[str, Callable[[], object]] | None = None, *, terminal: int | None = None
+    ) -> None:
         self._keys = dict(keys or {})
         if taken := sorted(self._keys.keys() & {*AXES, GRIPPER, TAKE}):
             raise ConfigError(f"keyboard: {taken} move the robot, so they cannot do something else")
         self._terminal = Terminal(terminal)
-        self._until = np.zeros((6, 2))  # s of `time.monotonic`: until when a key counts, for each axis and direction
+        # S of `time.monotonic`: until when a key counts, for each axis and direction.
+        self._until = np.zeros((6, 2))
         self._open = contextlib.ExitStack()
 
     def __enter__(self) -> Keyboard:
@@ -238,9 +261,11 @@ _REPORTS = 64  # reports read at one tick, as the device sends more reports than
 
 
 class SpaceMouse(AxesDevice):
-    """The cap of a SpaceMouse as six axes: forward, left and up are +x, +y, +z, as in ROS (REP 103).
+    """The cap of a SpaceMouse as six axes: forward, left and up are +x, +y, +z, as in ROS (REP
+    103).
 
-    Moving it takes over, its first button opens and closes the gripper, and its last one takes over or gives back.
+    Moving it takes over, its first button opens and closes the gripper, and its last one takes over
+    or gives back.
 
     Raises:
         ConfigError: There is no such device, or it may not be read.
@@ -253,7 +278,8 @@ class SpaceMouse(AxesDevice):
             self._device: Any = library.open(axis_convention=library.AxisConvention.ROS)
         except (OSError, RuntimeError) as error:  # also of hidapi, which the library loads
             raise ConfigError(
-                f"SpaceMouse: {error}; plug one in, install hidapi (Debian: libhidapi-hidraw0), and let this user read "
+                f"SpaceMouse: {error}; plug one in, install hidapi (Debian: libhidapi-hidraw0), "
+                "and let this user read "
                 "its /dev/hidraw"
             ) from error
         self._axes = np.zeros(6, np.float32)
@@ -293,14 +319,19 @@ class SpaceMouse(AxesDevice):
 
 @contextlib.contextmanager
 def open_keyboard(
-    contract: Contract | None, *, step: float | None = None, measure: Callable[[Obs], np.ndarray] | None = None
+    contract: Contract | None,
+    *,
+    step: float | None = None,
+    measure: Callable[[Obs], np.ndarray] | None = None,
 ) -> Iterator[Leader]:
     """Open the keys of the terminal as a leader.
 
     Args:
         contract: The contract of the policy or the environment.
-        step: The change of a number of the action at a tick with an axis at its end; None: by the contract.
-        measure: Returns the robot's measured pose, (D,), in an observation; None: the state's part `joints`.
+        step: The change of a number of the action at a tick with an axis at its end; None: by the
+            contract.
+        measure: Returns the robot's measured pose, (D,), in an observation; None: the state's part
+            `joints`.
 
     Yields:
         The leader, an `AxesLeader`.
@@ -311,14 +342,19 @@ def open_keyboard(
 
 @contextlib.contextmanager
 def open_spacemouse(
-    contract: Contract | None, *, step: float | None = None, measure: Callable[[Obs], np.ndarray] | None = None
+    contract: Contract | None,
+    *,
+    step: float | None = None,
+    measure: Callable[[Obs], np.ndarray] | None = None,
 ) -> Iterator[Leader]:
     """Open a SpaceMouse as a leader.
 
     Args:
         contract: The contract of the policy or the environment.
-        step: The change of a number of the action at a tick with an axis at its end; None: by the contract.
-        measure: Returns the robot's measured pose, (D,), in an observation; None: the state's part `joints`.
+        step: The change of a number of the action at a tick with an axis at its end; None: by the
+            contract.
+        measure: Returns the robot's measured pose, (D,), in an observation; None: the state's part
+            `joints`.
 
     Yields:
         The leader, an `AxesLeader`.

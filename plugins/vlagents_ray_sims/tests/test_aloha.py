@@ -9,7 +9,13 @@ from in_process_episode import Always, play
 
 from vlagents_ray.contract import CameraSpec
 from vlagents_ray.envs.base import known_contract, make_env
-from vlagents_ray.errors import ConfigError, ContractMismatch, InvalidObservation, NotReset, UnknownEnv
+from vlagents_ray.errors import (
+    ConfigError,
+    ContractMismatch,
+    InvalidObservation,
+    NotReset,
+    UnknownEnv,
+)
 from vlagents_ray.interface import Act, Obs
 from vlagents_ray.testing import check_env
 from vlagents_ray_sims.aloha import Aloha
@@ -57,7 +63,10 @@ def test_observations_rewards_and_actions_are_gym_alohas_to_the_bit() -> None:
 def test_the_contract_is_known_before_the_simulator_is_made() -> None:
     with Aloha("insertion", width=40, height=32, cameras=("top", "angle")) as env:
         assert (
-            known_contract("aloha/insertion", {"width": 40, "height": 32, "cameras": ["top", "angle"]}) == env.contract
+            known_contract(
+                "aloha/insertion", {"width": 40, "height": 32, "cameras": ["top", "angle"]}
+            )
+            == env.contract
         )
         assert env.contract.cameras == {"top": CameraSpec(32, 40), "angle": CameraSpec(32, 40)}
         obs, _ = env.reset(seed=0)

@@ -1,4 +1,6 @@
-"""CALVIN as it is known without its simulator: scenes, contract, hash, and what a wrong checkout is told."""
+"""CALVIN as it is known without its simulator: scenes, contract, hash, and what a wrong checkout
+is told.
+"""
 
 from __future__ import annotations
 
@@ -31,13 +33,19 @@ def test_the_hash_that_places_the_blocks_is_pyhashs() -> None:
     assert fnv1_32("hello world") == 2805756500
 
 
-def test_wrong_settings_are_told_with_the_cure(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_wrong_settings_are_told_with_the_cure(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
     monkeypatch.delenv("CALVIN_SRC", raising=False)
-    with pytest.raises(UnknownEnv, match=r"calvin has no task 'E': want one of \['A', 'B', 'C', 'D'\]"):
+    with pytest.raises(
+        UnknownEnv, match=r"calvin has no task 'E': want one of \['A', 'B', 'C', 'D'\]"
+    ):
         make_env("calvin/E")
     with pytest.raises(ConfigError, match="renderer is 'vulkan', want egl or tiny"):
         make_env("calvin/D", renderer="vulkan")
     with pytest.raises(ConfigError, match="CALVIN_SRC is not set; git clone --recurse-submodules"):
         make_env("calvin/D")
-    with pytest.raises(ConfigError, match=r"lacks \['calvin_env/conf', .*want a checkout .* with its submodules"):
+    with pytest.raises(
+        ConfigError, match=r"lacks \['calvin_env/conf', .*want a checkout .* with its submodules"
+    ):
         make_env("calvin/D", source_dir=str(tmp_path))

@@ -28,5 +28,8 @@ def test_robosuite_sees_the_number_that_egl_has_for_the_gpu_while_it_is_imported
 def test_libero_without_a_gpu_and_without_software_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("MUJOCO_GL", "egl")
     monkeypatch.setenv(GPUS, "")
-    with pytest.raises(EnvFailed, match="no EGL device that renders in software"), importing_robosuite("libero"):
+    with (
+        pytest.raises(EnvFailed, match="no EGL device that renders in software"),
+        importing_robosuite("libero"),
+    ):
         pass

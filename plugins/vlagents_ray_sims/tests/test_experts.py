@@ -1,4 +1,6 @@
-"""The experts of simulators: those that are installed here are solved, and what an expert lacks is named."""
+"""The experts of simulators: those that are installed here are solved, and what an expert lacks
+is named.
+"""
 
 from __future__ import annotations
 
@@ -53,7 +55,9 @@ def test_the_oracle_says_what_it_wants() -> None:
 @pytest.mark.assets("simpler")
 @pytest.mark.slow
 @pytest.mark.parametrize(("task", "state"), list(zip(Simpler.tasks(), (1, 12, 12, 1), strict=True)))
-def test_the_expert_of_simpler_solves_every_task_however_the_object_lies(task: str, state: int) -> None:
+def test_the_expert_of_simpler_solves_every_task_however_the_object_lies(
+    task: str, state: int
+) -> None:
     name = f"simpler/{task}"
     with make_env(name, shader="minimal") as env:  # experts do not look at the image
         obs, _ = env.reset(seed=0, options={"init_state": state})
@@ -66,7 +70,9 @@ def test_the_expert_of_simpler_solves_every_task_however_the_object_lies(task: s
 
 
 @pytest.mark.parametrize("info", [{}, {"sim_state": np.zeros(7, np.float32)}])
-def test_without_the_simulators_state_the_expert_says_what_it_wants(info: dict[str, np.ndarray]) -> None:
+def test_without_the_simulators_state_the_expert_says_what_it_wants(
+    info: dict[str, np.ndarray],
+) -> None:
     expert = SimplerExpert("simpler/PutCarrotOnPlateInScene-v1")
     with pytest.raises(InvalidObservation, match=r"sim_state.*\(13,\).*PutCarrotOnPlate"):
         expert.reset(Obs(info=info), "push the cube")
@@ -90,12 +96,16 @@ def test_it_sets_out_for_the_cuboid_in_small_steps_with_an_open_gripper() -> Non
     assert action[7] == 1.0
 
 
-@pytest.mark.parametrize(("turn", "hand"), [(0.0, 0.0), (0.5, 0.5), (-1.0, -1.0), (2.5, 2.5 - math.pi)])
+@pytest.mark.parametrize(
+    ("turn", "hand"), [(0.0, 0.0), (0.5, 0.5), (-1.0, -1.0), (2.5, 2.5 - math.pi)]
+)
 def test_the_hand_turns_with_the_cuboid_the_shorter_way(turn: float, hand: float) -> None:
     expert = RcsPick("rcs/pick")
     expert.reset(seen(turn=turn), "pick up the green cuboid")
     quaternion = expert.act(seen(turn=turn)).action[3:7]
-    np.testing.assert_allclose(quaternion, [math.cos(hand / 2), math.sin(hand / 2), 0.0, 0.0], atol=1e-6)
+    np.testing.assert_allclose(
+        quaternion, [math.cos(hand / 2), math.sin(hand / 2), 0.0, 0.0], atol=1e-6
+    )
 
 
 def test_what_it_cannot_do_without_is_named() -> None:

@@ -115,7 +115,9 @@ def test_fifty_initial_states_are_those_of_mt1() -> None:
             drawn = pickle.loads(tasks[index].data)["rand_vec"]  # noqa: S301 - Meta-World's own, of this process
             np.testing.assert_array_equal(goal, drawn[3:])
         again = env.reset(seed=99, options={"init_state": 7})[0].info["sim_state"]
-        np.testing.assert_array_equal(again, env.reset(seed=7, options={"init_state": 7})[0].info["sim_state"])
+        np.testing.assert_array_equal(
+            again, env.reset(seed=7, options={"init_state": 7})[0].info["sim_state"]
+        )
 
 
 @pytest.mark.parametrize("ends", [True, False])

@@ -1,4 +1,6 @@
-"""Between a flat row and RCS's dict for each robot, and what is said where RCS and DuoBench cannot run."""
+"""Between a flat row and RCS's dict for each robot, and what is said where RCS and DuoBench
+cannot run.
+"""
 
 from __future__ import annotations
 
@@ -19,20 +21,27 @@ from vlagents_ray_sims.rcs import Arms, DuoBench, Rcs
 _SIZES = {"joints": 7, "tquat": 7, "xyzrpy": 6}
 
 
-def spaces(*names: str, mode: str = "joints", gripper: bool = True) -> tuple[dict[str, Any], dict[str, Any]]:
+def spaces(
+    *names: str, mode: str = "joints", gripper: bool = True
+) -> tuple[dict[str, Any], dict[str, Any]]:
     """The action and the observation space of robots with these names, as RCS states them."""
 
     def boxes(parts: dict[str, int]) -> Any:
         sized = parts | ({"gripper": 1} if gripper else {})
-        return gymnasium.spaces.Dict({part: gymnasium.spaces.Box(-9, 9, (size,)) for part, size in sized.items()})
+        return gymnasium.spaces.Dict(
+            {part: gymnasium.spaces.Box(-9, 9, (size,)) for part, size in sized.items()}
+        )
 
-    return {name: boxes({mode: _SIZES[mode]}) for name in names}, {name: boxes(_SIZES) for name in names}
+    return {name: boxes({mode: _SIZES[mode]}) for name in names}, {
+        name: boxes(_SIZES) for name in names
+    }
 
 
 def seen(*names: str, gripper: float = 1.0) -> dict[str, Any]:
     """An observation in which every part of the first robot is 0, of the second 1."""
     return {
-        name: {part: np.full(size, i, np.float64) for part, size in _SIZES.items()} | {"gripper": [gripper]}
+        name: {part: np.full(size, i, np.float64) for part, size in _SIZES.items()}
+        | {"gripper": [gripper]}
         for i, name in enumerate(names)
     }
 
@@ -49,7 +58,9 @@ def test_a_row_is_each_arms_command_then_its_gripper() -> None:
 
 def test_arms_without_gripper_take_none() -> None:
     arms = Arms(*spaces("left", "right", mode="xyzrpy", gripper=False), "xyzrpy")
-    assert {name: list(parts) for name, parts in arms.command(np.zeros(12, np.float32)).items()} == {
+    assert {
+        name: list(parts) for name, parts in arms.command(np.zeros(12, np.float32)).items()
+    } == {
         "left": ["xyzrpy"],
         "right": ["xyzrpy"],
     }
@@ -76,11 +87,16 @@ def test_an_observation_becomes_the_parts_that_the_contract_states() -> None:
 
 @pytest.mark.parametrize(("opening", "told"), [(-0.01, 0.0), (0.25, 0.25), (1.01, 1.0)])
 def test_a_single_arms_gripper_is_the_observations(opening: float, told: float) -> None:
-    assert Arms(*spaces("right", mode="tquat"), "tquat").read(seen("right", gripper=opening))[1] == told
+    assert (
+        Arms(*spaces("right", mode="tquat"), "tquat").read(seen("right", gripper=opening))[1]
+        == told
+    )
 
 
 def test_the_contract_says_what_is_commanded_and_in_which_order() -> None:
-    assert Arms(*spaces("left", "right", mode="tquat"), "tquat").action_spec(delta=True) == ActionSpec(
+    assert Arms(*spaces("left", "right", mode="tquat"), "tquat").action_spec(
+        delta=True
+    ) == ActionSpec(
         dim=16,
         space="ee_pose",
         delta=True,
@@ -96,7 +112,9 @@ def test_the_contract_says_what_is_commanded_and_in_which_order() -> None:
 @pytest.fixture
 def installed(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
     """As if both packages were there; the home folder, without their assets."""
-    monkeypatch.setattr(importlib.util, "find_spec", lambda name: importlib.machinery.ModuleSpec(name, None))
+    monkeypatch.setattr(
+        importlib.util, "find_spec", lambda name: importlib.machinery.ModuleSpec(name, None)
+    )
     monkeypatch.setenv("HOME", str(tmp_path))
     for variable in ("RCS_PREFIX", "DUOBENCH_PREFIX"):
         monkeypatch.delenv(variable, raising=False)
@@ -109,9 +127,13 @@ def put_assets(prefix: Path) -> None:
     scene.touch()
 
 
-def test_without_the_package_the_environment_to_make_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_the_package_the_environment_to_make_is_named(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     monkeypatch.setattr(importlib.util, "find_spec", {}.get)
-    with pytest.raises(MissingDependency, match=r"rcs/pick: rcs is not installed.*env make rcs`.*py_executable"):
+    with pytest.raises(
+        MissingDependency, match=r"rcs/pick: rcs is not installed.*env make rcs`.*py_executable"
+    ):
         make_env("rcs/pick")
     assert "rcs is not installed" in (DuoBench.missing() or "")
 
@@ -121,7 +143,9 @@ def test_without_assets_the_package_is_not_imported(installed: Path) -> None:
         make_env("rcs/pick")
 
 
-def test_assets_are_looked_for_where_the_packages_keep_them(installed: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_assets_are_looked_for_where_the_packages_keep_them(
+    installed: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     put_assets(installed / ".rcs")
     assert Rcs.missing() is None
     assert "set DUOBENCH_PREFIX" in (DuoBench.missing() or "")

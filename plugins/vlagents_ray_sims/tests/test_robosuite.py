@@ -1,4 +1,6 @@
-"""robosuite's tasks as they are known without it: protocols, contracts, options, and what the expert does."""
+"""robosuite's tasks as they are known without it: protocols, contracts, options, and what the
+expert does.
+"""
 
 from __future__ import annotations
 
@@ -10,7 +12,14 @@ from experts.osc_pose import RobosuiteExpert
 
 from vlagents_ray.contract import CameraSpec
 from vlagents_ray.envs.base import known_contract, make_env
-from vlagents_ray.errors import ConfigError, ContractMismatch, InvalidObservation, MissingState, NotReset, UnknownEnv
+from vlagents_ray.errors import (
+    ConfigError,
+    ContractMismatch,
+    InvalidObservation,
+    MissingState,
+    NotReset,
+    UnknownEnv,
+)
 from vlagents_ray.interface import Obs
 from vlagents_ray_sims.robosuite import TASKS, Robosuite
 
@@ -32,8 +41,16 @@ def test_the_protocols_are_robomimics() -> None:
 def test_the_contract_is_known_before_the_simulator_is_made() -> None:
     lift = known_contract("robosuite/Lift", {})
     assert lift is not None
-    assert lift.cameras == {"agentview": CameraSpec(84, 84), "robot0_eye_in_hand": CameraSpec(84, 84)}
-    assert (lift.action.dim, lift.action.frame, lift.action.gripper_open, lift.control_hz) == (7, "base", -1.0, 20.0)
+    assert lift.cameras == {
+        "agentview": CameraSpec(84, 84),
+        "robot0_eye_in_hand": CameraSpec(84, 84),
+    }
+    assert (lift.action.dim, lift.action.frame, lift.action.gripper_open, lift.control_hz) == (
+        7,
+        "base",
+        -1.0,
+        20.0,
+    )
     both = known_contract("robosuite/TwoArmTransport", {"cameras": ["agentview"], "width": 96})
     assert both is not None
     assert both.cameras == {"agentview": CameraSpec(84, 96)}
@@ -53,7 +70,10 @@ def test_a_wrong_name_size_or_installation_is_named(monkeypatch: pytest.MonkeyPa
 
 def seen(hand: tuple[float, float, float], yaw: float = 0.0) -> Obs:
     """A hand that points down, and a nut that is turned by `yaw`."""
-    state = {"robot0_eef_pos": np.array(hand, np.float32), "robot0_eef_quat": np.array([1, 0, 0, 0], np.float32)}
+    state = {
+        "robot0_eef_pos": np.array(hand, np.float32),
+        "robot0_eef_quat": np.array([1, 0, 0, 0], np.float32),
+    }
     nut = {
         "SquareNut_pos": np.array([0.1, 0.2, 0.83]),
         "SquareNut_quat": np.array([0, 0, math.sin(yaw / 2), math.cos(yaw / 2)]),

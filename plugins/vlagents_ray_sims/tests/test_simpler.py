@@ -27,7 +27,11 @@ PROTOCOL = {  # instruction, configurations, steps
     CARROT: ("put carrot on plate", 24, 60),
     EGGPLANT: ("put eggplant into yellow basket", 64, 120),
     "PutSpoonOnTableClothInScene-v1": ("put the spoon on the towel", 24, 60),
-    "StackGreenCubeOnYellowCubeBakedTexInScene-v1": ("stack the green block on the yellow block", 24, 60),
+    "StackGreenCubeOnYellowCubeBakedTexInScene-v1": (
+        "stack the green block on the yellow block",
+        24,
+        60,
+    ),
 }
 
 
@@ -57,7 +61,12 @@ def test_each_task_keeps_to_simplers_constants(task: str) -> None:
         assert env.contract.cameras == {CAMERA: CameraSpec(480, 640)}
         assert env.contract.control_hz == 5.0
         action = env.contract.action
-        assert (action.dim, action.space, action.delta, action.frame) == (7, "ee_pose", True, "base")
+        assert (action.dim, action.space, action.delta, action.frame) == (
+            7,
+            "ee_pose",
+            True,
+            "base",
+        )
         assert (action.gripper_open, action.gripper_closed) == (1.0, 0.0)
         facts = env.describe()
         assert facts["control_mode"] == "arm_pd_ee_target_delta_pose_align2_gripper_pd_joint_pos"
@@ -96,7 +105,9 @@ def test_the_state_alone_decides_where_an_episode_begins(carrot: Simpler) -> Non
 
 
 def test_images_stand_upright(carrot: Simpler) -> None:
-    """The camera looks from the robot over the table: what is farther, at larger x, is higher; larger y is left."""
+    """The camera looks from the robot over the table: what is farther, at larger x, is higher;
+    larger y is left.
+    """
     places = []
     for state in (0, 6, 12, 18):
         obs = begin(carrot, state)
@@ -165,13 +176,18 @@ def test_two_twins_in_one_process_keep_their_own_pictures(carrot: Simpler) -> No
 
 def test_what_deviates_from_the_protocol_is_said() -> None:
     with Simpler(CARROT, max_steps=3, shader="minimal") as env:
-        assert env.describe()["protocol"]["deviations"] == ["max_steps is 3, not 60", "shader is minimal, not default"]
+        assert env.describe()["protocol"]["deviations"] == [
+            "max_steps is 3, not 60",
+            "shader is minimal, not default",
+        ]
 
 
 def test_missing_assets_are_named_with_the_commands_that_get_them(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    commands = r"download_asset bridge_v2_real2sim && python -m mani_skill.utils.download_asset widowx250s"
+    commands = (
+        r"download_asset bridge_v2_real2sim && python -m mani_skill.utils.download_asset widowx250s"
+    )
     with pytest.raises(ConfigError, match="MS_ASSET_DIR before it starts"):
         Simpler(CARROT, assets=str(tmp_path))
     monkeypatch.setattr("mani_skill.ASSET_DIR", tmp_path / "data")

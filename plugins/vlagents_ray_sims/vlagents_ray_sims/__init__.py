@@ -1,1 +1,3 @@
-"""Benchmarks in simulation: LIBERO, robosuite, CALVIN, SIMPLER, RoboCasa, RCS, ALOHA and Meta-World."""
+"""Benchmarks in simulation: LIBERO, robosuite, CALVIN, SIMPLER, RoboCasa, RCS, ALOHA and
+Meta-World.
+"""

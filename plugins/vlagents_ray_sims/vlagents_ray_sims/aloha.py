@@ -1,7 +1,8 @@
 """ALOHA in simulation: two ViperX 300 arms at a table in MuJoCo, with ACT's two tasks.
 
-Zhao et al. 2023, "Learning Fine-Grained Bimanual Manipulation with Low-Cost Hardware", arXiv 2304.13705, as packaged by
-gym-aloha. Images need OpenGL without a display: EGL, which Mesa also provides in software.
+Zhao et al. 2023, "Learning Fine-Grained Bimanual Manipulation with Low-Cost Hardware", arXiv
+2304.13705, as packaged by gym-aloha. Images need OpenGL without a display: EGL, which Mesa also
+provides in software.
 """
 
 from __future__ import annotations
@@ -18,7 +19,8 @@ from vlagents_ray.registry import require
 
 PROTOCOL = BenchmarkProtocol(
     name="ALOHA",
-    source="gym-aloha 0.1.5; ACT, imitate_episodes.py and constants.py; LeRobot 0.4.4, AlohaEnv and EvalConfig",
+    source="gym-aloha 0.1.5; ACT, imitate_episodes.py and constants.py; LeRobot 0.4.4, AlohaEnv "
+    "and EvalConfig",
     max_steps=400,
     control_hz=50.0,
     control="absolute joint positions",
@@ -32,7 +34,8 @@ _TASKS = {
     "transfer_cube": "pick up the cube with the right arm and transfer it to the left arm",
     "insertion": "insert the peg into the socket",
 }
-# The place of each part of the state in gym-aloha's vector (14,), whose gripper positions are 0 closed, 1 open.
+# The place of each part of the state in gym-aloha's vector (14,), whose gripper positions are 0
+# closed, 1 open.
 _STATE = {
     "left/joints": slice(0, 6),
     "left/gripper": slice(6, 7),
@@ -44,18 +47,23 @@ _STATE = {
 class Aloha(SimulatorEnv):
     """One environment of one of ALOHA's two tasks, "transfer_cube" or "insertion".
 
-    Observation: cameras, by default "top", as in ACT's and LeRobot's data; `state`: "left/joints" (6,) rad,
-    "left/gripper" (1,), "right/joints", "right/gripper", in the order of gym-aloha's `agent_pos`; in
-    `info["sim_state"]`, (7,) float64 or (14,), the poses of the cube, or of peg and socket, in the world frame:
-    position in m and quaternion w, x, y, z.
+    Observation: cameras, by default "top", as in ACT's and LeRobot's data; `state`: "left/joints"
+        (6,) rad,
+    "left/gripper" (1,), "right/joints", "right/gripper", in the order of gym-aloha's `agent_pos`;
+    in `info["sim_state"]`, (7,) float64 or (14,), the poses of the cube, or of peg and socket, in
+    the world frame: position in m and quaternion w, x, y, z.
 
-    Action: (14,), for the left arm and then for the right: six joint angles, rad, and the gripper, 0 closed, 1 open.
-    They are not clipped to gym-aloha's action space, [-1, 1], which excludes even the arms' first pose: neither ACT nor
-    LeRobot clips them.
+    Action: (14,), for the left arm and then for the right: six joint angles, rad, and the gripper,
+        0 closed, 1 open.
+    They are not clipped to gym-aloha's action space, [-1, 1], which excludes even the arms' first
+    pose: neither ACT nor LeRobot clips them.
     """
 
     suite, title, known = "aloha", "gym-aloha", tuple(_TASKS)
-    packages, distributions = ("gym_aloha", "dm_control", "mujoco"), ("gym-aloha", "dm-control", "mujoco")
+    packages, distributions = (
+        ("gym_aloha", "dm_control", "mujoco"),
+        ("gym-aloha", "dm-control", "mujoco"),
+    )
     cure = "pip install 'vlagents-ray-sims[aloha]'"
     _protocol = PROTOCOL
 
@@ -70,7 +78,8 @@ class Aloha(SimulatorEnv):
         max_steps: int = PROTOCOL.max_steps,
         ends_on_success: bool = True,
     ) -> None:
-        """Make the environment; raises the errors of `make_env`. Other options are described in `SimulatorEnv`.
+        """Make the environment; raises the errors of `make_env`. Other options are described in
+        `SimulatorEnv`.
 
         Args:
             task: "transfer_cube" or "insertion".
@@ -83,17 +92,23 @@ class Aloha(SimulatorEnv):
         simulator = require("gym_aloha.env")
         with self._making():
             self._env = simulator.AlohaEnv(task)
-            # gym-aloha renders three cameras at 640x480 in each step; here only those of the contract are rendered.
+            # gym-aloha renders three cameras at 640x480 in each step; here only those of the
+            # contract are rendered.
             self._env._env.task.get_observation = self._env._env.task.get_qpos
             self._env._format_raw_obs = np.array
             self._physics = self._env._env.physics
-            self._cameras = MujocoCameras(self._name, self._physics.model.ptr, cameras, (height, width))
+            self._cameras = MujocoCameras(
+                self._name, self._physics.model.ptr, cameras, (height, width)
+            )
             self._resources.callback(self._cameras.close)
 
     @classmethod
     def known_contract(cls, arguments: Mapping[str, Any]) -> Contract:
         return Contract(
-            cameras={name: CameraSpec(arguments["height"], arguments["width"]) for name in arguments["cameras"]},
+            cameras={
+                name: CameraSpec(arguments["height"], arguments["width"])
+                for name in arguments["cameras"]
+            },
             state={
                 name: StateSpec(part.stop - part.start, "rad" if name.endswith("joints") else None)
                 for name, part in _STATE.items()
@@ -101,7 +116,12 @@ class Aloha(SimulatorEnv):
             gripper=False,
             instruction=True,
             action=ActionSpec(
-                dim=14, space="joint", delta=False, gripper_open=1.0, gripper_closed=0.0, arms=("left", "right")
+                dim=14,
+                space="joint",
+                delta=False,
+                gripper_open=1.0,
+                gripper_closed=0.0,
+                arms=("left", "right"),
             ),
             control_hz=PROTOCOL.control_hz,
         )
@@ -116,7 +136,11 @@ class Aloha(SimulatorEnv):
     def _advance(self, action: np.ndarray) -> tuple[Obs, float, bool, dict[str, Any]]:
         """Execute an action; the reward is the stage of the task in the new state, 0 to 4."""
         qpos, reward, *_ = self._env.step(action.astype(np.float64))
-        return self._observe(qpos, look=self.looked_at), float(reward), *self._solved(bool(reward == 4))
+        return (
+            self._observe(qpos, look=self.looked_at),
+            float(reward),
+            *self._solved(bool(reward == 4)),
+        )
 
     def _observe(self, qpos: np.ndarray, *, look: bool = True) -> Obs:
         images = self._cameras.render(self._physics.data.ptr) if look else {}

@@ -1,4 +1,6 @@
-"""CALVIN: chains of five tasks, given in words, at a table with drawer, sliding door, lights and blocks."""
+"""CALVIN: chains of five tasks, given in words, at a table with drawer, sliding door, lights and
+blocks.
+"""
 
 from __future__ import annotations
 
@@ -49,8 +51,9 @@ class Chain:
 class Chains:
     """The chains by their number, as `get_sequences(1000)` orders them.
 
-    For each of 192 initial states, with its own seed, CALVIN draws tasks at random until it has enough feasible
-    sequences. All draws take minutes; here the draws of a state are made when one of its chains is requested.
+    For each of 192 initial states, with its own seed, CALVIN draws tasks at random until it has
+    enough feasible sequences. All draws take minutes; here the draws of a state are made when one
+    of its chains is requested.
     """
 
     def __init__(self, checkout: Path) -> None:
@@ -66,7 +69,9 @@ class Chains:
         self._state_of = utils["get_env_state_for_initial_condition"]
         self._rules = rules = _definitions(
             evaluation / "multistep_sequences.py",
-            ProcessPoolExecutor=lambda max_workers: contextlib.nullcontext(SimpleNamespace(map=_places)),  # noqa: ARG005
+            ProcessPoolExecutor=lambda max_workers: contextlib.nullcontext(  # noqa: ARG005
+                SimpleNamespace(map=_places)
+            ),
             deepcopy=copy.deepcopy,
             functools=functools,
             logging=logging,
@@ -75,7 +80,9 @@ class Chains:
             product=itertools.product,
             temp_seed=utils["temp_seed"],
         )
-        self._order: list[tuple[Mapping[str, Any], tuple[int, int]]] = rules["get_sequences"](NUMBER)
+        self._order: list[tuple[Mapping[str, Any], tuple[int, int]]] = rules["get_sequences"](
+            NUMBER
+        )
         self._drawn: dict[int, tuple[np.random.RandomState, list[tuple[str, ...]]]] = {}
 
     def __getitem__(self, number: int) -> Chain:
@@ -83,14 +90,17 @@ class Chains:
         names, check = list(self._rules["tasks"]), self._rules["check_sequence"]
         random, found = self._drawn.setdefault(seed, (np.random.RandomState(seed), []))
         while len(found) <= place:
-            drawn = tuple(names[i] for i in random.permutation(len(names))[:_LENGTH])  # a `choice` without replacement
+            # A `choice` without replacement.
+            drawn = tuple(names[i] for i in random.permutation(len(names))[:_LENGTH])
             if check(state, drawn):
                 found.append(drawn)
         return Chain(found[place], *self._state_of(state))
 
 
 def _places(_: Callable[..., Any], jobs: Iterable[tuple[Any, int, int]]) -> list[list[np.ndarray]]:
-    """Return the seed and place of each chain of a state, instead of the chains that CALVIN's processes would draw."""
+    """Return the seed and place of each chain of a state, instead of the chains that CALVIN's
+    processes would draw.
+    """
     return [[np.array([seed, place]) for place in range(count)] for _, count, seed in jobs]
 
 
@@ -113,7 +123,8 @@ def _definitions(path: Path, **given: Any) -> dict[str, Any]:
 
 VARIABLE = "CALVIN_SRC"
 _CURE = (
-    f"git clone --recurse-submodules https://github.com/mees/calvin, and name that folder in {VARIABLE} on every node, "
+    "git clone --recurse-submodules https://github.com/mees/calvin, and name that folder in "
+    f"{VARIABLE} on every node, "
     f"or as the env's option `source_dir`"
 )
 RendererName = Literal["egl", "tiny"]
@@ -121,10 +132,12 @@ _PACKAGE, _CONF = Path("calvin_env"), Path("calvin_env/conf")
 _TASKS = Path("calvin_models/conf/callbacks/rollout/tasks/new_playtable_tasks.yaml")
 _WORDS = Path("calvin_models/conf/annotations/new_playtable_validation.yaml")
 SCENES = ("A", "B", "C", "D")
-TASKS, STEPS = 5, 360  # tasks per episode, and the limit of steps per task: evaluate_policy.py, EP_LEN
+# Tasks per episode, and the limit of steps per task: evaluate_policy.py, EP_LEN.
+TASKS, STEPS = 5, 360
 PROTOCOL = BenchmarkProtocol(
     name="CALVIN",
-    source="Mees et al. 2022, arXiv 2112.03227; calvin_agent/evaluation/evaluate_policy.py at fa03f01",
+    source="Mees et al. 2022, arXiv 2112.03227; calvin_agent/evaluation/evaluate_policy.py at "
+    "fa03f01",
     max_steps=TASKS * STEPS,
     control_hz=30.0,
     control="pose of the tool, relative: 0.02 m and 0.05 rad a unit, added to the last target",
@@ -135,7 +148,8 @@ PROTOCOL = BenchmarkProtocol(
     episodes=NUMBER,
 )
 _CAMERAS = {"static": CameraSpec(200, 200), "gripper": CameraSpec(84, 84)}
-_STATE = {  # parts of CALVIN's `robot_obs`, (15,), in order; its last number is the gripper's command
+# Parts of CALVIN's `robot_obs`, (15,), in order; its last number is the gripper's command.
+_STATE = {
     "tcp_pos": StateSpec(3, "m"),
     "tcp_orn": StateSpec(3, "rad"),
     "gripper_opening_width": StateSpec(1, "m"),
@@ -146,7 +160,14 @@ CONTRACT = Contract(
     state=_STATE,
     gripper=True,
     instruction=True,
-    action=ActionSpec(dim=7, space="ee_pose", delta=True, rotation="euler_xyz", gripper_open=1.0, gripper_closed=-1.0),
+    action=ActionSpec(
+        dim=7,
+        space="ee_pose",
+        delta=True,
+        rotation="euler_xyz",
+        gripper_open=1.0,
+        gripper_closed=-1.0,
+    ),
     control_hz=PROTOCOL.control_hz,
 )
 
@@ -154,41 +175,54 @@ CONTRACT = Contract(
 class Calvin(SimulatorEnv):
     """One scene of CALVIN, "A" to "D", in which an episode is a chain of five tasks.
 
-    Observation: cameras `static`, 200x200, and `gripper`, 84x84; in `state`, in the world frame, `tcp_pos` (3,) m and
-    `tcp_orn` (3,) rad of the tool, x-y-z angles about fixed axes, `gripper_opening_width` (1,) m, and `robot_joints`
-    (7,) rad; `gripper` is the last command, 1 = open.
+    Observation: cameras `static`, 200x200, and `gripper`, 84x84; in `state`, in the world frame,
+        `tcp_pos` (3,) m and
+    `tcp_orn` (3,) rad of the tool, x-y-z angles about fixed axes, `gripper_opening_width` (1,) m,
+    and `robot_joints` (7,) rad; `gripper` is the last command, 1 = open.
 
-    Action: (7,): the tool's target moves by 0.02 m per unit along the world's axes, and its angles by 0.05 rad per
+    Action: (7,): the tool's target moves by 0.02 m per unit along the world's axes, and its angles
+        by 0.05 rad per
     unit; the last is the gripper: 1 opens, -1 closes, and only its sign counts.
 
-    The reward is 1 in the step that solves a task. Its sum over an episode is the number of tasks solved in a row,
-    whose mean is CALVIN's average length. The episode ends with the fifth task, or with one that exceeds its steps.
-    `info["tasks"]` are CALVIN's names of the chain, `info["solved"]` is the number of solved tasks.
+    The reward is 1 in the step that solves a task. Its sum over an episode is the number of tasks
+    solved in a row, whose mean is CALVIN's average length. The episode ends with the fifth task, or
+    with one that exceeds its steps. `info["tasks"]` are CALVIN's names of the chain,
+    `info["solved"]` is the number of solved tasks.
     """
 
     suite, known = "calvin", SCENES
     _contract = CONTRACT
     several_tasks = True
     init_states = NUMBER
-    _open: ClassVar[str | None] = None  # upstream's code assumes that the process has only one simulation
+    # upstream's code assumes that the process has only one simulation.
+    _open: ClassVar[str | None] = None
 
     def __init__(
-        self, task: str = "D", *, task_steps: int = STEPS, renderer: RendererName = "egl", source_dir: str | None = None
+        self,
+        task: str = "D",
+        *,
+        task_steps: int = STEPS,
+        renderer: RendererName = "egl",
+        source_dir: str | None = None,
     ) -> None:
-        """Make the environment; raises the errors of `make_env`, and `ConfigError` if another one is open.
+        """Make the environment; raises the errors of `make_env`, and `ConfigError` if another one
+        is open.
 
         Args:
             task: The scene.
             task_steps: The limit of steps for each task of a chain.
-            renderer: "egl" renders as upstream does; "tiny" is PyBullet's own in software, with other light and
-                shadows.
+            renderer: "egl" renders as upstream does; "tiny" is PyBullet's own in software, with
+                other light and shadows.
             source_dir: A checkout of CALVIN with its submodules; None selects CALVIN_SRC.
         """
         super().__init__(task, task_steps=task_steps)
         if renderer not in ("egl", "tiny"):
             raise ConfigError(f"{self._name}: renderer is {renderer!r}, want egl or tiny")
         if Calvin._open is not None:
-            raise ConfigError(f"{self._name}: {Calvin._open} is open in this process, want one at a time; close it")
+            raise ConfigError(
+                f"{self._name}: {Calvin._open} is open in this process, want one at a time; close "
+                "it"
+            )
         self._renderer, self._checkout = renderer, find_checkout(source_dir)
         self._task_steps, self.max_steps = task_steps, TASKS * task_steps
         with self._making():
@@ -197,14 +231,18 @@ class Calvin(SimulatorEnv):
             self._resources.callback(self._free, self._env)
             omegaconf = require("omegaconf").OmegaConf
             with quietly():
-                self._judge = require("hydra").utils.instantiate(omegaconf.load(self._checkout / _TASKS))
+                self._judge = require("hydra").utils.instantiate(
+                    omegaconf.load(self._checkout / _TASKS)
+                )
             texts = omegaconf.load(self._checkout / _WORDS)
-            self._words: dict[str, str] = {name: of_task[0] for name, of_task in texts.items()}  # instructions
+            # instructions.
+            self._words: dict[str, str] = {name: of_task[0] for name, of_task in texts.items()}
             self._chains = Chains(self._checkout)
         self._chain: Chain | None = None
         self._done = 0  # number of finished tasks
         self._task_step = 0  # steps of the current task
-        self._before: dict[str, Any] = {}  # CALVIN's info of the state in which the current task began
+        # CALVIN's info of the state in which the current task began.
+        self._before: dict[str, Any] = {}
 
     @classmethod
     def known_contract(cls, arguments: Mapping[str, Any]) -> Contract:  # noqa: ARG003 - it is the same in each scene
@@ -257,10 +295,14 @@ class Calvin(SimulatorEnv):
         return self._observe(look=True), self._info()
 
     def _advance(self, action: np.ndarray) -> tuple[Obs, float, bool, dict[str, Any]]:
-        """Execute an action; the reward is 1 if it solves a task, and a task that exceeds its steps ends the chain."""
+        """Execute an action; the reward is 1 if it solves a task, and a task that exceeds its
+        steps ends the chain.
+        """
         env, chain = self._env, self._playing()
         if self._ended():
-            raise NotReset(f"{self._name}: step after the end of the chain; call reset(seed=...) first")
+            raise NotReset(
+                f"{self._name}: step after the end of the chain; call reset(seed=...) first"
+            )
         command = action.astype(np.float64)
         command[-1] = 1.0 if command[-1] > 0 else -1.0
         env.robot.apply_action(command)  # as in upstream's `step`, which would also render
@@ -268,11 +310,18 @@ class Calvin(SimulatorEnv):
             env.p.stepSimulation(physicsClientId=env.cid)
         env.scene.step()
         now = env.get_info()
-        solved = bool(self._judge.get_task_info_for_set(self._before, now, {chain.tasks[self._done]}))
+        solved = bool(
+            self._judge.get_task_info_for_set(self._before, now, {chain.tasks[self._done]})
+        )
         self._task_step += 1
         if solved:
             self._done, self._task_step, self._before = self._done + 1, 0, now
-        return self._observe(look=self.looked_at or solved), float(solved), self._ended(), self._info()
+        return (
+            self._observe(look=self.looked_at or solved),
+            float(solved),
+            self._ended(),
+            self._info(),
+        )
 
     def _ended(self) -> bool:
         return self._done == TASKS or self._task_step >= self._task_steps
@@ -286,14 +335,22 @@ class Calvin(SimulatorEnv):
     def _observe(self, *, look: bool) -> Obs:
         env = self._alive()
         robot, _ = env.robot.get_observation()
-        parts = np.split(robot[:14].astype(np.float32), np.cumsum([spec.dim for spec in _STATE.values()])[:-1])
+        parts = np.split(
+            robot[:14].astype(np.float32), np.cumsum([spec.dim for spec in _STATE.values()])[:-1]
+        )
         cameras = {}
         if look:
-            cameras = {one.name: np.ascontiguousarray(one.render()[0], np.uint8) for one in env.cameras}
+            cameras = {
+                one.name: np.ascontiguousarray(one.render()[0], np.uint8) for one in env.cameras
+            }
         return Obs(cameras, 1.0 if robot[14] > 0 else 0.0, dict(zip(_STATE, parts, strict=True)))
 
     def _info(self) -> dict[str, Any]:
-        return {"success": self._done == TASKS, "solved": self._done, "tasks": list(self._playing().tasks)}
+        return {
+            "success": self._done == TASKS,
+            "solved": self._done,
+            "tasks": list(self._playing().tasks),
+        }
 
     def _playing(self) -> Chain:
         if self._chain is None:
@@ -302,18 +359,25 @@ class Calvin(SimulatorEnv):
 
 
 def find_checkout(chosen: str | None) -> Path:
-    """Return the checkout of CALVIN, `chosen` or that of CALVIN_SRC; raises `ConfigError` if it is incomplete."""
+    """Return the checkout of CALVIN, `chosen` or that of CALVIN_SRC; raises `ConfigError` if it
+    is incomplete.
+    """
     named = chosen or os.environ.get(VARIABLE)
     if not named:
         raise ConfigError(f"calvin: {VARIABLE} is not set; {_CURE}")
     checkout = Path(named).expanduser().resolve()
     if lacks := [str(part) for part in (_CONF, _TASKS, _WORDS) if not (checkout / part).exists()]:
-        raise ConfigError(f"calvin: {checkout} lacks {lacks}, want a checkout of CALVIN with its submodules; {_CURE}")
+        raise ConfigError(
+            f"calvin: {checkout} lacks {lacks}, want a checkout of CALVIN with its submodules; "
+            f"{_CURE}"
+        )
     return checkout
 
 
 def make_simulator(checkout: Path, scene: str, renderer: RendererName) -> Any:
-    """Make CALVIN's `PlayTableSimEnv` of a scene, with the cameras, arm and rates of its datasets."""
+    """Make CALVIN's `PlayTableSimEnv` of a scene, with the cameras, arm and rates of its
+    datasets.
+    """
     if (folder := str(checkout / _PACKAGE)) not in sys.path:
         sys.path.insert(0, folder)
     if device := os.environ.get(EGL_DEVICE):
@@ -331,7 +395,9 @@ def make_simulator(checkout: Path, scene: str, renderer: RendererName) -> Any:
             "static": "cameras/cameras/static",
             "gripper": "cameras/cameras/gripper",
         }
-        read = {name: omegaconf.load(checkout / _CONF / f"{path}.yaml") for name, path in parts.items()}
+        read = {
+            name: omegaconf.load(checkout / _CONF / f"{path}.yaml") for name, path in parts.items()
+        }
         read["fingers"].pop("defaults")  # the arm; hydra would merge it
         settings = omegaconf.create(
             {
@@ -344,15 +410,25 @@ def make_simulator(checkout: Path, scene: str, renderer: RendererName) -> Any:
             }
         )
         try:
-            return hydra.utils.instantiate(settings.env, use_scene_info=True, use_egl=renderer == "egl")
+            return hydra.utils.instantiate(
+                settings.env, use_scene_info=True, use_egl=renderer == "egl"
+            )
         except SystemExit as error:  # PyBullet could not load its plug-in, and has printed why
-            raise EnvFailed(f"calvin: PyBullet cannot draw through EGL; {EGL_CURE}, or set renderer to tiny") from error
+            raise EnvFailed(
+                f"calvin: PyBullet cannot draw through EGL; {EGL_CURE}, or set renderer to tiny"
+            ) from error
 
 
 @contextlib.contextmanager
 def quietly() -> Iterator[None]:
-    """Keep output and warnings of upstream's code, such as gym's end of life, off the terminal; errors are raised."""
+    """Keep output and warnings of upstream's code, such as gym's end of life, off the terminal;
+    errors are raised.
+    """
     nowhere = io.StringIO()
-    with contextlib.redirect_stdout(nowhere), contextlib.redirect_stderr(nowhere), warnings.catch_warnings():
+    with (
+        contextlib.redirect_stdout(nowhere),
+        contextlib.redirect_stderr(nowhere),
+        warnings.catch_warnings(),
+    ):
         warnings.simplefilter("ignore")
         yield

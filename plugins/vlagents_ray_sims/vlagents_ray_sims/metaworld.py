@@ -28,7 +28,8 @@ PROTOCOL = BenchmarkProtocol(
     control="position of the hand, delta",
     success="the task is solved after any step: success_once",
     metric="success_once",
-    begins="where the object and the goal are: the episode's seed, or one of the 50 states that MT1 draws",
+    begins="where the object and the goal are: the episode's seed, or one of the 50 states that "
+    "MT1 draws",
     ends_on_success=True,
     episodes=50,
 )
@@ -38,16 +39,18 @@ _UPSIDE_DOWN = ("corner2",)  # cameras that Meta-World mounts upside down; the o
 class MetaWorld(SimulatorEnv):
     """One environment of one Meta-World task, e.g. "reach-v3".
 
-    Observation: cameras, by default "corner2", turned upright; `state["xyz"]` (3,) m, the hand in the world frame, and
-    `gripper`; in `info["sim_state"]`, (39,) float64, Meta-World's observation including the goal, which its oracles
-    need bit for bit.
+    Observation: cameras, by default "corner2", turned upright; `state["xyz"]` (3,) m, the hand in
+        the world frame, and
+    `gripper`; in `info["sim_state"]`, (39,) float64, Meta-World's observation including the goal,
+    which its oracles need bit for bit.
 
-    Action: (4,) in [-1, 1]: the hand's target moves by 0.01 m per unit, x, y, z in the world frame; the last is the
+    Action: (4,) in [-1, 1]: the hand's target moves by 0.01 m per unit, x, y, z in the world frame;
+        the last is the
     gripper's effort: -1 opens, 1 closes.
 
-    The seed draws the positions of the object and the goal, as Meta-World's own generator of tasks does.
-    With `goals_seed` the initial states are the 50 that MT1 draws with that seed, in order. Success ends the episode
-    unless `ends_on_success` is False.
+    The seed draws the positions of the object and the goal, as Meta-World's own generator of tasks
+    does. With `goals_seed` the initial states are the 50 that MT1 draws with that seed, in order.
+    Success ends the episode unless `ends_on_success` is False.
     """
 
     suite, title = "metaworld", "Meta-World"
@@ -69,20 +72,26 @@ class MetaWorld(SimulatorEnv):
         camera_positions: Mapping[str, Sequence[float]] | None = None,
         shadows: bool = True,
     ) -> None:
-        """Make the environment; raises the errors of `make_env`. Other options are described in `SimulatorEnv`.
+        """Make the environment; raises the errors of `make_env`. Other options are described in
+        `SimulatorEnv`.
 
         Args:
             task: Meta-World's name.
             cameras: MuJoCo's names, e.g. "corner2", "gripperPOV".
             instruction: None selects the task's name in words.
             max_steps: 500 at most.
-            goals_seed: The seed of MT1, whose 50 initial states are used; None: the seed of each episode draws one.
-            camera_positions: Name -> (x, y, z) m, of cameras that are moved from their place in Meta-World.
-            shadows: Whether images have shadows, reflections and smooth edges as in Meta-World; they take ten times as
-                long without a GPU.
+            goals_seed: The seed of MT1, whose 50 initial states are used; None: the seed of each
+                episode draws one.
+            camera_positions: Name -> (x, y, z) m, of cameras that are moved from their place in
+                Meta-World.
+            shadows: Whether images have shadows, reflections and smooth edges as in Meta-World;
+                they take ten times as long without a GPU.
         """
         if max_steps > PROTOCOL.max_steps:
-            raise ConfigError(f"metaworld: max_steps is {max_steps}, want at most {PROTOCOL.max_steps}: there it stops")
+            raise ConfigError(
+                f"metaworld: max_steps is {max_steps}, want at most {PROTOCOL.max_steps}: there it "
+                "stops"
+            )
         super().__init__(task, width=width, height=height, max_steps=max_steps)
         self.max_steps, self._ends_on_success = max_steps, ends_on_success
         self._instruction = instruction or task.removesuffix("-v3").replace("-", " ")
@@ -105,7 +114,12 @@ class MetaWorld(SimulatorEnv):
             for name, position in moved.items():
                 env.model.camera(name).pos = position
             self._cameras = MujocoCameras(
-                self._name, env.model, cameras, (height, width), upside_down=_UPSIDE_DOWN, shadows=shadows
+                self._name,
+                env.model,
+                cameras,
+                (height, width),
+                upside_down=_UPSIDE_DOWN,
+                shadows=shadows,
             )
             self._resources.callback(self._cameras.close)
         stated = self.known_contract({"cameras": cameras, "width": width, "height": height})
@@ -115,7 +129,10 @@ class MetaWorld(SimulatorEnv):
     def known_contract(cls, arguments: Mapping[str, Any]) -> Contract:
         """Return the contract without the control rate, which only the simulator knows."""
         return Contract(
-            cameras={name: CameraSpec(arguments["height"], arguments["width"]) for name in arguments["cameras"]},
+            cameras={
+                name: CameraSpec(arguments["height"], arguments["width"])
+                for name in arguments["cameras"]
+            },
             state={"xyz": StateSpec(3, "m")},
             gripper=True,
             instruction=True,
@@ -144,12 +161,17 @@ class MetaWorld(SimulatorEnv):
 
     def _advance(self, action: np.ndarray) -> tuple[Obs, float, bool, dict[str, Any]]:
         raw, reward, _, _, info = self._env.step(np.clip(action, -1.0, 1.0))
-        return self._observe(raw, look=self.looked_at), float(reward), *self._solved(bool(info["success"]))
+        return (
+            self._observe(raw, look=self.looked_at),
+            float(reward),
+            *self._solved(bool(info["success"])),
+        )
 
     def _observe(self, raw: np.ndarray, *, look: bool = True) -> Obs:
         return Obs(
             cameras=self._cameras.render(self._env.data) if look else {},
-            gripper=float(raw[3]),  # the fingers' distance over 0.1 m, clipped to [0, 1] by Meta-World
+            # The fingers' distance over 0.1 m, clipped to [0, 1] by Meta-World.
+            gripper=float(raw[3]),
             state={"xyz": raw[:3].astype(np.float32)},
             info={"sim_state": raw},
         )

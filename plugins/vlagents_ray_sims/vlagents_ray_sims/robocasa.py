@@ -1,4 +1,6 @@
-"""RoboCasa365's kitchen tasks: a Panda arm on a mobile base, in MuJoCo; the fifty of its evaluation."""
+"""RoboCasa365's kitchen tasks: a Panda arm on a mobile base, in MuJoCo; the fifty of its
+evaluation.
+"""
 
 from __future__ import annotations
 
@@ -28,8 +30,8 @@ CAMERAS = ("robot0_agentview_left", "robot0_agentview_right", "robot0_eye_in_han
 Split = Literal["target", "pretrain"]
 ActionOrder = Literal["base_first", "arm_first"]
 
-# RoboCasa's three sets of tasks with their horizons in steps, from dataset_registry.py of version 1.0.1: 1.5 times
-# those of 1.0.0.
+# RoboCasa's three sets of tasks with their horizons in steps, from dataset_registry.py of version
+# 1.0.1: 1.5 times those of 1.0.0.
 ATOMIC_SEEN: Mapping[str, int] = {
     "CloseBlenderLid": 900,
     "CloseFridge": 900,
@@ -106,32 +108,41 @@ _ON = 0.5  # the threshold of RoboCasa's own Gymnasium environments: both {-1, 1
 
 
 def protocol(task: str, split: Split) -> BenchmarkProtocol:
-    """Return the protocol of a task in the kitchens of `split`; results are published for both splits."""
+    """Return the protocol of a task in the kitchens of `split`; results are published for both
+    splits.
+    """
     return BenchmarkProtocol(
         name=f"RoboCasa365, split {split}",
-        source="Nasiriany et al. 2026, arXiv 2603.04356; robocasa 1.0.1, docs/benchmarking and dataset_registry.py",
+        source="Nasiriany et al. 2026, arXiv 2603.04356; robocasa 1.0.1, docs/benchmarking and "
+        "dataset_registry.py",
         max_steps=HORIZONS[task],
         control_hz=CONTROL_HZ,
-        control="pose of the hand, delta, by OSC_POSE: 0.05 m and 0.5 rad a unit; velocity of the base",
+        control="pose of the hand, delta, by OSC_POSE: 0.05 m and 0.5 rad a unit; velocity of the "
+        "base",
         success="RoboCasa's own check of the task holds after a step",
         metric="success_once",
         begins=f"{_KITCHENS[split]}, and where everything stands and lies in it: the seed's",
-        ends_on_success=True,  # as in openpi's evaluation; GR00T's checks success at the end of each chunk of 16 steps
+        # As in openpi's evaluation; GR00T's checks success at the end of each chunk of 16 steps.
+        ends_on_success=True,
         episodes=50,
     )
 
 
 class RoboCasa(RobosuiteEnv):
-    """One environment of one of RoboCasa365's tasks, e.g. "OpenDrawer": a Panda arm on an Omron base, in a kitchen.
+    """One environment of one of RoboCasa365's tasks, e.g. "OpenDrawer": a Panda arm on an Omron
+    base, in a kitchen.
 
-    Observation: cameras by RoboCasa's names, upright; in `state`, by the names of its datasets, `base_position` (3,) m
+    Observation: cameras by RoboCasa's names, upright; in `state`, by the names of its datasets,
+        `base_position` (3,) m
     and `base_rotation` (4,) xyzw in the world frame, `end_effector_position_relative` (3,) m and
-    `end_effector_rotation_relative` (4,) xyzw of the hand in the base frame, `gripper_qpos` (2,) m of the fingers.
+    `end_effector_rotation_relative` (4,) xyzw of the hand in the base frame, `gripper_qpos` (2,) m
+    of the fingers.
 
-    Action: (12,) in [-1, 1]: the base's velocity forward and to the left (1 m/s per unit) and about its axis (1.5 rad/s
-    per unit); the torso's height; the mode, at least 0.5 to move the base together with the hand; the hand's target,
-    which moves by 0.05 m per unit along the base's axes and turns by 0.5 rad per unit about them, axis-angle; the
-    gripper, which closes at 0.5 or more and opens below that.
+    Action: (12,) in [-1, 1]: the base's velocity forward and to the left (1 m/s per unit) and about
+        its axis (1.5 rad/s
+    per unit); the torso's height; the mode, at least 0.5 to move the base together with the hand;
+    the hand's target, which moves by 0.05 m per unit along the base's axes and turns by 0.5 rad per
+    unit about them, axis-angle; the gripper, which closes at 0.5 or more and opens below that.
     """
 
     suite, title, known = "robocasa", "RoboCasa", tuple(HORIZONS)
@@ -158,14 +169,16 @@ class RoboCasa(RobosuiteEnv):
         max_steps: int | None = None,
         ends_on_success: bool = True,
     ) -> None:
-        """Make the environment; raises the errors of `make_env`. Other options are described in `SimulatorEnv`.
+        """Make the environment; raises the errors of `make_env`. Other options are described in
+        `SimulatorEnv`.
 
         Args:
             task: RoboCasa's name, one of `tasks()`.
             split: The kitchens and objects: "target" or "pretrain".
             cameras: RoboCasa's names; None selects the protocol's three cameras.
-            action_order: "base_first", the order of an action in RoboCasa365's datasets, or "arm_first": hand,
-                gripper, base, torso, mode, the order of RoboCasa's `convert_action` and of LeRobot's environment.
+            action_order: "base_first", the order of an action in RoboCasa365's datasets, or
+                "arm_first": hand, gripper, base, torso, mode, the order of RoboCasa's
+                `convert_action` and of LeRobot's environment.
             object_registries: The sets of objects to draw from; the protocol uses both.
         """
         super().__init__(task, width=width, height=height, max_steps=max_steps)
@@ -175,7 +188,9 @@ class RoboCasa(RobosuiteEnv):
             ("object_registries", object_registries, REGISTRIES),
         ):
             if not chosen or not set(chosen) <= set(known):
-                raise ConfigError(f"{self._name}: {option} has {list(chosen)}, want some of {list(known)}")
+                raise ConfigError(
+                    f"{self._name}: {option} has {list(chosen)}, want some of {list(known)}"
+                )
         self._protocol, self._ends_on_success = protocol(task, split), ends_on_success
         self.max_steps = max_steps or HORIZONS[task]
         self._contract = self.known_contract(
@@ -203,16 +218,21 @@ class RoboCasa(RobosuiteEnv):
                 camera_widths=width or SIZE,
                 renderer="mujoco",  # as in envs/robosuite
             )
-            made.use_camera_obs = made.has_offscreen_renderer = bool(images)  # before the first reset loads the model
+            # Before the first reset loads the model.
+            made.use_camera_obs = made.has_offscreen_renderer = bool(images)
             self._use(made)
-        self._versions = {"robocasa": simulator.__version__, "robosuite": simulator.robosuite.__version__}
+        self._versions = {
+            "robocasa": simulator.__version__,
+            "robosuite": simulator.robosuite.__version__,
+        }
 
     @classmethod
     def known_contract(cls, arguments: Mapping[str, Any]) -> Contract:
         """Return the contract; the state has the names of RoboCasa365's datasets."""
         chosen = CAMERAS if arguments["cameras"] is None else arguments["cameras"]
         size = CameraSpec(arguments["height"] or SIZE, arguments["width"] or SIZE)
-        last = arguments["action_order"] == "base_first"  # the gripper is the last number, as in other envs
+        # The gripper is the last number, as in other envs.
+        last = arguments["action_order"] == "base_first"
         return Contract(
             cameras=dict.fromkeys(chosen, size),
             state={
@@ -258,7 +278,9 @@ class RoboCasa(RobosuiteEnv):
 
 
 def require_assets(registries: Sequence[str] = REGISTRIES) -> None:
-    """Raise `EnvFailed`, with the cure, if textures, appliances or the objects of one of `registries` are missing."""
+    """Raise `EnvFailed`, with the cure, if textures, appliances or the objects of one of
+    `registries` are missing.
+    """
     spec = importlib.util.find_spec("robocasa")
     if spec is None or spec.origin is None:  # `require` raises a better error
         return
@@ -267,7 +289,9 @@ def require_assets(registries: Sequence[str] = REGISTRIES) -> None:
     if lacks := [part for part in wanted if not (folder / part).is_dir()]:
         types = " ".join(TYPES[part] for part in lacks)
         raise EnvFailed(
-            f"robocasa: the assets in {folder} lack {lacks}; download them once, about 10 GB, with that environment's "
-            f"Python: python -m robocasa.scripts.download_kitchen_assets --type {types}; or make that folder a link to "
+            f"robocasa: the assets in {folder} lack {lacks}; download them once, about 10 GB, with "
+            "that environment's "
+            f"Python: python -m robocasa.scripts.download_kitchen_assets --type {types}; or make "
+            "that folder a link to "
             f"a copy of them"
         )

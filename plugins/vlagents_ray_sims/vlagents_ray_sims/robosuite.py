@@ -28,10 +28,12 @@ _OPEN_M = 0.04  # m, travel of a finger from closed to open
 class RobosuiteEnv(SimulatorEnv):
     """One environment of robosuite; a subclass makes the simulator and passes it to `_use`.
 
-    `info["sim_state"]`, for scripted experts only, has the positions and quaternions xyzw of objects.
+    `info["sim_state"]`, for scripted experts only, has the positions and quaternions xyzw of
+    objects.
     """
 
-    _raw: Mapping[str, str] = {}  # names in the contract's state -> robosuite's names, where they differ
+    # Names in the contract's state -> robosuite's names, where they differ.
+    _raw: Mapping[str, str] = {}
 
     def _use(self, simulator: Any) -> None:
         self._env, self._renderer = simulator, CameraRenderer(simulator)
@@ -40,9 +42,11 @@ class RobosuiteEnv(SimulatorEnv):
 
     def _begin(self, seed: int, state: int) -> tuple[Obs, dict[str, Any]]:
         with seeded(seed):
-            if hasattr(self._env, "rng"):  # robosuite 1.5 has its own generator, shared by its components
+            # Robosuite 1.5 has its own generator, shared by its components.
+            if hasattr(self._env, "rng"):
                 self._env.rng.bit_generator.state = np.random.default_rng(seed).bit_generator.state
-            self._renderer.make_current()  # frees the rendering resources of the last episode in their own context
+            # Frees the rendering resources of the last episode in their own context.
+            self._renderer.make_current()
             self._renderer.open = True
             raw = self._env.reset()
         return self._observe(raw), {}
@@ -64,7 +68,8 @@ class RobosuiteEnv(SimulatorEnv):
         return {
             name: np.asarray(value, np.float64)
             for name, value in raw.items()
-            if name.endswith(("_pos", "_quat")) and not {"robot0", "robot1", "to"} & set(name.split("_"))
+            if name.endswith(("_pos", "_quat"))
+            and not {"robot0", "robot1", "to"} & set(name.split("_"))
         }
 
     def _observe(self, raw: Mapping[str, Any], *, look: bool = True) -> Obs:
@@ -73,7 +78,10 @@ class RobosuiteEnv(SimulatorEnv):
         return Obs(
             cameras={name: np.ascontiguousarray(raw[f"{name}_image"][::-1]) for name in cameras},
             gripper=gripper_opening(raw) if contract.gripper else None,
-            state={name: np.asarray(raw[self._raw.get(name, name)], np.float32) for name in contract.state or {}},
+            state={
+                name: np.asarray(raw[self._raw.get(name, name)], np.float32)
+                for name in contract.state or {}
+            },
             info={"sim_state": self._sim_state(raw)},
         )
 
@@ -86,8 +94,9 @@ def gripper_opening(raw: Mapping[str, Any]) -> float:
 class CameraRenderer:
     """Renders the cameras while `open` is set; otherwise they return black images and cost nothing.
 
-    robosuite renders each camera for every observation, 14 times from the beginning of a reset to the first observation
-    of the policy. It samples the observation of a step, images included, after the first 2 ms of the step's 50.
+    robosuite renders each camera for every observation, 14 times from the beginning of a reset to
+    the first observation of the policy. It samples the observation of a step, images included,
+    after the first 2 ms of the step's 50.
     """
 
     def __init__(self, domain: Any) -> None:
@@ -99,10 +108,13 @@ class CameraRenderer:
     def make_current(self) -> None:
         """Activate this simulator's OpenGL context; the process may have others."""
         sim = self._domain.sim
-        if sim is not None and sim._render_context_offscreen is not None:  # missing after a failed reset
+        # Missing after a failed reset.
+        if sim is not None and sim._render_context_offscreen is not None:
             sim._render_context_offscreen.gl_ctx.make_current()
 
-    def _sensors(self, cam_name: str, cam_w: int, cam_h: int, **rest: Any) -> tuple[list[Any], list[str]]:
+    def _sensors(
+        self, cam_name: str, cam_w: int, cam_h: int, **rest: Any
+    ) -> tuple[list[Any], list[str]]:
         [own], names = self._own(cam_name, cam_w=cam_w, cam_h=cam_h, **rest)
 
         @functools.wraps(own)  # keeps robosuite's attributes
@@ -117,7 +129,9 @@ class CameraRenderer:
 
 @contextmanager
 def seeded(seed: int) -> Iterator[None]:
-    """Seed numpy's global generator, from which robosuite 1.4 and LIBERO draw, and restore its state afterwards."""
+    """Seed numpy's global generator, from which robosuite 1.4 and LIBERO draw, and restore its
+    state afterwards.
+    """
     before = np.random.get_state()  # noqa: NPY002
     np.random.seed(seed)  # noqa: NPY002
     try:
@@ -128,16 +142,19 @@ def seeded(seed: int) -> Iterator[None]:
 
 @contextmanager
 def importing_robosuite(env: str) -> Iterator[None]:
-    """Guard the first import of robosuite: make it render on the chosen EGL device, and suppress its advice and log.
+    """Guard the first import of robosuite: make it render on the chosen EGL device, and suppress
+    its advice and log.
 
-    When it is imported, robosuite reads EGL's device number as CUDA's, and refuses numbers that CUDA_VISIBLE_DEVICES
-    does not list. If no EGL device was chosen, it would render on the one with CUDA's number, and fail on an empty
-    CUDA_VISIBLE_DEVICES; the worker finds out which device was used. The log file's path is the same for all users of
-    the machine. Errors name `env`.
+    When it is imported, robosuite reads EGL's device number as CUDA's, and refuses numbers that
+    CUDA_VISIBLE_DEVICES does not list. If no EGL device was chosen, it would render on the one with
+    CUDA's number, and fail on an empty CUDA_VISIBLE_DEVICES; the worker finds out which device was
+    used. The log file's path is the same for all users of the machine. Errors name `env`.
     """
     chosen, visible = os.environ.get(EGL_DEVICE), os.environ.get(GPUS)
     if visible == "" and chosen is None and os.environ.get("MUJOCO_GL") == "egl":
-        raise EnvFailed(f"{env} finds no EGL device that renders in software, and was given no GPU; {EGL_CURE}")
+        raise EnvFailed(
+            f"{env} finds no EGL device that renders in software, and was given no GPU; {EGL_CURE}"
+        )
     log = logging.getLogger("robosuite_logs")
     real, level = logging.FileHandler, log.level
     logging.FileHandler = lambda _: logging.NullHandler()  # type: ignore[assignment,misc]
@@ -167,7 +184,8 @@ class RobosuiteTask:
     def protocol(self) -> BenchmarkProtocol:
         return BenchmarkProtocol(
             name="robomimic",
-            source="Mandlekar et al. 2021, arXiv 2108.03298; robomimic 0.3.0, dataset registry and base_config.py",
+            source="Mandlekar et al. 2021, arXiv 2108.03298; robomimic 0.3.0, dataset registry and "
+            "base_config.py",
             max_steps=self.max_steps,
             control_hz=CONTROL_HZ,
             control="pose of the hand, delta, by OSC_POSE: 0.05 m and 0.5 rad a unit",
@@ -184,7 +202,10 @@ TASKS: Mapping[str, RobosuiteTask] = {
     "PickPlaceCan": RobosuiteTask("pick up the can and place it in its bin"),
     "NutAssemblySquare": RobosuiteTask("put the square nut onto the square peg"),
     "ToolHang": RobosuiteTask(
-        "assemble the frame and hang the tool on it", 700, ("sideview", "robot0_eye_in_hand"), size=240
+        "assemble the frame and hang the tool on it",
+        700,
+        ("sideview", "robot0_eye_in_hand"),
+        size=240,
     ),
     "TwoArmTransport": RobosuiteTask(
         "move the hammer from its bin into the other one, and the trash out of that",
@@ -198,13 +219,17 @@ TASKS: Mapping[str, RobosuiteTask] = {
 class Robosuite(RobosuiteEnv):
     """One environment of one of robosuite's tasks, e.g. "Lift".
 
-    Observation: cameras by robosuite's names, upright; in `state`, by robomimic's names, for each arm
-    `robot0_eef_pos` (3,) m and `robot0_eef_quat` (4,) xyzw of the hand in the world frame, `robot0_gripper_qpos`
-    (2,) m of the fingers, and `robot0_joint_pos` (7,) rad. In `info["sim_state"]`, for scripted experts only: the
-    positions and quaternions xyzw of objects, and `target_pos`, the target position of one of them.
+    Observation: cameras by robosuite's names, upright; in `state`, by robomimic's names, for each
+        arm
+    `robot0_eef_pos` (3,) m and `robot0_eef_quat` (4,) xyzw of the hand in the world frame,
+    `robot0_gripper_qpos` (2,) m of the fingers, and `robot0_joint_pos` (7,) rad. In
+    `info["sim_state"]`, for scripted experts only: the positions and quaternions xyzw of objects,
+    and `target_pos`, the target position of one of them.
 
-    Action: (7,) in [-1, 1] for each arm: the hand's target moves by 0.05 m per unit along the base's axes and turns by
-    0.5 rad per unit about them, axis-angle; the last is the gripper: -1 opens, 1 closes, and only its sign counts.
+    Action: (7,) in [-1, 1] for each arm: the hand's target moves by 0.05 m per unit along the
+        base's axes and turns by
+    0.5 rad per unit about them, axis-angle; the last is the gripper: -1 opens, 1 closes, and only
+    its sign counts.
     """
 
     suite = title = "robosuite"
@@ -223,7 +248,8 @@ class Robosuite(RobosuiteEnv):
         max_steps: int | None = None,
         ends_on_success: bool = True,
     ) -> None:
-        """Make the environment; raises the errors of `make_env`. Other options are described in `SimulatorEnv`.
+        """Make the environment; raises the errors of `make_env`. Other options are described in
+        `SimulatorEnv`.
 
         Args:
             task: robosuite's name, one of `tasks()`.
@@ -233,13 +259,18 @@ class Robosuite(RobosuiteEnv):
         self._task = TASKS[task]
         self._protocol, self._ends_on_success = self._task.protocol, ends_on_success
         self.max_steps = max_steps or self._task.protocol.max_steps
-        self._contract = self.known_contract({"task": task, "width": width, "height": height, "cameras": cameras})
+        self._contract = self.known_contract(
+            {"task": task, "width": width, "height": height, "cameras": cameras}
+        )
         self._instruction = instruction or self._task.instruction
         with importing_robosuite("robosuite"), warnings.catch_warnings():
             warnings.simplefilter("ignore")  # warnings of upstream code
             simulator = require("robosuite")
         if task not in simulator.ALL_ENVIRONMENTS:
-            raise ConfigError(f"{self._name}: robosuite {simulator.__version__} has no such task, 1.5 has; {self.cure}")
+            raise ConfigError(
+                f"{self._name}: robosuite {simulator.__version__} has no such task, 1.5 has; "
+                f"{self.cure}"
+            )
         images = self._contract.cameras or {}
         with self._making(), seeded(0):
             made = simulator.make(
@@ -250,13 +281,15 @@ class Robosuite(RobosuiteEnv):
                 ignore_done=True,
                 has_renderer=False,
                 has_offscreen_renderer=bool(images),
-                renderer="mujoco",  # with 1.5's own renderer, a reset leaves the last one to garbage collection
+                # With 1.5's own renderer, a reset leaves the last one to garbage collection.
+                renderer="mujoco",
                 use_camera_obs=bool(images),
                 camera_names=list(images) or "agentview",
                 camera_heights=[spec.height for spec in images.values()] or 1,
                 camera_widths=[spec.width for spec in images.values()] or 1,
             )
-            for arm in self._task.arms:  # left out by robosuite, but part of robomimic's observations
+            # Left out by robosuite, but part of robomimic's observations.
+            for arm in self._task.arms:
                 made.modify_observable(f"{arm}_joint_pos", "active", modifier=True)
             self._use(made)
 
@@ -277,7 +310,9 @@ class Robosuite(RobosuiteEnv):
             state={f"{arm}_{part}": spec for arm in task.arms for part, spec in parts.items()},
             gripper=len(task.arms) == 1,
             instruction=True,
-            action=replace(DELTA_POSE, dim=7 * len(task.arms), arms=task.arms if len(task.arms) > 1 else None),
+            action=replace(
+                DELTA_POSE, dim=7 * len(task.arms), arms=task.arms if len(task.arms) > 1 else None
+            ),
             control_hz=CONTROL_HZ,
         )
 

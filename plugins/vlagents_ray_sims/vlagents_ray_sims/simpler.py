@@ -1,8 +1,8 @@
 """SIMPLER's Bridge tasks in ManiSkill 3: digital twins of a real table with a WidowX.
 
-Li et al. 2024, "Evaluating Real-World Robot Manipulation Policies in Simulation", https://arxiv.org/abs/2405.05941.
-Visual matching: photographs of the real scene behind the simulated robot and objects, and a fixed list of initial
-configurations.
+Li et al. 2024, "Evaluating Real-World Robot Manipulation Policies in Simulation",
+https://arxiv.org/abs/2405.05941. Visual matching: photographs of the real scene behind the
+simulated robot and objects, and a fixed list of initial configurations.
 """
 
 from __future__ import annotations
@@ -48,24 +48,29 @@ PROTOCOL: dict[str, Any] = {
     "obs_mode": "rgb+segmentation",
     "shader": "default",
     "gripper_open_above": 0.5,  # the command is binarised at this value
-    "sticky_gripper_steps": 1,  # 15 only for the Google robot, whose scenes ManiSkill 3 does not have
+    # 15 only for the Google robot, whose scenes ManiSkill 3 does not have.
+    "sticky_gripper_steps": 1,
 }
 
 
 class Simpler(SimulatorEnv):
     """One Bridge task with its WidowX 250 S, at 5 Hz.
 
-    Observation: "3rd_view_camera", (480, 640, 3), the size that the policies of the paper received and resized
-    themselves; `state`: the arm's `joints` (6,) rad, and `tquat` and `xyzrpy`, the pose of the gripper's link in the
-    robot's base frame; `gripper`. For scripted experts only, `info["sim_state"]`, (13,) float32 in that frame: the
-    positions in m of object, target, gripper and commanded gripper, and the object's yaw in rad.
+    Observation: "3rd_view_camera", (480, 640, 3), the size that the policies of the paper received
+        and resized
+    themselves; `state`: the arm's `joints` (6,) rad, and `tquat` and `xyzrpy`, the pose of the
+    gripper's link in the robot's base frame; `gripper`. For scripted experts only,
+    `info["sim_state"]`, (13,) float32 in that frame: the positions in m of object, target, gripper
+    and commanded gripper, and the object's yaw in rad.
 
-    Action, (7,), as policies trained on Bridge give it: the gripper's change of position in m along the base's axes,
-    its change of roll, pitch and yaw in rad, and the gripper, 1 open, 0 closed. It is relative to the last command, not
-    to the measured pose. As in SIMPLER's script, the controller reads the rotation as the numbers of a rotation vector.
+    Action, (7,), as policies trained on Bridge give it: the gripper's change of position in m along
+    the base's axes, its change of roll, pitch and yaw in rad, and the gripper, 1 open, 0 closed. It
+    is relative to the last command, not to the measured pose. As in SIMPLER's script, the
+    controller reads the rotation as the numbers of a rotation vector.
 
-    The initial state is `options["init_state"]`, SIMPLER's episode id; without it the seed modulo `init_states`. The
-    seed has no other effect. The env continues after success, and never reports `terminated`.
+    The initial state is `options["init_state"]`, SIMPLER's episode id; without it the seed modulo
+    `init_states`. The seed has no other effect. The env continues after success, and never reports
+    `terminated`.
     """
 
     suite, known = "simpler", tuple(TWINS)
@@ -81,12 +86,14 @@ class Simpler(SimulatorEnv):
         render_backend: str = "auto",
         shader: str = PROTOCOL["shader"],
     ) -> None:
-        """Make the environment; raises the errors of `make_env`. Other options are described in `SimulatorEnv`.
+        """Make the environment; raises the errors of `make_env`. Other options are described in
+        `SimulatorEnv`.
 
         Args:
             task: ManiSkill's id, one of `Simpler.tasks()`.
-            assets: The folder that holds `data/`; None selects `MS_ASSET_DIR`, or ~/.maniskill. ManiSkill
-                reads the variable once, so all environments of a process share one folder.
+            assets: The folder that holds `data/`; None selects `MS_ASSET_DIR`, or ~/.maniskill.
+                ManiSkill reads the variable once, so all environments of a process share one
+                folder.
             max_steps: None selects the task's own limit, 60, or 120 for the eggplant.
             sim_backend: "physx_cpu" or "physx_cuda".
             render_backend: "cpu", "gpu", or "auto": the GPU if both SAPIEN and torch can use it.
@@ -98,19 +105,22 @@ class Simpler(SimulatorEnv):
         used = require("mani_skill").ASSET_DIR.parent
         if assets is not None and used.resolve() != Path(assets).resolve():
             raise ConfigError(
-                f"simpler: assets is {assets!r}, but this process has read ManiSkill's from {str(used)!r}; "
+                f"simpler: assets is {assets!r}, but this process has read ManiSkill's from "
+                f"{str(used)!r}; "
                 f"set MS_ASSET_DIR before it starts"
             )
         if missing := _missing_assets(used):
             raise EnvFailed(missing)
         self.max_steps, own_limit = step_limits(self._name, task, max_steps)
-        self._deviations = [] if self.max_steps == own_limit else [f"max_steps is {max_steps}, not {own_limit}"]
+        self._deviations = (
+            [] if self.max_steps == own_limit else [f"max_steps is {max_steps}, not {own_limit}"]
+        )
         if shader != PROTOCOL["shader"]:
             self._deviations.append(f"shader is {shader}, not {PROTOCOL['shader']}")
         self._task = task
         self._given_instruction = instruction
-        # ManiSkill keeps the photographs, and the objects that they must not hide, in lists of the class. A second twin
-        # of this process would otherwise use the lists of the first one.
+        # ManiSkill keeps the photographs, and the objects that they must not hide, in lists of the
+        # class. A second twin of this process would otherwise use the lists of the first one.
         twins: Any = require("mani_skill.envs.tasks.digital_twins.base_env").BaseDigitalTwinEnv
         twins._objects_to_remove_from_greenscreen, twins._rgb_overlay_images = [], {}
         self._env = Simulator(
@@ -130,7 +140,11 @@ class Simpler(SimulatorEnv):
 
     @property
     def instruction(self) -> str:
-        return self._alive().instructions()[0] if self._given_instruction is None else self._given_instruction
+        return (
+            self._alive().instructions()[0]
+            if self._given_instruction is None
+            else self._given_instruction
+        )
 
     @classmethod
     def missing(cls) -> str | None:
@@ -150,7 +164,9 @@ class Simpler(SimulatorEnv):
         }
 
     def _begin(self, seed: int, state: int) -> tuple[Obs, dict[str, Any]]:
-        now = self._env.reset([seed], {"episode_id": require("torch").tensor([state]), "reconfigure": True})
+        now = self._env.reset(
+            [seed], {"episode_id": require("torch").tensor([state]), "reconfigure": True}
+        )
         return self._seen(now), {"success": now.success[0]}
 
     def _advance(self, action: np.ndarray) -> tuple[Obs, float, bool, dict[str, Any]]:
@@ -171,12 +187,20 @@ class Simpler(SimulatorEnv):
 
 
 _ACTION = ActionSpec(
-    dim=7, space="ee_pose", delta=True, rotation="euler_xyz", frame="base", gripper_open=1.0, gripper_closed=0.0
+    dim=7,
+    space="ee_pose",
+    delta=True,
+    rotation="euler_xyz",
+    frame="base",
+    gripper_open=1.0,
+    gripper_closed=0.0,
 )
 
 
 def _command(action: np.ndarray) -> np.ndarray:
-    """Convert an action to ManiSkill's controller, both (7,): rotation vector, gripper -1 closed, 1 open."""
+    """Convert an action to ManiSkill's controller, both (7,): rotation vector, gripper -1
+    closed, 1 open.
+    """
     roll, pitch, yaw = action[3:6].tolist()
     axis, angle = require("transforms3d.euler").euler2axangle(roll, pitch, yaw)
     gripper = 1.0 if action[6] > PROTOCOL["gripper_open_above"] else -1.0
@@ -186,4 +210,7 @@ def _command(action: np.ndarray) -> np.ndarray:
 def _missing_assets(folder: Path) -> str | None:
     if not (lacks := [place for place in _DATA.values() if not (folder / "data" / place).is_dir()]):
         return None
-    return f"SIMPLER's assets are not in {folder} (no data/{lacks[0]}); set MS_ASSET_DIR, or get them: {_DOWNLOADS}"
+    return (
+        f"SIMPLER's assets are not in {folder} (no data/{lacks[0]}); set MS_ASSET_DIR, or get "
+        f"them: {_DOWNLOADS}"
+    )

@@ -42,7 +42,9 @@ def known(monkeypatch: pytest.MonkeyPatch) -> Known:
 
 
 @pytest.mark.torch
-def test_the_deployment_file_serves_the_checkpoint_with_this_python(tmp_path: Path, known: Known) -> None:
+def test_the_deployment_file_serves_the_checkpoint_with_this_python(
+    tmp_path: Path, known: Known
+) -> None:
     asked = known()
     written = write_checkpoint("own", tmp_path / "made", "small")
     assert asked == [Recipe("own", tmp_path / "made", "small", "bfloat16")]
@@ -72,7 +74,9 @@ def test_what_is_in_a_folder_stays(tmp_path: Path, known: Known) -> None:
 
 def test_a_missing_package_names_the_environment_with_it(tmp_path: Path, known: Known) -> None:
     known("no_such_package")
-    with pytest.raises(MissingDependency, match=r"no_such_package.*env make hf .*benchmarks\.checkpoints own"):
+    with pytest.raises(
+        MissingDependency, match=r"no_such_package.*env make hf .*benchmarks\.checkpoints own"
+    ):
         write_checkpoint("own", tmp_path / "made")
     assert list(tmp_path.iterdir()) == []
 

@@ -40,11 +40,15 @@ def network() -> Any:
     import torch
 
     with parameters_on_meta():
-        return torch.nn.Sequential(torch.nn.Linear(3, 64), torch.nn.BatchNorm1d(64), torch.nn.Linear(64, 2)).bfloat16()
+        return torch.nn.Sequential(
+            torch.nn.Linear(3, 64), torch.nn.BatchNorm1d(64), torch.nn.Linear(64, 2)
+        ).bfloat16()
 
 
 def written(folder: Path) -> dict[str, Any]:
-    """The tensors of all files of a folder by name, each of which starts at a multiple of its type's size."""
+    """The tensors of all files of a folder by name, each of which starts at a multiple of its
+    type's size.
+    """
     import torch
 
     types = {"F32": torch.float32, "BF16": torch.bfloat16, "I64": torch.int64}
@@ -67,7 +71,9 @@ def written(folder: Path) -> dict[str, Any]:
 def test_every_tensor_of_a_model_is_written_in_its_type(tmp_path: Path) -> None:
     model = network()
     assert all(parameter.is_meta for parameter in model.parameters())
-    assert write_weights(model, tmp_path) == sum(parameter.numel() for parameter in model.parameters())
+    assert write_weights(model, tmp_path) == sum(
+        parameter.numel() for parameter in model.parameters()
+    )
     tensors = written(tmp_path)
     assert {name: (one.shape, one.dtype) for name, one in tensors.items()} == {
         name: (one.shape, one.dtype) for name, one in model.state_dict().items()
@@ -97,7 +103,9 @@ def test_a_parameter_with_two_names_is_written_and_counted_once(tmp_path: Path) 
     import torch
 
     with parameters_on_meta():
-        model = torch.nn.ModuleDict({"embed": torch.nn.Embedding(5, 4), "head": torch.nn.Linear(4, 5, bias=False)})
+        model = torch.nn.ModuleDict(
+            {"embed": torch.nn.Embedding(5, 4), "head": torch.nn.Linear(4, 5, bias=False)}
+        )
         model["head"].weight = model["embed"].weight
     assert write_weights(model, tmp_path) == 20
     assert list(written(tmp_path)) == ["embed.weight"]
@@ -122,7 +130,9 @@ def test_modules_made_afterwards_have_values_again() -> None:
     assert not torch.nn.Linear(2, 2).weight.is_meta
 
 
-def test_too_little_space_is_said_before_anything_is_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_too_little_space_is_said_before_anything_is_written(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(shutil, "disk_usage", lambda _: SimpleNamespace(free=10))
     with pytest.raises(ConfigError, match="free space"):
         write_weights(network(), tmp_path)
@@ -131,7 +141,11 @@ def test_too_little_space_is_said_before_anything_is_written(tmp_path: Path, mon
 
 def test_memory_holds_single_tensors_and_not_the_model(tmp_path: Path) -> None:
     done = subprocess.run(
-        [sys.executable, "-c", _PEAK, str(tmp_path)], check=True, capture_output=True, text=True, timeout=300
+        [sys.executable, "-c", _PEAK, str(tmp_path)],
+        check=True,
+        capture_output=True,
+        text=True,
+        timeout=300,
     )
     [file] = tmp_path.iterdir()
     assert file.stat().st_size > 256 * 2**20

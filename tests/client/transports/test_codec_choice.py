@@ -1,4 +1,6 @@
-"""The codec of the cameras depends on where the server is, not on what a link carries at the moment."""
+"""The codec of the cameras depends on where the server is, not on what a link carries at the
+moment.
+"""
 
 from __future__ import annotations
 
@@ -38,7 +40,8 @@ def another_network() -> Iterator[str]:
 
     number = os.getpid() % 2**14
     space, ours, theirs = f"vlr{number}", f"vlrh{number}", f"vlrn{number}"
-    host, peer = (f"198.18.{number // 64}.{number % 64 * 4 + end}" for end in (1, 2))  # RFC 2544's, for tests of links
+    # RFC 2544's, for tests of links.
+    host, peer = (f"198.18.{number // 64}.{number % 64 * 4 + end}" for end in (1, 2))
     inside = ["netns", "exec", space]
     with ExitStack() as stack:
         ip("netns", "add", space)
@@ -60,7 +63,8 @@ def test_pixels_are_raw_within_a_machine_and_compressed_over_a_network(
 ) -> None:
     choice = CodecChoice(requested)
     assert choice.codec is None
-    for near, chosen in ((True, RAW), (False, compressed), (True, RAW)):  # each connection decides anew
+    # Each connection decides anew.
+    for near, chosen in ((True, RAW), (False, compressed), (True, RAW)):
         choice.connected(near=near)
         assert choice.codec == choice.codec_for(OBS) == chosen
     assert choice.codec_for(OBS, most_bytes=SIZE) == RAW

@@ -94,15 +94,25 @@ def test_what_connects_has_time_left_when_the_first_replicas_hang(
 @pytest.mark.parametrize(
     ("transport", "attempt", "url", "error"),
     [
-        (HttpTransport("http://127.0.0.1:9", CodecChoice("raw")), "_metadata", "http://127.0.0.1:9", PolicyUnavailable),
+        (
+            HttpTransport("http://127.0.0.1:9", CodecChoice("raw")),
+            "_metadata",
+            "http://127.0.0.1:9",
+            PolicyUnavailable,
+        ),
         (HandleTransport("app"), "_attach", "serve://app", ConnectionLost),
     ],
 )
 @pytest.mark.parametrize("ready_s", [1.0, 30.0])
 def test_a_server_that_is_waited_for_is_reported_once_within_seconds(
-    transport: HttpTransport | HandleTransport, attempt: str, url: str, error: type[Exception], ready_s: float,
-    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture,
-) -> None:  # fmt: skip
+    transport: HttpTransport | HandleTransport,
+    attempt: str,
+    url: str,
+    error: type[Exception],
+    ready_s: float,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
+) -> None:
     """A wrong URL was silent for a minute; a server that restarts within a second is no news."""
     clock = Clock()
     reported_at: list[float] = []
@@ -129,7 +139,9 @@ def test_a_server_that_is_waited_for_is_reported_once_within_seconds(
 def test_a_server_that_refuses_connections_is_one_without_replicas(
     kind: type[HttpTransport | WebSocketTransport],
 ) -> None:
-    """So that a reset waits for HAProxy as it waits for a replica; both start again within seconds."""
+    """So that a reset waits for HAProxy as it waits for a replica; both start again within
+    seconds.
+    """
     transport = kind(f"http://127.0.0.1:{free_port()}", CodecChoice("raw"))
     with pytest.raises(NoReplica, match="is it running"):
         transport.call([Request("reset", Obs(), request_id="1")], 1.0)
@@ -138,7 +150,10 @@ def test_a_server_that_refuses_connections_is_one_without_replicas(
 @pytest.mark.parametrize("transport", ["auto", "websocket", "http"])
 def test_the_metadata_is_fetched_once(transport: TransportName) -> None:
     asked: Counter[str] = Counter()
-    with policy_server(Noop(), asked) as port, RemoteAgent(f"http://127.0.0.1:{port}", transport=transport) as agent:
+    with (
+        policy_server(Noop(), asked) as port,
+        RemoteAgent(f"http://127.0.0.1:{port}", transport=transport) as agent,
+    ):
         agent.reset(Obs(), "stack")
         agent.act(Obs())
     assert asked["/v1/metadata"] == 1, asked

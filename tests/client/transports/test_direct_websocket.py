@@ -1,4 +1,6 @@
-"""A connection that its server ends politely, as RFC 6455 has it: a last message, and then the line."""
+"""A connection that its server ends politely, as RFC 6455 has it: a last message, and then the
+line.
+"""
 
 from __future__ import annotations
 
@@ -72,18 +74,24 @@ def test_a_message_arrives_whole_in_pieces_of_any_length() -> None:
             stream.send(b"before", 30)
             stream.send_pieces([message[: size // 3], b"", memoryview(message)[size // 3 :]], 30)
             stream.send(b"after", 30)
-            assert [received.get(timeout=30) for _ in range(3)] == [b"before", message, b"after"], size
+            assert [received.get(timeout=30) for _ in range(3)] == [b"before", message, b"after"], (
+                size
+            )
         stream.send_pieces([b"a"] * 2000, 30)  # more than the kernel takes at once
         assert received.get(timeout=30) == b"a" * 2000
 
 
-def test_a_server_that_closes_in_place_of_an_answer_is_a_connection_that_is_gone(stream: Stream) -> None:
+def test_a_server_that_closes_in_place_of_an_answer_is_a_connection_that_is_gone(
+    stream: Stream,
+) -> None:
     stream.send(b"nothing", 5)
     with pytest.raises((ConnectionClosed, OSError), match="1000"):
         stream.recv(30)
 
 
-def test_a_server_that_closes_after_an_answer_is_noticed_by_the_next_request(stream: Stream) -> None:
+def test_a_server_that_closes_after_an_answer_is_noticed_by_the_next_request(
+    stream: Stream,
+) -> None:
     stream.send(b"answer first", 5)
     assert stream.recv(30) == b"answered"
     with pytest.raises((ConnectionClosed, OSError)):  # noqa: PT012 - by whichever hears of it
@@ -92,7 +100,9 @@ def test_a_server_that_closes_after_an_answer_is_noticed_by_the_next_request(str
 
 
 @pytest.mark.parametrize("answered", [True, False])
-def test_a_server_that_does_not_answer_is_left_by_a_reset_so_that_it_holds_nothing_any_longer(answered: bool) -> None:
+def test_a_server_that_does_not_answer_is_left_by_a_reset_so_that_it_holds_nothing_any_longer(
+    answered: bool,
+) -> None:
     ends: queue.SimpleQueue[ConnectionClosed] = queue.SimpleQueue()
 
     def listen(connection: ServerConnection) -> None:
@@ -113,7 +123,9 @@ def test_a_server_that_does_not_answer_is_left_by_a_reset_so_that_it_holds_nothi
             with pytest.raises(TimeoutError):
                 stream.recv(0.01)
         stream.close()
-        assert isinstance(ends.get(timeout=30), ConnectionClosedOK if answered else ConnectionClosedError)
+        assert isinstance(
+            ends.get(timeout=30), ConnectionClosedOK if answered else ConnectionClosedError
+        )
 
 
 def test_the_key_is_in_no_log(port: int, caplog: pytest.LogCaptureFixture) -> None:
@@ -121,7 +133,11 @@ def test_the_key_is_in_no_log(port: int, caplog: pytest.LogCaptureFixture) -> No
     with caplog.at_level(logging.DEBUG):
         connected(port, credentials.headers).close()
         ProxiedSocket(f"ws://127.0.0.1:{port}/", credentials, 5).close()
-    client = [record.getMessage() for record in caplog.records if not record.name.startswith("websockets.server")]
+    client = [
+        record.getMessage()
+        for record in caplog.records
+        if not record.name.startswith("websockets.server")
+    ]
     assert "> Sec-WebSocket-Version: 13" in client  # the others are logged
     assert not [line for line in client if "the-secret-key" in line]
 

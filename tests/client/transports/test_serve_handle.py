@@ -1,4 +1,6 @@
-"""What a Ray that broke makes of a call through a Serve handle: an infrastructure failure, never the policy's."""
+"""What a Ray that broke makes of a call through a Serve handle: an infrastructure failure, never
+the policy's.
+"""
 
 from __future__ import annotations
 
@@ -10,7 +12,13 @@ from unittest.mock import Mock
 import pytest
 import ray
 from ray import serve
-from ray.exceptions import ActorDiedError, LocalRayletDiedError, ObjectStoreFullError, OutOfDiskError, RayTaskError
+from ray.exceptions import (
+    ActorDiedError,
+    LocalRayletDiedError,
+    ObjectStoreFullError,
+    OutOfDiskError,
+    RayTaskError,
+)
 
 from vlagents_ray.client.transports import serve_handle
 from vlagents_ray.client.transports.serve_handle import HandleTransport
@@ -35,7 +43,9 @@ def test_a_frame_that_neither_store_nor_disk_has_room_for_is_not_sent(
     monkeypatch.setattr(ray, "put", failing(error))
     with pytest.raises(PolicyUnavailable, match=r"\d+ bytes cannot be sent") as raised:
         HandleTransport("app").call([REQUEST], 1)
-    assert not isinstance(raised.value, ConnectionLost), "that would say that it may have been executed"
+    assert not isinstance(raised.value, ConnectionLost), (
+        "that would say that it may have been executed"
+    )
 
 
 @pytest.mark.parametrize("error", [ActorDiedError(), LocalRayletDiedError()])
@@ -52,7 +62,9 @@ def test_an_answer_that_is_lost_with_its_node_is_a_lost_connection(
 def test_a_replica_that_fails_says_why(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(ray, "put", lambda _: None)
     monkeypatch.setattr(serve_handle, "call_replica", lambda *_, **__: None)
-    monkeypatch.setattr(ray, "get", failing(RayTaskError("call", "its traceback", ValueError("no such layout"))))
+    monkeypatch.setattr(
+        ray, "get", failing(RayTaskError("call", "its traceback", ValueError("no such layout")))
+    )
     with pytest.raises(ConnectionLost, match="the replica failed: no such layout"):
         HandleTransport("app").call([REQUEST], 1)
 
@@ -62,8 +74,12 @@ class TestConnecting:
     def in_a_cluster(self, monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setattr(ray, "is_initialized", lambda: True)
 
-    def test_another_replica_is_chosen_in_place_of_one_that_is_gone(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        answers: Iterator[Any] = iter([ConnectionLost("gone"), ConnectionLost("gone"), {"policy": "p"}])
+    def test_another_replica_is_chosen_in_place_of_one_that_is_gone(
+        self, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        answers: Iterator[Any] = iter(
+            [ConnectionLost("gone"), ConnectionLost("gone"), {"policy": "p"}]
+        )
 
         def attach(self: HandleTransport, timeout_s: float) -> Any:
             answer = next(answers)
@@ -79,8 +95,12 @@ class TestConnecting:
         with pytest.raises(PolicyUnavailable, match="gone"):
             HandleTransport("app").connect(0.5)
 
-    def test_one_that_hangs_is_not_waited_for_while_another_may_answer(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        """`reset` connects with `connect_timeout_s`, a minute: all of it went to the replica that was chosen first."""
+    def test_one_that_hangs_is_not_waited_for_while_another_may_answer(
+        self, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        """`reset` connects with `connect_timeout_s`, a minute: all of it went to the replica
+        that was chosen first.
+        """
         cancelled: list[bool] = []
         result = Mock(side_effect=[TimeoutError, TimeoutError, ({"policy": "p"}, "replica")])
         attaching = SimpleNamespace(result=result, cancel=lambda: cancelled.append(True))

@@ -1,4 +1,6 @@
-"""Shared memory and plasma: who can use them, decided before anything is sent, and servers that hang."""
+"""Shared memory and plasma: who can use them, decided before anything is sent, and servers that
+hang.
+"""
 
 from __future__ import annotations
 
@@ -55,18 +57,29 @@ def test_requests_to_a_server_that_hangs_take_no_more_memory_than_it_would_accep
 
 
 @pytest.mark.usefixtures("here")
-def test_a_server_of_another_user_is_sent_nothing(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    """Neither a key nor an observation: whoever takes the name of a server that has ended would command the robot."""
+def test_a_server_of_another_user_is_sent_nothing(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """Neither a key nor an observation: whoever takes the name of a server that has ended would
+    command the robot.
+    """
     monkeypatch.setattr("vlagents_ray.client.transports.shm.peer_uid", lambda _: os.getuid() + 1)
     for keyed in (False, True):
         with listening(f"\0{NAME}") as listener:
-            transport = ShmTransport(LocalAddress(NAME, boot_id(), keyed=keyed), Credentials("vlr_x"))
-            with pytest.raises(PolicyUnavailable, match=f"belongs to the user with the number {os.getuid() + 1}"):
+            transport = ShmTransport(
+                LocalAddress(NAME, boot_id(), keyed=keyed), Credentials("vlr_x")
+            )
+            with pytest.raises(
+                PolicyUnavailable, match=f"belongs to the user with the number {os.getuid() + 1}"
+            ):
                 transport.call([Request("act", Obs(), request_id="1")], 5)
             peer, _ = listener.accept()
             with peer:
                 assert peer.recv(1) == b""
-    with listening(str(tmp_path / "s")), pytest.raises(PolicyUnavailable, match="belongs to the user"):
+    with (
+        listening(str(tmp_path / "s")),
+        pytest.raises(PolicyUnavailable, match="belongs to the user"),
+    ):
         connect_plasma({"socket": str(tmp_path / "s"), "node": HERE})
 
 
@@ -80,7 +93,11 @@ def test_a_server_of_another_user_is_sent_nothing(monkeypatch: pytest.MonkeyPatc
     ],
 )
 def test_without_an_endpoint_on_this_node_plasma_is_refused_with_what_to_use(
-    monkeypatch: pytest.MonkeyPatch, node: str | None, address: dict[str, Any] | None, error: type, said: str
+    monkeypatch: pytest.MonkeyPatch,
+    node: str | None,
+    address: dict[str, Any] | None,
+    error: type,
+    said: str,
 ) -> None:
     monkeypatch.setattr("vlagents_ray.client.transports.serve_handle.this_node", lambda: node)
     with pytest.raises(error, match=said):
@@ -96,11 +113,16 @@ def test_outside_of_a_cluster_there_is_no_plasma() -> None:
 
 @pytest.mark.own_process
 @pytest.mark.usefixtures("here")
-def test_a_connection_that_fails_is_closed_at_once(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_a_connection_that_fails_is_closed_at_once(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
     with listening(str(tmp_path / "s")):
         for broken in (KeyboardInterrupt(), UnicodeError("a key that is no text"), OSError("gone")):
-            monkeypatch.setattr("vlagents_ray.client.transports.shm._require_same_user", Mock(side_effect=broken))
+            monkeypatch.setattr(
+                "vlagents_ray.client.transports.shm._require_same_user", Mock(side_effect=broken)
+            )
             before = os.listdir("/proc/self/fd")
-            with pytest.raises((type(broken), PolicyUnavailable)) as raised:  # which holds the frame with the socket
+            # Which holds the frame with the socket.
+            with pytest.raises((type(broken), PolicyUnavailable)) as raised:
                 connect_plasma({"socket": str(tmp_path / "s"), "node": HERE})
             assert len(os.listdir("/proc/self/fd")) == len(before), raised.value

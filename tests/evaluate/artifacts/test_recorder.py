@@ -54,16 +54,25 @@ def test_a_trajectory_is_what_was_seen_and_done(config: Config) -> None:
             assert sum(1 for _ in video.decode(video=0)) == result.steps + 1
 
 
-@pytest.mark.parametrize(("record", "kept"), [("none", [False] * 2), ("failures", [True, False]), ("all", [True] * 2)])
-def test_trajectories_are_kept_of_the_episodes_that_are_wanted(config: Config, record: str, kept: list[bool]) -> None:
+@pytest.mark.parametrize(
+    ("record", "kept"), [("none", [False] * 2), ("failures", [True, False]), ("all", [True] * 2)]
+)
+def test_trajectories_are_kept_of_the_episodes_that_are_wanted(
+    config: Config, record: str, kept: list[bool]
+) -> None:
     results = play(config(episodes=12, record=record))
-    found = {bool(one.result.success_once): one.trajectory is not None for one in results.cells[0].episodes}
+    found = {
+        bool(one.result.success_once): one.trajectory is not None
+        for one in results.cells[0].episodes
+    }
     assert [found[False], found[True]] == kept
     stored = {str(path.relative_to(results.out)) for path in results.out.rglob("*.npz")}
     assert stored == {one.trajectory for one in results.cells[0].episodes} - {None}
 
 
-def test_a_checkpoint_of_a_sweep_has_not_the_files_of_a_policy_named_almost_like_it(config: Config) -> None:
+def test_a_checkpoint_of_a_sweep_has_not_the_files_of_a_policy_named_almost_like_it(
+    config: Config,
+) -> None:
     settings = config(episodes=1, record="all", policy="pi0", steps=[2])
     other = settings.policies[0].model_copy(update={"name": "pi0_2", "steps": []})
     results = play(settings.model_copy(update={"policies": [*settings.policies, other]}))
@@ -74,7 +83,10 @@ def test_a_checkpoint_of_a_sweep_has_not_the_files_of_a_policy_named_almost_like
 def test_a_video_that_is_also_the_trajectorys_is_there_once(config: Config) -> None:
     results = play(config(episodes=1, record="all", video="all", env_options=CAMERA))
     [episode] = results.cells[0].episodes
-    paths = results.out / episode.videos[0], videos_of(results.out / str(episode.trajectory), ["front"])["front"]
+    paths = (
+        results.out / episode.videos[0],
+        videos_of(results.out / str(episode.trajectory), ["front"])["front"],
+    )
     assert os.path.samefile(*paths)
 
 
@@ -87,7 +99,9 @@ class Pushed(ToZero):
 
     def act(self, obs: Obs) -> Act:
         self.version += 1
-        return replace(super().act(obs), info={"policy": {"version": self.version, "fingerprint": "of a test"}})
+        return replace(
+            super().act(obs), info={"policy": {"version": self.version, "fingerprint": "of a test"}}
+        )
 
 
 def versions(config: EvalConfig, make: Callable[[], Agent]) -> list[int]:
@@ -99,15 +113,21 @@ def versions(config: EvalConfig, make: Callable[[], Agent]) -> list[int]:
     return list(map(int, found))
 
 
-def test_a_trajectory_names_the_weights_that_chose_each_action(config: Config, tmp_path: Path) -> None:
+def test_a_trajectory_names_the_weights_that_chose_each_action(
+    config: Config, tmp_path: Path
+) -> None:
     recorded = config(episodes=1, record="all")
     assert versions(recorded, Pushed) == [1, 1, 2, 2, 3, 3, 4, 4, 5, 5]
-    assert versions(config(episodes=1, record="all", out=tmp_path / "none"), ToZero) == [NO_VERSION] * 10
+    assert (
+        versions(config(episodes=1, record="all", out=tmp_path / "none"), ToZero)
+        == [NO_VERSION] * 10
+    )
 
 
 def test_what_is_executed_until_an_answer_comes_is_of_the_weights_before_it(config: Config) -> None:
     [suite] = config().suites
-    late = ClockConfig(latency=0.1, meanwhile="hold", align=False, neutral=[0.0])  # one step at 10 Hz
+    # One step at 10 Hz.
+    late = ClockConfig(latency=0.1, meanwhile="hold", align=False, neutral=[0.0])
     settings = config(episodes=1, record="all").model_copy(
         update={"suites": [suite.model_copy(update={"clock": late, "episodes": 1})]}
     )
@@ -139,7 +159,10 @@ def test_an_observation_that_lacks_a_part_of_the_state_is_the_simulators_failure
 def test_states_of_several_arms_and_a_gripper_survive_the_file(tmp_path: Path) -> None:
     recorder = TrajectoryRecorder()
     for i in range(3):
-        parts = {"left/joints": np.full(7, i, np.float32), "right/joints": np.full(6, -i, np.float32)}
+        parts = {
+            "left/joints": np.full(7, i, np.float32),
+            "right/joints": np.full(6, -i, np.float32),
+        }
         recorder.add_observation(Obs(gripper=i / 2, state=parts))
         if i < 2:
             recorder.add_action(np.full(13, i, np.float32), 0.5, i == 1)
@@ -206,7 +229,9 @@ def test_odd_sizes_are_made_even() -> None:
 
 def test_every_camera_has_its_video() -> None:
     with closing(VideoRecorder()) as recorder:
-        recorder.add_observation(Obs(cameras={"front": plain(COLOURS[0], 128, 128), "wrist": plain(COLOURS[1])}))
+        recorder.add_observation(
+            Obs(cameras={"front": plain(COLOURS[0], 128, 128), "wrist": plain(COLOURS[1])})
+        )
         videos = recorder.finish()
     sizes = {}
     for camera, video in videos.items():
@@ -220,7 +245,13 @@ def test_a_camera_that_changes_its_size_is_an_env_failure() -> None:
         record([plain(COLOURS[0]), plain(COLOURS[0], 32, 32)])
 
 
-CELL = EvalCase(PolicyConfig(name="act", steps=[20]), 20, SuiteConfig(name="unseen", envs=[ENV]), ENV, WorkerConfig())
+CELL = EvalCase(
+    PolicyConfig(name="act", steps=[20]),
+    20,
+    SuiteConfig(name="unseen", envs=[ENV]),
+    ENV,
+    WorkerConfig(),
+)
 
 
 def result(success: bool, status: str = "done") -> EpisodeResult:

@@ -1,4 +1,6 @@
-"""Disks that take no more: one sentence with the cure, and nothing recorded is lost; the code beside the results."""
+"""Disks that take no more: one sentence with the cure, and nothing recorded is lost; the code
+beside the results.
+"""
 
 from __future__ import annotations
 
@@ -66,7 +68,10 @@ def test_a_disk_is_full_for_sqlite_too(tmp_path: Path) -> None:
     with closing(sqlite3.connect(tmp_path / "x.db")) as db:
         db.executescript("CREATE TABLE t (x); PRAGMA max_page_count = 3;")
         with (
-            pytest.raises(StorageFailed, match=r"the disk is full \(database or disk is full\); make room; .*--resume"),
+            pytest.raises(
+                StorageFailed,
+                match=r"the disk is full \(database or disk is full\); make room; .*--resume",
+            ),
             storing(tmp_path),
         ):
             db.execute("INSERT INTO t VALUES (?)", ("x" * 100_000,))
@@ -85,12 +90,21 @@ def test_a_disk_is_full_for_sqlite_too(tmp_path: Path) -> None:
     ],
 )
 def test_what_a_disk_refuses_says_what_to_do(number: int, said: str, tmp_path: Path) -> None:
-    with pytest.raises(StorageFailed, match=f"^{re.escape(str(tmp_path))}: .*{said}"), storing(tmp_path):
+    with (
+        pytest.raises(StorageFailed, match=f"^{re.escape(str(tmp_path))}: .*{said}"),
+        storing(tmp_path),
+    ):
         raise OSError(number, os.strerror(number), str(tmp_path / "video.mp4"))
 
 
 @pytest.mark.parametrize(
-    "error", [FileNotFoundError(errno.ENOENT, "gone"), DeadlineExceeded("late"), ConnectionLost("lost"), TypeError("?")]
+    "error",
+    [
+        FileNotFoundError(errno.ENOENT, "gone"),
+        DeadlineExceeded("late"),
+        ConnectionLost("lost"),
+        TypeError("?"),
+    ],
 )
 def test_what_is_no_fault_of_the_disk_passes(error: Exception, tmp_path: Path) -> None:
     with pytest.raises(type(error)) as told, storing(tmp_path):
@@ -109,7 +123,9 @@ def test_what_was_half_written_gives_its_room_back(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
-def test_the_first_failure_is_the_one_that_is_told(config: Config, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_first_failure_is_the_one_that_is_told(
+    config: Config, monkeypatch: pytest.MonkeyPatch
+) -> None:
     def full(*_: object) -> None:
         raise OSError(errno.ENOSPC, "while a video was written")
 
@@ -122,7 +138,9 @@ def test_the_first_failure_is_the_one_that_is_told(config: Config, monkeypatch: 
         evaluate(config(workers=0), agent_factory=ToZero)
 
 
-def test_a_disk_that_fills_up_at_the_very_end_is_told(config: Config, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_disk_that_fills_up_at_the_very_end_is_told(
+    config: Config, monkeypatch: pytest.MonkeyPatch
+) -> None:
     def full(*_: object) -> None:
         raise OSError(errno.ENOSPC, "no space left")
 
@@ -141,7 +159,9 @@ def test_a_folder_that_is_a_file_is_one_sentence(config: Config, tmp_path: Path)
             Store(config(out=out))
 
 
-def test_a_file_system_without_locks_is_named(config: Config, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_file_system_without_locks_is_named(
+    config: Config, monkeypatch: pytest.MonkeyPatch
+) -> None:
     def no_locks(*_: object) -> None:
         raise OSError(errno.ENOSYS, "Function not implemented")
 
@@ -159,18 +179,26 @@ def one_sentence(done: subprocess.CompletedProcess[str]) -> str:
 
 @pytest.mark.hosts
 @pytest.mark.parametrize("size", ["64k", "300k", "600k"])  # nothing fits; some episodes do; most do
-def test_a_full_disk_costs_nothing_that_was_recorded(size: str, config: Config, tmp_path: Path) -> None:
+def test_a_full_disk_costs_nothing_that_was_recorded(
+    size: str, config: Config, tmp_path: Path
+) -> None:
     folder = tmp_path / "disk"
     folder.mkdir()
-    settings = config(out=folder / "out", episodes=150, video="all", env_options={"camera": [32, 32]})
+    settings = config(
+        out=folder / "out", episodes=150, video="all", env_options={"camera": [32, 32]}
+    )
     done = python_on(FULL, folder, UNTIL_FULL, settings.model_dump_json(), size=size)
-    assert re.search(r"StorageFailed: .*the disk is full .*; make room; .*--resume", one_sentence(done))
+    assert re.search(
+        r"StorageFailed: .*the disk is full .*; make room; .*--resume", one_sentence(done)
+    )
     assert "episodes 150 True" in done.stdout, done.stderr
     assert ("runs 2" in done.stdout) == (size != "64k")
 
 
 @pytest.mark.hosts
-def test_reports_merges_and_exports_tell_a_read_only_folder_alike(config: Config, tmp_path: Path) -> None:
+def test_reports_merges_and_exports_tell_a_read_only_folder_alike(
+    config: Config, tmp_path: Path
+) -> None:
     evaluate(config(workers=0), agent_factory=ToZero)
     out, target = str(config().out), tmp_path / "target"
     target.mkdir()
@@ -195,7 +223,9 @@ def test_each_difference_is_stored_once_under_its_digest(tmp_path: Path) -> None
     assert (path.name, path.read_bytes()) == (f"{'d' * 64}.diff", DIRTY.diff)
 
 
-def test_the_difference_of_a_policy_is_known_only_if_its_server_has_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_difference_of_a_policy_is_known_only_if_its_server_has_the_same(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     monkeypatch.setattr(storage, "code_of", lambda _target: DIRTY)
     assert policy_code({"policy": "noop", "code": DIRTY.to_json()}) is DIRTY
     assert policy_code({"policy": "noop", "code": CLEAN.to_json()}) is None

@@ -28,7 +28,9 @@ class PhysicsError(RuntimeError):
 
 
 EXPLOSIONS: dict[str, Exception] = {  # by which simulators tell that they diverged
-    "MuJoCo": RuntimeError("Nan, Inf or huge value in QACC at DOF 0. The simulation is unstable. Time = 0.0020."),
+    "MuJoCo": RuntimeError(
+        "Nan, Inf or huge value in QACC at DOF 0. The simulation is unstable. Time = 0.0020."
+    ),
     "dm_control": PhysicsError("Physics state is invalid. Warning(s) raised: mjWARN_BADQACC"),
     "numpy": FloatingPointError("overflow encountered in multiply"),
     "linear algebra": np.linalg.LinAlgError("Eigenvalues did not converge"),
@@ -60,7 +62,9 @@ class Fragile(EvalEnv):
         number = float(self._seed)
         if abs(act.action[0]) > _LIMIT:
             if self._trouble == "refuses":
-                raise InvalidAction(f"action: got {act.action[0]}, want a finite number of at most {_LIMIT}")
+                raise InvalidAction(
+                    f"action: got {act.action[0]}, want a finite number of at most {_LIMIT}"
+                )
             if self._trouble in EXPLOSIONS:
                 raise EXPLOSIONS[self._trouble]
             if self._trouble == "raises":
@@ -77,7 +81,9 @@ class Fragile(EvalEnv):
         pass
 
     def _look(self, number: float | None = None, width: int = 1) -> Obs:
-        return Obs(state={"seed": np.full(width, self._seed if number is None else number, np.float32)})
+        return Obs(
+            state={"seed": np.full(width, self._seed if number is None else number, np.float32)}
+        )
 
 
 class InOneSimulator(SequentialBatch):
@@ -98,7 +104,9 @@ class FragileTogether(Fragile):
 
 
 class Extreme(Agent):
-    """Exceeds the limit in the third step of each third episode, and always in another way if it is `restless`."""
+    """Exceeds the limit in the third step of each third episode, and always in another way if it
+    is `restless`.
+    """
 
     def __init__(self, restless: bool = False) -> None:
         self._restless, self._steps, self._extreme = restless, 0, 10.0
@@ -125,9 +133,15 @@ class Extreme(Agent):
 def run(config: Config, tmp_path: Any) -> Callable[..., Summary]:
     def play(trouble: str, num_envs: int = 1, **options: Any) -> Summary:
         settings = flat_config(
-            env_options={"trouble": trouble}, episodes=EPISODES, num_envs=num_envs, workers=0,
-            video="none", out=tmp_path / f"{num_envs}", abort_after=0, **{"envs": [NAME], "retries": 1, **options},
-        )  # fmt: skip
+            env_options={"trouble": trouble},
+            episodes=EPISODES,
+            num_envs=num_envs,
+            workers=0,
+            video="none",
+            out=tmp_path / f"{num_envs}",
+            abort_after=0,
+            **{"envs": [NAME], "retries": 1, **options},
+        )
         return evaluate(settings, agent_factory=Extreme)
 
     return play
@@ -136,13 +150,19 @@ def run(config: Config, tmp_path: Any) -> Callable[..., Summary]:
 def outcomes(summary: Summary) -> dict[int, tuple[object, ...]]:
     """Status, success and actions of each episode, by its number."""
     return {
-        one.result.key.episode: (one.result.status, one.result.success_once, one.result.actions_sha256)
+        one.result.key.episode: (
+            one.result.status,
+            one.result.success_once,
+            one.result.actions_sha256,
+        )
         for one in summary.results.cells[0].episodes
     }
 
 
 @pytest.mark.parametrize("trouble", TROUBLES)
-def test_an_episode_that_fails_leaves_those_beside_it_as_they_are(run: Callable[..., Summary], trouble: str) -> None:
+def test_an_episode_that_fails_leaves_those_beside_it_as_they_are(
+    run: Callable[..., Summary], trouble: str
+) -> None:
     alone = outcomes(run(trouble))
     assert len(alone) == EPISODES
     assert {episode for episode, (status, *_) in alone.items() if status != "done"} == {1, 4, 7}
@@ -168,9 +188,17 @@ def test_a_simulation_that_diverges_again_under_the_same_actions_is_a_failure_of
 ) -> None:
     summary = run(trouble, num_envs)
     [group] = summary.cells
-    assert (group.success_once.successes, group.success_once.episodes, group.infra_failures) == (5, EPISODES, 0)
-    failed = [one.result for one in summary.results.cells[0].episodes if one.result.status != "done"]
-    assert {(one.status, one.steps, one.success_once) for one in failed} == {("policy_error", 3, False)}
+    assert (group.success_once.successes, group.success_once.episodes, group.infra_failures) == (
+        5,
+        EPISODES,
+        0,
+    )
+    failed = [
+        one.result for one in summary.results.cells[0].episodes if one.result.status != "done"
+    ]
+    assert {(one.status, one.steps, one.success_once) for one in failed} == {
+        ("policy_error", 3, False)
+    }
     assert all("diverged, and again under the same actions" in str(one.error) for one in failed)
     assert len(summary.results.cells[0].attempts) == 3, "the first attempt at each"
 
@@ -179,18 +207,29 @@ def test_a_simulation_that_diverges_under_other_actions_is_lost_and_bounds_stand
     config: Config, tmp_path: Any
 ) -> None:
     settings = flat_config(
-        envs=[NAME], env_options={"trouble": "diverges"}, episodes=EPISODES, workers=0, video="none",
-        out=tmp_path / "out", retries=1,
-    )  # fmt: skip
+        envs=[NAME],
+        env_options={"trouble": "diverges"},
+        episodes=EPISODES,
+        workers=0,
+        video="none",
+        out=tmp_path / "out",
+        retries=1,
+    )
     summary = evaluate(settings, agent_factory=lambda: Extreme(restless=True))
     [group] = summary.cells
-    assert (group.success_once.successes, group.success_once.episodes, group.infra_failures) == (5, 5, 3)
+    assert (group.success_once.successes, group.success_once.episodes, group.infra_failures) == (
+        5,
+        5,
+        3,
+    )
     assert group.with_lost(group.success_once) == (5 / 8, 1.0)
     assert summary.to_json()["cells"][0]["with_lost"]["success_once"] == (5 / 8, 1.0)
     page = write_report(summary.results, tmp_path / "page.html").read_text()
     assert "62.5 to 100.0" in page
 
 
-def test_a_simulator_that_raises_is_lost_and_not_a_failure_of_the_policy(run: Callable[..., Summary]) -> None:
+def test_a_simulator_that_raises_is_lost_and_not_a_failure_of_the_policy(
+    run: Callable[..., Summary],
+) -> None:
     [group] = run("raises").cells
     assert (group.success_once.episodes, group.infra_failures) == (5, 3)

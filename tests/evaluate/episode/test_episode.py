@@ -11,7 +11,14 @@ from in_process_episode import run_episode
 
 from vlagents_ray.contract import ActionSpec, CameraSpec, Contract, StateSpec
 from vlagents_ray.envs import EvalEnv
-from vlagents_ray.errors import ConnectionLost, ContractMismatch, EnvFailed, InvalidAction, PolicyFailed, UnknownSession
+from vlagents_ray.errors import (
+    ConnectionLost,
+    ContractMismatch,
+    EnvFailed,
+    InvalidAction,
+    PolicyFailed,
+    UnknownSession,
+)
 from vlagents_ray.evaluate.plan.jobs import EpisodeKey
 from vlagents_ray.interface import Act, Agent, Obs
 
@@ -23,7 +30,9 @@ class Script(EvalEnv):
 
     max_steps = 6
 
-    def __init__(self, solved: tuple[int, ...] = (), terminates_at: int | None = None, obs: Obs | None = None) -> None:
+    def __init__(
+        self, solved: tuple[int, ...] = (), terminates_at: int | None = None, obs: Obs | None = None
+    ) -> None:
         self.solved, self.terminates_at = solved, terminates_at
         self.obs = obs or Obs()
         self.actions: list[list[float]] = []
@@ -37,14 +46,22 @@ class Script(EvalEnv):
     def instruction(self) -> str:
         return "do it"
 
-    def reset(self, *, seed: int, options: Mapping[str, Any] | None = None) -> tuple[Obs, dict[str, Any]]:
+    def reset(
+        self, *, seed: int, options: Mapping[str, Any] | None = None
+    ) -> tuple[Obs, dict[str, Any]]:
         self.resets.append((seed, options))
         return self.obs, {}
 
     def step(self, act: Act) -> tuple[Obs, float, bool, bool, dict[str, Any]]:
         self.actions.append(act.action.tolist())
         n = len(self.actions)
-        return self.obs, 0.5, n == self.terminates_at, n == self.max_steps, {"success": n in self.solved}
+        return (
+            self.obs,
+            0.5,
+            n == self.terminates_at,
+            n == self.max_steps,
+            {"success": n in self.solved},
+        )
 
     def close(self) -> None:
         self.actions = []
@@ -74,7 +91,9 @@ ROW = [1.0, 2.0]
 CHUNK = [[1.0, 0.0], [2.0, 0.0], [3.0, 0.0]]
 
 
-@pytest.mark.parametrize(("execute", "rows", "acts"), [(None, [1, 2, 3] * 2, 2), (2, [1, 2] * 3, 3)])
+@pytest.mark.parametrize(
+    ("execute", "rows", "acts"), [(None, [1, 2, 3] * 2, 2), (2, [1, 2] * 3, 3)]
+)
 def test_a_chunk_or_its_first_rows_are_executed_without_asking_again(
     execute: int | None, rows: list[int], acts: int
 ) -> None:
@@ -94,7 +113,8 @@ class Endless(Script):
 @pytest.mark.parametrize(
     ("env", "answers", "steps", "ending"),
     [
-        (Script(), [ROW, Act(np.asarray(CHUNK, np.float32), done=True)], 4, "policy_done"),  # after its rows
+        # After its rows.
+        (Script(), [ROW, Act(np.asarray(CHUNK, np.float32), done=True)], 4, "policy_done"),
         (Script(terminates_at=2), [CHUNK], 2, "terminated"),  # within a chunk
         (Script(), [ROW] * 6, 6, "truncated"),
         (Endless(), [ROW] * 9, 6, "truncated"),
@@ -134,13 +154,20 @@ def test_a_further_task_begins_the_policy_anew_in_the_middle_of_a_chunk() -> Non
     assert agent.resets == [("task 0", 0), ("task 1", 2), ("task 2", 4)]
     assert [obs.info.get("step", 0) for obs in agent.seen] == [0, 2, 4]
     assert env.actions == [[1, 0], [2, 0]] * 2 + [[1, 0]]
-    assert (result.instruction, result.steps, result.ending) == ("task 0; task 1; task 2", 5, "terminated")
+    assert (result.instruction, result.steps, result.ending) == (
+        "task 0; task 1; task 2",
+        5,
+        "terminated",
+    )
 
 
 @pytest.mark.parametrize(
-    ("solved", "once", "at_end"), [((), False, False), ((2,), True, False), ((2, 6), True, True), ((6,), True, True)]
+    ("solved", "once", "at_end"),
+    [((), False, False), ((2,), True, False), ((2, 6), True, True), ((6,), True, True)],
 )
-def test_success_once_and_at_the_end_are_told_apart(solved: tuple[int, ...], once: bool, at_end: bool) -> None:
+def test_success_once_and_at_the_end_are_told_apart(
+    solved: tuple[int, ...], once: bool, at_end: bool
+) -> None:
     result = run_episode(Script(solved), Chunks(*[ROW] * 6), KEY)
     assert (result.success_once, result.success_at_end) == (once, at_end)
 
@@ -180,7 +207,12 @@ def test_a_policy_that_fails_ends_its_episode_without_success(answer: Any, code:
 @pytest.mark.parametrize("where", ["step", "contract"])
 @pytest.mark.parametrize(
     "error",
-    [RuntimeError("physics exploded"), SystemExit("an asset is missing"), PolicyFailed("mine"), UnknownSession("who")],
+    [
+        RuntimeError("physics exploded"),
+        SystemExit("an asset is missing"),
+        PolicyFailed("mine"),
+        UnknownSession("who"),
+    ],
 )
 def test_whatever_a_simulator_raises_is_an_env_failure(
     error: BaseException, where: str, monkeypatch: pytest.MonkeyPatch
@@ -211,22 +243,33 @@ FRONT = {"front": np.zeros((4, 4, 3), np.uint8)}
 
 
 class Stated(Script):
-    """Returns `after` from the second step on, or `before` from its reset; its contract states what it gives."""
+    """Returns `after` from the second step on, or `before` from its reset; its contract states
+    what it gives.
+    """
 
-    def __init__(self, *, after: tuple[Any, ...] | None = None, before: Any = None, words: Any = "do it") -> None:
+    def __init__(
+        self, *, after: tuple[Any, ...] | None = None, before: Any = None, words: Any = "do it"
+    ) -> None:
         super().__init__(obs=Obs(dict(FRONT), 0.5, dict(JOINTS)))
         self.after, self.before, self.words = after, before, words
 
     @property
     def contract(self) -> Contract:
-        return Contract({"front": CameraSpec(4, 4)}, {"joints": StateSpec(6)}, gripper=True, action=ActionSpec(dim=2))
+        return Contract(
+            {"front": CameraSpec(4, 4)},
+            {"joints": StateSpec(6)},
+            gripper=True,
+            action=ActionSpec(dim=2),
+        )
 
     @property
     def instruction(self) -> str:
         text: str = self.words
         return text
 
-    def reset(self, *, seed: int, options: Mapping[str, Any] | None = None) -> tuple[Obs, dict[str, Any]]:
+    def reset(
+        self, *, seed: int, options: Mapping[str, Any] | None = None
+    ) -> tuple[Obs, dict[str, Any]]:
         answer: tuple[Obs, dict[str, Any]] = self.before or super().reset(seed=seed)
         return answer
 
@@ -255,18 +298,26 @@ SOLVED = {"success": True}
         (Obs(dict(FRONT), 0.5, dict(JOINTS), info=None), "NoneType as the observation's info"),  # type: ignore[arg-type]
     ],
 )
-def test_an_observation_that_is_none_is_the_envs_failure_and_never_the_policys(obs: Any, said: str) -> None:
+def test_an_observation_that_is_none_is_the_envs_failure_and_never_the_policys(
+    obs: Any, said: str
+) -> None:
     with pytest.raises(EnvFailed, match=f"env step: .*{said}"):
         run_episode(Stated(after=(obs, 0.0, False, False, SOLVED)), Chunks(*[ROW] * 6), KEY)
-    # A first observation that does not fit would not fit at a second attempt; a number that is not finite might.
-    with pytest.raises(EnvFailed if said == "got NaN" else ContractMismatch, match=f"env reset: .*{said}"):
+    # A first observation that does not fit would not fit at a second attempt; a number that is not
+    # finite might.
+    with pytest.raises(
+        EnvFailed if said == "got NaN" else ContractMismatch, match=f"env reset: .*{said}"
+    ):
         run_episode(Stated(before=(obs, {})), Chunks(*[ROW] * 6), KEY)
 
 
 @pytest.mark.parametrize(
     ("answer", "said"),
     [
-        ((GOOD, 0.0, False, False, {"success": "yes"}), "got 'yes' as info\\['success'\\], want a bool"),
+        (
+            (GOOD, 0.0, False, False, {"success": "yes"}),
+            "got 'yes' as info\\['success'\\], want a bool",
+        ),
         ((GOOD, 0.0, False, False, {"success": None}), "got None as info"),
         ((GOOD, 0.0, False, False, {"success": 0.7}), "got 0.7 as info"),
         ((GOOD, 0.0, False, False, None), "got NoneType as info, want 'success' among it"),
@@ -297,7 +348,8 @@ def test_a_number_that_is_a_bool_is_one(success: Any) -> None:
 
 
 @pytest.mark.parametrize(
-    ("images", "looked_at"), [(True, [True] * 6), (False, [False, False, True, False, False, False])]
+    ("images", "looked_at"),
+    [(True, [True] * 6), (False, [False, False, True, False, False, False])],
 )
 def test_images_may_be_left_out_where_nobody_looks(images: bool, looked_at: list[bool]) -> None:
     told: list[bool] = []
@@ -311,10 +363,14 @@ def test_images_may_be_left_out_where_nobody_looks(images: bool, looked_at: list
     assert run_episode(Sparing(), Chunks(CHUNK, CHUNK), KEY, images=images).status == "done"
     assert told == looked_at
     with pytest.raises(EnvFailed, match="camera 'front' is missing"):
-        run_episode(Stated(after=(replace(GOOD, cameras={}), 0.0, False, False, SOLVED)), Chunks(CHUNK), KEY)
+        run_episode(
+            Stated(after=(replace(GOOD, cameras={}), 0.0, False, False, SOLVED)), Chunks(CHUNK), KEY
+        )
 
 
-def test_the_result_says_which_checkpoint_and_weights_played_and_how_long_each_side_was_busy() -> None:
+def test_the_result_says_which_checkpoint_and_weights_played_and_how_long_each_side_was_busy() -> (
+    None
+):
     """A server says how long a batch took, of which each answer has its part."""
 
     class Served(Chunks):

@@ -46,7 +46,8 @@ def clock(**settings: Any) -> ClockConfig:
         (4, {}, RELATIVE, [(0.2, [0, 0, 1, 2, 3, 4]), (0.2, [5, 6, 3, 4]), (0.3, [5, 6, 0, 3, 4])]),
         # Where actions are absolute, the last one is held.
         (4, {"neutral": [9, 9]}, ABSOLUTE, [(0.2, [9, 9, 1, 2, 3, 4]), (0.4, [5, 6, 6, 6, 3, 4])]),
-        # Where holding goes on moving, it is in place of the rows; before the first answer nothing moves.
+        # Where holding goes on moving, it is in place of the rows; before the first answer nothing
+        # moves.
         (
             None,
             {"meanwhile": "hold"},
@@ -56,14 +57,20 @@ def clock(**settings: Any) -> ClockConfig:
     ],
 )
 def test_what_is_executed_until_an_answer_comes_and_of_it(
-    execute: int | None, settings: dict[str, Any], env: Contract, answers: list[tuple[float, list[int]]]
+    execute: int | None,
+    settings: dict[str, Any],
+    env: Contract,
+    answers: list[tuple[float, list[int]]],
 ) -> None:
     player = ChunkExecutor(execute, clock(**settings), env)
-    assert [played(player, latency_s) for latency_s, _ in answers] == [executed for _, executed in answers]
+    assert [played(player, latency_s) for latency_s, _ in answers] == [
+        executed for _, executed in answers
+    ]
 
 
 @pytest.mark.parametrize(
-    ("meanwhile", "env"), [("chunk", RELATIVE), ("zero", RELATIVE), ("chunk", ABSOLUTE), ("hold", ABSOLUTE)]
+    ("meanwhile", "env"),
+    [("chunk", RELATIVE), ("zero", RELATIVE), ("chunk", ABSOLUTE), ("hold", ABSOLUTE)],
 )
 def test_no_row_is_dropped_for_ticks_at_which_the_robot_held(meanwhile: str, env: Contract) -> None:
     player = ChunkExecutor(None, clock(meanwhile=meanwhile, neutral=[0, 0]), env)
@@ -114,7 +121,14 @@ def test_what_a_clock_lacks_is_named() -> None:
 
 
 @pytest.mark.parametrize(
-    "wrong", [{"latency": -1}, {"latency": float("inf")}, {"latency": "guessed"}, {"meanwhile": "dance"}, {"hz": 0}]
+    "wrong",
+    [
+        {"latency": -1},
+        {"latency": float("inf")},
+        {"latency": "guessed"},
+        {"meanwhile": "dance"},
+        {"hz": 0},
+    ],
 )
 def test_a_clock_that_cannot_be_is_refused(wrong: dict[str, Any]) -> None:
     with pytest.raises(ValidationError):
@@ -152,7 +166,9 @@ def test_an_answer_later_than_the_rows_it_was_given_is_dropped() -> None:
 
 
 def episode(seed: int, timing: ClockConfig | None, execute: int | None = None) -> EpisodeResult:
-    return run_episode(Line(), ToZero(chunk=6), EpisodeKey("line", 0, seed, "0"), clock=timing, execute=execute)
+    return run_episode(
+        Line(), ToZero(chunk=6), EpisodeKey("line", 0, seed, "0"), clock=timing, execute=execute
+    )
 
 
 def outcome(result: EpisodeResult) -> dict[str, Any]:
@@ -168,9 +184,16 @@ def test_without_latency_it_is_the_synchronous_episode(meanwhile: Any, execute: 
 
 def test_latency_lowers_success_and_repeats_exactly() -> None:
     timing = ClockConfig(latency=0.5, meanwhile="hold", neutral=[0])
-    synchronous, late, again = ([episode(seed, clock, 1) for seed in range(40)] for clock in (None, timing, timing))
-    assert sum(bool(one.success_once) for one in synchronous) > 2 * sum(bool(one.success_once) for one in late)
-    assert all(one.latency_ms == pytest.approx(500) and one.ticks_waited >= 5 * (one.acts - 1) for one in late)
+    synchronous, late, again = (
+        [episode(seed, clock, 1) for seed in range(40)] for clock in (None, timing, timing)
+    )
+    assert sum(bool(one.success_once) for one in synchronous) > 2 * sum(
+        bool(one.success_once) for one in late
+    )
+    assert all(
+        one.latency_ms == pytest.approx(500) and one.ticks_waited >= 5 * (one.acts - 1)
+        for one in late
+    )
     assert [outcome(one) for one in again] == [outcome(one) for one in late]
 
 
@@ -198,7 +221,9 @@ def test_an_episode_never_has_more_steps_than_its_env_allows(
     latency: float, rows: int, execute: int | None, meanwhile: Any, align: bool
 ) -> None:
     timing = ClockConfig(latency=latency, meanwhile=meanwhile, align=align, neutral=[0])
-    result = run_episode(Line(), ToZero(chunk=rows), EpisodeKey("line", 0, 1, "0"), execute=execute, clock=timing)
+    result = run_episode(
+        Line(), ToZero(chunk=rows), EpisodeKey("line", 0, 1, "0"), execute=execute, clock=timing
+    )
     assert result.steps <= Line.max_steps
     assert result.ticks_held <= result.ticks_waited <= result.steps
     assert not rows > 1 or latency > 0 or result.ticks_waited == 0

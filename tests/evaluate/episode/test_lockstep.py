@@ -51,13 +51,22 @@ def untimed(results: Sequence[EpisodeResult | VLAgentsError]) -> list[EpisodeRes
     return timeless
 
 
-def together(env: BatchEnv, agent: Agent, wanted: Sequence[EpisodeKey], *, images: bool = True, **settings: Any) -> Any:
+def together(
+    env: BatchEnv,
+    agent: Agent,
+    wanted: Sequence[EpisodeKey],
+    *,
+    images: bool = True,
+    **settings: Any,
+) -> Any:
     sessions = [copy.deepcopy(agent) for _ in wanted]
     return run_episodes(env, agent, sessions, wanted, **settings, images=images)
 
 
 @pytest.mark.parametrize("execute", [None, 2])
-@pytest.mark.parametrize("agent", [Scripted(), Random(), ToZero(chunk=3)], ids=lambda agent: type(agent).__name__)
+@pytest.mark.parametrize(
+    "agent", [Scripted(), Random(), ToZero(chunk=3)], ids=lambda agent: type(agent).__name__
+)
 def test_results_are_those_of_episodes_played_alone(agent: Agent, execute: int | None) -> None:
     on_line = isinstance(agent, ToZero)
     wanted = keys("line" if on_line else "tabletop", 4)
@@ -65,7 +74,8 @@ def test_results_are_those_of_episodes_played_alone(agent: Agent, execute: int |
     others = [Line() if on_line else Tabletop(**SIZE, max_steps=50) for _ in wanted]
     agent.initialize()
     expected = [run_episode(alone, copy.deepcopy(agent), key, execute=execute) for key in wanted]
-    assert len({result.steps for result in expected}) > (isinstance(agent, Scripted))  # they do not end at one time
+    # They do not end at one time.
+    assert len({result.steps for result in expected}) > (isinstance(agent, Scripted))
     with SequentialBatch(others) as env:
         assert untimed(together(env, agent, wanted, execute=execute)) == untimed(expected)
 
@@ -123,7 +133,9 @@ def test_a_lost_session_stands_in_place_of_its_result_alone() -> None:
     with SequentialBatch([Line() for _ in wanted]) as env:
         results = together(env, Odd(wanted[0].seed, ConnectionLost("gone")), wanted)
     assert isinstance(results[0], ConnectionLost)
-    assert untimed(results[1:]) == untimed([run_episode(Line(), ToZero(), key) for key in wanted[1:]])
+    assert untimed(results[1:]) == untimed(
+        [run_episode(Line(), ToZero(), key) for key in wanted[1:]]
+    )
 
 
 @pytest.mark.parametrize(
@@ -159,7 +171,11 @@ def test_initial_states_go_by_the_episodes_number_and_the_user_before_them() -> 
 
     envs = [Fixed() for _ in range(3)]
     together(SequentialBatch(envs), ToZero(), keys("line", 3))
-    assert [env.begun for env in envs] == [[100, {"init_state": 0}], [107, {"init_state": 1}], [114, {"init_state": 0}]]
+    assert [env.begun for env in envs] == [
+        [100, {"init_state": 0}],
+        [107, {"init_state": 1}],
+        [114, {"init_state": 0}],
+    ]
     together(SequentialBatch(envs), ToZero(), keys("line", 3), reset_options={"init_state": 1})
     assert all(env.begun[1] == {"init_state": 1} for env in envs)
 
@@ -187,7 +203,10 @@ def test_a_missing_image_is_never_anothers() -> None:
             obs, *rest = super().step(act)
             return replace(obs, cameras={}), *rest
 
-    with SequentialBatch([Line(camera=(4, 4)), Blind(camera=(4, 4))]) as env, pytest.raises(EnvFailed, match="front"):
+    with (
+        SequentialBatch([Line(camera=(4, 4)), Blind(camera=(4, 4))]) as env,
+        pytest.raises(EnvFailed, match="front"),
+    ):
         together(env, ToZero(), keys("line", 2))
 
 

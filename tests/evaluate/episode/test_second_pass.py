@@ -33,12 +33,20 @@ class Altered(Line):
         if self._what == "image":
             obs = replace(obs, cameras={"front": obs.cameras["front"] ^ 1})
         if self._what == "state":
-            obs = replace(obs, state={"position": np.nextafter(obs.state["position"], np.float32(100))})
+            obs = replace(
+                obs, state={"position": np.nextafter(obs.state["position"], np.float32(100))}
+            )
         if self._what == "gripper":
             obs = replace(obs, gripper=0.5)
         if self._what == "success":
             info = {"success": True}
-        return obs, np.nextafter(reward, 0.0) if self._what == "reward" else reward, terminated, truncated, info
+        return (
+            obs,
+            np.nextafter(reward, 0.0) if self._what == "reward" else reward,
+            terminated,
+            truncated,
+            info,
+        )
 
 
 def once(env: EvalEnv, left_out: int | None = None) -> PlayedEpisode:

@@ -1,4 +1,6 @@
-"""Settings, cases and jobs: what is planned, under which keys, and in which order workers take it."""
+"""Settings, cases and jobs: what is planned, under which keys, and in which order workers take
+it.
+"""
 
 from __future__ import annotations
 
@@ -33,7 +35,10 @@ def keys(config: EvalConfig) -> list[EpisodeKey]:
 def test_a_plan_numbers_and_seeds_every_episode_of_every_env(config: Config) -> None:
     found = keys(config(envs=[LINE, OTHER_LINE], episodes=2, seeds=[7, 100]))
     assert [(key.env, key.episode, key.seed) for key in found] == [
-        (env, episode, seed + episode) for env in (LINE, OTHER_LINE) for seed in (7, 100) for episode in (0, 1)
+        (env, episode, seed + episode)
+        for env in (LINE, OTHER_LINE)
+        for seed in (7, 100)
+        for episode in (0, 1)
     ]
     assert len(set(map(str, found))) == 8
 
@@ -42,14 +47,20 @@ def test_pushed_weights_are_a_checkpoint_and_part_of_the_key(config: Config) -> 
     usual = config(episodes=2)
 
     def pushed(fingerprint: str) -> EvalConfig:
-        given = usual.policies[0].model_dump() | {"pushed_weights": {"version": 3, "fingerprint": fingerprint}}
+        given = usual.policies[0].model_dump() | {
+            "pushed_weights": {"version": 3, "fingerprint": fingerprint}
+        }
         return usual.model_copy(update={"policies": [PolicyConfig.model_validate(given)]})
 
     [cell] = cells(pushed("a"))
-    assert (cell.contender, cell.policy_options) == ("policy@3", {}), "the policy is asked for no checkpoint"
+    assert (cell.contender, cell.policy_options) == ("policy@3", {}), (
+        "the policy is asked for no checkpoint"
+    )
     assert len({str(key) for one in (usual, pushed("a"), pushed("b")) for key in keys(one)}) == 6
     with pytest.raises(ValueError, match="got steps and pushed_weights, want one of them"):
-        PolicyConfig.model_validate({"steps": [1], "pushed_weights": {"version": 1, "fingerprint": "a"}})
+        PolicyConfig.model_validate(
+            {"steps": [1], "pushed_weights": {"version": 1, "fingerprint": "a"}}
+        )
 
 
 def test_a_sweep_plays_checkpoint_by_checkpoint(config: Config) -> None:
@@ -60,9 +71,14 @@ def test_a_sweep_plays_checkpoint_by_checkpoint(config: Config) -> None:
         ("policy@20", LINE),
         ("policy@20", OTHER_LINE),
     ]
-    assert [job.cell.policy_options for job in jobs[::2]] == [{"checkpoint_step": 10}, {"checkpoint_step": 20}]
+    assert [job.cell.policy_options for job in jobs[::2]] == [
+        {"checkpoint_step": 10},
+        {"checkpoint_step": 20},
+    ]
     assert len({str(job.key) for job in jobs}) == 4
-    assert jobs[0].cell.place == jobs[2].cell.place, "checkpoints share the env that a worker has made"
+    assert jobs[0].cell.place == jobs[2].cell.place, (
+        "checkpoints share the env that a worker has made"
+    )
 
 
 @pytest.mark.parametrize(
@@ -95,7 +111,9 @@ def test_what_changes_the_outcome_changes_the_key(config: Config, change: dict[s
         {"codec": "lossless"},
     ],
 )
-def test_what_does_not_change_the_outcome_keeps_the_key(config: Config, change: dict[str, Any]) -> None:
+def test_what_does_not_change_the_outcome_keeps_the_key(
+    config: Config, change: dict[str, Any]
+) -> None:
     assert keys(config()) == keys(config(**change))
 
 
@@ -103,10 +121,15 @@ def test_what_does_not_change_the_outcome_keeps_the_key(config: Config, change: 
     ("second", "said"),
     [
         ({"envs": [LINE], "env_options": {"width": 8}}, "are in two suites of one name"),
-        ({"name": "all", "envs": [LINE, OTHER_LINE], "seeds": [100]}, "stand in two suites with the same settings"),
+        (
+            {"name": "all", "envs": [LINE, OTHER_LINE], "seeds": [100]},
+            "stand in two suites with the same settings",
+        ),
     ],
 )
-def test_an_env_in_two_suites_of_one_name_or_that_do_not_differ_is_refused(second: dict[str, Any], said: str) -> None:
+def test_an_env_in_two_suites_of_one_name_or_that_do_not_differ_is_refused(
+    second: dict[str, Any], said: str
+) -> None:
     suites = [SuiteConfig(envs=[LINE]), SuiteConfig.model_validate(second)]
     with pytest.raises(ConfigError, match=said):
         cells(EvalConfig(policies=[PolicyConfig()], suites=suites, out=Path("out")))
@@ -186,10 +209,17 @@ def test_episodes_side_by_side_are_of_one_cell() -> None:
     jobs = jobs_of(LINE, 5, steps=[1, 2], num_envs=3)
     queue = JobQueue(jobs)
     kind = jobs[0].cell.kind
-    assert queue.needs_worker({}, {kind: 3}) is not None, "ten episodes, three at a time, are for four workers"
+    assert queue.needs_worker({}, {kind: 3}) is not None, (
+        "ten episodes, three at a time, are for four workers"
+    )
     assert queue.needs_worker({}, {kind: 4}) is None
     taken = [queue.take(kind, None, Counter()) for _ in range(4)]
-    assert [[job.cell.step for job in some] for some in taken] == [[1, 1, 1], [1, 1], [2, 2, 2], [2, 2]]
+    assert [[job.cell.step for job in some] for some in taken] == [
+        [1, 1, 1],
+        [1, 1],
+        [2, 2, 2],
+        [2, 2],
+    ]
 
 
 def test_a_range_of_steps_includes_the_last(config: Config) -> None:
@@ -216,7 +246,9 @@ def test_numbers_that_json_lacks_are_refused(value: Any) -> None:
 
 def test_a_batch_has_no_latency_to_measure() -> None:
     assert SuiteConfig(envs=["line"], num_envs=2, clock=ClockConfig(latency=0.1)).clock is not None
-    with pytest.raises(ValidationError, match="of the whole batch; want 1, or a latency in seconds"):
+    with pytest.raises(
+        ValidationError, match="of the whole batch; want 1, or a latency in seconds"
+    ):
         SuiteConfig(envs=["line"], num_envs=2, clock=ClockConfig())
 
 
@@ -225,10 +257,18 @@ def test_a_batch_has_no_latency_to_measure() -> None:
     [
         ({"wokers": 3}, "wokers"),
         ({"envs": ["a", "b", "a"]}, "named twice"),
-        ({"policies": [{"name": "a", "url": "http://x"}, {"name": "a", "url": "http://y"}]}, "two policies are named"),
-        ({"policy_options": {"seed": 3, "checkpoint_step": 20}}, r"\['seed'\] are set episode by episode"),
+        (
+            {"policies": [{"name": "a", "url": "http://x"}, {"name": "a", "url": "http://y"}]},
+            "two policies are named",
+        ),
+        (
+            {"policy_options": {"seed": 3, "checkpoint_step": 20}},
+            r"\['seed'\] are set episode by episode",
+        ),
     ],
 )
-def test_settings_that_cannot_be_are_refused(config: Config, wrong: dict[str, Any], said: str) -> None:
+def test_settings_that_cannot_be_are_refused(
+    config: Config, wrong: dict[str, Any], said: str
+) -> None:
     with pytest.raises(ValidationError, match=said):
         config(**wrong)

@@ -1,4 +1,6 @@
-"""Comparisons over whole families: the chance of any wrong decision, and episodes of several clocks."""
+"""Comparisons over whole families: the chance of any wrong decision, and episodes of several
+clocks.
+"""
 
 from __future__ import annotations
 
@@ -43,14 +45,22 @@ def _episode(number: int, *, solved: bool) -> Episode:
 
 
 def _equal_policies(number: int, *, sweep: bool, random: np.random.Generator) -> Results:
-    """Return results of policy ids that all solve half of the episodes: policies, or checkpoints of one policy."""
+    """Return results of policy ids that all solve half of the episodes: policies, or checkpoints
+    of one policy.
+    """
     cells = []
     for index, outcomes in enumerate(random.random((number, EPISODES)) < 0.5):
         name, step = ("learner", 100 * (index + 1)) if sweep else (f"policy{index}", None)
-        episodes = tuple(_episode(episode, solved=bool(solved)) for episode, solved in enumerate(outcomes))
+        episodes = tuple(
+            _episode(episode, solved=bool(solved)) for episode, solved in enumerate(outcomes)
+        )
         settings = {"policy": name, "checkpoint": step, "env": LINE, "clock": None}
         identity = ({}, {}, {}, {})
-        cells.append(CellResults(f"cell{index}", name, step, "", LINE, EPISODES, settings, *identity, episodes, ()))
+        cells.append(
+            CellResults(
+                f"cell{index}", name, step, "", LINE, EPISODES, settings, *identity, episodes, ()
+            )
+        )
     run = Run(1, 0.0, 1.0, "complete", {}, {})
     return Results(Path("/nowhere"), tuple(cells), (run,), {})
 
@@ -68,7 +78,9 @@ def _equal_policies(number: int, *, sweep: bool, random: np.random.Generator) ->
 def test_equal_policies_are_told_apart_in_five_percent_of_evaluations_at_most(
     number: int, most_pairs: int, most_compared: int, sweep: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """On either side of each constant, as the pairs that are shown are chosen by their outcomes on one of them."""
+    """On either side of each constant, as the pairs that are shown are chosen by their outcomes
+    on one of them.
+    """
     monkeypatch.setattr(success, "MOST_PAIRS", most_pairs)
     monkeypatch.setattr(success, "MOST_COMPARED", most_compared)
     random = np.random.default_rng(number)
@@ -89,15 +101,26 @@ def test_the_page_decides_by_the_adjusted_p_values(monkeypatch: pytest.MonkeyPat
         summary = summarize(_equal_policies(18, sweep=False, random=random))
         [family], compared = families(summary), compare_all(summary)
         assert compared is not None
-        shown = {(row.a, row.b): row for part in compared.parts for row in (*part.shown, *part.folded)}
+        shown = {
+            (row.a, row.b): row for part in compared.parts for row in (*part.shown, *part.folded)
+        }
         for comparison in family.comparisons:
             row = shown[comparison.a, comparison.b]
-            assert (row.adjusted, row.decided) == (comparison.total.adjusted, comparison.total.adjusted < ERROR_RATE)
+            assert (row.adjusted, row.decided) == (
+                comparison.total.adjusted,
+                comparison.total.adjusted < ERROR_RATE,
+            )
 
 
-# Of 11 episodes that wait and 13 in real time, these are solved: no rate of one clock is one of both.
+# Of 11 episodes that wait and 13 in real time, these are solved: no rate of one clock is one of
+# both.
 WAITING, LIVE = 11, 13
-SOLVED = {("learner", "waiting"): 10, ("learner", "live"): 1, ("base", "waiting"): 5, ("base", "live"): 12}
+SOLVED = {
+    ("learner", "waiting"): 10,
+    ("learner", "live"): 1,
+    ("base", "waiting"): 5,
+    ("base", "live"): 12,
+}
 
 
 def _solved(cell: EvalCase, seed: int) -> int | None:
@@ -161,7 +184,10 @@ def _pooled() -> dict[str, float]:
     both = WAITING + LIVE
     learner, base = (SOLVED[name, "waiting"] + SOLVED[name, "live"] for name in ("learner", "base"))
     rates = {"learner": learner / both, "base": base / both}
-    mean = {name: (SOLVED[name, "waiting"] / WAITING + SOLVED[name, "live"] / LIVE) / 2 for name in ("learner", "base")}
+    mean = {
+        name: (SOLVED[name, "waiting"] / WAITING + SOLVED[name, "live"] / LIVE) / 2
+        for name in ("learner", "base")
+    }
     returns = {f"return of {name}": 1 - rate for name, rate in rates.items()}
     difference = {"difference": abs(rates["learner"] - rates["base"])}
     return rates | {f"mean of {name}": rate for name, rate in mean.items()} | returns | difference
@@ -182,7 +208,9 @@ def test_no_output_pools_episodes_of_two_clocks(
             assert not equal, f"{output} has the pooled {name}, {value:.4f}"
         expected = SOLVED["learner", "waiting"] / WAITING
         found = any(round(number, 2) == round(expected, 2) for number in numbers)
-        assert found or output == "report --json", f"{output} has no rate of one clock, {expected:.3f}"
+        assert found or output == "report --json", (
+            f"{output} has no rate of one clock, {expected:.3f}"
+        )
     a, b = results.contenders[0], results.contenders[-1]
     with pytest.raises(ConfigError, match="several clocks"):
         compare(results, a, b)
@@ -197,12 +225,18 @@ def test_episodes_in_real_time_change_nothing_of_those_that_wait(
     def synchronous_parts(live_solved: dict[str, int]) -> list[object]:
         for name, solved in live_solved.items():
             monkeypatch.setitem(SOLVED, (name, "live"), solved)
-        results = record(runs(tmp_path / str(live_solved["base"]), steps=[1000, 2000], suites=_suites()), _solved)
+        results = record(
+            runs(tmp_path / str(live_solved["base"]), steps=[1000, 2000], suites=_suites()), _solved
+        )
         summary: Summary = summarize(results)
-        compared = [family for family in families_json(summary) if family["timing"] == "synchronous"]
+        compared = [
+            family for family in families_json(summary) if family["timing"] == "synchronous"
+        ]
         page = write_report(results, results.out / "page.html").read_text()
         headline = re.search(r"solved by the best, ([^<,]*, [^<,]*)", page)
         assert headline is not None
         return [summary.best[0], compared, headline.group(1)]
 
-    assert synchronous_parts({"learner": 0, "base": 13}) == synchronous_parts({"learner": 13, "base": 0})
+    assert synchronous_parts({"learner": 0, "base": 13}) == synchronous_parts(
+        {"learner": 13, "base": 0}
+    )

@@ -1,4 +1,6 @@
-"""A running evaluation: in a document of the results as they are recorded, in a terminal, and in a log."""
+"""A running evaluation: in a document of the results as they are recorded, in a terminal, and in
+a log.
+"""
 
 from __future__ import annotations
 
@@ -76,13 +78,23 @@ def played(tmp_path: Path, document: ProgressDocument) -> Iterator[Played]:
 
 def test_it_is_empty_before_there_are_results(tmp_path: Path) -> None:
     said = read(ProgressDocument(tmp_path / "later"))
-    assert (said["name"], said["state"], said["cells"], said["failures"]) == ("later", "starting", [], [])
+    assert (said["name"], said["state"], said["cells"], said["failures"]) == (
+        "later",
+        "starting",
+        [],
+        [],
+    )
 
 
 def test_cells_fill_with_their_intervals(document: ProgressDocument, played: Played) -> None:
     first = played.jobs[0]
     before = read(document)
-    assert (before["state"], before["done"], before["planned"], before["ends"]) == ("running", 0, 24, None)
+    assert (before["state"], before["done"], before["planned"], before["ends"]) == (
+        "running",
+        0,
+        24,
+        None,
+    )
     for job, solved in zip(played.jobs, (True, False, True), strict=False):
         played.play(job, solved)
     said = read(document)
@@ -105,7 +117,9 @@ def test_the_time_left_is_that_of_the_episodes_to_come(
     assert read(document)["ends"] == pytest.approx(run.started + 40 + 40 / 4 * 20)
 
 
-def test_failures_come_newest_first_with_what_went_wrong(document: ProgressDocument, played: Played) -> None:
+def test_failures_come_newest_first_with_what_went_wrong(
+    document: ProgressDocument, played: Played
+) -> None:
     a, b, c, d = played.jobs[:4]
     played.play(a, True)
     played.play(b, False)
@@ -114,7 +128,11 @@ def test_failures_come_newest_first_with_what_went_wrong(document: ProgressDocum
     played.play(d, None, "infra_failed")
     said = read(document)
     assert [one["episode"] for one in said["failures"]] == [3, 2, 1]
-    assert [one["outcome"] for one in said["failures"]] == ["infra_failed", "policy_error", "failure"]
+    assert [one["outcome"] for one in said["failures"]] == [
+        "infra_failed",
+        "policy_error",
+        "failure",
+    ]
     assert said["failed"] == 3
     [cell] = [one for one in said["cells"] if one["done"]]
     assert (cell["done"], cell["episodes"]) == (4, 3)  # what infrastructure lost is in no rate
@@ -153,9 +171,15 @@ def test_a_training_waits_between_its_versions_and_has_a_learning_curve(tmp_path
     [curve] = said["curves"]
     assert curve["policy"] == "learner"
     assert [point["step"] for point in curve["points"]] == [1000, 2000]
-    totals = {group.contender: group.success_once for group in summarize(Results.load(tmp_path)).totals}
-    assert [point["rate"] for point in curve["points"]] == [totals[f"learner@{step}"].rate for step in (1000, 2000)]
-    assert all(point["whole"] and point["low"] < point["rate"] < point["high"] for point in curve["points"])
+    totals = {
+        group.contender: group.success_once for group in summarize(Results.load(tmp_path)).totals
+    }
+    assert [point["rate"] for point in curve["points"]] == [
+        totals[f"learner@{step}"].rate for step in (1000, 2000)
+    ]
+    assert all(
+        point["whole"] and point["low"] < point["rate"] < point["high"] for point in curve["points"]
+    )
     document.close()
     assert read(document)["state"] == "complete"
 
@@ -202,12 +226,19 @@ def test_calls_reach_the_terminal_too(tmp_path: Path) -> None:
     document.stopped(one.jobs[1].cell, 1, 3)
     one.end("complete")
     one.store.close()
-    assert [call[0] for call in terminal.method_calls] == ["begin", "episode", "retry", "stopped", "end"]
+    assert [call[0] for call in terminal.method_calls] == [
+        "begin",
+        "episode",
+        "retry",
+        "stopped",
+        "end",
+    ]
 
 
 def test_cells_that_may_stop_early_have_a_confidence_sequence(tmp_path: Path) -> None:
     config = EvalConfig.model_validate(
-        runs(tmp_path, steps=[1000], episodes=40).model_dump() | {"stop": {"width": 0.9, "at_least": 5}}
+        runs(tmp_path, steps=[1000], episodes=40).model_dump()
+        | {"stop": {"width": 0.9, "at_least": 5}}
     )
     record(config, lambda _cell, _seed: 3)
     found = read(ProgressDocument(tmp_path))["cells"]

@@ -14,7 +14,12 @@ from recorded_results import HOSTILE, better_later, record, runs
 
 from vlagents_ray.evaluate import EvalConfig, Results
 from vlagents_ray.evaluate.report import success
-from vlagents_ray.evaluate.report.charts import MINUS, difference_glyph, difference_labels, difference_limit
+from vlagents_ray.evaluate.report.charts import (
+    MINUS,
+    difference_glyph,
+    difference_labels,
+    difference_limit,
+)
 from vlagents_ray.evaluate.report.episodes import Gallery
 from vlagents_ray.evaluate.report.page import write_report
 from vlagents_ray.evaluate.results.store import Store
@@ -77,7 +82,10 @@ def page(results: Results) -> Read:
 
 def test_nothing_is_fetched_from_anywhere(page: Read) -> None:
     addresses = [
-        value for _, attributes in page.elements for key in ("src", "href", "poster") if (value := attributes.get(key))
+        value
+        for _, attributes in page.elements
+        for key in ("src", "href", "poster")
+        if (value := attributes.get(key))
     ]
     assert addresses
     assert all(re.match(r"(#|data:|videos/)", address) for address in addresses)
@@ -87,7 +95,8 @@ def test_nothing_is_fetched_from_anywhere(page: Read) -> None:
 def test_what_policies_and_simulators_say_is_text(page: Read) -> None:
     assert len(page.all("script")) == 1
     assert all("onerror" not in attributes for attributes in page.all("img"))
-    assert page.words.count(" ".join(HOSTILE.split())) >= 4  # instruction, policy error, failure, protocol
+    # instruction, policy error, failure, protocol.
+    assert page.words.count(" ".join(HOSTILE.split())) >= 4
 
 
 def test_names_are_text_wherever_they_are_shown(page: Read, tmp_path: Path) -> None:
@@ -104,17 +113,25 @@ def test_names_are_text_wherever_they_are_shown(page: Read, tmp_path: Path) -> N
 
 
 def test_rates_stand_with_their_intervals(page: Read) -> None:
-    assert re.search(r"all base \d+ .*? learner@1000 35/36 25\.0 to 27\.8 25\.7 14\.2 to 42\.1 25\.7", page.words)
+    assert re.search(
+        r"all base \d+ .*? learner@1000 35/36 25\.0 to 27\.8 25\.7 14\.2 to 42\.1 25\.7", page.words
+    )
 
 
 def test_workers_are_counted_where_they_ran_by_transport_and_renderer(page: Read) -> None:
-    assert re.search(r"gpu-box base handle llvmpipe .* 2 gpu-box learner handle llvmpipe .* 2 ", page.words)
+    assert re.search(
+        r"gpu-box base handle llvmpipe .* 2 gpu-box learner handle llvmpipe .* 2 ", page.words
+    )
 
 
 def test_every_part_is_there(page: Read) -> None:
     headings = ["Success", "Comparison", "Learning curve", "Latency", "Failures", "Episodes"]
     headings += ["Errors", "Protocol", "Configuration", "To repeat"]
-    links = [attributes["href"] for attributes in page.all("a") if (attributes["href"] or "").startswith("#")]
+    links = [
+        attributes["href"]
+        for attributes in page.all("a")
+        if (attributes["href"] or "").startswith("#")
+    ]
     assert links == [f"#{attributes['id']}" for attributes in page.all("h2")]
     for heading in headings:
         assert heading in page.words
@@ -125,7 +142,9 @@ def test_every_part_is_there(page: Read) -> None:
 def test_tables_and_charts_are_named_for_those_who_cannot_see_them(page: Read) -> None:
     assert all(attributes.get("scope") for attributes in page.all("th"))
     regions = [attributes for attributes in page.all("div") if attributes.get("class") == "scroll"]
-    assert all(attributes.get("aria-label") and attributes.get("tabindex") == "0" for attributes in regions)
+    assert all(
+        attributes.get("aria-label") and attributes.get("tabindex") == "0" for attributes in regions
+    )
     charts = [attributes for attributes in page.all("svg") if attributes.get("class") == "chart"]
     assert charts
     assert all(attributes.get("role") == "img" for attributes in charts)
@@ -136,7 +155,9 @@ def test_tables_and_charts_are_named_for_those_who_cannot_see_them(page: Read) -
 def test_the_settings_it_shows_give_the_same_again(page: Read, results: Results) -> None:
     text = "".join(page.text)
     shown = (
-        text[text.index("Save this as again.yaml:") :].partition(":")[2].partition("vlagents-ray eval again.yaml")[0]
+        text[text.index("Save this as again.yaml:") :]
+        .partition(":")[2]
+        .partition("vlagents-ray eval again.yaml")[0]
     )
     again = EvalConfig.model_validate(yaml.safe_load(shown) | {"out": results.out})
     assert again == EvalConfig.model_validate(results.runs[-1].config)
@@ -144,7 +165,9 @@ def test_the_settings_it_shows_give_the_same_again(page: Read, results: Results)
 
 def test_a_policy_that_was_served_is_served_again(tmp_path: Path) -> None:
     policies = [{"name": "noop", "source": "noop", "url": "serve://noop"}]
-    config = EvalConfig.model_validate({"policies": policies, "suites": [{"envs": [LINE]}], "out": tmp_path})
+    config = EvalConfig.model_validate(
+        {"policies": policies, "suites": [{"envs": [LINE]}], "out": tmp_path}
+    )
     words = page_of(record(config)).words
     again = words[words.index("Save this as") :]
     assert "source: noop" in again
@@ -178,9 +201,15 @@ def test_a_video_that_is_gone_or_broken_leaves_the_rest(tmp_path: Path) -> None:
     assert str(first.relative_to(tmp_path)) not in [video["src"] for video in page.all("video")]
 
 
-def test_one_policy_that_solved_everything_has_no_failures_and_nothing_to_compare(tmp_path: Path) -> None:
+def test_one_policy_that_solved_everything_has_no_failures_and_nothing_to_compare(
+    tmp_path: Path,
+) -> None:
     config = EvalConfig.model_validate(
-        {"policies": [{"name": "a", "url": "http://localhost:1"}], "suites": [{"envs": [LINE]}], "out": tmp_path}
+        {
+            "policies": [{"name": "a", "url": "http://localhost:1"}],
+            "suites": [{"envs": [LINE]}],
+            "out": tmp_path,
+        }
     )
     page = page_of(record(config, lambda _cell, _seed: 7))
     headings = {attributes["id"] for attributes in page.all("h2")}
@@ -189,13 +218,19 @@ def test_one_policy_that_solved_everything_has_no_failures_and_nothing_to_compar
 
 
 @pytest.mark.parametrize(("better", "verdict"), [(4, ", not told apart"), (20, "")])
-def test_the_headline_of_two_policies_is_their_difference(better: int, verdict: str, tmp_path: Path) -> None:
+def test_the_headline_of_two_policies_is_their_difference(
+    better: int, verdict: str, tmp_path: Path
+) -> None:
     """The rate of the better one was chosen by its size, and says nothing about the other."""
-    policies = [{"name": name, "url": f"http://localhost:{port}"} for port, name in enumerate("ab", 1)]
+    policies = [
+        {"name": name, "url": f"http://localhost:{port}"} for port, name in enumerate("ab", 1)
+    ]
     config = EvalConfig.model_validate(
         {"policies": policies, "suites": [{"envs": [LINE], "episodes": 40}], "out": tmp_path}
     )
-    page = page_of(record(config, lambda cell, seed: 7 if cell.contender == "b" or seed >= better else None))
+    page = page_of(
+        record(config, lambda cell, seed: 7 if cell.contender == "b" or seed >= better else None)
+    )
     assert f"+{100 * better / 40:.1f} points b less a{verdict} 95 % [" in page.words
     assert "solved by the best" not in page.words
 
@@ -252,7 +287,9 @@ def test_an_episode_that_does_not_count_is_marked(tmp_path: Path) -> None:
     assert "In brackets: beyond the point" in page.words
 
 
-def test_baselines_stand_before_checkpoints_and_are_a_level_line_in_the_learning_curve(tmp_path: Path) -> None:
+def test_baselines_stand_before_checkpoints_and_are_a_level_line_in_the_learning_curve(
+    tmp_path: Path,
+) -> None:
     results = record(runs(tmp_path, steps=[3000, 1000, 2000]), better_later)
     assert results.contenders == ["base", "learner@1000", "learner@2000", "learner@3000"]
     page = page_of(results)
@@ -262,14 +299,21 @@ def test_baselines_stand_before_checkpoints_and_are_a_level_line_in_the_learning
     assert "base (no steps)" in words
     assert re.search(r"base \(no steps\) \N{EN DASH} \d", words)  # in the numbers, with no step
     words = page.section("Comparison")
-    first = [words.index(pair) for pair in ("learner@2000 learner@1000", "learner@3000 learner@2000")]
-    others = [words.index(pair) for pair in ("learner@3000 base", "learner@2000 base", "learner@3000 learner@1000")]
+    first = [
+        words.index(pair) for pair in ("learner@2000 learner@1000", "learner@3000 learner@2000")
+    ]
+    others = [
+        words.index(pair)
+        for pair in ("learner@3000 base", "learner@2000 base", "learner@3000 learner@1000")
+    ]
     assert first == sorted(first), "consecutive checkpoints, and the later one is A"
     assert max(first) < min(others)
     assert others[0] == min(others), "the best against the baseline"
 
 
-def test_with_an_expert_the_checkpoints_before_and_after_are_not_folded_away(tmp_path: Path) -> None:
+def test_with_an_expert_the_checkpoints_before_and_after_are_not_folded_away(
+    tmp_path: Path,
+) -> None:
     config = runs(tmp_path, steps=list(range(200, 2001, 200)), episodes=6)
     expert = record(config, lambda cell, seed: 5 if cell.step is None else better_later(cell, seed))
     words = page_of(expert).section("Comparison")
@@ -290,22 +334,38 @@ def test_cells_that_stopped_early_have_intervals_of_another_name(tmp_path: Path)
     assert "Wilson's method" not in words
 
 
-def test_an_env_of_two_suites_is_named_with_its_suite_in_errors_and_protocol(tmp_path: Path) -> None:
-    suites = [{"name": name, "envs": [LINE], "episodes": 4, "env_options": {"folder": name}} for name in ("one", "two")]
-    page = write_report(record(runs(tmp_path, suites=suites), troubles=True), tmp_path / "report.html").read_text()
+def test_an_env_of_two_suites_is_named_with_its_suite_in_errors_and_protocol(
+    tmp_path: Path,
+) -> None:
+    suites = [
+        {"name": name, "envs": [LINE], "episodes": 4, "env_options": {"folder": name}}
+        for name in ("one", "two")
+    ]
+    page = write_report(
+        record(runs(tmp_path, suites=suites), troubles=True), tmp_path / "report.html"
+    ).read_text()
     errors, _, rest = page.partition('id="errors"')[2].partition("</section>")
     assert f"one {LINE}" in errors
     assert f"<h3>one {LINE}</h3>" in rest
     assert f"<h3>two {LINE}</h3>" in rest
 
 
-def test_real_time_and_synchronous_scores_are_compared_apart_and_their_gap_is_shown(tmp_path: Path) -> None:
+def test_real_time_and_synchronous_scores_are_compared_apart_and_their_gap_is_shown(
+    tmp_path: Path,
+) -> None:
     suites = [
-        {"name": "live", "envs": [LINE], "episodes": 4, "clock": {"latency": 0.1, "meanwhile": "hold"}},
+        {
+            "name": "live",
+            "envs": [LINE],
+            "episodes": 4,
+            "clock": {"latency": 0.1, "meanwhile": "hold"},
+        },
         {"name": "waiting", "envs": [LINE], "episodes": 4},
     ]
     page = page_of(record(runs(tmp_path, steps=[], suites=suites), lambda _cell, _seed: 5))
-    row = f"learner, live in real time learner, waiting 0.0 {MINUS}50.0 to +50.0 1.00 1.00 4 4 0 0 0 "
+    row = (
+        f"learner, live in real time learner, waiting 0.0 {MINUS}50.0 to +50.0 1.00 1.00 4 4 0 0 0 "
+    )
     assert row in page.words
     assert len(page.all("h3")) >= 2
 
@@ -317,9 +377,14 @@ def test_differences_share_an_axis_that_holds_them_all(bounds: list[tuple[float,
     assert all(-limit <= low <= high <= limit for low, high in intervals)
     left, middle, right = (float(label.replace(MINUS, "-")) for label in difference_labels(limit))
     assert (left, middle, right) == pytest.approx((-100 * limit, 0, 100 * limit))
-    ends = [difference_glyph(value, (value, value), limit, decided=True).dot for value in (-limit, 0.0, limit)]
+    ends = [
+        difference_glyph(value, (value, value), limit, decided=True).dot
+        for value in (-limit, 0.0, limit)
+    ]
     axis = difference_glyph(0.0, (0.0, 0.0), limit, decided=True).axis
-    assert axis == f"M{ends[0]:g} 8H{ends[2]:g}M{ends[1]:.1f} 2V14", "from the left label to the right one, with 0"
+    assert axis == f"M{ends[0]:g} 8H{ends[2]:g}M{ends[1]:.1f} 2V14", (
+        "from the left label to the right one, with 0"
+    )
 
 
 def test_a_small_difference_is_seen_beside_its_dot() -> None:

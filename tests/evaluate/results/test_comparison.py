@@ -33,20 +33,30 @@ def test_pairs_are_episodes_of_the_same_env_and_seed(tmp_path: Path) -> None:
 
 
 def test_what_infrastructure_lost_is_in_no_pair(tmp_path: Path) -> None:
-    results = record(runs(tmp_path, episodes=5, steps=[]), solved_by(learner=set(), base={0, 1}), troubles=True)
+    results = record(
+        runs(tmp_path, episodes=5, steps=[]), solved_by(learner=set(), base={0, 1}), troubles=True
+    )
     first = compare(results, "learner", "base").total.strata[0]
-    assert first == Pairs(only_b=1, neither=3)  # of seed 1 there is but base's; the policy's error of seed 0 counts
+    # Of seed 1 there is but base's; the policy's error of seed 0 counts.
+    assert first == Pairs(only_b=1, neither=3)
 
 
 def test_p_values_of_more_comparisons_are_larger(tmp_path: Path) -> None:
     results = record(runs(tmp_path, episodes=20))
     pairs, reasons = comparable(results)
-    assert pairs == [("base", "learner@1000"), ("base", "learner@2000"), ("learner@1000", "learner@2000")]
+    assert pairs == [
+        ("base", "learner@1000"),
+        ("base", "learner@2000"),
+        ("learner@1000", "learner@2000"),
+    ]
     assert reasons == []
     together = comparisons(results, pairs)
     alone = [compare(results, a, b) for a, b in pairs]
     assert [one.total.adjusted for one in alone] == [one.total.pairs.p_value for one in alone]
-    assert all(one.total.adjusted >= single.total.adjusted for one, single in zip(together, alone, strict=True))
+    assert all(
+        one.total.adjusted >= single.total.adjusted
+        for one, single in zip(together, alone, strict=True)
+    )
     smallest = min(range(3), key=lambda index: alone[index].total.adjusted)
     assert together[smallest].total.adjusted == pytest.approx(3 * alone[smallest].total.adjusted)
 
@@ -54,27 +64,36 @@ def test_p_values_of_more_comparisons_are_larger(tmp_path: Path) -> None:
 def test_a_comparison_as_json_has_every_line(tmp_path: Path) -> None:
     found = compare(record(runs(tmp_path)), "learner@1000", "base").to_json()
     assert [line["suite"] for line in found["lines"]] == ["one", "two", "all"]
-    assert {"pairs", "both", "difference", "interval_95", "p_value", "p_holm"} <= found["lines"][0].keys()
+    assert {"pairs", "both", "difference", "interval_95", "p_value", "p_holm"} <= found["lines"][
+        0
+    ].keys()
 
 
 def folder(out: Path, name: str, **suite: Any) -> Results:
     """One policy in one env."""
     settings = {
-        "policies": [{"name": name, "url": "http://localhost:1"}], "suites": [{"envs": [LINE], "episodes": 4} | suite]
-    }  # fmt: skip
+        "policies": [{"name": name, "url": "http://localhost:1"}],
+        "suites": [{"envs": [LINE], "episodes": 4} | suite],
+    }
     config = type(runs(out)).model_validate(settings | {"out": out})
     return record(config, lambda _cell, seed: 3 if seed % 2 else None, videos=True)
 
 
 def test_other_settings_of_an_env_are_no_pair(tmp_path: Path) -> None:
-    results = combined([folder(tmp_path / "a", "a"), folder(tmp_path / "b", "b", env_options={"state_dim": 1})])
-    with pytest.raises(ConfigError, match=r"had env_options {} for 'a', but {'state_dim': 1} for 'b'"):
+    results = combined(
+        [folder(tmp_path / "a", "a"), folder(tmp_path / "b", "b", env_options={"state_dim": 1})]
+    )
+    with pytest.raises(
+        ConfigError, match=r"had env_options {} for 'a', but {'state_dim': 1} for 'b'"
+    ):
         compare(results, "a", "b")
     assert comparable(results)[0] == []
 
 
 def test_no_shared_episode_and_unknown_contenders_are_no_comparison(tmp_path: Path) -> None:
-    results = combined([folder(tmp_path / "a", "a"), folder(tmp_path / "b", "b", envs=[OTHER_LINE])])
+    results = combined(
+        [folder(tmp_path / "a", "a"), folder(tmp_path / "b", "b", envs=[OTHER_LINE])]
+    )
     with pytest.raises(ConfigError, match="share no finished episode"):
         compare(results, "a", "b")
     with pytest.raises(ConfigError, match=r"got \['best'\], want two of the contenders"):
@@ -117,16 +136,25 @@ def test_other_weights_under_one_name_are_told_apart_by_their_folders(tmp_path: 
 
 
 def test_parts_of_one_evaluation_are_to_be_merged(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match=r"merge .* --out OUT`, with --accept-changes if code or weights changed"):
+    with pytest.raises(
+        ConfigError, match=r"merge .* --out OUT`, with --accept-changes if code or weights changed"
+    ):
         combined([folder(tmp_path / "a", "pi0"), folder(tmp_path / "b", "pi0")])
 
 
-def test_the_gap_to_the_synchronous_score_pairs_suites_that_differ_in_their_clock(tmp_path: Path) -> None:
-    suites: list[dict[str, Any]] = [{"name": name, "envs": [LINE], "episodes": 4} for name in ("live", "waiting")]
+def test_the_gap_to_the_synchronous_score_pairs_suites_that_differ_in_their_clock(
+    tmp_path: Path,
+) -> None:
+    suites: list[dict[str, Any]] = [
+        {"name": name, "envs": [LINE], "episodes": 4} for name in ("live", "waiting")
+    ]
     suites[0]["clock"] = {"latency": 0.1, "meanwhile": "hold"}
     config = runs(tmp_path, steps=[], suites=suites)
-    gaps = clock_gaps(record(config, lambda cell, seed: 5 if cell.suite.name == "waiting" or seed == 0 else None))
+    gaps = clock_gaps(
+        record(config, lambda cell, seed: 5 if cell.suite.name == "waiting" or seed == 0 else None)
+    )
     assert [(gap.a, gap.b) for gap in gaps] == [
-        ("learner, live in real time", "learner, waiting"), ("base, live in real time", "base, waiting")
-    ]  # fmt: skip
+        ("learner, live in real time", "learner, waiting"),
+        ("base, live in real time", "base, waiting"),
+    ]
     assert gaps[0].total.pairs == Pairs(both=1, only_b=3)

@@ -62,7 +62,10 @@ def begun(config: EvalConfig) -> Store:
 def kill_in(config: EvalConfig) -> None:
     """Have a process record an episode and die."""
     command = [sys.executable, "-c", KILLED, config.model_dump_json()]
-    assert subprocess.run(command, check=False, env=os.environ | {"PYTHONPATH": PYTHONPATH}).returncode == 9
+    assert (
+        subprocess.run(command, check=False, env=os.environ | {"PYTHONPATH": PYTHONPATH}).returncode
+        == 9
+    )
 
 
 def episodes(results: Results) -> int:
@@ -73,7 +76,9 @@ def test_another_process_reads_meanwhile_and_commits_reach_the_disk(config: Conf
     with begun(config()) as store:
         [[synchronous]] = store._db.execute("PRAGMA synchronous")
         assert synchronous == 2
-        done = subprocess.run([sys.executable, "-c", COUNT, config().out], capture_output=True, text=True, check=True)
+        done = subprocess.run(
+            [sys.executable, "-c", COUNT, config().out], capture_output=True, text=True, check=True
+        )
         assert done.stdout.split() == ["1"]
 
 
@@ -87,7 +92,9 @@ def test_a_reader_cannot_write_and_results_at_rest_are_one_file(config: Config) 
     assert sorted(path.name for path in config().out.iterdir()) == ["results.db", "results.lock"]
 
 
-def test_what_a_killed_evaluation_left_is_read_and_only_the_run_that_holds_the_lock_is_running(config: Config) -> None:
+def test_what_a_killed_evaluation_left_is_read_and_only_the_run_that_holds_the_lock_is_running(
+    config: Config,
+) -> None:
     kill_in(config())
     assert episodes(Results.load(config().out)) == 1
 
@@ -144,7 +151,10 @@ FOREIGN = 'x") VALUES (1); DROP TABLE episodes; --'
 
 @pytest.mark.parametrize(
     ("table", "kind"),
-    [(table, "") for table in ("runs", "policies", "cells", "episodes", "attempts", "workers", "tracked")]
+    [
+        (table, "")
+        for table in ("runs", "policies", "cells", "episodes", "attempts", "workers", "tracked")
+    ]
     + [("episodes", " AS (1)")],  # generated
 )
 def test_a_column_of_somebody_else_is_refused_by_all_that_open_the_file(
@@ -161,18 +171,24 @@ def test_a_column_of_somebody_else_is_refused_by_all_that_open_the_file(
         lambda: Store(config(resume=True)),
     ]
     for read in opened:
-        with pytest.raises(ConfigError, match=r"got the unknown columns .*DROP TABLE.* read it with the version"):
+        with pytest.raises(
+            ConfigError, match=r"got the unknown columns .*DROP TABLE.* read it with the version"
+        ):
             read()
     assert not (tmp_path / "merged").exists()
     with closing(sqlite3.connect(config().out / "results.db")) as db:
         assert list(db.iterdump()) == before
 
 
-@pytest.mark.parametrize(("table", "column"), [("episodes", "status"), ("cells", "stop"), ("runs", "config")])
+@pytest.mark.parametrize(
+    ("table", "column"), [("episodes", "status"), ("cells", "stop"), ("runs", "config")]
+)
 def test_a_column_that_is_missing_is_named(config: Config, table: str, column: str) -> None:
     begun(config()).close()
     with closing(sqlite3.connect(config().out / "results.db")) as db, db:
         db.execute(f"ALTER TABLE {table} RENAME COLUMN {column} TO odd")
         db.execute(f"ALTER TABLE {table} DROP COLUMN odd")
-    with pytest.raises(ConfigError, match=rf"got none of the columns \['{column}'\] in its table '{table}'"):
+    with pytest.raises(
+        ConfigError, match=rf"got none of the columns \['{column}'\] in its table '{table}'"
+    ):
         Results.load(config().out)

@@ -11,13 +11,20 @@ from vlagents_ray.evaluate import Rate, wilson
 from vlagents_ray.evaluate.results.statistics import Pairs, difference_interval, holm, mcnemar
 
 
-# From R. G. Newcombe, "Two-sided confidence intervals for the single proportion: comparison of seven
-# methods", Statistics in Medicine 17 (1998), table I, method 3.
+# From R. G. Newcombe, "Two-sided confidence intervals for the single proportion: comparison of
+# seven methods", Statistics in Medicine 17 (1998), table I, method 3.
 @pytest.mark.parametrize(
     ("successes", "trials", "low", "high"),
-    [(81, 263, 0.2553, 0.3662), (15, 148, 0.0624, 0.1605), (0, 20, 0.0, 0.1611), (1, 29, 0.0061, 0.1718)],
+    [
+        (81, 263, 0.2553, 0.3662),
+        (15, 148, 0.0624, 0.1605),
+        (0, 20, 0.0, 0.1611),
+        (1, 29, 0.0061, 0.1718),
+    ],
 )
-def test_wilson_agrees_with_published_values(successes: int, trials: int, low: float, high: float) -> None:
+def test_wilson_agrees_with_published_values(
+    successes: int, trials: int, low: float, high: float
+) -> None:
     assert wilson(successes, trials) == pytest.approx((low, high), abs=5e-5)
 
 
@@ -60,7 +67,8 @@ def test_mcnemar_is_the_binomial_test_of_what_only_one_solved(only_a: int, only_
     assert mcnemar(only_a, only_b) == pytest.approx(want, rel=1e-9)
 
 
-# From the paper that `mcnemar` names, table 3: airway hyper-responsiveness before and after stem cell transplantation,
+# From the paper that `mcnemar` names, table 3: airway hyper-responsiveness before and after stem
+# cell transplantation,
 # 1 and 7 discordant pairs.
 def test_mcnemar_agrees_with_published_values() -> None:
     assert mcnemar(1, 7) == pytest.approx(0.070, abs=5e-4)
@@ -132,7 +140,9 @@ def test_the_interval_is_what_drawing_again_comes_to() -> None:
         outcomes = np.array([one.only_a, one.only_b, one.both, one.neither]) + 0.5 * one.total / 80
         counts = rng.multinomial(one.total, outcomes / outcomes.sum(), len(drawn))
         drawn += counts[:, 0] - counts[:, 1]
-    assert difference_interval(strata) == pytest.approx(tuple(np.quantile(drawn / 80, [0.025, 0.975])), abs=1e-9)
+    assert difference_interval(strata) == pytest.approx(
+        tuple(np.quantile(drawn / 80, [0.025, 0.975])), abs=1e-9
+    )
 
 
 def test_thousands_of_episodes_narrow_the_interval() -> None:

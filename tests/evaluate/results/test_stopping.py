@@ -64,14 +64,22 @@ def test_the_true_rate_is_missed_no_more_often_than_is_said_whenever_one_looks(r
     missed = np.zeros(streams, bool)
     for n in range(1, length + 1):
         here = counts[:, n - 1]
-        bounds = {s: confidence_sequence(s, n, error_rate) for s in np.unique(here[~missed]).tolist()}
+        bounds = {
+            s: confidence_sequence(s, n, error_rate) for s in np.unique(here[~missed]).tolist()
+        }
         missed |= [
-            not done and not bounds[s][0] <= rate <= bounds[s][1] for done, s in zip(missed, here.tolist(), strict=True)
+            not done and not bounds[s][0] <= rate <= bounds[s][1]
+            for done, s in zip(missed, here.tolist(), strict=True)
         ]
     assert missed.mean() <= error_rate
-    fixed = [wilson(s, n) for s, n in ((int(counts[i, n - 1]), n) for i in range(100) for n in range(10, length, 10))]
+    fixed = [
+        wilson(s, n)
+        for s, n in ((int(counts[i, n - 1]), n) for i in range(100) for n in range(10, length, 10))
+    ]
     looks = np.array([not low <= rate <= high for low, high in fixed]).reshape(100, -1).any(axis=1)
-    assert looks.mean() > error_rate, "an interval for one look is missed more often, or the test shows nothing"
+    assert looks.mean() > error_rate, (
+        "an interval for one look is missed more often, or the test shows nothing"
+    )
 
 
 def test_several_cells_share_the_error_rate() -> None:
@@ -106,7 +114,9 @@ def test_nothing_after_an_episode_without_a_result_counts() -> None:
 def test_where_a_cell_stops_does_not_depend_on_the_order_in_which_episodes_arrive() -> None:
     rng = np.random.default_rng(1)
     outcomes = [
-        result(seed, bool(rng.random() < 0.4), first) for first in (100, 0) for seed in range(first, first + 30)
+        result(seed, bool(rng.random() < 0.4), first)
+        for first in (100, 0)
+        for seed in range(first, first + 30)
     ]
     found = set()
     for _ in range(20):
@@ -133,10 +143,21 @@ class TestOnACluster:
         out = config().out
         found = []
         for workers in (1, 4):
-            settings = config(envs=[LINE, OTHER_LINE], episodes=40, workers=workers, stop=STOP, out=out / str(workers))
+            settings = config(
+                envs=[LINE, OTHER_LINE],
+                episodes=40,
+                workers=workers,
+                stop=STOP,
+                out=out / str(workers),
+            )
             summary = evaluate(settings, agent_factory=ToZero)
             assert summary.state == "complete"
-            found.append([(cell.stopped_at, [outcome(one) for one in cell.counted]) for cell in summary.results.cells])
+            found.append(
+                [
+                    (cell.stopped_at, [outcome(one) for one in cell.counted])
+                    for cell in summary.results.cells
+                ]
+            )
         assert all(one == found[0] for one in found)
         for (at, counted), cell in zip(found[0], summary.results.cells, strict=True):
             assert at is not None
@@ -161,7 +182,9 @@ def test_what_a_stopped_cell_says_holds_and_resuming_plays_nothing(config: Confi
     assert again.episodes == cell.episodes
     with pytest.raises(ConfigError, match=r"plan: .*early stopping was"):
         evaluate(config(episodes=40, workers=0, resume=True), agent_factory=ToZero)
-    whole = evaluate(config(episodes=40, workers=0, resume=True, accept_changes=True), agent_factory=ToZero)
+    whole = evaluate(
+        config(episodes=40, workers=0, resume=True, accept_changes=True), agent_factory=ToZero
+    )
     assert whole.total.episodes == 40
     assert whole.total.success_once.error_rate is None
 

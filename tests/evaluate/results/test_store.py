@@ -93,12 +93,16 @@ def test_a_run_without_an_episode_leaves_nothing_to_resume(config: Config, begun
     with Store(config()) as store:
         if begun:  # and ended by a wrong setting
             store.begin_run(config(), {})
-            store.record_attempt(planned(config())[0], Failure("user", "unknown_env", "no such task"), retried=False)
+            store.record_attempt(
+                planned(config())[0], Failure("user", "unknown_env", "no such task"), retried=False
+            )
     with Store(config(seed=5)) as store:
         store.begin_run(config(seed=5), {})
         found = Results.load(config().out)
     assert [run.config["suites"][0]["seeds"] for run in found.runs] == [[5]]
-    assert [(cell.cell, cell.attempts) for cell in found.cells] == [(one.fingerprint, ()) for one in store.cells]
+    assert [(cell.cell, cell.attempts) for cell in found.cells] == [
+        (one.fingerprint, ()) for one in store.cells
+    ]
 
 
 @pytest.mark.parametrize(
@@ -109,7 +113,9 @@ def test_a_run_without_an_episode_leaves_nothing_to_resume(config: Config, begun
         ({"env_options": {"camera": [8, 8]}}, "env_options"),
     ],
 )
-def test_results_of_other_settings_are_not_resumed(config: Config, change: dict[str, object], differing: str) -> None:
+def test_results_of_other_settings_are_not_resumed(
+    config: Config, change: dict[str, object], differing: str
+) -> None:
     with Store(config()) as store:
         store.begin_run(config(), {})
     with pytest.raises(ConfigError, match=f"{differing}: the results have .*, now it is"):
@@ -142,7 +148,9 @@ def test_a_plan_that_becomes_smaller_or_may_stop_early_is_a_change(
     assert {change.subject for change in found.accepted_changes} == {"plan"}
 
 
-def test_resuming_a_folder_without_results_says_so(config: Config, caplog: pytest.LogCaptureFixture) -> None:
+def test_resuming_a_folder_without_results_says_so(
+    config: Config, caplog: pytest.LogCaptureFixture
+) -> None:
     Store(config(resume=True)).close()
     assert "has no results to resume" in caplog.text
     assert "did you mean" not in caplog.text
@@ -152,14 +160,17 @@ def test_resuming_a_folder_without_results_says_so(config: Config, caplog: pytes
 
 
 @pytest.mark.parametrize(
-    "change", [{"episodes": 50}, {"seeds": [0, 100]}, {"video": "all"}, {"envs": [LINE, OTHER_LINE]}]
+    "change",
+    [{"episodes": 50}, {"seeds": [0, 100]}, {"video": "all"}, {"envs": [LINE, OTHER_LINE]}],
 )
 def test_more_of_the_same_is_resumed(config: Config, change: dict[str, object]) -> None:
     with Store(config()) as store:
         store.begin_run(config(), {})
     Store(config(resume=True, **change)).close()
     known = {cell.cell for cell in Results.load(config().out).cells}
-    assert known >= {cell.fingerprint for one in (config(), config(**change)) for cell in cells(one)}
+    assert known >= {
+        cell.fingerprint for one in (config(), config(**change)) for cell in cells(one)
+    }
 
 
 def test_two_evaluations_do_not_write_to_one_folder(config: Config) -> None:
@@ -175,7 +186,9 @@ def test_another_checkpoint_on_the_server_is_noticed(config: Config) -> None:
         store.note_policy("policy", {"policy": "act", "checkpoint": "a", "uptime_s": 9})
         with pytest.raises(ConfigError, match=r"checkpoint 'b'.*are of 'a'"):
             store.note_policy("policy", {"policy": "act", "checkpoint": "b"})
-        assert Results.load(config().out).policies == {"policy": {"policy": "act", "checkpoint": "a", "uptime_s": 9}}
+        assert Results.load(config().out).policies == {
+            "policy": {"policy": "act", "checkpoint": "a", "uptime_s": 9}
+        }
 
 
 def test_where_workers_ran_is_kept(config: Config) -> None:
@@ -185,7 +198,10 @@ def test_where_workers_ran_is_kept(config: Config) -> None:
         store.note_worker(near)
         store.note_worker(replace(near, host="cpu1", transport="handle", renderer=None))
     found = Results.load(config().out).workers
-    assert [(one.run, one.host, one.node, one.pid, one.policy, one.transport, one.renderer) for one in found] == [
+    assert [
+        (one.run, one.host, one.node, one.pid, one.policy, one.transport, one.renderer)
+        for one in found
+    ] == [
         (1, "gpu1", "ab12", 7, "pi0", "shm", "llvmpipe"),
         (1, "cpu1", "ab12", 7, "pi0", "handle", None),
     ]
@@ -208,7 +224,9 @@ def test_an_env_that_has_changed_between_runs_is_noticed(config: Config) -> None
         store.record(done(planned(config())[0].key), attempts=1)
     with Store(config(resume=True)) as store:
         assert store.cells == [cell]
-        with pytest.raises(ConfigError, match=r"its description 'version' was 1, is 2\n.*--accept-changes"):
+        with pytest.raises(
+            ConfigError, match=r"its description 'version' was 1, is 2\n.*--accept-changes"
+        ):
             store.note_env(cell.place, EnvInfo({"simulator": "line", "version": 2}, {}))
     assert [one.described for one in Results.load(config().out).cells] == [
         {"simulator": "line", "version": 1, "node": "b"}
@@ -225,7 +243,11 @@ def test_what_is_not_planned_any_more_is_kept_and_not_counted(config: Config) ->
     with Store(config(episodes=3, resume=True, accept_changes=True)) as store:
         store.begin_run(config(episodes=3), {})
         [cell] = Results.load(config().out).cells
-        assert [(one.result.key.episode, one.counts) for one in cell.episodes] == [(0, True), (2, True), (4, False)]
+        assert [(one.result.key.episode, one.counts) for one in cell.episodes] == [
+            (0, True),
+            (2, True),
+            (4, False),
+        ]
         [group] = summarize(Results.load(config().out)).cells
         assert (group.episodes, group.planned) == (2, 3)
     with Store(config(resume=True)):
@@ -235,7 +257,11 @@ def test_what_is_not_planned_any_more_is_kept_and_not_counted(config: Config) ->
 @pytest.mark.parametrize(
     ("known", "other", "said"),
     [
-        ({"checkpoint": "runs/1"}, {"checkpoint": "runs/2"}, r"played by checkpoint 'runs/2'.* are of 'runs/1'"),
+        (
+            {"checkpoint": "runs/1"},
+            {"checkpoint": "runs/2"},
+            r"played by checkpoint 'runs/2'.* are of 'runs/1'",
+        ),
         (
             {"checkpoint": "runs/1", "weights": "a"},
             {"checkpoint": "runs/1", "weights": "b"},
@@ -283,5 +309,7 @@ def test_a_server_with_other_weights_is_noticed_before_anything_is_played(config
         store.note_policy("policy", said)  # of a server that tells no weights
         store.note_policy("policy", said | {"weights": {"digest": "x", "revision": None}})
         store.note_policy("policy", said | {"weights": {"digest": "x", "revision": "c0ffee"}})
-        with pytest.raises(ConfigError, match=r"(?s)policy policy: weights was x, is y\n.*--accept-changes"):
+        with pytest.raises(
+            ConfigError, match=r"(?s)policy policy: weights was x, is y\n.*--accept-changes"
+        ):
             store.note_policy("policy", said | {"weights": {"digest": "y", "revision": None}})

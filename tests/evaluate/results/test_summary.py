@@ -27,7 +27,9 @@ Config = Callable[..., EvalConfig]
 @pytest.fixture
 def summary(config: Config) -> Summary:
     """Two envs with 3 planned episodes each: one finished but for a lost episode, one begun."""
-    settings = config(envs=[LINE, OTHER_LINE], episodes=3, policy="act", policy_url="http://localhost:1")
+    settings = config(
+        envs=[LINE, OTHER_LINE], episodes=3, policy="act", policy_url="http://localhost:1"
+    )
     jobs = plan(cells(settings))
     keys = [job.key for job in jobs]
     with Store(settings) as store:
@@ -36,21 +38,47 @@ def summary(config: Config) -> Summary:
         store.note_policy("act", {"policy": "act", "checkpoint": "a"})
         store.record(
             EpisodeResult(
-                keys[0], "done", True, False, steps=10, episode_return=2.0, seconds=1.0, transport="http", policy_ms=3.0
+                keys[0],
+                "done",
+                True,
+                False,
+                steps=10,
+                episode_return=2.0,
+                seconds=1.0,
+                transport="http",
+                policy_ms=3.0,
             ),
             1,
         )
         store.record(
             EpisodeResult(
-                keys[1], "policy_error", False, False, steps=2, episode_return=1.0, seconds=0.5, transport="http"
+                keys[1],
+                "policy_error",
+                False,
+                False,
+                steps=2,
+                episode_return=1.0,
+                seconds=0.5,
+                transport="http",
             ),
             2,
         )
         store.record_attempt(jobs[1], Failure("policy", "connection_lost", "gone"), retried=True)
-        store.record_attempt(replace(jobs[2], attempt=4), Failure("worker", "env_failed", "hung"), retried=False)
+        store.record_attempt(
+            replace(jobs[2], attempt=4), Failure("worker", "env_failed", "hung"), retried=False
+        )
         store.record(EpisodeResult(keys[2], "infra_failed", error="hung"), 4)
         store.record(
-            EpisodeResult(keys[3], "done", True, True, steps=6, episode_return=3.0, seconds=1.0, transport="websocket"),
+            EpisodeResult(
+                keys[3],
+                "done",
+                True,
+                True,
+                steps=6,
+                episode_return=3.0,
+                seconds=1.0,
+                transport="websocket",
+            ),
             1,
         )
         store.end_run("interrupted")
@@ -59,7 +87,12 @@ def summary(config: Config) -> Summary:
 
 def test_infrastructure_failures_are_in_no_rate(summary: Summary) -> None:
     group = summary.cells[0]
-    assert (group.planned, group.episodes, group.infra_failures, group.policy_errors) == (3, 2, 1, 1)
+    assert (group.planned, group.episodes, group.infra_failures, group.policy_errors) == (
+        3,
+        2,
+        1,
+        1,
+    )
     assert (group.success_once.successes, group.success_at_end.successes) == (1, 0)
     assert (group.success_once.rate, group.mean_steps, group.mean_return) == (0.5, 6.0, 1.5)
     assert group.retries == 1
@@ -105,7 +138,16 @@ def test_a_summary_says_how_busy_envs_and_policy_were(config: Config) -> None:
     with Store(settings) as store:
         store.begin_run(settings, versions())
         for job in plan(store.cells):
-            done = EpisodeResult(job.key, "done", True, True, steps=9, seconds=8.0, env_seconds=6.0, policy_seconds=1.0)
+            done = EpisodeResult(
+                job.key,
+                "done",
+                True,
+                True,
+                steps=9,
+                seconds=8.0,
+                env_seconds=6.0,
+                policy_seconds=1.0,
+            )
             store.record(done, 1)
         store.end_run("complete")
     summary = summarize(Results.load(settings.out))
@@ -113,7 +155,10 @@ def test_a_summary_says_how_busy_envs_and_policy_were(config: Config) -> None:
     assert summary.policy_busy == pytest.approx(2 / summary.rollout_seconds)
     assert summary.to_json()["env_busy"] == summary.env_busy
     of_replica = f"{summary.policy_busy:.0%}"
-    assert f"envs busy for 75% of the workers' time, the policy for {of_replica} of one replica's" in printed(summary)
+    assert (
+        f"envs busy for 75% of the workers' time, the policy for {of_replica} of one replica's"
+        in printed(summary)
+    )
 
 
 def recorded(settings: EvalConfig, outcomes: dict[str, list[bool]], **fields: int) -> Summary:
@@ -124,7 +169,9 @@ def recorded(settings: EvalConfig, outcomes: dict[str, list[bool]], **fields: in
             if job.key.episode < len(outcomes[job.cell.suite.name]):
                 success = outcomes[job.cell.suite.name][job.key.episode]
                 waited = fields if job.cell.suite.clock else {}
-                store.record(EpisodeResult(job.key, "done", success, success, **{"steps": 10} | waited), 1)
+                store.record(
+                    EpisodeResult(job.key, "done", success, success, **{"steps": 10} | waited), 1
+                )
         store.end_run("complete")
     return summarize(Results.load(settings.out))
 
@@ -157,7 +204,11 @@ def test_a_cell_in_real_time_tells_its_gap_to_the_synchronous_one(tmp_path: Path
     assert synchronous_twin(summary.results, moves) is waits
     assert synchronous_twin(summary.results, waits) is None
     assert synchronous_twin(summary.results, smaller) is None, "it differs in more than its clock"
-    assert [cell["gap_to_synchronous"] for cell in summary.to_json()["cells"]] == [None, -0.75, None]
+    assert [cell["gap_to_synchronous"] for cell in summary.to_json()["cells"]] == [
+        None,
+        -0.75,
+        None,
+    ]
     assert "policy, moves on in real time: -75.0 points to the synchronous score (" in text
     assert ", 4 pairs); 50% of its ticks waited for an answer, 20% with nothing to execute" in text
 
@@ -172,7 +223,12 @@ def test_console_report_and_summary_tell_the_same_gap(tmp_path: Path) -> None:
     # of the six episodes that wait, two have no pair: rates differ by -60 points, pairs by -50
     outcomes = {"waits": [True] * 3 + [False] + [True] * 2, "moves on": [True] + [False] * 3}
     summary, text = in_real_time(tmp_path, outcomes, [LINE, OTHER_LINE])
-    assert [cell["gap_to_synchronous"] for cell in summary.to_json()["cells"]] == [None, None, -0.5, -0.5]
+    assert [cell["gap_to_synchronous"] for cell in summary.to_json()["cells"]] == [
+        None,
+        None,
+        -0.5,
+        -0.5,
+    ]
     assert "moves on in real time: -50.0 points to the synchronous score (" in text
     assert ", 8 pairs)" in text
     page = write_report(summary.results, tmp_path / "report.html").read_text()
@@ -192,7 +248,9 @@ def test_real_time_and_synchronous_episodes_are_in_no_rate_together(tmp_path: Pa
     assert ">0.0" in page, "of those in real time"
 
 
-def test_cells_that_stopped_after_different_numbers_have_no_rate_in_common(config: Config, tmp_path: Path) -> None:
+def test_cells_that_stopped_after_different_numbers_have_no_rate_in_common(
+    config: Config, tmp_path: Path
+) -> None:
     settings = config(envs=[LINE, OTHER_LINE], episodes=40, stop={"target": 0.5, "at_least": 5})
     alike = recorded(settings.model_copy(update={"out": tmp_path / "alike"}), {"": [True] * 12})
     assert {cell.stopped_at for cell in alike.results.cells} != {None}
@@ -202,7 +260,9 @@ def test_cells_that_stopped_after_different_numbers_have_no_rate_in_common(confi
         for job in plan(store.cells):  # one task is solved at once, the other every second time
             success = job.cell.env == LINE or bool(job.key.episode % 2)
             if job.cell.env == OTHER_LINE or job.key.episode < 12:
-                store.record(EpisodeResult(job.key, "done", success, success, first_success=3, steps=9), 1)
+                store.record(
+                    EpisodeResult(job.key, "done", success, success, first_success=3, steps=9), 1
+                )
         store.end_run("complete")
     summary = summarize(Results.load(settings.out))
     first, second = summary.results.cells
@@ -218,7 +278,9 @@ def test_cells_that_stopped_after_different_numbers_have_no_rate_in_common(confi
     assert f"{pooled:.1f}" not in page
 
 
-def test_a_cell_that_stopped_early_says_after_how_many_and_at_which_error_rate(config: Config) -> None:
+def test_a_cell_that_stopped_early_says_after_how_many_and_at_which_error_rate(
+    config: Config,
+) -> None:
     settings = config(episodes=40, stop={"target": 0.5, "error_rate": 0.01})
     summary = recorded(settings, {"": [True] * 20})
     [cell] = summary.to_json()["cells"]
@@ -247,7 +309,9 @@ def test_pushed_weights_are_named_with_the_checkpoint(
     with Store(settings) as store:
         store.begin_run(settings, {})
         for job, (first, last) in zip(plan(cells(settings)), versions, strict=True):
-            done = EpisodeResult(job.key, "done", True, True, first_policy_version=first, policy_version=last)
+            done = EpisodeResult(
+                job.key, "done", True, True, first_policy_version=first, policy_version=last
+            )
             store.record(replace(done, policy_fingerprint=f"digest {last}"), 1)
     summary = summarize(Results.load(settings.out))
     assert summary.to_json()["cells"][0]["pushed_weights"] == says

@@ -1,4 +1,6 @@
-"""The operator's page: what it answers, to whom, and a whole evaluation over it; and the operator at a terminal."""
+"""The operator's page: what it answers, to whom, and a whole evaluation over it; and the
+operator at a terminal.
+"""
 
 from __future__ import annotations
 
@@ -18,7 +20,12 @@ import pytest
 from eval_fakes import wait_for
 from robot_trials import NAMES, URLS, Arm, Evaluation, plan, tasks
 
-from vlagents_ray.evaluate.robot import PageOperator, TerminalOperator, TrialsInterrupted, VisibleTrial
+from vlagents_ray.evaluate.robot import (
+    PageOperator,
+    TerminalOperator,
+    TrialsInterrupted,
+    VisibleTrial,
+)
 from vlagents_ray.images.jpeg_png import decode
 
 
@@ -50,7 +57,11 @@ class Person:
         return found
 
     def answer(self, do: str, state: dict[str, Any], **more: Any) -> int:
-        about = {"phase": state["phase"], "trial": state["trial"]["number"], "attempt": state["trial"]["attempt"]}
+        about = {
+            "phase": state["phase"],
+            "trial": state["trial"]["number"],
+            "attempt": state["trial"]["attempt"],
+        }
         return self.post(json.dumps({**about, "do": do, **more}).encode())
 
     def post(self, body: bytes, kind: str = "application/json") -> int:
@@ -73,13 +84,17 @@ def operator() -> Iterator[PageOperator]:
 
 
 def watch_to_the_end(person: Person) -> None:
-    """Poll as an open page does: the operator waits for one that is open to show how the evaluation ended."""
+    """Poll as an open page does: the operator waits for one that is open to show how the
+    evaluation ended.
+    """
     with contextlib.suppress(OSError):  # it has ended already
         while person.state()["phase"] != "end":
             time.sleep(0.01)
 
 
-def test_a_whole_evaluation_over_the_page_shows_no_policy(tmp_path: Path, operator: PageOperator) -> None:
+def test_a_whole_evaluation_over_the_page_shows_no_policy(
+    tmp_path: Path, operator: PageOperator
+) -> None:
     person = Person(operator.url)
     config = plan(tmp_path / "out", suite={"episodes": 1})
     run = Evaluation(config, operator, Arm())
@@ -98,7 +113,12 @@ def test_a_whole_evaluation_over_the_page_shows_no_policy(tmp_path: Path, operat
         assert verdict["ending"] == "the trial is over"
         assert person.answer("repeat", verdict) == 400, "it wants a reason"
         earned = ["the cup is on the plate"]
-        assert person.answer("partial" if number < 3 else "success", verdict, earned=earned, note="slowly") == 200
+        assert (
+            person.answer(
+                "partial" if number < 3 else "success", verdict, earned=earned, note="slowly"
+            )
+            == 200
+        )
     run.join()
     assert run.error is None
     assert run.summary is not None
@@ -110,7 +130,11 @@ def test_a_whole_evaluation_over_the_page_shows_no_policy(tmp_path: Path, operat
 
 @pytest.mark.parametrize(
     ("error", "said"),
-    [(None, "is complete"), (KeyboardInterrupt(), "--resume"), (ValueError("pi0"), "see the terminal")],
+    [
+        (None, "is complete"),
+        (KeyboardInterrupt(), "--resume"),
+        (ValueError("pi0"), "see the terminal"),
+    ],
 )
 def test_an_open_page_says_how_the_evaluation_ended(error: BaseException | None, said: str) -> None:
     """Before the server is gone: afterwards, an end and a lost connection look the same."""
@@ -120,7 +144,10 @@ def test_an_open_page_says_how_the_evaluation_ended(error: BaseException | None,
         while not read or read[-1]["phase"] != "end":
             read.append(person.state())
 
-    with contextlib.suppress(KeyboardInterrupt, ValueError), PageOperator(say=lambda _: None) as operator:
+    with (
+        contextlib.suppress(KeyboardInterrupt, ValueError),
+        PageOperator(say=lambda _: None) as operator,
+    ):
         watching = threading.Thread(target=watch, args=[Person(operator.url)])
         watching.start()
         wait_for(lambda: read)
@@ -131,7 +158,9 @@ def test_an_open_page_says_how_the_evaluation_ended(error: BaseException | None,
     assert "pi0" not in read[-1]["ending"]
 
 
-def test_an_answer_counts_for_the_question_that_was_shown(tmp_path: Path, operator: PageOperator) -> None:
+def test_an_answer_counts_for_the_question_that_was_shown(
+    tmp_path: Path, operator: PageOperator
+) -> None:
     person = Person(operator.url)
     run = Evaluation(plan(tmp_path / "out"), operator, arm := Arm())
     scene = person.until("scene")
@@ -141,7 +170,9 @@ def test_an_answer_counts_for_the_question_that_was_shown(tmp_path: Path, operat
     assert person.post(b"[" * 9999) == 400
     assert person.post(b"{}") == 400
     assert person.post(b" " * 20_000) == 413
-    assert person.post(b"{}", "text/plain") == 415, "what a form of another site can send without being asked"
+    assert person.post(b"{}", "text/plain") == 415, (
+        "what a form of another site can send without being asked"
+    )
     assert arm.applied == 0, "and nothing moved"
     assert person.answer("end", scene) == 200
     run.join()
@@ -160,7 +191,9 @@ def test_without_the_addresss_random_part_there_is_no_answer(operator: PageOpera
 def test_the_page_may_load_nothing_from_elsewhere(operator: PageOperator) -> None:
     with urllib.request.urlopen(operator.url, timeout=30) as answer:
         policy, html = answer.headers["content-security-policy"], answer.read().decode()
-    assert policy.startswith("default-src 'none'; script-src 'self'; style-src 'self'; connect-src 'self';")
+    assert policy.startswith(
+        "default-src 'none'; script-src 'self'; style-src 'self'; connect-src 'self';"
+    )
     assert "http" not in html.replace("http-equiv", "")
 
 
@@ -169,7 +202,9 @@ def test_a_trial_is_stopped_by_the_button_or_when_the_page_is_gone(
     tmp_path: Path, operator: PageOperator, how: str
 ) -> None:
     person = Person(operator.url)
-    config = plan(tmp_path / "out", robot={"tasks": tasks(max_steps=200 * 60)}, suite={"envs": ["drawer"]})
+    config = plan(
+        tmp_path / "out", robot={"tasks": tasks(max_steps=200 * 60)}, suite={"envs": ["drawer"]}
+    )
     run = Evaluation(config, operator, arm := Arm())
     assert person.answer("ready", person.until("scene")) == 200
     playing = person.until("playing")
@@ -213,7 +248,9 @@ def test_enter_stops_a_trial_once(keyboard: int) -> None:
     assert not person.stops(), "it is read, and no answer to the next question"
 
 
-def test_lines_of_a_pipe_are_left_for_the_questions(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_lines_of_a_pipe_are_left_for_the_questions(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     (tmp_path / "answers").write_text("s\n")
     with (tmp_path / "answers").open() as stdin:
         monkeypatch.setattr("sys.stdin", stdin)

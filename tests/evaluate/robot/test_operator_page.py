@@ -15,7 +15,10 @@ from vlagents_ray.evaluate.robot import PageOperator
 pytestmark = [pytest.mark.browser, pytest.mark.slow]
 
 PHASE = "document.getElementById('phase').textContent"
-LIVE = "[...document.querySelectorAll('figure img')].filter((one) => one.naturalWidth === 32 && !one.hidden).length"
+LIVE = (
+    "[...document.querySelectorAll('figure img')].filter((one) => one.naturalWidth === 32 && "
+    "!one.hidden).length"
+)
 CLICK = "document.querySelector('[data-do={}]').click()"
 
 
@@ -37,10 +40,14 @@ def require_tidy(page: Page, width: int) -> None:
 
 
 @pytest.mark.parametrize(("width", "scheme"), [(360, "light"), (1400, "dark")])
-def test_a_scene_is_set_played_and_judged(page: Page, tmp_path: Path, width: int, scheme: str) -> None:
+def test_a_scene_is_set_played_and_judged(
+    page: Page, tmp_path: Path, width: int, scheme: str
+) -> None:
     page.said.clear()
     page.asked.clear()
-    config = plan(tmp_path / "out", suite={"episodes": 1}, robot={"tasks": tasks(max_steps=200 * 60)})
+    config = plan(
+        tmp_path / "out", suite={"episodes": 1}, robot={"tasks": tasks(max_steps=200 * 60)}
+    )
     with PageOperator(say=lambda _: None) as operator:
         run = Evaluation(config, operator, Arm())
         page.open(operator.url, width=width, scheme=scheme)
@@ -52,7 +59,10 @@ def test_a_scene_is_set_played_and_judged(page: Page, tmp_path: Path, width: int
                 page.value("document.getElementById('opacity').value = 20")
                 until(page, "[...document.querySelectorAll('figure img')][1].style.opacity", "0.2")
             require_tidy(page, width)
-            assert page.value("document.querySelector('[data-do=ready]').getBoundingClientRect().bottom <= innerHeight")
+            assert page.value(
+                "document.querySelector('[data-do=ready]').getBoundingClientRect().bottom <= "
+                "innerHeight"
+            )
             page.value(CLICK.format("ready"))
             if number > 2:
                 until(page, PHASE, "Running")
@@ -61,7 +71,11 @@ def test_a_scene_is_set_played_and_judged(page: Page, tmp_path: Path, width: int
             until(page, PHASE, "Your verdict")
             require_tidy(page, width)
             page.value(CLICK.format("repeat"))
-            until(page, "document.getElementById('error').textContent.includes('without a reason')", want=True)
+            until(
+                page,
+                "document.getElementById('error').textContent.includes('without a reason')",
+                want=True,
+            )
             if number < 3:
                 page.value("document.querySelector('#parts input').click()")
             page.value(CLICK.format("partial" if number < 3 else "failure"))
@@ -72,7 +86,8 @@ def test_a_scene_is_set_played_and_judged(page: Page, tmp_path: Path, width: int
     until(page, PHASE, "The evaluation is complete: close this page")
     until(
         page,
-        "document.querySelectorAll('button').length - document.querySelectorAll('#answers[hidden] button').length",
+        "document.querySelectorAll('button').length - document.querySelectorAll('#answers[hidden] "
+        "button').length",
         0,
     )
     require_tidy(page, width)

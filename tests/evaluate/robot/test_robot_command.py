@@ -34,7 +34,13 @@ def write_plan(file: Path) -> None:
         {"name": name, "source": "noop", "config": {"action_dim": 2, "chunk": chunk}}
         for chunk, name in enumerate(NAMES, start=3)
     ]
-    robot = {"hz": 50, "mode": "open_loop", "safe": "hold", "key": "the key of the plan", "tasks": tasks()}
+    robot = {
+        "hz": 50,
+        "mode": "open_loop",
+        "safe": "hold",
+        "key": "the key of the plan",
+        "tasks": tasks(),
+    }
     plan = {"policies": policies, "suites": [{"envs": ["drawer"], "episodes": 2}], "robot": robot}
     file.write_text(yaml.safe_dump(plan))
 
@@ -64,11 +70,24 @@ class Terminal:
 
 @contextmanager
 def evaluating(plan: Path, out: Path, *options: str) -> Iterator[Terminal]:
-    command = [sys.executable, "-c", "from vlagents_ray.cli import main; main()", "eval", str(plan), "--out", str(out)]
+    command = [
+        sys.executable,
+        "-c",
+        "from vlagents_ray.cli import main; main()",
+        "eval",
+        str(plan),
+        "--out",
+        str(out),
+    ]
     command += ["--robot", "robot_trials:Arm", "--operator", "terminal", *options]
     environment = os.environ | {"PYTHONPATH": PYTHONPATH, "PYTHONUNBUFFERED": "1"}
     with subprocess.Popen(
-        command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, bufsize=0, env=environment
+        command,
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        bufsize=0,
+        env=environment,
     ) as process:
         try:
             yield Terminal(process)
@@ -77,7 +96,9 @@ def evaluating(plan: Path, out: Path, *options: str) -> Iterator[Terminal]:
 
 
 def require_blind(terminal: Terminal, out: Path) -> None:
-    visible = [path for path in out.rglob("*") if path.is_file() and path.name != "trials.hidden.jsonl"]
+    visible = [
+        path for path in out.rglob("*") if path.is_file() and path.name != "trials.hidden.jsonl"
+    ]
     seen = [terminal.read] + [path.read_bytes() for path in visible]
     seen += [str(path.relative_to(out)).encode() for path in out.rglob("*")]
     for text in (*NAMES, "serve://", "zebra", "walrus", "noop"):
@@ -108,7 +129,9 @@ def test_it_serves_both_is_killed_goes_on_and_then_tells(tmp_path: Path) -> None
     results = Results.load(out)
     config = EvalConfig.model_validate(results.runs[-1].config)
     order = [trial.job.key for trial in schedule(cells(config), b"the key of the plan")]
-    outcomes = {one.result.key: one.result.success_once for cell in results.cells for one in cell.episodes}
+    outcomes = {
+        one.result.key: one.result.success_once for cell in results.cells for one in cell.episodes
+    }
     assert [outcomes[key] for key in order] == [True, True, False, False]
     assert [attempt.cause for cell in results.cells for attempt in cell.attempts] == ["operator"]
     assert {one.result.transport for cell in results.cells for one in cell.episodes} == {"shm"}

@@ -1,4 +1,6 @@
-"""Trials on a simulated arm with a scripted person: what they see, what is recorded, and what comes out."""
+"""Trials on a simulated arm with a scripted person: what they see, what is recorded, and what
+comes out.
+"""
 
 from __future__ import annotations
 
@@ -27,7 +29,13 @@ from robot_trials import (
 from vlagents_ray.errors import ConfigError, ConnectionLost, MissingState, PolicyFailed
 from vlagents_ray.evaluate import EvalConfig, evaluate
 from vlagents_ray.evaluate.plan.cases import cells
-from vlagents_ray.evaluate.robot import TrialsInterrupted, Verdict, evaluate_on_robot, schedule, unblind
+from vlagents_ray.evaluate.robot import (
+    TrialsInterrupted,
+    Verdict,
+    evaluate_on_robot,
+    schedule,
+    unblind,
+)
 from vlagents_ray.images.jpeg_png import decode
 from vlagents_ray.interface import Act, Obs
 
@@ -51,7 +59,10 @@ def test_what_tells_the_policy_is_nowhere_until_all_are_judged(
         seen = [output(), "\n".join(person.printed).encode(), caplog.text.encode()]
         for path in tmp_path.rglob("*"):
             visible = path.is_file() and path != hidden
-            seen += [str(path.relative_to(tmp_path)).encode(), path.read_bytes() if visible else b""]
+            seen += [
+                str(path.relative_to(tmp_path)).encode(),
+                path.read_bytes() if visible else b"",
+            ]
         found = [text for text in revealing if any(text.encode() in one for one in seen)]
         assert not found, f"before question {looks}"
 
@@ -61,22 +72,30 @@ def test_what_tells_the_policy_is_nowhere_until_all_are_judged(
         summary = evaluate_on_robot(config, person, agent_factory=Policies(Talkative))
     assert looks == 3 * 8, "ready, verdict and note of each trial"
     assert (tmp_path / "out" / "recordings" / "trial0008-1" / "meta" / "info.json").is_file()
-    lines = [json.loads(line) for line in (tmp_path / "out" / "trials.jsonl").read_text().splitlines()]
+    lines = [
+        json.loads(line) for line in (tmp_path / "out" / "trials.jsonl").read_text().splitlines()
+    ]
     assert hidden.stat().st_mode & 0o777 == 0o600
-    assert len({len(line) for line in hidden.read_bytes().splitlines()}) == 1, "the size of the file tells nothing"
+    assert len({len(line) for line in hidden.read_bytes().splitlines()}) == 1, (
+        "the size of the file tells nothing"
+    )
     shown = {"trial", "attempt", "at", "outcome", "earned", "note", "score", "ending", "hidden"}
     assert [set(line) for line in lines if "outcome" in line] == [shown] * 8
     found = summary.results
     assert found.contenders == list(NAMES), "and then it is told"
     assert b"step-4711" in (tmp_path / "out" / "results.db").read_bytes()
-    assert {one.result.weights for cell in found.of(NAMES[0]) for one in cell.episodes} == {f"digest-of-{NAMES[0]}"}
+    assert {one.result.weights for cell in found.of(NAMES[0]) for one in cell.episodes} == {
+        f"digest-of-{NAMES[0]}"
+    }
 
 
 class Talkative(Reaching):
     """A policy whose connection logs its name."""
 
     def act(self, obs: Obs) -> Act:
-        logging.getLogger("vlagents_ray.client.connection").warning("%s: slow, at %s", self.name, URLS[self.name])
+        logging.getLogger("vlagents_ray.client.connection").warning(
+            "%s: slow, at %s", self.name, URLS[self.name]
+        )
         logging.getLogger("ray.serve").error("replica of %s", self.name)
         return super().act(obs)
 
@@ -90,13 +109,17 @@ def test_without_a_key_one_is_drawn_that_this_user_alone_can_read(tmp_path: Path
         key = tmp_path / str(number) / "trials.key"
         assert key.stat().st_mode & 0o777 == 0o600
         drawn = [trial.job.cell.contender for trial in schedule(cells(config), key.read_bytes())]
-        assert policies.made[:2] == sorted(NAMES), "each is rehearsed, in an order that tells nothing"
+        assert policies.made[:2] == sorted(NAMES), (
+            "each is rehearsed, in an order that tells nothing"
+        )
         assert policies.made[2:] == drawn, "who has the key draws the same"
         orders.add(key.read_bytes())
     assert len(orders) == 2
 
 
-def test_a_partial_success_is_none_and_its_score_is_the_share_of_the_rubrics_points(tmp_path: Path) -> None:
+def test_a_partial_success_is_none_and_its_score_is_the_share_of_the_rubrics_points(
+    tmp_path: Path,
+) -> None:
     def answer(question: str) -> str:
         if "grasped" in question:
             return "y"
@@ -105,7 +128,11 @@ def test_a_partial_success_is_none_and_its_score_is_the_share_of_the_rubrics_poi
     config = plan(tmp_path / "out", suite={"envs": ["cups"], "episodes": 1})
     summary = evaluate_on_robot(config, ScriptedPerson(answer), agent_factory=Policies())
     [one, other] = [episode.result for cell in summary.results.cells for episode in cell.episodes]
-    assert (one.success_once, one.episode_return) == (other.success_once, other.episode_return) == (False, 0.25)
+    assert (
+        (one.success_once, one.episode_return)
+        == (other.success_once, other.episode_return)
+        == (False, 0.25)
+    )
     assert summary.total.mean_return == 0.25
     line = json.loads((tmp_path / "out" / "trials.jsonl").read_text().splitlines()[2])
     assert (line["outcome"], line["earned"]) == ("partial", ["the cup is grasped"])
@@ -120,7 +147,9 @@ def test_a_task_without_a_rubric_knows_no_partial_success() -> None:
         Verdict("repeat").score({})
 
 
-def test_a_repeated_trial_is_counted_with_its_reason_and_played_by_the_same_policy(tmp_path: Path) -> None:
+def test_a_repeated_trial_is_counted_with_its_reason_and_played_by_the_same_policy(
+    tmp_path: Path,
+) -> None:
     lines = ["", "r", "", "r", "somebody walked into the scene", "", "s", "", *["", "s", ""] * 3]
     config, policies = plan(tmp_path / "out", suite={"episodes": 2, "envs": ["drawer"]}), Policies()
     person = ScriptedPerson(typed(lines))
@@ -130,19 +159,32 @@ def test_a_repeated_trial_is_counted_with_its_reason_and_played_by_the_same_poli
     assert any("without a reason" in line for line in person.printed)
     assert any("played again: somebody walked into the scene" in line for line in person.printed)
     [attempt] = [attempt for cell in summary.results.cells for attempt in cell.attempts]
-    assert (attempt.cause, attempt.error, attempt.retried) == ("operator", "somebody walked into the scene", True)
+    assert (attempt.cause, attempt.error, attempt.retried) == (
+        "operator",
+        "somebody walked into the scene",
+        True,
+    )
     assert summary.total.retries == 1
-    assert sorted(one.attempts for cell in summary.results.cells for one in cell.episodes) == [1, 1, 1, 2]
+    assert sorted(one.attempts for cell in summary.results.cells for one in cell.episodes) == [
+        1,
+        1,
+        1,
+        2,
+    ]
 
 
-def test_an_arm_that_fails_is_stopped_and_its_trial_played_again_by_the_same_policy(tmp_path: Path) -> None:
+def test_an_arm_that_fails_is_stopped_and_its_trial_played_again_by_the_same_policy(
+    tmp_path: Path,
+) -> None:
     arm, policies = Arm(fails_at=7), Policies()
     config = plan(tmp_path / "out", suite={"episodes": 1}, robot={"hz": 50})
     person = ScriptedPerson(judged("s"))
     summary = evaluate_on_robot(config, person, robot=arm, agent_factory=policies)
     order = names_by_trial(config)
     assert policies.made[2:] == [order[0], order[1], order[1], *order[2:]]
-    assert any("joint 3 is too hot" in line for line in person.printed), "the person is told what to mend"
+    assert any("joint 3 is too hot" in line for line in person.printed), (
+        "the person is told what to mend"
+    )
     assert arm.stops >= 5
     [attempt] = [attempt for cell in summary.results.cells for attempt in cell.attempts]
     assert (attempt.cause, attempt.code) == ("worker", "env_failed")
@@ -168,7 +210,9 @@ def test_a_lost_connection_is_told_without_the_policy_and_is_no_failure_of_it(
 
     policies = Policies(Losing)
     config = plan(
-        tmp_path / "out", suite={"episodes": 1, "envs": ["drawer"]}, robot={"tasks": tasks(max_steps=12), "hz": 50}
+        tmp_path / "out",
+        suite={"episodes": 1, "envs": ["drawer"]},
+        robot={"tasks": tasks(max_steps=12), "hz": 50},
     )
     person = ScriptedPerson(judged("f"))
     summary = evaluate_on_robot(config, person, agent_factory=policies)
@@ -193,7 +237,9 @@ def test_a_policy_that_fails_has_failed_without_a_verdict(tmp_path: Path) -> Non
     person = ScriptedPerson(judged("s"))
     summary = evaluate_on_robot(config, person, agent_factory=Policies(Failing))
     assert sum(question.startswith("verdict") for question in person.printed) == 1
-    assert any("trial 1: the policy failed, so it counts as a failure" in line for line in person.printed)
+    assert any(
+        "trial 1: the policy failed, so it counts as a failure" in line for line in person.printed
+    )
     assert not any("zebra" in line or "walrus" in line for line in person.printed)
     assert (summary.total.policy_errors, summary.total.success_once.successes) == (1, 1)
 
@@ -220,13 +266,18 @@ def test_the_guard_sees_each_action(tmp_path: Path) -> None:
 def test_a_trial_has_the_limits_of_the_plan(tmp_path: Path) -> None:
     (tmp_path / "arm.json").write_text('{"low": -0.001, "high": 0.001}')
     robot = {"limits": str(tmp_path / "arm.json")}
-    arm, config = Arm(), plan(tmp_path / "out", suite={"episodes": 1, "envs": ["drawer"]}, robot=robot)
+    arm, config = (
+        Arm(),
+        plan(tmp_path / "out", suite={"episodes": 1, "envs": ["drawer"]}, robot=robot),
+    )
     evaluate_on_robot(config, ScriptedPerson(judged("f")), robot=arm, agent_factory=Policies())
     assert np.abs(arm.observe().state["joints"]).max() <= 0.001
 
 
 @pytest.mark.parametrize("mode", ["async", "ensemble"])
-def test_it_plays_in_each_mode_of_the_chunk_player_and_closes_what_it_opened(tmp_path: Path, mode: str) -> None:
+def test_it_plays_in_each_mode_of_the_chunk_player_and_closes_what_it_opened(
+    tmp_path: Path, mode: str
+) -> None:
     closed: list[str] = []
 
     class Closing(Reaching):
@@ -236,12 +287,16 @@ def test_it_plays_in_each_mode_of_the_chunk_player_and_closes_what_it_opened(tmp
     arm, policies = Arm(), Policies(Closing)
     robot = {"mode": mode, "tasks": tasks(max_steps=20)}
     config = plan(tmp_path / "out", suite={"episodes": 2, "envs": ["drawer"]}, robot=robot)
-    summary = evaluate_on_robot(config, ScriptedPerson(judged("s")), robot=arm, agent_factory=policies)
+    summary = evaluate_on_robot(
+        config, ScriptedPerson(judged("s")), robot=arm, agent_factory=policies
+    )
     assert sorted(closed) == sorted(policies.made)
     results = [episode.result for cell in summary.results.cells for episode in cell.episodes]
     assert sum(result.steps for result in results) == arm.applied > 0
     assert all(0 < result.steps <= 20 and result.acts > 0 for result in results)
-    assert {result.policy_fingerprint for result in results} == {f"fingerprint-of-{name}" for name in NAMES}
+    assert {result.policy_fingerprint for result in results} == {
+        f"fingerprint-of-{name}" for name in NAMES
+    }
 
 
 def test_the_arm_stays_still_while_nobody_is_there(tmp_path: Path) -> None:
@@ -271,15 +326,26 @@ def test_it_goes_on_with_the_next_trial(tmp_path: Path) -> None:
     person = ScriptedPerson(judged("f"))
     summary = evaluate_on_robot(again, person, agent_factory=later)
     assert later.made[2:] == names_by_trial(config)[2:]
-    assert any("played again: the evaluation ended before the verdict" in line for line in person.printed)
-    assert (summary.total.episodes, summary.total.success_once.successes, summary.total.retries) == (8, 2, 1)
-    assert evaluate_on_robot(again, ScriptedPerson(typed([])), agent_factory=Policies()).total.episodes == 8
+    assert any(
+        "played again: the evaluation ended before the verdict" in line for line in person.printed
+    )
+    assert (
+        summary.total.episodes,
+        summary.total.success_once.successes,
+        summary.total.retries,
+    ) == (8, 2, 1)
+    assert (
+        evaluate_on_robot(again, ScriptedPerson(typed([])), agent_factory=Policies()).total.episodes
+        == 8
+    )
 
 
 def test_a_line_that_a_killed_process_left_half_written_is_dropped(tmp_path: Path) -> None:
     config = plan(tmp_path / "out")
     with pytest.raises(TrialsInterrupted):
-        evaluate_on_robot(config, ScriptedPerson(typed(["", "s", "", "", "s", ""])), agent_factory=Policies())
+        evaluate_on_robot(
+            config, ScriptedPerson(typed(["", "s", "", "", "s", ""])), agent_factory=Policies()
+        )
     log = tmp_path / "out" / "trials.jsonl"
     whole = log.read_bytes()
     log.write_bytes(whole[:-40])
@@ -305,11 +371,15 @@ def test_a_hidden_file_that_was_changed_is_refused(tmp_path: Path, damage: str) 
         hidden.write_text(text[:-40])
     else:
         hidden.unlink()
-    with pytest.raises(ConfigError, match=r"hidden line of trial 1 is missing in .*, or was changed"):
+    with pytest.raises(
+        ConfigError, match=r"hidden line of trial 1 is missing in .*, or was changed"
+    ):
         evaluate_on_robot(config, ScriptedPerson(judged("s")), agent_factory=Policies())
 
 
-def test_a_hidden_line_that_a_killed_process_left_incomplete_before_its_first_trial_is_dropped(tmp_path: Path) -> None:
+def test_a_hidden_line_that_a_killed_process_left_incomplete_before_its_first_trial_is_dropped(
+    tmp_path: Path,
+) -> None:
     config = plan(tmp_path / "out", resume=True, suite={"episodes": 1})
     (tmp_path / "out").mkdir()
     (tmp_path / "out" / "trials.hidden.jsonl").write_bytes(b'{"config": {"pol')
@@ -331,15 +401,23 @@ def test_a_hidden_line_without_its_line_in_the_log_is_of_no_trial(tmp_path: Path
     hidden.write_bytes(hidden.read_bytes() + b'{"result": {"ste')
     with pytest.raises(TrialsInterrupted, match="after 0 of 8"):
         evaluate_on_robot(config, ScriptedPerson(typed([])), agent_factory=Policies())
-    assert evaluate_on_robot(config, ScriptedPerson(judged("s")), agent_factory=Policies()).total.episodes == 8
+    assert (
+        evaluate_on_robot(
+            config, ScriptedPerson(judged("s")), agent_factory=Policies()
+        ).total.episodes
+        == 8
+    )
 
 
 @pytest.mark.parametrize(
-    "changes", [{"robot": {"key": "another key"}}, {"suite": {"episodes": 5}}, {"robot": {"hz": 100}}]
+    "changes",
+    [{"robot": {"key": "another key"}}, {"suite": {"episodes": 5}}, {"robot": {"hz": 100}}],
 )
 def test_another_plan_or_key_is_refused(tmp_path: Path, changes: dict[str, Any]) -> None:
     with pytest.raises(TrialsInterrupted):
-        evaluate_on_robot(plan(tmp_path / "out"), ScriptedPerson(typed(["", "s", ""])), agent_factory=Policies())
+        evaluate_on_robot(
+            plan(tmp_path / "out"), ScriptedPerson(typed(["", "s", ""])), agent_factory=Policies()
+        )
     other = plan(tmp_path / "out", resume=True, **changes)
     with pytest.raises(ConfigError, match="is of another plan, robot or key"):
         evaluate_on_robot(other, ScriptedPerson(typed([])), agent_factory=Policies())
@@ -351,8 +429,12 @@ def test_a_policy_that_changed_between_trials_ends_it_without_being_named(tmp_pa
             super().__init__(name, f"/weights/{name}/{len(policies.made) > 4}")
 
     policies = Policies(Swapped)
-    with pytest.raises(ConfigError, match="the checkpoint of a policy has changed since its earlier trials") as raised:
-        evaluate_on_robot(plan(tmp_path / "out"), ScriptedPerson(judged("s")), agent_factory=policies)
+    with pytest.raises(
+        ConfigError, match="the checkpoint of a policy has changed since its earlier trials"
+    ) as raised:
+        evaluate_on_robot(
+            plan(tmp_path / "out"), ScriptedPerson(judged("s")), agent_factory=policies
+        )
     assert not any(name in str(raised.value) for name in NAMES)
 
 
@@ -376,10 +458,14 @@ def test_a_task_ends_early_once_all_its_policies_are_certain(tmp_path: Path) -> 
 def test_results_can_be_told_before_the_end_which_the_log_says(tmp_path: Path) -> None:
     config = plan(tmp_path / "out", robot={"key": None})
     with pytest.raises(TrialsInterrupted):
-        evaluate_on_robot(config, ScriptedPerson(typed(["", "s", "", "", "f", ""])), agent_factory=Policies())
+        evaluate_on_robot(
+            config, ScriptedPerson(typed(["", "s", "", "", "f", ""])), agent_factory=Policies()
+        )
     summary = unblind(tmp_path / "out")
     assert (summary.state, summary.total.episodes) == ("interrupted", 2)
-    assert "unblinded" in json.loads((tmp_path / "out" / "trials.jsonl").read_text().splitlines()[-1])
+    assert "unblinded" in json.loads(
+        (tmp_path / "out" / "trials.jsonl").read_text().splitlines()[-1]
+    )
     with pytest.raises(ConfigError, match="cannot be read with this key"):
         unblind(tmp_path / "out", "another key")
     with pytest.raises(ConfigError, match="want the folder of an evaluation on a robot"):
@@ -401,7 +487,11 @@ def test_the_first_start_of_a_scene_is_what_later_trials_of_it_are_set_to(tmp_pa
     evaluate_on_robot(config, person, agent_factory=Policies())
     start = tmp_path / "out" / "scenes" / "drawer-scene1" / "front.jpg"
     overlay = start.parent.with_name("overlay-front.jpg")
-    assert [line.strip() for line in person.printed if "scene" in line and "start picture" in line and "yet" in line]
+    assert [
+        line.strip()
+        for line in person.printed
+        if "scene" in line and "start picture" in line and "yet" in line
+    ]
     assert any(str(start) in line for line in person.printed)
     assert any(line.strip() == str(overlay) for line in person.printed)
     assert decode(start.read_bytes()).shape == decode(overlay.read_bytes()).shape == (32, 32, 3)
@@ -413,7 +503,10 @@ def test_a_first_trial_that_is_repeated_takes_the_start_pictures_again(tmp_path:
 
         def observe(self) -> Obs:
             self.seen += 1
-            return replace(super().observe(), cameras={"front": np.full((8, 8, 3), 5 * self.seen % 256, np.uint8)})
+            return replace(
+                super().observe(),
+                cameras={"front": np.full((8, 8, 3), 5 * self.seen % 256, np.uint8)},
+            )
 
     pictures: list[bytes] = []
 
@@ -422,7 +515,9 @@ def test_a_first_trial_that_is_repeated_takes_the_start_pictures_again(tmp_path:
 
     lines = ["", "r", "the cup stood on another mark", "", "s", "", "", "s", ""]
     config = plan(tmp_path / "out", suite={"episodes": 1, "envs": ["drawer"]})
-    evaluate_on_robot(config, ScriptedPerson(typed(lines), keep), robot=Flashing(), agent_factory=Policies())
+    evaluate_on_robot(
+        config, ScriptedPerson(typed(lines), keep), robot=Flashing(), agent_factory=Policies()
+    )
     assert len(pictures) == 8, "at every question but the first"
     assert list(dict.fromkeys(pictures)) == [pictures[0], pictures[3]]
     assert pictures[3:] == [pictures[3]] * 5, "the second policy is not asked for another start"

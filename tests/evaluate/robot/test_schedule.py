@@ -19,7 +19,9 @@ keys = st.binary(min_size=8, max_size=40)
 TASKS = ("cups", "drawer")
 
 
-def drawn(key: bytes, policies: int, episodes: int, seeds: list[int], tasks: Sequence[str] = TASKS) -> list[Trial]:
+def drawn(
+    key: bytes, policies: int, episodes: int, seeds: list[int], tasks: Sequence[str] = TASKS
+) -> list[Trial]:
     names = [{"name": f"p{number}", "url": "http://x"} for number in range(policies)]
     robot = {"tasks": {task: {"instruction": f"use the {task}", "max_steps": 5} for task in tasks}}
     suite = {"envs": list(tasks), "episodes": episodes, "seeds": seeds}
@@ -43,7 +45,9 @@ def orders_by_task(trials: list[Trial]) -> dict[str, list[list[str]]]:
 
 
 def imbalance(orders: list[list[str]]) -> int:
-    """Return by how much two policies differ at most in how often they are first, second, and so on."""
+    """Return by how much two policies differ at most in how often they are first, second, and so
+    on.
+    """
     names = sorted(orders[0])
     differences = []
     for position in range(len(names)):
@@ -55,7 +59,9 @@ def imbalance(orders: list[list[str]]) -> int:
 
 @settings(max_examples=60, deadline=None)
 @given(keys, st.integers(1, 5), st.integers(1, 13), st.sampled_from([[0], [0, 100], [7, 20, 400]]))
-def test_every_policy_plays_every_scene_once(key: bytes, policies: int, episodes: int, seeds: list[int]) -> None:
+def test_every_policy_plays_every_scene_once(
+    key: bytes, policies: int, episodes: int, seeds: list[int]
+) -> None:
     trials = drawn(key, policies, episodes, seeds)
     assert [trial.number for trial in trials] == list(range(1, len(trials) + 1))
     expected = [(task, scene) for task in TASKS for scene in range(1, episodes * len(seeds) + 1)]
@@ -77,19 +83,29 @@ def test_each_place_is_had_equally_often_whatever_the_shape_of_the_plan(
     key: bytes, policies: int, episodes: int, seeds: int, tasks: int
 ) -> None:
     """In each task and in the whole plan, also with one episode of many seeds, or of many tasks."""
-    trials = drawn(key, policies, episodes, [100 * seed for seed in range(seeds)], [f"task{n}" for n in range(tasks)])
+    trials = drawn(
+        key,
+        policies,
+        episodes,
+        [100 * seed for seed in range(seeds)],
+        [f"task{n}" for n in range(tasks)],
+    )
     by_task = orders_by_task(trials)
     assert imbalance([names for orders in by_task.values() for names in orders]) <= 1
     for orders in by_task.values():
         assert imbalance(orders) <= 1
         for first in range(0, len(orders) - policies + 1, policies):
             square = orders[first : first + policies]
-            assert imbalance(square) == 0, "a Latin square, so that a task that stops early is balanced"
+            assert imbalance(square) == 0, (
+                "a Latin square, so that a task that stops early is balanced"
+            )
 
 
 @settings(max_examples=20, deadline=None)
 @given(keys, st.permutations(["a", "b", "c"]))
-def test_the_key_decides_whatever_order_the_plan_names_policies_in(key: bytes, names: list[str]) -> None:
+def test_the_key_decides_whatever_order_the_plan_names_policies_in(
+    key: bytes, names: list[str]
+) -> None:
     def of(ordered: list[str]) -> list[tuple[str, int, str]]:
         config = plan(Path("out"), policies=[{"name": name, "url": "http://x"} for name in ordered])
         return order(schedule(cells(config), key))
@@ -98,9 +114,16 @@ def test_the_key_decides_whatever_order_the_plan_names_policies_in(key: bytes, n
 
 
 def test_the_draw_is_the_one_of_earlier_evaluations() -> None:
-    """With the key of an evaluation its order can be reproduced later, so that a change of the draw is a break."""
+    """With the key of an evaluation its order can be reproduced later, so that a change of the
+    draw is a break.
+    """
     found = [name for env, _, name in order(drawn(b"a published key", 3, 4, [0])) if env == "cups"]
-    assert found == [*("p1", "p0", "p2"), *("p2", "p1", "p0"), *("p0", "p2", "p1"), *("p0", "p2", "p1")]
+    assert found == [
+        *("p1", "p0", "p2"),
+        *("p2", "p1", "p0"),
+        *("p0", "p2", "p1"),
+        *("p0", "p2", "p1"),
+    ]
 
 
 def test_every_order_is_about_equally_likely_over_keys() -> None:
@@ -111,18 +134,25 @@ def test_every_order_is_about_equally_likely_over_keys() -> None:
 def test_a_pair_has_the_key_of_the_same_scene() -> None:
     trials = drawn(b"some key", 2, 3, [5])
     for scene in range(1, 4):
-        pair = [trial.job.key for trial in trials if trial.task == ("", "cups") and trial.scene == scene]
+        pair = [
+            trial.job.key for trial in trials if trial.task == ("", "cups") and trial.scene == scene
+        ]
         assert {(key.episode, key.seed) for key in pair} == {(scene - 1, 5 + scene - 1)}
         assert len({key.settings for key in pair}) == 2
 
 
 def test_tasks_are_those_of_the_plan_and_patterns_match_them(tmp_path: Path) -> None:
-    assert [cell.env for cell in cells(plan(tmp_path, suite={"envs": ["dr*"]}))] == ["drawer", "drawer"]
+    assert [cell.env for cell in cells(plan(tmp_path, suite={"envs": ["dr*"]}))] == [
+        "drawer",
+        "drawer",
+    ]
     with pytest.raises(UnknownEnv, match="none of the plan's"):
         cells(plan(tmp_path, suite={"envs": ["kettle"]}))
     with pytest.raises(ConfigError, match="got no robot"):
         planned_cells(plan(tmp_path, robot={"arm": None}))
-    pushed = [{"name": "base", "url": "http://x", "pushed_weights": {"version": 3, "fingerprint": "ab"}}]
+    pushed = [
+        {"name": "base", "url": "http://x", "pushed_weights": {"version": 3, "fingerprint": "ab"}}
+    ]
     with pytest.raises(ConfigError, match="want checkpoints"):
         planned_cells(plan(tmp_path, policies=pushed))
 

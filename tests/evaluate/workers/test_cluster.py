@@ -19,7 +19,15 @@ from vlagents_ray.client.credentials import KEY_VARIABLE, Credentials
 from vlagents_ray.envs.graphics import GPUS
 from vlagents_ray.evaluate.plan.cases import EvalCase, cells
 from vlagents_ray.evaluate.workers import cluster
-from vlagents_ray.evaluate.workers.cluster import MOST_BYTES, Placement, fewest, runtime_env, strategy, tail, tail_at
+from vlagents_ray.evaluate.workers.cluster import (
+    MOST_BYTES,
+    Placement,
+    fewest,
+    runtime_env,
+    strategy,
+    tail,
+    tail_at,
+)
 from vlagents_ray.evaluate.workers.rollout import Rollout
 
 
@@ -75,7 +83,9 @@ def test_the_key_of_a_server_is_in_no_runtime_environment(monkeypatch: pytest.Mo
     credentials = Credentials()
     assert "vlr_x" not in repr(credentials)
     monkeypatch.delenv(KEY_VARIABLE)
-    Rollout(flat_config(envs=["tabletop/reach"], out="out"), lambda _: pytest.fail("made")).ready(credentials)
+    Rollout(flat_config(envs=["tabletop/reach"], out="out"), lambda _: pytest.fail("made")).ready(
+        credentials
+    )
     assert Credentials().api_key == "vlr_x"
 
 
@@ -89,9 +99,14 @@ def test_the_end_of_each_file_is_kept_under_its_name(tmp_path: Path) -> None:
 
 
 def test_a_process_knows_the_files_that_it_writes_to(tmp_path: Path) -> None:
-    code = "from vlagents_ray.evaluate.workers.rollout import own_logs; import sys; print(own_logs(), file=sys.stderr)"
+    code = (
+        "from vlagents_ray.evaluate.workers.rollout import own_logs; import sys; "
+        "print(own_logs(), file=sys.stderr)"
+    )
     with (tmp_path / "log").open("w") as file:
-        subprocess.run([sys.executable, "-c", code], stdout=subprocess.DEVNULL, stderr=file, check=True)
+        subprocess.run(
+            [sys.executable, "-c", code], stdout=subprocess.DEVNULL, stderr=file, check=True
+        )
     assert (tmp_path / "log").read_text().strip() == str([str(tmp_path / "log")])
 
 
@@ -102,7 +117,8 @@ def test_another_node_reads_its_own_files(tmp_path: Path, monkeypatch: pytest.Mo
     monkeypatch.setattr(cluster, "TIMEOUT_S", 120.0)  # a busy machine starts the process that reads
     [node] = ray.nodes()
     reads = []
-    monkeypatch.setattr(cluster, "tail", lambda paths: reads.append(paths) or f"{os.getpid()}")  # not in this process
+    # Not in this process.
+    monkeypatch.setattr(cluster, "tail", lambda paths: reads.append(paths) or f"{os.getpid()}")
     assert tail_at(node["NodeManagerHostname"], [str(tmp_path / "log")]) != str(os.getpid())
     assert reads == []
 
@@ -113,7 +129,9 @@ def test_a_host_that_is_gone_has_no_log(monkeypatch: pytest.MonkeyPatch) -> None
 
 
 @pytest.mark.usefixtures("shared_ray")
-def test_a_host_that_does_not_answer_is_no_host_without_a_log(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_host_that_does_not_answer_is_no_host_without_a_log(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     monkeypatch.setattr(socket, "gethostname", lambda: "here")
     monkeypatch.setattr(cluster, "TIMEOUT_S", 0.1)
     monkeypatch.setattr(cluster, "tail", lambda _: threading.Event().wait())

@@ -1,4 +1,6 @@
-"""The pool of workers: nodes that are lost, fewer workers than it wants, and reports that come together."""
+"""The pool of workers: nodes that are lost, fewer workers than it wants, and reports that come
+together.
+"""
 
 from __future__ import annotations
 
@@ -39,10 +41,14 @@ class Process:
 
 
 def worker(config: EvalConfig, starting: Any = None, **known: Any) -> WorkerHandle:
-    return WorkerHandle(config.worker, "kind", Process.remote(), starting=starting, started_at=monotonic(), **known)
+    return WorkerHandle(
+        config.worker, "kind", Process.remote(), starting=starting, started_at=monotonic(), **known
+    )
 
 
-def test_workers_that_are_lost_together_while_they_start_are_no_row_of_failures(config: Config) -> None:
+def test_workers_that_are_lost_together_while_they_start_are_no_row_of_failures(
+    config: Config,
+) -> None:
     settings = config(workers=5)
 
     def lose(workers: int) -> None:
@@ -57,20 +63,30 @@ def test_workers_that_are_lost_together_while_they_start_are_no_row_of_failures(
             lose(1)
 
 
-def test_workers_play_on_while_there_is_no_room_for_all(config: Config, caplog: pytest.LogCaptureFixture) -> None:
+def test_workers_play_on_while_there_is_no_room_for_all(
+    config: Config, caplog: pytest.LogCaptureFixture
+) -> None:
     settings = config(workers=2, place_timeout_s=0.2)
     job = Job(EpisodeKey(LINE, 0, 0, "settings"), None)  # type: ignore[arg-type]
     waiting = worker(settings, Process.options(num_cpus=64).remote().__ray_ready__.remote())
-    playing = worker(settings, jobs=(job,), heartbeat_at=math.inf, queried_at=math.inf)  # nobody asks how it gets on
+    # Nobody asks how it gets on.
+    playing = worker(settings, jobs=(job,), heartbeat_at=math.inf, queried_at=math.inf)
     reports: list[tuple[Job, Report]] = []
     with WorkerPool(settings, ToZero) as short:
         short._workers = [waiting, playing]
-        wait_for(lambda: reports.extend(short.wait(0.1)) or "going on with 1 of 2 workers: the cluster" in caplog.text)
+        wait_for(
+            lambda: (
+                reports.extend(short.wait(0.1))
+                or "going on with 1 of 2 workers: the cluster" in caplog.text
+            )
+        )
         assert short._workers == [waiting, playing]
     assert reports == []
 
 
-def test_a_host_that_does_not_answer_is_waited_for_once(config: Config, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_host_that_does_not_answer_is_waited_for_once(
+    config: Config, monkeypatch: pytest.MonkeyPatch
+) -> None:
     asked = []
 
     def silent(host: str, paths: object) -> str:
@@ -86,13 +102,22 @@ def test_a_host_that_does_not_answer_is_waited_for_once(config: Config, monkeypa
     assert asked == ["host1", "host2"]
 
 
-def test_no_log_is_looked_for_once_the_head_is_gone_too(config: Config, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Ray's calls would block, and Slurm kills a cancelled job before its evaluation has written a summary."""
+def test_no_log_is_looked_for_once_the_head_is_gone_too(
+    config: Config, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Ray's calls would block, and Slurm kills a cancelled job before its evaluation has written
+    a summary.
+    """
     monkeypatch.setattr(pool, "tail_at", lambda *_: pytest.fail("asked a cluster that is gone"))
     monkeypatch.setattr(pool, "head_is_gone", lambda: True)
     failure = Failure("worker", EnvFailed.code, "the worker died")
     with WorkerPool(config(), ToZero) as watched:
-        assert watched._with_log(failure, worker(config(), process={"host": "host1", "logs": ["/log"]})) == failure
+        assert (
+            watched._with_log(
+                failure, worker(config(), process={"host": "host1", "logs": ["/log"]})
+            )
+            == failure
+        )
 
 
 def test_a_worker_that_cannot_be_killed_saves_no_other_one(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -130,7 +155,9 @@ def capacity(config: Config, clock: Clock) -> CapacityMonitor:
     return CapacityMonitor(config(workers=3, place_timeout_s=100), clock)
 
 
-def test_a_worker_may_wait_for_as_long_as_the_settings_say(capacity: CapacityMonitor, clock: Clock) -> None:
+def test_a_worker_may_wait_for_as_long_as_the_settings_say(
+    capacity: CapacityMonitor, clock: Clock
+) -> None:
     clock.now = 110.0
     assert not capacity.timed_out(since=10.0)
     assert capacity.timed_out(since=9.0)
@@ -157,7 +184,9 @@ def test_between_two_episodes_nobody_gives_up_but_where_nothing_is_played_for_as
     clock.now = 1100.0
     capacity.report_shortage(WANTED, running=1)
     clock.now = 1101.0
-    with pytest.raises(ConfigError, match=r"no room for a worker in 100 s: each needs .*64.* lower `workers`"):
+    with pytest.raises(
+        ConfigError, match=r"no room for a worker in 100 s: each needs .*64.* lower `workers`"
+    ):
         capacity.report_shortage(WANTED, running=1)
 
 

@@ -68,7 +68,9 @@ def test_after_a_lost_connection_the_next_attempt_has_a_new_agent(
 
     def connect(_policy: PolicyConfig) -> ToZero:
         agents.append(ToZero(lost_on=3 if not agents else None))
-        monkeypatch.setattr(agents[-1], "close", lambda agent=agents[-1]: closed.append(agent), raising=False)
+        monkeypatch.setattr(
+            agents[-1], "close", lambda agent=agents[-1]: closed.append(agent), raising=False
+        )
         return agents[-1]
 
     worker = Rollout(config(), connect)
@@ -104,7 +106,12 @@ def test_a_policy_that_cannot_start_stops_the_evaluation(config: Config) -> None
     ],
 )
 def test_an_env_that_cannot_be_made_is_an_infrastructure_failure_unless_it_says_what_it_misses(
-    config: Config, monkeypatch: pytest.MonkeyPatch, missing: str | None, cause: str, code: str, said: str
+    config: Config,
+    monkeypatch: pytest.MonkeyPatch,
+    missing: str | None,
+    cause: str,
+    code: str,
+    said: str,
 ) -> None:
     monkeypatch.setattr(Line, "missing", classmethod(lambda _cls: missing))
     failure = played(rollout_of(config, ToZero), job(env_options={"broken": "GPU lost"})).failure
@@ -123,7 +130,9 @@ def seeds_by_outcome(config: Config, chunk: int) -> dict[bool, list[int]]:
     return found
 
 
-def rendered(worker: Rollout, *seeds: int, env: str = SPARING_LINE) -> tuple[list[int], list[Report]]:
+def rendered(
+    worker: Rollout, *seeds: int, env: str = SPARING_LINE
+) -> tuple[list[int], list[Report]]:
     """How many images each episode took, and the reports."""
     images, reports = [], []
     for seed in seeds:
@@ -134,15 +143,27 @@ def rendered(worker: Rollout, *seeds: int, env: str = SPARING_LINE) -> tuple[lis
 
 
 @pytest.mark.parametrize("kept", ["video", "record"])
-def test_only_failed_episodes_are_rendered_wholly_and_show_what_a_video_of_all_shows(config: Config, kept: str) -> None:
-    """Of 11 observations the policy gets 1, 4, 7 and 10; a failed episode is played again for all of them."""
+def test_only_failed_episodes_are_rendered_wholly_and_show_what_a_video_of_all_shows(
+    config: Config, kept: str
+) -> None:
+    """Of 11 observations the policy gets 1, 4, 7 and 10; a failed episode is played again for
+    all of them.
+    """
     seeds = seeds_by_outcome(config, chunk=3)
     solved, failed = seeds[True][0], seeds[False][0]
-    few, [first, second] = rendered(rollout_of(config, lambda: ToZero(3), **{kept: "failures"}), solved, failed)
-    every, [_, shown] = rendered(rollout_of(config, lambda: ToZero(3), **{kept: "all"}), solved, failed)
+    few, [first, second] = rendered(
+        rollout_of(config, lambda: ToZero(3), **{kept: "failures"}), solved, failed
+    )
+    every, [_, shown] = rendered(
+        rollout_of(config, lambda: ToZero(3), **{kept: "all"}), solved, failed
+    )
     assert few == [4, 4 + 11]
     assert every == [11, 11]
-    assert (first.artifacts.shown, first.artifacts.seen, first.artifacts.trajectory) == ({}, {}, None)
+    assert (first.artifacts.shown, first.artifacts.seen, first.artifacts.trajectory) == (
+        {},
+        {},
+        None,
+    )
     assert second.artifacts == shown.artifacts
     assert second.result is not None
     assert shown.result is not None
@@ -179,7 +200,9 @@ def test_episodes_side_by_side_are_rendered_again_one_by_one(config: Config) -> 
     assert found["failures"][1].artifacts.shown
 
 
-def test_progress_tells_phase_age_and_place(config: Config, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_progress_tells_phase_age_and_place(
+    config: Config, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(rollout, "LONG_S", 0.0)
     pulses = []
 

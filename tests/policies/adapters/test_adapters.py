@@ -1,4 +1,6 @@
-"""LoRA adapters chosen by session: one pass for rows of different adapters, each as if merged into the base alone."""
+"""LoRA adapters chosen by session: one pass for rows of different adapters, each as if merged
+into the base alone.
+"""
 
 from __future__ import annotations
 
@@ -37,7 +39,9 @@ def network(tmp_path: Path) -> Any:
 
 
 def at(seed: int, **info: Any) -> Obs:
-    return Obs(state={"joints": np.random.default_rng(seed).normal(size=DIM).astype(np.float32)}, info=info)
+    return Obs(
+        state={"joints": np.random.default_rng(seed).normal(size=DIM).astype(np.float32)}, info=info
+    )
 
 
 def begun(policy: Small, seed: int, **options: Any) -> Any:
@@ -68,7 +72,9 @@ def test_each_row_of_one_pass_acts_as_its_adapter_merged_alone(tmp_path: Path) -
     chosen = ["stack", None, "pour", "fold", "stack", "fold"]
     sessions = [begun(policy, seed, adapter=name) for seed, name in enumerate(chosen)]
     policy.passes.clear()
-    acts = policy.act_batch([at(seed, **{SAMPLES: seed % 3}) for seed in range(len(chosen))], sessions)
+    acts = policy.act_batch(
+        [at(seed, **{SAMPLES: seed % 3}) for seed in range(len(chosen))], sessions
+    )
     assert policy.passes == [len(chosen) + sum(seed % 3 for seed in range(len(chosen)))]
     for seed, (name, act) in enumerate(zip(chosen, acts, strict=True)):
         alone = loaded(tmp_path)
@@ -81,13 +87,19 @@ def test_each_row_of_one_pass_acts_as_its_adapter_merged_alone(tmp_path: Path) -
         assert name is None or np.abs(act.action - plain).max() > 0.1  # the adapter matters
         if seed % 3:
             np.testing.assert_allclose(
-                act.info[DISTRIBUTION]["samples"], wanted.info[DISTRIBUTION]["samples"], rtol=RTOL, atol=RTOL
+                act.info[DISTRIBUTION]["samples"],
+                wanted.info[DISTRIBUTION]["samples"],
+                rtol=RTOL,
+                atol=RTOL,
             )
 
 
 def test_passes_of_two_threads_each_have_the_adapters_of_their_rows(tmp_path: Path) -> None:
     made, found = three(tmp_path), dict[str, np.ndarray]()
-    policy, barrier = loaded(tmp_path, adapters=paths(tmp_path, *made)), threading.Barrier(2, timeout=60)
+    policy, barrier = (
+        loaded(tmp_path, adapters=paths(tmp_path, *made)),
+        threading.Barrier(2, timeout=60),
+    )
 
     def meet(*_: Any) -> None:
         barrier.wait()  # both threads are in a pass
@@ -121,9 +133,15 @@ def test_sessions_without_an_adapter_act_as_the_base_to_the_bit(tmp_path: Path) 
 def test_acts_and_resets_say_which_adapter_it_was(tmp_path: Path) -> None:
     three(tmp_path)
     policy = loaded(tmp_path, adapters=paths(tmp_path, "stack", "pour"))
-    said = {name: begun(policy, 0, adapter=name).act(at(0)).info.get(POLICY) for name in (None, "stack", "pour")}
+    said = {
+        name: begun(policy, 0, adapter=name).act(at(0)).info.get(POLICY)
+        for name in (None, "stack", "pour")
+    }
     assert policy.weights_id is not None
-    assert said[None] == {"version": 0, "fingerprint": policy.weights_id["digest"].rpartition(":")[2][:16]}
+    assert said[None] == {
+        "version": 0,
+        "fingerprint": policy.weights_id["digest"].rpartition(":")[2][:16],
+    }
     assert said["stack"]["fingerprint"] != said["pour"]["fingerprint"]
     ids = policy.weights_id["adapters"]
     for name in ("stack", "pour"):
@@ -133,7 +151,8 @@ def test_acts_and_resets_say_which_adapter_it_was(tmp_path: Path) -> None:
     assert "weights" not in begun(policy, 0).reset(at(0), None)
     without = loaded(tmp_path, adapters=paths(tmp_path, "pour"))
     assert without.weights_id is not None
-    assert without.weights_id["adapters"] == {"pour": ids["pour"]}  # another adapter beside it changes nothing
+    # Another adapter beside it changes nothing.
+    assert without.weights_id["adapters"] == {"pour": ids["pour"]}
     assert without.weights_id["digest"] == policy.weights_id["digest"]
 
 
@@ -141,7 +160,9 @@ def test_another_base_makes_another_fingerprint(tmp_path: Path) -> None:
     three(tmp_path)
     policy = loaded(tmp_path, adapters=paths(tmp_path, "stack"))
     (tmp_path / "base" / "weights.bin").write_bytes(b"other")
-    other = Small.from_config({"checkpoint": str(tmp_path / "base"), "adapters": paths(tmp_path, "stack")})
+    other = Small.from_config(
+        {"checkpoint": str(tmp_path / "base"), "adapters": paths(tmp_path, "stack")}
+    )
     other.initialize()
     assert other.weights_id is not None
     assert policy.weights_id is not None
@@ -161,18 +182,24 @@ def test_a_session_without_its_adapter_here_is_unknown(tmp_path: Path) -> None:
 def test_an_adapter_that_is_not_offered_is_refused_with_what_is(tmp_path: Path) -> None:
     three(tmp_path)
     policy = loaded(tmp_path, adapters=paths(tmp_path, "stack", "pour"))
-    with pytest.raises(UnknownCheckpoint, match=r"got 'fold', want one of \['pour', 'stack'\], or none"):
+    with pytest.raises(
+        UnknownCheckpoint, match=r"got 'fold', want one of \['pour', 'stack'\], or none"
+    ):
         begun(policy, 0, adapter="fold")
 
 
 @pytest.mark.parametrize("setting", [{"compile": True}, {"quantization": "int8"}])
 def test_what_needs_one_set_of_weights_is_refused(tmp_path: Path, setting: dict[str, Any]) -> None:
-    with pytest.raises(ConfigError, match=f"adapters and {next(iter(setting))}: got both, want one"):
+    with pytest.raises(
+        ConfigError, match=f"adapters and {next(iter(setting))}: got both, want one"
+    ):
         Small.from_config({"checkpoint": "any", "adapters": {"stack": "any"}, **setting})
 
 
 def test_a_family_without_adapters_says_so(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match="adapters: Plain does not offer them; merge each into its base"):
+    with pytest.raises(
+        ConfigError, match="adapters: Plain does not offer them; merge each into its base"
+    ):
         Plain.from_config({"checkpoint": "any", "adapters": {"stack": "any"}})
 
 
@@ -190,7 +217,9 @@ def test_a_family_without_adapters_says_so(tmp_path: Path) -> None:
         ({"base_model_name_or_path": "other/base"}, None),
     ],
 )
-def test_another_kind_of_adapter_is_refused(tmp_path: Path, config: dict[str, Any], says: str | None) -> None:
+def test_another_kind_of_adapter_is_refused(
+    tmp_path: Path, config: dict[str, Any], says: str | None
+) -> None:
     save(tmp_path / "stack", pairs(network(tmp_path), LAYERS, 2), **config)
     if says is None:  # a local folder may be a copy of what the hub has under that name
         loaded(tmp_path, adapters=paths(tmp_path, "stack"))
@@ -219,7 +248,9 @@ def broken(values: dict[str, np.ndarray], what: str) -> dict[str, np.ndarray]:
         "whole numbers": {first: np.ones((2, 4), np.int8)},
         "no linear": {"base_model.model.head.1.lora_A.weight": np.ones((2, 4), np.float32)}
         | {"base_model.model.head.1.lora_B.weight": np.ones((8, 2), np.float32)},
-        "attention": {"base_model.model.attention.out_proj.lora_A.weight": np.ones((2, 8), np.float32)}
+        "attention": {
+            "base_model.model.attention.out_proj.lora_A.weight": np.ones((2, 8), np.float32)
+        }
         | {"base_model.model.attention.out_proj.lora_B.weight": np.ones((8, 2), np.float32)},
         "changed": {"base_model.model.see.base_layer.weight": np.ones((8, 4), np.float32)},
         "whole": {"base_model.model.see.weight": np.ones((8, 4), np.float32)},
@@ -230,14 +261,27 @@ def broken(values: dict[str, np.ndarray], what: str) -> dict[str, np.ndarray]:
 @pytest.mark.parametrize(
     ("what", "says"),
     [
-        ("unknown", r"1 of its 5 layers are not in the network: \['eye'\]; want an adapter that was trained on"),
+        (
+            "unknown",
+            (
+                r"1 of its 5 layers are not in the network: \['eye'\]; want an adapter that was "
+                r"trained on"
+            ),
+        ),
         ("half", r"got \['base_model.model.head.1.lora_B.weight'\], want pairs"),
         ("shape", r"see: got A \(2, 5\) and B \(8, 2\), want them for weights \(8, 4\)"),
         ("nan", "see: got NaN or infinite values"),
         ("whole numbers", "see: got A int8 and B float32, want real numbers"),
         ("no linear", "got adapters of {'head.1': 'Tanh'}, want those of linear layers and"),
         ("attention", "got adapters of {'attention.out_proj': 'NonDynamicallyQuantizableLinear'}"),
-        ("changed", r"got \['base_model.model.see.base_layer.weight'\], want pairs .* and no changes of the base"),
+        (
+            "changed",
+            (
+                r"got \['base_model.model.see.base_layer.weight'\], want pairs .* and no changes "
+                r"of "
+                r"the base"
+            ),
+        ),
         ("whole", r"got \['base_model.model.see.weight'\], want pairs"),
     ],
 )
@@ -265,7 +309,9 @@ def test_a_truncated_or_absent_file_is_refused(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=r"adapter 'stack': .*is damaged, or of another format"):
         loaded(tmp_path, adapters=paths(tmp_path, "stack"))
     file.rename(folder / "adapter_model.bin")  # a pickle, by its name
-    with pytest.raises(ConfigError, match=r"adapter 'stack': .*misses \['adapter_model.safetensors'\]"):
+    with pytest.raises(
+        ConfigError, match=r"adapter 'stack': .*misses \['adapter_model.safetensors'\]"
+    ):
         loaded(tmp_path, adapters=paths(tmp_path, "stack"))
 
 
@@ -273,8 +319,13 @@ def test_an_adapter_of_another_base_is_refused(tmp_path: Path) -> None:
     other = tmp_path / "other"
     other.mkdir()
     (other / "weights.bin").write_bytes(b"other")
-    folder = save(tmp_path / "stack", pairs(network(tmp_path), LAYERS, 2), base_model_name_or_path=str(other))
-    with pytest.raises(ConfigError, match=r"adapter 'stack': .*was trained on '.*other', want an adapter of '.*base'"):
+    folder = save(
+        tmp_path / "stack", pairs(network(tmp_path), LAYERS, 2), base_model_name_or_path=str(other)
+    )
+    with pytest.raises(
+        ConfigError,
+        match=r"adapter 'stack': .*was trained on '.*other', want an adapter of '.*base'",
+    ):
         loaded(tmp_path, adapters=paths(tmp_path, "stack"))
     (other / "weights.bin").write_bytes(b"base")  # a copy of the base
     loaded(tmp_path, adapters=paths(tmp_path, "stack"))
@@ -287,7 +338,10 @@ def test_an_adapter_of_another_base_is_refused(tmp_path: Path) -> None:
 
 def test_a_file_of_the_folder_is_not_the_adapter(tmp_path: Path) -> None:
     folder = save(tmp_path / "stack", pairs(network(tmp_path), LAYERS, 2))
-    with pytest.raises(ConfigError, match=r"adapter 'stack': .*got a file, want the folder with adapter_config.json"):
+    with pytest.raises(
+        ConfigError,
+        match=r"adapter 'stack': .*got a file, want the folder with adapter_config.json",
+    ):
         loaded(tmp_path, adapters={"stack": str(folder / "adapter_model.safetensors")})
 
 
@@ -297,7 +351,9 @@ def test_a_base_that_cannot_be_looked_up_is_unknown(tmp_path: Path, named: str) 
     loaded(tmp_path, adapters=paths(tmp_path, "stack"))
 
 
-@pytest.mark.parametrize("content", ["[" * 100_000, '{"peft_type": "LORA", "base_model_name_or_path": 3}', "\0"])
+@pytest.mark.parametrize(
+    "content", ["[" * 100_000, '{"peft_type": "LORA", "base_model_name_or_path": 3}', "\0"]
+)
 def test_a_damaged_config_is_refused(tmp_path: Path, content: str) -> None:
     folder = save(tmp_path / "stack", pairs(network(tmp_path), LAYERS, 2))
     (folder / "adapter_config.json").write_text(content)
@@ -308,10 +364,21 @@ def test_a_damaged_config_is_refused(tmp_path: Path, content: str) -> None:
 def test_values_are_scaled_before_they_are_rounded(tmp_path: Path) -> None:
     small = network(tmp_path).half()
     values = pairs(small, LAYERS, 2)
-    tiny = {name: value * np.float32(1e-9) if ".lora_B." in name else value for name, value in values.items()}
-    folder, x = save(tmp_path / "tiny", tiny, lora_alpha=2e9), small["see"].weight.new_tensor(np.eye(DIM))
+    tiny = {
+        name: value * np.float32(1e-9) if ".lora_B." in name else value
+        for name, value in values.items()
+    }
+    folder, x = (
+        save(tmp_path / "tiny", tiny, lora_alpha=2e9),
+        small["see"].weight.new_tensor(np.eye(DIM)),
+    )
     adapters, plain = Adapters(), small["see"](x)
-    adapters.load(small, {"tiny": str(folder)}, lambda source: (Adapter(source, "a", "a"), folder), lambda *_: None)
+    adapters.load(
+        small,
+        {"tiny": str(folder)},
+        lambda source: (Adapter(source, "a", "a"), folder),
+        lambda *_: None,
+    )
     with adapters.rows([adapters.named("tiny").fingerprint] * DIM):
         change = small["see"](x) - plain
     down, up = (values[f"base_model.model.see.lora_{part}.weight"] for part in "AB")

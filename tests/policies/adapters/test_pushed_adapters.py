@@ -1,4 +1,6 @@
-"""A learner that trains one adapter pushes its values alone; everything else acts as before, to the bit."""
+"""A learner that trains one adapter pushes its values alone; everything else acts as before, to
+the bit.
+"""
 
 from __future__ import annotations
 
@@ -32,7 +34,9 @@ A = "stack/base_model.model.see.lora_A.weight"
 
 @pytest.fixture
 def values(tmp_path: Path) -> dict[str, dict[str, np.ndarray]]:
-    """The saved values of each adapter, and under "trained" what a learner makes of those of "stack"."""
+    """The saved values of each adapter, and under "trained" what a learner makes of those of
+    "stack".
+    """
     network = made(tmp_path).model
     found = {name: pairs(network, LAYERS, rank, seed=rank) for name, rank in RANKS.items()}
     found["trained"] = pairs(network, LAYERS, RANKS["stack"], seed=9)
@@ -87,7 +91,9 @@ def act(engine: Engine, name: str | None) -> Act:
 
 
 def played(engine: Engine) -> dict[str | None, tuple[bytes, dict[str, Any]]]:
-    """The first action of an episode with each adapter and without one, and the weights that it states."""
+    """The first action of an episode with each adapter and without one, and the weights that it
+    states.
+    """
     found = {}
     for name in ("stack", "pour", None):
         reset(engine, name)
@@ -98,21 +104,34 @@ def played(engine: Engine) -> dict[str | None, tuple[bytes, dict[str, Any]]]:
 
 @pytest.mark.parametrize("process", ["own", "child"])
 def test_a_pushed_adapter_acts_as_the_saved_one_and_all_else_as_before(
-    tmp_path: Path, values: dict[str, dict[str, np.ndarray]], serving: Callable[[Agent], Engine], process: str
+    tmp_path: Path,
+    values: dict[str, dict[str, np.ndarray]],
+    serving: Callable[[Agent], Engine],
+    process: str,
 ) -> None:
     config = settings(tmp_path, stack="stack", pour="pour")
-    engine = serving(in_child("adapted_network:Small", **config) if process == "child" else Small.from_config(config))
+    engine = serving(
+        in_child("adapted_network:Small", **config)
+        if process == "child"
+        else Small.from_config(config)
+    )
     before, weights = played(engine), Publisher(engine)
     assert weights.push(pushed(values["trained"]), partial=True) == 1
-    after, saved = played(engine), played(serving(Small.from_config(settings(tmp_path, stack="trained", pour="pour"))))
+    after, saved = (
+        played(engine),
+        played(serving(Small.from_config(settings(tmp_path, stack="trained", pour="pour")))),
+    )
     assert before["stack"][0] != saved["stack"][0]
     assert {name: action for name, (action, _) in after.items()} == {
         name: action for name, (action, _) in saved.items()
     }
     assert after[None] == before[None], "the base's weights are not the learner's"
-    assert [after[name][0] for name in ("pour", None)] == [before[name][0] for name in ("pour", None)]
+    assert [after[name][0] for name in ("pour", None)] == [
+        before[name][0] for name in ("pour", None)
+    ]
     whole = {
-        name: np.asarray(value) for name, value in (pushed(values["trained"]) | pushed(values["pour"], "pour")).items()
+        name: np.asarray(value)
+        for name, value in (pushed(values["trained"]) | pushed(values["pour"], "pour")).items()
     }
     named = {"version": 1, "fingerprint": fingerprint(whole)}
     assert [after[name][1] for name in ("stack", "pour")] == [named, named]
@@ -124,9 +143,14 @@ def test_a_pushed_adapter_acts_as_the_saved_one_and_all_else_as_before(
 
 @pytest.mark.parametrize("refused", [False, True])
 def test_all_replicas_act_with_it_or_none(
-    tmp_path: Path, values: dict[str, dict[str, np.ndarray]], serving: Callable[[Agent], Engine], refused: bool
+    tmp_path: Path,
+    values: dict[str, dict[str, np.ndarray]],
+    serving: Callable[[Agent], Engine],
+    refused: bool,
 ) -> None:
-    own, other = (serving(Small.from_config(settings(tmp_path, stack="stack", pour="pour"))) for _ in range(2))
+    own, other = (
+        serving(Small.from_config(settings(tmp_path, stack="stack", pour="pour"))) for _ in range(2)
+    )
     if refused:  # by the other one, which has these values already
         Publisher(other).push(pushed(values["trained"]), partial=True)
     before = [played(engine) for engine in (own, other)]
@@ -149,8 +173,11 @@ def test_all_replicas_act_with_it_or_none(
 def test_a_replica_that_starts_later_states_and_does_the_same(
     tmp_path: Path, values: dict[str, dict[str, np.ndarray]], serving: Callable[[Agent], Engine]
 ) -> None:
-    engines = [serving(Small.from_config(settings(tmp_path, stack="stack", pour="pour"))) for _ in range(2)]
-    Publisher(engines[0]).push(pushed(values["stack"]), partial=True, allow_same=True)  # as a training begins
+    engines = [
+        serving(Small.from_config(settings(tmp_path, stack="stack", pour="pour"))) for _ in range(2)
+    ]
+    # As a training begins.
+    Publisher(engines[0]).push(pushed(values["stack"]), partial=True, allow_same=True)
     [held] = [one for one in engines[0].weights.held() if one.number]
     engines[1].weights.stage(held.number, held.values, PushOptions(allow_same=True))
     engines[1].weights.commit(held.number, PushOptions())
@@ -161,7 +188,9 @@ def test_a_replica_that_starts_later_states_and_does_the_same(
 def test_sessions_of_two_versions_keep_theirs_until_their_reset(
     tmp_path: Path, values: dict[str, dict[str, np.ndarray]], serving: Callable[[Agent], Engine]
 ) -> None:
-    engines = [serving(Small.from_config(settings(tmp_path, stack="stack", pour="pour"))) for _ in range(2)]
+    engines = [
+        serving(Small.from_config(settings(tmp_path, stack="stack", pour="pour"))) for _ in range(2)
+    ]
     for engine in engines:
         reset(engine, "stack")
     pushing, still = engines
@@ -170,7 +199,9 @@ def test_sessions_of_two_versions_keep_theirs_until_their_reset(
     acts = [act(engine, "stack") for engine in engines]
     assert acts[0].action.tobytes() == acts[1].action.tobytes()
     assert acts[0].info["policy"] == acts[1].info["policy"]
-    Publisher(pushing).push(pushed(values["pour"], "pour"), mode="keep", partial=True, allow_same=True)
+    Publisher(pushing).push(
+        pushed(values["pour"], "pour"), mode="keep", partial=True, allow_same=True
+    )
     assert act(pushing, "stack").info["policy"]["version"] == 2
     assert act(still, "stack").info["policy"]["version"] == 0
 
@@ -178,8 +209,14 @@ def test_sessions_of_two_versions_keep_theirs_until_their_reset(
 @pytest.mark.parametrize(
     ("change", "says"),
     [
-        ({"stack/base_model.model.head.1.lora_A.weight": np.ones((4, 8), np.float32)}, "unknown, want one of"),
-        ({"see.weight": np.ones((8, 4), np.float32)}, "'see.weight': unknown, want one of the policy's 16 names"),
+        (
+            {"stack/base_model.model.head.1.lora_A.weight": np.ones((4, 8), np.float32)},
+            "unknown, want one of",
+        ),
+        (
+            {"see.weight": np.ones((8, 4), np.float32)},
+            "'see.weight': unknown, want one of the policy's 16 names",
+        ),
         ({A: np.ones((8, DIM), np.float32)}, rf"'{A}': got shape \(8, 4\), want \(4, 4\)"),
         ({A: np.full((4, DIM), np.nan, np.float32)}, "got NaN or infinite values"),
         ({A: np.ones((4, DIM), np.int64)}, "got int64, want float32"),
@@ -214,9 +251,13 @@ def test_a_transposed_view_is_pushed_by_its_values(
 ) -> None:
     import torch
 
-    engines = [serving(Small.from_config(settings(tmp_path, stack="stack", pour="pour"))) for _ in range(2)]
-    views = {name: torch.from_numpy(value.T.copy()).permute(*reversed(range(value.ndim))) for name, value in
-             pushed(values["trained"]).items()}  # fmt: skip
+    engines = [
+        serving(Small.from_config(settings(tmp_path, stack="stack", pour="pour"))) for _ in range(2)
+    ]
+    views = {
+        name: torch.from_numpy(value.T.copy()).permute(*reversed(range(value.ndim)))
+        for name, value in pushed(values["trained"]).items()
+    }
     for engine, one in zip(engines, (views, pushed(values["trained"])), strict=True):
         Publisher(engine).push(one, partial=True)
     assert played(engines[0]) == played(engines[1])

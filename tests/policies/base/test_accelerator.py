@@ -52,7 +52,9 @@ def without_cuda(patch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.parametrize("given", ["0", "3,4", "GPU-8f2c", "MIG-1"])
-def test_a_gpu_that_torch_cannot_use_is_an_error_with_torchs_reason(monkeypatch: Any, given: str) -> None:
+def test_a_gpu_that_torch_cannot_use_is_an_error_with_torchs_reason(
+    monkeypatch: Any, given: str
+) -> None:
     without_cuda(monkeypatch)
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", given)
     torchs = re.escape(f"torch {torch.__version__} cannot use: {OLD}")
@@ -100,30 +102,46 @@ def no_limits(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.parametrize("share", [None, "0.5"])
-def test_a_share_of_a_gpu_is_a_limit_of_its_memory(no_limits: None, monkeypatch: Any, share: str | None) -> None:
+def test_a_share_of_a_gpu_is_a_limit_of_its_memory(
+    no_limits: None, monkeypatch: Any, share: str | None
+) -> None:
     cuda, limits = FakeCuda(), []
     cuda.install(monkeypatch)
     monkeypatch.setattr(torch, "empty", lambda *_, **__: None)
-    monkeypatch.setattr(torch.cuda, "get_device_properties", lambda _: SimpleNamespace(name="", total_memory=0))
-    monkeypatch.setattr(torch.cuda, "set_per_process_memory_fraction", lambda *limit: limits.append(limit))
+    monkeypatch.setattr(
+        torch.cuda, "get_device_properties", lambda _: SimpleNamespace(name="", total_memory=0)
+    )
+    monkeypatch.setattr(
+        torch.cuda, "set_per_process_memory_fraction", lambda *limit: limits.append(limit)
+    )
     if share is not None:
         monkeypatch.setenv(GPU_SHARE, share)
     with loading_report(lambda _: None) as report:
         torch_device()
     assert limits == ([] if share is None else [(0.5, torch.device("cuda"))])
-    assert os.environ.get("XLA_PYTHON_CLIENT_MEM_FRACTION") == share, "beside torch, as in openpi's port"
+    assert os.environ.get("XLA_PYTHON_CLIENT_MEM_FRACTION") == share, (
+        "beside torch, as in openpi's port"
+    )
     tensors = [cuda.tensor(torch.zeros(10**6))]
     free = (80 if share is None else 40) * 10**9 - 4 * 10**6
-    assert gpu_memory(report.devices) == {"allocated": 4 * 10**6, "reserved": 4 * 10**6, "free": free}
+    assert gpu_memory(report.devices) == {
+        "allocated": 4 * 10**6,
+        "reserved": 4 * 10**6,
+        "free": free,
+    }
     del tensors
     assert gpu_memory([{"kind": "cpu", "device": "cpu"}]) == {}
 
 
 @pytest.mark.parametrize("chosen", [None, "true"])
-def test_jax_allocates_as_it_needs_unless_told_otherwise(no_limits: None, monkeypatch: Any, chosen: str | None) -> None:
+def test_jax_allocates_as_it_needs_unless_told_otherwise(
+    no_limits: None, monkeypatch: Any, chosen: str | None
+) -> None:
     class Jax(FakeJax):
         def devices(self, kind: str = "cpu") -> list[Any]:
-            assert os.environ["XLA_PYTHON_CLIENT_PREALLOCATE"] == (chosen or "false"), "before its first use"
+            assert os.environ["XLA_PYTHON_CLIENT_PREALLOCATE"] == (chosen or "false"), (
+                "before its first use"
+            )
             return super().devices(kind)
 
     monkeypatch.setitem(sys.modules, "jax", Jax())
@@ -142,7 +160,11 @@ def test_the_memory_of_jax_is_that_of_its_device(monkeypatch: Any) -> None:
             return {"bytes_in_use": 3, "bytes_limit": 10, "pool_bytes": 4}
 
     monkeypatch.setitem(sys.modules, "jax", SimpleNamespace(local_devices=lambda: [Gpu()]))
-    assert gpu_memory([{"kind": "gpu", "device": "cuda:0"}]) == {"allocated": 3, "reserved": 4, "free": 7}
+    assert gpu_memory([{"kind": "gpu", "device": "cuda:0"}]) == {
+        "allocated": 3,
+        "reserved": 4,
+        "free": 7,
+    }
 
 
 class FakeJax:
@@ -162,7 +184,9 @@ def test_a_gpu_that_jax_cannot_use_is_an_error_with_jaxs_reason(monkeypatch: Any
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "")
     assert jax_device("auto").platform == "cpu"
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "1")
-    with pytest.raises(ConfigError, match=r"given GPU 1 .*jax 0\.5\.3 cannot use: Unknown backend: 'gpu'"):
+    with pytest.raises(
+        ConfigError, match=r"given GPU 1 .*jax 0\.5\.3 cannot use: Unknown backend: 'gpu'"
+    ):
         jax_device("auto")
     assert jax_device("cpu").platform == "cpu"
 
@@ -171,47 +195,106 @@ def test_a_gpu_that_jax_cannot_use_is_an_error_with_jaxs_reason(monkeypatch: Any
     ("error", "exhausted", "failed"),
     [
         (torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 2.00 GiB."), True, False),
-        (RuntimeError("CUDA error: out of memory\nCUDA kernel errors might be reported later"), True, False),
-        (RuntimeError("CUDA error: CUBLAS_STATUS_ALLOC_FAILED when calling `cublasCreate(handle)`"), True, False),
-        (RuntimeError("RESOURCE_EXHAUSTED: Out of memory allocating 8589934592 bytes."), True, False),
+        (
+            RuntimeError("CUDA error: out of memory\nCUDA kernel errors might be reported later"),
+            True,
+            False,
+        ),
+        (
+            RuntimeError(
+                "CUDA error: CUBLAS_STATUS_ALLOC_FAILED when calling `cublasCreate(handle)`"
+            ),
+            True,
+            False,
+        ),
+        (
+            RuntimeError("RESOURCE_EXHAUSTED: Out of memory allocating 8589934592 bytes."),
+            True,
+            False,
+        ),
         (torch.AcceleratorError("CUDA error: device-side assert triggered", 710), False, True),
         (RuntimeError("CUDA error: an illegal memory access was encountered"), False, True),
         (RuntimeError("cuDNN error: CUDNN_STATUS_EXECUTION_FAILED"), False, True),
-        (RuntimeError("INTERNAL: CUDA_ERROR_ILLEGAL_ADDRESS: an illegal memory access"), False, True),
-        (RuntimeError("The size of tensor a (3) must match the size of tensor b (4)"), False, False),
+        (
+            RuntimeError("INTERNAL: CUDA_ERROR_ILLEGAL_ADDRESS: an illegal memory access"),
+            False,
+            True,
+        ),
+        (
+            RuntimeError("The size of tensor a (3) must match the size of tensor b (4)"),
+            False,
+            False,
+        ),
         (ValueError("CUDA error: of a name"), False, False),
         (MemoryError("out of memory"), False, False),
     ],
 )
-def test_errors_of_accelerators_are_told_apart(error: Exception, exhausted: bool, failed: bool) -> None:
+def test_errors_of_accelerators_are_told_apart(
+    error: Exception, exhausted: bool, failed: bool
+) -> None:
     assert (is_out_of_memory(error), is_device_failure(error)) == (exhausted, failed)
 
 
 ALLOCATION = "Failed to allocate memory for requested buffer of size 2147483648"
-CONVOLUTION = "Non-zero status code returned while running Conv node. Name:'/vision/conv' Status Message: "
+CONVOLUTION = (
+    "Non-zero status code returned while running Conv node. Name:'/vision/conv' Status Message: "
+)
 
 
-@pytest.mark.parametrize("name", ["Fail", "RuntimeException", "EPFail", "EngineError", "DeviceReset"])
+@pytest.mark.parametrize(
+    "name", ["Fail", "RuntimeException", "EPFail", "EngineError", "DeviceReset"]
+)
 @pytest.mark.parametrize(
     ("text", "exhausted", "failed"),
     [
-        (f"6 : RUNTIME_EXCEPTION : {CONVOLUTION}/core/framework/bfc_arena.cc:376 {ALLOCATION}", True, False),
-        ("1 : FAIL : CUDA failure 2: out of memory ; GPU=0 ; expr=cudaMalloc((void**)&p, size);", True, False),
-        ("1 : FAIL : CUBLAS failure 3: CUBLAS_STATUS_ALLOC_FAILED ; GPU=0 ; hostname=robot", True, False),
-        ("1 : FAIL : CUDA failure 700: an illegal memory access was encountered ; GPU=0", False, True),
-        (f"1 : FAIL : {CONVOLUTION}CUDNN failure 8: CUDNN_STATUS_EXECUTION_FAILED ; GPU=0", False, True),
+        (
+            f"6 : RUNTIME_EXCEPTION : {CONVOLUTION}/core/framework/bfc_arena.cc:376 {ALLOCATION}",
+            True,
+            False,
+        ),
+        (
+            "1 : FAIL : CUDA failure 2: out of memory ; GPU=0 ; expr=cudaMalloc((void**)&p, size);",
+            True,
+            False,
+        ),
+        (
+            "1 : FAIL : CUBLAS failure 3: CUBLAS_STATUS_ALLOC_FAILED ; GPU=0 ; hostname=robot",
+            True,
+            False,
+        ),
+        (
+            "1 : FAIL : CUDA failure 700: an illegal memory access was encountered ; GPU=0",
+            False,
+            True,
+        ),
+        (
+            f"1 : FAIL : {CONVOLUTION}CUDNN failure 8: CUDNN_STATUS_EXECUTION_FAILED ; GPU=0",
+            False,
+            True,
+        ),
         ("1 : FAIL : CUBLAS failure 13: the GPU program failed to execute ; GPU=0", False, True),
         ("1 : FAIL : CUFFT failure 6: CUFFT_EXEC_FAILED ; GPU=0", False, True),
         ("1 : FAIL : HIP failure 719: unspecified launch failure ; GPU=0", False, True),
         ("16 : DEVICE_RESET : the device was removed", False, True),
-        ("2 : INVALID_ARGUMENT : Got invalid dimensions for input: images for the following indices", False, False),
+        (
+            (
+                "2 : INVALID_ARGUMENT : Got invalid dimensions for input: images for the following "
+                "indices"
+            ),
+            False,
+            False,
+        ),
         ("1 : FAIL : the model of CUDA devices is not found", False, False),
     ],
 )
-def test_errors_of_onnx_runtime_are_told_apart(name: str, text: str, exhausted: bool, failed: bool) -> None:
+def test_errors_of_onnx_runtime_are_told_apart(
+    name: str, text: str, exhausted: bool, failed: bool
+) -> None:
     classes = pytest.importorskip("onnxruntime.capi.onnxruntime_pybind11_state")
     error = getattr(classes, name)(f"[ONNXRuntimeError] : {text}")
-    assert not isinstance(error, RuntimeError), "otherwise the class of the error would need no rule"
+    assert not isinstance(error, RuntimeError), (
+        "otherwise the class of the error would need no rule"
+    )
     assert (is_out_of_memory(error), is_device_failure(error)) == (exhausted, failed)
     own = ValueError(str(error))  # a request's text is no error of a device
     assert not is_out_of_memory(own)
@@ -227,7 +310,9 @@ class Crowded(ModelPolicy):
 
     @property
     def contract(self) -> Contract:
-        return Contract(state={"joints": StateSpec(DIM)}, action=ActionSpec(dim=DIM), chunk=self.chunk(HORIZON))
+        return Contract(
+            state={"joints": StateSpec(DIM)}, action=ActionSpec(dim=DIM), chunk=self.chunk(HORIZON)
+        )
 
     def load(self) -> Any:
         report_device({"kind": "cuda"})
@@ -259,7 +344,9 @@ def made(kind: type[Crowded], **config: Any) -> Crowded:
 
 def acted(policy: Crowded, number: int, samples: int = 0) -> list[Act]:
     sessions = [copy.copy(policy) for _ in range(number)]
-    view = Obs(state={"joints": np.zeros(DIM, np.float32)}, info={SAMPLES: samples} if samples else {})
+    view = Obs(
+        state={"joints": np.zeros(DIM, np.float32)}, info={SAMPLES: samples} if samples else {}
+    )
     for seed, session in enumerate(sessions):
         session.reset(view, "go", seed=seed)
     acts = policy.act_batch([view] * number, sessions)
@@ -267,7 +354,9 @@ def acted(policy: Crowded, number: int, samples: int = 0) -> list[Act]:
     return acts  # type: ignore[return-value]
 
 
-def test_values_are_read_after_a_copy_that_does_not_wait_is_over(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_values_are_read_after_a_copy_that_does_not_wait_is_over(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     values, on_host = torch.arange(6.0).view(2, 3), torch.zeros(2, 3)
 
     def to(place: str, *, non_blocking: bool) -> torch.Tensor:
@@ -288,17 +377,23 @@ def test_float32_products_on_a_gpu_are_as_set(
     found: list[Any] = []
     monkeypatch.setattr(torch, "set_float32_matmul_precision", found.append)
     monkeypatch.setattr(torch.backends.cudnn, "allow_tf32", wanted != "high")
-    monkeypatch.setattr(Roomy, "predict", lambda _, rows: found.append("rows") or Crowded.predict(_, rows))
+    monkeypatch.setattr(
+        Roomy, "predict", lambda _, rows: found.append("rows") or Crowded.predict(_, rows)
+    )
     policy = made(Roomy, **setting)
     assert found[:2] == [wanted, "rows"]
     assert torch.backends.cudnn.allow_tf32 is (wanted == "high")
     assert policy.report.devices == [{"kind": "cuda", "matmul": wanted}]
 
 
-def test_float32_products_of_jax_are_as_set_and_those_of_a_cpu_stay(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_float32_products_of_jax_are_as_set_and_those_of_a_cpu_stay(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     found: list[Any] = []
     monkeypatch.setitem(
-        sys.modules, "jax", SimpleNamespace(config=SimpleNamespace(update=lambda *to: found.append(to)))
+        sys.modules,
+        "jax",
+        SimpleNamespace(config=SimpleNamespace(update=lambda *to: found.append(to))),
     )
     gpu, cpu = {"kind": "gpu", "jax": "0.5.3"}, {"kind": "cpu", "torch": "2.13.0"}
     set_matmul("highest", gpu)
@@ -307,17 +402,22 @@ def test_float32_products_of_jax_are_as_set_and_those_of_a_cpu_stay(monkeypatch:
     assert (gpu["matmul"], "matmul" in cpu) == ("highest", False)
 
 
-def test_a_full_batch_that_does_not_fit_is_found_while_a_model_loads(caplog: pytest.LogCaptureFixture) -> None:
+def test_a_full_batch_that_does_not_fit_is_found_while_a_model_loads(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
     policy = Crowded.from_config({"checkpoint": "none", "max_rows": 12})
     policy.initialize()
     assert policy.model["passes"] == [1, 12, 6, 3, 3, 3, 3]
     assert policy.most_rows == 3
-    assert "out of memory in a forward pass of 12 rows: of at most 6 rows from now on" in caplog.text
+    assert (
+        "out of memory in a forward pass of 12 rows: of at most 6 rows from now on" in caplog.text
+    )
     assert "Lower batch.max_size, max_rows or batch_sizes" in caplog.text
 
 
 @pytest.mark.parametrize(
-    ("sizes", "passes", "later"), [(None, [5, 2, 2, 1], [2, 2, 1]), ([1, 2, 5, 8], [5, 2, 2, 1], [2, 2, 1])]
+    ("sizes", "passes", "later"),
+    [(None, [5, 2, 2, 1], [2, 2, 1]), ([1, 2, 5, 8], [5, 2, 2, 1], [2, 2, 1])],
 )
 def test_a_batch_that_does_not_fit_is_halved_and_acts_as_if_it_had(
     monkeypatch: pytest.MonkeyPatch, sizes: list[int] | None, passes: list[int], later: list[int]
@@ -338,7 +438,9 @@ def test_a_batch_that_does_not_fit_is_halved_and_acts_as_if_it_had(
 
 def test_a_batch_that_onnx_runtime_cannot_fit_is_halved(monkeypatch: pytest.MonkeyPatch) -> None:
     classes = pytest.importorskip("onnxruntime.capi.onnxruntime_pybind11_state")
-    monkeypatch.setattr(Crowded, "exhausted", classes.RuntimeException(f"6 : RUNTIME_EXCEPTION : {ALLOCATION}"))
+    monkeypatch.setattr(
+        Crowded, "exhausted", classes.RuntimeException(f"6 : RUNTIME_EXCEPTION : {ALLOCATION}")
+    )
     policy = made(Crowded, max_rows=8)
     for one, other in zip(acted(policy, 5), acted(made(Roomy), 5), strict=True):
         np.testing.assert_array_equal(one.action, other.action)
@@ -348,9 +450,13 @@ def test_a_batch_that_onnx_runtime_cannot_fit_is_halved(monkeypatch: pytest.Monk
 def test_samples_that_do_not_fit_are_those_that_would_have_fitted() -> None:
     policy = made(Crowded, max_rows=3)
     policy.config = policy.config.model_copy(update={"max_rows": 64})
-    for one, other in zip(acted(policy, 2, samples=6), acted(made(Roomy), 2, samples=6), strict=True):
+    for one, other in zip(
+        acted(policy, 2, samples=6), acted(made(Roomy), 2, samples=6), strict=True
+    ):
         np.testing.assert_array_equal(one.action, other.action)
-        np.testing.assert_array_equal(one.info[DISTRIBUTION]["samples"], other.info[DISTRIBUTION]["samples"])
+        np.testing.assert_array_equal(
+            one.info[DISTRIBUTION]["samples"], other.info[DISTRIBUTION]["samples"]
+        )
     assert policy.most_rows == 3
 
 
@@ -359,7 +465,8 @@ def test_one_row_that_does_not_fit_is_an_error_and_counted(monkeypatch: pytest.M
     engine = Engine(policy)
     engine.start()
     try:
-        assert engine.stats.collect().out_of_memory == 2  # the full batch, and half of it, while it loaded
+        # The full batch, and half of it, while it loaded.
+        assert engine.stats.collect().out_of_memory == 2
         monkeypatch.setattr(Crowded, "fits", 0)
         with pytest.raises(torch.OutOfMemoryError):
             acted(policy, 3)
@@ -369,7 +476,9 @@ def test_one_row_that_does_not_fit_is_an_error_and_counted(monkeypatch: pytest.M
         engine.close()
 
 
-def test_the_time_of_a_batch_on_the_gpu_is_reported_at_the_next_one(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_time_of_a_batch_on_the_gpu_is_reported_at_the_next_one(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     cuda = FakeCuda()
     cuda.install(monkeypatch)
     predict = Crowded.predict

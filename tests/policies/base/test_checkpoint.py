@@ -1,4 +1,6 @@
-"""Checkpoints: found by name, step or commit, held whole by the model, and known by their digest."""
+"""Checkpoints: found by name, step or commit, held whole by the model, and known by their
+digest.
+"""
 
 from __future__ import annotations
 
@@ -42,7 +44,9 @@ def test_what_is_not_there_is_said_with_what_is(tmp_path: Path) -> None:
 
 def model() -> Any:
     torch = pytest.importorskip("torch")
-    layers = torch.nn.Sequential(torch.nn.Linear(8, 8), torch.nn.BatchNorm1d(8), torch.nn.Linear(8, 8))
+    layers = torch.nn.Sequential(
+        torch.nn.Linear(8, 8), torch.nn.BatchNorm1d(8), torch.nn.Linear(8, 8)
+    )
     layers[2].weight = layers[0].weight  # tied
     return layers
 
@@ -62,7 +66,9 @@ def test_random_weights_missing_ones_and_wrong_shapes_are_told(name: str) -> Non
     net = model()
     saved = {key: tensor.clone() for key, tensor in net.state_dict().items()}
     for wrong in (saved[name] + 1e-3, saved[name][:4]):
-        with pytest.raises(ConfigError, match=f"1 are not what it holds .*{name}|2 are not what it holds .*{name}"):
+        with pytest.raises(
+            ConfigError, match=f"1 are not what it holds .*{name}|2 are not what it holds .*{name}"
+        ):
             require_loaded(net, saved | {name: wrong})
     tied = {name, "2.weight"} if name == "0.weight" else {name}
     with pytest.raises(ConfigError, match=f"are not in it .*{name}"):
@@ -87,14 +93,22 @@ WANTED = {"dense": {"kernel": np.empty((2, 3)), "bias": np.empty(3)}, "scale": n
 
 
 def test_parameters_of_the_right_names_and_shapes_pass() -> None:
-    require_filled({"scale": np.ones(1), "dense": {"bias": np.ones(3), "kernel": np.ones((2, 3))}}, WANTED)
+    require_filled(
+        {"scale": np.ones(1), "dense": {"bias": np.ones(3), "kernel": np.ones((2, 3))}}, WANTED
+    )
 
 
 @pytest.mark.parametrize(
     ("params", "message"),
     [
-        ({"dense": {"kernel": np.ones((2, 3))}, "scale": np.ones(1)}, r"1 parameters are not in it \['dense/bias'\]"),
-        ({**WANTED, "scale": SimpleNamespace(shape=(1,))}, r"1 parameters are not in it \['scale'\]"),
+        (
+            {"dense": {"kernel": np.ones((2, 3))}, "scale": np.ones(1)},
+            r"1 parameters are not in it \['dense/bias'\]",
+        ),
+        (
+            {**WANTED, "scale": SimpleNamespace(shape=(1,))},
+            r"1 parameters are not in it \['scale'\]",
+        ),
         ({**WANTED, "scale": np.ones(2)}, r"1 have another shape \['scale'\]"),
         ({**WANTED, "extra": {"bias": np.ones(2)}}, r"1 are not the model's \['extra/bias'\]"),
     ],
@@ -150,23 +164,31 @@ def change_a_byte_of_the_zip(folder: Path) -> None:
 CHANGES: dict[str, Callable[[Path], object]] = {
     "one tensor of many": change_a_tensor,
     "a byte in a zip file": change_a_byte_of_the_zip,
-    "another file throughout": lambda folder: (folder / "sub" / "opaque").write_bytes(b"x" * 9 * 2**20),
+    "another file throughout": lambda folder: (folder / "sub" / "opaque").write_bytes(
+        b"x" * 9 * 2**20
+    ),
     "settings": lambda folder: (folder / "config.json").write_text('{"a": 2}'),
     "a name": lambda folder: (folder / "config.json").rename(folder / "b.json"),
     "a place": lambda folder: (folder / "config.json").rename(folder / "sub" / "config.json"),
     "one more file": lambda folder: (folder / "more.json").touch(),
-    "a file behind a link to a folder": lambda folder: (folder.with_name("linked") / "params").write_text("b"),
+    "a file behind a link to a folder": lambda folder: (
+        folder.with_name("linked") / "params"
+    ).write_text("b"),
 }
 
 
 @pytest.mark.parametrize("change", CHANGES.values(), ids=list(CHANGES))
-def test_what_changes_the_weights_changes_the_digest(change: Callable[[Path], object], folder: Path) -> None:
+def test_what_changes_the_weights_changes_the_digest(
+    change: Callable[[Path], object], folder: Path
+) -> None:
     before = digest([folder])
     change(folder)
     assert digest([folder]) != before
 
 
-def test_a_copy_has_the_same_and_what_is_written_about_it_does_not_count(folder: Path, tmp_path: Path) -> None:
+def test_a_copy_has_the_same_and_what_is_written_about_it_does_not_count(
+    folder: Path, tmp_path: Path
+) -> None:
     before = digest([folder])
     assert before.startswith("sampled-sha256:")
     copy = Path(shutil.copytree(folder, tmp_path / "copy"))
@@ -215,31 +237,47 @@ def test_a_link_to_a_folder_above_is_no_endless_way(folder: Path) -> None:
     assert digest([folder]) == before
 
 
-def test_the_commit_is_that_of_the_policy_and_not_of_an_encoder_beside_it(folder: Path, tmp_path: Path) -> None:
+def test_the_commit_is_that_of_the_policy_and_not_of_an_encoder_beside_it(
+    folder: Path, tmp_path: Path
+) -> None:
     snapshot = tmp_path / "models--org--encoder" / "snapshots" / COMMIT
     snapshot.mkdir(parents=True)
-    assert weights_of([folder, snapshot]) == {"digest": digest([folder, snapshot]), "revision": None}
-    assert weights_of([snapshot, folder]) == {"digest": digest([snapshot, folder]), "revision": COMMIT}
+    assert weights_of([folder, snapshot]) == {
+        "digest": digest([folder, snapshot]),
+        "revision": None,
+    }
+    assert weights_of([snapshot, folder]) == {
+        "digest": digest([snapshot, folder]),
+        "revision": COMMIT,
+    }
 
 
 class RevisionNotFoundError(Exception):
     """Stands in for that of huggingface_hub, known by its name."""
 
 
-def test_a_revision_that_is_not_there_is_named_with_those_that_are(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_revision_that_is_not_there_is_named_with_those_that_are(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     def download(name: str, revision: str | None) -> str:
         raise RevisionNotFoundError(name)
 
-    refs = SimpleNamespace(branches=[SimpleNamespace(name="main")], tags=[SimpleNamespace(name="v1")])
+    refs = SimpleNamespace(
+        branches=[SimpleNamespace(name="main")], tags=[SimpleNamespace(name="v1")]
+    )
     api = SimpleNamespace(list_repo_refs=lambda _name: refs)
     hub = SimpleNamespace(snapshot_download=download, HfApi=lambda: api)
     monkeypatch.setitem(sys.modules, "huggingface_hub", hub)
-    with pytest.raises(ConfigError, match=r"org/name has no revision 'v2', want one of its commits.*are main, v1$"):
+    with pytest.raises(
+        ConfigError, match=r"org/name has no revision 'v2', want one of its commits.*are main, v1$"
+    ):
         find_checkpoint("org/name@v2")
     del hub.HfApi  # such as without a network
     with pytest.raises(ConfigError, match=r"no revision 'v2'.*not known here"):
         find_checkpoint("org/name@v2")
-    with pytest.raises(ConfigError, match=r"'org/name@': got no revision after the @, want a commit"):
+    with pytest.raises(
+        ConfigError, match=r"'org/name@': got no revision after the @, want a commit"
+    ):
         find_checkpoint("org/name@")
 
 
@@ -268,8 +306,12 @@ def test_a_hub_id_takes_a_commit_and_says_which_it_was(
         find_checkpoint("org/name@gone")
 
 
-@pytest.mark.parametrize("start", [b"", (2**62).to_bytes(8, "little"), (9).to_bytes(8, "little") + b'{"a": 1}!'])
-def test_a_file_that_is_not_what_its_name_says_has_a_digest_too(start: bytes, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    "start", [b"", (2**62).to_bytes(8, "little"), (9).to_bytes(8, "little") + b'{"a": 1}!']
+)
+def test_a_file_that_is_not_what_its_name_says_has_a_digest_too(
+    start: bytes, tmp_path: Path
+) -> None:
     found = []
     for rest in (b"x", b"x", b"y"):
         (tmp_path / "model.safetensors").write_bytes(start + rest * 2**21)

@@ -1,4 +1,6 @@
-"""What is done to torchvision and LeRobot in the environments that `env make` makes, shown with small packages."""
+"""What is done to torchvision and LeRobot in the environments that `env make` makes, shown with
+small packages.
+"""
 
 from __future__ import annotations
 
@@ -66,7 +68,9 @@ class Packages:
 
 @pytest.fixture
 def packages(tmp_path: Path) -> Packages:
-    """Those of a laptop: a torch without CUDA, a torchvision with it and without a video reader, no torchcodec."""
+    """Those of a laptop: a torch without CUDA, a torchvision with it and without a video reader,
+    no torchcodec.
+    """
     made = Packages(tmp_path)
     made.write("torch", TORCH.format(cuda=None))
     made.write("torchvision", TORCHVISION)
@@ -77,7 +81,9 @@ def packages(tmp_path: Path) -> Packages:
     return made
 
 
-def test_a_torchvision_of_another_build_is_imported_and_videos_are_read_with_pyav(packages: Packages) -> None:
+def test_a_torchvision_of_another_build_is_imported_and_videos_are_read_with_pyav(
+    packages: Packages,
+) -> None:
     said, _ = packages.run(USED)
     assert said == "True ['torchvision::nms', 'torchvision::qnms'] pyav decode_frames"
 
@@ -95,15 +101,24 @@ def test_a_torchcodec_that_finds_no_ffmpeg_is_left_out_and_that_is_said(packages
     packages.write("torchvision", FITS)
     packages.write("torchvision.io", "class VideoReader: pass\n")
     packages.write("torchcodec", "")
-    packages.write("torchcodec.decoders", "raise RuntimeError('Could not load libtorchcodec.\\nMany lines follow.')\n")
+    packages.write(
+        "torchcodec.decoders",
+        "raise RuntimeError('Could not load libtorchcodec.\\nMany lines follow.')\n",
+    )
     said, warned = packages.run(USED)
     assert said == "True [] pyav decode_video_frames_torchvision"
-    assert warned == "torchcodec does not load (Could not load libtorchcodec.); videos are read with PyAV"
+    assert (
+        warned
+        == "torchcodec does not load (Could not load libtorchcodec.); videos are read with PyAV"
+    )
 
 
 def test_with_cuda_a_torchvision_that_does_not_fit_stays_an_error(packages: Packages) -> None:
     packages.write("torch", TORCH.format(cuda="13.0"))
-    assert packages.run("import torchvision")[1] == "RuntimeError: operator torchvision::nms does not exist"
+    assert (
+        packages.run("import torchvision")[1]
+        == "RuntimeError: operator torchvision::nms does not exist"
+    )
 
 
 def test_other_errors_of_torchvision_stay_as_they_are(packages: Packages) -> None:
@@ -112,5 +127,7 @@ def test_other_errors_of_torchvision_stay_as_they_are(packages: Packages) -> Non
 
 
 def test_without_torchvision_and_lerobot_nothing_is_imported(packages: Packages) -> None:
-    said, _ = packages.run("import sys; print(sorted({'torch', 'torchvision', 'numpy', 'av'} & set(sys.modules)))")
+    said, _ = packages.run(
+        "import sys; print(sorted({'torch', 'torchvision', 'numpy', 'av'} & set(sys.modules)))"
+    )
     assert said == "[]"

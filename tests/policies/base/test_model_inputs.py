@@ -4,7 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from vlagents_ray.policies.base.model_inputs import KEPT, KEPT_CHARACTERS, keeping_tokens, resize_with_pad
+from vlagents_ray.policies.base.model_inputs import (
+    KEPT,
+    KEPT_CHARACTERS,
+    keeping_tokens,
+    resize_with_pad,
+)
 
 
 def test_a_wide_image_gets_bars_above_and_below() -> None:

@@ -1,4 +1,6 @@
-"""What every model family inherits: sessions, chunks, samples, batches, shown on a model of three lines."""
+"""What every model family inherits: sessions, chunks, samples, batches, shown on a model of
+three lines.
+"""
 
 from __future__ import annotations
 
@@ -14,7 +16,14 @@ import pytest
 
 from vlagents_ray import Obs
 from vlagents_ray.contract import ActionSpec, Contract, StateSpec
-from vlagents_ray.errors import ConfigError, InvalidAction, InvalidObservation, MissingState, NotReset, NotTrainable
+from vlagents_ray.errors import (
+    ConfigError,
+    InvalidAction,
+    InvalidObservation,
+    MissingState,
+    NotReset,
+    NotTrainable,
+)
 from vlagents_ray.interface import BEHAVIOUR, DELAY, DISTRIBUTION, LEFTOVER, SAMPLES, WANT, Act
 from vlagents_ray.policies.base import ModelConfig, ModelPolicy, Prediction, Row, shared_frames
 from vlagents_ray.policies.base.model_inputs import state_specs, state_vector
@@ -26,7 +35,9 @@ HORIZON, DIM = 4, 2
 
 
 class Wobble(ModelPolicy):
-    """Row h of a chunk: the sum of the last two states, plus h, plus a little of the session's noise."""
+    """Row h of a chunk: the sum of the last two states, plus h, plus a little of the session's
+    noise.
+    """
 
     Config = ModelConfig
 
@@ -37,7 +48,9 @@ class Wobble(ModelPolicy):
     @property
     def contract(self) -> Contract:
         chunk = self.chunk(HORIZON)
-        return Contract(state={"joints": StateSpec(DIM)}, action=ActionSpec(dim=DIM), chunk=chunk, history=2)
+        return Contract(
+            state={"joints": StateSpec(DIM)}, action=ActionSpec(dim=DIM), chunk=chunk, history=2
+        )
 
     def load(self) -> Any:
         return {"batches": []}
@@ -48,7 +61,9 @@ class Wobble(ModelPolicy):
     def predict(self, rows: Sequence[Row]) -> list[Prediction | Exception]:
         self.model["batches"].append(len(rows))
         ramp = np.arange(HORIZON, dtype=np.float32)[:, None]
-        return [Prediction(sum(row.history(2)) + ramp + 0.01 * row.noise(HORIZON, DIM)) for row in rows]
+        return [
+            Prediction(sum(row.history(2)) + ramp + 0.01 * row.noise(HORIZON, DIM)) for row in rows
+        ]
 
 
 def made(**config: Any) -> Wobble:
@@ -72,7 +87,9 @@ def loaded(**config: Any) -> Wobble:
     return policy
 
 
-@pytest.mark.parametrize("config", [{"actions": "queue"}, {"actions": "ensemble"}, {"batch_sizes": [1, 2, 4]}])
+@pytest.mark.parametrize(
+    "config", [{"actions": "queue"}, {"actions": "ensemble"}, {"batch_sizes": [1, 2, 4]}]
+)
 def test_keeps_the_contract(config: dict[str, Any]) -> None:
     check_agent(made(**config), steps=2 * HORIZON)
 
@@ -82,7 +99,9 @@ class Stepping(Wobble):
 
     def predict(self, rows: Sequence[Row]) -> list[Prediction | Exception]:
         first = [row.noise(HORIZON, DIM) for row in rows]
-        return [Prediction(one - row.noise(HORIZON, DIM)) for one, row in zip(first, rows, strict=True)]
+        return [
+            Prediction(one - row.noise(HORIZON, DIM)) for one, row in zip(first, rows, strict=True)
+        ]
 
 
 def test_samples_do_not_depend_on_how_a_batch_is_cut_into_passes() -> None:
@@ -139,7 +158,10 @@ def test_nine_rows_are_a_pass_of_eight_and_one_of_one_where_that_is_faster() -> 
     sessions = [begun(policy, seed) for seed in range(9)]
 
     def passes(on: str, **pass_s: float) -> list[int]:
-        report.devices, report.pass_s = [{"kind": on}], {int(size[1:]): took for size, took in pass_s.items()}
+        report.devices, report.pass_s = (
+            [{"kind": on}],
+            {int(size[1:]): took for size, took in pass_s.items()},
+        )
         batches.clear()
         acts = policy.act_batch([at(0.0)] * 9, [copy.deepcopy(session) for session in sessions])
         found.append([act.action for act in acts if isinstance(act, Act)])
@@ -165,7 +187,9 @@ def test_nine_rows_are_a_pass_of_eight_and_one_of_one_where_that_is_faster() -> 
         (1, {1: 1.0}, [1]),
     ],
 )
-def test_the_split_with_the_shortest_time_is_found(rows: int, pass_s: dict[int, float], want: list[int]) -> None:
+def test_the_split_with_the_shortest_time_is_found(
+    rows: int, pass_s: dict[int, float], want: list[int]
+) -> None:
     found = fastest_split(rows, tuple(pass_s.items()))
     assert (sorted(found), sum(found)) == (want, rows)
 
@@ -208,7 +232,10 @@ def test_the_named_network_is_quantized_once_loaded_and_no_weights_can_be_pushed
 @pytest.mark.parametrize("kind", ["cuda", "cpu"])
 @pytest.mark.parametrize("compiled", ["graphs", False, True, "require"])
 def test_weights_of_8_bits_on_a_gpu_need_compiled_products(
-    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, kind: str, compiled: bool | str
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
+    kind: str,
+    compiled: bool | str,
 ) -> None:
     monkeypatch.setattr("vlagents_ray.policies.base.policy.quantize", lambda *_: None)
     monkeypatch.setattr(Wobble, "_decide_on_compiling", lambda _: None)
@@ -230,7 +257,9 @@ def test_what_torchao_cannot_quantize_is_named(monkeypatch: pytest.MonkeyPatch) 
     monkeypatch.setitem(sys.modules, "torchao", ModuleType("torchao"))
     monkeypatch.setitem(sys.modules, "torchao.quantization", torchao)
     monkeypatch.setattr(Wobble, "network", "model")
-    with pytest.raises(ConfigError, match=r"cannot use it here \(NotImplementedError: no such kernel\)"):
+    with pytest.raises(
+        ConfigError, match=r"cannot use it here \(NotImplementedError: no such kernel\)"
+    ):
         loaded(quantization="int8")
 
 
@@ -249,8 +278,10 @@ def test_a_queue_asks_the_model_every_execute_acts_and_remembers_every_observati
     session = begun(policy)
     rows = [session.act(at(float(x))).action for x in range(4)]
     assert len(policy.model["batches"]) == 2
-    assert [round(float(row[0])) for row in rows[:3]] == [0, 1, 2]  # the chunk of the first observation, seen twice
-    assert round(float(rows[3][0])) == 2 + 3  # the last two observations, although the model saw neither of them alone
+    # The chunk of the first observation, seen twice.
+    assert [round(float(row[0])) for row in rows[:3]] == [0, 1, 2]
+    # The last two observations, although the model saw neither of them alone.
+    assert round(float(rows[3][0])) == 2 + 3
 
 
 def test_an_ensemble_averages_what_the_chunks_say_of_a_tick() -> None:
@@ -295,7 +326,9 @@ class Learnt(Wobble):
         return replace(super().contract, behaviour=self.offered(("logprob", "replay")))
 
     def predict(self, rows: Sequence[Row]) -> list[Prediction | Exception]:
-        drawn = [prediction for prediction in super().predict(rows) if isinstance(prediction, Prediction)]
+        drawn = [
+            prediction for prediction in super().predict(rows) if isinstance(prediction, Prediction)
+        ]
         said = [{"logprob": one.actions.sum(), "replay": {"chunk": one.actions}} for one in drawn]
         return [
             replace(one, behaviour={name: about[name] for name in row.want})
@@ -348,7 +381,11 @@ def test_rows_of_which_something_is_wanted_are_drawn_as_samples_are() -> None:
 
 def test_samples_see_what_their_session_sees() -> None:
     rows = [Row((np.full(2, i),), "go", np.random.default_rng(i)) for i in range(2)]
-    rows += [replace(rows[0]), Row((np.full(2, 2),), "go", np.random.default_rng(2)), replace(rows[1])]
+    rows += [
+        replace(rows[0]),
+        Row((np.full(2, 2),), "go", np.random.default_rng(2)),
+        replace(rows[1]),
+    ]
     assert shared_frames(rows) == ([0, 1, 3], [0, 1, 0, 2, 1])
 
 

@@ -1,4 +1,6 @@
-"""Real-time chunking, shown on a flow whose answer is known: its velocity points straight at a target."""
+"""Real-time chunking, shown on a flow whose answer is known: its velocity points straight at a
+target.
+"""
 
 from __future__ import annotations
 
@@ -74,9 +76,13 @@ STEP = 0.25  # by which the policy below goes on in each row
 
 
 class Prefixed(FlowPasses):
-    """A policy that was trained with prefixes: its rows go on from the last one at time 0, by STEP each."""
+    """A policy that was trained with prefixes: its rows go on from the last one at time 0, by
+    STEP each.
+    """
 
-    def encode(self, tokens: Any, mask: Any, cameras: Any, state: Any, *images: Any) -> tuple[Any, Any]:
+    def encode(
+        self, tokens: Any, mask: Any, cameras: Any, state: Any, *images: Any
+    ) -> tuple[Any, Any]:
         return state, mask
 
     def velocity(self, encoded: Any, seen: Any, state: Any, actions: Any, times: Any) -> Any:
@@ -87,7 +93,8 @@ class Prefixed(FlowPasses):
         start = actions[torch.arange(len(actions)), last.clamp(min=0)] * (last >= 0)[:, None]
         behind = torch.arange(HORIZON)[None, :, None] - last[:, None, None]
         wanted = (actions - start[:, None] - STEP * behind) / times.clamp(min=1e-6)[..., None]
-        return torch.where(given[..., None], 100.0, wanted)  # of given rows, no velocity was ever trained
+        # Of given rows, no velocity was ever trained.
+        return torch.where(given[..., None], 100.0, wanted)
 
 
 def prefixed(*rows: Row) -> np.ndarray:
@@ -129,5 +136,7 @@ def test_prefixes_of_other_lengths_in_a_batch_do_not_matter() -> None:
     both = prefixed(*rows)
     np.testing.assert_allclose(np.diff(both[1], axis=0), STEP, atol=1e-5)  # without a plan
     for one, delay in ((0, 2), (2, 3)):
-        np.testing.assert_allclose(both[one], prefixed([row(plan(), 2), row(), row(plan(3), 5)][one])[0], atol=1e-6)
+        np.testing.assert_allclose(
+            both[one], prefixed([row(plan(), 2), row(), row(plan(3), 5)][one])[0], atol=1e-6
+        )
         np.testing.assert_array_equal(both[one][:delay], plan(6 if one == 0 else 3)[:delay])

@@ -1,4 +1,6 @@
-"""Rows on their way to the policy's device: pinned, on a stream of their own, stacked there without a wait."""
+"""Rows on their way to the policy's device: pinned, on a stream of their own, stacked there
+without a wait.
+"""
 
 from __future__ import annotations
 
@@ -36,7 +38,9 @@ def arrays(seed: int, side: int = 5) -> dict[str, np.ndarray]:
 def require_stacked(batch: dict[str, torch.Tensor], *rows: dict[str, np.ndarray]) -> None:
     assert list(batch) == list(rows[0])
     for name, tensor in batch.items():
-        values = tensor.values if hasattr(tensor, "values") and not callable(tensor.values) else tensor
+        values = (
+            tensor.values if hasattr(tensor, "values") and not callable(tensor.values) else tensor
+        )
         wanted = torch.from_numpy(np.stack([np.asarray(row[name]) for row in rows]))
         assert values.dtype == wanted.dtype
         torch.testing.assert_close(values, wanted, rtol=0, atol=0)
@@ -68,12 +72,16 @@ def test_batches_on_a_cpu_share_their_memory_whatever_the_mode() -> None:
 
 def test_rows_of_other_shapes_are_refused_though_they_are_as_long() -> None:
     staging = Staging("cpu")
-    wide, high = (staging.stage({"image": np.zeros(shape, np.uint8)}) for shape in ((4, 8, 3), (8, 4, 3)))
+    wide, high = (
+        staging.stage({"image": np.zeros(shape, np.uint8)}) for shape in ((4, 8, 3), (8, 4, 3))
+    )
     with pytest.raises(ValueError, match=r"\(4, 8, 3\).*\(8, 4, 3\)"):
         staging.stack([wide, high])
 
 
-def test_a_gpu_copies_rows_of_other_threads_and_the_batch_waits_for_the_copies(cuda: FakeCuda) -> None:
+def test_a_gpu_copies_rows_of_other_threads_and_the_batch_waits_for_the_copies(
+    cuda: FakeCuda,
+) -> None:
     staging, rows = Staging(CUDA), [StagedRow({}) for _ in range(4)]
 
     def stage(place: int) -> None:
@@ -85,7 +93,8 @@ def test_a_gpu_copies_rows_of_other_threads_and_the_batch_waits_for_the_copies(c
     for thread in threads:
         thread.join()
     blocks = [row.block for row in rows]
-    assert not any(torch.equal(block.values, cuda.pinned[0]) for block in blocks)  # none is copied yet
+    # None is copied yet.
+    assert not any(torch.equal(block.values, cuda.pinned[0]) for block in blocks)
     require_stacked(staging.stack(rows), *map(arrays, range(4)))
     assert all(block.streams == [cuda.current_stream(CUDA)] for block in blocks)
     assert all(row.block is None for row in rows)  # only waiting requests take memory there

@@ -78,7 +78,9 @@ MODES = ("graphs", "require")
 
 
 @pytest.mark.parametrize("mode", MODES)
-def test_policies_on_two_devices_are_each_captured_on_their_own(cuda: FakeCuda, mode: CompileMode) -> None:
+def test_policies_on_two_devices_are_each_captured_on_their_own(
+    cuda: FakeCuda, mode: CompileMode
+) -> None:
     cores = []
     for index in (0, 1):
         w = weight(cuda, index)
@@ -105,11 +107,15 @@ def elsewhere(cuda: FakeCuda, function: Callable[[Any], Any]) -> Callable[[Any],
 NAMES = {"graphs": "CUDA graph", "require": "torch.compile"}
 
 
-def compiles_to(monkeypatch: pytest.MonkeyPatch, change: Callable[[Callable[..., Any]], Callable[..., Any]]) -> None:
+def compiles_to(
+    monkeypatch: pytest.MonkeyPatch, change: Callable[[Callable[..., Any]], Callable[..., Any]]
+) -> None:
     monkeypatch.setattr(torch, "compile", lambda function, **_: change(function))
 
 
-def refused(cuda: FakeCuda, monkeypatch: pytest.MonkeyPatch, mode: CompileMode, function: Callable[..., Any]) -> str:
+def refused(
+    cuda: FakeCuda, monkeypatch: pytest.MonkeyPatch, mode: CompileMode, function: Callable[..., Any]
+) -> str:
     """Return the report of a mode whose last tier has this function in the place of the core."""
     eager = (lambda x: x.tanh() + x) if mode == "require" else function
     compiles_to(monkeypatch, lambda _: function)
@@ -118,7 +124,8 @@ def refused(cuda: FakeCuda, monkeypatch: pytest.MonkeyPatch, mode: CompileMode, 
     x = numbers(cuda)
     same(core(x), eager(x))
     assert len(report.uncompiled) == 3
-    assert compilation.sizes == ([1, 2, 4] if mode == "require" else [])  # the graph of the eager core stays
+    # The graph of the eager core stays.
+    assert compilation.sizes == ([1, 2, 4] if mode == "require" else [])
     return report.uncompiled[0]
 
 
@@ -127,8 +134,13 @@ def test_a_graph_that_recorded_nothing_is_refused(
     cuda: FakeCuda, monkeypatch: pytest.MonkeyPatch, mode: CompileMode
 ) -> None:
     said = refused(cuda, monkeypatch, mode, elsewhere(cuda, lambda x: x.tanh() + x))
-    assert said.startswith(f"4 rows: 'core' by {NAMES[str(mode)]}: RuntimeError: the CUDA graph is empty")
-    with pytest.raises(ConfigError, match="compile: require: 'core' by CUDA graph: RuntimeError: the CUDA graph is em"):
+    assert said.startswith(
+        f"4 rows: 'core' by {NAMES[str(mode)]}: RuntimeError: the CUDA graph is empty"
+    )
+    with pytest.raises(
+        ConfigError,
+        match="compile: require: 'core' by CUDA graph: RuntimeError: the CUDA graph is em",
+    ):
         compiled(cuda, elsewhere(cuda, lambda x: x.tanh()))
 
 
@@ -143,7 +155,9 @@ def test_a_graph_that_missed_a_part_is_refused(
         compiled(cuda, lambda x: part(x) + x)
 
 
-def test_without_a_compiler_the_graphs_of_eager_cores_stay(cuda: FakeCuda, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_a_compiler_the_graphs_of_eager_cores_stay(
+    cuda: FakeCuda, monkeypatch: pytest.MonkeyPatch
+) -> None:
     def missing(function: Any) -> Any:
         raise RuntimeError("Cannot find a working triton installation")
 
@@ -155,9 +169,16 @@ def test_without_a_compiler_the_graphs_of_eager_cores_stay(cuda: FakeCuda, monke
         x = numbers(cuda)
         np.testing.assert_array_equal(core(x).values, x.values.tanh())
         assert cuda.replays
-        reasons = [f"{n} rows: 'core' by torch.compile: RuntimeError: Cannot find a working triton" for n in (4, 2, 1)]
-        assert [said[: len(reasons[0])] for said in report.uncompiled] == (reasons if mode is True else [])
-    with pytest.raises(ConfigError, match=r"require: 'core' by torch.compile: RuntimeError: Cannot find"):
+        reasons = [
+            f"{n} rows: 'core' by torch.compile: RuntimeError: Cannot find a working triton"
+            for n in (4, 2, 1)
+        ]
+        assert [said[: len(reasons[0])] for said in report.uncompiled] == (
+            reasons if mode is True else []
+        )
+    with pytest.raises(
+        ConfigError, match=r"require: 'core' by torch.compile: RuntimeError: Cannot find"
+    ):
         compiled(cuda, torch.tanh)
 
 
@@ -184,14 +205,21 @@ def test_what_torch_compiles_is_used_if_it_is_faster_by_three_percent(
 
 def test_the_graphs_of_a_policy_share_memory_and_the_largest_is_made_first(cuda: FakeCuda) -> None:
     compilation, w = Compilation("graphs"), weight(cuda)
-    halves = [compilation.core("a", lambda x: x @ w), compilation.core("b", lambda x: (x * 2, x - 1))]
+    halves = [
+        compilation.core("a", lambda x: x @ w),
+        compilation.core("b", lambda x: (x * 2, x - 1)),
+    ]
 
     def act(x: Any) -> Any:
         return [core(x) for core in (*halves, *halves)]
 
     for size in (4, 2):
         compilation.add_size(size, lambda size=size: act(numbers(cuda, size)))  # type: ignore[misc]
-    assert len({id(graph.pool) for graph in cuda.captures}) == len({graph.stream for graph in cuda.captures}) == 1
+    assert (
+        len({id(graph.pool) for graph in cuda.captures})
+        == len({graph.stream for graph in cuda.captures})
+        == 1
+    )
     assert [len(graph.calls[0][1]) for graph in cuda.captures] == [4, 4, 2, 2]
     assert cuda.reserved[0] == (4 + 2) * 3 * DIM * 4
     assert compilation.graph_bytes > cuda.reserved[0], "the inputs take memory, too"
@@ -214,12 +242,16 @@ def test_constants_from_the_host_are_copied_before_the_capture(cuda: FakeCuda) -
         x = numbers(cuda)
         assert compilation.sizes == [1, 2, 4]
         same(core(x), masked(x))
-        with pytest.raises(torch.AcceleratorError, match="operation failed due to a previous error"):
+        with pytest.raises(
+            torch.AcceleratorError, match="operation failed due to a previous error"
+        ):
             CudaGraph(masked, [x])
 
 
 def test_casts_of_autocast_are_not_kept_beyond_it() -> None:
-    """The cache ends with the context, in which a graph was captured, but the graph reads the memory further on."""
+    """The cache ends with the context, in which a graph was captured, but the graph reads the
+    memory further on.
+    """
     layer, cached = torch.nn.Linear(DIM, DIM), list[bool]()
 
     def function(x: Any) -> Any:
@@ -238,7 +270,9 @@ STEPS = 3
 class Passes(FlowPasses):
     """The passes of a model without layers."""
 
-    def encode(self, tokens: Any, mask: Any, cameras: Any, state: Any, *images: Any) -> tuple[Any, Any]:
+    def encode(
+        self, tokens: Any, mask: Any, cameras: Any, state: Any, *images: Any
+    ) -> tuple[Any, Any]:
         return tokens.float()[:, :1] + state, mask.long()
 
     def velocity(self, encoded: Any, seen: Any, state: Any, actions: Any, times: Any) -> Any:
@@ -260,7 +294,9 @@ def drawn(cuda: FakeCuda, rows: int) -> dict[str, Any]:
 
 
 @pytest.mark.parametrize("mode", MODES)
-def test_a_flow_is_one_graph_and_one_of_each_step_if_steps_are_changed(cuda: FakeCuda, mode: CompileMode) -> None:
+def test_a_flow_is_one_graph_and_one_of_each_step_if_steps_are_changed(
+    cuda: FakeCuda, mode: CompileMode
+) -> None:
     compilation = Compilation(mode)
     passes, plain = Passes(cuda, compilation), Passes(cuda, Compilation(False))
     for size in (4, 1):
@@ -268,20 +304,29 @@ def test_a_flow_is_one_graph_and_one_of_each_step_if_steps_are_changed(cuda: Fak
     assert [core.name for core in compilation.cores] == ["encode", "velocity", "flow"]
     assert [core.tier(size) for core in compilation.cores for size in (1, 4)] == ["CUDA graph"] * 6
     for rows in (1, 2, 4):
-        for changes, replays in (((), 2), ([lambda velocity, actions, time: velocity - time * actions], 1 + STEPS)):
+        for changes, replays in (
+            ((), 2),
+            ([lambda velocity, actions, time: velocity - time * actions], 1 + STEPS),
+        ):
             inputs = drawn(cuda, rows) | {"changes": changes, "fingerprints": [""] * rows}
             wanted = plain.sample(**inputs)
             cuda.replays.clear()
             same(passes.sample(**inputs), wanted)
             assert len(cuda.replays) == replays
     cuda.replays.clear()
-    same(passes.sample(**(inputs := drawn(cuda, 5))), plain.sample(**inputs))  # no graph has so many rows
+    # No graph has so many rows.
+    same(passes.sample(**(inputs := drawn(cuda, 5))), plain.sample(**inputs))
     assert cuda.replays == []
 
 
-def test_the_graph_of_a_flow_has_the_compiled_steps(cuda: FakeCuda, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_graph_of_a_flow_has_the_compiled_steps(
+    cuda: FakeCuda, monkeypatch: pytest.MonkeyPatch
+) -> None:
     compiles_to(
-        monkeypatch, lambda function: lambda *tensors: tanh_alone(*tensors) if len(tensors) == 5 else function(*tensors)
+        monkeypatch,
+        lambda function: (
+            lambda *tensors: tanh_alone(*tensors) if len(tensors) == 5 else function(*tensors)
+        ),
     )
 
     def tanh_alone(encoded: Any, seen: Any, state: Any, actions: Any, times: Any) -> Any:
@@ -291,7 +336,11 @@ def test_the_graph_of_a_flow_has_the_compiled_steps(cuda: FakeCuda, monkeypatch:
     compilation = Compilation(True)
     passes, plain = Passes(cuda, compilation), Passes(cuda, Compilation(False))
     compilation.add_size(2, lambda: passes.sample(**drawn(cuda, 2)))
-    assert [core.tier(2) for core in compilation.cores] == ["CUDA graph", "torch.compile", "torch.compile"]
+    assert [core.tier(2) for core in compilation.cores] == [
+        "CUDA graph",
+        "torch.compile",
+        "torch.compile",
+    ]
     cuda.replays.clear()
     same(passes.sample(**(inputs := drawn(cuda, 2))), plain.sample(**inputs))
     assert len(cuda.replays) == 2
@@ -305,7 +354,9 @@ def test_after_a_capture_that_failed_the_thread_is_on_its_stream_again(cuda: Fak
             torch.cuda.synchronize()
         return x.tanh()
 
-    with pytest.raises(torch.AcceleratorError, match="operation failed due to a previous error during capture"):
+    with pytest.raises(
+        torch.AcceleratorError, match="operation failed due to a previous error during capture"
+    ):
         CudaGraph(waits, [numbers(cuda)])
     assert torch.cuda.current_stream() is before
 
@@ -330,7 +381,9 @@ class Waiting(Agent):
 
 
 def captured_beside(cuda: FakeCuda, begin: Callable[[], queue.SimpleQueue[Any]]) -> Any:
-    """Capture a graph, begin something on another thread meanwhile, and return its result, which comes afterwards."""
+    """Capture a graph, begin something on another thread meanwhile, and return its result, which
+    comes afterwards.
+    """
     begun: list[queue.SimpleQueue[Any]] = []
 
     def function(x: Any) -> Any:
@@ -359,7 +412,9 @@ def on_a_thread(call: Callable[[], Any]) -> queue.SimpleQueue[Any]:
 
 
 @pytest.mark.parametrize("op", ["reset", "act"])
-def test_an_act_that_waits_for_the_device_waits_for_the_end_of_a_capture(cuda: FakeCuda, op: Any) -> None:
+def test_an_act_that_waits_for_the_device_waits_for_the_end_of_a_capture(
+    cuda: FakeCuda, op: Any
+) -> None:
     engine = Engine(Waiting())
     engine.start()
 
@@ -375,7 +430,9 @@ def test_an_act_that_waits_for_the_device_waits_for_the_end_of_a_capture(cuda: F
         engine.close()
 
 
-def test_another_checkpoint_is_loaded_on_another_stream_than_that_of_the_acts(cuda: FakeCuda) -> None:
+def test_another_checkpoint_is_loaded_on_another_stream_than_that_of_the_acts(
+    cuda: FakeCuda,
+) -> None:
     streams: list[Any] = []
 
     class Loading(Waiting):
@@ -405,7 +462,9 @@ def test_a_push_waits_for_the_end_of_a_capture(cuda: FakeCuda) -> None:
     weights.drop(1)
 
 
-def test_memory_for_another_process_is_finished_without_a_wait_for_the_device(cuda: FakeCuda) -> None:
+def test_memory_for_another_process_is_finished_without_a_wait_for_the_device(
+    cuda: FakeCuda,
+) -> None:
     def function(x: Any) -> Any:
         if cuda.capture is not None:
             assert on_a_thread(lambda: _GpuMemory().finish(x.device)).get(timeout=10) is None
@@ -414,7 +473,9 @@ def test_memory_for_another_process_is_finished_without_a_wait_for_the_device(cu
     CudaGraph(function, [numbers(cuda)])
 
 
-def test_a_capture_that_waits_for_a_push_delays_no_act_and_is_not_starved_by_acts(cuda: FakeCuda) -> None:
+def test_a_capture_that_waits_for_a_push_delays_no_act_and_is_not_starved_by_acts(
+    cuda: FakeCuda,
+) -> None:
     acting, stop = threading.Event(), threading.Event()
 
     def acts() -> int:
@@ -471,7 +532,9 @@ class OnGpu(ModelPolicy):
         return [Prediction(chunk[None]) for chunk in chunks.values.numpy()]
 
 
-def test_a_model_that_sleeps_frees_its_graphs_and_weights_and_acts_the_same_when_it_wakes(cuda: FakeCuda) -> None:
+def test_a_model_that_sleeps_frees_its_graphs_and_weights_and_acts_the_same_when_it_wakes(
+    cuda: FakeCuda,
+) -> None:
     OnGpu.cuda = cuda
     policy = OnGpu.from_config({"checkpoint": "none", "compile": "require", "batch_sizes": [1, 2]})
     policy.initialize()
@@ -494,9 +557,13 @@ def test_a_model_that_sleeps_frees_its_graphs_and_weights_and_acts_the_same_when
     assert len(cuda.replays) == replayed + 1, "from a graph"
 
 
-def test_a_model_on_a_gpu_acts_from_graphs_in_less_memory_and_until_the_gpu_fails(cuda: FakeCuda) -> None:
+def test_a_model_on_a_gpu_acts_from_graphs_in_less_memory_and_until_the_gpu_fails(
+    cuda: FakeCuda,
+) -> None:
     OnGpu.cuda = cuda
-    policy = OnGpu.from_config({"checkpoint": "none", "compile": "require", "batch_sizes": [1, 2, 4]})
+    policy = OnGpu.from_config(
+        {"checkpoint": "none", "compile": "require", "batch_sizes": [1, 2, 4]}
+    )
     engine = Engine(policy)
     engine.start()
 
@@ -507,7 +574,9 @@ def test_a_model_on_a_gpu_acts_from_graphs_in_less_memory_and_until_the_gpu_fail
             given: dict[str, Any] = {"instruction": "go"} if op == "reset" else {}
             tickets = []
             for seed in range(rows):
-                request = Request(op, Obs(), **given, kwargs={"seed": seed} if op == "reset" else {})  # type: ignore[arg-type]
+                request = Request(
+                    op, Obs(), **given, kwargs={"seed": seed} if op == "reset" else {}
+                )  # type: ignore[arg-type]
                 tickets.append(checked(engine, str(seed), request, replies.put))
             engine.queue.put(*tickets)
             found = [replies.get(timeout=10) for _ in tickets]
@@ -564,7 +633,9 @@ def test_the_device_and_the_family_decide_unless_the_settings_do(
 ) -> None:
     OnGpu.cuda = cuda
     caplog.set_level("INFO")
-    policy = kind.from_config({"checkpoint": "none"} | ({} if mode == "auto" else {"compile": mode}))
+    policy = kind.from_config(
+        {"checkpoint": "none"} | ({} if mode == "auto" else {"compile": mode})
+    )
     with loading_report(lambda _: None, [1, 2]):
         policy.initialize()
     assert (policy.config.compile, policy.compilation.mode) == (decided, decided)

@@ -1,4 +1,6 @@
-"""Compiled cores: their results, when they are made, what happens to wrong ones, and where programs are kept."""
+"""Compiled cores: their results, when they are made, what happens to wrong ones, and where
+programs are kept.
+"""
 
 from __future__ import annotations
 
@@ -45,7 +47,9 @@ class Linear(ModelPolicy):
 
     @property
     def contract(self) -> Contract:
-        return Contract(state={"joints": StateSpec(DIM)}, action=ActionSpec(dim=DIM), chunk=self.chunk(HORIZON))
+        return Contract(
+            state={"joints": StateSpec(DIM)}, action=ActionSpec(dim=DIM), chunk=self.chunk(HORIZON)
+        )
 
     def load(self) -> Any:
         torch.manual_seed(0)
@@ -105,7 +109,10 @@ def loaded(kind: type[Linear] = Linear, **config: Any) -> tuple[Linear, LoadingR
 
 def acted(policy: Linear, seeds: Sequence[int], **info: Any) -> list[np.ndarray]:
     rng = np.random.default_rng(7)
-    views = [Obs(state={"joints": rng.normal(size=DIM).astype(np.float32)}, info=info) for _ in range(max(seeds) + 1)]
+    views = [
+        Obs(state={"joints": rng.normal(size=DIM).astype(np.float32)}, info=info)
+        for _ in range(max(seeds) + 1)
+    ]
     sessions = [copy.copy(policy) for _ in seeds]
     for session, seed in zip(sessions, seeds, strict=True):
         session.reset(views[seed], WORDS, seed=seed)
@@ -128,7 +135,8 @@ def test_programs_are_made_once_while_the_policy_loads(compiler: CountingCompile
     assert (compiler.rows, policy.compilation.sizes, report.uncompiled) == (sizes[::-1], sizes, [])
     assert steps == [f"compiling {size} rows ({13 - size} of 12)" for size in sizes[::-1]]
     acted(policy, range(5))
-    other = threading.Thread(target=acted, args=(policy, range(7)))  # the policy's thread is not always the loading one
+    # The policy's thread is not always the loading one.
+    other = threading.Thread(target=acted, args=(policy, range(7)))
     other.start()
     other.join()
     acted(policy, range(5), **{SAMPLES: 2})
@@ -177,7 +185,9 @@ def test_a_closed_policy_keeps_no_weights(compiler: CountingCompiler) -> None:
     assert weights() is None
 
 
-def test_usual_sizes_if_neither_the_settings_nor_a_server_name_some(compiler: CountingCompiler) -> None:
+def test_usual_sizes_if_neither_the_settings_nor_a_server_name_some(
+    compiler: CountingCompiler,
+) -> None:
     assert made(compile="require").compilation.sizes == [1, 2, 4, 8, 16]
     assert made().config.batch_sizes is None
 
@@ -209,7 +219,9 @@ def test_a_policy_that_is_not_compiled_keeps_any_size_in_a_server() -> None:
         assert policy.config.batch_sizes is None
 
 
-@pytest.mark.parametrize("wrong", [lambda out: out + 0.01, lambda out: out * float("nan"), lambda out: out.flip(0)])
+@pytest.mark.parametrize(
+    "wrong", [lambda out: out + 0.01, lambda out: out * float("nan"), lambda out: out.flip(0)]
+)
 def test_a_program_with_other_results_is_not_used(
     compiler: CountingCompiler, caplog: pytest.LogCaptureFixture, wrong: Callable[[Any], Any]
 ) -> None:
@@ -227,7 +239,9 @@ def test_a_program_with_other_results_is_not_used(
 def test_a_program_that_keeps_an_input_of_its_first_call_is_not_used(
     monkeypatch: pytest.MonkeyPatch, kept: tuple[int, ...]
 ) -> None:
-    """As a CUDA graph does that missed a part: the values which that part had in the capture stay."""
+    """As a CUDA graph does that missed a part: the values which that part had in the capture
+    stay.
+    """
 
     def stale(graph: Any, examples: Sequence[Any]) -> Callable[..., Any]:
         first: list[Any] = []
@@ -243,12 +257,16 @@ def test_a_program_that_keeps_an_input_of_its_first_call_is_not_used(
         return program
 
     monkeypatch.setattr(Compilation, "backend", staticmethod(stale))
-    with pytest.raises(ConfigError, match=r"compile: require: 'linear' by torch.compile: its results are off by"):
+    with pytest.raises(
+        ConfigError, match=r"compile: require: 'linear' by torch.compile: its results are off by"
+    ):
         made(compile="require", batch_sizes=[2])
     torch._dynamo.reset()
 
 
-def test_a_program_is_not_made_with_the_inputs_with_which_it_is_compared(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_program_is_not_made_with_the_inputs_with_which_it_is_compared(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     kept: list[Any] = []
 
     def stale(graph: Any, examples: Sequence[Any]) -> Callable[..., Any]:
@@ -279,19 +297,36 @@ def test_the_rounding_of_a_program_is_accepted(compiler: CountingCompiler) -> No
 
 
 class Bfloat16Step:
-    """A step of a flow in bfloat16: it reads little of the state, and both cameras by the same layers."""
+    """A step of a flow in bfloat16: it reads little of the state, and both cameras by the same
+    layers.
+    """
 
     def __init__(self, steps: int = 1, width: int = 64) -> None:
         torch.manual_seed(0)
         self.steps = steps
-        self.layers = torch.nn.ModuleList(torch.nn.Linear(width, width) for _ in range(8)).bfloat16()
-        self.cameras, self.state, self.actions = (torch.randn(n, width) / n**0.5 for n in (16, 8, 6))
+        self.layers = torch.nn.ModuleList(
+            torch.nn.Linear(width, width) for _ in range(8)
+        ).bfloat16()
+        self.cameras, self.state, self.actions = (
+            torch.randn(n, width) / n**0.5 for n in (16, 8, 6)
+        )
         self.output = torch.randn(width, 6) / width**0.5
 
     def inputs(self, rows: int) -> tuple[Any, ...]:
-        return torch.randn(rows, 2, 16).bfloat16(), torch.randn(rows, 8).bfloat16(), torch.randn(rows, 6)
+        return (
+            torch.randn(rows, 2, 16).bfloat16(),
+            torch.randn(rows, 8).bfloat16(),
+            torch.randn(rows, 6),
+        )
 
-    def __call__(self, cameras: Any, state: Any, actions: Any, layers: Any = None, dtype: Any = torch.bfloat16) -> Any:
+    def __call__(
+        self,
+        cameras: Any,
+        state: Any,
+        actions: Any,
+        layers: Any = None,
+        dtype: Any = torch.bfloat16,
+    ) -> Any:
         layers = layers or self.layers
         for step in range(self.steps):
             front, wrist = (cameras.to(dtype) @ self.cameras.to(dtype)).unbind(1)
@@ -335,9 +370,15 @@ RIGHT: dict[str, Callable[[Bfloat16Step], Any]] = {
 }
 WRONG: dict[str, Callable[[Bfloat16Step], Any]] = {
     "velocities too large": lambda step: lambda *inputs: 1.05 * step(*inputs),
-    "state never seen": lambda step: lambda cameras, state, actions: step(cameras, 0 * state, actions),
-    "cameras exchanged": lambda step: lambda cameras, state, actions: step(cameras.flip(1), state, actions),
-    "actions too small": lambda step: lambda cameras, state, actions: step(cameras, state, 0.9 * actions),
+    "state never seen": lambda step: (
+        lambda cameras, state, actions: step(cameras, 0 * state, actions)
+    ),
+    "cameras exchanged": lambda step: (
+        lambda cameras, state, actions: step(cameras.flip(1), state, actions)
+    ),
+    "actions too small": lambda step: (
+        lambda cameras, state, actions: step(cameras, state, 0.9 * actions)
+    ),
     "first layer again": first_layer_again,
     "row of the neighbour": row_of_the_neighbour,
 }
@@ -396,11 +437,15 @@ def test_a_measurement_of_rounding_draws_nothing(compiler: CountingCompiler) -> 
 
 
 class Candidates(Linear):
-    """A model that runs five rows for each of a batch, at most three at a time, as a planner tries plans."""
+    """A model that runs five rows for each of a batch, at most three at a time, as a planner
+    tries plans.
+    """
 
     def load(self) -> Any:
         model = super().load()
-        self.pass_of = partial(self._in_passes, self.compilation.core("tried", self._layer(model), rows=3))
+        self.pass_of = partial(
+            self._in_passes, self.compilation.core("tried", self._layer(model), rows=3)
+        )
         return model
 
     def _in_passes(self, core: Callable[..., Any], states: Any, noise: Any) -> Any:
@@ -408,7 +453,9 @@ class Candidates(Linear):
         return torch.cat([core(*each) for each in zip(*tried, strict=True)])[::5]
 
 
-def test_a_core_of_its_own_number_of_rows_has_one_program_for_all_batches(compiler: CountingCompiler) -> None:
+def test_a_core_of_its_own_number_of_rows_has_one_program_for_all_batches(
+    compiler: CountingCompiler,
+) -> None:
     policy = made(Candidates, compile="require", batch_sizes=[1, 2])
     assert compiler.rows == [3]
     for seeds in ([0], [0, 1], [0, 1, 2]):
@@ -417,7 +464,9 @@ def test_a_core_of_its_own_number_of_rows_has_one_program_for_all_batches(compil
     assert compiler.rows == [3]
 
 
-def test_a_program_of_its_own_number_of_rows_that_is_wrong_is_not_used(compiler: CountingCompiler) -> None:
+def test_a_program_of_its_own_number_of_rows_that_is_wrong_is_not_used(
+    compiler: CountingCompiler,
+) -> None:
     compiler.change[3] = lambda out: out + 0.01
     policy, report, _ = loaded(Candidates, compile=True, batch_sizes=[1, 2])
     assert (policy.compilation.sizes, len(report.uncompiled)) == ([], 2)
@@ -432,7 +481,9 @@ def test_what_leaves_the_graph_runs_without_compilation(compiler: CountingCompil
         made(Breaking, compile="require", batch_sizes=[1])
 
 
-def test_an_error_of_the_policy_itself_is_raised(compiler: CountingCompiler, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_error_of_the_policy_itself_is_raised(
+    compiler: CountingCompiler, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(Linear, "refused", True)
     with pytest.raises(InvalidObservation, match="joints: refused"):
         made(compile=True)
@@ -450,7 +501,8 @@ TORCH = "TORCHINDUCTOR_CACHE_DIR"
 @pytest.fixture
 def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """The user's cache, in which nothing is yet."""
-    monkeypatch.setenv(TORCH, "")  # so that its old value comes back: torch and the tested function set it
+    # So that its old value comes back: torch and the tested function set it.
+    monkeypatch.setenv(TORCH, "")
     monkeypatch.delenv(TORCH)
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     return tmp_path / "cache"
@@ -503,15 +555,22 @@ def test_a_cache_that_cannot_be_written_is_no_error(
 @pytest.mark.skipif(shutil.which("g++") is None, reason="no C++ compiler")
 def test_a_program_is_compiled_once_and_found_at_the_next_start(cache: Path) -> None:
     def start() -> tuple[int, int]:
-        """Compile, as a new process would; returns how many programs were found, and how many were not."""
+        """Compile, as a new process would; returns how many programs were found, and how many
+        were not.
+        """
         torch._dynamo.reset()
         torch._dynamo.utils.counters.clear()
         compilation = Compilation("require")
         core = compilation.core("core", lambda numbers: (numbers * 2).sin().sum(-1, keepdim=True))
         compilation.add_size(2, lambda: core(torch.ones(2, 3)))
-        torch.testing.assert_close(core(torch.ones(1, 3)), torch.full((1, 1), 3.0) * torch.tensor(2.0).sin())
+        torch.testing.assert_close(
+            core(torch.ones(1, 3)), torch.full((1, 1), 3.0) * torch.tensor(2.0).sin()
+        )
         counters = torch._dynamo.utils.counters
-        found = counters["aot_autograd"]["autograd_cache_hit"] + counters["inductor"]["fxgraph_cache_hit"]
+        found = (
+            counters["aot_autograd"]["autograd_cache_hit"]
+            + counters["inductor"]["fxgraph_cache_hit"]
+        )
         return min(found, 1), counters["inductor"]["fxgraph_cache_miss"]
 
     assert start() == (0, 1)

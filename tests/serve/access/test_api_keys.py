@@ -20,7 +20,13 @@ from eval_fakes import wait_for
 from in_flight import send
 
 from vlagents_ray import Obs
-from vlagents_ray.errors import ConfigError, Forbidden, PolicyUnavailable, TooManyRequests, Unauthorized
+from vlagents_ray.errors import (
+    ConfigError,
+    Forbidden,
+    PolicyUnavailable,
+    TooManyRequests,
+    Unauthorized,
+)
 from vlagents_ray.policies.noop import Noop
 from vlagents_ray.protocol.frames import Decoded, decode_requests, encode_requests
 from vlagents_ray.protocol.messages import DEFAULT_LIMITS, Reply, Request
@@ -119,7 +125,8 @@ NONSENSE = {
     "a number for a hash": b'{"keys": [{"name": "a", "sha256": 3}]}',
     "a list for a name": b'{"keys": [{"name": ["a"], "sha256": "00"}]}',
     "no number": b'{"keys": [{"name": "a", "sha256": "%s", "rate": NaN}]}' % (b"0" * 64),
-    "a huge number": b'{"keys": [{"name": "a", "sha256": "%s", "expires": 1%s}]}' % (b"0" * 64, b"0" * 400),
+    "a huge number": b'{"keys": [{"name": "a", "sha256": "%s", "expires": 1%s}]}'
+    % (b"0" * 64, b"0" * 400),
     "huge digits": b'{"keys": [%s]}' % (b"9" * 10_000),
     "zeros": bytes(1000),
 }
@@ -169,7 +176,10 @@ def test_a_network_drive_that_hangs_delays_one_request_and_closes_the_server_lat
         answers.wait()
         return asked
 
-    keys = Keys(lambda: json.dumps({"keys": [{"name": "arm", "sha256": hashlib.sha256(b"k").hexdigest()}]}), changed)
+    keys = Keys(
+        lambda: json.dumps({"keys": [{"name": "arm", "sha256": hashlib.sha256(b"k").hexdigest()}]}),
+        changed,
+    )
     caller = keys.check("k", "noop")
     answers.clear()
     monkeypatch.setattr(api_keys, "_WAIT_S", 0.01)
@@ -190,7 +200,9 @@ def test_a_network_drive_that_hangs_delays_one_request_and_closes_the_server_lat
     assert keys.unreadable_s == 0
 
 
-@pytest.mark.parametrize("error", [PermissionError("no"), OSError("stale file handle"), RuntimeError("whatever")])
+@pytest.mark.parametrize(
+    "error", [PermissionError("no"), OSError("stale file handle"), RuntimeError("whatever")]
+)
 @pytest.mark.parametrize("at", ["read", "changed"])
 def test_a_file_that_cannot_be_read_any_more_closes_the_server(
     error: Exception, at: str, monkeypatch: pytest.MonkeyPatch
@@ -244,15 +256,23 @@ def test_the_file_keeps_its_owner_and_its_mode(monkeypatch: pytest.MonkeyPatch) 
         before = file.stat()
         synced: list[int] = []
         sync = os.fsync
-        monkeypatch.setattr(key_store.os, "fsync", lambda descriptor: (synced.append(descriptor), sync(descriptor)))
+        monkeypatch.setattr(
+            key_store.os, "fsync", lambda descriptor: (synced.append(descriptor), sync(descriptor))
+        )
         revoke(file, "arm")
         after = file.stat()
-        assert (after.st_uid, after.st_gid, after.st_mode) == (before.st_uid, before.st_gid, before.st_mode)
+        assert (after.st_uid, after.st_gid, after.st_mode) == (
+            before.st_uid,
+            before.st_gid,
+            before.st_mode,
+        )
         assert read_keys(file)[0].revoked
         assert len(synced) == 2  # the file and its folder
 
 
-def test_a_file_that_cannot_be_given_to_its_owner_is_left_as_it_is(file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_file_that_cannot_be_given_to_its_owner_is_left_as_it_is(
+    file: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     new_key(file, "arm")
     before = file.read_text()
     asked: list[tuple[int, int]] = []
@@ -275,7 +295,9 @@ def test_a_file_that_cannot_be_given_to_its_owner_is_left_as_it_is(file: Path, m
     assert list(file.parent.iterdir()) == [file]
 
 
-def test_a_rate_is_kept_by_name_over_all_connections(file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_rate_is_kept_by_name_over_all_connections(
+    file: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     now = 1000.0
     monkeypatch.setattr(api_keys.time, "monotonic", lambda: now)
     token = new_key(file, "arm", rate=4)
@@ -310,7 +332,8 @@ def test_each_request_of_a_message_is_charged_to_the_key_once(
     message = sender.message()
     sender.send(message, decoded, lambda _: None, admission=admission)
     engine.close()
-    assert [type(reply.error) for reply in message.replies] == [PolicyUnavailable] * 3  # the engine is not started
+    # The engine is not started.
+    assert [type(reply.error) for reply in message.replies] == [PolicyUnavailable] * 3
     with pytest.raises(TooManyRequests):
         caller.admit()
 
@@ -427,7 +450,10 @@ def test_the_audit_log_says_which_key_did_what_and_not_each_time(
     ]
     now += audit._EVERY_S
     caller.note("reset session", repr("robot-2"))
-    assert caplog.records[-1].getMessage() == "key arm: reset session 'robot-2' (49 more like this since the last line)"
+    assert (
+        caplog.records[-1].getMessage()
+        == "key arm: reset session 'robot-2' (49 more like this since the last line)"
+    )
     assert token not in caplog.text
 
 
@@ -440,7 +466,11 @@ def test_a_reset_stands_in_the_audit_log_with_its_key_and_its_session(
     engine = Engine(Noop.from_config({}))
     engine.start()
     answered: queue.SimpleQueue[list[Reply]] = queue.SimpleQueue()
-    send(Sender(engine, "http", "robot-1", connected=False, caller=caller), [Request("reset", Obs())], answered.put)
+    send(
+        Sender(engine, "http", "robot-1", connected=False, caller=caller),
+        [Request("reset", Obs())],
+        answered.put,
+    )
     [reply] = answered.get(timeout=30)
     engine.close()
     assert reply.error is None

@@ -47,7 +47,9 @@ def test_a_name_in_the_public_dns_may_be_another_sites(host: str) -> None:
         require_own_page({"host": host})
 
 
-def test_whoever_runs_the_server_says_which_of_them_are_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_whoever_runs_the_server_says_which_of_them_are_its_own(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     require_own_page({"host": "policy.example.org:8000"}, ["policy.example.org"])
     with pytest.raises(Forbidden):
         require_own_page({"host": "policy.example.org"}, ["example.org"])

@@ -1,4 +1,6 @@
-"""The gateway as Ray Serve uses it, the sessions of its clients, and the policy `upstream` in front of it."""
+"""The gateway as Ray Serve uses it, the sessions of its clients, and the policy `upstream` in
+front of it.
+"""
 
 from __future__ import annotations
 
@@ -28,7 +30,9 @@ from vlagents_ray_dialects.upstream import Upstream
 
 
 @pytest.mark.parametrize("dialect", ["vlagents", "lerobot"])
-def test_with_keys_on_a_protocol_without_them_must_accept_whoever_reaches_it(open_dialect: Any, dialect: str) -> None:
+def test_with_keys_on_a_protocol_without_them_must_accept_whoever_reaches_it(
+    open_dialect: Any, dialect: str
+) -> None:
     """That clients are served then is in tests/serve/test_access_matrix.py."""
     with pytest.raises(ConfigError, match="without_key: true"):
         open_dialect(dialect, check=lambda _: NoKey.OPEN)
@@ -38,7 +42,9 @@ def test_with_keys_on_a_protocol_without_them_must_accept_whoever_reaches_it(ope
 def test_a_gateway_serves_each_dialect_on_its_port_and_is_healthy_while_all_are(
     replicas: Replicas, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(module.serve, "get_replica_context", lambda: SimpleNamespace(app_name="noop"))
+    monkeypatch.setattr(
+        module.serve, "get_replica_context", lambda: SimpleNamespace(app_name="noop")
+    )
     monkeypatch.setattr(module, "wait_for_policy", lambda _app: None)
     monkeypatch.setattr(module, "_connect", lambda *_: replicas.agent())
     ports = {"vlagents": free_port(), "gr00t": free_port()}
@@ -52,7 +58,9 @@ def test_a_gateway_serves_each_dialect_on_its_port_and_is_healthy_while_all_are(
             assert client.act(document(7))[0] == 7
         video, state = np.full((1, 1, 8, 8, 3), 9, np.uint8), np.full((1, 1, 2), 0.5, np.float32)
         with PolicyClient(ports["gr00t"]) as robot:
-            actions, _ = robot.get_action({"video": {"front": video}, "state": {"arm": state}, "language": {}})
+            actions, _ = robot.get_action(
+                {"video": {"front": video}, "state": {"arm": state}, "language": {}}
+            )
         assert actions["action"][0, 0, :2].tolist() == [9, 0.5]
         made._dialects[-1].close()
         with pytest.raises(PolicyUnavailable, match=rf"\['{made._dialects[-1].name}'\]"):

@@ -1,4 +1,6 @@
-"""A dialect of somebody else's: the example in `vlagents_ray/serve/dialects/base.py`, from outside of this package."""
+"""A dialect of somebody else's: the example in `vlagents_ray/serve/dialects/base.py`, from
+outside of this package.
+"""
 
 from __future__ import annotations
 
@@ -40,7 +42,9 @@ def entry_point(package: Path) -> str:
     (package / f"{PACKAGE}_registry.py").write_text(
         f"from vlagents_ray.registry import RegistryEntry\nPLAIN = RegistryEntry({CLASS!r})\n"
     )
-    (info / "entry_points.txt").write_text(f"[vlagents_ray.dialects]\nplain = {PACKAGE}_registry:PLAIN\n")
+    (info / "entry_points.txt").write_text(
+        f"[vlagents_ray.dialects]\nplain = {PACKAGE}_registry:PLAIN\n"
+    )
     return "plain"
 
 
@@ -71,7 +75,10 @@ def test_a_deployment_file_may_name_the_class_of_a_dialect(package: Path) -> Non
 def test_its_settings_are_checked_like_those_of_ours(plain: str) -> None:
     for settings, said in (
         ({plain: {"mappin": {}}}, r"dialects.plain.mappin: .*did you mean 'mapping'"),
-        ({plain: {"mapping": {"preset": "gr01t"}}}, r"dialects.plain.mapping: .*did you mean 'gr00t'"),
+        (
+            {plain: {"mapping": {"preset": "gr01t"}}},
+            r"dialects.plain.mapping: .*did you mean 'gr00t'",
+        ),
         ({"plane": {}}, "'plane' is not registered: want one of .*'plain'"),
         ({"served_agents:Mirror": {}}, "served_agents.Mirror has no Config; want a subclass"),
     ):

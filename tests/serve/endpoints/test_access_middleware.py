@@ -1,4 +1,6 @@
-"""The guard before the robots' endpoint: keys and slow clients, on a real HTTP server without Ray."""
+"""The guard before the robots' endpoint: keys and slow clients, on a real HTTP server without
+Ray.
+"""
 
 from __future__ import annotations
 
@@ -49,7 +51,10 @@ class Big(Agent):
     """Tells more than any socket takes without being read."""
 
     def act(self, obs: Obs) -> Act:
-        return Act(np.zeros(2, np.float32), info={"much": np.zeros(int(obs.info.get("bytes", 1)), np.uint8)})
+        return Act(
+            np.zeros(2, np.float32),
+            info={"much": np.zeros(int(obs.info.get("bytes", 1)), np.uint8)},
+        )
 
 
 @dataclass
@@ -63,7 +68,9 @@ class Endpoint:
     def agent(self, name: str, transport: str = "http", **options: object) -> RemoteAgent:
         return RemoteAgent(self.url, transport=transport, api_key=self.tokens[name], **options)  # type: ignore[arg-type]
 
-    def get(self, path: str, headers: dict[str, str] | None = None) -> tuple[int, dict[str, str], bytes]:
+    def get(
+        self, path: str, headers: dict[str, str] | None = None
+    ) -> tuple[int, dict[str, str], bytes]:
         connection = http.client.HTTPConnection("127.0.0.1", self.port, timeout=10)
         with contextlib.closing(connection):
             connection.request("GET", path, headers=headers or {})
@@ -83,7 +90,9 @@ def endpoint(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Endpoint]:
     engine = Engine(Big())
     engine.start()
     inside = build_http_app(
-        engine, lambda: {"policy": "p", "version": "0", "protocol": PROTOCOL_VERSION}, Limits(body_bytes=2**24)
+        engine,
+        lambda: {"policy": "p", "version": "0", "protocol": PROTOCOL_VERSION},
+        Limits(body_bytes=2**24),
     )
     guard = AccessMiddleware(inside, Keys.from_file(file), "noop", slow_s=SLOW_S, idle_s=3600)
     with served(guard) as port:
@@ -98,7 +107,17 @@ def bearer(token: str) -> dict[str, str]:
 
 @pytest.mark.parametrize(
     "path",
-    ["/docs", "/v1/metadata", "/v1/act", "/", "/nope", "/healthz/", "//healthz", "/live/", "/v1/live"],
+    [
+        "/docs",
+        "/v1/metadata",
+        "/v1/act",
+        "/",
+        "/nope",
+        "/healthz/",
+        "//healthz",
+        "/live/",
+        "/v1/live",
+    ],
 )
 def test_no_path_answers_without_a_key(endpoint: Endpoint, path: str) -> None:
     for headers in ({}, bearer("wrong"), {"x-api-key": "wrong"}):
@@ -143,7 +162,9 @@ def test_without_keys_pages_of_other_sites_are_refused(endpoint: Endpoint) -> No
     """A browser on the robot's machine says whose page asks, and reaches loopback."""
     unkeyed = AccessMiddleware(
         build_http_app(
-            endpoint.engine, lambda: {"policy": "p", "version": "0", "protocol": PROTOCOL_VERSION}, Limits()
+            endpoint.engine,
+            lambda: {"policy": "p", "version": "0", "protocol": PROTOCOL_VERSION},
+            Limits(),
         ),
         None,
         "noop",
@@ -154,7 +175,10 @@ def test_without_keys_pages_of_other_sites_are_refused(endpoint: Endpoint) -> No
         assert own.get("/v1/metadata", {"origin": own.url})[0] == 200
         rebound = {"origin": "http://evil.example:8000", "host": "evil.example:8000"}
         assert own.get("/v1/metadata", rebound)[0] == 403  # a name that its site has lead here
-        with pytest.raises(InvalidStatus) as refused, own.stream({"origin": "https://evil.example"}):
+        with (
+            pytest.raises(InvalidStatus) as refused,
+            own.stream({"origin": "https://evil.example"}),
+        ):
             pass
         assert refused.value.response.status_code == 403
 
@@ -165,7 +189,11 @@ def test_a_request_id_of_the_callers_own_comes_back_with_the_refusal(endpoint: E
 
 
 def test_a_websocket_is_refused_before_it_is_accepted(endpoint: Endpoint) -> None:
-    for headers, status in (({}, 401), (bearer("wrong"), 401), (bearer(endpoint.tokens["other"]), 403)):
+    for headers, status in (
+        ({}, 401),
+        (bearer("wrong"), 401),
+        (bearer(endpoint.tokens["other"]), 403),
+    ):
         with pytest.raises(InvalidStatus) as refused, endpoint.stream(headers):
             pytest.fail("was let in")
         assert refused.value.response.status_code == status
@@ -175,13 +203,23 @@ def test_a_websocket_is_refused_before_it_is_accepted(endpoint: Endpoint) -> Non
 @pytest.mark.parametrize("transport", ["http", "websocket", "auto"])
 def test_a_client_without_a_right_key_hears_so_at_once(endpoint: Endpoint, transport: str) -> None:
     begun = time.monotonic()
-    for token, error in ((None, Unauthorized), ("wrong", Unauthorized), (endpoint.tokens["other"], Forbidden)):
-        with pytest.raises(error), RemoteAgent(endpoint.url, transport=transport, api_key=token) as agent:  # type: ignore[arg-type]
+    for token, error in (
+        (None, Unauthorized),
+        ("wrong", Unauthorized),
+        (endpoint.tokens["other"], Forbidden),
+    ):
+        with (
+            pytest.raises(error),
+            RemoteAgent(endpoint.url, transport=transport, api_key=token) as agent,
+        ):  # type: ignore[arg-type]
             agent.reset(Obs(), "x")
-    assert time.monotonic() - begun < 20  # it tries no further for the 60 s that a server may take to start
+    # It tries no further for the 60 s that a server may take to start.
+    assert time.monotonic() - begun < 20
 
 
-def test_the_key_may_come_from_the_environment(endpoint: Endpoint, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_key_may_come_from_the_environment(
+    endpoint: Endpoint, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setenv("VLAGENTS_RAY_API_KEY", endpoint.tokens["lab"])
     with RemoteAgent(endpoint.url, transport="websocket") as agent:
         agent.reset(Obs(), "x")
@@ -192,8 +230,14 @@ def test_one_keys_session_is_out_of_reach_for_another(endpoint: Endpoint) -> Non
     def post(token: str, op: str) -> tuple[int, bytes]:
         connection = http.client.HTTPConnection("127.0.0.1", endpoint.port, timeout=10)
         with contextlib.closing(connection):
-            headers = {"x-session-id": "shared", "content-type": "application/json", **bearer(token)}
-            connection.request("POST", f"/v1/{op}", b'{"obs": {}}' if op == "close" else b"{}", headers)
+            headers = {
+                "x-session-id": "shared",
+                "content-type": "application/json",
+                **bearer(token),
+            }
+            connection.request(
+                "POST", f"/v1/{op}", b'{"obs": {}}' if op == "close" else b"{}", headers
+            )
             answer = connection.getresponse()
             return answer.status, answer.read()
 
@@ -210,13 +254,18 @@ def test_a_key_holds_no_more_sessions_than_it_may(endpoint: Endpoint, transport:
     with endpoint.agent("arm", transport) as first, endpoint.agent("arm", transport) as second:
         first.reset(Obs(), "x")
         second.reset(Obs(), "x")
-        with endpoint.agent("arm", transport) as third, pytest.raises(TooManyRequests, match="2 sessions"):
+        with (
+            endpoint.agent("arm", transport) as third,
+            pytest.raises(TooManyRequests, match="2 sessions"),
+        ):
             third.reset(Obs(), "x")
         with endpoint.agent("lab", transport) as other:
             other.reset(Obs(), "x")
         first.reset(Obs(), "again")
         second.close()
-        wait_for(lambda: sum(name.startswith("arm/") for name in endpoint.engine.sessions.ids()) < 2)
+        wait_for(
+            lambda: sum(name.startswith("arm/") for name in endpoint.engine.sessions.ids()) < 2
+        )
         with endpoint.agent("arm", transport) as third:
             third.reset(Obs(), "x")
     wait_for(lambda: not any(name.startswith("arm/") for name in endpoint.engine.sessions.ids()))
@@ -239,7 +288,10 @@ def test_too_many_requests_are_told_when_to_come_again(endpoint: Endpoint) -> No
 
 
 def test_a_revoked_key_hangs_up_its_websockets_and_no_others(endpoint: Endpoint) -> None:
-    with endpoint.stream(bearer(endpoint.tokens["leaver"])) as idle, endpoint.agent("lab", "websocket") as other:
+    with (
+        endpoint.stream(bearer(endpoint.tokens["leaver"])) as idle,
+        endpoint.agent("lab", "websocket") as other,
+    ):
         other.reset(Obs(), "x")
         revoke(endpoint.file, "leaver")
         with pytest.raises(ConnectionClosed) as closed:
@@ -250,7 +302,9 @@ def test_a_revoked_key_hangs_up_its_websockets_and_no_others(endpoint: Endpoint)
 
 
 def test_a_key_that_is_revoked_at_the_moment_of_a_message_hangs_up_too(tmp_path: Path) -> None:
-    """`asyncio.wait_for` of Python 3.11 drops a cancellation that comes with the message that it waits for."""
+    """`asyncio.wait_for` of Python 3.11 drops a cancellation that comes with the message that it
+    waits for.
+    """
     file = tmp_path / "keys.json"
     token = new_key(file, "leaver")
     sent: list[Message] = []
@@ -289,7 +343,9 @@ def test_a_key_that_is_revoked_at_the_moment_of_a_message_hangs_up_too(tmp_path:
     assert "revoked" in sent[1]["reason"]
 
 
-def test_a_look_at_a_websocket_that_fails_is_not_the_last(endpoint: Endpoint, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_look_at_a_websocket_that_fails_is_not_the_last(
+    endpoint: Endpoint, monkeypatch: pytest.MonkeyPatch
+) -> None:
     refusal, failed = api_keys.Caller.refusal, threading.Event()
 
     def fail_once(caller: api_keys.Caller) -> str | None:
@@ -307,10 +363,18 @@ def test_a_look_at_a_websocket_that_fails_is_not_the_last(endpoint: Endpoint, mo
 
 
 def test_a_body_that_does_not_come_is_cut_off(endpoint: Endpoint) -> None:
-    with endpoint.agent("lab") as bystander, socket.create_connection(("127.0.0.1", endpoint.port), timeout=30) as slow:
+    with (
+        endpoint.agent("lab") as bystander,
+        socket.create_connection(("127.0.0.1", endpoint.port), timeout=30) as slow,
+    ):
         bystander.reset(Obs(), "x")
-        head = f"POST /v1/reset HTTP/1.1\r\nhost: x\r\nauthorization: Bearer {endpoint.tokens['lab']}\r\n"
-        head += "x-session-id: slow\r\ncontent-type: application/json\r\ncontent-length: 100\r\n\r\n{"
+        head = (
+            "POST /v1/reset HTTP/1.1\r\nhost: x\r\nauthorization: Bearer "
+            f"{endpoint.tokens['lab']}\r\n"
+        )
+        head += (
+            "x-session-id: slow\r\ncontent-type: application/json\r\ncontent-length: 100\r\n\r\n{"
+        )
         slow.sendall(head.encode())
         answer = slow.recv(65536)
         assert answer.startswith(b"HTTP/1.1 408")
@@ -319,7 +383,9 @@ def test_a_body_that_does_not_come_is_cut_off(endpoint: Endpoint) -> None:
     assert "lab/slow" not in endpoint.engine.sessions.ids()
 
 
-def test_a_websocket_that_never_reads_its_replies_ends_with_its_sessions_alone(endpoint: Endpoint) -> None:
+def test_a_websocket_that_never_reads_its_replies_ends_with_its_sessions_alone(
+    endpoint: Endpoint,
+) -> None:
     from vlagents_ray.protocol.frames import encode_requests
     from vlagents_ray.protocol.messages import Request
 
@@ -340,7 +406,8 @@ def test_a_websocket_that_never_reads_its_replies_ends_with_its_sessions_alone(e
         ) as stream:
             stream.send(encode_requests([Request("reset", Obs())]))
             wait_for(deaf_ones)
-            with contextlib.suppress(ConnectionClosed):  # before the last is sent, on a busy machine
+            # Before the last is sent, on a busy machine.
+            with contextlib.suppress(ConnectionClosed):
                 for _ in range(30):
                     stream.send(encode_requests([Request("act", Obs(info={"bytes": 2**20}))]))
             wait_for(lambda: not deaf_ones())
@@ -352,18 +419,24 @@ def test_a_websocket_that_never_reads_its_replies_ends_with_its_sessions_alone(e
 def test_a_websocket_that_stays_silent_or_sends_half_a_message_is_cut_off() -> None:
     engine = Engine(Big())
     engine.start()
-    with served(AccessMiddleware(build_http_app(engine, dict, Limits()), None, "noop", idle_s=SLOW_S)) as port:
+    with served(
+        AccessMiddleware(build_http_app(engine, dict, Limits()), None, "noop", idle_s=SLOW_S)
+    ) as port:
         with socket.create_connection(("127.0.0.1", port), timeout=30) as half:
             half.sendall(
-                b"GET /v1/stream HTTP/1.1\r\nhost: x\r\nconnection: upgrade\r\nupgrade: websocket\r\n"
+                b"GET /v1/stream HTTP/1.1\r\nhost: x\r\nconnection: upgrade\r\nupgrade: "
+                b"websocket\r\n"
                 b"sec-websocket-version: 13\r\nsec-websocket-key: dGhlIHNhbXBsZSBub25jZQ==\r\n\r\n"
             )
             accepted, _, early = half.recv(4096).partition(b"\r\n\r\n")
             assert accepted.startswith(b"HTTP/1.1 101")
-            half.sendall(b"\x82\xfe\x00\x7e" + bytes(8))  # of a masked frame of 126 bytes, the first 4
+            # Of a masked frame of 126 bytes, the first 4.
+            half.sendall(b"\x82\xfe\x00\x7e" + bytes(8))
             assert (early or half.recv(4096))[0] == 0x88  # the server closes
         with (
-            connect(f"ws://127.0.0.1:{port}/v1/stream", ping_interval=None, close_timeout=1) as silent,
+            connect(
+                f"ws://127.0.0.1:{port}/v1/stream", ping_interval=None, close_timeout=1
+            ) as silent,
             pytest.raises(ConnectionClosed, match="silent"),
         ):
             silent.recv(timeout=30)

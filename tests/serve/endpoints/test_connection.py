@@ -62,7 +62,9 @@ def no_descriptors_left() -> Iterator[None]:
 
 
 @pytest.mark.own_process
-def test_who_comes_when_no_descriptor_is_left_is_turned_away_and_the_next_let_in(endpoint: Endpoint) -> None:
+def test_who_comes_when_no_descriptor_is_left_is_turned_away_and_the_next_let_in(
+    endpoint: Endpoint,
+) -> None:
     for _ in range(2):
         with endpoint.connect() as refused:
             with no_descriptors_left():
@@ -73,7 +75,9 @@ def test_who_comes_when_no_descriptor_is_left_is_turned_away_and_the_next_let_in
     assert len(endpoint.clients) == 1
 
 
-def test_whom_the_endpoint_cannot_take_is_turned_away_and_the_next_let_in(endpoint: Endpoint) -> None:
+def test_whom_the_endpoint_cannot_take_is_turned_away_and_the_next_let_in(
+    endpoint: Endpoint,
+) -> None:
     endpoint.broken = True
     with endpoint.connect() as refused:
         endpoint.accept()

@@ -1,4 +1,6 @@
-"""What happens before Serve's own code: headers that are not UTF-8, and messages over the limit of the server."""
+"""What happens before Serve's own code: headers that are not UTF-8, and messages over the limit
+of the server.
+"""
 
 from __future__ import annotations
 
@@ -33,7 +35,11 @@ def _close_of(url: str, size: int) -> tuple[int, str]:
             client.send(bytes(size))
             client.recv(timeout=10)
         except ConnectionClosed as closed:
-            return (0, "no close frame") if closed.rcvd is None else (closed.rcvd.code, closed.rcvd.reason)
+            return (
+                (0, "no close frame")
+                if closed.rcvd is None
+                else (closed.rcvd.code, closed.rcvd.reason)
+            )
     raise AssertionError("the server has answered")
 
 
@@ -51,12 +57,17 @@ def test_a_message_over_the_limit_gets_1009_with_a_reason_each_time() -> None:
 
 @pytest.mark.parametrize("header", [b"x-request-id: \xff", b"x-session-id: a\xc3", b"x-\xe9: a"])
 def test_headers_that_are_not_utf_8_are_malformed(header: bytes) -> None:
-    upgrade = b"connection: upgrade\r\nupgrade: websocket\r\nsec-websocket-version: 13\r\nsec-websocket-key: "
+    upgrade = (
+        b"connection: upgrade\r\nupgrade: websocket\r\nsec-websocket-version: "
+        b"13\r\nsec-websocket-key: "
+    )
     upgrade += b"dGhlIHNhbXBsZSBub25jZQ==\r\n"
     with served(APP) as port:
         for more in (b"", upgrade):
             with socket.create_connection(("127.0.0.1", port), timeout=10) as client:
-                client.sendall(b"GET / HTTP/1.1\r\nhost: localhost\r\n" + more + header + b"\r\n\r\n")
+                client.sendall(
+                    b"GET / HTTP/1.1\r\nhost: localhost\r\n" + more + header + b"\r\n\r\n"
+                )
                 head, _, body = client.recv(65536).partition(b"\r\n\r\n")
                 assert head.split(b" ")[1] == b"400"
                 if b"x-\xe9" in header:  # the server itself refuses a name with such bytes

@@ -60,11 +60,18 @@ def client() -> Iterator[TestClient]:
 
 
 def post(
-    client: TestClient, op: str, obs: Any = GOOD, files: Any = None, session: str | None = "robot-1", **kwargs: Any
+    client: TestClient,
+    op: str,
+    obs: Any = GOOD,
+    files: Any = None,
+    session: str | None = "robot-1",
+    **kwargs: Any,
 ):
     headers = {**({"x-session-id": session} if session else {}), **kwargs.pop("headers", {})}
     text = obs if isinstance(obs, (str, bytes)) else json.dumps(obs)
-    parts = {"obs": (None, text, "application/json")} | ({"cameras.front": JPEG} if files is None else files)
+    parts = {"obs": (None, text, "application/json")} | (
+        {"cameras.front": JPEG} if files is None else files
+    )
     return client.post(f"/v1/{op}", headers=headers, files=parts, **kwargs)
 
 
@@ -77,7 +84,13 @@ def good_act(client: TestClient) -> None:
     np.testing.assert_allclose(document["action"][3:], [0.1, 0.2], atol=1e-6)
     assert document["info"].pop("policy") == {"version": 0, "fingerprint": ""}
     assert document["info"] == {"instruction": "push", "array": [0, 1]}
-    assert document["timing"].keys() >= {"queue_ms", "inference_ms", "decode_ms", "encode_ms", "total_ms"}
+    assert document["timing"].keys() >= {
+        "queue_ms",
+        "inference_ms",
+        "decode_ms",
+        "encode_ms",
+        "total_ms",
+    }
 
 
 def test_a_form_that_does_not_say_how_long_it_is_has_the_limit_of_all(client: TestClient) -> None:
@@ -115,16 +128,32 @@ def form(*parts: tuple[str, str | None, bytes]) -> bytes:
 
 OBS = ("obs", None, json.dumps(GOOD).encode())
 HINTS = [  # what is sent, and what the answer says of it
-    (form(OBS, ("cameras.front", "f", JPEG), ("cameras.front", "f", JPEG)), "'cameras.front' twice, want it once"),
+    (
+        form(OBS, ("cameras.front", "f", JPEG), ("cameras.front", "f", JPEG)),
+        "'cameras.front' twice, want it once",
+    ),
     (form(OBS, OBS, ("cameras.front", "f", JPEG)), "'obs' twice, want it once"),
     (form(OBS, ("cameras.", "f", JPEG)), "names no camera, want 'cameras.<name>'"),
     (form(OBS, ("cameras.front", None, b"text")), "is text, want a file: send it with a filename"),
-    (form(OBS, ("front", "f", JPEG)), "unknown part 'front', want 'obs' and files 'cameras.<name>'"),
-    (form(OBS, ("cameras.front", "f", JPEG), ("cameras.left", "f", JPEG[:-20])), "camera 'left': broken JPEG"),
-    (form(OBS, ("cameras.left", "f", b"GIF89a"), ("cameras.front", "f", JPEG)), "camera 'left': got 6 bytes starting"),
+    (
+        form(OBS, ("front", "f", JPEG)),
+        "unknown part 'front', want 'obs' and files 'cameras.<name>'",
+    ),
+    (
+        form(OBS, ("cameras.front", "f", JPEG), ("cameras.left", "f", JPEG[:-20])),
+        "camera 'left': broken JPEG",
+    ),
+    (
+        form(OBS, ("cameras.left", "f", b"GIF89a"), ("cameras.front", "f", JPEG)),
+        "camera 'left': got 6 bytes starting",
+    ),
 ]
 DOCUMENTS = [
-    (b'{"cameras": {"front": "..."}}', {}, "send multipart/form-data, in it the document as part 'obs' and each image"),
+    (
+        b'{"cameras": {"front": "..."}}',
+        {},
+        "send multipart/form-data, in it the document as part 'obs' and each image",
+    ),
     (b'{"state": {"joints": [1, 2], "joints": [3, 4]}}', {}, "the key 'joints' stands twice"),
     (gzip.compress(b"{}"), {"content-encoding": "gzip"}, "content-encoding: got 'gzip', want none"),
     (gzip.compress(b"{}"), {}, "body: got gzip, want it uncompressed"),
@@ -133,11 +162,21 @@ DOCUMENTS = [
 
 
 def test_what_is_misplaced_is_refused_with_the_cure(client: TestClient) -> None:
-    answers = [(client.post("/v1/act", content=body, headers=MULTIPART), said) for body, said in HINTS]
+    answers = [
+        (client.post("/v1/act", content=body, headers=MULTIPART), said) for body, said in HINTS
+    ]
     plain = {"x-session-id": "robot-1", "content-type": "application/json"}
-    answers += [(client.post("/v1/act", content=body, headers=plain | more), said) for body, more, said in DOCUMENTS]
+    answers += [
+        (client.post("/v1/act", content=body, headers=plain | more), said)
+        for body, more, said in DOCUMENTS
+    ]
     body, more = gzip.compress(HINTS[0][0]), {"content-encoding": "gzip"}
-    answers.append((client.post("/v1/act", content=body, headers=MULTIPART | more), "content-encoding: got 'gzip'"))
+    answers.append(
+        (
+            client.post("/v1/act", content=body, headers=MULTIPART | more),
+            "content-encoding: got 'gzip'",
+        )
+    )
     for answer, said in answers:
         assert (answer.status_code, answer.json()["code"]) == (400, "malformed"), said
         assert said in answer.json()["detail"]
@@ -148,10 +187,16 @@ def test_a_camera_or_state_whose_name_is_none_is_refused(client: TestClient, nam
     good_act(client)
     for obs in (
         Obs({"front": IMAGE, name: IMAGE}, None, {"joints": np.zeros(2, np.float32)}),
-        Obs({"front": IMAGE}, None, {"joints": np.zeros(2, np.float32), name: np.zeros(2, np.float32)}),
+        Obs(
+            {"front": IMAGE},
+            None,
+            {"joints": np.zeros(2, np.float32), name: np.zeros(2, np.float32)},
+        ),
     ):
         headers = {"x-session-id": "robot-1", "content-type": CONTENT_TYPE}
-        answer = client.post("/v1/act", content=encode_requests([Request("act", obs)]), headers=headers)
+        answer = client.post(
+            "/v1/act", content=encode_requests([Request("act", obs)]), headers=headers
+        )
         assert (answer.status_code, answer.json()["code"]) == (422, "invalid_observation")
         assert "want 1 to 128 printable characters" in answer.json()["detail"]
 
@@ -192,7 +237,11 @@ def test_health_and_refusals_name_the_step_of_a_long_start() -> None:
         starting.start()
         try:
             assert policy.compiling.wait(60)
-            for answer in (client.get("/healthz"), client.get("/v1/metadata"), post(client, "reset")):
+            for answer in (
+                client.get("/healthz"),
+                client.get("/v1/metadata"),
+                post(client, "reset"),
+            ):
                 assert answer.status_code == 503
                 assert "the policy is loading (compiling 2 rows (2 of 2))" in answer.text
         finally:
@@ -206,19 +255,47 @@ def test_health_and_refusals_name_the_step_of_a_long_start() -> None:
 NAN, HUGE = float("nan"), 10**400
 
 
-FRAME = encode_requests([Request("act", Obs({"front": IMAGE}, 1.0, {"joints": np.zeros(2, np.float32)}))])
+FRAME = encode_requests(
+    [Request("act", Obs({"front": IMAGE}, 1.0, {"joints": np.zeros(2, np.float32)}))]
+)
 FRAMED = {"content-type": CONTENT_TYPE}
 
-# (request, status, code): each kind of fault that a robot's software can commit; tests/protocol has more of frames.
+# (request, status, code): each kind of fault that a robot's software can commit; tests/protocol has
+# more of frames.
 FAULTS: list[tuple[dict[str, Any], int, str]] = [
     *[({"files": {"cameras.front": JPEG[:-cut]}}, 400, "malformed") for cut in (20, 700)],
     *[({"content": FRAME[:-cut], "headers": FRAMED}, 400, "malformed") for cut in (1, 900)],
-    *[({"obs": text}, 400, "malformed") for text in ("", "{", "null", "[1]", "nan", "[" * 9999, '{"a": 1}', "\xff")],
-    *[({"obs": json.dumps({**GOOD, "info": {text: text}})}, 400, "malformed") for text in ("\ud800", "a\udfff")],
-    *[({"obs": {**GOOD, key: 1}}, 400, "malformed") for key in ("camera", "images", "prompt", "session", "x" * 999)],
-    *[({"obs": {**GOOD, "state": {"joints": x}}}, 422, "invalid_observation")
-      for x in ([NAN, 0], [float("inf"), 0], [1], [1, 2, 3], [[1, 2]], ["1", "2"], [None, 1], [True, 1], [HUGE, 1], 1)],
-    *[({"obs": {**GOOD, "gripper": x}}, 422, "invalid_observation") for x in (-0.1, 1.1, "open", [1], NAN, True, HUGE)],
+    *[
+        ({"obs": text}, 400, "malformed")
+        for text in ("", "{", "null", "[1]", "nan", "[" * 9999, '{"a": 1}', "\xff")
+    ],
+    *[
+        ({"obs": json.dumps({**GOOD, "info": {text: text}})}, 400, "malformed")
+        for text in ("\ud800", "a\udfff")
+    ],
+    *[
+        ({"obs": {**GOOD, key: 1}}, 400, "malformed")
+        for key in ("camera", "images", "prompt", "session", "x" * 999)
+    ],
+    *[
+        ({"obs": {**GOOD, "state": {"joints": x}}}, 422, "invalid_observation")
+        for x in (
+            [NAN, 0],
+            [float("inf"), 0],
+            [1],
+            [1, 2, 3],
+            [[1, 2]],
+            ["1", "2"],
+            [None, 1],
+            [True, 1],
+            [HUGE, 1],
+            1,
+        )
+    ],
+    *[
+        ({"obs": {**GOOD, "gripper": x}}, 422, "invalid_observation")
+        for x in (-0.1, 1.1, "open", [1], NAN, True, HUGE)
+    ],
     *[({"obs": {**GOOD, "state": x}}, 400, "malformed") for x in ([1], "joints", 3)],
     ({"obs": {**GOOD, "state": {}}}, 422, "missing_state"),
     ({"obs": {**GOOD, "state": {"joint": [1, 2]}}}, 422, "missing_state"),
@@ -248,11 +325,15 @@ FAULTS: list[tuple[dict[str, Any], int, str]] = [
     ({"content": FRAME, "headers": {"content-type": "text/plain"}}, 400, "malformed"),
     ({"content": FRAME}, 400, "malformed"),
     ({"content": b"{}", "headers": {"content-type": "multipart/form-data"}}, 400, "malformed"),
-    ({"content": b"--x", "headers": {"content-type": "multipart/form-data; boundary=x"}}, 400, "malformed"),
+    (
+        {"content": b"--x", "headers": {"content-type": "multipart/form-data; boundary=x"}},
+        400,
+        "malformed",
+    ),
     ({"content": bytes(400_000), "headers": FRAMED}, 413, "too_large"),
     ({"content": encode_requests([Request("close")]), "headers": FRAMED}, 400, "malformed"),
     ({"content": FRAME.replace(b'"<f4"', b'"|O8"'), "headers": FRAMED}, 400, "malformed"),
-]  # fmt: skip
+]
 
 
 def send(client: TestClient, fault: dict[str, Any]):
@@ -267,7 +348,10 @@ def test_each_fault_gets_its_code_and_harms_nobody(client: TestClient) -> None:
     for fault, status, code in FAULTS:
         answer = send(client, fault)
         summary = {key: str(value)[:80] for key, value in fault.items()}
-        assert (answer.status_code, answer.json().get("code")) == (status, code), (summary, answer.text[:300])
+        assert (answer.status_code, answer.json().get("code")) == (status, code), (
+            summary,
+            answer.text[:300],
+        )
         assert answer.headers["content-type"] == "application/problem+json"
         assert answer.json()["request_id"]
         assert "Traceback" not in answer.text
@@ -289,7 +373,8 @@ def test_a_deadline_that_passed_is_504(client: TestClient) -> None:
     engine.start()
     with TestClient(AccessMiddleware(build_http_app(engine, dict, LIMITS), None, "app")) as slow:
         post(slow, "reset")
-        while not acts:  # the policy is at work on it; on a busy machine the first may be over before
+        # The policy is at work on it; on a busy machine the first may be over before.
+        while not acts:
             answer = post(slow, "act", headers={"x-deadline-ms": "30"})
         assert (answer.status_code, answer.json()["code"]) == (504, "outcome_unknown")
         answer = post(slow, "act", headers={"x-deadline-ms": "30"})  # it waits behind that
@@ -301,7 +386,10 @@ def test_a_deadline_that_passed_is_504(client: TestClient) -> None:
 
 
 def test_unknown_paths_and_methods_are_problems(client: TestClient) -> None:
-    assert (client.get("/nope").status_code, client.get("/nope").json()["code"]) == (404, "unknown_app")
+    assert (client.get("/nope").status_code, client.get("/nope").json()["code"]) == (
+        404,
+        "unknown_app",
+    )
     assert client.get("/v1/metadata/", follow_redirects=False).status_code == 404
     for path in ("/nope", "/v1/act"):  # 403 would read as a problem of keys
         with pytest.raises(WebSocketDenialResponse) as refused, client.websocket_connect(path):
@@ -312,7 +400,9 @@ def test_unknown_paths_and_methods_are_problems(client: TestClient) -> None:
 
 
 @pytest.mark.parametrize("name", ["a b", "\xe9", "x" * 129])
-def test_a_request_id_that_could_forge_a_line_in_the_log_is_replaced(client: TestClient, name: str) -> None:
+def test_a_request_id_that_could_forge_a_line_in_the_log_is_replaced(
+    client: TestClient, name: str
+) -> None:
     answer = client.get("/nope", headers=[(b"x-request-id", name.encode("latin-1"))])
     assert answer.json()["request_id"].isalnum()
     assert client.get("/nope", headers={"x-request-id": "mine-1"}).json()["request_id"] == "mine-1"

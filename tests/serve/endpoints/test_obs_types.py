@@ -1,4 +1,6 @@
-"""A policy gets observations of exactly the declared types, and no malformed request is the server's failure."""
+"""A policy gets observations of exactly the declared types, and no malformed request is the
+server's failure.
+"""
 
 from __future__ import annotations
 
@@ -63,7 +65,9 @@ class Strict(Agent):
 
     def act(self, obs: Obs) -> Act:
         self._check(obs)
-        return Act(np.zeros(2, np.float32), info={"last": collections.deque([1, 2]), "some": range(3)})
+        return Act(
+            np.zeros(2, np.float32), info={"last": collections.deque([1, 2]), "some": range(3)}
+        )
 
 
 POLICY = Strict()
@@ -79,13 +83,26 @@ def client() -> Iterator[TestClient]:
 
 
 def chunk(name: bytes, data: bytes) -> bytes:
-    return struct.pack(">I", len(data)) + name + data + struct.pack(">I", zlib.crc32(data, zlib.crc32(name)))
+    return (
+        struct.pack(">I", len(data))
+        + name
+        + data
+        + struct.pack(">I", zlib.crc32(data, zlib.crc32(name)))
+    )
 
 
 JPEG = encode_jpeg(np.zeros((8, 8, 3), np.uint8))
 PNG_HEAD = b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", struct.pack(">2I5B", 1, 1, 8, 2, 0, 0, 0))
-ODD_PNG = PNG_HEAD + chunk(b"IDAT", zlib.compress(bytes(4))) + chunk(b"gAMA", b"") + chunk(b"IEND", b"")
-BLOBS = [np.zeros(2, np.float32).tobytes(), JPEG, b"bytes", ODD_PNG, np.zeros(12, np.uint8).tobytes()]
+ODD_PNG = (
+    PNG_HEAD + chunk(b"IDAT", zlib.compress(bytes(4))) + chunk(b"gAMA", b"") + chunk(b"IEND", b"")
+)
+BLOBS = [
+    np.zeros(2, np.float32).tobytes(),
+    JPEG,
+    b"bytes",
+    ODD_PNG,
+    np.zeros(12, np.uint8).tobytes(),
+]
 VALUES: list[Any] = [
     None,
     True,
@@ -169,12 +186,18 @@ def is_fine(status: int, field: str) -> bool:
 
 @pytest.mark.parametrize("field", FIELDS)
 @pytest.mark.parametrize("op", ["reset", "act", "close"])
-def test_a_frame_with_any_value_in_any_field_is_answered(client: TestClient, op: str, field: str) -> None:
+def test_a_frame_with_any_value_in_any_field_is_answered(
+    client: TestClient, op: str, field: str
+) -> None:
     client.post("/v1/reset", headers={"x-session-id": "s"}, json={})
     for value in VALUES:
         node = {"op": op} | with_value(field, value)
         content = b"".join(frame_layout.pack(node, list(BLOBS)))
-        answer = client.post(f"/v1/{op}", content=content, headers={"x-session-id": "s", "content-type": CONTENT_TYPE})
+        answer = client.post(
+            f"/v1/{op}",
+            content=content,
+            headers={"x-session-id": "s", "content-type": CONTENT_TYPE},
+        )
         assert is_fine(answer.status_code, field), (field, value, answer.content)
         if op == "close":
             client.post("/v1/reset", headers={"x-session-id": "s"}, json={})
@@ -200,7 +223,9 @@ def test_a_document_with_any_value_in_any_field_is_answered(
     assert POLICY.wrong == []
 
 
-@pytest.mark.parametrize("op", ["reset", "act", "close", "observe", "unknown", None, {"$": ["nd", 0, "<f4", [2]]}, []])
+@pytest.mark.parametrize(
+    "op", ["reset", "act", "close", "observe", "unknown", None, {"$": ["nd", 0, "<f4", [2]]}, []]
+)
 def test_what_a_decoder_returns_has_the_types_of_an_observation(op: Any) -> None:
     """At the endpoints without status codes: own port, shared memory and plasma."""
     for field in FIELDS:
@@ -213,7 +238,11 @@ def test_what_a_decoder_returns_has_the_types_of_an_observation(op: Any) -> None
             for request in decoded.requests:
                 for obs in (*request.history, *([] if request.obs is None else [request.obs])):
                     require_types(obs)
-                assert (type(request.request_id), type(request.session), type(request.rank)) == (str, str, str)
+                assert (type(request.request_id), type(request.session), type(request.rank)) == (
+                    str,
+                    str,
+                    str,
+                )
                 assert type(request.kwargs) is dict
             assert all(isinstance(reply.error, VLAgentsError) for reply in decoded.refused.values())
 
@@ -246,8 +275,12 @@ class Joints(Agent):
 
 
 @pytest.mark.parametrize("order", [("own", "arm7"), ("arm3", "arm7"), ("own", "arm3")])
-def test_an_act_behind_a_reset_is_checked_against_the_contract_of_that_reset(order: tuple[str, str]) -> None:
-    """In one frame, the act is checked as it arrives, when the session still has the earlier checkpoint."""
+def test_an_act_behind_a_reset_is_checked_against_the_contract_of_that_reset(
+    order: tuple[str, str],
+) -> None:
+    """In one frame, the act is checked as it arrives, when the session still has the earlier
+    checkpoint.
+    """
     choices = {"arm7": {"dim": 7}, "arm3": {"dim": 3}}
     engine = Engine(Checkpoints(lambda config: Joints(config.get("dim", 0)), {}, choices))
     engine.start()
@@ -261,7 +294,12 @@ def test_an_act_behind_a_reset_is_checked_against_the_contract_of_that_reset(ord
 
     def reset(name: str) -> Request:
         length = choices.get(name, {"dim": 3})["dim"]
-        return Request("reset", observations[length], kwargs={} if name == "own" else {"checkpoint": name}, session="s")
+        return Request(
+            "reset",
+            observations[length],
+            kwargs={} if name == "own" else {"checkpoint": name},
+            session="s",
+        )
 
     first, second = order
     for name in (second, first):  # so that both are loaded

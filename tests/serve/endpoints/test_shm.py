@@ -1,4 +1,6 @@
-"""Shared memory between a policy and processes on its machine: sessions, the end of clients, faults, and strangers."""
+"""Shared memory between a policy and processes on its machine: sessions, the end of clients,
+faults, and strangers.
+"""
 
 from __future__ import annotations
 
@@ -54,8 +56,12 @@ def served() -> Iterator[tuple[Engine, ShmServer]]:
     endpoint.close()
 
 
-def test_memory_that_the_policy_keeps_is_given_back_when_it_lets_go(served: tuple[Engine, ShmServer]) -> None:
-    """A window of four frames: four files stay with the policy, and no frame is ever copied for it."""
+def test_memory_that_the_policy_keeps_is_given_back_when_it_lets_go(
+    served: tuple[Engine, ShmServer],
+) -> None:
+    """A window of four frames: four files stay with the policy, and no frame is ever copied for
+    it.
+    """
     transport = client(served[1])
     call(transport, request("reset"), 5)
     for pixel in range(1, 200):
@@ -69,7 +75,9 @@ def test_memory_that_the_policy_keeps_is_given_back_when_it_lets_go(served: tupl
     transport.close()
 
 
-def test_vectors_of_sessions_and_odd_observations_come_as_they_are(served: tuple[Engine, ShmServer]) -> None:
+def test_vectors_of_sessions_and_odd_observations_come_as_they_are(
+    served: tuple[Engine, ShmServer],
+) -> None:
     transport = client(served[1])
     names = [f"env-{i}" for i in range(7)]
 
@@ -83,15 +91,24 @@ def test_vectors_of_sessions_and_odd_observations_come_as_they_are(served: tuple
     assert all(first)
     for step in (1, 2, 3):
         replies = transport.call(requests("act", step), 5)
-        assert [int(reply.act.action[-1]) for reply in replies if reply.act] == [10 * step + i for i in range(7)]
+        assert [int(reply.act.action[-1]) for reply in replies if reply.act] == [
+            10 * step + i for i in range(7)
+        ]
         assert [reply.step for reply in replies] == [begun + step for begun in first]
     striped = np.zeros((8, 16, 3), np.uint8)
     striped[:, ::2] = 77
-    odd = Obs({"front": striped[:, ::2]}, 1.0, {"joints": np.arange(3.0), "none": np.zeros(0, np.float32)})
-    [reply] = transport.call([Request("act", odd, session=names[0], request_id="odd", step=first[0] + 3)], 5)
+    odd = Obs(
+        {"front": striped[:, ::2]}, 1.0, {"joints": np.arange(3.0), "none": np.zeros(0, np.float32)}
+    )
+    [reply] = transport.call(
+        [Request("act", odd, session=names[0], request_id="odd", step=first[0] + 3)], 5
+    )
     assert reply.act.action.tolist()[-1] == 77
-    for step in (first[0] + 3, 3, first[0] - 1):  # it has four acts behind it, and may be called by that count
-        [reply] = transport.call([Request("act", odd, session=names[0], request_id="odd", step=step)], 5)
+    # It has four acts behind it, and may be called by that count.
+    for step in (first[0] + 3, 3, first[0] - 1):
+        [reply] = transport.call(
+            [Request("act", odd, session=names[0], request_id="odd", step=step)], 5
+        )
         assert isinstance(reply.error, UnknownSession)
     odd.gripper = 3.0
     [reply] = transport.call([Request("act", odd, session=names[0], request_id="odd")], 5)
@@ -124,7 +141,9 @@ def test_frames_and_replies_of_any_size(served: tuple[Engine, ShmServer]) -> Non
     transport.close()
 
 
-def test_a_late_reply_is_discarded_and_its_memory_is_not_reused_meanwhile(served: tuple[Engine, ShmServer]) -> None:
+def test_a_late_reply_is_discarded_and_its_memory_is_not_reused_meanwhile(
+    served: tuple[Engine, ShmServer],
+) -> None:
     Keeper.gate = threading.Event()
     transport = client(served[1])
     call(transport, request("reset"), 5)
@@ -137,7 +156,9 @@ def test_a_late_reply_is_discarded_and_its_memory_is_not_reused_meanwhile(served
 
 
 @pytest.mark.own_process
-def test_neither_descriptors_in_a_message_nor_a_killed_client_leave_anything(served: tuple[Engine, ShmServer]) -> None:
+def test_neither_descriptors_in_a_message_nor_a_killed_client_leave_anything(
+    served: tuple[Engine, ShmServer],
+) -> None:
     engine, endpoint = served
     before = descriptors()
     for message in (bytes(LocalAddress.REQUEST.size), b""):
@@ -158,7 +179,9 @@ def test_neither_descriptors_in_a_message_nor_a_killed_client_leave_anything(ser
         "print('ready', flush=True)\n"
         "while True: t.call([Request('act', obs, request_id='b')], 5)\n"
     )
-    with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True) as process:
+    with subprocess.Popen(
+        [sys.executable, "-c", code], stdout=subprocess.PIPE, text=True
+    ) as process:
         assert process.stdout.readline().strip() == "ready"
         assert len(engine.sessions) == 1
         process.send_signal(signal.SIGKILL)
@@ -189,7 +212,8 @@ def test_many_sessions_leave_nothing(served: tuple[Engine, ShmServer]) -> None:
 
 
 def _new(running: set[threading.Thread]) -> list[str]:
-    """Threads beside those, but for the helpers of a batch queue: the first batch that a busy machine delays starts
+    """Threads beside those, but for the helpers of a batch queue: the first batch that a busy
+    machine delays starts
     them, and they end with it."""
     return [one.name for one in running_threads() - running if not one.name.startswith("policy-")]
 
@@ -223,7 +247,8 @@ def test_a_client_that_ends_while_its_batch_runs_harms_nobody() -> None:
     one, other = (ShmTransport(endpoint.address) for _ in range(2))
     for each, name in ((one, "first"), (other, "second")):
         call(each, Request("reset", Obs({}), name, request_id=name), 60)
-    # The queue polls beside a batch once it has seen a slow one, and one before it that was another session's.
+    # The queue polls beside a batch once it has seen a slow one, and one before it that was another
+    # session's.
     for ending in (False, False, True):
         asking = one if ending else other
         Gated.gate, Gated.busy = threading.Event(), threading.Event()
@@ -267,12 +292,15 @@ def test_a_server_that_is_gone_is_noticed(served: tuple[Engine, ShmServer]) -> N
         call(transport, request("act"), 5)
 
 
-def test_who_leaves_before_hearing_that_the_replica_is_full_keeps_nobody_out(served: tuple[Engine, ShmServer]) -> None:
+def test_who_leaves_before_hearing_that_the_replica_is_full_keeps_nobody_out(
+    served: tuple[Engine, ShmServer],
+) -> None:
     engine, endpoint = served
     engine.sessions.limit = 1
     one, busy = client(endpoint), threading.Event()
     call(one, request("reset"), 5)
-    engine.queue.poller.call_soon(lambda: busy.wait(10) and None)  # the endpoint opens when all of them are gone
+    # The endpoint opens when all of them are gone.
+    engine.queue.poller.call_soon(lambda: busy.wait(10) and None)
     for _ in range(3):
         with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as gone:
             gone.connect(f"\0{endpoint.address.socket}")
@@ -318,8 +346,13 @@ def test_faults_are_answered_and_harm_nobody(served: tuple[Engine, ShmServer]) -
         (pack(99, len(frame)), memory(frame), "too_large"),
         (pack(0, len(frame)), memory(frame), "not_reset"),
         (pack(0, 64, LocalAddress.COMPACT), memory(bytes(64)), "malformed"),
-        (pack(0, 64, LocalAddress.COMPACT) + act.message, memory(bytes(64)), "malformed"),  # its arrays need more
-        (pack(0, act.size, LocalAddress.COMPACT) + act.message, memory(bytes(act.size)), "not_reset"),
+        # Its arrays need more.
+        (pack(0, 64, LocalAddress.COMPACT) + act.message, memory(bytes(64)), "malformed"),
+        (
+            pack(0, act.size, LocalAddress.COMPACT) + act.message,
+            memory(bytes(act.size)),
+            "not_reset",
+        ),
     ]
     for message, descriptor, code in faults:
         with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as bad:
@@ -356,7 +389,9 @@ def test_a_client_that_reads_no_replies_is_cut_off(served: tuple[Engine, ShmServ
     wait_for(lambda: len(served[0].sessions) == 0)
 
 
-def test_only_this_machine_is_reached_and_only_the_same_user_let_in(served: tuple[Engine, ShmServer]) -> None:
+def test_only_this_machine_is_reached_and_only_the_same_user_let_in(
+    served: tuple[Engine, ShmServer],
+) -> None:
     local = served[1].address
     assert reaches(local)
     assert not reaches(replace(local, boot_id="another machine"))
@@ -367,7 +402,9 @@ def test_only_this_machine_is_reached_and_only_the_same_user_let_in(served: tupl
 
 
 @pytest.mark.skipif(os.getuid() != 0, reason="only root can become another user")
-def test_another_user_is_not_let_in(served: tuple[Engine, ShmServer], caplog: pytest.LogCaptureFixture) -> None:
+def test_another_user_is_not_let_in(
+    served: tuple[Engine, ShmServer], caplog: pytest.LogCaptureFixture
+) -> None:
     code = (
         "import os, socket, sys\n"
         "print(os.getpid())\n"
@@ -376,7 +413,9 @@ def test_another_user_is_not_let_in(served: tuple[Engine, ShmServer], caplog: py
         f"s.connect('\\0{served[1].address.socket}')\n"
         "print(s.recv(10))\n"
     )
-    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=30, check=True)
+    result = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, timeout=30, check=True
+    )
     pid, answer = result.stdout.split()
     assert answer == "b''"
     assert len(served[0].sessions) == 0
@@ -391,7 +430,8 @@ def test_what_could_not_be_sent_keeps_no_memory() -> None:
         deaf.listen(1)
         transport = ShmTransport(LocalAddress(name, boot_id=""))
         busy = [0]
-        while len(busy) <= 20 or busy[-1] > busy[-20]:  # sent, or its time was over before, and given up
+        # sent, or its time was over before, and given up.
+        while len(busy) <= 20 or busy[-1] > busy[-20]:
             with pytest.raises(DeadlineExceeded):
                 call(transport, request("act", size=8), 0.001)
             busy.append(sum(memory.busy for memory in transport._memories))
@@ -405,7 +445,9 @@ def test_what_could_not_be_sent_keeps_no_memory() -> None:
 
 
 def test_a_client_whose_key_is_refused_is_answered_a_few_times_and_then_ended() -> None:
-    """Otherwise a process without a key occupies the policy's thread, which answers each of its messages."""
+    """Otherwise a process without a key occupies the policy's thread, which answers each of its
+    messages.
+    """
     keys: list[str | None] = []
 
     def admit(key: str | None) -> Caller:

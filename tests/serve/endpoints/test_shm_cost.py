@@ -1,4 +1,6 @@
-"""What a lone act costs, in what does not depend on the machine: calls of Python, looks at the socket, no move."""
+"""What a lone act costs, in what does not depend on the machine: calls of Python, looks at the
+socket, no move.
+"""
 
 from __future__ import annotations
 
@@ -28,7 +30,8 @@ from vlagents_ray.serve.engine.engine import Engine
 ACTS = 50
 MOST_CALLS = 82  # with 88 a round trip of 50 us takes 5 us more
 OBS = Obs({"front": np.zeros((64, 64, 3), np.uint8)}, 0.5, {"joints": np.zeros(7, np.float32)})
-POLLING = ("_wait_for_request", "_wait_for_event", "poll", "mark_idle", "mark_busy")  # as often as time passes
+# As often as time passes.
+POLLING = ("_wait_for_request", "_wait_for_event", "poll", "mark_idle", "mark_busy")
 
 
 class Counted(Agent):
@@ -75,7 +78,9 @@ def serving(agent: Agent) -> Iterator[ShmTransport]:
 
 def test_a_lone_act_costs_the_server_few_calls() -> None:
     def calls(transport: ShmTransport) -> float:
-        """The lower quartile: where the machine is busy, most may take long, and the queue looks after those."""
+        """The lower quartile: where the machine is busy, most may take long, and the queue looks
+        after those.
+        """
         totals = []
         for number in range(ACTS):
             [reply] = transport.call([Request("act", OBS, request_id=str(number))], 5)
@@ -84,12 +89,15 @@ def test_a_lone_act_costs_the_server_few_calls() -> None:
         return statistics.quantiles((b - a for a, b in pairwise(totals)), n=4)[0]
 
     with serving(Counted()) as transport:
-        rounds = (calls(transport) for _ in range(20))  # on a starved machine all acts of a round may take long
+        # On a starved machine all acts of a round may take long.
+        rounds = (calls(transport) for _ in range(20))
         assert any(found <= MOST_CALLS for found in rounds), Counted.calls
 
 
 def test_a_client_that_waits_for_its_answer_reads_it_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    """To look whether it is there costs a fraction of the exception that reading raises where it is not."""
+    """To look whether it is there costs a fraction of the exception that reading raises where it
+    is not.
+    """
     reads = []
     receive = ShmTransport._receive
 
@@ -106,10 +114,11 @@ def test_a_client_that_waits_for_its_answer_reads_it_once(monkeypatch: pytest.Mo
 
 
 def test_an_act_waits_for_no_certain_core(monkeypatch: pytest.MonkeyPatch) -> None:
-    """`os.sched_setaffinity` returns when the thread runs on such a core, and keeps the interpreter's lock until then.
+    """`os.sched_setaffinity` returns when the thread runs on such a core, and keeps the
+    interpreter's lock until then.
 
-    A client once moved off the core of the policy's thread in this way. When other programs kept the other core busy,
-    all eight sessions of that process stood still for 3 s.
+    A client once moved off the core of the policy's thread in this way. When other programs kept
+    the other core busy, all eight sessions of that process stood still for 3 s.
     """
     moves: list[tuple[int, set[int]]] = []
     monkeypatch.setattr(os, "sched_setaffinity", lambda *move: moves.append(move))

@@ -36,7 +36,10 @@ class Echo(Agent):
     """Answers what the camera shows, and as many bytes as it is asked for."""
 
     def act(self, obs: Obs) -> Act:
-        return Act(np.array([obs.cameras["front"][0, 0, 0]]), info={"bytes": bytes(obs.info.get("bytes", 0))})
+        return Act(
+            np.array([obs.cameras["front"][0, 0, 0]]),
+            info={"bytes": bytes(obs.info.get("bytes", 0))},
+        )
 
 
 @pytest.fixture
@@ -86,7 +89,9 @@ def test_who_does_not_know_the_path_is_not_let_in(endpoint: WebSocketServer) -> 
 
 
 @pytest.mark.parametrize("compression", [None, "deflate"])
-def test_an_ordinary_websocket_client_is_served_too(endpoint: WebSocketServer, compression: str | None) -> None:
+def test_an_ordinary_websocket_client_is_served_too(
+    endpoint: WebSocketServer, compression: str | None
+) -> None:
     url = f"ws://127.0.0.1:{endpoint.address.port}{endpoint.address.path}"
     with connect(url, compression=compression) as socket_:
         assert not socket_.protocol.extensions  # the server accepts no compression
@@ -111,11 +116,15 @@ def test_what_is_too_long_or_in_pieces_ends_the_connection_that_sent_it_alone(
             with connect(url, compression=None) as client:
                 client.send([b"a", b"b"])
                 client.recv(5)
-        with contextlib.closing(stream(endpoint)) as late:  # reads nothing before it has sent everything
+        # Reads nothing before it has sent everything.
+        with contextlib.closing(stream(endpoint)) as late:
             late.send(bytes(STREAM_BYTES + 9 * 2**20), 5)
             late.recv(5)
 
-    with pytest.raises((ConnectionClosed, ConnectionResetError), match="1003" if fragments else "1009"):  # says why
+    # Says why.
+    with pytest.raises(
+        (ConnectionClosed, ConnectionResetError), match="1003" if fragments else "1009"
+    ):
         send()
     wait_for(lambda: len(endpoint._clients) == 1)
     act = ask(other, "act", 7).act
@@ -131,7 +140,8 @@ def test_who_stays_after_a_wrong_message_is_cut_off(
     endpoint.limits = Limits(body_bytes=1_000_000)
     client = stream(endpoint)
     ask(client, "reset")
-    client._socket.sendall(b"\x82\xff" + (2**40).to_bytes(8, "big") + bytes(4))  # a message of a TB begins
+    # A message of a TB begins.
+    client._socket.sendall(b"\x82\xff" + (2**40).to_bytes(8, "big") + bytes(4))
     if floods:
         client._socket.settimeout(5)
         with pytest.raises(OSError, match=r"reset|pipe"):
@@ -147,7 +157,9 @@ def test_a_client_that_takes_no_replies_holds_up_nobody(
     slow, other = stream(endpoint), stream(endpoint)
     for client in (slow, other):
         ask(client, "reset")
-    frame = encode_requests([Request("act", Obs({"front": np.zeros((2, 2, 3), np.uint8)}, info={"bytes": 3_000_000}))])
+    frame = encode_requests(
+        [Request("act", Obs({"front": np.zeros((2, 2, 3), np.uint8)}, info={"bytes": 3_000_000}))]
+    )
     with suppress(ConnectionClosed, OSError):  # cut off before the last is sent, on a busy machine
         for _ in range(4):
             slow.send(frame, 5)
@@ -155,7 +167,9 @@ def test_a_client_that_takes_no_replies_holds_up_nobody(
         act = ask(other, "act", pixel).act
         assert act.action.tolist() == [pixel]
     wait_for(lambda: len(endpoint.engine.sessions) == 1)  # it was cut off
-    wait_for(lambda: not [thread for thread in threading.enumerate() if thread.name == "send-slowly"])
+    wait_for(
+        lambda: not [thread for thread in threading.enumerate() if thread.name == "send-slowly"]
+    )
     slow.close()
     other.close()
 
@@ -213,10 +227,20 @@ def test_who_does_not_wait_for_answers_fills_no_memory_and_gets_them_all(
 
     monkeypatch.setattr(Echo, "act", act)
     frames = [
-        encode_requests([Request("act", Obs({"front": np.full((96, 96, 3), i % 256, np.uint8)}), request_id=str(i))])
+        encode_requests(
+            [
+                Request(
+                    "act",
+                    Obs({"front": np.full((96, 96, 3), i % 256, np.uint8)}),
+                    request_id=str(i),
+                )
+            ]
+        )
         for i in range(1000)
     ]
-    with connect(f"ws://127.0.0.1:{endpoint.address.port}{endpoint.address.path}", compression=None) as client:
+    with connect(
+        f"ws://127.0.0.1:{endpoint.address.port}{endpoint.address.path}", compression=None
+    ) as client:
         client.send(encode_requests([Request("reset", Obs())]))
         assert decode_replies(client.recv(5))[0].error is None
         sending = threading.Thread(target=lambda: [client.send(frame) for frame in frames])

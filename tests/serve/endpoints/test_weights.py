@@ -1,4 +1,6 @@
-"""Pushes of learners on other machines: one connection is one push, by a key with the scope for it."""
+"""Pushes of learners on other machines: one connection is one push, by a key with the scope for
+it.
+"""
 
 from __future__ import annotations
 
@@ -46,7 +48,13 @@ from vlagents_ray.serve.endpoints.weights import weights_routes
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.scaling.weight_push import ThisReplica, WeightPusher
 from vlagents_ray.serve.weights import PushOptions, PushResult
-from vlagents_ray.weights.safetensors import MESSAGE_BYTES, PART_BYTES, header_of, parts_of, read_header
+from vlagents_ray.weights.safetensors import (
+    MESSAGE_BYTES,
+    PART_BYTES,
+    header_of,
+    parts_of,
+    read_header,
+)
 from vlagents_ray_learn import Publisher, publisher
 
 LENGTH = 3 * 2**20  # 12 MiB, so that there are several parts
@@ -92,7 +100,11 @@ def serving(monkeypatch: pytest.MonkeyPatch) -> Iterator[Serving]:
     opened: list[Any] = []
 
     def open_one(
-        agent: Agent | None = None, keys: Keys | None = None, slow_s: float = 30.0, *, insecure: bool = False
+        agent: Agent | None = None,
+        keys: Keys | None = None,
+        slow_s: float = 30.0,
+        *,
+        insecure: bool = False,
     ) -> SimpleNamespace:
         engine = Engine(agent or Gain())
         engine.start()
@@ -129,7 +141,11 @@ def test_a_learner_elsewhere_pushes_and_asks_which_replicas_act_with_it(serving:
     with Publisher(server.url) as weights:
         assert weights.push(gains(1)) == 1
         assert weights.push({"offset": np.ones(2)}, partial=True, mode="keep", allow_same=True) == 2
-        assert (weights.acknowledged(1), weights.acknowledged(2), weights.acknowledged(3)) == (1, 1, 0)
+        assert (weights.acknowledged(1), weights.acknowledged(2), weights.acknowledged(3)) == (
+            1,
+            1,
+            0,
+        )
         assert weights.push(gains(1), version=500, allow_same=True) == 500
     held = server.engine.models.own_weights._agent.tree
     assert server.engine.weights.describe()["newest"]["version"] == 500
@@ -138,22 +154,30 @@ def test_a_learner_elsewhere_pushes_and_asks_which_replicas_act_with_it(serving:
     assert (newest["gain"][0], newest["gain"][-1], newest["offset"][0]) == (1, 1, 1)
 
 
-def test_values_that_are_received_are_not_copied_again(serving: Serving, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_values_that_are_received_are_not_copied_again(
+    serving: Serving, monkeypatch: pytest.MonkeyPatch
+) -> None:
     server = serving()
     received: list[Mapping[str, Any]] = []
     own = server.engine.models.own_weights
     stage = own.stage
-    monkeypatch.setattr(own, "stage", lambda *args, **how: (received.append(args[1]), stage(*args, **how))[1])
+    monkeypatch.setattr(
+        own, "stage", lambda *args, **how: (received.append(args[1]), stage(*args, **how))[1]
+    )
     Publisher(server.url).push(gains(1))
     assert np.shares_memory(own.newest.values["gain"], received[0]["gain"])
 
 
-def test_what_does_not_fit_is_refused_before_it_is_sent(serving: Serving, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_does_not_fit_is_refused_before_it_is_sent(
+    serving: Serving, monkeypatch: pytest.MonkeyPatch
+) -> None:
     server = serving()
     weights = Publisher(server.url)
     sent: list[int] = []
     send = ProxiedSocket.send
-    monkeypatch.setattr(ProxiedSocket, "send", lambda self, part, s: (sent.append(len(part)), send(self, part, s)))
+    monkeypatch.setattr(
+        ProxiedSocket, "send", lambda self, part, s: (sent.append(len(part)), send(self, part, s))
+    )
     for wrong, says in (
         (gains(1) | {"other": np.zeros(2**24, np.int8)}, "'other': unknown"),
         ({"gain": gains(1)["gain"]}, "'offset': missing"),
@@ -163,7 +187,8 @@ def test_what_does_not_fit_is_refused_before_it_is_sent(serving: Serving, monkey
         with pytest.raises(InvalidWeights, match=says):
             weights.push(wrong)
         assert sum(sent) < 1000
-    for wrong, error in ((gains(np.nan), InvalidWeights), (gains(0), UnchangedWeights)):  # after it was
+    # After it was.
+    for wrong, error in ((gains(np.nan), InvalidWeights), (gains(0), UnchangedWeights)):
         with pytest.raises(error):
             weights.push(wrong)
     assert server.engine.weights.number == 0
@@ -176,7 +201,10 @@ def test_keys_need_the_scope(serving: Serving) -> None:
     assert Publisher(server.url, api_key=learner).push(gains(1)) == 1
     for key, error in ((robot, Forbidden), ("", Unauthorized), ("vlr_wrong", Unauthorized)):
         weights = Publisher(server.url, api_key=key)
-        for ask in (lambda weights=weights: weights.push(gains(2)), lambda weights=weights: weights.acknowledged(1)):
+        for ask in (
+            lambda weights=weights: weights.push(gains(2)),
+            lambda weights=weights: weights.acknowledged(1),
+        ):
             with pytest.raises(error):
                 ask()
     known.change("learner", rate=1e-6)
@@ -186,7 +214,9 @@ def test_keys_need_the_scope(serving: Serving) -> None:
     assert server.engine.weights.number == 1
 
 
-def test_a_learner_elsewhere_lets_the_policy_rest_with_the_scope_for_pushes(serving: Serving) -> None:
+def test_a_learner_elsewhere_lets_the_policy_rest_with_the_scope_for_pushes(
+    serving: Serving,
+) -> None:
     known = ChangingKeys()
     server = serving(keys=known.keys)
     robot, key = known.add("robot"), known.add("learner", scopes=["weights"])
@@ -201,13 +231,23 @@ def test_a_learner_elsewhere_lets_the_policy_rest_with_the_scope_for_pushes(serv
     with pytest.raises(Forbidden):
         Publisher(serving(insecure=True).url).sleep()
     with closing(HttpTransport(server.url, CodecChoice("raw"), Credentials(key))) as http:
-        for path in ("nap", "sleep?offload=maybe", "sleep?at_most_s=nan", "sleep?at_most_s=1e99", "wake?level=2"):
+        for path in (
+            "nap",
+            "sleep?offload=maybe",
+            "sleep?at_most_s=nan",
+            "sleep?at_most_s=1e99",
+            "wake?level=2",
+        ):
             with pytest.raises(InvalidInput):
                 http.get(f"/v1/weights/{path}", 10, method="POST")
 
 
-@pytest.mark.parametrize(("change", "error"), [({"revoked": True}, Unauthorized), ({"scopes": []}, Forbidden)])
-def test_a_key_that_loses_its_right_ends_the_push(serving: Serving, change: Any, error: type[Exception]) -> None:
+@pytest.mark.parametrize(
+    ("change", "error"), [({"revoked": True}, Unauthorized), ({"scopes": []}, Forbidden)]
+)
+def test_a_key_that_loses_its_right_ends_the_push(
+    serving: Serving, change: Any, error: type[Exception]
+) -> None:
     known = ChangingKeys()
     server = serving(keys=known.keys)
     key, values = known.add("learner", scopes=["weights"]), gains(1)
@@ -225,8 +265,12 @@ def test_several_parts_are_on_their_way_at_once_but_none_before_the_header_is_ac
 ) -> None:
     server, steps = serving(), list[str]()
     send, recv = ProxiedSocket.send, ProxiedSocket.recv
-    monkeypatch.setattr(ProxiedSocket, "send", lambda self, *of: (steps.append("s"), send(self, *of))[1])
-    monkeypatch.setattr(ProxiedSocket, "recv", lambda self, *of: (steps.append("r"), recv(self, *of))[1])
+    monkeypatch.setattr(
+        ProxiedSocket, "send", lambda self, *of: (steps.append("s"), send(self, *of))[1]
+    )
+    monkeypatch.setattr(
+        ProxiedSocket, "recv", lambda self, *of: (steps.append("r"), recv(self, *of))[1]
+    )
     monkeypatch.setattr(publisher, "_WINDOW", 4)
     Publisher(server.url).push(gains(1))  # a header and 13 parts
     assert "".join(steps) == "sr" + "sss" + "sr" * 10 + "rrr"
@@ -283,7 +327,8 @@ def test_a_learner_that_is_silent_is_not_waited_for(serving: Serving) -> None:
     server, header = serving(slow_s=0.2), header_of(gains(1))
     for _ in range(20):
         with opened(server) as socket:
-            if answer(socket, header) == {"received": 0}:  # else this machine was too slow for the header, too
+            # Else this machine was too slow for the header, too.
+            if answer(socket, header) == {"received": 0}:
                 refused = read_error(json.loads(socket.recv(30)))
                 break
     assert isinstance(refused, MalformedMessage)
@@ -297,7 +342,10 @@ def test_a_push_that_sends_too_little_does_not_hold_up_others(
 ) -> None:
     server, values = serving(), gains(1)
     monkeypatch.setattr(endpoint, "LEAST_RATE", 2**40)
-    monkeypatch.setattr(endpoint, "time", SimpleNamespace(monotonic=iter(range(0, 1000, 20)).__next__))  # 20 s a call
+    # 20 s a call.
+    monkeypatch.setattr(
+        endpoint, "time", SimpleNamespace(monotonic=iter(range(0, 1000, 20)).__next__)
+    )
     with opened(server) as socket:
         assert answer(socket, header_of(values)) == {"received": 0}
         parts = parts_of(values)
@@ -311,9 +359,13 @@ def _is_free(server: SimpleNamespace) -> bool:
         return answer(socket, header_of(gains(1))) == {"received": 0}
 
 
-def test_a_header_beyond_the_policys_own_names_is_not_parsed(serving: Serving, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_header_beyond_the_policys_own_names_is_not_parsed(
+    serving: Serving, monkeypatch: pytest.MonkeyPatch
+) -> None:
     parsed: list[bytes] = []
-    monkeypatch.setattr(versions, "read_header", lambda data: (parsed.append(data), read_header(data))[1])
+    monkeypatch.setattr(
+        versions, "read_header", lambda data: (parsed.append(data), read_header(data))[1]
+    )
     many = header_of({f"name {number}": np.zeros(1, np.float32) for number in range(200)})
     with opened(serving()) as socket:
         assert isinstance(read_error(answer(socket, many)), MessageTooLarge)
@@ -333,7 +385,11 @@ def test_garbage_is_refused_with_its_reason(serving: Serving) -> None:
         ("", [b""], MalformedMessage),
         ("?partial=true", [header_of({"offset": np.zeros(2, np.float32)}), b""], MalformedMessage),
         ("", [b"\0" * (MESSAGE_BYTES + 1)], MessageTooLarge),
-        ("?partial=true", [header_of({"offset": np.zeros(2, np.float32)}), b"\0" * 9], MalformedMessage),
+        (
+            "?partial=true",
+            [header_of({"offset": np.zeros(2, np.float32)}), b"\0" * 9],
+            MalformedMessage,
+        ),
         ("", ["text"], MalformedMessage),
     ]
     server = serving()
@@ -341,13 +397,18 @@ def test_garbage_is_refused_with_its_reason(serving: Serving) -> None:
 
         def found(query: str = query, parts: list[Any] = parts) -> type:
             with opened(server, query) as socket:
-                return type(read_error([answer(socket, part) for part in parts or [b"garbage"]][-1]))
+                return type(
+                    read_error([answer(socket, part) for part in parts or [b"garbage"]][-1])
+                )
 
-        wait_for(lambda error=error, found=found: found() is error)  # one push at a time: the last may not have ended
+        # One push at a time: the last may not have ended.
+        wait_for(lambda error=error, found=found: found() is error)
     assert server.engine.weights.number == 0
 
 
-def test_an_error_of_the_server_itself_is_not_shown(serving: Serving, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_error_of_the_server_itself_is_not_shown(
+    serving: Serving, monkeypatch: pytest.MonkeyPatch
+) -> None:
     server = serving()
 
     def fail(*args: Any, **how: Any) -> str:
@@ -365,7 +426,9 @@ def test_a_push_whose_learner_leaves_after_the_last_part_is_completed(
     begun, may_go_on = threading.Event(), threading.Event()
     own = server.engine.models.own_weights
     stage = own.stage
-    monkeypatch.setattr(own, "stage", lambda *args, **how: (begun.set(), may_go_on.wait(30), stage(*args, **how))[2])
+    monkeypatch.setattr(
+        own, "stage", lambda *args, **how: (begun.set(), may_go_on.wait(30), stage(*args, **how))[2]
+    )
     values = {"offset": np.ones(2, np.float32)}
     with opened(server, "?partial=true") as socket:
         answer(socket, header_of(values))

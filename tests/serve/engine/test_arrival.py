@@ -1,4 +1,6 @@
-"""A deadline is counted from when the request came, not from when the policy's thread had time to read it."""
+"""A deadline is counted from when the request came, not from when the policy's thread had time
+to read it.
+"""
 
 from __future__ import annotations
 
@@ -79,7 +81,9 @@ class WebSocket:
     """The same at the replica's own port."""
 
     def __init__(self, endpoint: WebSocketServer) -> None:
-        self._stream = Stream(urlsplit("http://127.0.0.1"), endpoint.address.port, endpoint.address.path, 5)
+        self._stream = Stream(
+            urlsplit("http://127.0.0.1"), endpoint.address.port, endpoint.address.path, 5
+        )
         self.close = self._stream.close
 
     def send(self, request: Request) -> None:
@@ -91,8 +95,13 @@ class WebSocket:
 
 @pytest.fixture
 def timestamps() -> Iterator[None]:
-    """The kernel stamps what arrives by TCP; it begins to a little after the first connection asks for it."""
-    with socket.create_server(("127.0.0.1", 0)) as listener, socket.create_connection(listener.getsockname()) as sender:
+    """The kernel stamps what arrives by TCP; it begins to a little after the first connection
+    asks for it.
+    """
+    with (
+        socket.create_server(("127.0.0.1", 0)) as listener,
+        socket.create_connection(listener.getsockname()) as sender,
+    ):
         receiver, _ = listener.accept()
         with receiver:
             enable_timestamps(receiver)
@@ -109,7 +118,9 @@ def timestamps() -> Iterator[None]:
 @pytest.mark.usefixtures("timestamps")
 @pytest.mark.parametrize("behind", ["an act", "a process that stood still"])
 @pytest.mark.parametrize("transport", ["shm", "websocket"])
-def test_an_act_that_lay_in_the_socket_until_its_deadline_is_not_executed(transport: str, behind: str) -> None:
+def test_an_act_that_lay_in_the_socket_until_its_deadline_is_not_executed(
+    transport: str, behind: str
+) -> None:
     Gated.gate.clear()
     Gated.entered.clear()
     engine = Engine(Gated())
@@ -120,7 +131,9 @@ def test_an_act_that_lay_in_the_socket_until_its_deadline_is_not_executed(transp
     )
     endpoint.open()
     engine.start()
-    slow, hasty = [Shm(endpoint) if isinstance(endpoint, ShmServer) else WebSocket(endpoint) for _ in range(2)]
+    slow, hasty = [
+        Shm(endpoint) if isinstance(endpoint, ShmServer) else WebSocket(endpoint) for _ in range(2)
+    ]
     for client in (slow, hasty):
         client.send(Request("reset", Obs()))
         assert client.receive().error is None
@@ -135,7 +148,8 @@ def test_an_act_that_lay_in_the_socket_until_its_deadline_is_not_executed(transp
     if behind == "an act":
         assert slow.receive().error is None
     assert type(hasty.receive().error) is DeadlineExceeded
-    hasty.send(Request("act", Obs(), deadline_ms=20e3))  # one that is read at once has all of its time
+    # One that is read at once has all of its time.
+    hasty.send(Request("act", Obs(), deadline_ms=20e3))
     act = hasty.receive().act
     assert act.action.tolist() == [1], "the late one was acted on"
     for client in (slow, hasty):
@@ -159,7 +173,9 @@ def test_a_pause_counts_for_what_is_read_right_after_it_alone() -> None:
     now += 0.1
     assert pauses.waited_s() == pytest.approx(7.1)
     pauses.check()
-    now += 0.6  # a pause within the backlog, as a busy machine makes them: what came in the long one is still unread
+    # A pause within the backlog, as a busy machine makes them: what came in the long one is still
+    # unread.
+    now += 0.6
     assert pauses.waited_s() == pytest.approx(7.7)
     pauses.check()
     now += 0.2
@@ -180,7 +196,9 @@ def test_a_pause_counts_for_what_is_read_right_after_it_alone() -> None:
 
 
 def test_a_machine_that_is_always_starved_refuses_only_what_may_have_waited() -> None:
-    """Pauses that follow upon each other make a backlog longer by themselves alone, and not for ever."""
+    """Pauses that follow upon each other make a backlog longer by themselves alone, and not for
+    ever.
+    """
     now = 100.0
     pauses = PauseDetector(lambda: now)
     pauses._checked = now
@@ -196,7 +214,9 @@ def test_a_machine_that_is_always_starved_refuses_only_what_may_have_waited() ->
 @pytest.mark.parametrize(
     ("sent", "deadline_ms"), [("in the pause", 300.0), ("in the pause", 60e3), ("after it", 300.0)]
 )
-def test_after_a_pause_an_http_request_is_refused_only_if_it_was_late(sent: str, deadline_ms: float) -> None:
+def test_after_a_pause_an_http_request_is_refused_only_if_it_was_late(
+    sent: str, deadline_ms: float
+) -> None:
     """As its connection's record says, and not for as long as others may be late."""
     now = 100.0
     engine = Engine(Gated())
@@ -210,10 +230,17 @@ def test_after_a_pause_an_http_request_is_refused_only_if_it_was_late(sent: str,
         loops.put(asyncio.get_running_loop())
         await AccessMiddleware(inside, None, "app", slow_s=30, idle_s=30)(scope, receive, send)
 
-    with served(app) as port, contextlib.closing(http.client.HTTPConnection("127.0.0.1", port, timeout=30)) as client:
+    with (
+        served(app) as port,
+        contextlib.closing(http.client.HTTPConnection("127.0.0.1", port, timeout=30)) as client,
+    ):
 
         def send(op: str, limit_ms: float = 60e3) -> None:
-            headers = {"content-type": "application/json", DEADLINE_HEADER: str(limit_ms), SESSION_HEADER: "robot"}
+            headers = {
+                "content-type": "application/json",
+                DEADLINE_HEADER: str(limit_ms),
+                SESSION_HEADER: "robot",
+            }
             client.request("POST", f"/v1/{op}", "{}", headers)
 
         def answer() -> dict[str, Any]:

@@ -49,11 +49,14 @@ class Echo(Agent):
         if obs.info.get("unsendable"):
             return Act(np.zeros(1), info={"x": object()})
         return Act(
-            np.array([self.seed, self.step]), info={"instruction": self.instruction, "value": obs.info.get("value")}
+            np.array([self.seed, self.step]),
+            info={"instruction": self.instruction, "value": obs.info.get("value")},
         )
 
 
-def ask(engine: Engine, session: str, op: Any, info: dict[str, Any] | None = None, **fields: Any) -> Reply:
+def ask(
+    engine: Engine, session: str, op: Any, info: dict[str, Any] | None = None, **fields: Any
+) -> Reply:
     return answered(engine, session, Request(op, Obs(info=info or {}), **fields))
 
 
@@ -61,9 +64,9 @@ def test_sessions_interleaved_at_random_never_mix(serving: Callable[..., Engine]
     engine = serving(Echo())
     steps = dict.fromkeys(("a", "b", "c"), 0)
     for seed, name in enumerate(steps):
-        assert ask(engine, name, "reset", instruction=f"task {name}", kwargs={"seed": seed}).info == {
-            "hello": f"task {name}"
-        }
+        assert ask(
+            engine, name, "reset", instruction=f"task {name}", kwargs={"seed": seed}
+        ).info == {"hello": f"task {name}"}
     choose = random.Random(0)
     for value in range(1000):
         name = choose.choice(sorted(steps))
@@ -115,10 +118,14 @@ def test_a_failing_act_fails_alone_and_what_the_policy_raised_stays_on_the_serve
 class Contracted(Echo):
     @property
     def contract(self) -> Contract:
-        return Contract({"front": CameraSpec(4, 4)}, {"joints": StateSpec(2)}, action=ActionSpec(dim=2))
+        return Contract(
+            {"front": CameraSpec(4, 4)}, {"joints": StateSpec(2)}, action=ActionSpec(dim=2)
+        )
 
 
-def test_what_the_policy_does_not_offer_is_refused_before_it_acts(serving: Callable[..., Engine]) -> None:
+def test_what_the_policy_does_not_offer_is_refused_before_it_acts(
+    serving: Callable[..., Engine],
+) -> None:
     engine = serving(Echo())
     ask(engine, "a", "reset")
     with pytest.raises(NotOffered, match=r"got \['logprob'\], want some of \[\]"):
@@ -159,7 +166,10 @@ def test_a_batch_goes_to_the_initialized_agent_in_one_call(serving: Callable[...
         for name in names:
             submit(engine, name, Request("act", Obs(), request_id=name), replies.put)
     answers = [replies.get(timeout=10) for _ in range(160)]
-    assert all(reply.act is not None and reply.act.info["instruction"] == reply.request_id for reply in answers)
+    assert all(
+        reply.act is not None and reply.act.info["instruction"] == reply.request_id
+        for reply in answers
+    )
     assert sum(agent.sizes) == 160
     assert max(agent.sizes) <= 8
 
@@ -192,7 +202,11 @@ class Held(Agent):
     [("simulation", True, True), ("robot", False, True), ("robot", True, False)],
 )
 def test_replies_are_sent_beside_the_next_full_batch_unless_a_robot_would_wait(
-    serving: Callable[..., Engine], monkeypatch: pytest.MonkeyPatch, rank: Any, computes: bool, beside: bool
+    serving: Callable[..., Engine],
+    monkeypatch: pytest.MonkeyPatch,
+    rank: Any,
+    computes: bool,
+    beside: bool,
 ) -> None:
     monkeypatch.setattr(time, "thread_time", time.perf_counter if computes else float)
     agent = Held()
@@ -205,7 +219,10 @@ def test_replies_are_sent_beside_the_next_full_batch_unless_a_robot_would_wait(
     agent.go.clear()
     for session in "ab":
         submit(
-            engine, session, Request("act", Obs(), rank=rank), lambda _: threads.put(threading.current_thread().name)
+            engine,
+            session,
+            Request("act", Obs(), rank=rank),
+            lambda _: threads.put(threading.current_thread().name),
         )
     while engine.queue.depth() != 1:
         pass
@@ -224,7 +241,8 @@ def test_a_loading_policy_is_unavailable_and_a_broken_one_says_why() -> None:
         engine.require_ready()
     with pytest.raises(PolicyFailed, match=r"no such checkpoint \(test_engine.py:\d+\)$"):
         engine.start()
-    with pytest.raises(PolicyFailed, match="did not load: FileNotFoundError; the server"):  # no path leaves it
+    # No path leaves it.
+    with pytest.raises(PolicyFailed, match="did not load: FileNotFoundError; the server"):
         ask(engine, "a", "reset")
 
 

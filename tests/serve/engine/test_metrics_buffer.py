@@ -55,7 +55,9 @@ def engine() -> Iterator[Engine]:
 def client(engine: Engine) -> Iterator[TestClient]:
     engine.start()
     engine.stats.enable()
-    with TestClient(AccessMiddleware(build_http_app(engine, dict, Limits()), None, "app")) as client:
+    with TestClient(
+        AccessMiddleware(build_http_app(engine, dict, Limits()), None, "app")
+    ) as client:
         yield client
 
 
@@ -69,12 +71,16 @@ def test_stages_add_up_over_http_in_json_and_in_frames(client: TestClient) -> No
     headers = {"x-session-id": "robot", "content-type": CONTENT_TYPE}
     client.post("/v1/reset", content=encode_requests([Request("reset", OBS)]), headers=headers)
     begun = time.perf_counter()
-    answer = client.post("/v1/act", content=encode_requests([Request("act", OBS)], JPEG), headers=headers)
+    answer = client.post(
+        "/v1/act", content=encode_requests([Request("act", OBS)], JPEG), headers=headers
+    )
     check(answer.json()["timing"], (time.perf_counter() - begun) * 1e3)
     assert answer.json()["info"]["text"] == "ünïcode"
     begun = time.perf_counter()
     answer = client.post(
-        "/v1/act", content=encode_requests([Request("act", OBS)], JPEG), headers={**headers, "accept": CONTENT_TYPE}
+        "/v1/act",
+        content=encode_requests([Request("act", OBS)], JPEG),
+        headers={**headers, "accept": CONTENT_TYPE},
     )
     check(decode_replies(answer.content)[0].timing, (time.perf_counter() - begun) * 1e3)
     form = {"obs": (None, json.dumps({"gripper": 1.0}), "application/json")}
@@ -137,7 +143,8 @@ def test_all_are_counted_from_whatever_thread_and_a_fair_sample_is_kept() -> Non
     stats = MetricsBuffer()
     stats.enable()
     threads = [
-        threading.Thread(target=lambda: [stats.handled(KIND, (float(n),)) for n in range(10_000)]) for _ in range(4)
+        threading.Thread(target=lambda: [stats.handled(KIND, (float(n),)) for n in range(10_000)])
+        for _ in range(4)
     ]
     for thread in threads:
         thread.start()
@@ -146,7 +153,8 @@ def test_all_are_counted_from_whatever_thread_and_a_fair_sample_is_kept() -> Non
     sample = stats.collect().requests[KIND]
     assert (sample.seen, len(sample.values)) == (40_000, SAMPLE)
     mean = sum(value for (value,) in sample.values) / SAMPLE
-    assert abs(mean - 5_000) < 5 * 10_000 / 12**0.5 / SAMPLE**0.5  # five standard errors of a uniform draw
+    # Five standard errors of a uniform draw.
+    assert abs(mean - 5_000) < 5 * 10_000 / 12**0.5 / SAMPLE**0.5
 
 
 def test_a_request_leaves_nothing_to_the_garbage_collector(engine: Engine) -> None:
@@ -183,7 +191,9 @@ def test_load_is_the_busy_share_and_the_mean_queue(engine: Engine) -> None:
     assert quiet.utilisation < 0.2
     assert quiet.waiting == 0
     Large.gate.clear()
-    submit(engine, "a", Request("act", Obs(info={"wait": True})), lambda _: answered.release() and None)
+    submit(
+        engine, "a", Request("act", Obs(info={"wait": True})), lambda _: answered.release() and None
+    )
     wait_for(lambda: engine.queue.depth() == 0)  # it is in its batch
     for name in ("b", "c"):
         submit(engine, name, Request("act", Obs()), lambda _: answered.release() and None)

@@ -1,4 +1,6 @@
-"""Requests in flight: what is left of one that its sender gives up, and of a message that cannot be answered."""
+"""Requests in flight: what is left of one that its sender gives up, and of a message that cannot
+be answered.
+"""
 
 from __future__ import annotations
 
@@ -103,7 +105,9 @@ def test_a_reset_that_waits_when_its_connection_ends_leaves_no_session(served: S
     assert served.engine.sessions.ids() == ["first"]
 
 
-def test_a_close_that_comes_too_late_leaves_the_session_to_the_end_of_its_connection(served: Served) -> None:
+def test_a_close_that_comes_too_late_leaves_the_session_to_the_end_of_its_connection(
+    served: Served,
+) -> None:
     other = served.sender("other")
     served.ask(other, "reset")
     served.occupy()
@@ -141,7 +145,9 @@ def test_a_connection_acts_without_a_step_in_an_episode_that_had_begun_when_it_w
     served.ask(served.sender("other", connected=not reset_over_http), "reset")
     new = served.sender("new")
     served.occupy()
-    [withdrawn] = send(served.sender("other", connected=False), [Request("reset", Obs())], lambda _: None)
+    [withdrawn] = send(
+        served.sender("other", connected=False), [Request("reset", Obs())], lambda _: None
+    )
     served.engine.withdraw(withdrawn)
     act = served.put(new, "act", session="other")
     served.go_on()
@@ -151,8 +157,12 @@ def test_a_connection_acts_without_a_step_in_an_episode_that_had_begun_when_it_w
 
 
 @pytest.mark.parametrize("error", [RuntimeError("broken"), SystemExit(1)], ids=repr)
-def test_a_policy_that_breaks_fails_its_batch_and_goes_on(served: Served, error: BaseException) -> None:
-    assert isinstance(served.put(served.first, "act", {"error": error}).get(timeout=10)[0].error, PolicyFailed)
+def test_a_policy_that_breaks_fails_its_batch_and_goes_on(
+    served: Served, error: BaseException
+) -> None:
+    assert isinstance(
+        served.put(served.first, "act", {"error": error}).get(timeout=10)[0].error, PolicyFailed
+    )
     served.ask(served.first, "act")
 
 
@@ -164,7 +174,9 @@ def test_a_caller_that_cannot_take_its_reply_does_not_stop_the_queue(served: Ser
     served.ask(served.first, "act")
 
 
-def test_closing_answers_everyone_and_so_does_a_deadline_that_passes_in_the_queue(served: Served) -> None:
+def test_closing_answers_everyone_and_so_does_a_deadline_that_passes_in_the_queue(
+    served: Served,
+) -> None:
     other = served.sender("other")
     served.ask(other, "reset")
     Gated.gate.clear()
@@ -186,11 +198,15 @@ def test_closing_answers_everyone_and_so_does_a_deadline_that_passes_in_the_queu
     closer.join(10)
     assert running.get(timeout=10)[0].error is None
     assert not served.engine.alive
-    assert isinstance(served.put(other, "act").get(timeout=10)[0].error, PolicyUnavailable | PolicyFailed)
+    assert isinstance(
+        served.put(other, "act").get(timeout=10)[0].error, PolicyUnavailable | PolicyFailed
+    )
 
 
 @pytest.mark.parametrize("for_good", [True, False])
-def test_a_connection_to_a_draining_replica_leaves_its_sessions_to_another_one(served: Served, for_good: bool) -> None:
+def test_a_connection_to_a_draining_replica_leaves_its_sessions_to_another_one(
+    served: Served, for_good: bool
+) -> None:
     other = served.sender("other")
     served.ask(other, "reset")
     served.engine.drain()
@@ -199,7 +215,9 @@ def test_a_connection_to_a_draining_replica_leaves_its_sessions_to_another_one(s
 
 
 @pytest.mark.parametrize("began", [True, False])
-def test_a_reset_whose_caller_is_gone_is_as_if_it_had_never_been(served: Served, began: bool) -> None:
+def test_a_reset_whose_caller_is_gone_is_as_if_it_had_never_been(
+    served: Served, began: bool
+) -> None:
     other = served.sender("other", connected=False)
     if began:
         served.ask(other, "reset")
@@ -221,18 +239,26 @@ def test_a_reset_whose_caller_is_gone_is_as_if_it_had_never_been(served: Served,
     assert after.get("other") == before.get("other")
 
 
-def test_too_many_replies_for_one_frame_are_errors_and_recorded(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_too_many_replies_for_one_frame_are_errors_and_recorded(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     monkeypatch.setattr(frames, "DEFAULT_LIMITS", Limits(body_bytes=2000))
     stats = MetricsBuffer()
     stats.enable()
     message = Message(stats, "test")
     message.decoded_alike(2)
-    message.replies = [Reply(act=Act(np.zeros(300, np.float32)), timing={"queue_ms": 1.0}) for _ in range(2)]
-    assert all(isinstance(reply.error, MessageTooLarge) for reply in decode_replies(message.frame()))
+    message.replies = [
+        Reply(act=Act(np.zeros(300, np.float32)), timing={"queue_ms": 1.0}) for _ in range(2)
+    ]
+    assert all(
+        isinstance(reply.error, MessageTooLarge) for reply in decode_replies(message.frame())
+    )
     assert sum(sample.seen for sample in stats.collect().requests.values()) == 2
 
 
-def test_an_observer_that_fails_costs_no_answer(served: Served, caplog: pytest.LogCaptureFixture) -> None:
+def test_an_observer_that_fails_costs_no_answer(
+    served: Served, caplog: pytest.LogCaptureFixture
+) -> None:
     class Broken(Observer):
         def on_request(self, pending: PendingRequest) -> None:
             raise RuntimeError("request")
@@ -318,7 +344,9 @@ class Executed(list[str]):
 STEPS = {"reset": ("take", "run", "hold", "begin_episode"), "act": ("take", "run", "ready", "act")}
 
 
-@pytest.mark.parametrize(("op", "step"), [(op, step) for op, steps in STEPS.items() for step in steps])
+@pytest.mark.parametrize(
+    ("op", "step"), [(op, step) for op, steps in STEPS.items() for step in steps]
+)
 def test_no_request_is_executed_of_which_a_deadline_said_that_it_never_will_be(
     op: str, step: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:

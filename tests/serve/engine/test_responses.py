@@ -15,7 +15,12 @@ from vlagents_ray.interface import Act, Obs
 from vlagents_ray.protocol.messages import Limits, Reply, Request
 from vlagents_ray.serve.config.deployment import LimitArgs
 from vlagents_ray.serve.engine import responses
-from vlagents_ray.serve.engine.responses import build_reply, public_error, raised_at, require_serializable
+from vlagents_ray.serve.engine.responses import (
+    build_reply,
+    public_error,
+    raised_at,
+    require_serializable,
+)
 from vlagents_ray.serve.queue.call_limits import CallLimits
 from vlagents_ray.serve.requests import PendingRequest
 from vlagents_ray.serve.sessions import Session
@@ -30,7 +35,9 @@ def large(nbytes: int) -> np.ndarray:
 
 def replied(act: Act) -> tuple[Reply, Session]:
     session = Session("s")
-    return build_reply(PendingRequest("s", Request("act", Obs()), lambda _: None), session, act, None, LIMIT), session
+    return build_reply(
+        PendingRequest("s", Request("act", Obs()), lambda _: None), session, act, None, LIMIT
+    ), session
 
 
 @pytest.mark.parametrize(
@@ -62,12 +69,17 @@ def test_no_info_may_be_said_with_none() -> None:
 def test_sessions_to_which_a_policy_gives_one_info_have_each_their_own() -> None:
     """What the server adds to one answer, such as a command to that robot, is in no other."""
     shared = {"upstream_ms": 1.0}
-    (one, _), (other, _) = replied(Act(np.zeros(1), info=shared)), replied(Act(np.zeros(1), info=shared))
+    (one, _), (other, _) = (
+        replied(Act(np.zeros(1), info=shared)),
+        replied(Act(np.zeros(1), info=shared)),
+    )
     one.act.info["command"] = "stop"
     assert other.act.info == shared == {"upstream_ms": 1.0}
 
 
-def test_nothing_of_what_is_too_large_is_copied_or_looked_at(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_nothing_of_what_is_too_large_is_copied_or_looked_at(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     monkeypatch.setattr(responses, "check_action", lambda *_: pytest.fail("looked at"))
     monkeypatch.setattr(np, "ascontiguousarray", lambda *_: pytest.fail("copied"))
     replied(Act(large(2**40)))
@@ -77,9 +89,14 @@ def test_nothing_of_what_is_too_large_is_copied_or_looked_at(monkeypatch: pytest
 
 @pytest.mark.parametrize(
     ("info", "said"),
-    [({"list": [0] * 10_000}, "more than 10000 values"), ({"a": [[[[[[[[0]]]]]]]]}, "nested deeper than 8")],
+    [
+        ({"list": [0] * 10_000}, "more than 10000 values"),
+        ({"a": [[[[[[[[0]]]]]]]]}, "nested deeper than 8"),
+    ],
 )
-def test_what_no_client_would_read_is_refused_where_it_was_made(info: dict[str, Any], said: str) -> None:
+def test_what_no_client_would_read_is_refused_where_it_was_made(
+    info: dict[str, Any], said: str
+) -> None:
     with pytest.raises(PolicyFailed, match=said):
         require_serializable(info)
 
@@ -99,7 +116,9 @@ def test_an_error_in_this_process_names_no_server() -> None:
 
 
 @pytest.mark.parametrize("fail", [lambda: json.loads("{"), lambda: np.linalg.inv(np.zeros((2, 2)))])
-def test_an_error_that_a_library_raised_names_the_line_of_the_caller(fail: Callable[[], Any]) -> None:
+def test_an_error_that_a_library_raised_names_the_line_of_the_caller(
+    fail: Callable[[], Any],
+) -> None:
     with pytest.raises(ValueError) as caught:  # noqa: PT011 - both libraries' errors are of this type
         fail()
     assert re.fullmatch(r" \(test_responses\.py:\d+\)", raised_at(caught.value))

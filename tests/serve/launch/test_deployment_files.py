@@ -1,4 +1,6 @@
-"""Deployment files, and servers whose settings cannot hold: all is refused before anything starts."""
+"""Deployment files, and servers whose settings cannot hold: all is refused before anything
+starts.
+"""
 
 from __future__ import annotations
 
@@ -34,13 +36,19 @@ def application(args: str) -> str:
         (application("{}"), "policy"),
         (application("{policy: noop, config: {xy: 1}}"), "xy"),
         (application("{policy: noop, batch: {max_size: 0}}"), "max_size"),
-        (application("{policy: noop, dialects: {vlagents: {}, gr00t: {port: 8080}}}"), "share port 8080"),
+        (
+            application("{policy: noop, dialects: {vlagents: {}, gr00t: {port: 8080}}}"),
+            "share port 8080",
+        ),
         (application("{policy: noop, dialects: {gr00t: {mapping: gr01t}}}"), "gr01t"),
         (application("{policy: noop, replicas: 1, autoscaling: {}}"), "exclude each other"),
         ("applications: 3", "applications"),
         (application("{policy: noop}") + "\nproxy_location: Nowhere", "proxy_location"),
         (application("{policy: noop}") + "\nlogging_config: {log_level: 3}", "log_level"),
-        (application("{policy: noop}").replace("name: a", "name: a, route_prefix: b"), "route_prefix"),
+        (
+            application("{policy: noop}").replace("name: a", "name: a, route_prefix: b"),
+            "route_prefix",
+        ),
         ("a: [", "YAML"),
     ],
 )
@@ -56,7 +64,9 @@ def test_a_file_says_where_to_listen_and_nobody_is_let_in_by_default(tmp_path: P
     file.write_text(application("{policy: noop}"))
     http = read_deployment(str(file)).http_options
     assert (http.host, http.port) == ("127.0.0.1", 8000)
-    file.write_text(application("{policy: noop}") + f"\nhttp_options: {{host: {EVERYWHERE}, port: 8123}}")
+    file.write_text(
+        application("{policy: noop}") + f"\nhttp_options: {{host: {EVERYWHERE}, port: 8123}}"
+    )
     http = read_deployment(str(file)).http_options
     assert (http.host, http.port) == (EVERYWHERE, 8123)
 
@@ -81,18 +91,24 @@ def test_every_shipped_deployment_file_is_valid(file: Path, tmp_path: Path) -> N
 @pytest.mark.parametrize(
     "read",
     [
-        lambda config: deployment(STORED, config=config, checkpoints={"choices": {"a": {"scales": 1}}}),
+        lambda config: deployment(
+            STORED, config=config, checkpoints={"choices": {"a": {"scales": 1}}}
+        ),
         lambda _: deployment("noop", checkpoints={"steps": True}),
         lambda config: deployment(STORED, config=config, checkpoints={"loaded": 0}),
     ],
     ids=["setting", "steps", "loaded"],
 )
-def test_checkpoints_that_cannot_be_chosen_are_refused(read: Callable[[dict[str, Any]], Any]) -> None:
+def test_checkpoints_that_cannot_be_chosen_are_refused(
+    read: Callable[[dict[str, Any]], Any],
+) -> None:
     with pytest.raises(ConfigError):
         read({"checkpoint": "x"})
 
 
-def test_nothing_starts_without_keys_off_loopback_or_certificates_or_on_ipv6(tmp_path: Path) -> None:
+def test_nothing_starts_without_keys_off_loopback_or_certificates_or_on_ipv6(
+    tmp_path: Path,
+) -> None:
     certificate, key = authority(tmp_path, "a").sign("server")
     other = authority(tmp_path, "b").sign("server")[1]
     wrong: list[tuple[str, dict[str, Any]]] = [

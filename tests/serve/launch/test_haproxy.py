@@ -91,17 +91,21 @@ def test_it_is_late_while_a_replica_that_runs_is_not_reached(running: int, rows:
 
 @contextmanager
 def proxied(folder: Path, *servers: str, settings: str = "") -> Iterator[str]:
-    """The URL of a HAProxy in front of an application with these servers; ADDRESS is one that never answers."""
+    """The URL of a HAProxy in front of an application with these servers; ADDRESS is one that
+    never answers.
+    """
     port = free_port()
     config = folder / "haproxy.cfg"
     with socket.create_server(("127.0.0.1", 0)) as silent:
         address = f"127.0.0.1:{silent.getsockname()[1]}"
         text = (
             f"global\n    maxconn {MOST_CONNECTIONS}\n"
-            "defaults\n    mode http\n    timeout connect 60s\n    timeout client 60s\n    timeout server 60s\n"
+            "defaults\n    mode http\n    timeout connect 60s\n    timeout client 60s\n    timeout "
+            "server 60s\n"
             f"frontend http_frontend\n    bind 127.0.0.1:{port}\n"
             "    acl routes path -i /-/routes\n"
-            '    http-request return status 200 content-type text/plain string "all applications" if routes\n'
+            '    http-request return status 200 content-type text/plain string "all applications" '
+            "if routes\n"
             "    default_backend http-app\n"
             "backend http-app\n" + settings + "".join(f"    server {one}\n" for one in servers)
         )
@@ -122,8 +126,15 @@ def seconds(setting: str) -> float:
     return int(number) / (1000 if unit == "ms" else 1)
 
 
-REPLICA, FALLBACK = "SERVE_REPLICA_app-Policy-1 ADDRESS", "SERVE_PROXY_ACTOR-fallback ADDRESS backup"
-UPGRADE = {"connection": "upgrade", "upgrade": "websocket", "sec-websocket-key": "dGhlIHNhbXBsZSBub25jZQ=="}
+REPLICA, FALLBACK = (
+    "SERVE_REPLICA_app-Policy-1 ADDRESS",
+    "SERVE_PROXY_ACTOR-fallback ADDRESS backup",
+)
+UPGRADE = {
+    "connection": "upgrade",
+    "upgrade": "websocket",
+    "sec-websocket-key": "dGhlIHNhbXBsZSBub25jZQ==",
+}
 needs_haproxy = pytest.mark.skipif(haproxy_binary() is None, reason="HAProxy is not installed")
 
 
@@ -144,15 +155,21 @@ listen stats
 
 
 def binds(launcher: Path, config: Path, server: str) -> list[str]:
-    """The addresses at which HAProxy would listen with the settings that Serve writes for a server of the backend."""
+    """The addresses at which HAProxy would listen with the settings that Serve writes for a
+    server of the backend.
+    """
     config.write_text(SERVES_OWN.format(server=server))
     subprocess.run([launcher, "-f", config], check=True)
     return re.findall(r"^ *bind (\S+)", config.read_text(), re.MULTILINE)
 
 
 @pytest.mark.parametrize("begins_empty", [False, True])
-def test_clients_are_refused_until_the_first_replica_runs(begins_empty: bool, tmp_path: Path) -> None:
-    """openpi's client waits for a server whose port is closed, and ends at a handshake that is refused or hangs."""
+def test_clients_are_refused_until_the_first_replica_runs(
+    begins_empty: bool, tmp_path: Path
+) -> None:
+    """openpi's client waits for a server whose port is closed, and ends at a handshake that is
+    refused or hangs.
+    """
     launcher, config = _launcher(tmp_path, "/bin/true"), tmp_path / "haproxy.cfg"
     own, public = ["127.0.0.1:9000", "127.0.0.1:9001"], ["127.0.0.1:8000", "192.0.2.7:8443"]
     if begins_empty:
@@ -181,7 +198,9 @@ def test_a_cluster_whose_haproxy_serves_others_opens_its_port_at_once(tmp_path: 
 def test_without_a_replica_that_answers_haproxy_does(
     servers: list[str], path: str, body: bytes | None, tmp_path: Path
 ) -> None:
-    """Serve keeps requests until there is a replica: for ever, where it waits for a GPU that no node has."""
+    """Serve keeps requests until there is a replica: for ever, where it waits for a GPU that no
+    node has.
+    """
     with proxied(tmp_path, *servers) as url:
         with pytest.raises(urllib.error.HTTPError, match="503") as refused:
             urllib.request.urlopen(urllib.request.Request(url + path, data=body), timeout=30)
@@ -204,8 +223,13 @@ def test_a_replica_may_take_its_time_and_a_websocket_waits_for_one(
 
 
 def test_a_frozen_replica_is_out_of_the_way_when_its_clients_leave_it() -> None:
-    """Each would else come back to it by the hash, now and then, until its next calls had ended, too."""
-    between = max(seconds(RAY_SERVE_HAPROXY_HEALTH_CHECK_FASTINTER), seconds(RAY_SERVE_HAPROXY_HEALTH_CHECK_DOWNINTER))
+    """Each would else come back to it by the hash, now and then, until its next calls had ended,
+    too.
+    """
+    between = max(
+        seconds(RAY_SERVE_HAPROXY_HEALTH_CHECK_FASTINTER),
+        seconds(RAY_SERVE_HAPROXY_HEALTH_CHECK_DOWNINTER),
+    )
     every, failures = seconds(ROBOTS[_CHECK_INTERVAL]), int(ROBOTS[_CHECK_FAILURES])
     assert every + every + (failures - 1) * (between + every) < SILENT_S
 
@@ -223,7 +247,9 @@ def test_a_replica_that_does_not_answer_gets_no_more_requests(tmp_path: Path) ->
     def answered(url: str) -> bool:
         try:
             for number in range(10):
-                request = urllib.request.Request(f"{url}/v1/act", headers={"x-session-id": f"session-{number}"})
+                request = urllib.request.Request(
+                    f"{url}/v1/act", headers={"x-session-id": f"session-{number}"}
+                )
                 urllib.request.urlopen(request, timeout=3).close()
         except OSError:
             return False
@@ -288,7 +314,9 @@ def answer_to(url: str, request: str, address: str = "127.0.0.1") -> bytes:
 
 @contextmanager
 def upgrading() -> Iterator[tuple[str, list[dict[str, str]]]]:
-    """A replica's line in HAProxy's settings, and the headers of the requests that reach the replica."""
+    """A replica's line in HAProxy's settings, and the headers of the requests that reach the
+    replica.
+    """
     headers: list[dict[str, str]] = []
 
     class Upgrade(BaseHTTPRequestHandler):
@@ -299,7 +327,8 @@ def upgrading() -> Iterator[tuple[str, list[dict[str, str]]]]:
             self.send_response(101)
             self.send_header("connection", "upgrade")
             self.send_header("upgrade", "websocket")
-            self.send_header("sec-websocket-accept", "s3pPLMBiTxaQ9kYGzzhZRbK+xOo=")  # for the key in UPGRADE
+            # For the key in UPGRADE.
+            self.send_header("sec-websocket-accept", "s3pPLMBiTxaQ9kYGzzhZRbK+xOo=")
             self.end_headers()
 
         def log_message(self, *_: Any) -> None:
@@ -319,7 +348,14 @@ def test_the_list_of_applications_is_hidden_in_each_encoding_of_its_path(tmp_pat
     encoded = [f"{plain[:at]}%{ord(plain[at]):02x}{plain[at + 1 :]}" for at in range(1, len(plain))]
     all_encoded = "/" + "".join(f"%{ord(character):02X}" for character in plain[1:])
     with upgrading() as (replica, reached), proxied(tmp_path, replica) as url:
-        for path in [plain, "/-/ROUTES", "/-/routes?x=1", all_encoded, *encoded, *map(str.upper, encoded)]:
+        for path in [
+            plain,
+            "/-/ROUTES",
+            "/-/routes?x=1",
+            all_encoded,
+            *encoded,
+            *map(str.upper, encoded),
+        ]:
             answer = answer_to(url, f"GET {path} HTTP/1.1\r\nhost: localhost\r\n\r\n")
             assert answer.startswith(b"HTTP/1.1 404"), path
         assert not reached
@@ -339,7 +375,9 @@ def test_no_replica_is_offered_compression(tmp_path: Path) -> None:
 
 
 @needs_haproxy
-@pytest.mark.parametrize("more", ["Content-Length: 5\r\n\r\nhello", "Transfer-Encoding: chunked\r\n\r\n"])
+@pytest.mark.parametrize(
+    "more", ["Content-Length: 5\r\n\r\nhello", "Transfer-Encoding: chunked\r\n\r\n"]
+)
 def test_a_handshake_with_a_body_is_refused_at_once(more: str, tmp_path: Path) -> None:
     """A replica would never answer it."""
     with upgrading() as (replica, reached), proxied(tmp_path, replica) as url:
@@ -352,8 +390,11 @@ def test_one_address_does_not_take_all_connections(tmp_path: Path) -> None:
     with upgrading() as (replica, _), proxied(tmp_path, replica) as url, ExitStack() as held:
         port = int(url.rpartition(":")[2])
         for _number in range(MOST_CONNECTIONS):
-            with suppress(OSError):  # HAProxy closes those beyond the limit, some before they are connected here
-                client = held.enter_context(socket.create_connection(("127.0.0.1", port), 10, ("127.0.0.2", 0)))
+            # HAProxy closes those beyond the limit, some before they are connected here.
+            with suppress(OSError):
+                client = held.enter_context(
+                    socket.create_connection(("127.0.0.1", port), 10, ("127.0.0.2", 0))
+                )
                 client.sendall(b"GET /healthz HTTP/1.1\r\n")
         assert answer_to(url, HANDSHAKE + "\r\n").startswith(b"HTTP/1.1 101")
         held.close()
@@ -382,13 +423,17 @@ def test_a_session_returns_from_serves_own_proxy_but_not_from_a_replica_where_it
         else:
             servers.append(f"SERVE_PROXY_ACTOR-fallback 127.0.0.1:{second} {checked} backup")
         balance = ROBOTS["RAY_SERVE_HAPROXY_BALANCE_ALGORITHM"]
-        settings = f"    balance {balance}    option httpchk GET /-/healthz\n    option abortonclose\n"
+        settings = (
+            f"    balance {balance}    option httpchk GET /-/healthz\n    option abortonclose\n"
+        )
         with proxied(tmp_path, *servers, settings=settings) as url:
             wait_for(lambda: {server_of(url, one) for one in sessions} == {other}, 30)
             up.set()
             names = (f"new-{number}" for number in itertools.count())
             wait_for(lambda: server_of(url, next(names)) == "thawing", 30)
-            assert {server_of(url, one) for one in sessions} == {"thawing" if other == "fallback" else other}
+            assert {server_of(url, one) for one in sessions} == {
+                "thawing" if other == "fallback" else other
+            }
 
 
 def listens(port: int) -> bool:

@@ -1,4 +1,6 @@
-"""Which process builds the applications of a server, what it waits for, how many GPUs it gets, and how it ends."""
+"""Which process builds the applications of a server, what it waits for, how many GPUs it gets,
+and how it ends.
+"""
 
 from __future__ import annotations
 
@@ -20,7 +22,13 @@ from vlagents_ray.ray_tools import head_monitor
 from vlagents_ray.ray_tools.private import gpus_here, long_polls
 from vlagents_ray.serve.access.key_store import new_key
 from vlagents_ray.serve.launch import server
-from vlagents_ray.serve.launch.deployment_file import Deployment, deployment, together, with_replicas_on, with_settings
+from vlagents_ray.serve.launch.deployment_file import (
+    Deployment,
+    deployment,
+    together,
+    with_replicas_on,
+    with_settings,
+)
 from vlagents_ray.serve.launch.server import deploy, wait_for_proxies
 from vlagents_ray.serve.replica import replica
 
@@ -50,7 +58,12 @@ def test_a_server_on_its_own_ray_builds_its_applications_itself(
 ) -> None:
     """For a file Serve starts a process that imports everything once more, which takes a second."""
     client = FakeClient(monkeypatch)
-    two = together({"a": deployment("noop", replicas=2), "b": with_settings(deployment("noop"), {"action_dim": 3})})
+    two = together(
+        {
+            "a": deployment("noop", replicas=2),
+            "b": with_settings(deployment("noop"), {"action_dim": 3}),
+        }
+    )
     deploy(client, two, own=True, ingress=not ends_at_once)
     assert client.by_serve == []
     assert [(app.name, app.route_prefix) for app in client.built_here] == [("a", "/a"), ("b", "/b")]
@@ -71,15 +84,21 @@ def test_a_server_on_its_own_ray_builds_its_applications_itself(
         changed({}),
     ],
 )
-def test_what_serve_must_apply_is_deployed_by_serve(config: Deployment, monkeypatch: pytest.MonkeyPatch) -> None:
-    """So that another deployment of the file changes it without new replicas; in a cluster of others, all of it is."""
+def test_what_serve_must_apply_is_deployed_by_serve(
+    config: Deployment, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """So that another deployment of the file changes it without new replicas; in a cluster of
+    others, all of it is.
+    """
     client = FakeClient(monkeypatch)
     deploy(client, config, own=config != changed({}), ingress=True)
     assert (client.by_serve, client.built_here) == ([config.for_serve()], [])
 
 
 @pytest.mark.parametrize("deaths", [0, 2])
-def test_a_proxy_that_serve_replaces_is_waited_for(monkeypatch: pytest.MonkeyPatch, deaths: int) -> None:
+def test_a_proxy_that_serve_replaces_is_waited_for(
+    monkeypatch: pytest.MonkeyPatch, deaths: int
+) -> None:
     """Serve kills one that does not start within some seconds."""
     asked: list[str] = []
 
@@ -108,7 +127,8 @@ ANYWHERE = "0.0.0.0"  # noqa: S104 - what is warned of
 
 
 @pytest.mark.parametrize(
-    ("host", "plain", "warned"), [(ANYWHERE, False, True), (ANYWHERE, True, False), ("127.0.0.1", False, False)]
+    ("host", "plain", "warned"),
+    [(ANYWHERE, False, True), (ANYWHERE, True, False), ("127.0.0.1", False, False)],
 )
 def test_a_server_whose_keys_cross_a_network_unencrypted_warns(
     tmp_path: Path,
@@ -126,7 +146,9 @@ def test_a_server_whose_keys_cross_a_network_unencrypted_warns(
     monkeypatch.setattr(server, "_ray", no_ray)
     with (
         pytest.raises(PolicyUnavailable, match="no Ray"),
-        server.running_server(deployment("noop"), host=host, keys_file=tmp_path / "keys", plain_http=plain),
+        server.running_server(
+            deployment("noop"), host=host, keys_file=tmp_path / "keys", plain_http=plain
+        ),
     ):
         pass
     assert ("--plain-http" in caplog.text) == warned
@@ -162,8 +184,17 @@ def test_a_replica_stands_on_each_gpu_unless_the_file_says_otherwise(
         ({}, 0.0),
         ({"resources": {"num_gpus": 1}}, 1.0),
         ({"resources": {"num_gpus": 0.5}, "replicas": 3}, 1.5),
-        ({"resources": {"num_gpus": 1}, "autoscaling": {"min_replicas": 0, "max_replicas": 4}}, 0.0),
-        ({"resources": {"num_gpus": 1}, "autoscaling": {"initial_replicas": 2, "max_replicas": 4}}, 2.0),
+        (
+            {"resources": {"num_gpus": 1}, "autoscaling": {"min_replicas": 0, "max_replicas": 4}},
+            0.0,
+        ),
+        (
+            {
+                "resources": {"num_gpus": 1},
+                "autoscaling": {"initial_replicas": 2, "max_replicas": 4},
+            },
+            2.0,
+        ),
     ],
 )
 @pytest.mark.parametrize("own", [True, False])
@@ -177,7 +208,11 @@ def test_more_gpus_than_this_machine_has_are_refused_at_once(
     if not wanted:
         return
     monkeypatch.setattr(ray, "cluster_resources", dict)
-    with pytest.raises(ConfigError, match=f"need {wanted:g} GPUs, this machine has 0") if own else nullcontext():
+    with (
+        pytest.raises(ConfigError, match=f"need {wanted:g} GPUs, this machine has 0")
+        if own
+        else nullcontext()
+    ):
         server._require_gpus(deployment("noop", **said))
     where = "machine" if own else "cluster"
     assert f"need {wanted:g} GPUs, this {where} has 0; want less" in str(
@@ -205,7 +240,9 @@ def test_more_gpus_than_this_machine_has_are_refused_before_a_ray_starts(
         pass
 
 
-def test_gpus_are_counted_as_ray_counts_them_less_those_that_are_hidden(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_gpus_are_counted_as_ray_counts_them_less_those_that_are_hidden(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     nvidia = accelerators.get_accelerator_manager_for_resource("GPU")
     monkeypatch.setattr(nvidia, "get_current_node_num_accelerators", staticmethod(lambda: 4))
     monkeypatch.delenv("CUDA_VISIBLE_DEVICES", raising=False)
@@ -222,7 +259,9 @@ def test_what_a_cluster_is_missing_is_repeated_until_it_is_there(
     monkeypatch.setattr(server, "_REMIND_S", 0.0)
     missing = iter(["a GPU", "a GPU", None])
     states = iter(["DEPLOYING", "DEPLOYING", "DEPLOYING", "RUNNING"])
-    client = SimpleNamespace(status=lambda: SimpleNamespace(applications={"a": SimpleNamespace(status=next(states))}))
+    client = SimpleNamespace(
+        status=lambda: SimpleNamespace(applications={"a": SimpleNamespace(status=next(states))})
+    )
     monkeypatch.setattr(server, "_http_reason", lambda _: None)
     server.wait_until_ready(client, {"a": "url"}, ["a"], float("inf"), lambda: next(missing))
     assert [record.getMessage() for record in caplog.records] == ["waiting: a GPU"] * 2
@@ -230,7 +269,10 @@ def test_what_a_cluster_is_missing_is_repeated_until_it_is_there(
 
 @pytest.mark.parametrize(("given", "visible"), [([], ""), (["2"], "2")])
 def test_gpus_are_hidden_from_a_replica_to_which_ray_gave_none(
-    caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch, given: list[str], visible: str
+    caplog: pytest.LogCaptureFixture,
+    monkeypatch: pytest.MonkeyPatch,
+    given: list[str],
+    visible: str,
 ) -> None:
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "2")
     monkeypatch.setattr(replica, "gpus_here", lambda: 4.0)
@@ -242,14 +284,23 @@ def test_gpus_are_hidden_from_a_replica_to_which_ray_gave_none(
 # The end.
 
 
-@pytest.mark.parametrize(("ends", "head", "said"), [(True, True, False), (False, True, True), (False, False, False)])
+@pytest.mark.parametrize(
+    ("ends", "head", "said"), [(True, True, False), (False, True, True), (False, False, False)]
+)
 def test_a_controller_that_ends_or_that_does_not_answer_is_no_error(
-    ends: bool, head: bool, said: bool, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+    ends: bool,
+    head: bool,
+    said: bool,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
 ) -> None:
     ending = SimpleNamespace(remote=lambda: None)
     controller = SimpleNamespace(graceful_shutdown=SimpleNamespace(options=lambda **_: ending))
     client = SimpleNamespace(
-        _controller=controller, handle_cache={}, shutdown_cached_handles=lambda: None, _shutdown=False
+        _controller=controller,
+        handle_cache={},
+        shutdown_cached_handles=lambda: None,
+        _shutdown=False,
     )
     monkeypatch.setattr(ray, "wait", lambda refs, **_: (refs, []) if ends else ([], refs))
     monkeypatch.setattr(head_monitor, "head_is_gone", lambda: not head)
@@ -259,16 +310,24 @@ def test_a_controller_that_ends_or_that_does_not_answer_is_no_error(
     assert ("has not ended within" in caplog.text) is said
 
 
-def test_each_long_poll_of_a_controller_can_be_stopped_before_it_ends(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_each_long_poll_of_a_controller_can_be_stopped_before_it_ends(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     """Ray would tell the user of a failed task, in one end of four."""
     stopped: list[str] = []
     own = SimpleNamespace(stop=lambda: stopped.append("own"))
-    shared = SimpleNamespace(long_poll_client=SimpleNamespace(stop=lambda: stopped.append("shared")))
+    shared = SimpleNamespace(
+        long_poll_client=SimpleNamespace(stop=lambda: stopped.append("shared"))
+    )
     monkeypatch.setattr(SharedRouterLongPollClient, "get_or_create", lambda *_: shared)
     used = SimpleNamespace(
-        _router=SimpleNamespace(_asyncio_router=SimpleNamespace(long_poll_client=own, _event_loop=1))
+        _router=SimpleNamespace(
+            _asyncio_router=SimpleNamespace(long_poll_client=own, _event_loop=1)
+        )
     )
     unused = SimpleNamespace(_router=None)
-    for poll in long_polls(SimpleNamespace(_controller=None, handle_cache={"used": used, "unused": unused})):
+    for poll in long_polls(
+        SimpleNamespace(_controller=None, handle_cache={"used": used, "unused": unused})
+    ):
         poll.stop()
     assert stopped == ["own", "shared"]

@@ -1,4 +1,6 @@
-"""Sessions with different LoRA adapters are sessions of one model: one batch, one load, and their own identity."""
+"""Sessions with different LoRA adapters are sessions of one model: one batch, one load, and
+their own identity.
+"""
 
 from __future__ import annotations
 
@@ -20,7 +22,11 @@ from vlagents_ray.serve.config.deployment import CheckpointArgs
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.settings import wrong_settings
 
-CHOICES = {"stack": {"adapter": "/runs/stack"}, "pour": {"adapter": "org/pour@main"}, "late": {"checkpoint": "/runs/b"}}
+CHOICES = {
+    "stack": {"adapter": "/runs/stack"},
+    "pour": {"adapter": "org/pour@main"},
+    "late": {"checkpoint": "/runs/b"},
+}
 
 
 class Adapted(Agent):
@@ -44,7 +50,10 @@ class Adapted(Agent):
     def act_batch(self, obs: Sequence[Obs], sessions: Sequence[Agent]) -> list[Act | Exception]:
         names = [session.adapter for session in sessions]  # type: ignore[attr-defined]
         self.batches.append(names)
-        return [Act(np.zeros(1), info={POLICY: {"version": 0, "fingerprint": name}} if name else {}) for name in names]
+        return [
+            Act(np.zeros(1), info={POLICY: {"version": 0, "fingerprint": name}} if name else {})
+            for name in names
+        ]
 
 
 @pytest.fixture
@@ -82,14 +91,28 @@ def test_sessions_of_one_base_act_in_one_batch_and_say_what_acted(
     serve: Callable[..., Engine], made: list[Adapted]
 ) -> None:
     engine = serve()
-    assert told(engine, "s0", checkpoint="stack") == {"checkpoint": "/runs/stack", "weights": "with:stack"}
-    assert told(engine, "s1", checkpoint="pour") == {"checkpoint": "org/pour@main", "weights": "with:pour"}
+    assert told(engine, "s0", checkpoint="stack") == {
+        "checkpoint": "/runs/stack",
+        "weights": "with:stack",
+    }
+    assert told(engine, "s1", checkpoint="pour") == {
+        "checkpoint": "org/pour@main",
+        "weights": "with:pour",
+    }
     assert told(engine, "s2") == {"checkpoint": "/runs/a", "weights": "whole:/runs/a"}
-    assert told(engine, "s3", checkpoint="late") == {"checkpoint": "/runs/b", "weights": "whole:/runs/b"}
+    assert told(engine, "s3", checkpoint="late") == {
+        "checkpoint": "/runs/b",
+        "weights": "whole:/runs/b",
+    }
     replies: list[queue.SimpleQueue[Reply]] = [queue.SimpleQueue() for _ in range(4)]
-    engine.queue.put(*(checked(engine, f"s{i}", Request("act", Obs()), replies[i].put) for i in range(4)))
+    engine.queue.put(
+        *(checked(engine, f"s{i}", Request("act", Obs()), replies[i].put) for i in range(4))
+    )
     acts = [one.get(timeout=120).act for one in replies]
-    assert [one.info[POLICY]["fingerprint"] for one in acts if one is not None][:2] == ["stack", "pour"]
+    assert [one.info[POLICY]["fingerprint"] for one in acts if one is not None][:2] == [
+        "stack",
+        "pour",
+    ]
     assert [agent.batches for agent in made] == [[["stack", "pour", ""]], [[""]]]
 
 
@@ -112,7 +135,9 @@ def test_a_swap_keeps_the_adapters(serve: Callable[..., Engine], made: list[Adap
     engine.models.configure({"checkpoint": "/runs/c"})
     while told(engine, "s0", checkpoint="stack") and len(made) < 2:
         pass
-    assert [agent.settings["adapters"] for agent in made] == [{"stack": "/runs/stack", "pour": "org/pour@main"}] * 2
+    assert [agent.settings["adapters"] for agent in made] == [
+        {"stack": "/runs/stack", "pour": "org/pour@main"}
+    ] * 2
     assert made[1].settings["checkpoint"] == "/runs/c"
 
 
@@ -120,18 +145,30 @@ def test_a_swap_keeps_the_adapters(serve: Callable[..., Engine], made: list[Adap
     ("options", "says"),
     [
         ({"checkpoint": "fold"}, r"got 'fold', want one of \['late', 'pour', 'stack'\]"),
-        ({"checkpoint": "stack", "checkpoint_step": 3}, "got 3 with the adapter 'stack', which has none"),
-        ({"checkpoint": "stack", "adapter": "pour"}, "got 'pour' and checkpoint 'stack', want one of them"),
+        (
+            {"checkpoint": "stack", "checkpoint_step": 3},
+            "got 3 with the adapter 'stack', which has none",
+        ),
+        (
+            {"checkpoint": "stack", "adapter": "pour"},
+            "got 'pour' and checkpoint 'stack', want one of them",
+        ),
     ],
 )
-def test_what_is_not_offered_is_refused(serve: Callable[..., Engine], options: dict[str, Any], says: str) -> None:
+def test_what_is_not_offered_is_refused(
+    serve: Callable[..., Engine], options: dict[str, Any], says: str
+) -> None:
     with pytest.raises(UnknownCheckpoint, match=says):
         begin(serve(steps=True), "s", **options)
 
 
-@pytest.mark.parametrize("settings", [{"adapter": "/runs/stack", "checkpoint": "/runs/b"}, {"adapter": 3}])
+@pytest.mark.parametrize(
+    "settings", [{"adapter": "/runs/stack", "checkpoint": "/runs/b"}, {"adapter": 3}]
+)
 def test_an_adapter_stands_alone(settings: dict[str, Any]) -> None:
-    with pytest.raises(ValueError, match=r"stack: got .*, want \{adapter: FOLDER or org/name@COMMIT\} alone") as error:
+    with pytest.raises(
+        ValueError, match=r"stack: got .*, want \{adapter: FOLDER or org/name@COMMIT\} alone"
+    ) as error:
         CheckpointArgs(choices={"stack": settings})
     assert "choices" in str(wrong_settings(error.value, CheckpointArgs))
 
@@ -143,8 +180,16 @@ def of(settings: Mapping[str, Any]) -> dict[str, Any]:
 
 def test_adapters_of_the_settings_stay_beside_those_of_the_deployment() -> None:
     both = of({"checkpoint": "/runs/a", "adapters": {"fold": "/runs/fold", "stack": "/runs/stack"}})
-    assert both["adapters"] == {"fold": "/runs/fold", "stack": "/runs/stack", "pour": "org/pour@main"}
-    with pytest.raises(ConfigError, match=r"got \['stack'\] both in the policy's settings and among"):
+    assert both["adapters"] == {
+        "fold": "/runs/fold",
+        "stack": "/runs/stack",
+        "pour": "org/pour@main",
+    }
+    with pytest.raises(
+        ConfigError, match=r"got \['stack'\] both in the policy's settings and among"
+    ):
         of({"checkpoint": "/runs/a", "adapters": {"stack": "/runs/other"}})
-    with pytest.raises(ConfigError, match=r"adapters: got \['stack'\], want a folder or hub id by the name"):
+    with pytest.raises(
+        ConfigError, match=r"adapters: got \['stack'\], want a folder or hub id by the name"
+    ):
         of({"checkpoint": "/runs/a", "adapters": ["stack"]})

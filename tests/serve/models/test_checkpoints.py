@@ -1,4 +1,6 @@
-"""Sessions choose among the checkpoints of a deployment, which swaps its own: loading, sharing, making room."""
+"""Sessions choose among the checkpoints of a deployment, which swaps its own: loading, sharing,
+making room.
+"""
 
 from __future__ import annotations
 
@@ -63,13 +65,21 @@ def test_sessions_act_by_the_checkpoint_that_they_chose(serving: Callable[..., E
     engine = serving(choices=["b/2"], steps=True, loaded=3)
     assert reset(engine, "own") == "a/1"
     chosen = begin(engine, "chosen", checkpoint="b", seed=4).get(timeout=10)
-    assert chosen.info == {"checkpoint": "b/2", "options": {"seed": 4}}, "the choice is not the policy's business"
+    assert chosen.info == {"checkpoint": "b/2", "options": {"seed": 4}}, (
+        "the choice is not the policy's business"
+    )
     assert reset(engine, "step", checkpoint_step=30) == "a/30"
     for step in range(1, 20):
-        assert [act(engine, name) for name in ("own", "chosen", "step")] == [[1, step], [2, step], [30, step]]
+        assert [act(engine, name) for name in ("own", "chosen", "step")] == [
+            [1, step],
+            [2, step],
+            [30, step],
+        ]
 
 
-def test_a_batch_is_run_checkpoint_by_checkpoint(serving: Callable[..., Engine], library: Library) -> None:
+def test_a_batch_is_run_checkpoint_by_checkpoint(
+    serving: Callable[..., Engine], library: Library
+) -> None:
     engine = serving(choices=["b/2"])
     for i in range(4):
         reset(engine, f"s{i}", checkpoint="b" if i % 2 else None)
@@ -120,18 +130,24 @@ def test_loading_one_checkpoint_keeps_no_session_of_another_waiting(
     assert library.loads["b/2"] == 1, "once for all who need it"
 
 
-def test_what_does_not_load_says_why_and_is_tried_again(serving: Callable[..., Engine], library: Library) -> None:
+def test_what_does_not_load_says_why_and_is_tried_again(
+    serving: Callable[..., Engine], library: Library
+) -> None:
     engine = serving(choices=["broken"])
     reset(engine, "own")
     for tried in (1, 2):
-        with pytest.raises(CheckpointFailed, match="checkpoint 'b' did not load: FileNotFoundError; the server"):
+        with pytest.raises(
+            CheckpointFailed, match="checkpoint 'b' did not load: FileNotFoundError; the server"
+        ):
             reset(engine, "chosen", checkpoint="b")
         assert library.loads["broken"] == tried
     assert act(engine, "own") == [1, 1]
     assert engine.models.describe()["loaded"] == ["a/1"]
 
 
-def test_the_least_recently_used_checkpoint_makes_room(serving: Callable[..., Engine], library: Library) -> None:
+def test_the_least_recently_used_checkpoint_makes_room(
+    serving: Callable[..., Engine], library: Library
+) -> None:
     engine = serving(choices=["b/2", "c/3"])
     reset(engine, "s", checkpoint="b")
     reset(engine, "s")  # the own one is the last that was used
@@ -149,7 +165,9 @@ def test_memory_is_given_back(serving: Callable[..., Engine], library: Library) 
     assert set(library.alive) == {"b/2"}
 
 
-def test_a_checkpoint_in_use_stays_until_an_episode_ends(serving: Callable[..., Engine], library: Library) -> None:
+def test_a_checkpoint_in_use_stays_until_an_episode_ends(
+    serving: Callable[..., Engine], library: Library
+) -> None:
     engine = serving(choices=["b/2", "c/3"])
     reset(engine, "own")
     reset(engine, "chosen", checkpoint="b")
@@ -192,7 +210,9 @@ def test_a_checkpoint_that_does_not_fit_into_memory_waits_for_another_to_leave(
 def test_ten_checkpoints_have_their_turns_with_room_for_two(
     serving: Callable[..., Engine], library: Library, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Ten clients, each with a checkpoint of its own, that begin one episode after the other for ever."""
+    """Ten clients, each with a checkpoint of its own, that begin one episode after the other for
+    ever.
+    """
     monkeypatch.setattr(model_manager, "PATIENCE_S", 0.0)
     engine = serving(steps=True)
     replies: queue.SimpleQueue[tuple[int, Reply]] = queue.SimpleQueue()
@@ -316,19 +336,26 @@ def test_a_session_that_closes_while_it_arrives_keeps_no_checkpoint(
     assert holders(there) == {"a/1": 0}
 
 
-def test_an_episode_that_could_not_begin_keeps_no_checkpoint(serving: Callable[..., Engine]) -> None:
+def test_an_episode_that_could_not_begin_keeps_no_checkpoint(
+    serving: Callable[..., Engine],
+) -> None:
     engine = serving(choices=["b/2"], loaded=1)
-    assert isinstance(begin(engine, "s", checkpoint="b", fail=True).get(timeout=10).error, PolicyFailed)
+    assert isinstance(
+        begin(engine, "s", checkpoint="b", fail=True).get(timeout=10).error, PolicyFailed
+    )
     assert reset(engine, "another") == "a/1"
 
 
-def test_each_checkpoint_has_a_contract_of_its_own(serving: Callable[..., Engine], library: Library) -> None:
+def test_each_checkpoint_has_a_contract_of_its_own(
+    serving: Callable[..., Engine], library: Library
+) -> None:
     library.joints = {"a/1": 2, "b/2": 3}
     engine = serving(choices=["b/2"])
     two, three = ({"state": {"joints": np.zeros(n, np.float32)}} for n in (2, 3))
     chosen = {"checkpoint": "b"}
     assert ask(engine, "s", "reset", obs=two).get(timeout=10).error is None
-    early = ask(engine, "t", "reset", obs=two, kwargs=chosen).get(timeout=10)  # it is not loaded yet
+    # It is not loaded yet.
+    early = ask(engine, "t", "reset", obs=two, kwargs=chosen).get(timeout=10)
     assert isinstance(early.error, InvalidObservation)
     with pytest.raises(InvalidObservation):
         ask(engine, "t", "reset", obs=two, kwargs=chosen)
@@ -349,7 +376,9 @@ def test_a_stopping_replica_turns_away_who_waits(library: Library) -> None:
     assert library.closed == ["a/1"]
 
 
-def test_a_session_that_moves_takes_its_checkpoint_along(serving: Callable[..., Engine], library: Library) -> None:
+def test_a_session_that_moves_takes_its_checkpoint_along(
+    serving: Callable[..., Engine], library: Library
+) -> None:
     here, there = serving(choices=["b/2"]), serving(choices=["b/2"])
     elsewhere = serving(choices=["b/4"])
     reset(here, "s", checkpoint="b")
@@ -384,7 +413,9 @@ class Computed(Agent):
         self.weights_id = weights
 
 
-def test_what_is_loaded_is_told_by_its_digest_in_the_metadata_and_with_each_reset(tmp_path: Path) -> None:
+def test_what_is_loaded_is_told_by_its_digest_in_the_metadata_and_with_each_reset(
+    tmp_path: Path,
+) -> None:
     """Of files that `find_checkpoint` found, or what the agent says itself."""
     file = tmp_path / "weights.pt"
     file.write_bytes(b"1")
@@ -395,7 +426,10 @@ def test_what_is_loaded_is_told_by_its_digest_in_the_metadata_and_with_each_rese
         engine.start()
         try:
             reply = begin(engine, "s").get(timeout=10)
-            assert reply.info == {"weights": told["digest"], **({"revision": "c0ffee"} if own else {})}
+            assert reply.info == {
+                "weights": told["digest"],
+                **({"revision": "c0ffee"} if own else {}),
+            }
             assert engine.models.describe()["weights"] == [told]
             assert engine.models.weights == told
         finally:
@@ -428,7 +462,9 @@ def test_the_statistics_of_the_training_are_in_the_metadata_of_the_weights(
 
 
 def test_sessions_move_between_replicas_with_the_same_weights_only(tmp_path: Path) -> None:
-    """A replica that started after training had overwritten the checkpoint has others, by the same settings."""
+    """A replica that started after training had overwritten the checkpoint has others, by the
+    same settings.
+    """
     file = tmp_path / "weights.pt"
     versions = []
     for content in (b"1", b"1", b"2"):
@@ -440,7 +476,8 @@ def test_sessions_move_between_replicas_with_the_same_weights_only(tmp_path: Pat
     assert versions[0] == versions[1] != versions[2]
 
 
-# A deployment's own settings change while it runs: new episodes get the new ones, running ones end on the old.
+# A deployment's own settings change while it runs: new episodes get the new ones, running ones end
+# on the old.
 
 
 def swap(engine: Engine, checkpoint: str) -> None:
@@ -477,12 +514,16 @@ def test_running_episodes_end_on_the_old_checkpoint_and_new_ones_begin_on_the_ne
     wait_for(lambda: library.closed == ["a/1"] and set(library.alive) == {"b/2"})
 
 
-def test_a_checkpoint_that_does_not_load_leaves_the_old_one_in_place(serving: Callable[..., Engine]) -> None:
+def test_a_checkpoint_that_does_not_load_leaves_the_old_one_in_place(
+    serving: Callable[..., Engine],
+) -> None:
     engine = serving()
     reset(engine, "old")
     swap(engine, "broken")
     wait_for(lambda: state(engine) is not None and state(engine)["state"] == "failed")
-    assert state(engine)["error"].endswith("did not load: FileNotFoundError; the server's log says why")
+    assert state(engine)["error"].endswith(
+        "did not load: FileNotFoundError; the server's log says why"
+    )
     assert act(engine, "old") == [1, 1]
     assert reset(engine, "new") == "a/1"
     engine.models.configure({"checkpoint": "a/{step}", "checkpoint_step": 1})
@@ -572,7 +613,9 @@ def test_a_third_waits_for_the_episodes_on_the_first(serving: Callable[..., Engi
     assert reset(engine, "third") == "c/3"
 
 
-def test_replicas_with_different_settings_have_different_versions(serving: Callable[..., Engine]) -> None:
+def test_replicas_with_different_settings_have_different_versions(
+    serving: Callable[..., Engine],
+) -> None:
     here, there = serving(), serving()
     assert here.models.version == there.models.version
     swapped(here, "b/2")
@@ -581,14 +624,17 @@ def test_replicas_with_different_settings_have_different_versions(serving: Calla
     assert here.models.version == there.models.version
 
 
-def test_a_swap_without_room_takes_that_of_a_choice(serving: Callable[..., Engine], library: Library) -> None:
+def test_a_swap_without_room_takes_that_of_a_choice(
+    serving: Callable[..., Engine], library: Library
+) -> None:
     engine = serving(choices=["c/3"])
     reset(engine, "own")
     reset(engine, "chosen", checkpoint="c")
     gate = library.hold("b/2")
     swap(engine, "b/2")
     wait_for(lambda: engine.models._cache.draining != "")
-    again = begin(engine, "chosen", checkpoint="c")  # its last episode is over: the room goes to the swap
+    # Its last episode is over: the room goes to the swap.
+    again = begin(engine, "chosen", checkpoint="c")
     library.wait_for("b/2")
     assert reset(engine, "another") == "a/1"
     gate.set()

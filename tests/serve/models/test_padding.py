@@ -107,11 +107,15 @@ def test_a_batch_is_padded_up_to_the_next_size(serving: Callable[..., Engine]) -
     answers = [replies.get(timeout=10) for _ in names[1:]]
     assert [len(batch) for batch in agent.batches] == [8, 2]
     assert [reply.act.info["name"] for reply in answers if reply.act] == names[1:]
-    assert [reply.act.action.tolist() for reply in answers if reply.act] == [[i, 1] for i in range(1, 11)]
+    assert [reply.act.action.tolist() for reply in answers if reply.act] == [
+        [i, 1] for i in range(1, 11)
+    ]
     assert [reply.timing["batch_size"] for reply in answers] == [8] * 8 + [2] * 2
 
 
-def test_padding_acts_as_a_session_of_its_own_on_what_a_neighbour_sees(serving: Callable[..., Engine]) -> None:
+def test_padding_acts_as_a_session_of_its_own_on_what_a_neighbour_sees(
+    serving: Callable[..., Engine],
+) -> None:
     agent = Compiled()
     engine = serving(agent, **SIZED)
     ask(engine, "first", "reset")
@@ -120,7 +124,8 @@ def test_padding_acts_as_a_session_of_its_own_on_what_a_neighbour_sees(serving: 
         reply = ask(engine, "second", "act", value=7)
         assert (reply.act.action.tolist(), reply.act.info["name"]) == ([7, step], "second")
         assert reply.timing["batch_size"] == 1
-        assert agent.batches[-1] == ["second", "first"]  # the row beside it began as the first session did
+        # The row beside it began as the first session did.
+        assert agent.batches[-1] == ["second", "first"]
         assert agent.seen == [7, 7]
     assert len(engine.sessions) == 2
     reply = ask(engine, "first", "act")
@@ -151,9 +156,12 @@ def test_a_policy_that_pads_gets_the_batch_as_it_is(serving: Callable[..., Engin
     assert ask(engine, "a", "act", 3).act.action.tolist() == [3, 1]
 
 
-def test_a_refused_first_reset_is_not_what_padding_begins_with(serving: Callable[..., Engine]) -> None:
+def test_a_refused_first_reset_is_not_what_padding_begins_with(
+    serving: Callable[..., Engine],
+) -> None:
     engine = serving(Compiled(), **SIZED)
-    refused = answered(engine, "bad", Request("reset", Obs(), "bad"))  # lacks the `env` that the policy needs
+    # Lacks the `env` that the policy needs.
+    refused = answered(engine, "bad", Request("reset", Obs(), "bad"))
     assert isinstance(refused.error, PolicyFailed)
     ask(engine, "good", "reset")
     assert ask(engine, "good", "act").error is None
@@ -170,7 +178,14 @@ def test_the_largest_size_is_the_batch_limit(args: dict[str, Any], max_size: int
 
 
 @pytest.mark.parametrize(
-    "args", [{"sizes": []}, {"sizes": [0, 1]}, {"sizes": [2, 1]}, {"sizes": [1, 1]}, {"sizes": [1, 8], "max_size": 16}]
+    "args",
+    [
+        {"sizes": []},
+        {"sizes": [0, 1]},
+        {"sizes": [2, 1]},
+        {"sizes": [1, 1]},
+        {"sizes": [1, 8], "max_size": 16},
+    ],
 )
 def test_sizes_that_contradict_are_refused(args: dict[str, Any]) -> None:
     with pytest.raises(ValidationError, match="sizes"):

@@ -48,7 +48,9 @@ ROOT = Path(__file__).parents[3]
 
 def agent(policy: str = "Telling", **config: Any) -> ChildAgent:
     settings = Settings(f"python_env_agents:{policy}", config, 16, "1")
-    return ChildAgent(Child(sys.executable, settings, {"PYTHONPATH": f"{SUPPORT}:{ROOT}", "VARIABLE": "set"}))
+    return ChildAgent(
+        Child(sys.executable, settings, {"PYTHONPATH": f"{SUPPORT}:{ROOT}", "VARIABLE": "set"})
+    )
 
 
 @pytest.fixture(scope="module")
@@ -96,7 +98,9 @@ def test_what_was_loaded_there_is_known_here(engine: Engine) -> None:
     told = engine.models.weights
     assert told["digest"]
     assert (ask(engine, "weights", "reset").info or {})["weights"] == told["digest"]
-    assert (ask(engine, "adapted", "reset", kwargs={"adapter": "stack"}).info or {})["weights"] == "with stack"
+    assert (ask(engine, "adapted", "reset", kwargs={"adapter": "stack"}).info or {})[
+        "weights"
+    ] == "with stack"
     assert engine.contract.action.dim == 1
 
 
@@ -140,7 +144,8 @@ def test_one_that_hangs_is_noticed_and_keeps_nobody_waiting() -> None:
     pid = info(ask(one, "a", "reset"))["pid"]
     assert one.ready
     os.kill(pid, signal.SIGSTOP)
-    wait_for(lambda: psutil.Process(pid).status() == psutil.STATUS_STOPPED, 30)  # else it may answer once more
+    # Else it may answer once more.
+    wait_for(lambda: psutil.Process(pid).status() == psutil.STATUS_STOPPED, 30)
     replies: list[Reply] = []
     submit(one, "a", Request("act", observation()), replies.append)
     wait_for(lambda: not one.ready, 30)
@@ -153,9 +158,15 @@ def test_one_that_hangs_is_noticed_and_keeps_nobody_waiting() -> None:
 def test_a_batch_stays_a_batch_and_sessions_stay_apart(engine: Engine) -> None:
     names = [f"session {i}" for i in range(7)]
     for i, name in enumerate(names):
-        assert info(ask(engine, name, "reset", i, instruction=f"task {i}"))["instruction"] == f"task {i}"
+        assert (
+            info(ask(engine, name, "reset", i, instruction=f"task {i}"))["instruction"]
+            == f"task {i}"
+        )
     for step in (1, 2, 3):
-        replies = ask_all(engine, [(name, Request("act", observation(10 * step + i))) for i, name in enumerate(names)])
+        replies = ask_all(
+            engine,
+            [(name, Request("act", observation(10 * step + i))) for i, name in enumerate(names)],
+        )
         for i, told in enumerate(map(info, replies)):
             assert (told["batch"], told["acts"], told["instruction"]) == (7, step, f"task {i}")
             assert told["seen"] == [i, *(10 * s + i for s in range(1, step + 1))]
@@ -219,7 +230,9 @@ def test_a_session_that_cannot_move_stays(other: Engine) -> None:
 
 
 @pytest.mark.parametrize(("ends", "status"), [("is killed", "-9"), ("exits in an act", "7")])
-def test_a_child_that_dies_loses_the_connection_and_makes_the_replica_unhealthy(ends: str, status: str) -> None:
+def test_a_child_that_dies_loses_the_connection_and_makes_the_replica_unhealthy(
+    ends: str, status: str
+) -> None:
     one = Engine(agent())
     one.start()
     told = info(ask(one, "a", "reset", instruction="a task"))
@@ -228,7 +241,10 @@ def test_a_child_that_dies_loses_the_connection_and_makes_the_replica_unhealthy(
         os.kill(told["pid"], signal.SIGKILL)
     [reply] = ask_all(one, [("a", Request("act", observation(exit=ends != "is killed")))])
     assert isinstance(reply.error, ConnectionLost)
-    assert str(reply.error) == f"the policy's process ended with exit status {status}; the replica is being replaced"
+    assert (
+        str(reply.error)
+        == f"the policy's process ended with exit status {status}; the replica is being replaced"
+    )
     with pytest.raises(PolicyUnavailable, match=f"exit status {status}"):
         one.check_health()
     assert not one.ready
@@ -284,7 +300,9 @@ def test_the_child_ends_with_its_replica_that_is_killed() -> None:
         "time.sleep(600)\n"
     )
     environment = os.environ | {"PYTHONPATH": str(ROOT)}
-    with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True, env=environment) as replica:
+    with subprocess.Popen(
+        [sys.executable, "-c", code], stdout=subprocess.PIPE, text=True, env=environment
+    ) as replica:
         pid = int(replica.stdout.readline())
         assert not ended(pid)
         replica.send_signal(signal.SIGKILL)
@@ -309,7 +327,9 @@ def test_a_push_to_a_child_that_dies_is_refused_and_leaves_nothing() -> None:
     served, child = learner("DyingInAPush")
     files = Path(f"/proc/{os.getpid()}/fd")
     before = len(list(files.iterdir()))
-    with pytest.raises(PolicyUnavailable, match="exit status 9, so that nothing was changed; push again"):
+    with pytest.raises(
+        PolicyUnavailable, match="exit status 9, so that nothing was changed; push again"
+    ):
         Publisher(served).push(gains(1))
     assert len(list(files.iterdir())) <= before
     assert served.weights.number == 0
@@ -325,7 +345,10 @@ def test_the_child_drops_versions_that_nobody_acts_with_and_gives_others_to_new_
     for number in range(1, 5):
         weights.push(gains(number), pin=True)
         reply = ask(served, "a", "reset", rank="simulation")
-        assert (info(reply)["gain"], info(ask(served, "a", "act"))["policy"]["version"]) == (number, number)
+        assert (info(reply)["gain"], info(ask(served, "a", "act"))["policy"]["version"]) == (
+            number,
+            number,
+        )
     [held] = served.weights.held()
     np.testing.assert_equal(held.values, gains(4))
     wait_for(lambda: info(ask(served, "a", "reset", rank="simulation"))["versions"] == 1)
@@ -346,7 +369,10 @@ def test_handles_of_a_learners_gpu_are_opened_by_the_child(monkeypatch: pytest.M
     reply = info(ask(served, "a", "reset", rank="simulation"))
     assert (reply["weight"], digest) == (3.0, served.weights.describe()["newest"]["fingerprint"])
     monkeypatch.setattr(memory, "uuid", "another")
-    with shared({"weight": torch.ones(2, 2), "bias": torch.ones(2)}) as handles, pytest.raises(NotShared):
+    with (
+        shared({"weight": torch.ones(2, 2), "bias": torch.ones(2)}) as handles,
+        pytest.raises(NotShared),
+    ):
         served.weights.stage(2, handles, PushOptions())
     served.close()
 

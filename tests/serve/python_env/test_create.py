@@ -1,4 +1,6 @@
-"""`vlagents-ray env make`, but for what it downloads: tests/integration/test_environments.py uses what it makes."""
+"""`vlagents-ray env make`, but for what it downloads: tests/integration/test_environments.py
+uses what it makes.
+"""
 
 from __future__ import annotations
 
@@ -18,19 +20,26 @@ from vlagents_ray.serve.python_env.create import create, find_python, make_envir
 
 @pytest.fixture
 def asked(monkeypatch: pytest.MonkeyPatch) -> list[str]:
-    """What uv is told in the place of installing, with the text of overrides and constraints; nothing is installed."""
+    """What uv is told in the place of installing, with the text of overrides and constraints;
+    nothing is installed.
+    """
     told: list[str] = []
 
     def uv(arguments: Sequence[str]) -> str:
         if arguments[0] == "venv":
             return real(arguments)
-        files = [Path(arguments[i + 1]) for i, word in enumerate(arguments) if word in ("--override", "--constraint")]
+        files = [
+            Path(arguments[i + 1])
+            for i, word in enumerate(arguments)
+            if word in ("--override", "--constraint")
+        ]
         told.append(" ".join(arguments) + " " + " ".join(file.read_text() for file in files))
         return ""
 
     real = making._uv
     monkeypatch.setattr(making, "_uv", uv)
-    monkeypatch.setattr(making, "plugin_distributions", list)  # those of this environment would be another call
+    # Those of this environment would be another call.
+    monkeypatch.setattr(making, "plugin_distributions", list)
     return told
 
 
@@ -92,7 +101,9 @@ def test_a_light_one_and_one_of_another_python_are_without_ray(
     assert "ray==" not in asked[-1]
     assert "[serve]" not in asked[-1]
     assert "pydantic>=" in asked[-1]
-    monkeypatch.setattr(making, "_minor", lambda python: "3.11" if python == Path(sys.executable) else "3.12")
+    monkeypatch.setattr(
+        making, "_minor", lambda python: "3.11" if python == Path(sys.executable) else "3.12"
+    )
     said: list[str] = []
     make_environment(requirements, tmp_path / "env", progress=said.append)
     assert "ray==" not in asked[-1]
@@ -113,15 +124,24 @@ def interpreter(path: Path, says: str) -> Path:
 class TestThePythonThatRequirementsName:
     @pytest.fixture(autouse=True)
     def places(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-        for name, folder in (("PATH", "one:two"), ("PYENV_ROOT", "pyenv"), ("UV_PYTHON_INSTALL_DIR", "uv")):
+        for name, folder in (
+            ("PATH", "one:two"),
+            ("PYENV_ROOT", "pyenv"),
+            ("UV_PYTHON_INSTALL_DIR", "uv"),
+        ):
             monkeypatch.setenv(name, ":".join(f"{tmp_path}/{one}" for one in folder.split(":")))
 
     def test_is_this_one_or_one_that_runs_and_is_that_version(self, tmp_path: Path) -> None:
         assert find_python(OWN) == sys.executable
-        interpreter(tmp_path / "one" / "python3.97", "exit 127")  # as a shim of pyenv's without a version
-        in_uv = interpreter(tmp_path / "uv" / "cpython-3.97.0-linux" / "bin" / "python3.97", "echo 3.97")
+        # As a shim of pyenv's without a version.
+        interpreter(tmp_path / "one" / "python3.97", "exit 127")
+        in_uv = interpreter(
+            tmp_path / "uv" / "cpython-3.97.0-linux" / "bin" / "python3.97", "echo 3.97"
+        )
         assert find_python("3.97") == str(in_uv)
-        in_pyenv = interpreter(tmp_path / "pyenv" / "versions" / "3.97.2" / "bin" / "python3.97", "echo 3.97")
+        in_pyenv = interpreter(
+            tmp_path / "pyenv" / "versions" / "3.97.2" / "bin" / "python3.97", "echo 3.97"
+        )
         assert find_python("3.97") == str(in_pyenv)
         on_path = interpreter(tmp_path / "two" / "python3.97", "echo 3.97")
         assert find_python("3.97") == str(on_path)
@@ -133,7 +153,9 @@ class TestThePythonThatRequirementsName:
         assert make_environment(requirements, tmp_path / "env").is_file()
         requirements.write_text("# python: 3.97\nsix==1.16.0\n")
         assert make_environment(requirements, tmp_path / "other", python=sys.executable).is_file()
-        with pytest.raises(ConfigError, match=r"found no Python 3\.97.*python3\.97 on PATH.*--python"):
+        with pytest.raises(
+            ConfigError, match=r"found no Python 3\.97.*python3\.97 on PATH.*--python"
+        ):
             make_environment(requirements, tmp_path / "third")
         assert not (tmp_path / "third").exists()
 
@@ -148,7 +170,9 @@ class TestWithoutAGpu:
         monkeypatch.setattr(making, "has_gpu", lambda: False)
 
     @pytest.mark.torch
-    def test_torch_is_this_environments_own(self, asked: list[str], requirements: Path, tmp_path: Path) -> None:
+    def test_torch_is_this_environments_own(
+        self, asked: list[str], requirements: Path, tmp_path: Path
+    ) -> None:
         make_environment(requirements, tmp_path / "env")
         assert f"{own_torch()}\n" in asked[-1]
 
@@ -177,7 +201,9 @@ class TestWithoutAGpu:
 
         create(tmp_path / "env")
         monkeypatch.setattr(making, "_uv", uv)
-        with pytest.raises(ConfigError, match=r"bring CUDA packages \(nvidia-cublas==13.0, …\).*NAME.cpu.txt"):
+        with pytest.raises(
+            ConfigError, match=r"bring CUDA packages \(nvidia-cublas==13.0, …\).*NAME.cpu.txt"
+        ):
             make_environment(requirements, tmp_path / "env")
         assert len(asked) == 1
         assert "--dry-run" in asked[0]
@@ -205,7 +231,10 @@ def test_torch_is_for_cuda_12_where_the_driver_is_too_old_for_13(
     said: list[str] = []
     make_environment(requirements, tmp_path / "env", progress=said.append)
     assert asked[-1].endswith("torch<2.11\n")
-    assert "the driver, 570.124.06, is older than 580, the first for CUDA 13: taking torch<2.11" in said
+    assert (
+        "the driver, 570.124.06, is older than 580, the first for CUDA 13: taking torch<2.11"
+        in said
+    )
     monkeypatch.setenv("UV_TORCH_BACKEND", "cu126")
     make_environment(requirements, tmp_path / "env")
     assert "--constraint" not in asked[-1]
@@ -241,14 +270,22 @@ def test_a_gpu_is_found_on_linux_and_wsl_and_none_on_a_jetson(
             "exit 9",
             "550.54.15",
         ),
-        ("NVRM version: NVIDIA UNIX Open Kernel Module for x86_64  580.65.06  Release Build", "exit 9", "580.65.06"),
+        (
+            "NVRM version: NVIDIA UNIX Open Kernel Module for x86_64  580.65.06  Release Build",
+            "exit 9",
+            "580.65.06",
+        ),
         (None, "echo 576.02; echo 576.02", "576.02"),  # WSL2, with two GPUs
         (None, "exit 9", None),
         (None, None, None),
     ],
 )
 def test_the_driver_is_the_kernels_or_that_of_windows(
-    file: str | None, smi: str | None, version: str | None, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+    file: str | None,
+    smi: str | None,
+    version: str | None,
+    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path,
 ) -> None:
     monkeypatch.setattr(accelerator, "_DRIVER", tmp_path / "version")
     monkeypatch.setenv("PATH", str(tmp_path))
@@ -270,7 +307,9 @@ def test_it_imports_torchvision_and_lerobot_as_fits_the_machine(
     assert not done.stderr
 
 
-def test_missing_requirements_and_a_folder_of_something_else_are_refused(requirements: Path, tmp_path: Path) -> None:
+def test_missing_requirements_and_a_folder_of_something_else_are_refused(
+    requirements: Path, tmp_path: Path
+) -> None:
     with pytest.raises(ConfigError, match=r"no such file: got '/no/such\.txt'"):
         make_environment(Path("/no/such.txt"), tmp_path / "env")
     with pytest.raises(ConfigError, match="holds no Python environment"):
@@ -288,11 +327,16 @@ def test_uv_looks_where_pip_was_told_to(monkeypatch: pytest.MonkeyPatch) -> None
     assert making._places() == {}
     monkeypatch.setenv("PIP_FIND_LINKS", "/wheels /other")
     monkeypatch.setenv("PIP_INDEX_URL", "file:///simple")
-    assert making._places() == {"UV_FIND_LINKS": "/wheels,/other", "UV_DEFAULT_INDEX": "file:///simple"}
+    assert making._places() == {
+        "UV_FIND_LINKS": "/wheels,/other",
+        "UV_DEFAULT_INDEX": "file:///simple",
+    }
 
 
 def test_without_uv_the_cure_is_named(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setattr(making.importlib.util, "find_spec", lambda _: None)
     monkeypatch.setattr(making.shutil, "which", lambda *_, **__: None)
-    with pytest.raises(MissingDependency, match=r"'uv' is not installed; pip install 'vlagents-ray\[serve\]'"):
+    with pytest.raises(
+        MissingDependency, match=r"'uv' is not installed; pip install 'vlagents-ray\[serve\]'"
+    ):
         create(tmp_path / "env")

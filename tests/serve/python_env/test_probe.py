@@ -1,4 +1,6 @@
-"""What a deployment file may say of an environment, and what is wrong with the one that it names."""
+"""What a deployment file may say of an environment, and what is wrong with the one that it
+names.
+"""
 
 from __future__ import annotations
 
@@ -40,8 +42,12 @@ def args(**environment: Any) -> EnvironmentArgs:
     return EnvironmentArgs(**environment)
 
 
-def test_an_interpreter_that_is_a_link_stays_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A virtual environment's is a link to the one that it was made with, which knows nothing of the environment."""
+def test_an_interpreter_that_is_a_link_stays_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A virtual environment's is a link to the one that it was made with, which knows nothing of
+    the environment.
+    """
     link = tmp_path / "python"
     link.symlink_to(sys.executable)
     monkeypatch.chdir(tmp_path)
@@ -86,16 +92,24 @@ def test_another_python_or_ray_makes_a_child(monkeypatch: pytest.MonkeyPatch) ->
         ("ray", "2.40.0", "it has Ray 2.40.0, the cluster has"),
         ("ray", None, "it has no Ray, the cluster has"),
     ):
-        versions = {key: value for key, value in {**found.versions, name: version}.items() if value is not None}
+        versions = {
+            key: value
+            for key, value in {**found.versions, name: version}.items()
+            if value is not None
+        }
         other = interpreter.EnvironmentProbe(versions)
         monkeypatch.setattr(interpreter, "probe", lambda *_, other=other: other)
         assert with_process(args(python=sys.executable)).process == "child"
-        with pytest.raises(ConfigError, match=rf"got 'replica', which cannot run in .*{said}.*use process 'child'"):
+        with pytest.raises(
+            ConfigError, match=rf"got 'replica', which cannot run in .*{said}.*use process 'child'"
+        ):
             with_process(args(python=sys.executable, process="replica"))
 
 
 def test_no_such_interpreter(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match=r"no such file, got '/no/such/python', want an interpreter; make one"):
+    with pytest.raises(
+        ConfigError, match=r"no such file, got '/no/such/python', want an interpreter; make one"
+    ):
         probe("/no/such/python")
     for deployment in sorted((ROOT / "deployments").glob("*.yaml")):
         stated = yaml.safe_load(deployment.read_text())["applications"][0]["args"]
@@ -103,7 +117,9 @@ def test_no_such_interpreter(tmp_path: Path) -> None:
             continue
         with pytest.raises(ConfigError) as caught:
             probe(str(tmp_path / python))
-        [(requirements, folder)] = re.findall(r"`vlagents-ray env make (\S+) --out (\S+)`", str(caught.value))
+        [(requirements, folder)] = re.findall(
+            r"`vlagents-ray env make (\S+) --out (\S+)`", str(caught.value)
+        )
         assert requirements_file(requirements).is_file()
         assert Path(folder, "bin/python") == tmp_path / python
     (tmp_path / "bin").mkdir()
@@ -119,7 +135,11 @@ def test_no_such_interpreter(tmp_path: Path) -> None:
         ("#!/bin/sh\nexit 1\n", 0o755, "it said nothing"),
         ("#!/bin/sh\n", 0o644, "Permission denied"),
         ("not a program", 0o755, "no Python interpreter"),
-        ('#!/bin/sh\necho \'VLA{"python": "3.8.10"}\'\n', 0o755, r"is Python 3.8.10, want 3.10 or newer"),
+        (
+            '#!/bin/sh\necho \'VLA{"python": "3.8.10"}\'\n',
+            0o755,
+            r"is Python 3.8.10, want 3.10 or newer",
+        ),
     ],
 )
 def test_not_an_interpreter(tmp_path: Path, text: str, mode: int, said: str) -> None:
@@ -135,16 +155,22 @@ def test_settings_stand_on_no_command_line_where_every_user_could_read_them(tmp_
 
 
 def test_an_environment_without_this_package_or_with_another_version_of_it(bare: str) -> None:
-    with pytest.raises(ConfigError, match=r"has no vlagents-ray, want .* as here; install it there"):
+    with pytest.raises(
+        ConfigError, match=r"has no vlagents-ray, want .* as here; install it there"
+    ):
         probe(bare)
     [packages] = Path(bare).parents[1].glob("lib/python*/site-packages")
     (packages / "vlagents_ray-0.0.9.dist-info").mkdir()
-    (packages / "vlagents_ray-0.0.9.dist-info" / "METADATA").write_text("Name: vlagents-ray\nVersion: 0.0.9\n")
+    (packages / "vlagents_ray-0.0.9.dist-info" / "METADATA").write_text(
+        "Name: vlagents-ray\nVersion: 0.0.9\n"
+    )
     with pytest.raises(ConfigError, match=r"has vlagents-ray 0.0.9, want"):
         probe(bare)
 
 
-def test_the_policy_is_built_where_it_will_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_policy_is_built_where_it_will_run(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Its module is only to be found there."""
     python = layered(tmp_path / "env", "six==1.15.0")
     [packages] = python.parents[1].glob("lib/python*/site-packages")
@@ -164,7 +190,9 @@ def test_the_policy_is_built_where_it_will_run(tmp_path: Path, monkeypatch: pyte
     assert contract.action.dim == 15
     with pytest.raises(ConfigError, match=rf"in {python}: policy Policy: .*'gane'"):
         check_policy(environment, "only_there:Policy", {"gane": 2.0})
-    with pytest.raises(ConfigError, match=rf"in {python}: policy only_there:Policy: KeyError: 'SOURCE'"):
+    with pytest.raises(
+        ConfigError, match=rf"in {python}: policy only_there:Policy: KeyError: 'SOURCE'"
+    ):
         check_policy(args(python=str(python)), "only_there:Policy", {})
     with pytest.raises(ConfigError, match=rf"in {python}: .*no class 'Police'"):
         check_policy(environment, "only_there:Police", {})
@@ -186,5 +214,7 @@ def test_an_interpreter_that_does_not_answer_in_time_is_named_without_its_script
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr("vlagents_ray.serve.python_env.probe._TIMEOUT_S", 0.001)
-    with pytest.raises(ConfigError, match=r"runs here \(no answer in 0.001 s; is the machine busy\?\)$"):
+    with pytest.raises(
+        ConfigError, match=r"runs here \(no answer in 0.001 s; is the machine busy\?\)$"
+    ):
         probe(sys.executable)

@@ -1,4 +1,6 @@
-"""A batch waits for a group that is coming back: in simulated time, with the queue's own bookkeeping."""
+"""A batch waits for a group that is coming back: in simulated time, with the queue's own
+bookkeeping.
+"""
 
 from __future__ import annotations
 
@@ -42,13 +44,20 @@ class World:
     cost: Callable[[int], float] = fixed
     ranks: dict[int, Rank] = field(default_factory=dict)
     sizes: list[int] = field(default_factory=list)
-    waits: list[tuple[float, float]] = field(default_factory=list)  # how long, and how long the batch before took
+    # How long, and how long the batch before took.
+    waits: list[tuple[float, float]] = field(default_factory=list)
     robots_waited: float = 0.0
 
     def run(self, batches: int) -> World:
-        returning, waiting, now, took = BatchWindow(self.patience, SIZE, lambda _: True), FairQueue(), 0.0, 0.0
+        returning, waiting, now, took = (
+            BatchWindow(self.patience, SIZE, lambda _: True),
+            FairQueue(),
+            0.0,
+            0.0,
+        )
         order = itertools.count()
-        coming = [(0.003 * i, next(order), i) for i in range(len(self.delays))]  # a cold start, one by one
+        # A cold start, one by one.
+        coming = [(0.003 * i, next(order), i) for i in range(len(self.delays))]
         heapq.heapify(coming)
 
         def come() -> PendingRequest:
@@ -78,7 +87,10 @@ class World:
             returning.record_end(now, took)
             self.sizes.append(len(batch))
             for one in batch:
-                heapq.heappush(coming, (now + self.delays[int(one.session_id)](), next(order), int(one.session_id)))
+                heapq.heappush(
+                    coming,
+                    (now + self.delays[int(one.session_id)](), next(order), int(one.session_id)),
+                )
         return self
 
     def mean(self) -> float:
@@ -124,7 +136,9 @@ def test_robots_that_act_at_once_come_together(robots: int) -> None:
 @pytest.mark.parametrize("others", [0, 1])
 def test_a_robot_with_a_rate_of_its_own_neither_waits_nor_is_waited_for(others: int) -> None:
     delays = [robot(0, 0.1, 0.3), robot(1, 0.2, 0.4), *[robot(2)] * others]
-    world = World(delays, patience=0.1, cost=large_model, ranks=dict.fromkeys(range(3), Rank.ROBOT)).run(300)
+    world = World(
+        delays, patience=0.1, cost=large_model, ranks=dict.fromkeys(range(3), Rank.ROBOT)
+    ).run(300)
     assert world.waits == []
 
 
@@ -147,14 +161,18 @@ def test_clients_that_are_usually_slow_are_not_waited_for() -> None:
 
 def test_a_client_that_stops_is_waited_for_once() -> None:
     calls = itertools.count()
-    world = World([soon(0), soon(1), lambda: 0.0015 if next(calls) < 50 else 1e9], patience=0.15).run(150)
+    world = World(
+        [soon(0), soon(1), lambda: 0.0015 if next(calls) < 50 else 1e9], patience=0.15
+    ).run(150)
     in_vain = [wait for wait, took in world.waits if wait > 0.15 * took - 1e-9]
     assert len(in_vain) <= 2
     assert world.sizes[-50:] == [2] * 50
 
 
 def test_nobody_waits_where_batches_save_nothing() -> None:
-    world = World([soon(seed) for seed in range(4)], patience=0.3, cost=lambda size: 0.01 * size).run(400)
+    world = World(
+        [soon(seed) for seed in range(4)], patience=0.3, cost=lambda size: 0.01 * size
+    ).run(400)
     waited = sum(wait for wait, _ in world.waits)
     assert waited < 0.05 * sum(0.01 * size for size in world.sizes)
 
@@ -223,13 +241,16 @@ def test_a_robot_that_came_for_the_first_time_ends_the_wait_of_robots() -> None:
 
 def test_robots_do_not_wait_without_patience_or_for_longer_than_a_batch_saves() -> None:
     for patience, back_s in ((0.0, 0.002), (0.1, 0.06)):  # half of the last batch is 0.05
-        returning, waiting = answered_together("a", "b", patience=patience, robots="ab", back_s=back_s)
+        returning, waiting = answered_together(
+            "a", "b", patience=patience, robots="ab", back_s=back_s
+        )
         arrive(returning, waiting, ticket("a", 2 + back_s, Rank.ROBOT))
         assert returning.wait_s(2 + back_s, waiting) == 0
 
 
 def test_a_deadline_that_the_wait_would_endanger_prevents_it() -> None:
-    for deadline_ms, waits in ((105.0, False), (500.0, True)):  # the batch takes 100 ms, the wait 10 ms
+    # The batch takes 100 ms, the wait 10 ms.
+    for deadline_ms, waits in ((105.0, False), (500.0, True)):
         returning, waiting = answered_together("a", "b", "c")
         arrive(returning, waiting, ticket("a", 2.001, deadline_ms=deadline_ms))
         assert (returning.wait_s(2.001, waiting) > 0) is waits

@@ -1,4 +1,6 @@
-"""When a policy makes its replica unhealthy: by a call that does not return, an accelerator, or all of its batches."""
+"""When a policy makes its replica unhealthy: by a call that does not return, an accelerator, or
+all of its batches.
+"""
 
 from __future__ import annotations
 
@@ -26,7 +28,13 @@ from vlagents_ray.serve.access.api_keys import NoKey
 from vlagents_ray.serve.endpoints.http import build_http_app
 from vlagents_ray.serve.endpoints.shm import ShmServer
 from vlagents_ray.serve.engine.engine import Engine
-from vlagents_ray.serve.queue.call_limits import FAILED_BATCHES, LOAD, CallLimits, PolicyCall, PolicyCalls
+from vlagents_ray.serve.queue.call_limits import (
+    FAILED_BATCHES,
+    LOAD,
+    CallLimits,
+    PolicyCall,
+    PolicyCalls,
+)
 from vlagents_ray.serve.requests import DEFAULT, PendingRequest
 
 LIMITS = CallLimits(act_s=10.0, warm_up_s=100.0, load_s=1000.0)
@@ -127,7 +135,9 @@ def test_a_call_over_its_limit_is_unhealthy_those_who_wait_for_it_are_answered_a
     assert behind.empty()
     clock.now += 0.2
     assert not engine.ready
-    with pytest.raises(PolicyUnavailable, match=rf"not returned from '{op}' for 10.1 s; its limit is 10 s"):
+    with pytest.raises(
+        PolicyUnavailable, match=rf"not returned from '{op}' for 10.1 s; its limit is 10 s"
+    ):
         engine.check_health()
     engine.notice_hung()
     engine.notice_hung()
@@ -152,7 +162,9 @@ def test_a_call_over_its_limit_is_unhealthy_those_who_wait_for_it_are_answered_a
     assert begun.empty()
 
 
-def test_every_batch_size_may_compile_where_batches_have_fixed_sizes(agent: Hanging, clock: Clock) -> None:
+def test_every_batch_size_may_compile_where_batches_have_fixed_sizes(
+    agent: Hanging, clock: Clock
+) -> None:
     engine = Engine(agent, limits=LIMITS, batch_sizes=[1, 2], max_batch_size=2)
     engine.calls.clock = clock
     engine.start()
@@ -195,7 +207,8 @@ def test_an_engine_whose_policy_hangs_ends_all_the_same(
 ) -> None:
     engine = Engine(agent)
     engine.start()
-    monkeypatch.setattr(engine, "stop", lambda **_: None)  # which waits for the batch, but not for ever
+    # Which waits for the batch, but not for ever.
+    monkeypatch.setattr(engine, "stop", lambda **_: None)
     monkeypatch.setattr("vlagents_ray.serve.models.model_manager._CLOSE_S", 0.05)
     ask(engine, "bad", "reset", hangs_at="act")
     put(engine, "bad", "act")
@@ -235,7 +248,9 @@ def test_a_local_client_is_refused_though_the_thread_that_reads_its_requests_han
 
 
 class Forking(Agent):
-    """Forks in each call; the child `ends` in the same way as a call that succeeds, or raises SystemExit."""
+    """Forks in each call; the child `ends` in the same way as a call that succeeds, or raises
+    SystemExit.
+    """
 
     shared = ("children",)
 
@@ -270,7 +285,9 @@ class Forking(Agent):
 
 @pytest.mark.parametrize("ends", ["returns", "exits"])
 @pytest.mark.parametrize("op", OPS)
-def test_a_child_that_the_policy_forks_ends_with_the_call_and_answers_nobody(op: str, ends: str) -> None:
+def test_a_child_that_the_policy_forks_ends_with_the_call_and_answers_nobody(
+    op: str, ends: str
+) -> None:
     """It would go on with the clients' sockets and an older state of their sessions."""
     agent = Forking(ends)
     engine = Engine(agent)
@@ -299,7 +316,8 @@ class Failing(Agent):
     shared = ("errors",)
 
     def __init__(self) -> None:
-        self.errors: dict[str, Exception] = {"none": ValueError()}  # by op; an empty one would not be shared
+        # By op; an empty one would not be shared.
+        self.errors: dict[str, Exception] = {"none": ValueError()}
 
     def _raise(self, op: str) -> None:
         if op in self.errors:
@@ -322,7 +340,9 @@ class Failing(Agent):
 
 
 @pytest.fixture
-def failing(serving: Callable[..., Engine]) -> tuple[Engine, Failing, Callable[[Any], Exception | None]]:
+def failing(
+    serving: Callable[..., Engine],
+) -> tuple[Engine, Failing, Callable[[Any], Exception | None]]:
     """An engine, its policy, and how it is asked."""
     policy = Failing()
     engine = serving(policy)
@@ -366,7 +386,11 @@ def test_a_replica_all_of_whose_batches_fail_is_not_healthy_until_one_does_not(
 
 @pytest.mark.parametrize(
     "error",
-    [InvalidObservation("of a client"), PolicyUnavailable("of a policy elsewhere"), RuntimeError("CUDA out of memory")],
+    [
+        InvalidObservation("of a client"),
+        PolicyUnavailable("of a policy elsewhere"),
+        RuntimeError("CUDA out of memory"),
+    ],
 )
 def test_what_another_replica_could_not_do_better_leaves_a_replica_healthy(
     failing: tuple[Engine, Failing, Callable[[Any], Exception | None]], error: Exception

@@ -23,8 +23,12 @@ from vlagents_ray.serve.queue.fair_queue import PATIENCE_S, FairQueue
 from vlagents_ray.serve.requests import Origin, PendingRequest, Rank
 
 
-def ticket(session: str, *, owner: str = "", rank: Rank = Rank.SIMULATION, arrived: float = 0.0) -> PendingRequest:
-    return PendingRequest(session, Request("act"), lambda _: None, rank, arrived, origin=Origin(connection=owner))
+def ticket(
+    session: str, *, owner: str = "", rank: Rank = Rank.SIMULATION, arrived: float = 0.0
+) -> PendingRequest:
+    return PendingRequest(
+        session, Request("act"), lambda _: None, rank, arrived, origin=Origin(connection=owner)
+    )
 
 
 def filled(*tickets: PendingRequest) -> FairQueue:
@@ -61,8 +65,12 @@ def test_a_large_bundle_delays_others_by_no_more_than_a_batch() -> None:
 
 @pytest.mark.parametrize("connected", [False, True])
 @pytest.mark.parametrize("named", [False, True])
-def test_keys_with_equal_names_of_sessions_have_turns_of_their_own(connected: bool, named: bool) -> None:
-    """Many sessions of another key, whose sender has the robot's name, delay the robot by no more than a batch."""
+def test_keys_with_equal_names_of_sessions_have_turns_of_their_own(
+    connected: bool, named: bool
+) -> None:
+    """Many sessions of another key, whose sender has the robot's name, delay the robot by no
+    more than a batch.
+    """
     keys, engine = ChangingKeys(), Engine(Gain())
     waiting = FairQueue()
 
@@ -126,7 +134,8 @@ def test_robots_without_end_do_not_starve_simulations() -> None:
             assert served[-1][0].startswith("r")
     order = [name for batch in served for name in batch]
     assert {"s0", "s1"} <= set(order)
-    assert order.index("s1") - order.index("s0") == 2  # a robot in between, even where a batch has one slot
+    # A robot in between, even where a batch has one slot.
+    assert order.index("s1") - order.index("s0") == 2
 
 
 @settings(max_examples=100)
@@ -193,7 +202,9 @@ def test_a_lone_request_does_not_wait_for_others(queue: Callable[[int], BatchQue
     assert len(taken.batch) == 1
 
 
-def test_a_request_that_expired_or_was_given_up_never_reaches_the_policy(queue: Callable[[int], BatchQueue]) -> None:
+def test_a_request_that_expired_or_was_given_up_never_reaches_the_policy(
+    queue: Callable[[int], BatchQueue],
+) -> None:
     waiting = queue(4)
     late = put(waiting, "late", deadline_ms=1.0)
     late.deadline -= 1.0

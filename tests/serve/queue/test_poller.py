@@ -1,4 +1,6 @@
-"""Which thread polls the local endpoints while the policy runs, and what happens between two batches."""
+"""Which thread polls the local endpoints while the policy runs, and what happens between two
+batches.
+"""
 
 from __future__ import annotations
 
@@ -42,7 +44,9 @@ NAMES = ("a", "b", "c", "d", "e", "f", "r", "robot", "heard", "other")
 
 
 class Slow:
-    """A policy that takes at least `SLOW_S`, and then waits at a gate while that is closed; and what serves it."""
+    """A policy that takes at least `SLOW_S`, and then waits at a gate while that is closed; and
+    what serves it.
+    """
 
     def __init__(self, size: int = 2, patience: float = 0.0) -> None:
         self.events: list[str] = []
@@ -57,7 +61,9 @@ class Slow:
         self.engine.start()
         for name in NAMES:
             done: Future[Reply] = Future()
-            self.engine.submit([PendingRequest(name, Request("reset", Obs()), done.set_result, Rank.SIMULATION)])
+            self.engine.submit(
+                [PendingRequest(name, Request("reset", Obs()), done.set_result, Rank.SIMULATION)]
+            )
             assert done.result(10).error is None
 
     def put(self, *sessions: str, rank: Rank = Rank.SIMULATION) -> None:
@@ -70,7 +76,12 @@ class Slow:
 
             return answered
 
-        self.engine.submit([PendingRequest(s, Request("act", Obs(info={"name": s})), done(s), rank) for s in sessions])
+        self.engine.submit(
+            [
+                PendingRequest(s, Request("act", Obs(info={"name": s})), done(s), rank)
+                for s in sessions
+            ]
+        )
 
     def called(self, *events: str) -> bool:
         """Have these happened?"""
@@ -107,7 +118,9 @@ def slow() -> Iterator[Callable[..., Slow]]:
         assert not one.engine.alive
 
 
-def test_messages_are_heard_beside_a_batch_and_never_on_two_threads_at_once(slow: Callable[..., Slow]) -> None:
+def test_messages_are_heard_beside_a_batch_and_never_on_two_threads_at_once(
+    slow: Callable[..., Slow],
+) -> None:
     one = slow()
     ours, theirs = socket.socketpair()
     threads: list[str] = []
@@ -143,10 +156,14 @@ def test_nobody_listens_beside_a_lone_session(slow: Callable[..., Slow]) -> None
     one, before = slow(), threading.enumerate()
     one.start()
     one.learn("robot")
-    assert "policy-reader" not in {thread.name for thread in threading.enumerate() if thread not in before}
+    assert "policy-reader" not in {
+        thread.name for thread in threading.enumerate() if thread not in before
+    }
 
 
-def test_timers_run_in_order_on_the_thread_that_polls_even_beside_a_batch(slow: Callable[..., Slow]) -> None:
+def test_timers_run_in_order_on_the_thread_that_polls_even_beside_a_batch(
+    slow: Callable[..., Slow],
+) -> None:
     one = slow()
     ran: list[tuple[str, str]] = []
 
@@ -165,7 +182,8 @@ def test_timers_run_in_order_on_the_thread_that_polls_even_beside_a_batch(slow: 
     wait_for(lambda: ran[2:] == [("0.2", "policy-reader")])
     one.open.set()
     wait_for(lambda: one.called("answer a", "answer b"))
-    one.queue.poller.call_soon(lambda: set_timers(0.5))  # set before the reader is lent the poller again
+    # Set before the reader is lent the poller again.
+    one.queue.poller.call_soon(lambda: set_timers(0.5))
     one.hold("a", "b")
     wait_for(lambda: len(ran) == 4)
     one.open.set()
@@ -191,7 +209,9 @@ def test_a_callback_may_end_its_watch_beside_a_batch(slow: Callable[..., Slow]) 
     wait_for(lambda: one.called("answer a", "answer b"))
 
 
-def test_answers_come_while_the_next_batch_runs_and_when_the_queue_closes(slow: Callable[..., Slow]) -> None:
+def test_answers_come_while_the_next_batch_runs_and_when_the_queue_closes(
+    slow: Callable[..., Slow],
+) -> None:
     one = slow()
     one.start()
     one.learn("a", "b")
@@ -286,7 +306,9 @@ def test_a_file_whose_callback_failed_is_not_polled_again(caplog: pytest.LogCapt
     theirs.close()
 
 
-def test_only_other_threads_wake_the_queue(slow: Callable[..., Slow], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_only_other_threads_wake_the_queue(
+    slow: Callable[..., Slow], monkeypatch: pytest.MonkeyPatch
+) -> None:
     """A request that the queue's own thread has read finds it awake."""
     one = slow()
     ours, theirs = socket.socketpair()

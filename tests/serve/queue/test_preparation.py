@@ -1,4 +1,6 @@
-"""Observations are prepared beside the policy's thread, and what the policy then computes is the same."""
+"""Observations are prepared beside the policy's thread, and what the policy then computes is the
+same.
+"""
 
 from __future__ import annotations
 
@@ -99,7 +101,9 @@ def serving() -> Iterator[Callable[[int], Serving]]:
     wait_for(lambda: not [one for one in threading.enumerate() if one.name.startswith("prepare_")])
 
 
-def test_the_next_batch_is_prepared_while_the_policy_acts(serving: Callable[[int], Serving]) -> None:
+def test_the_next_batch_is_prepared_while_the_policy_acts(
+    serving: Callable[[int], Serving],
+) -> None:
     one, begun = serving(3), threading.Event()
     one.agent.gates["prepare"].set()
     answers = [one.submit(name, "act", begun=begun) for name in one.names[1:]]
@@ -111,7 +115,10 @@ def test_the_next_batch_is_prepared_while_the_policy_acts(serving: Callable[[int
 def test_the_policy_prepares_itself_what_has_not_begun(serving: Callable[[int], Serving]) -> None:
     one = serving(16)  # which is more than there are threads
     begun = [threading.Event() for _ in one.names[1:]]
-    answers = [one.submit(name, "act", begun=event) for name, event in zip(one.names[1:], begun, strict=True)]
+    answers = [
+        one.submit(name, "act", begun=event)
+        for name, event in zip(one.names[1:], begun, strict=True)
+    ]
     assert begun[0].wait(30)
     one.agent.gates["act"].set()
     assert begun[-1].wait(30), "although all threads are busy"
@@ -140,7 +147,9 @@ def test_an_error_of_a_preparation_is_that_of_its_request_alone(
     prepared(one.submit(one.names[-1], "act"))  # its session goes on
 
 
-def test_what_was_prepared_for_the_episode_before_is_not_used(serving: Callable[[int], Serving]) -> None:
+def test_what_was_prepared_for_the_episode_before_is_not_used(
+    serving: Callable[[int], Serving],
+) -> None:
     one, begun = serving(2), threading.Event()
     one.agent.gates["prepare"].set()
     again = one.submit("s1", "reset", instruction="another")
@@ -155,7 +164,9 @@ def test_a_request_that_is_withdrawn_is_not_prepared(serving: Callable[[int], Se
     one = serving(16)
     begun = [threading.Event() for _ in one.names[1:]]
     for name, event in zip(one.names[1:], begun, strict=True):
-        ticket = submit(one.engine, name, Request("act", Obs(info={"begun": event})), lambda _: None)
+        ticket = submit(
+            one.engine, name, Request("act", Obs(info={"begun": event})), lambda _: None
+        )
         ticket.fail(PolicyUnavailable("it is late"))
     one.agent.gates["prepare"].set()
     one.agent.gates["act"].set()

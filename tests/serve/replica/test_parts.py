@@ -1,4 +1,6 @@
-"""Parts of a replica: settings, order of opening and closing, observers, routes, facts, calls between replicas."""
+"""Parts of a replica: settings, order of opening and closing, observers, routes, facts, calls
+between replicas.
+"""
 
 from __future__ import annotations
 
@@ -24,7 +26,13 @@ from vlagents_ray.serve.config.parts import PartArgs, PartConfig
 from vlagents_ray.serve.endpoints.http import build_http_app
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.engine.observer import Observer
-from vlagents_ray.serve.replica.part import OtherReplica, PartContext, ReplicaPart, ReplicaParts, open_parts
+from vlagents_ray.serve.replica.part import (
+    OtherReplica,
+    PartContext,
+    ReplicaPart,
+    ReplicaParts,
+    open_parts,
+)
 
 HERE = __name__
 events: list[str] = []
@@ -68,7 +76,11 @@ class Failing(ReplicaPart):
 class Totals(ReplicaPart):
     """Adds up a number of each replica."""
 
-    sibling_methods: ClassVar[dict[str, float | None]] = {"in_thread": 5.0, "on_loop": None, "fail": 5.0}
+    sibling_methods: ClassVar[dict[str, float | None]] = {
+        "in_thread": 5.0,
+        "on_loop": None,
+        "fail": 5.0,
+    }
 
     def open(self) -> None:
         self.number = len(self.context.replica)
@@ -149,13 +161,17 @@ def test_a_server_without_parts_has_none(context: PartContext) -> None:
         ({f"{HERE}:Counter": {"most": 3}}, "most"),
     ],
 )
-def test_settings_of_a_part_are_checked_by_its_own_model(parts: dict[str, Any], message: str) -> None:
+def test_settings_of_a_part_are_checked_by_its_own_model(
+    parts: dict[str, Any], message: str
+) -> None:
     with pytest.raises(ValidationError, match=message):
         ServerArgs(policy="noop", parts=parts)
 
 
 def test_a_class_that_is_no_part_and_an_unknown_name_are_errors() -> None:
-    with pytest.raises(ValidationError, match=r"NoPart has no Config; want a subclass of .*ReplicaPart"):
+    with pytest.raises(
+        ValidationError, match=r"NoPart has no Config; want a subclass of .*ReplicaPart"
+    ):
         ServerArgs(policy="noop", parts={f"{HERE}:NoPart": {}})
     with pytest.raises(ValidationError, match="'latency' is not registered"):
         ServerArgs(policy="noop", parts={"latency": {}})
@@ -189,7 +205,9 @@ def test_a_part_may_be_on_by_default_and_null_turns_it_off(
     args = ServerArgs(policy="noop", parts=parts)
     at_the_replica = ServerArgs(**args.model_dump(mode="json"))
     for settings in (args, at_the_replica):
-        assert {name: getattr(config, "limit", None) for name, config in settings.parts.on().items()} == limits
+        assert {
+            name: getattr(config, "limit", None) for name, config in settings.parts.on().items()
+        } == limits
 
 
 @pytest.fixture
@@ -205,11 +223,15 @@ def totals(context: PartContext) -> Totals:
 
 
 @pytest.mark.parametrize(("method", "on_loop"), [(Totals.in_thread, False), (Totals.on_loop, True)])
-def test_a_part_calls_the_same_part_of_other_replicas(totals: Totals, method: Any, on_loop: bool) -> None:
+def test_a_part_calls_the_same_part_of_other_replicas(
+    totals: Totals, method: Any, on_loop: bool
+) -> None:
     async def call() -> list[Any]:
         siblings = await totals.siblings()
         assert [sibling.name for sibling in siblings] == ["with", "without"]
-        return await asyncio.gather(*(sibling.call(method, 5) for sibling in siblings), return_exceptions=True)
+        return await asyncio.gather(
+            *(sibling.call(method, 5) for sibling in siblings), return_exceptions=True
+        )
 
     answer, missing = asyncio.run(call())
     assert answer == (len("longer name") + 5, on_loop)
@@ -236,7 +258,11 @@ class OfEverybody(Counter):
     """Has one page, by the path in its settings."""
 
     def routes(self) -> list[BaseRoute]:
-        return [Route("/count", answer), Route("/v1/metadata", answer), Route("/files/{name}", answer)]
+        return [
+            Route("/count", answer),
+            Route("/v1/metadata", answer),
+            Route("/files/{name}", answer),
+        ]
 
 
 def answer(request: Request) -> Response:
@@ -244,7 +270,8 @@ def answer(request: Request) -> Response:
 
 
 @pytest.mark.parametrize(
-    ("path", "is_own"), [("/count", True), ("/v1/metadata", False), ("/v1/act", False), ("/no", False)]
+    ("path", "is_own"),
+    [("/count", True), ("/v1/metadata", False), ("/v1/act", False), ("/no", False)],
 )
 def test_only_a_parts_own_route_is_a_page_without_a_key(
     path: str, is_own: bool, context: PartContext, monkeypatch: pytest.MonkeyPatch
@@ -255,6 +282,8 @@ def test_only_a_parts_own_route_is_a_page_without_a_key(
     if is_own:
         assert parts.pages(app.routes) == {path}
     else:
-        with pytest.raises(ConfigError, match=f"expected pages that are routes of its own, got '{path}'"):
+        with pytest.raises(
+            ConfigError, match=f"expected pages that are routes of its own, got '{path}'"
+        ):
             parts.pages(app.routes)
     parts.close()

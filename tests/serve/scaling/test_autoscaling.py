@@ -33,7 +33,9 @@ def wanted(
     running: int | None = None,
     requests: float = 0.0,
 ) -> int:
-    """The decision where each replica of those that report has this utilisation, queue and number of sessions."""
+    """The decision where each replica of those that report has this utilisation, queue and
+    number of sessions.
+    """
     replicas = [ReplicaID(str(i), POLICY) for i in range(len(utilisation))]
     context = AutoscalingContext(
         deployment_id=POLICY,
@@ -107,7 +109,8 @@ def test_hidden_load_is_found_in_a_few_steps() -> None:
 def test_nothing_is_taken_away_before_all_have_reported() -> None:
     assert wanted(MeasuredLoad(), [0.3], running=2, target=2, sessions=1) == 2
     assert wanted(MeasuredLoad(), [], running=1, target=1) == 1
-    assert wanted(MeasuredLoad(), [1.0], running=1, target=2) == 2  # the second one is still loading
+    # The second one is still loading.
+    assert wanted(MeasuredLoad(), [1.0], running=1, target=2) == 2
 
 
 def test_only_an_unused_application_may_have_no_replica() -> None:
@@ -118,7 +121,9 @@ def test_only_an_unused_application_may_have_no_replica() -> None:
 
 
 def test_settings_reach_serve() -> None:
-    args = AutoscalingArgs(max_replicas=3, target_sessions=8, look_back_s=5, upscale_delay_s=2, downscale_delay_s=4)
+    args = AutoscalingArgs(
+        max_replicas=3, target_sessions=8, look_back_s=5, upscale_delay_s=2, downscale_delay_s=4
+    )
     config = AutoscalingConfig(**args.options())
     assert (config.max_replicas, config.upscale_delay_s, config.downscale_delay_s) == (3, 2, 4)
     assert (config.look_back_period_s, config.metrics_interval_s) == (5, 1)
@@ -126,7 +131,9 @@ def test_settings_reach_serve() -> None:
     assert wanted(policy, [0.1], sessions=16) == 2
 
 
-@pytest.mark.parametrize("args", [{"target_ongoing_requests": 8}, {"target_utilisation": 1.5}, {"look_back_s": 0}])
+@pytest.mark.parametrize(
+    "args", [{"target_ongoing_requests": 8}, {"target_utilisation": 1.5}, {"look_back_s": 0}]
+)
 def test_other_settings_are_refused(args: dict[str, Any]) -> None:
     with pytest.raises(ValidationError):
         AutoscalingArgs(**args)

@@ -1,6 +1,8 @@
-"""Sessions that begin, act, move, get new weights and end, in any order, for a policy in this process and in a child.
+"""Sessions that begin, act, move, get new weights and end, in any order, for a policy in this
+process and in a child.
 
-After each answer, every session is at one replica, in the state and with the weights that its client expects.
+After each answer, every session is at one replica, in the state and with the weights that its
+client expects.
 """
 
 from __future__ import annotations
@@ -48,20 +50,34 @@ class _Session:
     step: int | None
 
 
-@pytest.fixture(scope="module", params=[Gain, partial(in_child, "Gain")], ids=["in this process", "in a child"])
+@pytest.fixture(
+    scope="module", params=[Gain, partial(in_child, "Gain")], ids=["in this process", "in a child"]
+)
 def served(request: pytest.FixtureRequest) -> Iterator[Replicas]:
     replicas = Replicas([request.param(), request.param()])
     yield replicas
     replicas.close()
 
 
-def ask(served: Replicas, at: int, op: Any, name: str, caller: Caller | NoKey = NoKey.OPEN, **fields: Any) -> Reply:
+def ask(
+    served: Replicas,
+    at: int,
+    op: Any,
+    name: str,
+    caller: Caller | NoKey = NoKey.OPEN,
+    **fields: Any,
+) -> Reply:
     """As a plain HTTP client."""
     return begin(served, at, op, name, caller, **fields).get(timeout=30)
 
 
 def begin(
-    served: Replicas, at: int, op: Any, name: str, caller: Caller | NoKey = NoKey.OPEN, **fields: Any
+    served: Replicas,
+    at: int,
+    op: Any,
+    name: str,
+    caller: Caller | NoKey = NoKey.OPEN,
+    **fields: Any,
 ) -> queue.SimpleQueue[Reply]:
     replies: queue.SimpleQueue[Reply] = queue.SimpleQueue()
     sender = Sender(served.engines[at], "http", name, connected=False, caller=caller)
@@ -86,14 +102,22 @@ class Moves(RuleBasedStateMachine):
     def reset(self, name: str, at: int, follows: bool) -> None:
         kwargs = {"weights": "follow" if follows else "pinned", "seed": 3}
         known = self.open.get(name)
-        reply = ask(self.served, at, "reset", self.names[name], kwargs=kwargs, step=known and known.step)
+        reply = ask(
+            self.served, at, "reset", self.names[name], kwargs=kwargs, step=known and known.step
+        )
         assert reply.error is None
         self.open[name] = _Session(0, self.newest if follows else self.pinned, follows, reply.step)
 
     @rule(name=st.sampled_from(_NAMES), at=st.sampled_from([0, 1]), steps=st.booleans())
     def act(self, name: str, at: int, steps: bool) -> None:
         session = self.open.get(name)
-        reply = ask(self.served, at, "act", self.names[name], step=session.step if session and steps else None)
+        reply = ask(
+            self.served,
+            at,
+            "act",
+            self.names[name],
+            step=session.step if session and steps else None,
+        )
         if session is None:
             assert isinstance(reply.error, UnknownSession)
             return
@@ -134,7 +158,9 @@ class Moves(RuleBasedStateMachine):
         first.commit(number, options)
         if missed:
             second.drop(number)
-            near, far = (ThisReplica(str(at), updates) for at, updates in enumerate((first, second)))
+            near, far = (
+                ThisReplica(str(at), updates) for at, updates in enumerate((first, second))
+            )
 
             async def others() -> Sequence[WeightsReplica]:
                 return [near]
@@ -178,7 +204,11 @@ class Moves(RuleBasedStateMachine):
             self.end(name)
 
     def _place(self, name: str) -> int | None:
-        places = [at for at, engine in enumerate(self.served.engines) if self.names[name] in engine.sessions]
+        places = [
+            at
+            for at, engine in enumerate(self.served.engines)
+            if self.names[name] in engine.sessions
+        ]
         assert len(places) <= 1
         return places[0] if places else None
 
@@ -201,8 +231,12 @@ def test_sessions_survive_any_order_of_moves_pushes_and_rests(served: Replicas) 
     )
 
 
-def test_a_session_that_moves_acts_with_the_weights_that_were_pushed_before(served: Replicas) -> None:
-    """The child process of its first replica last acted for it with older weights, which the other child may hold."""
+def test_a_session_that_moves_acts_with_the_weights_that_were_pushed_before(
+    served: Replicas,
+) -> None:
+    """The child process of its first replica last acted for it with older weights, which the
+    other child may hold.
+    """
     number = served.engines[0].weights.number + 1
     follows = {"weights": "follow"}
     assert ask(served, 0, "reset", "moving", kwargs=follows).error is None
@@ -210,7 +244,8 @@ def test_a_session_that_moves_acts_with_the_weights_that_were_pushed_before(serv
     for engine in served.engines:
         engine.weights.stage(number, gains(float(number)), options)
         engine.weights.commit(number, options)
-    assert ask(served, 1, "reset", "beside", kwargs=follows).error is None  # the weights are in use at that replica
+    # The weights are in use at that replica.
+    assert ask(served, 1, "reset", "beside", kwargs=follows).error is None
     reply = ask(served, 1, "act", "moving")
     for name in ("moving", "beside"):
         assert ask(served, 1, "close", name).error is None
@@ -222,7 +257,9 @@ def test_a_session_that_moves_acts_with_the_weights_that_were_pushed_before(serv
 def test_sessions_move_with_weights_that_no_other_session_uses(
     served: Replicas, stops: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The other replica has freed them. It gets them once for all sessions, and frees them with the last session."""
+    """The other replica has freed them. It gets them once for all sessions, and frees them with
+    the last session.
+    """
     fetched: list[str] = []
     weights = HeldSessions.weights
 
@@ -245,8 +282,12 @@ def test_sessions_move_with_weights_that_no_other_session_uses(
     if stops:
         held, other = served.migrators[0].held, _Peer(served, 1)
         for name in names:
-            asyncio.run_coroutine_threadsafe(held.send_to_peer(name, [other]), served._loop).result(30)
-    for reply in [answer.get(timeout=30) for answer in [begin(served, 1, "act", name) for name in names]]:
+            asyncio.run_coroutine_threadsafe(held.send_to_peer(name, [other]), served._loop).result(
+                30
+            )
+    for reply in [
+        answer.get(timeout=30) for answer in [begin(served, 1, "act", name) for name in names]
+    ]:
         assert reply.error is None
         assert reply.act.info["policy"]["version"] == reply.act.action[0] == first
     assert len(fetched) == 1
@@ -268,14 +309,17 @@ def test_no_key_has_more_sessions_at_a_replica_than_it_may_whatever_moves_there(
                 assert ask(served, 0, "reset", f"s{number}", caller).error is None
             else:
                 assert ask(served, 0, "reset", f"s{number}", caller).error is None
-                answers = [begin(served, 1, "act", f"s{number - n}", caller) for n in (0, 1)]  # both at once
+                # Both at once.
+                answers = [begin(served, 1, "act", f"s{number - n}", caller) for n in (0, 1)]
                 errors = [answer.get(timeout=30).error for answer in answers]
                 if number == 1:
                     assert errors == [None, None]
                 else:
                     assert all(isinstance(error, TooManyRequests) for error in errors)
                     for n in (0, 1):
-                        assert ask(served, 0, "act", f"s{number - n}", caller).error is None, "it stayed where it was"
+                        assert ask(served, 0, "act", f"s{number - n}", caller).error is None, (
+                            "it stayed where it was"
+                        )
                         assert ask(served, 0, "close", f"s{number - n}", caller).error is None
         assert len(served.engines[1].sessions) == 2
     finally:
@@ -312,9 +356,13 @@ class Guarded(Agent):
 def test_no_method_of_a_policy_runs_without_its_lock(monkeypatch: pytest.MonkeyPatch) -> None:
     served = Replicas([Guarded(), Guarded()], batch_sizes=(4,), max_batch_size=4)
     try:
-        models = [model for engine in served.engines for model in engine.models._cache.loaded.values()]
+        models = [
+            model for engine in served.engines for model in engine.models._cache.loaded.values()
+        ]
         assert len(models) == 2
-        monkeypatch.setattr(Guarded, "held", staticmethod(lambda: any(model.busy.locked() for model in models)))
+        monkeypatch.setattr(
+            Guarded, "held", staticmethod(lambda: any(model.busy.locked() for model in models))
+        )
         for at, op in [(0, "reset"), (0, "act"), (1, "act"), (0, "act"), (0, "close")]:
             reply = ask(served, at, op, "robot")
             assert reply.error is None, (op, reply.error)

@@ -53,7 +53,9 @@ def test_a_client_that_reaches_one_machine_only_is_sent_nowhere_else() -> None:
     assert chosen([load("far", 0, "far"), load("near", 90, "near")], place) == "near"
     assert chosen([load("far", 0, "far")], place) is None
     nowhere = replace(load("a", 0), node="", boot_id="")
-    assert chosen([nowhere], ClientLocation(must_be_near=True)) is None, "it does not know where it is"
+    assert chosen([nowhere], ClientLocation(must_be_near=True)) is None, (
+        "it does not know where it is"
+    )
 
 
 @pytest.mark.parametrize(
@@ -146,7 +148,9 @@ def test_clients_that_come_at_once_are_spread_evenly() -> None:
 
 
 def test_a_client_that_no_replica_is_near_to_gets_the_least_loaded_of_the_next_place() -> None:
-    mine, _ = balance(Engine(Counting()), load("b", 0), replace(load("c", 2), boot_id="another machine"))
+    mine, _ = balance(
+        Engine(Counting()), load("b", 0), replace(load("c", 2), boot_id="another machine")
+    )
     near = [
         ClientLocation(boot_id=machine, must_be_near=True)
         for machine in ("another machine", "none", load("b", 0).boot_id)

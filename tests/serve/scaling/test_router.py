@@ -25,7 +25,9 @@ def choose(
     *,
     choice_s: float,
 ) -> tuple[Any, list[str]]:
-    """What a proxy's wait of `wait_s` gives where Serve's own choice takes `choice_s`; what became of that choice."""
+    """What a proxy's wait of `wait_s` gives where Serve's own choice takes `choice_s`; what
+    became of that choice.
+    """
     became: list[str] = []
 
     async def serves_own(self: Any, request: Any, *, is_retry: bool) -> str:

@@ -1,4 +1,6 @@
-"""Sessions that move: never two of one, nor none, and never an older state in place of a newer one. No Ray."""
+"""Sessions that move: never two of one, nor none, and never an older state in place of a newer
+one. No Ray.
+"""
 
 from __future__ import annotations
 
@@ -98,7 +100,9 @@ def serve(replicas: Replicas, number: int, method: str, *args: Any) -> Any:
 
 @contextlib.contextmanager
 def slow(engine: Engine, step: str) -> Iterator[tuple[queue.SimpleQueue[str], threading.Event]]:
-    """Have a step of taking over a session wait for the event, and put something into the queue when it begins."""
+    """Have a step of taking over a session wait for the event, and put something into the queue
+    when it begins.
+    """
     begun, release, work = queue.SimpleQueue[str](), threading.Event(), getattr(engine, step)
 
     def waits(*args: Any) -> Any:
@@ -142,7 +146,9 @@ def test_an_older_episode_never_takes_the_place_of_a_newer_one_which_takes_its(
     assert obeys(c) == ("episode 2", 2)
 
 
-def test_a_reset_under_way_is_not_overtaken_by_what_it_ends(replicas: Callable[[int], Replicas]) -> None:
+def test_a_reset_under_way_is_not_overtaken_by_what_it_ends(
+    replicas: Callable[[int], Replicas],
+) -> None:
     served = replicas(2)
     cut_off(served)
     a, b = served.engines
@@ -159,8 +165,12 @@ def test_a_reset_under_way_is_not_overtaken_by_what_it_ends(replicas: Callable[[
 
 
 @pytest.mark.parametrize("first", ["the late reset", "the newer episode"])
-def test_a_reset_that_comes_late_ends_no_newer_episode(replicas: Callable[[int], Replicas], first: str) -> None:
-    """The newer episode survives, whichever of the two the replica comes to first; acts of the late one are refused."""
+def test_a_reset_that_comes_late_ends_no_newer_episode(
+    replicas: Callable[[int], Replicas], first: str
+) -> None:
+    """The newer episode survives, whichever of the two the replica comes to first; acts of the
+    late one are refused.
+    """
     served = replicas(2)
     cut_off(served)
     a, b = served.engines
@@ -211,16 +221,25 @@ def test_where_a_session_is_reset_the_others_forget_it(replicas: Callable[[int],
     assert obeys(served.engines[0]) == ("the next one", 1)
 
 
-def test_an_act_after_a_reset_is_of_the_new_episode_at_every_replica(replicas: Callable[[int], Replicas]) -> None:
-    """Also at a replica that still has the old episode, for a client that sends no step and acts at once."""
+def test_an_act_after_a_reset_is_of_the_new_episode_at_every_replica(
+    replicas: Callable[[int], Replicas],
+) -> None:
+    """Also at a replica that still has the old episode, for a client that sends no step and acts
+    at once.
+    """
     served = replicas(3)
     for number in range(12):
         ask(served.engines[number % 3], "reset", instruction=f"episode {number}")
-        acting = [served.engines[(number + further) % 3] for further in (2, 1, 0)]  # the first has the old episode
-        assert [obeys(engine) for engine in acting] == [(f"episode {number}", acts) for acts in (1, 2, 3)]
+        # The first has the old episode.
+        acting = [served.engines[(number + further) % 3] for further in (2, 1, 0)]
+        assert [obeys(engine) for engine in acting] == [
+            (f"episode {number}", acts) for acts in (1, 2, 3)
+        ]
 
 
-def test_a_replica_that_does_not_answer_delays_a_reset_only_a_little(replicas: Callable[[int], Replicas]) -> None:
+def test_a_replica_that_does_not_answer_delays_a_reset_only_a_little(
+    replicas: Callable[[int], Replicas],
+) -> None:
     served = replicas(2)
     served.frozen.add(1)
     assert ask(served.engines[0], "reset", instruction="episode 1").error is None
@@ -266,7 +285,9 @@ def test_clocks_that_differ_do_not_make_an_episode_old_that_its_client_knows_to_
     assert ask(b, "act", step=newer).error is None
 
 
-def test_of_two_states_that_a_fault_left_the_newest_moves(replicas: Callable[[int], Replicas]) -> None:
+def test_of_two_states_that_a_fault_left_the_newest_moves(
+    replicas: Callable[[int], Replicas],
+) -> None:
     served = replicas(3)
     a, b, c = served.engines
     peers = served.migrators[0]._peers, served.migrators[1]._peers
@@ -327,7 +348,9 @@ def test_a_release_that_the_policy_has_begun_is_answered_however_long_it_takes(
     assert act.get(timeout=20).act.info["obeys"] == "episode 1"
 
 
-def test_an_act_that_joins_a_search_is_not_answered_from_older_answers(replicas: Callable[[int], Replicas]) -> None:
+def test_an_act_that_joins_a_search_is_not_answered_from_older_answers(
+    replicas: Callable[[int], Replicas],
+) -> None:
     """The session has acted at its replica after that sent its state."""
     served = replicas(2)
     a, b = served.engines
@@ -353,7 +376,9 @@ def test_an_act_that_joins_a_search_is_not_answered_from_older_answers(replicas:
     assert int(reply.act.action[0]) == 2
 
 
-def test_a_session_that_goes_on_while_it_is_copied_is_not_released(replicas: Callable[[int], Replicas]) -> None:
+def test_a_session_that_goes_on_while_it_is_copied_is_not_released(
+    replicas: Callable[[int], Replicas],
+) -> None:
     served = replicas(2)
     a, _ = served.engines
     ask(a, "reset", instruction="episode 1")
@@ -385,7 +410,9 @@ def test_what_comes_twice_or_late_changes_nothing(replicas: Callable[[int], Repl
     assert obeys(a) == ("episode 1", 2)
 
 
-def test_a_slow_replica_that_was_given_a_session_is_waited_for(replicas: Callable[[int], Replicas]) -> None:
+def test_a_slow_replica_that_was_given_a_session_is_waited_for(
+    replicas: Callable[[int], Replicas],
+) -> None:
     served = replicas(3)
     a, b, c = served.engines
     for number in range(20):
@@ -429,7 +456,8 @@ def test_no_request_waits_for_a_replica_that_hangs_while_it_is_to_release_a_sess
     monkeypatch.setattr(old, "release", released)
     monkeypatch.setattr(old, "held", answered)
     try:
-        assert isinstance(ask(b, "act").error, UnknownSession)  # upon which a client begins its episode again
+        # Upon which a client begins its episode again.
+        assert isinstance(ask(b, "act").error, UnknownSession)
         assert [len(engine.sessions) for engine in (a, b)] == [1, 0], "the copy waits all the same"
     finally:
         ends.set()
@@ -437,7 +465,9 @@ def test_no_request_waits_for_a_replica_that_hangs_while_it_is_to_release_a_sess
     assert obeys(b) == ("episode 1", 1)
 
 
-def test_a_session_on_its_way_to_another_replica_is_waited_for(replicas: Callable[[int], Replicas]) -> None:
+def test_a_session_on_its_way_to_another_replica_is_waited_for(
+    replicas: Callable[[int], Replicas],
+) -> None:
     served = replicas(3)
     a, b, c = served.engines
     ask(a, "reset", instruction="episode 1")
@@ -465,7 +495,8 @@ def test_an_act_whose_deadline_passed_while_its_session_was_fetched_is_not_execu
             sender = Sender(b, "http", "robot-1", connected=False, caller=NoKey.OPEN)
             if timed:  # as HTTP and the proxied WebSocket
                 return await ask_of(sender, [request])
-            answers: queue.SimpleQueue[list[Reply]] = queue.SimpleQueue()  # as shared memory and the replica's own port
+            # As shared memory and the replica's own port.
+            answers: queue.SimpleQueue[list[Reply]] = queue.SimpleQueue()
             send(sender, [request], answers.put)
             await asyncio.sleep(0.1)
             release.set()
@@ -488,7 +519,8 @@ def test_an_act_whose_client_has_gone_while_its_session_was_fetched_is_not_execu
 
         async def go() -> None:
             sender = Sender(b, "http", "robot-1", connected=False, caller=NoKey.OPEN)
-            asked = asyncio.create_task(ask_of(sender, [Request("act", Obs())]))  # without a deadline
+            # Without a deadline.
+            asked = asyncio.create_task(ask_of(sender, [Request("act", Obs())]))
             await asyncio.to_thread(begun.get, timeout=20)
             asked.cancel()
             await asyncio.wait([asked])
@@ -499,16 +531,21 @@ def test_an_act_whose_client_has_gone_while_its_session_was_fetched_is_not_execu
     assert [obeys(b) for _ in range(3)] == [("episode 1", 1), ("episode 1", 2), ("episode 1", 3)]
 
 
-def test_an_act_that_was_begun_before_its_deadline_is_said_to_be(replicas: Callable[[int], Replicas]) -> None:
+def test_an_act_that_was_begun_before_its_deadline_is_said_to_be(
+    replicas: Callable[[int], Replicas],
+) -> None:
     engine = replicas(1).engines[0]
     ask(engine, "reset", instruction="episode 1")
 
     async def late(wait: bool) -> Reply:
         request = Request("act", Obs(info={"wait": wait}), deadline_ms=50)
-        [reply] = await ask_of(Sender(engine, "http", "robot-1", connected=False, caller=NoKey.OPEN), [request])
+        [reply] = await ask_of(
+            Sender(engine, "http", "robot-1", connected=False, caller=NoKey.OPEN), [request]
+        )
         return reply
 
-    while Counting.entered.empty():  # on a busy machine a deadline may be over before the policy begins
+    # On a busy machine a deadline may be over before the policy begins.
+    while Counting.entered.empty():
         reply = asyncio.run(late(True))
     assert isinstance(reply.error, OutcomeUnknown)
     assert type(asyncio.run(late(False)).error) is DeadlineExceeded
@@ -556,7 +593,9 @@ def test_who_looks_for_too_many_sessions_is_refused_alone(
         return await peers()
 
     migrator._peers = when_told
-    assert [migrator.fetch(f"none-{i}", told.release, "one") for i in range(5)] == [True] * 3 + [False] * 2
+    assert [migrator.fetch(f"none-{i}", told.release, "one") for i in range(5)] == [True] * 3 + [
+        False
+    ] * 2
     assert migrator.fetch("none-0", told.release, "another")
     answer.set()
     for _ in range(4):

@@ -39,9 +39,15 @@ def raised(cause: Exception) -> RayTaskError:
     ],
     ids=lambda one: getattr(one, "__name__", type(one).__name__),
 )
-def test_errors_of_another_replica(monkeypatch: pytest.MonkeyPatch, error: Exception, becomes: type[Exception]) -> None:
+def test_errors_of_another_replica(
+    monkeypatch: pytest.MonkeyPatch, error: Exception, becomes: type[Exception]
+) -> None:
     async def call(actor: Any, method: Any, *args: Any) -> Any:
-        assert (actor, method.__name__, args) == ("actor", "peer", ("WeightUpdates.stage", 1, {}, PushOptions()))
+        assert (actor, method.__name__, args) == (
+            "actor",
+            "peer",
+            ("WeightUpdates.stage", 1, {}, PushOptions()),
+        )
         raise error
 
     monkeypatch.setattr(sibling_replicas, "call_replica", call)
@@ -73,14 +79,21 @@ class Cluster:
     def __init__(self, monkeypatch: pytest.MonkeyPatch, **answers: Any) -> None:
         self.answers = {self.name(replica): answer for replica, answer in answers.items()}
         self.asked: list[tuple[str, str]] = []
-        named = [{"name": name, "namespace": "serve"} for name in [*self.answers, "SERVE_REPLICA::other#Policy#x"]]
+        named = [
+            {"name": name, "namespace": "serve"}
+            for name in [*self.answers, "SERVE_REPLICA::other#Policy#x"]
+        ]
         monkeypatch.setattr(ray.util, "list_named_actors", lambda **_: named)
         monkeypatch.setattr(ray, "get_actor", self._actor)
         monkeypatch.setattr(sibling_replicas, "call_replica", self._call)
         monkeypatch.setattr(sibling_replicas, "_SILENT_S", 60.0)
         self.initialized = set(self.answers)
-        monkeypatch.setattr(sibling_replicas.private, "replica_is_initialized", self._is_initialized)
-        context = SimpleNamespace(app_name="app", replica_id=SimpleNamespace(to_full_id_str=lambda: self.name("me")))
+        monkeypatch.setattr(
+            sibling_replicas.private, "replica_is_initialized", self._is_initialized
+        )
+        context = SimpleNamespace(
+            app_name="app", replica_id=SimpleNamespace(to_full_id_str=lambda: self.name("me"))
+        )
         monkeypatch.setattr(serve, "get_replica_context", lambda: context)
 
     @staticmethod
@@ -123,7 +136,9 @@ def test_loads_are_those_of_the_replicas_that_answer_and_the_others_are_left_alo
 
 
 def test_a_replica_is_called_once_it_is_initialized(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Serve would log a traceback for a call before; by any method, and again after it was replaced."""
+    """Serve would log a traceback for a call before; by any method, and again after it was
+    replaced.
+    """
     cluster = Cluster(monkeypatch, a=load("a"), b=load("b"))
     cluster.initialized = {cluster.name("a")}
 
@@ -144,11 +159,14 @@ def test_a_replica_is_called_once_it_is_initialized(monkeypatch: pytest.MonkeyPa
 
 
 @pytest.mark.parametrize(
-    ("replica", "answer"), [("a", ({"policy": "noop"}, "actor")), ("late", None), ("dead", None), ("gone", None)]
+    ("replica", "answer"),
+    [("a", ({"policy": "noop"}, "actor")), ("late", None), ("dead", None), ("gone", None)],
 )
 def test_a_client_goes_where_it_was_announced_or_stays(
     monkeypatch: pytest.MonkeyPatch, replica: str, answer: Any
 ) -> None:
-    cluster = Cluster(monkeypatch, a=({"policy": "noop"}, "actor"), late=None, dead=ActorDiedError())
+    cluster = Cluster(
+        monkeypatch, a=({"policy": "noop"}, "actor"), late=None, dead=ActorDiedError()
+    )
     assert asyncio.run(SiblingReplicas().announce_client(cluster.name(replica))) == answer
     assert cluster.asked == ([] if replica == "gone" else [(replica, "expect_client")])

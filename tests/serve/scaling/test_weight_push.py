@@ -1,4 +1,6 @@
-"""New weights for several replicas: all of them, or none; and replicas that die or start meanwhile."""
+"""New weights for several replicas: all of them, or none; and replicas that die or start
+meanwhile.
+"""
 
 from __future__ import annotations
 
@@ -10,7 +12,13 @@ import numpy as np
 import pytest
 from in_flight import answered
 
-from vlagents_ray.errors import InvalidInput, InvalidWeights, Overloaded, PolicyUnavailable, UnchangedWeights
+from vlagents_ray.errors import (
+    InvalidInput,
+    InvalidWeights,
+    Overloaded,
+    PolicyUnavailable,
+    UnchangedWeights,
+)
 from vlagents_ray.interface import Act, Agent, Obs
 from vlagents_ray.protocol.messages import Request
 from vlagents_ray.serve.engine.engine import Engine
@@ -53,7 +61,10 @@ class Replica(ThisReplica):
     def gain(self, session: str = "s", *, reset: bool = True) -> tuple[int, float]:
         """The version and the gain with which a simulation acts."""
         if reset:
-            assert answered(self.engine, session, Request("reset", Obs(), rank="simulation")).error is None
+            assert (
+                answered(self.engine, session, Request("reset", Obs(), rank="simulation")).error
+                is None
+            )
         act = answered(self.engine, session, Request("act", Obs())).act
         return act.info["policy"]["version"], float(act.action[0])
 
@@ -124,7 +135,9 @@ def test_what_changes_nothing_is_refused_and_the_duration_of_a_push_is_noted_whe
     with pytest.raises(UnchangedWeights):
         app.push(5)
     assert [took_ms > 0 for took_ms in first.engine.weights.collect_pushes_ms()] == [True]
-    assert first.engine.weights.collect_pushes_ms() == other.engine.weights.collect_pushes_ms() == []
+    assert (
+        first.engine.weights.collect_pushes_ms() == other.engine.weights.collect_pushes_ms() == []
+    )
     assert app.push(5, PushOptions(allow_same=True)).version == 2
 
 
@@ -149,13 +162,19 @@ def test_if_one_replica_refuses_none_acts_with_it(app: Application) -> None:
 def test_a_learner_numbers_versions_as_it_likes_if_they_rise(app: Application) -> None:
     app.start(Gain(), Gain())
     assert app.push(5, PushOptions(version=500)).version == 500
-    with pytest.raises(InvalidInput, match="version: got 500, want one above 500, the newest that acts"):
+    with pytest.raises(
+        InvalidInput, match="version: got 500, want one above 500, the newest that acts"
+    ):
         app.push(6, PushOptions(version=500))
     assert app.push(6).version == 501
     assert app.gains() == [(501, 6.0)] * 2
-    with pytest.raises(InvalidInput, match=r"version: got 9007199254740992, want a number in \[1, 9007199254740991\]"):
+    with pytest.raises(
+        InvalidInput,
+        match=r"version: got 9007199254740992, want a number in \[1, 9007199254740991\]",
+    ):
         PushOptions(version=2**53)
-    with pytest.raises(InvalidInput, match="want at most 1000000000 above 501"):  # or no later number is above it
+    # Or no later number is above it.
+    with pytest.raises(InvalidInput, match="want at most 1000000000 above 501"):
         app.push(7, PushOptions(version=2**53 - 1))
     assert app.push(7, PushOptions(version=502)).version == 502
 
@@ -163,7 +182,9 @@ def test_a_learner_numbers_versions_as_it_likes_if_they_rise(app: Application) -
 def test_if_one_replica_cannot_be_reached_none_acts_with_it(app: Application) -> None:
     _, far = app.start(Gain(), Gain())
     far.fails["stage"] = PeerUnreachable("no route")
-    with pytest.raises(PolicyUnavailable, match="replica r1 cannot be reached, so that nothing was changed"):
+    with pytest.raises(
+        PolicyUnavailable, match="replica r1 cannot be reached, so that nothing was changed"
+    ):
         app.push(5)
     far.fails.clear()
     assert app.gains() == [(0, 0.0)] * 2
@@ -203,7 +224,9 @@ def test_a_push_beside_another_is_refused_and_leaves_that_one_alone(app: Applica
     assert app.gains() == [(0, 0.0), (1, 7.0)]
 
 
-def test_a_replica_that_starts_later_takes_the_newest_and_the_pinned_version(app: Application) -> None:
+def test_a_replica_that_starts_later_takes_the_newest_and_the_pinned_version(
+    app: Application,
+) -> None:
     app.start(Gain())
     app.push(5, PushOptions(pin=True))
     app.push(6)
@@ -216,7 +239,9 @@ def test_a_replica_that_starts_later_takes_the_newest_and_the_pinned_version(app
     assert app.push(8, at=1).version == 4
 
 
-def test_a_replica_that_loads_does_not_hold_up_the_others_and_one_that_is_lost_does(app: Application) -> None:
+def test_a_replica_that_loads_does_not_hold_up_the_others_and_one_that_is_lost_does(
+    app: Application,
+) -> None:
     _, other = app.start(Gain(), Gain())
     pusher = app.pusher(app.replicas[0])
     for error in (PeerUnreachable("no answer"), PolicyUnavailable("the policy is loading")):

@@ -1,4 +1,6 @@
-"""The memory that pushes of weights need on a GPU of a fake torch, and the streams of their copies."""
+"""The memory that pushes of weights need on a GPU of a fake torch, and the streams of their
+copies.
+"""
 
 from __future__ import annotations
 
@@ -54,7 +56,9 @@ class OnGpu(Agent):
         self.module = Module(cuda)
 
     def act(self, obs: Obs) -> Act:
-        return Act(np.array([float(getattr(self.module, name).detach().values[-1]) for name in "abcd"]))
+        return Act(
+            np.array([float(getattr(self.module, name).detach().values[-1]) for name in "abcd"])
+        )
 
 
 class OwnLoading(OnGpu):
@@ -114,7 +118,9 @@ def test_a_push_needs_the_model_twice_and_gives_one_back(cuda: FakeCuda) -> None
         assert 2 * MODEL <= pushed.peak() <= 2 * MODEL + 2 * PART
         if number > 1:  # the loaded checkpoint, which is pinned, is in the memory of the host
             assert cuda.memory.allocated == MODEL
-    assert cuda.emptied == 0, "torch keeps the memory for the next push: its return would wait for the GPU"
+    assert cuda.emptied == 0, (
+        "torch keeps the memory for the next push: its return would wait for the GPU"
+    )
     assert pushed.act(pushed.begin(follows=False)) == 0
     assert pushed.act(session) == 4
 
@@ -167,7 +173,9 @@ def test_a_dropped_version_gives_its_memory_back(cuda: FakeCuda) -> None:
         ("d", PushOptions("keep", partial=True, allow_same=True)),
     ],
 )
-def test_no_push_waits_for_an_act(cuda: FakeCuda, kind: type[OnGpu], values: str, options: PushOptions) -> None:
+def test_no_push_waits_for_an_act(
+    cuda: FakeCuda, kind: type[OnGpu], values: str, options: PushOptions
+) -> None:
     pushed = Pushed(cuda, kind(cuda))
     session = pushed.begin(follows=True)
     for number in (1, 2):  # the second one has moved the loaded checkpoint to the host, once
@@ -178,10 +186,14 @@ def test_no_push_waits_for_an_act(cuda: FakeCuda, kind: type[OnGpu], values: str
     with ThreadPoolExecutor(1) as executor:
         with acting:
             staged = executor.submit(
-                lambda: pushed.weights.stage(3, {name: np.full(SIZE, 3, np.float32) for name in names}, options)
+                lambda: pushed.weights.stage(
+                    3, {name: np.full(SIZE, 3, np.float32) for name in names}, options
+                )
             )
             done, _ = wait([staged], 60)
-            values_of_the_newest = executor.submit(lambda: pushed.weights.portable_values(pushed.weights.newest))
+            values_of_the_newest = executor.submit(
+                lambda: pushed.weights.portable_values(pushed.weights.newest)
+            )
             read, _ = wait([values_of_the_newest], 60)
         assert done
         assert read
@@ -206,7 +218,8 @@ def test_a_push_that_reads_values_while_another_version_takes_their_place_reads_
         calls.append(held)
         if len(calls) == 1:
             with pushed.weights._busy:
-                pushed.act(old)  # version 0 takes the memory of version 1, whose missing values are read
+                # Version 0 takes the memory of version 1, whose missing values are read.
+                pushed.act(old)
         return completed(held, *args, **options)
 
     monkeypatch.setattr(trainable, "completed", interrupted)
@@ -222,7 +235,9 @@ def test_a_value_with_two_names_is_pushed_by_either(cuda: FakeCuda) -> None:
     pushed = Pushed(cuda, OnGpu(cuda))
     session = pushed.begin(follows=True)
     for number, name in enumerate(["a", "tied"], 1):
-        pushed.weights.stage(number, {name: np.full(SIZE, number, np.float32)}, PushOptions(partial=True))
+        pushed.weights.stage(
+            number, {name: np.full(SIZE, number, np.float32)}, PushOptions(partial=True)
+        )
         pushed.weights.commit(number, KEEP, lambda: pushed.sessions)
         assert session.weights is not None
         pushed.weights.use(session.weights)
@@ -234,7 +249,9 @@ def test_a_part_of_the_values_completes_a_version_in_the_memory_of_the_host(cuda
     session = pushed.begin(follows=True)
     pushed.push(1, PushOptions())
     for number in (2, 3):
-        pushed.weights.stage(number, {"d": np.full(SIZE, 9, np.float32)}, PARTIAL, lambda: pushed.sessions)
+        pushed.weights.stage(
+            number, {"d": np.full(SIZE, 9, np.float32)}, PARTIAL, lambda: pushed.sessions
+        )
         pushed.weights.commit(number, PushOptions(), list)
     assert pushed.act(session) == 0
     new = pushed.begin(follows=True)
@@ -265,7 +282,9 @@ def test_copies_to_and_from_the_host_run_on_a_stream_of_their_own(cuda: FakeCuda
     assert max(size for _, size in cuda.transfers) <= PART
 
 
-def test_no_operation_of_a_push_is_on_the_stream_of_the_acts(cuda: FakeCuda, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_no_operation_of_a_push_is_on_the_stream_of_the_acts(
+    cuda: FakeCuda, monkeypatch: pytest.MonkeyPatch
+) -> None:
     run, streams = cuda.run, set()
 
     def noted(index: int, call: Any, inputs: Any) -> Any:
@@ -285,11 +304,17 @@ def test_no_operation_of_a_push_is_on_the_stream_of_the_acts(cuda: FakeCuda, mon
 
 def test_the_fingerprint_is_the_same_on_a_gpu(cuda: FakeCuda) -> None:
     for dtype in (torch.float32, torch.bfloat16, torch.uint8, torch.int64):
-        values = {str(length): (100 * torch.randn(length)).to(dtype) for length in (0, 1, 9, 10, 11, 500, 1234)}
+        values = {
+            str(length): (100 * torch.randn(length)).to(dtype)
+            for length in (0, 1, 9, 10, 11, 500, 1234)
+        }
         found = fingerprint(values)
         assert fingerprint({name: cuda.tensor(value) for name, value in values.items()}) == found
         assert (
-            fingerprint({name: value.numpy() for name, value in values.items() if dtype != torch.bfloat16} or values)
+            fingerprint(
+                {name: value.numpy() for name, value in values.items() if dtype != torch.bfloat16}
+                or values
+            )
             == found
         )
         values["500"][[3, 400]] = values["500"][[400, 3]] + 1
@@ -297,7 +322,9 @@ def test_the_fingerprint_is_the_same_on_a_gpu(cuda: FakeCuda) -> None:
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16, torch.int64])
-def test_values_of_any_length_and_type_arrive_bit_for_bit(cuda: FakeCuda, dtype: torch.dtype) -> None:
+def test_values_of_any_length_and_type_arrive_bit_for_bit(
+    cuda: FakeCuda, dtype: torch.dtype
+) -> None:
     for length in (0, 1, 99, 100, 500, 12_345):
         values = (100 * torch.randn(length)).to(dtype)
         target = cuda.tensor(torch.empty(length, dtype=dtype), length % 2)
@@ -310,7 +337,9 @@ def test_values_of_any_length_and_type_arrive_bit_for_bit(cuda: FakeCuda, dtype:
     halves = cuda.tensor(torch.empty(3, 50, 7, dtype=torch.bfloat16))
     copy(whole, halves)
     assert torch.equal(halves.values, whole.bfloat16())
-    assert torch.equal(torch.from_numpy(portable(halves).view(np.int16)).view(torch.bfloat16), whole.bfloat16())
+    assert torch.equal(
+        torch.from_numpy(portable(halves).view(np.int16)).view(torch.bfloat16), whole.bfloat16()
+    )
 
 
 def test_tensors_in_each_others_memory_are_not_swapped() -> None:

@@ -1,4 +1,6 @@
-"""New weights in one replica: two phases, when sessions change, and nothing changed by what is refused."""
+"""New weights in one replica: two phases, when sessions change, and nothing changed by what is
+refused.
+"""
 
 from __future__ import annotations
 
@@ -81,7 +83,9 @@ class Lazy(Doubled):
 
 
 @pytest.mark.parametrize("partial", [False, True])
-def test_parameters_that_the_first_act_makes_can_be_pushed(serving: Callable[..., Engine], partial: bool) -> None:
+def test_parameters_that_the_first_act_makes_can_be_pushed(
+    serving: Callable[..., Engine], partial: bool
+) -> None:
     served = Served(serving(Lazy()))
     options = PushOptions("keep", partial, allow_same=True)
     served.reset("a")
@@ -120,7 +124,9 @@ def test_an_episode_ends_with_the_weights_that_it_began_with_unless_they_are_pus
 
 
 @AGENTS
-def test_robots_keep_the_pinned_weights_unless_they_follow(serving: Callable[..., Engine], agent: type[Gain]) -> None:
+def test_robots_keep_the_pinned_weights_unless_they_follow(
+    serving: Callable[..., Engine], agent: type[Gain]
+) -> None:
     served = Served(serving(agent()))
     for session, options in {"pinned": {}, "follows": {"weights": "follow"}}.items():
         served.reset(session, "robot", **options)
@@ -144,10 +150,17 @@ def test_robots_keep_the_pinned_weights_unless_they_follow(serving: Callable[...
 @AGENTS
 @pytest.mark.parametrize(
     ("pushed", "error"),
-    [({}, InvalidWeights), ({"layer/gain": np.full(2, np.nan)}, InvalidWeights), (gains(1), UnchangedWeights)],
+    [
+        ({}, InvalidWeights),
+        ({"layer/gain": np.full(2, np.nan)}, InvalidWeights),
+        (gains(1), UnchangedWeights),
+    ],
 )
 def test_what_is_refused_changes_nothing(
-    serving: Callable[..., Engine], agent: type[Gain], pushed: dict[str, Any], error: type[Exception]
+    serving: Callable[..., Engine],
+    agent: type[Gain],
+    pushed: dict[str, Any],
+    error: type[Exception],
 ) -> None:
     served = Served(serving(agent()))
     served.push(1)
@@ -177,7 +190,10 @@ def test_a_staged_version_does_not_act_and_a_second_one_has_to_wait(
     served.learn.drop(1)
     served.push(1)
     served.learn.commit(1, PushOptions("keep"))  # as when its reply was lost
-    with pytest.raises(Overloaded, match="got version 1, want one above 1, the newest here: another push was faster"):
+    with pytest.raises(
+        Overloaded,
+        match="got version 1, want one above 1, the newest here: another push was faster",
+    ):
         served.learn.stage(1, gains(3), PushOptions())
 
 
@@ -234,7 +250,11 @@ def test_versions_never_go_back_and_no_act_fails_while_weights_are_pushed(
 def test_a_moved_session_goes_on_with_its_version_and_not_where_that_is_missing(
     serving: Callable[..., Engine], agent: type[Gain]
 ) -> None:
-    here, there, without = Served(serving(agent())), Served(serving(agent())), Served(serving(agent()))
+    here, there, without = (
+        Served(serving(agent())),
+        Served(serving(agent())),
+        Served(serving(agent())),
+    )
     here.push(1)
     here.reset("a")
     there.push(1)
@@ -263,7 +283,9 @@ def test_versions_that_nobody_acts_with_are_freed(serving: Callable[..., Engine]
     assert sorted(served.engine.models.own_weights._alive) == [0, 3]
 
 
-def test_weights_that_cannot_be_loaded_fail_the_act_and_others_act_again(serving: Callable[..., Engine]) -> None:
+def test_weights_that_cannot_be_loaded_fail_the_act_and_others_act_again(
+    serving: Callable[..., Engine],
+) -> None:
     class Fragile(Gain):
         def load_parameters(self, named: Mapping[str, Any]) -> None:
             if named["layer/gain"][0] == 1:
@@ -289,4 +311,6 @@ def test_a_policy_that_names_no_parameters_is_not_trainable(serving: Callable[..
     served = Served(serving(Fixed()))
     with pytest.raises(NotTrainable, match="Fixed: names no parameters"):
         served.learn.stage(1, {}, PushOptions())
-    assert served.learn.describe() == {key: {"version": 0, "fingerprint": ""} for key in ("newest", "pinned")}
+    assert served.learn.describe() == {
+        key: {"version": 0, "fingerprint": ""} for key in ("newest", "pinned")
+    }

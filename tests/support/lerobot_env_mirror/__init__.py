@@ -1,6 +1,8 @@
-"""An environment as LeRobot finds it, `--env.discover_packages_path=lerobot_env_mirror --env.type=mirror`.
+"""An environment as LeRobot finds it, `--env.discover_packages_path=lerobot_env_mirror
+--env.type=mirror`.
 
-It knows which actions `mirror_policy.MirrorPolicy` returns to a session of its own, and rewards each of them by 1.
+It knows which actions `mirror_policy.MirrorPolicy` returns to a session of its own, and rewards
+each of them by 1.
 """
 
 from dataclasses import dataclass, field
@@ -41,14 +43,21 @@ class Mirror(gym.Env):
         if self.steps % ROWS == 0:
             self.chunk = mirrored(self.state, self.pixel, self.steps // ROWS + 1, INSTRUCTION)
         right = np.array_equal(action, self.chunk[self.steps % ROWS])
-        self.state, self.steps, self.pixel = np.array(action, np.float32), self.steps + 1, (self.pixel + 37) % 256
+        self.state, self.steps, self.pixel = (
+            np.array(action, np.float32),
+            self.steps + 1,
+            (self.pixel + 37) % 256,
+        )
         return self._observation(), float(right), False, False, {"is_success": right}
 
     def render(self) -> Any:
         return self._observation()["pixels"][CAMERA]
 
     def _observation(self) -> dict[str, Any]:
-        return {"pixels": {CAMERA: np.full((SIDE, SIDE, 3), self.pixel, np.uint8)}, "agent_pos": self.state}
+        return {
+            "pixels": {CAMERA: np.full((SIDE, SIDE, 3), self.pixel, np.uint8)},
+            "agent_pos": self.state,
+        }
 
 
 gym.register(_ID, entry_point=Mirror, max_episode_steps=STEPS)

@@ -19,7 +19,8 @@ from vlagents_ray.protocol.messages import Reply, Request
 logger = logging.getLogger(__name__)
 
 CodecName = Literal["auto", "exact", "raw", "lossless", "jpeg"]
-_OVER_A_NETWORK = {"auto": JPEG, "exact": LOSSLESS}  # codecs that depend on the location of the server
+# Codecs that depend on the location of the server.
+_OVER_A_NETWORK = {"auto": JPEG, "exact": LOSSLESS}
 
 _ANSWER_S = 2.0  # s, time limit for the first byte of the first replica
 _SILENT_S = 2.0  # s after which an unfinished attempt to connect is reported
@@ -28,10 +29,12 @@ FAST_S = 600e-6  # s; after an answer within this time, wake-up included, the ne
 
 
 class Transport(Protocol):
-    """Carries the requests of one frame at a time to one replica of a server, which `connect` chooses.
+    """Carries the requests of one frame at a time to one replica of a server, which `connect`
+    chooses.
 
-    A request names its session, which ends with its `close` request, or with the connection. Errors that the server
-    replies with are in `Reply.error`. After `close`, `connect` may choose another replica.
+    A request names its session, which ends with its `close` request, or with the connection. Errors
+    that the server replies with are in `Reply.error`. After `close`, `connect` may choose another
+    replica.
 
     Raises:
         PolicyUnavailable: The server cannot be reached or is not ready.
@@ -51,16 +54,20 @@ class Transport(Protocol):
         """Try once to reach the server; return its metadata."""
 
     def call(self, requests: Sequence[Request], timeout_s: float) -> list[Reply]:
-        """Send requests as one frame and wait for their replies, in order. Nothing is ever sent twice."""
+        """Send requests as one frame and wait for their replies, in order. Nothing is ever sent
+        twice.
+        """
 
     def close(self) -> None:
         """End the connection."""
 
 
 class ConnectReport:
-    """Logs once, after 2 s of failing to connect, that a server is not ready and that the client retries.
+    """Logs once, after 2 s of failing to connect, that a server is not ready and that the client
+    retries.
 
-    That the host's name is unknown is logged at once: it is most often misspelt, but a container's name may come later.
+    That the host's name is unknown is logged at once: it is most often misspelt, but a container's
+    name may come later.
     """
 
     def __init__(self, url: str, timeout_s: float) -> None:
@@ -76,24 +83,32 @@ class ConnectReport:
         is_due = waited_s >= _SILENT_S or isinstance(error.__cause__, socket.gaierror)
         if not self._logged and is_due and left_s > 0:
             self._logged = True
-            logger.warning("%s: not ready; trying again for up to %.0f s (%s)", self._url, left_s, error)
+            logger.warning(
+                "%s: not ready; trying again for up to %.0f s (%s)", self._url, left_s, error
+            )
 
 
 def first_timeout_s(timeout_s: float) -> float:
-    """Return the time limit, s, for the first byte of the first replica, out of `timeout_s`; the next gets twice that.
+    """Return the time limit, s, for the first byte of the first replica, out of `timeout_s`; the
+    next gets twice that.
 
-    So every attempt to connect, however short, tries at least two replicas, the first of which may hang.
+    So every attempt to connect, however short, tries at least two replicas, the first of which may
+    hang.
     """
     return min(_ANSWER_S, timeout_s / 3)
 
 
 def left_s(deadline: float) -> float:
-    """Return the time until a deadline, s of `time.monotonic`; at least 1 ms, as 0 means no limit to some calls."""
+    """Return the time until a deadline, s of `time.monotonic`; at least 1 ms, as 0 means no
+    limit to some calls.
+    """
     return max(1e-3, deadline - time.monotonic())
 
 
 def wait(connection: socket.socket, event: int, deadline: float) -> None:
-    """Sleep until the socket is ready for `select.POLLIN` or `POLLOUT`; raises `TimeoutError` at the deadline."""
+    """Sleep until the socket is ready for `select.POLLIN` or `POLLOUT`; raises `TimeoutError` at
+    the deadline.
+    """
     left_s = deadline - time.monotonic()
     poller = select.poll()
     poller.register(connection, event)
@@ -101,31 +116,42 @@ def wait(connection: socket.socket, event: int, deadline: float) -> None:
         raise TimeoutError
 
 
-def await_answer(poller: select.poll, connection: socket.socket, spin_until: float, deadline: float) -> None:
-    """Wait for `connection`, which `poller` polls, as `wait`; sleep only after `spin_until`, s of `perf_counter`."""
+def await_answer(
+    poller: select.poll, connection: socket.socket, spin_until: float, deadline: float
+) -> None:
+    """Wait for `connection`, which `poller` polls, as `wait`; sleep only after `spin_until`, s
+    of `perf_counter`.
+    """
     while not poller.poll(0):  # a poll costs a fraction of the exception that an empty read raises
         if time.perf_counter() < spin_until:
-            os.sched_yield()  # other processes can use the core; to be woken up takes as long as everything else
+            # Other processes can use the core; to be woken up takes as long as everything else.
+            os.sched_yield()
         else:
             wait(connection, select.POLLIN, deadline)
 
 
 class CodecChoice:
-    """The codec of a connection's cameras: the user's choice, or one that depends on the location of the server.
+    """The codec of a connection's cameras: the user's choice, or one that depends on the location
+    of the server.
 
-    Within a machine, "auto" and "exact" select raw pixels; over a network, "auto" selects JPEG and "exact" PNG. On one
-    core of a server, JPEG costs 3 ns per byte of pixels, encoded and decoded, and leaves 7 to 10 % of the bytes, so
-    it is faster than raw pixels up to 300 MB/s (2.4 Gbit/s). PNG costs 18 ns and leaves about half.
+    Within a machine, "auto" and "exact" select raw pixels; over a network, "auto" selects JPEG and
+    "exact" PNG. On one core of a server, JPEG costs 3 ns per byte of pixels, encoded and decoded,
+    and leaves 7 to 10 % of the bytes, so it is faster than raw pixels up to 300 MB/s (2.4 Gbit/s).
+    PNG costs 18 ns and leaves about half.
     """
 
     def __init__(self, requested: CodecName | ImageCodec) -> None:
-        self._compressed = None if isinstance(requested, ImageCodec) else _OVER_A_NETWORK.get(requested)
+        self._compressed = (
+            None if isinstance(requested, ImageCodec) else _OVER_A_NETWORK.get(requested)
+        )
         self.codec: ImageCodec | None = None  # None until a connection determines the choice
         if isinstance(requested, ImageCodec):
             self.codec = requested
         elif self._compressed is None:
             if requested not in get_args(CodecName):
-                raise InvalidInput(f"codec: got {requested!r}, want one of {list(get_args(CodecName))}")
+                raise InvalidInput(
+                    f"codec: got {requested!r}, want one of {list(get_args(CodecName))}"
+                )
             self.codec = ImageCodec(requested)
 
     def connected(self, *, near: bool) -> None:
@@ -134,7 +160,9 @@ class CodecChoice:
             self.codec = RAW if near else self._compressed
 
     def codec_for(self, obs: Obs | None, most_bytes: float = float("inf")) -> ImageCodec:
-        """Return the codec for an observation; never raw for more than `most_bytes`, unless the user chose that."""
+        """Return the codec for an observation; never raw for more than `most_bytes`, unless the
+        user chose that.
+        """
         codec = self.codec or RAW
         if self._compressed is not None and obs is not None and codec == RAW:
             size = sum(image.nbytes for image in obs.cameras.values())

@@ -13,7 +13,13 @@ from collections.abc import Sequence
 from typing import Any
 from urllib.parse import SplitResult, urlsplit
 
-from vlagents_ray.client.credentials import ANONYMOUS, KEY_VARIABLE, Credentials, require_plain, tls_failure
+from vlagents_ray.client.credentials import (
+    ANONYMOUS,
+    KEY_VARIABLE,
+    Credentials,
+    require_plain,
+    tls_failure,
+)
 from vlagents_ray.client.http_deadline import DeadlineSocket
 from vlagents_ray.client.transports.base import CodecChoice, ConnectReport, first_timeout_s
 from vlagents_ray.errors import (
@@ -42,13 +48,19 @@ _UNKNOWN_APP_S = 10.0  # a starting server has no path until its first replica e
 
 
 class HttpTransport:
-    """The HTTP/1.1 transport; a header names the session, and routes all requests of this object to one replica."""
+    """The HTTP/1.1 transport; a header names the session, and routes all requests of this object
+    to one replica.
+    """
 
     name = "http"
     holds_sessions = False
 
-    def __init__(self, url: str, codec: CodecChoice, credentials: Credentials = ANONYMOUS, machine: str = "") -> None:
-        """Set the server; with `machine` (see `MACHINE_HEADER`), prefer the least loaded replica on that machine."""
+    def __init__(
+        self, url: str, codec: CodecChoice, credentials: Credentials = ANONYMOUS, machine: str = ""
+    ) -> None:
+        """Set the server; with `machine` (see `MACHINE_HEADER`), prefer the least loaded replica
+        on that machine.
+        """
         self._machine, self._credentials = machine, credentials
         self._url = http_url(url)
         self._codec = codec
@@ -65,13 +77,16 @@ class HttpTransport:
             try:
                 return self._metadata(max(0.1, min(left_s, attempt_s)))
             except (PolicyUnavailable, DeadlineExceeded) as error:
-                if isinstance(error, DeadlineExceeded):  # a hung replica: another session id selects another one
+                # A hung replica: another session id selects another one.
+                if isinstance(error, DeadlineExceeded):
                     self._session, attempt_s = uuid.uuid4().hex, 2 * attempt_s
                 url = self._url.geturl()
                 if isinstance(error, ConnectionLost):
                     require_plain(self._url, attempt_s)
                 if pause_s > left_s:
-                    raise PolicyUnavailable(f"{url}: not ready within {round(timeout_s, 1):g} s ({error})") from error
+                    raise PolicyUnavailable(
+                        f"{url}: not ready within {round(timeout_s, 1):g} s ({error})"
+                    ) from error
                 unknown_since = None
                 report.failed(error)
             except UnknownApp as error:
@@ -83,28 +98,44 @@ class HttpTransport:
             pause_s = min(0.3, pause_s * 1.5)
 
     def _metadata(self, timeout_s: float) -> dict[str, Any]:
-        # The session id selects the replica by its hash, since WebSockets rely on the load balancer's round robin for
-        # their distribution.
-        headers = {SESSION_HEADER: self._session} | ({MACHINE_HEADER: self._machine} if self._machine else {})
+        # The session id selects the replica by its hash, since WebSockets rely on the load
+        # balancer's round robin for their distribution.
+        headers = {SESSION_HEADER: self._session} | (
+            {MACHINE_HEADER: self._machine} if self._machine else {}
+        )
         metadata = self.get("/v1/metadata", timeout_s, headers)
         if "protocol" not in metadata:
-            raise ConfigError(f"{self._url.geturl()}: answers, but is no vlagents_ray server ({str(metadata)[:80]})")
+            raise ConfigError(
+                f"{self._url.geturl()}: answers, but is no vlagents_ray server "
+                f"({str(metadata)[:80]})"
+            )
         return metadata
 
     def get(
-        self, path: str, timeout_s: float, headers: dict[str, str] | None = None, *, method: str = "GET"
+        self,
+        path: str,
+        timeout_s: float,
+        headers: dict[str, str] | None = None,
+        *,
+        method: str = "GET",
     ) -> dict[str, Any]:
-        """Return the JSON document at a path of the server, or that which answers another method, without a body."""
+        """Return the JSON document at a path of the server, or that which answers another
+        method, without a body.
+        """
         status, kind, body = self._exchange(method, path, None, headers or {}, timeout_s)
         if status != 200:
             raise refusal(status, kind, body)
         document = _json(body)
         if not isinstance(document, dict):
-            raise ConfigError(f"{self._url.geturl()}: answers, but is no vlagents_ray server ({body[:80]!r})")
+            raise ConfigError(
+                f"{self._url.geturl()}: answers, but is no vlagents_ray server ({body[:80]!r})"
+            )
         return document
 
     def call(self, requests: Sequence[Request], timeout_s: float) -> list[Reply]:
-        """Send one POST; a response that is not a frame of replies becomes an error of the server or the proxy."""
+        """Send one POST; a response that is not a frame of replies becomes an error of the
+        server or the proxy.
+        """
         headers = {
             SESSION_HEADER: self._session,
             REQUEST_ID_HEADER: requests[0].request_id,
@@ -112,7 +143,9 @@ class HttpTransport:
             "accept": CONTENT_TYPE,
         }
         frame = encode_requests(requests, self._codec.codec_for(requests[0].obs))
-        status, kind, body = self._exchange("POST", f"/v1/{requests[0].op}", frame, headers, timeout_s)
+        status, kind, body = self._exchange(
+            "POST", f"/v1/{requests[0].op}", frame, headers, timeout_s
+        )
         if status == 200:
             return decode_replies(body)
         refused = refusal(status, kind, body)
@@ -132,25 +165,33 @@ class HttpTransport:
         connection, deadline_socket = self._open(timeout_s)
         deadline_socket.begin_exchange(timeout_s - (time.monotonic() - begun))
         try:
-            connection.request(method, self._url.path.rstrip("/") + path, body, headers | self._credentials.headers)
+            connection.request(
+                method, self._url.path.rstrip("/") + path, body, headers | self._credentials.headers
+            )
             answer = connection.getresponse()
             content = answer.read(DEFAULT_LIMITS.body_bytes + 1)
             if len(content) > DEFAULT_LIMITS.body_bytes:
                 self.close()
                 raise MessageTooLarge(
-                    f"{self._url.geturl()}: got an answer of more than {DEFAULT_LIMITS.body_bytes} bytes, want that of "
+                    f"{self._url.geturl()}: got an answer of more than {DEFAULT_LIMITS.body_bytes} "
+                    "bytes, want that of "
                     f"a policy server"
                 )
             return answer.status, answer.headers.get("content-type", ""), content
         except TimeoutError as error:
             self.close()
-            raise DeadlineExceeded(f"{self._url.geturl()}: no answer within {timeout_s:g} s") from error
-        except ssl.SSLError as error:  # with TLS 1.3, the server checks the client's certificate only now
+            raise DeadlineExceeded(
+                f"{self._url.geturl()}: no answer within {timeout_s:g} s"
+            ) from error
+        except ssl.SSLError as error:
+            # with TLS 1.3, the server checks the client's certificate only now
             self.close()
             raise tls_failure(self._url.geturl(), error) from error
         except (OSError, http.client.HTTPException) as error:
             self.close()
-            raise ConnectionLost(f"{self._url.geturl()}: {type(error).__name__}: {error}") from error
+            raise ConnectionLost(
+                f"{self._url.geturl()}: {type(error).__name__}: {error}"
+            ) from error
 
     def _open(self, timeout_s: float) -> tuple[http.client.HTTPConnection, DeadlineSocket]:
         if self._connection is not None and _closed_by_peer(self._connection[0].sock):
@@ -177,16 +218,23 @@ class HttpTransport:
 def no_replica(url: str, error: Exception) -> NoReplica:
     """Return the error of a client that cannot connect."""
     if isinstance(error, socket.gaierror):
-        return NoReplica(f"{url}: there is no host of this name ({error}); correct the name, or write its IP address")
+        return NoReplica(
+            f"{url}: there is no host of this name ({error}); correct the name, or write its IP "
+            "address"
+        )
     return NoReplica(f"{url}: cannot connect ({error}); is it running?")
 
 
 def http_url(url: str) -> SplitResult:
-    """Return the http(s) form of a server's URL; raises `ConfigError` if it is not a server's URL."""
+    """Return the http(s) form of a server's URL; raises `ConfigError` if it is not a server's
+    URL.
+    """
     parts = urlsplit(url)
     scheme = {"http": "http", "https": "https", "ws": "http", "wss": "https"}.get(parts.scheme)
     if scheme is None or not parts.hostname:
-        raise ConfigError(f"url: got {url!r}, want http(s)://HOST:PORT, ws(s)://HOST:PORT or serve://APP")
+        raise ConfigError(
+            f"url: got {url!r}, want http(s)://HOST:PORT, ws(s)://HOST:PORT or serve://APP"
+        )
     return parts._replace(scheme=scheme)
 
 
@@ -200,15 +248,20 @@ def _closed_by_peer(sock: socket.socket | None) -> bool:
 
 
 def refusal(status: int, kind: str, body: bytes) -> VLAgentsError:
-    """Return the error for an HTTP response of the server, or of a proxy in front of it, that is not a frame."""
+    """Return the error for an HTTP response of the server, or of a proxy in front of it, that is
+    not a frame.
+    """
     if "json" in kind and isinstance(document := _json(body), dict):
         return read_error(document)
     text = body[:200].decode(errors="replace").strip()
     if status == 413:
-        return MessageTooLarge(f"a proxy takes no body as large ({text}); raise its limit, or send JPEG")
+        return MessageTooLarge(
+            f"a proxy takes no body as large ({text}); raise its limit, or send JPEG"
+        )
     if status in (401, 403):  # without a JSON document, as when a WebSocket is refused
         return (Unauthorized if status == 401 else Forbidden)(
-            f"the server refuses this API key, or that there is none (HTTP {status}); set api_key or {KEY_VARIABLE}"
+            f"the server refuses this API key, or that there is none (HTTP {status}); set api_key "
+            f"or {KEY_VARIABLE}"
         )
     if status == 404:
         return UnknownApp(f"no application at this path ({text}); check the URL")

@@ -1,4 +1,6 @@
-"""Selects the transport for a URL; "auto" is the fastest that the server allows when it connects."""
+"""Selects the transport for a URL; "auto" is the fastest that the server allows when it
+connects.
+"""
 
 from __future__ import annotations
 
@@ -22,15 +24,25 @@ TransportName = Literal["auto", "shm", "plasma", "websocket", "http", "handle"]
 class AutoTransport:
     """Uses shared memory if the policy runs on this machine for this user; else a WebSocket.
 
-    Inside the cluster: shared memory, else a plasma channel on the replica's node, else the Serve handle. Shared memory
-    comes first because it is faster, without Ray's locks and framing; plasma reaches a replica on this node whose
-    socket is in another network namespace. If the object store has no room for a channel, the handle is used
+    Inside the cluster: shared memory, else a plasma channel on the replica's node, else the Serve
+    handle. Shared memory comes first because it is faster, without Ray's locks and framing; plasma
+    reaches a replica on this node whose socket is in another network namespace. If the object store
+    has no room for a channel, the handle is used
     instead: its frames are in the store for a moment, or on disk if the store has no room for them.
     """
 
-    def __init__(self, url: str, codec: CodecChoice, credentials: Credentials, *, only_shm: bool) -> None:
-        self._credentials, self._url, self._codec, self._only_shm = credentials, url, codec, only_shm
-        self._chosen: ShmTransport | PlasmaTransport | HandleTransport | WebSocketTransport | None = None
+    def __init__(
+        self, url: str, codec: CodecChoice, credentials: Credentials, *, only_shm: bool
+    ) -> None:
+        self._credentials, self._url, self._codec, self._only_shm = (
+            credentials,
+            url,
+            codec,
+            only_shm,
+        )
+        self._chosen: (
+            ShmTransport | PlasmaTransport | HandleTransport | WebSocketTransport | None
+        ) = None
         self._handle: HandleTransport | None = None  # in addition to a channel to the same replica
 
     @property
@@ -47,8 +59,14 @@ class AutoTransport:
         """Return the server's metadata, once it answers and the chosen transport is connected."""
         deadline = time.monotonic() + timeout_s
         parts = urlsplit(self._url)
-        handle = HandleTransport(parts.netloc, must_be_near=self._only_shm) if parts.scheme == "serve" else None
-        metadata_source = handle or HttpTransport(self._url, self._codec, self._credentials, boot_id())
+        handle = (
+            HandleTransport(parts.netloc, must_be_near=self._only_shm)
+            if parts.scheme == "serve"
+            else None
+        )
+        metadata_source = handle or HttpTransport(
+            self._url, self._codec, self._credentials, boot_id()
+        )
         try:
             metadata = metadata_source.connect(timeout_s)
             local = read_address(LocalAddress, metadata.get("local"))
@@ -56,7 +74,13 @@ class AutoTransport:
             metadata_source.close()
             raise
         left_s = max(1.0, deadline - time.monotonic())
-        if handle is not None and not self._only_shm and local and local.keyed and not self._credentials.api_key:
+        if (
+            handle is not None
+            and not self._only_shm
+            and local
+            and local.keyed
+            and not self._credentials.api_key
+        ):
             local = None  # a client in the cluster only needs a key for this endpoint
         shm = self._shm(local, left_s)
         if shm is not None or handle is None:
@@ -97,26 +121,35 @@ class AutoTransport:
     def _shm(self, local: LocalAddress | None, timeout_s: float) -> ShmTransport | None:
         if local is None or not reaches(local):
             if self._only_shm:
-                raise ConfigError(f"{self._url}: transport 'shm' needs the policy on this machine; it is on another")
+                raise ConfigError(
+                    f"{self._url}: transport 'shm' needs the policy on this machine; it is on "
+                    "another"
+                )
             return None
         transport = ShmTransport(local, self._credentials)
         try:
             transport.connect(timeout_s)
-        except PolicyUnavailable:  # the server belongs to another user, or is in a container with its own network
+        except PolicyUnavailable:
+            # the server belongs to another user, or is in a container with its own network
             if self._only_shm:
                 raise
             return None
         return transport
 
 
-def select_transport(url: str, transport: str, codec: CodecChoice, credentials: Credentials) -> Transport:
+def select_transport(
+    url: str, transport: str, codec: CodecChoice, credentials: Credentials
+) -> Transport:
     """Return the transport for a URL; raises `ConfigError` if the URL does not support it."""
     inside = urlsplit(url).scheme == "serve"
     if transport not in get_args(TransportName):
-        raise ConfigError(f"transport: got {transport!r}, want one of {list(get_args(TransportName))}")
+        raise ConfigError(
+            f"transport: got {transport!r}, want one of {list(get_args(TransportName))}"
+        )
     if transport in (("http", "websocket") if inside else ("handle", "plasma")):
         raise ConfigError(
-            f"transport {transport!r} does not reach {url!r}; 'handle' and 'plasma' go together with serve://APP"
+            f"transport {transport!r} does not reach {url!r}; 'handle' and 'plasma' go together "
+            "with serve://APP"
         )
     credentials.use_at(url)
     if transport in ("handle", "plasma"):

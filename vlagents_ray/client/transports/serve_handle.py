@@ -1,7 +1,9 @@
-"""`serve://APP`, from inside the Ray cluster: a Serve handle, or a plasma channel to a replica on this node.
+"""`serve://APP`, from inside the Ray cluster: a Serve handle, or a plasma channel to a replica on
+this node.
 
-A Serve handle may send each request to another replica. This transport therefore picks a replica once, and sends
-all requests of the session to it. `vlagents_ray.serve.endpoints.plasma` is the server's side of the channel.
+A Serve handle may send each request to another replica. This transport therefore picks a replica
+once, and sends all requests of the session to it. `vlagents_ray.serve.endpoints.plasma` is the
+server's side of the channel.
 """
 
 from __future__ import annotations
@@ -14,15 +16,29 @@ from typing import Any, ClassVar, Protocol
 
 from vlagents_ray.client.transports.base import ConnectReport, first_timeout_s
 from vlagents_ray.client.transports.shm import UnixTransport
-from vlagents_ray.errors import ConfigError, ConnectionLost, DeadlineExceeded, PolicyUnavailable, VLAgentsError
+from vlagents_ray.errors import (
+    ConfigError,
+    ConnectionLost,
+    DeadlineExceeded,
+    PolicyUnavailable,
+    VLAgentsError,
+)
 from vlagents_ray.images.codecs import RAW
 from vlagents_ray.protocol.frames import decode_replies, encode_requests, request_parts
-from vlagents_ray.protocol.messages import LocalAddress, PlasmaAddress, Reply, Request, boot_id, read_address
+from vlagents_ray.protocol.messages import (
+    LocalAddress,
+    PlasmaAddress,
+    Reply,
+    Request,
+    boot_id,
+    read_address,
+)
 from vlagents_ray.ray_tools import private
 
 _PAUSE_S = 0.2  # s before requesting another replica in place of a lost one
 _QUERY_S = 10.0  # s between two queries for the replicas' nodes, which change over time
-_FIRST_QUERY_S = 3.0  # s to wait for the first query; an application without a replica does not answer
+# S to wait for the first query; an application without a replica does not answer.
+_FIRST_QUERY_S = 3.0
 _CHUNK = 2**20  # bytes; Ray copies longer buffers in other threads
 _WRITE_MS = 1000  # the channel is free when a frame is written; a longer wait is a fault
 
@@ -33,27 +49,35 @@ class ClientApi(Protocol):
     `vlagents_ray.serve.replica.replica.PolicyReplica` implements them.
     """
 
-    async def attach(self, node: str = "", boot_id: str = "", must_be_near: bool = False) -> tuple[dict[str, Any], Any]:
+    async def attach(
+        self, node: str = "", boot_id: str = "", must_be_near: bool = False
+    ) -> tuple[dict[str, Any], Any]:
         """Return metadata and actor of the best replica for a client on that node."""
 
     async def call(self, session_id: str, frame: Any) -> bytes:
         """Return the replies to a frame of requests."""
 
     async def lease(self, length: int) -> tuple[bytes, int]:
-        """Lease a plasma channel for frames of `length` bytes; return its id and its capacity in bytes."""
+        """Lease a plasma channel for frames of `length` bytes; return its id and its capacity in
+        bytes.
+        """
 
     async def nodes(self) -> dict[str, int]:
         """Return the number of replicas that accept sessions on each node."""
 
 
 class HandleTransport:
-    """Sends raw frames as plasma objects, which the replica reads in place if it is on this node."""
+    """Sends raw frames as plasma objects, which the replica reads in place if it is on this
+    node.
+    """
 
     name = "handle"
     holds_sessions = False
 
     def __init__(self, app: str, *, must_be_near: bool = False) -> None:
-        """Set the application; `must_be_near` accepts no other machine, even if replicas there have far less load."""
+        """Set the application; `must_be_near` accepts no other machine, even if replicas there
+        have far less load.
+        """
         self._must_be_near, self._app = must_be_near, app
         self._session = uuid.uuid4().hex
         self._replica: Any = None
@@ -64,11 +88,15 @@ class HandleTransport:
 
         if not ray.is_initialized():
             raise ConfigError(
-                f"serve://{self._app}: this process is in no Ray cluster; call ray.init() (`vlagents-ray eval` does, "
+                f"serve://{self._app}: this process is in no Ray cluster; call ray.init() "
+                "(`vlagents-ray eval` does, "
                 f"with --address), or use http://"
             )
         deadline = time.monotonic() + timeout_s
-        attempt_s, report = first_timeout_s(timeout_s), ConnectReport(f"serve://{self._app}", timeout_s)
+        attempt_s, report = (
+            first_timeout_s(timeout_s),
+            ConnectReport(f"serve://{self._app}", timeout_s),
+        )
         while True:
             try:
                 return self._attach(max(0.0, min(attempt_s, deadline - time.monotonic())))
@@ -77,9 +105,12 @@ class HandleTransport:
                     raise PolicyUnavailable(str(error)) from error
                 report.failed(error)
                 time.sleep(_PAUSE_S)
-            except DeadlineExceeded as error:  # e.g. of a hung replica: the handle may choose another one
+            except DeadlineExceeded as error:
+                # e.g. of a hung replica: the handle may choose another one
                 if time.monotonic() >= deadline:
-                    raise PolicyUnavailable(f"serve://{self._app}: no replica within {timeout_s:g} s") from error
+                    raise PolicyUnavailable(
+                        f"serve://{self._app}: no replica within {timeout_s:g} s"
+                    ) from error
                 report.failed(error)
                 attempt_s *= 2
 
@@ -98,7 +129,9 @@ class HandleTransport:
             raise PolicyUnavailable(f"serve://{self._app}: {error}") from error
         except TimeoutError as error:
             attaching.cancel()
-            raise DeadlineExceeded(f"serve://{self._app}: no replica within {timeout_s:g} s") from error
+            raise DeadlineExceeded(
+                f"serve://{self._app}: no replica within {timeout_s:g} s"
+            ) from error
         except ray.exceptions.RayError as error:
             raise ConnectionLost(f"serve://{self._app}: {error}") from error
         found: dict[str, Any] = metadata
@@ -108,7 +141,8 @@ class HandleTransport:
         """Make one actor call; the frame is in plasma until the reply."""
         import ray
 
-        # A bare buffer is stored in plasma apart from its pickle; an array's pickle depends on the version of numpy.
+        # A bare buffer is stored in plasma apart from its pickle; an array's pickle depends on the
+        # version of numpy.
         content = pickle.PickleBuffer(encode_requests(requests, RAW))
         try:
             frame = ray.put(content)
@@ -116,25 +150,39 @@ class HandleTransport:
             raise PolicyUnavailable(
                 f"serve://{self._app}: {len(content.raw())} bytes cannot be sent: {error}"
             ) from error
-        pending = call_replica(self._replica, ClientApi.call, self._session, frame, request_id=requests[0].request_id)
+        pending = call_replica(
+            self._replica, ClientApi.call, self._session, frame, request_id=requests[0].request_id
+        )
         try:
             return decode_replies(ray.get(pending, timeout=timeout_s))
         except ray.exceptions.GetTimeoutError as error:
             ray.cancel(pending)
-            raise DeadlineExceeded(f"serve://{self._app}: no answer within {timeout_s:g} s") from error
-        except ray.exceptions.RayTaskError as error:  # it is unknown whether the replica executed the request
-            raise ConnectionLost(f"serve://{self._app}: the replica failed: {error.cause}; reset again") from error
-        except ray.exceptions.RayError as error:  # the replica is gone, or its node with the frame or the answer
+            raise DeadlineExceeded(
+                f"serve://{self._app}: no answer within {timeout_s:g} s"
+            ) from error
+        except ray.exceptions.RayTaskError as error:
+            # it is unknown whether the replica executed the request
+            raise ConnectionLost(
+                f"serve://{self._app}: the replica failed: {error.cause}; reset again"
+            ) from error
+        except ray.exceptions.RayError as error:
+            # the replica is gone, or its node with the frame or the answer
             raise self._lost(error) from error
 
     def lease(self, length: int, timeout_s: float) -> tuple[bytes, int]:
-        """Call `ClientApi.lease` of the chosen replica; raises its errors if they are of this package."""
+        """Call `ClientApi.lease` of the chosen replica; raises its errors if they are of this
+        package.
+        """
         import ray
 
         try:
-            leased: tuple[bytes, int] = ray.get(call_replica(self._replica, ClientApi.lease, length), timeout=timeout_s)
+            leased: tuple[bytes, int] = ray.get(
+                call_replica(self._replica, ClientApi.lease, length), timeout=timeout_s
+            )
         except ray.exceptions.GetTimeoutError as error:
-            raise DeadlineExceeded(f"serve://{self._app}: no answer within {timeout_s:g} s") from error
+            raise DeadlineExceeded(
+                f"serve://{self._app}: no answer within {timeout_s:g} s"
+            ) from error
         except ray.exceptions.RayTaskError as error:
             if isinstance(error.cause, VLAgentsError):
                 raise error.cause from None
@@ -147,11 +195,15 @@ class HandleTransport:
         self._replica = None
 
     def _lost(self, error: Exception) -> ConnectionLost:
-        return ConnectionLost(f"serve://{self._app}: the replica is gone ({type(error).__name__}); reset again")
+        return ConnectionLost(
+            f"serve://{self._app}: the replica is gone ({type(error).__name__}); reset again"
+        )
 
 
 class ReplicaNodes:
-    """The nodes on which an application has its replicas, queried with little blocking of the caller."""
+    """The nodes on which an application has its replicas, queried with little blocking of the
+    caller.
+    """
 
     def __init__(self, app: str) -> None:
         self._app = app
@@ -160,7 +212,9 @@ class ReplicaNodes:
         self._answer: Any = None  # the pending answer
 
     def query(self) -> dict[str, int]:
-        """Return the number of replicas on each node, by Ray's id, from the last answer; {} if there is none yet."""
+        """Return the number of replicas on each node, by Ray's id, from the last answer; {} if
+        there is none yet.
+        """
         import ray
         from ray import serve
         from ray.serve.exceptions import RayServeException
@@ -181,7 +235,8 @@ class ReplicaNodes:
 
 
 def call_replica(replica: Any, method: Callable[..., Any], *args: Any, request_id: str = "") -> Any:
-    """Call a method of one replica, as Serve's own router does; a Serve handle cannot choose its replica.
+    """Call a method of one replica, as Serve's own router does; a Serve handle cannot choose its
+    replica.
 
     `method` is one of `ClientApi`, or one of those between replicas.
     """
@@ -193,10 +248,11 @@ def call_replica(replica: Any, method: Callable[..., Any], *args: Any, request_i
 
 
 class PlasmaTransport(UnixTransport):
-    """Writes raw frames into a channel that the replica leases to this connection, which is a session.
+    """Writes raw frames into a channel that the replica leases to this connection, which is a
+    session.
 
-    Any process of the cluster on the replica's node can use it: actors, tasks, drivers. A frame that outgrows the
-    channel gets a larger one.
+    Any process of the cluster on the replica's node can use it: actors, tasks, drivers. A frame
+    that outgrows the channel gets a larger one.
     """
 
     name: ClassVar[str] = "plasma"
@@ -213,26 +269,36 @@ class PlasmaTransport(UnixTransport):
         """Choose a replica with the Serve handle, connect to its socket, and return its metadata.
 
         Raises:
-            ConfigError: The replica runs on another node, or this process does not run on a node of Ray.
+            ConfigError: The replica runs on another node, or this process does not run on a node of
+                Ray.
         """
         deadline = time.monotonic() + timeout_s
         metadata = self._handle.connect(timeout_s)
         self.connect_to(self._handle, metadata, max(1.0, deadline - time.monotonic()))
         return metadata
 
-    def connect_to(self, handle: HandleTransport, metadata: dict[str, Any], timeout_s: float) -> None:
-        """Connect like `connect`, but to the replica that `handle` chose and whose metadata is passed."""
+    def connect_to(
+        self, handle: HandleTransport, metadata: dict[str, Any], timeout_s: float
+    ) -> None:
+        """Connect like `connect`, but to the replica that `handle` chose and whose metadata is
+        passed.
+        """
         if (node := this_node()) is None:
             raise ConfigError(
-                f"serve://{self._app}: transport 'plasma' needs a process on a node of the cluster; "
+                f"serve://{self._app}: transport 'plasma' needs a process on a node of the "
+                "cluster; "
                 f"a Ray client (ray://) is none: use http://"
             )
         address = read_address(PlasmaAddress, metadata.get("plasma"))
         if address is None:
-            raise ConfigError(f"serve://{self._app}: its replica offers no plasma endpoint; use transport 'handle'")
+            raise ConfigError(
+                f"serve://{self._app}: its replica offers no plasma endpoint; use transport "
+                "'handle'"
+            )
         if address.node != node:
             raise ConfigError(
-                f"serve://{self._app}: transport 'plasma' needs the replica on this node ({node[:8]}), the chosen one "
+                f"serve://{self._app}: transport 'plasma' needs the replica on this node "
+                f"({node[:8]}), the chosen one "
                 f"is on {address.node[:8]}; use transport 'handle', or 'auto'"
             )
         self._handle = handle
@@ -244,7 +310,8 @@ class PlasmaTransport(UnixTransport):
 
     def _write(self, requests: Sequence[Request], deadline: float) -> tuple[bytes, int | None]:
         written = self._writer.write(requests)
-        # Ray copies longer buffers with six threads, whose start takes longer than the copy: hence the chunks.
+        # Ray copies longer buffers with six threads, whose start takes longer than the copy: hence
+        # the chunks.
         pieces = (
             memoryview(part)[at : at + _CHUNK]
             for part in (request_parts(requests, RAW) if written is None else written.parts())
@@ -254,7 +321,9 @@ class PlasmaTransport(UnixTransport):
         if frame.total_bytes > self._capacity:
             import ray
 
-            key, self._capacity = self._handle.lease(frame.total_bytes, max(1e-3, deadline - time.monotonic()))
+            key, self._capacity = self._handle.lease(
+                frame.total_bytes, max(1e-3, deadline - time.monotonic())
+            )
             # The id is sufficient: the replica owns the object, and keeps it as long as it lives.
             self._channel = ray.ObjectRef(key)
             private.register_writer(self._channel)

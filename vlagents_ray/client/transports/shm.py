@@ -1,7 +1,7 @@
 """Messages on a Unix socket that refer to observations in shared memory.
 
-`vlagents_ray.serve.endpoints.shm` is the server's side. With plasma (`.serve_handle`), the observations are in the
-object store instead.
+`vlagents_ray.serve.endpoints.shm` is the server's side. With plasma (`.serve_handle`), the
+observations are in the object store instead.
 """
 
 from __future__ import annotations
@@ -34,7 +34,9 @@ _PAGE = mmap.PAGESIZE
 
 
 class UnixTransport(ABC):
-    """Sends messages and receives replies; subclasses write the observations. Sessions end with the connection."""
+    """Sends messages and receives replies; subclasses write the observations. Sessions end with
+    the connection.
+    """
 
     name: ClassVar[str]
     holds_sessions = True
@@ -54,7 +56,8 @@ class UnixTransport(ABC):
 
     @abstractmethod
     def _write(self, requests: Sequence[Request], deadline: float) -> tuple[bytes, int | None]:
-        """Write requests to memory that the server reads; return the message and any descriptor to send.
+        """Write requests to memory that the server reads; return the message and any descriptor to
+        send.
 
         Raises `TimeoutError` at the deadline, and `OSError` if writing fails.
         """
@@ -68,7 +71,9 @@ class UnixTransport(ABC):
         """Process a reply. Bit n of `freed` is set if the server no longer reads memory n."""
 
     def call(self, requests: Sequence[Request], timeout_s: float) -> list[Reply]:
-        """Write requests for the server, send it a message and return its replies; late replies are discarded."""
+        """Write requests for the server, send it a message and return its replies; late replies
+        are discarded.
+        """
         deadline = time.monotonic() + timeout_s
         connection = self._socket or self._open(timeout_s)
         try:
@@ -87,8 +92,12 @@ class UnixTransport(ABC):
             self._socket = None
         self._writer = shm_layout.ShmWriter()
 
-    def _send(self, connection: socket.socket, requests: Sequence[Request], deadline: float) -> None:
-        """Write requests to memory that the server reads, and send the message; raises `TimeoutError` or `OSError`."""
+    def _send(
+        self, connection: socket.socket, requests: Sequence[Request], deadline: float
+    ) -> None:
+        """Write requests to memory that the server reads, and send the message; raises
+        `TimeoutError` or `OSError`.
+        """
         try:
             while not self._is_free():  # the memory still holds requests that timed out
                 try:
@@ -105,7 +114,9 @@ class UnixTransport(ABC):
             self._writer = shm_layout.ShmWriter()  # the server may not have received a layout
             raise
 
-    def _await(self, connection: socket.socket, requests: Sequence[Request], deadline: float) -> list[Reply]:
+    def _await(
+        self, connection: socket.socket, requests: Sequence[Request], deadline: float
+    ) -> list[Reply]:
         """Return the replies to these requests, skipping those to earlier ones."""
         begun = time.perf_counter()
         spin_until = begun + (SPIN_S if self._answers_fast else 0.0)
@@ -129,8 +140,11 @@ class UnixTransport(ABC):
                     connection.send(self._key.encode())
             except OSError as error:
                 connection.close()
-                raise PolicyUnavailable(f"{self.name}: the server's socket does not answer ({error})") from error
-            except BaseException:  # an unencodable key, or Ctrl-C: nothing else refers to the socket
+                raise PolicyUnavailable(
+                    f"{self.name}: the server's socket does not answer ({error})"
+                ) from error
+            except BaseException:
+                # an unencodable key, or Ctrl-C: nothing else refers to the socket
                 connection.close()
                 raise
             connection.setblocking(False)
@@ -140,7 +154,9 @@ class UnixTransport(ABC):
         return self._socket
 
     def _receive(self, connection: socket.socket) -> list[Reply]:
-        """Return the next replies, to any requests; raises `BlockingIOError` if there are none yet."""
+        """Return the next replies, to any requests; raises `BlockingIOError` if there are none
+        yet.
+        """
         size, control, _, _ = connection.recvmsg_into([self._buffer], _CONTROL)
         if size == 0:
             raise ConnectionResetError("the server closed the connection")
@@ -158,8 +174,12 @@ class UnixTransport(ABC):
         return decode_replies(bytes(content))
 
 
-def _send_message(connection: socket.socket, message: bytes, deadline: float, descriptor: int | None = None) -> None:
-    """Send a message and a descriptor, which is then closed; wait while the server does not read."""
+def _send_message(
+    connection: socket.socket, message: bytes, deadline: float, descriptor: int | None = None
+) -> None:
+    """Send a message and a descriptor, which is then closed; wait while the server does not
+    read.
+    """
     try:
         while True:
             try:
@@ -177,9 +197,13 @@ def _send_message(connection: socket.socket, message: bytes, deadline: float, de
 
 
 def _require_same_user(connection: socket.socket) -> None:
-    """Raise `PermissionError` if the server belongs to another user: any user may reuse the name of an ended server."""
+    """Raise `PermissionError` if the server belongs to another user: any user may reuse the name
+    of an ended server.
+    """
     if (uid := peer_uid(connection)) != os.getuid():
-        raise PermissionError(f"it belongs to the user with the number {uid}, want {os.getuid()}, this process's own")
+        raise PermissionError(
+            f"it belongs to the user with the number {uid}, want {os.getuid()}, this process's own"
+        )
 
 
 @dataclass(slots=True)
@@ -222,14 +246,19 @@ class ShmTransport(UnixTransport):
         self._memories.clear()
 
     def _is_free(self) -> bool:
-        return len(self._memories) < LocalAddress.FILES or not all(memory.busy for memory in self._memories)
+        return len(self._memories) < LocalAddress.FILES or not all(
+            memory.busy for memory in self._memories
+        )
 
     def _write(self, requests: Sequence[Request], deadline: float) -> tuple[bytes, int | None]:
         if (written := self._writer.write(requests)) is not None:
             memory, descriptor = self._memory(written.size)
             for at, array in written.arrays:
                 np.ndarray(array.shape, array.dtype, memory.map, at)[...] = array
-            message = LocalAddress.REQUEST.pack(memory.number, LocalAddress.COMPACT, written.size) + written.message
+            message = (
+                LocalAddress.REQUEST.pack(memory.number, LocalAddress.COMPACT, written.size)
+                + written.message
+            )
         else:
             parts = request_parts(requests, RAW)
             length = sum(map(len, parts))
@@ -244,7 +273,9 @@ class ShmTransport(UnixTransport):
         return message, descriptor
 
     def _unsent(self) -> None:
-        """Drop the memory file of the last request, which the server did not receive, to reuse its number."""
+        """Drop the memory file of the last request, which the server did not receive, to reuse
+        its number.
+        """
         if self._written is not None:
             memory, descriptor = self._written
             memory.busy = False
@@ -257,7 +288,9 @@ class ShmTransport(UnixTransport):
                 memory.busy = False
 
     def _memory(self, length: int) -> tuple[_Memory, int | None]:
-        """Return free memory for `length` bytes, with its descriptor if the server has not received it yet."""
+        """Return free memory for `length` bytes, with its descriptor if the server has not
+        received it yet.
+        """
         for memory in self._memories:
             if not memory.busy and len(memory.map) >= length:
                 return memory, None
@@ -266,7 +299,11 @@ class ShmTransport(UnixTransport):
         size = -(-length * 5 // 4 // _PAGE) * _PAGE
         descriptor = os.memfd_create("vlagents-ray-frames", os.MFD_CLOEXEC | os.MFD_ALLOW_SEALING)
         os.ftruncate(descriptor, size)
-        fcntl.fcntl(descriptor, fcntl.F_ADD_SEALS, fcntl.F_SEAL_SHRINK | fcntl.F_SEAL_GROW | fcntl.F_SEAL_SEAL)
+        fcntl.fcntl(
+            descriptor,
+            fcntl.F_ADD_SEALS,
+            fcntl.F_SEAL_SHRINK | fcntl.F_SEAL_GROW | fcntl.F_SEAL_SEAL,
+        )
         memory = _Memory(number, mmap.mmap(descriptor, size))
         if free:
             free[0].map.close()

@@ -1,8 +1,8 @@
 """The WebSocket transport: binary frames to a replica's own port, or through the proxy.
 
-Sessions end with the connection. The metadata has the replica's port. If that port cannot be reached (because of a
-firewall, a tunnel of one port, or TLS, which ends at the proxy), `WS /v1/stream` on the server's port replaces it, a
-little slower.
+Sessions end with the connection. The metadata has the replica's port. If that port cannot be
+reached (because of a firewall, a tunnel of one port, or TLS, which ends at the proxy), `WS
+/v1/stream` on the server's port replaces it, a little slower.
 """
 
 from __future__ import annotations
@@ -25,10 +25,30 @@ from websockets.protocol import State
 from websockets.sync.client import connect
 from websockets.uri import parse_uri
 
-from vlagents_ray.client.credentials import ANONYMOUS, WEBSOCKET_LOG, Credentials, require_plain, tls_failure
-from vlagents_ray.client.transports.base import FAST_S, SPIN_S, CodecChoice, await_answer, first_timeout_s, left_s, wait
+from vlagents_ray.client.credentials import (
+    ANONYMOUS,
+    WEBSOCKET_LOG,
+    Credentials,
+    require_plain,
+    tls_failure,
+)
+from vlagents_ray.client.transports.base import (
+    FAST_S,
+    SPIN_S,
+    CodecChoice,
+    await_answer,
+    first_timeout_s,
+    left_s,
+    wait,
+)
 from vlagents_ray.client.transports.http import HttpTransport, http_url, no_replica, refusal
-from vlagents_ray.errors import ConnectionLost, DeadlineExceeded, MessageTooLarge, PolicyUnavailable, UnknownApp
+from vlagents_ray.errors import (
+    ConnectionLost,
+    DeadlineExceeded,
+    MessageTooLarge,
+    PolicyUnavailable,
+    UnknownApp,
+)
 from vlagents_ray.protocol.frame_layout import Buffer
 from vlagents_ray.protocol.frames import decode_replies, request_parts
 from vlagents_ray.protocol.messages import (
@@ -44,14 +64,16 @@ from vlagents_ray.protocol.websocket_frames import ReceiveBuffer, frame_head
 
 logger = logging.getLogger(__name__)
 
-# Transient statuses of a proxy; HAProxy sends 500 for its own 502 to 504, and 404 while it restarts.
+# Transient statuses of a proxy; HAProxy sends 500 for its own 502 to 504, and 404 while it
+# restarts.
 _TRANSIENT = (404, 408, 500, 502, 503, 504)
 _PAUSE_S = 0.2
 _DIRECT_S = 1.0  # s to wait for a replica's own port: a firewall may drop the packets
 _READ_BYTES = 256 * 1024
 _MOST_PIECES = 64  # of a message that are sent without a copy; Linux takes at most 1,024 at once
-# A client's frames must have a mask, which keeps a web page from choosing the bytes that a proxy sees (RFC 6455, 10.3).
-# Here is neither page nor proxy, so this one changes nothing, which saves two passes over each message.
+# A client's frames must have a mask, which keeps a web page from choosing the bytes that a proxy
+# sees (RFC 6455, 10.3). Here is neither page nor proxy, so this one changes nothing, which saves
+# two passes over each message.
 _NO_MASK = bytes(4)
 
 
@@ -60,7 +82,8 @@ class ProxiedSocket:
 
     def __init__(self, url: str, credentials: Credentials, timeout_s: float) -> None:
         """Connect; raises the errors of `websockets`."""
-        self._open = contextlib.ExitStack()  # websockets 17.1 wants `connect` to be a context manager
+        # Websockets 17.1 wants `connect` to be a context manager.
+        self._open = contextlib.ExitStack()
         self._connection = self._open.enter_context(
             connect(
                 url,
@@ -77,8 +100,8 @@ class ProxiedSocket:
 
     def send(self, message: bytes, timeout_s: float) -> None:
         """Send a message within a time limit."""
-        # The kernel enforces the limit, since websockets sends without one: a hung proxy would block a robot for
-        # minutes.
+        # The kernel enforces the limit, since websockets sends without one: a hung proxy would
+        # block a robot for minutes.
         limit = struct.pack("@ll", int(timeout_s), int(timeout_s % 1 * 1e6))
         self._connection.socket.setsockopt(socket.SOL_SOCKET, socket.SO_SNDTIMEO, limit)
         self._connection.send(message)
@@ -93,7 +116,9 @@ class ProxiedSocket:
 
 
 def open_websocket(url: str, credentials: Credentials, timeout_s: float) -> ProxiedSocket:
-    """Connect to a path of a server's port; raises `NoReplica`, `PolicyUnavailable`, or a rejection of the key."""
+    """Connect to a path of a server's port; raises `NoReplica`, `PolicyUnavailable`, or a
+    rejection of the key.
+    """
     try:
         return ProxiedSocket(url, credentials, timeout_s)
     except ssl.SSLError as error:
@@ -101,7 +126,9 @@ def open_websocket(url: str, credentials: Credentials, timeout_s: float) -> Prox
     except InvalidStatus as error:
         if error.response.status_code in (401, 403, 404, 429):
             kind = error.response.headers.get("content-type", "")
-            raise refusal(error.response.status_code, kind, bytes(error.response.body or b"")) from error
+            raise refusal(
+                error.response.status_code, kind, bytes(error.response.body or b"")
+            ) from error
         raise PolicyUnavailable(f"{url}: refused with HTTP {error.response.status_code}") from error
     except (OSError, InvalidHandshake, TimeoutError) as error:
         if isinstance(error, InvalidHandshake):
@@ -110,15 +137,23 @@ def open_websocket(url: str, credentials: Credentials, timeout_s: float) -> Prox
 
 
 class Stream:
-    """A connection to a replica's own port, which the thread that waits for the answer reads and writes itself.
+    """A connection to a replica's own port, which the thread that waits for the answer reads and
+    writes itself.
 
     No thread answers pings: the server must rely on the kernel's keep-alive instead.
     """
 
     def __init__(
-        self, base: SplitResult, port: int, path: str, timeout_s: float, headers: Mapping[str, str] | None = None
+        self,
+        base: SplitResult,
+        port: int,
+        path: str,
+        timeout_s: float,
+        headers: Mapping[str, str] | None = None,
     ) -> None:
-        """Connect to `port` on the host of `base`; raises `OSError` or `InvalidHandshake` if no such server answers."""
+        """Connect to `port` on the host of `base`; raises `OSError` or `InvalidHandshake` if no
+        such server answers.
+        """
         host = base.hostname or ""
         deadline = time.monotonic() + timeout_s
         self._protocol = ClientProtocol(
@@ -166,10 +201,14 @@ class Stream:
             self._send_message(pieces, time.monotonic() + timeout_s)
         except TimeoutError as error:
             self._silent = True
-            raise ConnectionAbortedError(f"the server took no message within {timeout_s:g} s") from error
+            raise ConnectionAbortedError(
+                f"the server took no message within {timeout_s:g} s"
+            ) from error
 
     def recv(self, timeout_s: float) -> bytes:
-        """Return the next binary message; raises `ConnectionClosed`, `OSError` if it broke, or `TimeoutError`."""
+        """Return the next binary message; raises `ConnectionClosed`, `OSError` if it broke, or
+        `TimeoutError`.
+        """
         begun, deadline = time.perf_counter(), time.monotonic() + timeout_s
         spin_until = begun + (SPIN_S if self._answers_fast else 0.0)
         try:
@@ -187,23 +226,30 @@ class Stream:
     def close(self) -> None:
         """Close the connection, so that the server notices.
 
-        A message that was not answered in time is useless. Over a lost link the kernel would resend it for minutes, and
-        the server would then execute it and hold the sessions until then; a reset of the connection prevents both.
+        A message that was not answered in time is useless. Over a lost link the kernel would resend
+        it for minutes, and the server would then execute it and hold the sessions until then; a
+        reset of the connection prevents both.
         """
         with contextlib.suppress(OSError):
             if self._silent:
-                self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
+                self._socket.setsockopt(
+                    socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0)
+                )
             elif self._protocol.state is State.OPEN:
                 self._protocol.send_close()
                 self._flush(time.monotonic() + 1.0)
         self._socket.close()
 
     def _check_open(self) -> None:
-        """Raise `ConnectionClosed` or `OSError` if the connection is closed, or is being closed by the server."""
+        """Raise `ConnectionClosed` or `OSError` if the connection is closed, or is being closed
+        by the server.
+        """
         if (state := self._protocol.state) is State.CLOSED:
             raise self._protocol.close_exc
         if state is not State.OPEN:
-            raise ConnectionResetError(f"the server closes the connection ({self._protocol.close_rcvd})")
+            raise ConnectionResetError(
+                f"the server closes the connection ({self._protocol.close_rcvd})"
+            )
 
     def _read(self, parse: Callable[[memoryview], None], deadline: float) -> None:
         if count := self._socket.recv_into(self._read_memory):
@@ -220,7 +266,9 @@ class Stream:
             self._send(memoryview(piece), deadline)
 
     def _send_message(self, pieces: Sequence[Buffer], deadline: float) -> None:
-        """Send a binary message in one frame (RFC 6455, 5.2), from the memory where its pieces are."""
+        """Send a binary message in one frame (RFC 6455, 5.2), from the memory where its pieces
+        are.
+        """
         size = sum(map(len, pieces))
         head = frame_head(size, _NO_MASK)
         pieces = [head, *pieces]
@@ -275,12 +323,16 @@ class WebSocketTransport:
         self._stream(timeout_s)
 
     def call(self, requests: Sequence[Request], timeout_s: float) -> list[Reply]:
-        """Send one frame and return its replies; replies to earlier requests that timed out are discarded."""
+        """Send one frame and return its replies; replies to earlier requests that timed out are
+        discarded.
+        """
         deadline = time.monotonic() + timeout_s
         pieces = request_parts(requests, self._codec.codec_for(requests[0].obs, STREAM_BYTES))
-        if (size := sum(map(len, pieces))) > STREAM_BYTES:  # the server would just close the connection
+        # The server would just close the connection.
+        if (size := sum(map(len, pieces))) > STREAM_BYTES:
             raise MessageTooLarge(
-                f"{self._url}: got {size} bytes, the limit of a WebSocket message is {STREAM_BYTES}; "
+                f"{self._url}: got {size} bytes, the limit of a WebSocket message is "
+                f"{STREAM_BYTES}; "
                 f"send JPEG, or use transport='http'"
             )
         connection = self._stream(left_s(deadline))
@@ -312,7 +364,13 @@ class WebSocketTransport:
             return None
         try:
             limit_s = min(timeout_s, _DIRECT_S)
-            return Stream(self._base, self._address.port, self._address.path, limit_s, self._credentials.headers)
+            return Stream(
+                self._base,
+                self._address.port,
+                self._address.path,
+                limit_s,
+                self._credentials.headers,
+            )
         except TimeoutError:  # a firewall drops the packets: do not try again
             self._unreachable = True
         except (OSError, InvalidHandshake) as error:
@@ -320,20 +378,26 @@ class WebSocketTransport:
         return None
 
     def _proxied(self, timeout_s: float) -> ProxiedSocket:
-        """Connect through the proxy; retry while the proxy reports that a replica is starting or stopping.
+        """Connect through the proxy; retry while the proxy reports that a replica is starting or
+        stopping.
 
-        A missing answer is also retried: the replica that the proxy chose may hang while the next one works.
+        A missing answer is also retried: the replica that the proxy chose may hang while the next
+        one works.
         """
         deadline = time.monotonic() + timeout_s
         attempt_s = first_timeout_s(timeout_s)
         while True:
             try:
                 return open_websocket(
-                    self._url, self._credentials, max(0.1, min(attempt_s, deadline - time.monotonic()))
+                    self._url,
+                    self._credentials,
+                    max(0.1, min(attempt_s, deadline - time.monotonic())),
                 )
             except (PolicyUnavailable, UnknownApp) as error:
                 cause = error.__cause__
-                transient = isinstance(cause, InvalidStatus) and cause.response.status_code in _TRANSIENT
+                transient = (
+                    isinstance(cause, InvalidStatus) and cause.response.status_code in _TRANSIENT
+                )
                 silent = isinstance(cause, TimeoutError)
                 if not (transient or silent) or time.monotonic() + _PAUSE_S > deadline:
                     raise

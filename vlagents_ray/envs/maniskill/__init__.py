@@ -1,10 +1,12 @@
-"""ManiSkill 3: eleven table-top tasks that need no downloads, and any other task registered with ManiSkill.
+"""ManiSkill 3: eleven table-top tasks that need no downloads, and any other task registered with
+ManiSkill.
 
     with ManiSkill("PushCube-v1", width=224, height=224) as env:
         obs, _ = env.reset(seed=0)
         obs, reward, terminated, truncated, info = env.step(Act(action=np.zeros(7, np.float32)))
 
-It needs a Vulkan device, for example Mesa's software one; `ManiSkill.missing()` reports a missing one.
+It needs a Vulkan device, for example Mesa's software one; `ManiSkill.missing()` reports a missing
+one.
 """
 
 from __future__ import annotations
@@ -28,28 +30,33 @@ ON_GPU = ("gpu", "cuda", "physx_cuda")
 # The section "Evaluation" of ManiSkill 3's guide to reinforcement learning.
 PROTOCOL = {
     "ignore_terminations": True,  # an episode continues to the step limit after success or failure
-    "reconfiguration_freq": 1,  # the scene is rebuilt for each episode, with other objects if the task draws them
+    # The scene is rebuilt for each episode, with other objects if the task draws them.
+    "reconfiguration_freq": 1,
     "metrics": ["success_once", "success_at_end"],
     "metric": "success_once",  # the first of them, which ManiSkill's baselines compare
-    "seeds": "one an environment",  # each episode has its own seed, which determines all its random draws
+    # Each episode has its own seed, which determines all its random draws.
+    "seeds": "one an environment",
 }
 
 
 class ManiSkill(SimulatorEnv):
     """One environment of one ManiSkill task.
 
-    Observation: the task's cameras; in `state` the arm's `joints` (without the fingers), `tquat` and
-    `xyzrpy`, the pose of the tool centre point in the robot's base frame; `gripper`; and, for scripted experts only,
-    `info["sim_state"]`, (D,) float32, ManiSkill's flat state observation, which includes the positions of
-    objects. Some goals, such as PickCube's, are hidden from cameras.
+    Observation: the task's cameras; in `state` the arm's `joints` (without the fingers), `tquat`
+        and
+    `xyzrpy`, the pose of the tool centre point in the robot's base frame; `gripper`; and, for
+    scripted experts only, `info["sim_state"]`, (D,) float32, ManiSkill's flat state observation,
+    which includes the positions of objects. Some goals, such as PickCube's, are hidden from
+    cameras.
 
-    Action, in the default control mode `pd_ee_delta_pose`: (7,) in [-1, 1], of which the first three move the tool by
-    0.1 m per unit along the base's axes; the next three turn it about the base's axes by **minus** 0.1 rad per unit,
-    since ManiSkill scales them by their lower bound; the last is the gripper, 1 open, -1 closed. A robot without
-    gripper takes (6,). The arm lags behind its commands: a constant 1.0 moves it by about 0.03 m per step.
+    Action, in the default control mode `pd_ee_delta_pose`: (7,) in [-1, 1], of which the first
+    three move the tool by 0.1 m per unit along the base's axes; the next three turn it about the
+    base's axes by **minus** 0.1 rad per unit, since ManiSkill scales them by their lower bound; the
+    last is the gripper, 1 open, -1 closed. A robot without gripper takes (6,). The arm lags behind
+    its commands: a constant 1.0 moves it by about 0.03 m per step.
 
-    The env continues after success, so that success once and success at the end can both be measured,
-    and never reports `terminated`.
+    The env continues after success, so that success once and success at the end can both be
+    measured, and never reports `terminated`.
     """
 
     suite, known = "maniskill", tuple(INSTRUCTIONS)
@@ -70,12 +77,14 @@ class ManiSkill(SimulatorEnv):
         reward_mode: str | None = None,
         reconfigure: bool = True,
     ) -> None:
-        """Make the environment; raises the errors of `make_env`. Other options are described in `SimulatorEnv`.
+        """Make the environment; raises the errors of `make_env`. Other options are described in
+        `SimulatorEnv`.
 
         Args:
             task: ManiSkill's id.
             cameras: Cameras of the task to return; None selects all.
-            control_mode: None selects `pd_ee_delta_pose`, or the robot's own default if it lacks that.
+            control_mode: None selects `pd_ee_delta_pose`, or the robot's own default if it lacks
+                that.
             instruction: None selects the task's, see `instruction_for`.
             sim_backend: "physx_cpu", which is faster for a single environment, or "physx_cuda".
             render_backend: "cpu", "gpu", or "auto": the GPU if both SAPIEN and torch can use it.
@@ -104,10 +113,16 @@ class ManiSkill(SimulatorEnv):
 
     @property
     def instruction(self) -> str:
-        return self._alive().instructions()[0] if self._given_instruction is None else self._given_instruction
+        return (
+            self._alive().instructions()[0]
+            if self._given_instruction is None
+            else self._given_instruction
+        )
 
     def reset(self, *, seed: int, options: Options | None = None) -> tuple[Obs, dict[str, Any]]:
-        """Begin the episode of `seed`, taken modulo 2^32; `options` are passed to ManiSkill's own reset."""
+        """Begin the episode of `seed`, taken modulo 2^32; `options` are passed to ManiSkill's
+        own reset.
+        """
         self._options = options or {}
         return super().reset(seed=seed)
 
@@ -117,15 +132,25 @@ class ManiSkill(SimulatorEnv):
 
     @classmethod
     def missing(cls) -> str | None:
-        if missing := without(("mani_skill", "sapien", "gymnasium", "torch"), "pip install 'vlagents-ray[maniskill]'"):
+        if missing := without(
+            ("mani_skill", "sapien", "gymnasium", "torch"), "pip install 'vlagents-ray[maniskill]'"
+        ):
             return missing
         probe = render_probe()
-        return None if probe.ok else f"ManiSkill finds no Vulkan device to render on ({probe.error}); {probe.cure}"
+        return (
+            None
+            if probe.ok
+            else f"ManiSkill finds no Vulkan device to render on ({probe.error}); {probe.cure}"
+        )
 
     @classmethod
     def batched(cls, num_envs: int, **options: Any) -> BatchEnv | None:
         """Make all environments in one simulator, if it runs on a GPU."""
-        return ManiSkillBatch(num_envs=num_envs, **options) if options.get("sim_backend") in ON_GPU else None
+        return (
+            ManiSkillBatch(num_envs=num_envs, **options)
+            if options.get("sim_backend") in ON_GPU
+            else None
+        )
 
     def renderer(self) -> Renderer | None:
         found: Renderer | None = self._alive().renderer()
@@ -135,7 +160,9 @@ class ManiSkill(SimulatorEnv):
         return _described(self._alive(), self._reconfigure, self.max_steps, self._own_limit)
 
     def _begin(self, seed: int, state: int) -> tuple[Obs, dict[str, Any]]:
-        now = self._env.reset([seed], {**self._options, **({"reconfigure": True} if self._reconfigure else {})})
+        now = self._env.reset(
+            [seed], {**self._options, **({"reconfigure": True} if self._reconfigure else {})}
+        )
         return now.obs[0], {"success": now.success[0]}
 
     def _advance(self, action: np.ndarray) -> tuple[Obs, float, bool, dict[str, Any]]:
@@ -144,7 +171,8 @@ class ManiSkill(SimulatorEnv):
 
 
 class ManiSkillBatch(BatchEnv):
-    """`num_envs` environments of one ManiSkill task; observations and actions are those of `ManiSkill`.
+    """`num_envs` environments of one ManiSkill task; observations and actions are those of
+    `ManiSkill`.
 
     Physics on the GPU and on the CPU are not bit-identical: do not mix their results.
     """
@@ -166,7 +194,8 @@ class ManiSkillBatch(BatchEnv):
         """
         if sim_backend not in ON_GPU and num_envs > 1:
             raise ConfigError(
-                f"maniskill/{task}: {sim_backend} simulates one environment, not {num_envs}; want physx_cuda"
+                f"maniskill/{task}: {sim_backend} simulates one environment, not {num_envs}; want "
+                "physx_cuda"
             )
         self.num_envs = num_envs
         self.max_steps, self._own_limit = step_limits(f"maniskill/{task}", task, max_steps)
@@ -181,22 +210,35 @@ class ManiSkillBatch(BatchEnv):
 
     @property
     def instructions(self) -> list[str]:
-        own = self._simulator.instructions() if self._instruction is None else [self._instruction] * self.num_envs
+        own = (
+            self._simulator.instructions()
+            if self._instruction is None
+            else [self._instruction] * self.num_envs
+        )
         return own[: self._playing]
 
-    def reset(self, *, seeds: Sequence[int], options: Sequence[Options | None] | None = None) -> list[Obs]:
-        """Begin the episodes of `seeds`, taken modulo 2^32; the options are passed to ManiSkill's own reset."""
+    def reset(
+        self, *, seeds: Sequence[int], options: Sequence[Options | None] | None = None
+    ) -> list[Obs]:
+        """Begin the episodes of `seeds`, taken modulo 2^32; the options are passed to
+        ManiSkill's own reset.
+        """
         self._playing, self._steps = episodes_of(seeds, self.num_envs), 0
         spare = self.num_envs - self._playing
         every = [*seeds, *[seeds[-1]] * spare]
-        given: list[Options] = [*(option or {} for option in options or [{}] * self._playing), *[{}] * spare]
+        given: list[Options] = [
+            *(option or {} for option in options or [{}] * self._playing),
+            *[{}] * spare,
+        ]
         if self._reconfigure:
             self._simulator.reset(every, {"reconfigure": True})
         return self._simulator.reset_each(every, given).obs[: self._playing]
 
     def step(self, acts: Sequence[Act | None]) -> Steps:
         if not self._playing:
-            raise NotReset(f"maniskill/{self._task}: step before reset; call reset(seeds=...) first")
+            raise NotReset(
+                f"maniskill/{self._task}: step before reset; call reset(seeds=...) first"
+            )
         actions = np.zeros((self.num_envs, self._contract.action.dim or 0), np.float32)
         for i, act in enumerate(acts):
             if act is not None:
@@ -228,10 +270,15 @@ def _simulator(
     return Simulator(name, task, obs_mode="rgb+state", sensors=sensors, **options)
 
 
-def _described(simulator: Simulator, reconfigure: bool, max_steps: int, own_limit: int | None) -> dict[str, Any]:
+def _described(
+    simulator: Simulator, reconfigure: bool, max_steps: int, own_limit: int | None
+) -> dict[str, Any]:
     deviations = []
     if not reconfigure:
         deviations.append("reconfigure is False: scenes are kept from episode to episode")
     if max_steps != own_limit:
         deviations.append(f"max_steps is {max_steps}, the task's own is {own_limit}")
-    return simulator.describe() | {"reconfigure": reconfigure, "protocol": {**PROTOCOL, "deviations": deviations}}
+    return simulator.describe() | {
+        "reconfigure": reconfigure,
+        "protocol": {**PROTOCOL, "deviations": deviations},
+    }

@@ -1,4 +1,6 @@
-"""ManiSkill's tasks in words, and the construction of its environments in processes without a terminal."""
+"""ManiSkill's tasks in words, and the construction of its environments in processes without a
+terminal.
+"""
 
 from __future__ import annotations
 
@@ -45,7 +47,9 @@ INSTRUCTIONS: dict[str, str] = {
 
 
 def instruction_for(task: str) -> str:
-    """Return the task's instruction, or its name in words: "PickSingleYCB-v1" is "pick single ycb"."""
+    """Return the task's instruction, or its name in words: "PickSingleYCB-v1" is "pick single
+    ycb".
+    """
     if task in INSTRUCTIONS:
         return INSTRUCTIONS[task]
     words = re.findall(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+|\d+", re.sub(r"-v\d+$", "", task))
@@ -53,9 +57,11 @@ def instruction_for(task: str) -> str:
 
 
 def step_limits(env: str, task: str, wanted: int | None) -> tuple[int, int | None]:
-    """Return the step limit, `wanted` or else the task's own, and the latter; prepares the process for ManiSkill.
+    """Return the step limit, `wanted` or else the task's own, and the latter; prepares the process
+    for ManiSkill.
 
-    Raises `UnknownEnv` for an unknown task, and `ConfigError`, which names `env`, if there is no limit of 1 or more.
+    Raises `UnknownEnv` for an unknown task, and `ConfigError`, which names `env`, if there is no
+    limit of 1 or more.
     """
     prepare_rendering()
     require("sapien")
@@ -63,7 +69,10 @@ def step_limits(env: str, task: str, wanted: int | None) -> tuple[int, int | Non
     _prepare_process()
     registered = require("mani_skill.utils.registration").REGISTERED_ENVS
     if task not in registered:
-        raise UnknownEnv(f"maniskill has no task {task!r}: want one of {sorted(INSTRUCTIONS)}, or another of its ids")
+        raise UnknownEnv(
+            f"maniskill has no task {task!r}: want one of {sorted(INSTRUCTIONS)}, or another of "
+            "its ids"
+        )
     own: int | None = registered[task].max_episode_steps
     if (limit := own if wanted is None else wanted) is None:
         raise ConfigError(f"{env} has no step limit of its own; set max_steps")
@@ -72,7 +81,9 @@ def step_limits(env: str, task: str, wanted: int | None) -> tuple[int, int | Non
 
 
 def chosen_backend(wanted: str) -> str:
-    """Resolve the render backend: "auto" is the GPU if SAPIEN can render and torch can wait there, else the CPU."""
+    """Resolve the render backend: "auto" is the GPU if SAPIEN can render and torch can wait
+    there, else the CPU.
+    """
     if wanted != "auto":
         return wanted
     try:
@@ -82,11 +93,13 @@ def chosen_backend(wanted: str) -> str:
     return "gpu" if require("torch").cuda.is_available() else "cpu"
 
 
-def make_bare(task: str, control_mode: str | None, *, sim_backend: str, render_backend: str, **options: Any) -> Any:
+def make_bare(
+    task: str, control_mode: str | None, *, sim_backend: str, render_backend: str, **options: Any
+) -> Any:
     """Make the bare environment, without Gymnasium's wrappers.
 
-    A `control_mode` of None selects the default mode, or the robot's own if the robot lacks that. ManiSkill's defaults
-    replace `options` that are None.
+    A `control_mode` of None selects the default mode, or the robot's own if the robot lacks that.
+    ManiSkill's defaults replace `options` that are None.
 
     Raises:
         ConfigError: The robot lacks the control mode.
@@ -100,7 +113,9 @@ def make_bare(task: str, control_mode: str | None, *, sim_backend: str, render_b
         warnings.filterwarnings("ignore", "Creating a tensor from a list of numpy", UserWarning)
         _keep_renderer(sim_backend, render_backend)
         try:
-            return gymnasium.make(task, control_mode=control_mode or DEFAULT_CONTROL_MODE, **given).unwrapped
+            return gymnasium.make(
+                task, control_mode=control_mode or DEFAULT_CONTROL_MODE, **given
+            ).unwrapped
         except AssertionError as error:
             if "not in supported modes" not in str(error):
                 raise
@@ -111,17 +126,23 @@ def make_bare(task: str, control_mode: str | None, *, sim_backend: str, render_b
 
 @contextlib.contextmanager
 def _no_prompts(task: str) -> Iterator[None]:
-    """Turn ManiSkill's prompt on stdin, which offers to download missing assets, into `EnvFailed`."""
+    """Turn ManiSkill's prompt on stdin, which offers to download missing assets, into
+    `EnvFailed`.
+    """
     output = io.StringIO()
     stdin, sys.stdin = sys.stdin, io.StringIO("n\n")
     try:
         with contextlib.redirect_stdout(output):
             yield
     except SystemExit as error:
-        lacks = next((line for line in output.getvalue().splitlines() if "found" in line), "it did not say which")
+        lacks = next(
+            (line for line in output.getvalue().splitlines() if "found" in line),
+            "it did not say which",
+        )
         robot = re.match(r"Robot (\S+) ", lacks)
         raise EnvFailed(
-            f"maniskill/{task}: assets are missing ({lacks.partition(' Would you')[0]}); download them with: "
+            f"maniskill/{task}: assets are missing ({lacks.partition(' Would you')[0]}); download "
+            "them with: "
             f"python -m mani_skill.utils.download_asset {robot[1] if robot else task}"
         ) from error
     finally:
@@ -131,23 +152,27 @@ def _no_prompts(task: str) -> Iterator[None]:
 
 @functools.cache
 def _prepare_process() -> None:
-    """Make rebuilding a scene cheap, and keep repeated warnings out of the log; once per process."""
-    # ManiSkill collects garbage at each reconfiguration. Most of that time, 150 ms, is spent on modules just imported,
-    # which are not garbage.
+    """Make rebuilding a scene cheap, and keep repeated warnings out of the log; once per
+    process.
+    """
+    # ManiSkill collects garbage at each reconfiguration. Most of that time, 150 ms, is spent on
+    # modules just imported, which are not garbage.
     gc.collect()
     gc.freeze()
-    # Tasks and robots repeat these warnings at each reconfiguration, and no user can act on them. The logger's name
-    # ends with a space.
+    # Tasks and robots repeat these warnings at each reconfiguration, and no user can act on them.
+    # The logger's name ends with a space.
     repeated = ("No initial pose set for ", "Mimic targets dictionary is missing")
-    logging.getLogger("mani_skill ").addFilter(lambda record: not record.getMessage().startswith(repeated))
+    logging.getLogger("mani_skill ").addFilter(
+        lambda record: not record.getMessage().startswith(repeated)
+    )
 
 
 @functools.cache
 def _keep_renderer(sim_backend: str, render_backend: str) -> object:
     """Hold one renderer for the life of the process.
 
-    SAPIEN frees its device and compiled shaders with the last scene that uses them; making the next environment would
-    then take 5 s instead of 0.1 s.
+    SAPIEN frees its device and compiled shaders with the last scene that uses them; making the next
+    environment would then take 5 s instead of 0.1 s.
     """
     import sapien.render
 
@@ -156,8 +181,9 @@ def _keep_renderer(sim_backend: str, render_backend: str) -> object:
     return None if device is None else sapien.render.RenderSystem(device)
 
 
-# Position of a finger's joint when closed and when open, m, by ManiSkill's name of the robot. The last component of an
-# action for their controllers is -1 closed, 1 open. Other robots have no gripper in the contract.
+# Position of a finger's joint when closed and when open, m, by ManiSkill's name of the robot. The
+# last component of an action for their controllers is -1 closed, 1 open. Other robots have no
+# gripper in the contract.
 _FINGER_M = {
     "panda": (0.0, 0.04),
     "panda_wristcam": (0.0, 0.04),
@@ -166,8 +192,8 @@ _FINGER_M = {
 }
 _TOOL_LINK = "ee_gripper_link"  # of robots for which ManiSkill names no tool centre point
 
-# The part of the action that moves the arm, from mani_skill/agents/controllers. The rotation of "pd_ee_*pose" is
-# intrinsic XYZ Euler in the base frame; see `ManiSkill` for its sign.
+# The part of the action that moves the arm, from mani_skill/agents/controllers. The rotation of
+# "pd_ee_*pose" is intrinsic XYZ Euler in the base frame; see `ManiSkill` for its sign.
 _EE_POSE = {"space": "ee_pose", "rotation": "euler_xyz", "frame": "base"}
 _EE_POSITION = {"space": "ee_position", "rotation": "none", "frame": "base"}
 _JOINT: dict[str, Any] = {"space": "joint", "rotation": "none"}
@@ -189,16 +215,22 @@ class ManiSkillRobot:
 
     def __init__(self, agent: Any) -> None:
         names = [joint.name for joint in agent.robot.active_joints]
-        self._arm = np.array([names.index(name) for name in getattr(agent, "arm_joint_names", names)])
+        self._arm = np.array(
+            [names.index(name) for name in getattr(agent, "arm_joint_names", names)]
+        )
         self._finger_m = _FINGER_M.get(agent.uid)
         self.has_gripper = self._finger_m is not None
-        self._fingers = np.array([names.index(name) for name in getattr(agent, "gripper_joint_names", ())], dtype=int)
+        self._fingers = np.array(
+            [names.index(name) for name in getattr(agent, "gripper_joint_names", ())], dtype=int
+        )
         self.state = {"joints": StateSpec(len(self._arm), "rad")}
         if _tool(agent) is not None:
             self.state |= {"tquat": StateSpec(7, "m+quat_xyzw"), "xyzrpy": StateSpec(6, "m+rad")}
 
     def read(self, agent: Any) -> list[tuple[dict[str, np.ndarray], float | None]]:
-        """Return the state of each environment, each part (D,) float32, and the gripper in [0, 1], 1 = open."""
+        """Return the state of each environment, each part (D,) float32, and the gripper in [0,
+        1], 1 = open.
+        """
         rows = agent.robot.get_qpos().cpu().numpy()
         states = [{"joints": qpos[self._arm]} for qpos in rows]
         if "tquat" in self.state:
@@ -237,11 +269,12 @@ _LOCKED = 1e-4  # bound on the cosine of the pitch
 
 
 def tool_in_base(base: np.ndarray, tool: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Convert two (7,) world poses, metres and quaternion wxyz, as in SAPIEN, to the tool's pose in the base frame.
+    """Convert two (7,) world poses, metres and quaternion wxyz, as in SAPIEN, to the tool's pose in
+    the base frame.
 
     Returns:
-        `tquat` (7,), metres and quaternion xyzw with w >= 0, and `xyzrpy` (6,), metres and radians, where
-        R = Rz(yaw) Ry(pitch) Rx(roll); both float32.
+        `tquat` (7,), metres and quaternion xyzw with w >= 0, and `xyzrpy` (6,), metres and radians,
+        where R = Rz(yaw) Ry(pitch) Rx(roll); both float32.
     """
     bw, bx, by, bz = (float(v) for v in base[3:])
     tw, tx, ty, tz = (float(v) for v in tool[3:])
@@ -254,11 +287,21 @@ def tool_in_base(base: np.ndarray, tool: np.ndarray) -> tuple[np.ndarray, np.nda
         w, x, y, z = -w, -x, -y, -z
     px, py, pz = (float(t - b) for t, b in zip(tool[:3], base[:3], strict=True))
     # the offset turned by conj(base): v + 2 u x (u x v - bw v) with u the base's vector part
-    cx, cy, cz = by * pz - bz * py - bw * px, bz * px - bx * pz - bw * py, bx * py - by * px - bw * pz
-    px, py, pz = px + 2 * (by * cz - bz * cy), py + 2 * (bz * cx - bx * cz), pz + 2 * (bx * cy - by * cx)
-    rolls = 2 * (w * x + y * z), 1 - 2 * (x * x + y * y)  # sine and cosine of the roll, times the cosine of the pitch
+    cx, cy, cz = (
+        by * pz - bz * py - bw * px,
+        bz * px - bx * pz - bw * py,
+        bx * py - by * px - bw * pz,
+    )
+    px, py, pz = (
+        px + 2 * (by * cz - bz * cy),
+        py + 2 * (bz * cx - bx * cz),
+        pz + 2 * (bx * cy - by * cx),
+    )
+    # Sine and cosine of the roll, times the cosine of the pitch.
+    rolls = 2 * (w * x + y * z), 1 - 2 * (x * x + y * y)
     pitch = math.asin(min(max(2 * (w * y - z * x), -1.0), 1.0))
-    if math.hypot(*rolls) < _LOCKED:  # gimbal lock: only the sum or the difference of roll and yaw is determined
+    # Gimbal lock: only the sum or the difference of roll and yaw is determined.
+    if math.hypot(*rolls) < _LOCKED:
         roll, yaw = 0.0, math.copysign(2.0, -pitch) * math.atan2(x, w)
         yaw = math.remainder(yaw, 2 * math.pi)
     else:
@@ -293,7 +336,9 @@ class Simulator:
         reward_mode: str | None = None,
         sensors: Mapping[str, Any],
     ) -> None:
-        """Make the simulator, with `name` in errors; raises `ConfigError`, or `EnvFailed` with its cure."""
+        """Make the simulator, with `name` in errors; raises `ConfigError`, or `EnvFailed` with
+        its cure.
+        """
         self.name, self._task = name, task
         self._asked_for = render_backend != "auto"
         self.env: Any = make_bare(
@@ -310,40 +355,56 @@ class Simulator:
             if not hasattr(self.env.agent, "robot"):  # no robot, or several
                 raise ConfigError(f"{self.name}: want a task with exactly one robot")
             if "success" not in self.env.get_info():
-                raise ConfigError(f"{self.name} does not say what success is: there is nothing to evaluate")
+                raise ConfigError(
+                    f"{self.name} does not say what success is: there is nothing to evaluate"
+                )
             seen = self.env.single_observation_space["sensor_data"]
-            sizes = {name: textures["rgb"].shape[:2] for name, textures in seen.items() if "rgb" in textures.spaces}
+            sizes = {
+                name: textures["rgb"].shape[:2]
+                for name, textures in seen.items()
+                if "rgb" in textures.spaces
+            }
             require_cameras(self.name, cameras or (), sizes)
             chosen = sizes if cameras is None else cameras
-            self.cameras = {name: CameraSpec(height=sizes[name][0], width=sizes[name][1]) for name in chosen}
+            self.cameras = {
+                name: CameraSpec(height=sizes[name][0], width=sizes[name][1]) for name in chosen
+            }
             self._robot = ManiSkillRobot(self.env.agent)
         except BaseException:
             self.close()
             raise
 
     def contract(self, action: ActionSpec | None = None) -> Contract:
-        """Return the contract; `action` describes the actions, by default as ManiSkill's control mode has them."""
+        """Return the contract; `action` describes the actions, by default as ManiSkill's control
+        mode has them.
+        """
         env, has_gripper = self.alive(), self._robot.has_gripper
         return Contract(
             cameras=self.cameras,
             state=self._robot.state,
             gripper=has_gripper,
             instruction=True,
-            action=action or action_spec(env.control_mode, env.single_action_space, has_gripper=has_gripper),
+            action=action
+            or action_spec(env.control_mode, env.single_action_space, has_gripper=has_gripper),
             control_hz=float(env.control_freq),
         )
 
     def instructions(self) -> list[str]:
         env = self.alive()
         own = getattr(env, "get_language_instruction", None)
-        return [str(text) for text in own()] if own is not None else [instruction_for(self._task)] * env.num_envs
+        return (
+            [str(text) for text in own()]
+            if own is not None
+            else [instruction_for(self._task)] * env.num_envs
+        )
 
     def reset(self, seeds: Sequence[int], options: Mapping[str, Any]) -> Moment:
         """Begin an episode in each environment; seeds are taken modulo 2^32."""
         env = self.alive()
         with failing(self.name, "reset"):
             raw, info = env.reset(seed=[seed % 2**32 for seed in seeds], options=dict(options))
-            if env.num_envs == 1:  # rendering dominates the time of a step, so only the requested cameras are rendered
+            # Rendering dominates the time of a step, so only the requested cameras are rendered.
+            if env.num_envs == 1:
                 for name in set(env.scene.sensors) - set(self.cameras):
                     del env.scene.sensors[name]
             return self.moment(raw, info)
@@ -351,28 +412,39 @@ class Simulator:
     def reset_each(self, seeds: Sequence[int], options: Sequence[Mapping[str, Any]]) -> Moment:
         """Begin the episode of each environment separately, in the existing scenes.
 
-        ManiSkill seeds torch once for all environments that it resets together, with the seed of the first. Draws of a
-        task by torch would then depend on the other environments.
+        ManiSkill seeds torch once for all environments that it resets together, with the seed of
+        the first. Draws of a task by torch would then depend on the other environments.
         """
         env = self.alive()
         with failing(self.name, "reset"):
             with self._observing("none"):  # render nothing before all episodes have begun
                 for i, (seed, option) in enumerate(zip(seeds, options, strict=True)):
                     only = require("torch").tensor([i], device=env.device)
-                    env.reset(seed=[seed % 2**32] * env.num_envs, options={**option, "env_idx": only})
+                    env.reset(
+                        seed=[seed % 2**32] * env.num_envs, options={**option, "env_idx": only}
+                    )
             info = env.get_info()
             return self.moment(env.get_obs(info), info)
 
     def step(self, actions: np.ndarray, *, look: bool = True) -> Moment:
-        """Execute one action in each environment, (N, D) float32; without `look`, render nothing."""
+        """Execute one action in each environment, (N, D) float32; without `look`, render
+        nothing.
+        """
         env = self.alive()
-        with failing(self.name, "step"), contextlib.nullcontext() if look else self._observing("state_dict"):
+        with (
+            failing(self.name, "step"),
+            contextlib.nullcontext() if look else self._observing("state_dict"),
+        ):
             # a copy, since torch shares the memory, and warns of read-only arrays, such as Ray's
             raw, rewards, _, _, info = env.step(actions.copy())
-            return replace(self.moment(raw, info), rewards=rewards.cpu().numpy().astype(float).tolist())
+            return replace(
+                self.moment(raw, info), rewards=rewards.cpu().numpy().astype(float).tolist()
+            )
 
     def moment(self, raw: Mapping[str, Any], info: Mapping[str, Any]) -> Moment:
-        """Convert ManiSkill's observation and info. The images of a camera share one array, (N, H, W, 3)."""
+        """Convert ManiSkill's observation and info. The images of a camera share one array, (N,
+        H, W, 3).
+        """
         env = self.alive()
         rendered = raw.get("sensor_data")
         shown = {} if rendered is None else {name: rendered[name]["rgb"] for name in self.cameras}
@@ -381,7 +453,9 @@ class Simulator:
         seen = []
         for i, (state, gripper) in enumerate(self._robot.read(env.agent)):
             extra = {} if states is None else {"sim_state": states[i]}
-            seen.append(Obs({name: rows[i] for name, rows in images.items()}, gripper, state, extra))
+            seen.append(
+                Obs({name: rows[i] for name, rows in images.items()}, gripper, state, extra)
+            )
         return Moment(seen, [bool(value) for value in info["success"]], [0.0] * len(seen))
 
     def renderer(self) -> Renderer | None:
@@ -402,7 +476,10 @@ class Simulator:
             "sim_backend": env.backend.sim_backend,
             "render_backend": env.backend.render_backend,
             "render_device": None if (renderer := self.renderer()) is None else renderer.name,
-            "shaders": {name: env.scene.sensors[name].config.shader_config.shader_pack for name in self.cameras},
+            "shaders": {
+                name: env.scene.sensors[name].config.shader_config.shader_pack
+                for name in self.cameras
+            },
             "num_envs": env.num_envs,
         }
 
@@ -418,7 +495,9 @@ class Simulator:
 
     @contextlib.contextmanager
     def _observing(self, mode: str) -> Iterator[None]:
-        """Switch the observation mode; tasks still choose their additions to the state by their original mode."""
+        """Switch the observation mode; tasks still choose their additions to the state by their
+        original mode.
+        """
         env = self.alive()
         own, env._obs_mode = env._obs_mode, mode
         try:

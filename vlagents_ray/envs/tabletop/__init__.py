@@ -1,12 +1,14 @@
-"""The built-in tabletop: coloured pucks and pads, a gripper, and instructions that select among them.
+"""The built-in tabletop: coloured pucks and pads, a gripper, and instructions that select among
+them.
 
 It is plain numpy, without simulator or graphics driver, so that a first run works anywhere.
 
-Base frame: origin in the middle of the table's surface, x to the right in the image, y away from the camera, z up;
-metres. The camera "front" looks down at an elevation of 70 degrees without perspective: the view's shorter side spans
-0.66 m and the origin lies in the image's centre, so that
+Base frame: origin in the middle of the table's surface, x to the right in the image, y away from
+the camera, z up; metres. The camera "front" looks down at an elevation of 70 degrees without
+perspective: the view's shorter side spans 0.66 m and the origin lies in the image's centre, so that
 
-    u = width / 2 + s * x,   v = height / 2 - s * (y * sin 70° + z * cos 70°),   s = min(width, height) / 0.66 m
+    u = width / 2 + s * x,   v = height / 2 - s * (y * sin 70° + z * cos 70°),   s = min(width,
+    height) / 0.66 m
 
 The camera "wrist" shows a third of that, enlarged, with the fingertips in its centre.
 """
@@ -23,7 +25,15 @@ import numpy as np
 from vlagents_ray.contract import CameraSpec, Contract, StateSpec
 from vlagents_ray.envs.base import DELTA_POSE, EvalEnv, one_row, require_cameras, require_known
 from vlagents_ray.envs.tabletop.render import ELEVATION, VIEW, TabletopRenderer, WristRenderer
-from vlagents_ray.envs.tabletop.world import PUCKS, STEP_LIMIT, Goal, TabletopWorld, Task, draw_episode, goals
+from vlagents_ray.envs.tabletop.world import (
+    PUCKS,
+    STEP_LIMIT,
+    Goal,
+    TabletopWorld,
+    Task,
+    draw_episode,
+    goals,
+)
 from vlagents_ray.errors import ConfigError, NotReset
 from vlagents_ray.interface import Act, Obs
 
@@ -36,19 +46,23 @@ _POINTING_DOWN = (math.pi, 0.0, 0.0)  # roll, pitch, yaw of the gripper in rad, 
 
 
 class Tabletop(EvalEnv):
-    """Four pucks, three pads and one instruction about them, e.g. "put the red puck on the blue pad".
+    """Four pucks, three pads and one instruction about them, e.g. "put the red puck on the blue
+    pad".
 
-    Tasks: `pick_place`, `slide` (never lift the puck), `stack`, `lift`, and `mixed`, the default, which draws one of
+    Tasks: `pick_place`, `slide` (never lift the puck), `stack`, `lift`, and `mixed`, the default,
+        which draws one of
     them for each episode.
 
-    Observation: cameras (height, width, 3), by default "front" alone, of "front" and "wrist"; `state["xyzrpy"]` (6,),
-    the fingertips' position in m and the gripper's constant orientation in rad, in the base frame of the package's
-    docstring; `gripper` in [0, 1], 1 = open, about 0.58 around a puck. With `object_state`, also `state["puck"]` (3,),
-    the position of the underside of the instruction's puck, and `state["target"]` (3,), its target; m, in the base
-    frame.
+    Observation: cameras (height, width, 3), by default "front" alone, of "front" and "wrist";
+        `state["xyzrpy"]` (6,),
+    the fingertips' position in m and the gripper's constant orientation in rad, in the base frame
+    of the package's docstring; `gripper` in [0, 1], 1 = open, about 0.58 around a puck. With
+    `object_state`, also `state["puck"]` (3,), the position of the underside of the instruction's
+    puck, and `state["target"]` (3,), its target; m, in the base frame.
 
-    Action (4,): `dx, dy, dz` in units of 0.03 m per step along the base frame's axes, and the gripper, 1 = open, -1 =
-    closed. Components outside [-1, 1] are clipped, as by a robot's controller.
+    Action (4,): `dx, dy, dz` in units of 0.03 m per step along the base frame's axes, and the
+    gripper, 1 = open, -1 = closed. Components outside [-1, 1] are clipped, as by a robot's
+    controller.
 
     The reward is 1.0 in each step that ends in success, else 0.0. Nothing terminates an episode.
     """
@@ -75,10 +89,13 @@ class Tabletop(EvalEnv):
             height: The height of the image, at least 32 pixels.
             cameras: Of "front" and "wrist".
             max_steps: Steps until truncation.
-            pucks: Pucks on the table, 1 to 4. A policy without instructions can identify its puck only if it is alone.
-            object_state: Whether the state has the positions of the instruction's puck and of its target.
-            disturbance: Standard deviation of what is added to the motion of one step in ten, in units of an action;
-                demonstrations with it show how to recover from errors (DART, arXiv 1703.09327).
+            pucks: Pucks on the table, 1 to 4. A policy without instructions can identify its puck
+                only if it is alone.
+            object_state: Whether the state has the positions of the instruction's puck and of its
+                target.
+            disturbance: Standard deviation of what is added to the motion of one step in ten, in
+                units of an action; demonstrations with it show how to recover from errors (DART,
+                arXiv 1703.09327).
 
         Raises:
             ConfigError: There is no such task, or a number is out of its range.
@@ -96,7 +113,9 @@ class Tabletop(EvalEnv):
         }
         for name, (value, least, most) in ranges.items():
             if value < least or (most is not None and value > most):
-                wanted = f"at least {least}" if most is None else f"{least} to {most} in {self._task!r}"
+                wanted = (
+                    f"at least {least}" if most is None else f"{least} to {most} in {self._task!r}"
+                )
                 raise ConfigError(f"tabletop: {name} is {value}, want {wanted}")
         require_cameras("tabletop", cameras, _RENDERERS)
         self.max_steps, self._disturbance = max_steps, disturbance
@@ -122,11 +141,17 @@ class Tabletop(EvalEnv):
                 name: CameraSpec(arguments["height"], arguments["width"])
                 for name in arguments.get("cameras", ("front",))
             },
-            state={"xyzrpy": StateSpec(6, "m+rad")} | (objects if arguments.get("object_state") else {}),
+            state={"xyzrpy": StateSpec(6, "m+rad")}
+            | (objects if arguments.get("object_state") else {}),
             gripper=True,
             instruction=True,
             action=replace(
-                DELTA_POSE, dim=4, space="ee_position", rotation="none", gripper_open=1.0, gripper_closed=-1.0
+                DELTA_POSE,
+                dim=4,
+                space="ee_position",
+                rotation="none",
+                gripper_open=1.0,
+                gripper_closed=-1.0,
             ),
             control_hz=10.0,
         )
@@ -151,13 +176,18 @@ class Tabletop(EvalEnv):
             "numpy": np.__version__,
         }
 
-    def reset(self, *, seed: int, options: Mapping[str, Any] | None = None) -> tuple[Obs, dict[str, Any]]:
+    def reset(
+        self, *, seed: int, options: Mapping[str, Any] | None = None
+    ) -> tuple[Obs, dict[str, Any]]:
         """Begin an episode. The only option, `instruction`, sets another goal in the same scene.
 
-        `info["instructions"]` lists the instructions of the episode's task that are possible in this scene.
+        `info["instructions"]` lists the instructions of the episode's task that are possible in
+        this scene.
         """
         if unknown := sorted(set(options or {}) - {"instruction"}):
-            raise ConfigError(f"tabletop: unknown reset options {unknown}, want none or 'instruction'")
+            raise ConfigError(
+                f"tabletop: unknown reset options {unknown}, want none or 'instruction'"
+            )
         rng = np.random.default_rng(seed % 2**64)  # numpy accepts no negative seed
         task = self._tasks[rng.integers(len(_TASKS)) if self._task == MIXED else 0]
         world, goal = draw_episode(task, rng, self._pucks)
@@ -192,11 +222,18 @@ class Tabletop(EvalEnv):
             puck = world.puck(goal.puck)
             state["puck"] = np.array((puck.x, puck.y, puck.z), np.float32)
             state["target"] = np.array(goal.place(world), np.float32)
-        cameras = {name: renderer.draw(world) for name, renderer in self._renderers.items()} if look else {}
+        cameras = (
+            {name: renderer.draw(world) for name, renderer in self._renderers.items()}
+            if look
+            else {}
+        )
         return Obs(cameras=cameras, gripper=world.opening, state=state)
 
     def _chosen(self, world: TabletopWorld, instruction: object) -> Goal:
         possible = {goal.instruction: goal for task in self._tasks for goal in goals(world, task)}
         if instruction not in possible:
-            raise ConfigError(f"tabletop: got instruction {instruction!r}, want one of this scene's: {list(possible)}")
+            raise ConfigError(
+                f"tabletop: got instruction {instruction!r}, want one of this scene's: "
+                f"{list(possible)}"
+            )
         return possible[str(instruction)]

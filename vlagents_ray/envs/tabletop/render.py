@@ -1,7 +1,7 @@
 """Renderers of the table for the cameras "front" and "wrist".
 
-Objects at rest are drawn once; a step copies that image and adds the gripper, the held object, and their
-shadows. The camera's geometry is in the package's docstring.
+Objects at rest are drawn once; a step copies that image and adds the gripper, the held object, and
+their shadows. The camera's geometry is in the package's docstring.
 """
 
 from __future__ import annotations
@@ -43,7 +43,9 @@ _SHADOW = (0.35, -0.22)  # m, shadow offset along x and y per m of height
 
 
 class TabletopRenderer:
-    """A renderer for images of one size, which keeps the image of the objects at rest in the current episode."""
+    """A renderer for images of one size, which keeps the image of the objects at rest in the
+    current episode.
+    """
 
     def __init__(self, width: int, height: int) -> None:
         self._centre = (width / 2, height / 2)
@@ -70,7 +72,8 @@ class TabletopRenderer:
         resting = [p for p in world.pucks if p is not world.held]
         if (key := tuple([(p.x, p.y, p.z) for p in resting])) != self._still_key:
             self._still, self._still_key = self._floor_picture.copy(), key
-            for puck in sorted(resting, key=lambda p: (p.z, -p.y)):  # near ones over far ones, upper over lower
+            # Near ones over far ones, upper over lower.
+            for puck in sorted(resting, key=lambda p: (p.z, -p.y)):
                 self._draw_puck_at(self._still, puck)
         image = self._still.copy()
         self._shade(image, self._gripper_shadow, world.x, world.y, world.z + _FINGER_LENGTH)
@@ -104,13 +107,24 @@ class TabletopRenderer:
         canvas.paint(_FLOOR, np.ones_like(canvas.u))
         half_u, half_v = _TABLE_HALF[0] * s, _TABLE_HALF[1] * s * self._up
         drop = _TABLE_THICKNESS * s * self._deep
-        canvas.paint((30, 30, 32), 0.8 * canvas.glow(cu + 0.03 * s, cv + 0.05 * s, half_u * 1.3, half_v * 1.5))
+        canvas.paint(
+            (30, 30, 32),
+            0.8 * canvas.glow(cu + 0.03 * s, cv + 0.05 * s, half_u * 1.3, half_v * 1.5),
+        )
         canvas.paint(_TABLE_EDGE, canvas.box(cu, cv + drop, half_u, half_v, 0.02 * s))
-        light = 1.03 - 0.09 * np.hypot((canvas.u - cu) / half_u + 0.5, (canvas.v - cv) / half_v + 0.6) / 2
+        light = (
+            1.03
+            - 0.09 * np.hypot((canvas.u - cu) / half_u + 0.5, (canvas.v - cv) / half_v + 0.6) / 2
+        )
         grain = np.random.default_rng(0).normal(0, 0.006, light.shape)
-        canvas.paint(np.asarray(_TABLE) * (light + grain)[..., None], canvas.box(cu, cv, half_u, half_v, 0.02 * s))
+        canvas.paint(
+            np.asarray(_TABLE) * (light + grain)[..., None],
+            canvas.box(cu, cv, half_u, half_v, 0.02 * s),
+        )
         reach_u, reach_v = REACH[0][1] * s, REACH[1][1] * s * self._up
-        line = canvas.box(cu, cv, reach_u, reach_v, 0.015 * s) - canvas.box(cu, cv, reach_u - 1, reach_v - 1, 0.015 * s)
+        line = canvas.box(cu, cv, reach_u, reach_v, 0.015 * s) - canvas.box(
+            cu, cv, reach_u - 1, reach_v - 1, 0.015 * s
+        )
         canvas.paint((200, 198, 194), 0.7 * line)
         picture = np.zeros((height, width, 3), np.uint8)
         canvas.sprite().blend(picture, 0, 0)
@@ -133,13 +147,19 @@ class TabletopRenderer:
         canvas = Canvas(r, r, h + ry, ry)
         base = np.asarray(colour, np.float32)
         side = np.maximum.reduce(
-            [canvas.ellipse(0, 0, r, ry), canvas.ellipse(0, -h, r, ry), canvas.box(0, -h / 2, r, h / 2)]
+            [
+                canvas.ellipse(0, 0, r, ry),
+                canvas.ellipse(0, -h, r, ry),
+                canvas.box(0, -h / 2, r, h / 2),
+            ]
         )
         light = 0.72 - 0.28 * canvas.u / r  # from the left
         canvas.paint(base * np.clip(light, 0.4, 1.0)[..., None], side)
         canvas.paint(np.minimum(base * 1.08, 255), canvas.ellipse(0, -h, r, ry))
         canvas.paint(base * 0.94, canvas.ellipse(0, -h, r * 0.78, ry * 0.78))
-        canvas.paint((255, 255, 255), 0.4 * canvas.glow(-0.3 * r, -h - 0.3 * ry, 0.5 * r, 0.45 * ry))
+        canvas.paint(
+            (255, 255, 255), 0.4 * canvas.glow(-0.3 * r, -h - 0.3 * ry, 0.5 * r, 0.45 * ry)
+        )
         return canvas.sprite()
 
     def _draw_shadow(self, half_x: float, half_y: float, darkness: float) -> Sprite:
@@ -149,7 +169,9 @@ class TabletopRenderer:
         return canvas.sprite()
 
     def _draw_gripper(self, gap: float) -> Sprite:
-        """Draw two fingers `gap` pixels off the middle, the palm above them and the wrist on top."""
+        """Draw two fingers `gap` pixels off the middle, the palm above them and the wrist on
+        top.
+        """
         s = self._scale
         finger, length = FINGER_RADIUS * s, _FINGER_LENGTH * s * self._deep
         half, tall = 0.052 * s, 0.016 * s  # of the palm
@@ -158,25 +180,37 @@ class TabletopRenderer:
         for side in (-1.0, 1.0):
             u = side * (gap + finger)
             canvas.paint(
-                np.asarray(_FINGER) * 0.72, canvas.box(u, -length / 2, finger, length / 2 + finger / 2, finger / 2)
+                np.asarray(_FINGER) * 0.72,
+                canvas.box(u, -length / 2, finger, length / 2 + finger / 2, finger / 2),
             )
-            canvas.paint(_FINGER, canvas.box(u - finger * 0.25, -length / 2, finger * 0.6, length / 2, finger / 2))
-        canvas.paint(_PALM_FRONT, canvas.box(0, above + front / 2, half, tall * self._up + front / 2, 0.008 * s))
+            canvas.paint(
+                _FINGER,
+                canvas.box(u - finger * 0.25, -length / 2, finger * 0.6, length / 2, finger / 2),
+            )
+        canvas.paint(
+            _PALM_FRONT,
+            canvas.box(0, above + front / 2, half, tall * self._up + front / 2, 0.008 * s),
+        )
         canvas.paint(_PALM, canvas.box(0, above, half, tall * self._up, 0.008 * s))
         canvas.paint((48, 49, 51), 0.6 * canvas.glow(0, above, 0.03 * s, 0.024 * s))
         wrist = 0.02 * s
         rise = 0.02 * s * self._deep
         column = np.maximum(
-            canvas.ellipse(0, above, wrist, wrist * self._up), canvas.box(0, above - rise / 2, wrist, rise / 2)
+            canvas.ellipse(0, above, wrist, wrist * self._up),
+            canvas.box(0, above - rise / 2, wrist, rise / 2),
         )
         canvas.paint(np.asarray(_WRIST) * 0.75, column)
         canvas.paint(_WRIST, canvas.ellipse(0, above - rise, wrist, wrist * self._up))
-        canvas.paint((176, 178, 182), canvas.ellipse(0, above - rise, wrist * 0.55, wrist * 0.55 * self._up))
+        canvas.paint(
+            (176, 178, 182), canvas.ellipse(0, above - rise, wrist * 0.55, wrist * 0.55 * self._up)
+        )
         return canvas.sprite()
 
 
 class WristRenderer(TabletopRenderer):
-    """A renderer of what is around the gripper: a third of what `TabletopRenderer` shows, enlarged."""
+    """A renderer of what is around the gripper: a third of what `TabletopRenderer` shows,
+    enlarged.
+    """
 
     def __init__(self, width: int, height: int) -> None:
         super().__init__(_ENLARGED * width, _ENLARGED * height)
@@ -185,7 +219,10 @@ class WristRenderer(TabletopRenderer):
     def draw(self, world: TabletopWorld) -> np.ndarray:
         image = super().draw(world)
         u, v = self._pixel(world.x, world.y, world.z)
-        rows, columns = (self._rows + v).clip(0, len(image) - 1), (self._columns + u).clip(0, image.shape[1] - 1)
+        rows, columns = (
+            (self._rows + v).clip(0, len(image) - 1),
+            (self._columns + u).clip(0, image.shape[1] - 1),
+        )
         cut: np.ndarray = image[rows[:, None], columns]
         return cut
 
@@ -196,7 +233,9 @@ Colour = tuple[float, float, float]  # RGB, 0 to 255
 
 @dataclass(frozen=True, slots=True)
 class Sprite:
-    """A picture with transparency; its pixel (`left`, `top`) is at the anchor's (0, 0) plus these offsets."""
+    """A picture with transparency; its pixel (`left`, `top`) is at the anchor's (0, 0) plus
+    these offsets.
+    """
 
     paint: np.ndarray  # (h, w, 3) uint16, colour times opacity, opacity in [0, 256]
     keep: np.ndarray  # (h, w, 1) uint16, 256 minus the opacity
@@ -204,7 +243,9 @@ class Sprite:
     top: int  # px
 
     def blend(self, image: np.ndarray, u: int, v: int) -> None:
-        """Draw into `image`, (H, W, 3) uint8, with the anchor at column `u`, row `v`; clip at the edges."""
+        """Draw into `image`, (H, W, 3) uint8, with the anchor at column `u`, row `v`; clip at
+        the edges.
+        """
         x, y = u + self.left, v + self.top
         height, width = self.keep.shape[:2]
         x0, y0 = max(x, 0), max(y, 0)
@@ -213,7 +254,8 @@ class Sprite:
             return
         inside = (slice(y0 - y, y1 - y), slice(x0 - x, x1 - x))
         region = image[y0:y1, x0:x1]
-        mixed = region * self.keep[inside]  # at most 255 * 256, and so is the sum: both fit in uint16
+        # At most 255 * 256, and so is the sum: both fit in uint16.
+        mixed = region * self.keep[inside]
         mixed += self.paint[inside]
         mixed >>= 8
         region[...] = mixed
@@ -227,13 +269,19 @@ class Canvas:
         self._left, self._top = -int(np.ceil(left)) - 1, -int(np.ceil(up)) - 1
         width = int(np.ceil(right)) + 2 - self._left
         height = int(np.ceil(down)) + 2 - self._top
-        self.u: FloatArray = (np.arange(width, dtype=np.float32) + (self._left + 0.5))[None, :].repeat(height, 0)
-        self.v: FloatArray = (np.arange(height, dtype=np.float32) + (self._top + 0.5))[:, None].repeat(width, 1)
+        self.u: FloatArray = (np.arange(width, dtype=np.float32) + (self._left + 0.5))[
+            None, :
+        ].repeat(height, 0)
+        self.v: FloatArray = (np.arange(height, dtype=np.float32) + (self._top + 0.5))[
+            :, None
+        ].repeat(width, 1)
         self._rgb = np.zeros((height, width, 3), np.float32)  # premultiplied
         self._alpha = np.zeros((height, width, 1), np.float32)
 
     def paint(self, colour: Colour | np.ndarray, coverage: FloatArray) -> None:
-        """Paint a colour, one for all pixels or (h, w, 3), over the canvas, with `coverage` in [0, 1]."""
+        """Paint a colour, one for all pixels or (h, w, 3), over the canvas, with `coverage` in
+        [0, 1].
+        """
         amount = np.clip(coverage, 0.0, 1.0)[..., None]
         self._rgb = self._rgb * (1 - amount) + np.asarray(colour, np.float32) * amount
         self._alpha = self._alpha * (1 - amount) + amount
@@ -241,13 +289,17 @@ class Canvas:
     def sprite(self) -> Sprite:
         alpha = np.rint(self._alpha * 256)
         paint = np.minimum(np.rint(np.clip(self._rgb, 0, 255) * 256), alpha * 255)
-        return Sprite(paint.astype(np.uint16), (256 - alpha).astype(np.uint16), self._left, self._top)
+        return Sprite(
+            paint.astype(np.uint16), (256 - alpha).astype(np.uint16), self._left, self._top
+        )
 
     def ellipse(self, u: float, v: float, radius_u: float, radius_v: float) -> FloatArray:
         distance = np.hypot((self.u - u) / radius_u, (self.v - v) / radius_v) - 1
         return np.clip(0.5 - distance * min(radius_u, radius_v), 0, 1)
 
-    def box(self, u: float, v: float, half_u: float, half_v: float, corner: float = 0.0) -> FloatArray:
+    def box(
+        self, u: float, v: float, half_u: float, half_v: float, corner: float = 0.0
+    ) -> FloatArray:
         across = np.abs(self.u - u) - (half_u - corner)
         down = np.abs(self.v - v) - (half_v - corner)
         outside = np.hypot(np.maximum(across, 0), np.maximum(down, 0))

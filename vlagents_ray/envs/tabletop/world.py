@@ -1,7 +1,7 @@
 """The physics of the table, and the goals of its episodes.
 
-Quasi-static: a puck moves where it is carried or pushed and otherwise rests or falls. Plain floats replace arrays:
-for a handful of bodies they are several times faster.
+Quasi-static: a puck moves where it is carried or pushed and otherwise rests or falls. Plain floats
+replace arrays: for a handful of bodies they are several times faster.
 """
 
 from __future__ import annotations
@@ -26,7 +26,8 @@ _SUBSTEPS = 3  # so that between contact checks a finger moves at most 1 cm, les
 _OPENING_RATE = 0.5 / _SUBSTEPS  # share of the whole opening
 _CONTACT_PASSES = 4  # enough for a puck cradled by two fingers to come to rest
 _FALL = 0.06 / _SUBSTEPS  # m
-_GRASP_DEPTH = 0.012  # m, largest distance of a grasped puck's centre from the line between the fingers
+# m, largest distance of a grasped puck's centre from the line between the fingers.
+_GRASP_DEPTH = 0.012
 _LIFTED = 0.01  # m
 _EPSILON = 1e-6  # m
 
@@ -100,7 +101,9 @@ class TabletopWorld:
                 continue
             for _ in range(_CONTACT_PASSES):
                 # both fingers push at once: in sequence they would push a centred puck aside
-                pushes = [_overlap(puck, self.x + side * offset, self.y, reach) for side in (-1.0, 1.0)]
+                pushes = [
+                    _overlap(puck, self.x + side * offset, self.y, reach) for side in (-1.0, 1.0)
+                ]
                 puck.x += sum(push[0] for push in pushes if push)
                 puck.y += sum(push[1] for push in pushes if push)
                 if not any(pushes):
@@ -159,11 +162,17 @@ class TabletopWorld:
         self.gap = gap
 
     def _support(self, puck: Puck) -> float:
-        """Return the height of the support of `puck`, m: the table, or a puck under its centre of mass."""
+        """Return the height of the support of `puck`, m: the table, or a puck under its centre
+        of mass.
+        """
         height = 0.0
         for other in self.pucks:
             top = other.z + PUCK_HEIGHT
-            if other is not puck and top <= puck.z + _EPSILON and _distance(puck, other) < PUCK_RADIUS:
+            if (
+                other is not puck
+                and top <= puck.z + _EPSILON
+                and _distance(puck, other) < PUCK_RADIUS
+            ):
                 height = max(height, top)
         return height
 
@@ -187,16 +196,21 @@ class TabletopWorld:
     def _finger_over(self, puck: Puck) -> bool:
         reach = PUCK_RADIUS + FINGER_RADIUS - _EPSILON
         offset = self.gap + FINGER_RADIUS
-        return any(math.hypot(self.x + s * offset - puck.x, self.y - puck.y) < reach for s in (-1.0, 1.0))
+        return any(
+            math.hypot(self.x + s * offset - puck.x, self.y - puck.y) < reach for s in (-1.0, 1.0)
+        )
 
 
 def _overlap(puck: Puck, x: float, y: float, distance: float) -> tuple[float, float] | None:
-    """Return the shift (dx, dy) that moves a puck to `distance` from (x, y); None if it is far enough away."""
+    """Return the shift (dx, dy) that moves a puck to `distance` from (x, y); None if it is far
+    enough away.
+    """
     dx, dy = puck.x - x, puck.y - y
     if (have := math.hypot(dx, dy)) >= distance - _EPSILON:
         return None
     if have < _EPSILON:
-        return 0.0, -distance  # at the centre any direction is valid, as long as it is always the same
+        # At the centre any direction is valid, as long as it is always the same.
+        return 0.0, -distance
     return dx * (distance / have - 1), dy * (distance / have - 1)
 
 
@@ -253,7 +267,9 @@ class Goal:
         return at_pad and not (self.task == "slide" and puck.lifted)
 
     def place(self, world: TabletopWorld) -> tuple[float, float, float]:
-        """Return the target of the centre of the puck's underside: x, y, z in m, in the base frame."""
+        """Return the target of the centre of the puck's underside: x, y, z in m, in the base
+        frame.
+        """
         if self.target is None:
             puck = world.puck(self.puck)
             return puck.x, puck.y, _LIFT_HEIGHT
@@ -273,8 +289,12 @@ def goals(world: TabletopWorld, task: Task) -> list[Goal]:
     return [Goal(task, a, b) for a in pucks for b in targets if task != "stack" or a != b]
 
 
-def draw_episode(task: Task, rng: np.random.Generator, pucks: int = PUCKS) -> tuple[TabletopWorld, Goal]:
-    """Draw a scene with `pucks` pucks, and a goal; a slide is drawn only if no puck is in its way."""
+def draw_episode(
+    task: Task, rng: np.random.Generator, pucks: int = PUCKS
+) -> tuple[TabletopWorld, Goal]:
+    """Draw a scene with `pucks` pucks, and a goal; a slide is drawn only if no puck is in its
+    way.
+    """
     while True:
         world = _draw_scene(rng, pucks)
         wanted = [goal for goal in goals(world, task) if task != "slide" or _is_clear(world, goal)]
@@ -284,7 +304,8 @@ def draw_episode(task: Task, rng: np.random.Generator, pucks: int = PUCKS) -> tu
 
 def _draw_scene(rng: np.random.Generator, count: int) -> TabletopWorld:
     while True:
-        places: list[tuple[float, float, float]] = []  # x, y, and the clearance from objects of the same kind
+        # x, y, and the clearance from objects of the same kind.
+        places: list[tuple[float, float, float]] = []
         for _ in range(200):
             if len(places) == _PADS + count:
                 break
@@ -297,7 +318,9 @@ def _draw_scene(rng: np.random.Generator, count: int) -> TabletopWorld:
         pad_colours = rng.permutation(COLOURS)[:_PADS]
         puck_colours = rng.permutation(COLOURS)[:count]
         pads = [Pad(str(c), x, y) for c, (x, y, _) in zip(pad_colours, places[:_PADS], strict=True)]
-        pucks = [Puck(str(c), x, y) for c, (x, y, _) in zip(puck_colours, places[_PADS:], strict=True)]
+        pucks = [
+            Puck(str(c), x, y) for c, (x, y, _) in zip(puck_colours, places[_PADS:], strict=True)
+        ]
         return TabletopWorld(pucks, pads)
 
 
@@ -308,7 +331,9 @@ def _is_clear(world: TabletopWorld, goal: Goal) -> bool:
     for other in world.pucks:
         if other is start:
             continue
-        along = min(max(((other.x - start.x) * dx + (other.y - start.y) * dy) / length**2, 0.0), 1.0)
+        along = min(
+            max(((other.x - start.x) * dx + (other.y - start.y) * dy) / length**2, 0.0), 1.0
+        )
         if math.hypot(start.x + along * dx - other.x, start.y + along * dy - other.y) < _CORRIDOR:
             return False
     return True

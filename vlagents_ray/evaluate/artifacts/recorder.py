@@ -1,9 +1,10 @@
 """The artifacts of an episode: videos for people, a trajectory for programs.
 
-A trajectory is the numbers of the episode step by step in a .npz file, with the policy's images in MP4s beside it.
-Frames are encoded at once, in the worker, as H.264, which browsers play: at 224x224 a frame takes about 0.3 ms, less
-than a JPEG, so there is no thread and no backlog. Files are made in memory and sent to the driver with the episode's
-result, which works on any node and leaves no partial files of a worker that dies.
+A trajectory is the numbers of the episode step by step in a .npz file, with the policy's images in
+MP4s beside it. Frames are encoded at once, in the worker, as H.264, which browsers play: at 224x224
+a frame takes about 0.3 ms, less than a JPEG, so there is no thread and no backlog. Files are made
+in memory and sent to the driver with the episode's result, which works on any node and leaves no
+partial files of a worker that dies.
 """
 
 from __future__ import annotations
@@ -62,12 +63,17 @@ class VideoRecorder(EpisodeObserver):
             self._tracks.popitem()[1][1].abandon()
 
 
-def save_videos(out: Path, cell: EvalCase, result: EpisodeResult, videos: dict[str, bytes]) -> list[str]:
-    """Write `out/videos/POLICY/SUITE/ENV/epNNNN_seedS_OUTCOME_CAMERA.mp4`; returns the paths relative to `out`.
+def save_videos(
+    out: Path, cell: EvalCase, result: EpisodeResult, videos: dict[str, bytes]
+) -> list[str]:
+    """Write `out/videos/POLICY/SUITE/ENV/epNNNN_seedS_OUTCOME_CAMERA.mp4`; returns the paths
+    relative to `out`.
 
-    A suite without a name has no folder. Two cameras never share a file (`vlagents_ray.naming.distinct`).
+    A suite without a name has no folder. Two cameras never share a file
+    (`vlagents_ray.naming.distinct`).
 
-    Each file is complete once it has its name. Files of an earlier attempt at the episode are removed.
+    Each file is complete once it has its name. Files of an earlier attempt at the episode are
+    removed.
     """
     folder, names, written = _folder_for(out, storage.VIDEOS, cell, result), distinct(videos), []
     for camera, data in videos.items():
@@ -79,7 +85,9 @@ def save_videos(out: Path, cell: EvalCase, result: EpisodeResult, videos: dict[s
 
 
 def _folder_for(out: Path, kind: str, cell: EvalCase, result: EpisodeResult) -> Path:
-    """Return `out/KIND/POLICY/SUITE/ENV`, without the files of an earlier attempt at the episode."""
+    """Return `out/KIND/POLICY/SUITE/ENV`, without the files of an earlier attempt at the
+    episode.
+    """
     folder = out.joinpath(kind, *(plain(part) for part in cell.name if part))
     for old in folder.glob(f"{_stem(result)}[_.]*"):
         old.unlink()
@@ -91,7 +99,8 @@ def _stem(result: EpisodeResult) -> str:
     return f"ep{result.key.episode:04d}_seed{result.key.seed}"
 
 
-NO_VERSION = -1  # of a policy that names none, and of steps before its first answer in real-time mode
+# Of a policy that names none, and of steps before its first answer in real-time mode.
+NO_VERSION = -1
 _STATE = "state/"
 
 
@@ -115,7 +124,9 @@ class Trajectory:
         arrays: dict[str, Any] = {"cameras": np.array(self.cameras, str)}
         arrays |= {"actions": self.actions, "rewards": self.rewards, "success": self.success}
         arrays |= {_STATE + part: values for part, values in self.state.items()}
-        arrays |= {"versions": self.versions} | ({} if self.gripper is None else {"gripper": self.gripper})
+        arrays |= {"versions": self.versions} | (
+            {} if self.gripper is None else {"gripper": self.gripper}
+        )
         file = io.BytesIO()
         np.savez_compressed(file, **arrays)
         return file.getvalue()
@@ -131,12 +142,22 @@ class Trajectory:
         try:
             # Opened here: np.load leaves the file of a broken archive open.
             with path.open("rb") as opened, np.load(opened, allow_pickle=False) as file:
-                state = {name.removeprefix(_STATE): file[name] for name in file.files if name.startswith(_STATE)}
+                state = {
+                    name.removeprefix(_STATE): file[name]
+                    for name in file.files
+                    if name.startswith(_STATE)
+                }
                 gripper = file["gripper"] if "gripper" in file.files else None
                 cameras = tuple(map(str, file["cameras"]))
                 return cls(
-                    file["actions"], file["rewards"], file["success"], state, gripper, cameras, file["versions"]
-                )  # fmt: skip
+                    file["actions"],
+                    file["rewards"],
+                    file["success"],
+                    state,
+                    gripper,
+                    cameras,
+                    file["versions"],
+                )
         except (OSError, EOFError, ValueError, KeyError, zipfile.BadZipFile) as error:
             raise ConfigError(f"{path}: cannot be read as a trajectory ({error})") from error
 
@@ -147,19 +168,27 @@ class TrajectoryRecorder(EpisodeObserver):
     def __init__(self) -> None:
         self._seen: list[dict[str, np.ndarray]] = []
         self._grippers: list[float | None] = []
-        self._steps: list[tuple[np.ndarray, float, bool, int]] = []  # action, reward, success, version
+        # action, reward, success, version.
+        self._steps: list[tuple[np.ndarray, float, bool, int]] = []
         self._cameras: tuple[str, ...] = ()
         self._version = NO_VERSION
-        self._next: tuple[int, int] = (0, NO_VERSION)  # steps until the next version, and that version
+        # Steps until the next version, and that version.
+        self._next: tuple[int, int] = (0, NO_VERSION)
 
     def add_observation(self, obs: Obs) -> None:
         """Add an observation. Raises `EnvFailed` if its parts differ from those of the first."""
         state = {part: np.array(values, np.float32) for part, values in obs.state.items()}
         if self._seen and _shapes(state) != _shapes(self._seen[0]):
-            raise EnvFailed(f"env step: got the state {_shapes(state)}, want {_shapes(self._seen[0])} as after reset")
+            raise EnvFailed(
+                f"env step: got the state {_shapes(state)}, want {_shapes(self._seen[0])} as after "
+                "reset"
+            )
         if self._grippers and (obs.gripper is None) != (self._grippers[0] is None):
-            raise EnvFailed("env step: an observation has a gripper, another of the same episode has none")
-        self._cameras = self._cameras or tuple(sorted(obs.cameras))  # those of the reset; a later one may lack them
+            raise EnvFailed(
+                "env step: an observation has a gripper, another of the same episode has none"
+            )
+        # Those of the reset; a later one may lack them.
+        self._cameras = self._cameras or tuple(sorted(obs.cameras))
         self._seen.append(state)
         self._grippers.append(obs.gripper)
 
@@ -176,7 +205,9 @@ class TrajectoryRecorder(EpisodeObserver):
 
     def finish(self) -> Trajectory:
         """Return the trajectory; if no action was executed, the shape of `actions` is (0, 0)."""
-        actions, rewards, success, versions = zip(*self._steps, strict=True) if self._steps else ((), (), (), ())
+        actions, rewards, success, versions = (
+            zip(*self._steps, strict=True) if self._steps else ((), (), (), ())
+        )
         return Trajectory(
             np.stack(actions) if actions else np.zeros((0, 0), np.float32),
             np.array(rewards, np.float64),
@@ -189,8 +220,13 @@ class TrajectoryRecorder(EpisodeObserver):
 
 
 def videos_of(trajectory: Path, cameras: Iterable[str]) -> dict[str, Path]:
-    """Return the MP4s of the policy's images by camera; `cameras` are the trajectory's. Frame i is observation i."""
-    return {camera: trajectory.with_name(f"{trajectory.stem}_{name}.mp4") for camera, name in distinct(cameras).items()}
+    """Return the MP4s of the policy's images by camera; `cameras` are the trajectory's. Frame i
+    is observation i.
+    """
+    return {
+        camera: trajectory.with_name(f"{trajectory.stem}_{name}.mp4")
+        for camera, name in distinct(cameras).items()
+    }
 
 
 def _shapes(state: Mapping[str, np.ndarray]) -> dict[str, tuple[int, ...]]:
@@ -220,14 +256,17 @@ class EpisodeRecorder(EpisodeObserver):
         return "none"
 
     def finish(self, result: EpisodeResult, second_pass: SecondPass) -> Artifacts:
-        """Return the artifacts of an episode with this result; `second_pass` renders missing images."""
+        """Return the artifacts of an episode with this result; `second_pass` renders missing
+        images.
+        """
         return Artifacts()
 
     def close(self) -> None:
         """Free the recorder's resources."""
 
 
-RecorderFactory = Callable[[EvalConfig, float | None], EpisodeRecorder]  # called with the env's control_hz
+# Called with the env's control_hz.
+RecorderFactory = Callable[[EvalConfig, float | None], EpisodeRecorder]
 
 
 class Recording(EpisodeRecorder):
@@ -237,7 +276,9 @@ class Recording(EpisodeRecorder):
         self._wants_video, self._wants_trajectory = config.video, config.record
         self._video = VideoRecorder(fps)
         self._trajectory, self._played = TrajectoryRecorder(), PlayedEpisode()
-        self._observers: list[EpisodeObserver] = [self._video] if self.wants_images != "none" else []
+        self._observers: list[EpisodeObserver] = (
+            [self._video] if self.wants_images != "none" else []
+        )
         self._observers += [self._played] if self.wants_images == "failures" else []
         self._observers += [self._trajectory] if self._wants_trajectory != "none" else []
 
@@ -259,7 +300,10 @@ class Recording(EpisodeRecorder):
             observer.add_action(action, reward, success)
 
     def finish(self, result: EpisodeResult, second_pass: SecondPass) -> Artifacts:
-        video, trajectory = _wanted(self._wants_video, result), _wanted(self._wants_trajectory, result)
+        video, trajectory = (
+            _wanted(self._wants_video, result),
+            _wanted(self._wants_trajectory, result),
+        )
         if not video and not trajectory:
             return Artifacts()
         if self._played.lacks_images:
@@ -274,11 +318,15 @@ class Recording(EpisodeRecorder):
         self._video.close()
 
 
-def save(out: Path, cell: EvalCase, result: EpisodeResult, kept: Artifacts) -> tuple[list[str], str | None]:
-    """Write the files of an episode below `out`; returns the paths of its videos and its trajectory, relative to it.
+def save(
+    out: Path, cell: EvalCase, result: EpisodeResult, kept: Artifacts
+) -> tuple[list[str], str | None]:
+    """Write the files of an episode below `out`; returns the paths of its videos and its
+    trajectory, relative to it.
 
-    A trajectory is `out/trajectories/POLICY/SUITE/ENV/epNNNN_seedS.npz`, with `_CAMERA.mp4`. Its videos that are also
-    shown are links, and the .npz is written last: if it exists, the other files do.
+    A trajectory is `out/trajectories/POLICY/SUITE/ENV/epNNNN_seedS.npz`, with `_CAMERA.mp4`. Its
+    videos that are also shown are links, and the .npz is written last: if it exists, the other
+    files do.
     """
     videos = save_videos(out, cell, result, kept.shown)
     folder = _folder_for(out, storage.TRAJECTORIES, cell, result)

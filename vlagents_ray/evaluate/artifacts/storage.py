@@ -26,13 +26,19 @@ _REFUSED = "make it writable, or choose another folder"
 _CURES = {
     errno.ENOSPC: ("the disk is full", _FULL),
     errno.EDQUOT: ("your quota on this disk is used up", _FULL),
-    errno.EFBIG: ("a file would be larger than is allowed here (ulimit -f)", f"allow more; {_RESUME}"),
+    errno.EFBIG: (
+        "a file would be larger than is allowed here (ulimit -f)",
+        f"allow more; {_RESUME}",
+    ),
     errno.EROFS: ("is on a read-only file system", _REFUSED),
     errno.EACCES: ("you may not write there", _REFUSED),
     errno.EPERM: ("you may not write there", _REFUSED),
     errno.ENOTDIR: ("something on the way there is no folder", "choose another folder"),
     errno.EEXIST: ("is there, and no folder", "choose another folder"),
-    errno.EIO: ("the disk reports an error", f"see the system's log (dmesg), and mend the disk; {_RESUME}"),
+    errno.EIO: (
+        "the disk reports an error",
+        f"see the system's log (dmesg), and mend the disk; {_RESUME}",
+    ),
     errno.ESTALE: ("the file server has lost the folder", f"mount it again; {_RESUME}"),
 }
 # SQLite reports these texts in place of the system's errno.
@@ -45,7 +51,8 @@ _SQLITE = {
 
 
 def require_below(path: str) -> str:
-    """Return the `path` of an episode's file in results.db, or raise `ConfigError` if it leads out of the folder.
+    """Return the `path` of an episode's file in results.db, or raise `ConfigError` if it leads out
+    of the folder.
 
     The folder may come from another machine.
     """
@@ -59,15 +66,17 @@ def require_below(path: str) -> str:
 
 
 def inside(home: Path, path: str) -> Path:
-    """Return the absolute path of the file `path` in the folder of results `home`; it need not exist.
+    """Return the absolute path of the file `path` in the folder of results `home`; it need not
+    exist.
 
-    Raises `ConfigError` if it leads out of that folder, also by a symbolic link: its target is neither read, copied nor
-    published.
+    Raises `ConfigError` if it leads out of that folder, also by a symbolic link: its target is
+    neither read, copied nor published.
     """
     found = (home / require_below(path)).resolve()
     if not found.is_relative_to(home.resolve()):
         raise ConfigError(
-            f"{home / path}: is a symbolic link out of the folder of results; if you trust it, copy what it leads to "
+            f"{home / path}: is a symbolic link out of the folder of results; if you trust it, "
+            "copy what it leads to "
             f"into the folder in its place"
         )
     return found
@@ -76,14 +85,20 @@ def inside(home: Path, path: str) -> Path:
 def trajectory_videos(home: Path, trajectory: str) -> list[str]:
     """Return the MP4s of a trajectory's images, relative to the folder of results `home`."""
     numbers = home / require_below(trajectory)
-    return [str(path.relative_to(home)) for path in sorted(numbers.parent.glob(f"{escape(numbers.stem)}_*.mp4"))]
+    return [
+        str(path.relative_to(home))
+        for path in sorted(numbers.parent.glob(f"{escape(numbers.stem)}_*.mp4"))
+    ]
 
 
 def require_there(path: Path) -> Path:
-    """Return the `path` of an episode's file, or raise `ConfigError` if it is missing, as in a partial copy."""
+    """Return the `path` of an episode's file, or raise `ConfigError` if it is missing, as in a
+    partial copy.
+    """
     if not path.is_file():
         raise ConfigError(
-            f"{path}: got no file, want the one that results.db names there; copy the folder again from where it was "
+            f"{path}: got no file, want the one that results.db names there; copy the folder again "
+            "from where it was "
             f"evaluated, with its {VIDEOS}/ and {TRAJECTORIES}/"
         )
     return path
@@ -97,18 +112,22 @@ def outcome(result: EpisodeResult) -> str:
 
 
 def require_folder_of(file: Path) -> None:
-    """Raise `ConfigError` unless this file can be written: its folder exists, and it is not a folder itself."""
+    """Raise `ConfigError` unless this file can be written: its folder exists, and it is not a
+    folder itself.
+    """
     if file.is_dir():
         raise ConfigError(f"{file}: expected a file, got a folder; add the name of a file")
     if not file.absolute().parent.is_dir():
         raise ConfigError(
-            f"{file}: expected a file in a folder that exists, got no folder {file.parent}; make it first"
+            f"{file}: expected a file in a folder that exists, got no folder {file.parent}; make "
+            "it first"
         )
 
 
 @contextmanager
 def whole(path: Path) -> Iterator[Path]:
-    """Yield a path for writing, which is renamed to `path` when the file is complete; make missing folders.
+    """Yield a path for writing, which is renamed to `path` when the file is complete; make missing
+    folders.
 
     If writing fails, the file is removed: others need the room on a full disk.
     """
@@ -143,7 +162,9 @@ def storing(folder: Path) -> Iterator[None]:
     except (OSError, sqlite3.OperationalError) as error:
         found = error.errno if isinstance(error, OSError) else _SQLITE.get(str(error))
         if isinstance(error, sqlite3.OperationalError) and found == errno.EACCES:
-            disk = os.statvfs(next(one for one in (folder, *folder.absolute().parents) if one.exists()))
+            disk = os.statvfs(
+                next(one for one in (folder, *folder.absolute().parents) if one.exists())
+            )
             found = errno.EROFS if disk.f_flag & os.ST_RDONLY else found
         if found not in _CURES:
             raise
@@ -152,12 +173,16 @@ def storing(folder: Path) -> Iterator[None]:
 
 
 def driver_code() -> dict[str, GitState | None]:
-    """Return the git state of the working directory and of this package; None where there is no git repository."""
+    """Return the git state of the working directory and of this package; None where there is no
+    git repository.
+    """
     return {"folder": code_in(Path.cwd()), "vlagents_ray": code_of("vlagents_ray")}
 
 
 def versions() -> dict[str, Any]:
-    """Return the versions of Python, of packages and of the platform in the driver, and `driver_code` as JSON."""
+    """Return the versions of Python, of packages and of the platform in the driver, and
+    `driver_code` as JSON.
+    """
     packages = {}
     for name in ("vlagents-ray", "ray", "numpy", "av"):
         try:
@@ -165,11 +190,18 @@ def versions() -> dict[str, Any]:
         except PackageNotFoundError:
             packages[name] = "not installed"
     code = {name: None if one is None else one.to_json() for name, one in driver_code().items()}
-    return {"python": platform.python_version(), "platform": platform.platform(), **packages, "code": code}
+    return {
+        "python": platform.python_version(),
+        "platform": platform.platform(),
+        **packages,
+        "code": code,
+    }
 
 
 def policy_code(metadata: dict[str, Any]) -> GitState | None:
-    """Return the git state of a policy's code, diff included, if it is the same here as on its server; else None."""
+    """Return the git state of a policy's code, diff included, if it is the same here as on its
+    server; else None.
+    """
     policy = metadata.get("policy")
     here = code_of(target_of("policies", policy)) if isinstance(policy, str) else None
     return here if here is not None and here.to_json() == metadata.get("code") else None

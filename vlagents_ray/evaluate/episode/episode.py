@@ -1,8 +1,8 @@
 """The loop of episodes: environments and an agent play against each other. Plain Python, no Ray.
 
-The episodes of a batch are played in lockstep: at each step, one request to the policy serves all that need an answer.
-A single environment is a batch of one. Each episode has the same result as if it were played alone, except for the
-times."""
+The episodes of a batch are played in lockstep: at each step, one request to the policy serves all
+that need an answer. A single environment is a batch of one. Each episode has the same result as if
+it were played alone, except for the times."""
 
 from __future__ import annotations
 
@@ -19,7 +19,14 @@ import numpy as np
 from vlagents_ray.client.agent import RemoteAgent
 from vlagents_ray.contract import Contract
 from vlagents_ray.envs.base import ERROR, BatchEnv, Environment
-from vlagents_ray.errors import CheckpointFailed, ConfigError, EnvFailed, InvalidAction, PolicyFailed, VLAgentsError
+from vlagents_ray.errors import (
+    CheckpointFailed,
+    ConfigError,
+    EnvFailed,
+    InvalidAction,
+    PolicyFailed,
+    VLAgentsError,
+)
 from vlagents_ray.evaluate.episode import failures
 from vlagents_ray.evaluate.episode.latency import ChunkExecutor, Tick
 from vlagents_ray.evaluate.episode.records import Ending, EpisodeObserver, EpisodeResult, version_of
@@ -30,9 +37,20 @@ from vlagents_ray.validation import check_action
 
 _LITTLE_ENDIAN = np.dtype("<f4")
 _KEPT = (  # what `EpisodeStats` counts as a result has it
-    "key", "steps", "episode_return", "reset_ms", "policy_seconds", "ticks_waited", "ticks_held", "checkpoint",
-    "weights", "revision", "policy_version", "policy_fingerprint", "first_policy_version",
-)  # fmt: skip
+    "key",
+    "steps",
+    "episode_return",
+    "reset_ms",
+    "policy_seconds",
+    "ticks_waited",
+    "ticks_held",
+    "checkpoint",
+    "weights",
+    "revision",
+    "policy_version",
+    "policy_fingerprint",
+    "first_policy_version",
+)
 
 
 @dataclass(slots=True)
@@ -46,7 +64,8 @@ class EpisodeStats:
     success: bool = False
     first_success: int | None = None
     ending: Ending = "error"
-    instructions: list[str] = field(default_factory=list)  # one after the other; the last is the present one
+    # One after the other; the last is the present one.
+    instructions: list[str] = field(default_factory=list)
     checkpoint: str | None = None
     weights: str | None = None
     revision: str | None = None
@@ -74,20 +93,28 @@ class EpisodeStats:
         """Record an answer of the policy, its duration and, in real-time mode, its latency."""
         self.act_ms.append(1e3 * seconds)
         timing = act.info.get("timing", {})
-        # Each answer counts its share of a batch; a policy in this process computes during the whole wait.
+        # Each answer counts its share of a batch; a policy in this process computes during the
+        # whole wait.
         computed_ms = timing.get("inference_ms", 1e3 * seconds)
         self.policy_seconds += computed_ms / 1e3 / max(1, timing.get("batch_size", 1))
         for stage, spent in timing.items():
             if stage.endswith("_ms"):  # the batch size is not a time
                 self.timing_ms.setdefault(stage, []).append(float(spent))
         if (version := version_of(act)) is not None:
-            self.policy_version, self.policy_fingerprint = version, act.info[POLICY].get("fingerprint") or None
-            self.first_policy_version = version if self.first_policy_version is None else self.first_policy_version
+            self.policy_version, self.policy_fingerprint = (
+                version,
+                act.info[POLICY].get("fingerprint") or None,
+            )
+            self.first_policy_version = (
+                version if self.first_policy_version is None else self.first_policy_version
+            )
         if latency_s is not None:
             self.latency_ms.append(1e3 * latency_s)
 
     def result(self, transport: str, failed: PolicyFailed | None = None) -> EpisodeResult:
-        """Return the result of the finished episode; `failed` is the policy error that ended it, if any."""
+        """Return the result of the finished episode; `failed` is the policy error that ended it,
+        if any.
+        """
         kept = {name: getattr(self, name) for name in _KEPT}
         return EpisodeResult(
             **kept,
@@ -105,7 +132,9 @@ class EpisodeStats:
             policy_ms=_quantile(self.act_ms, 0.5),
             policy_p95_ms=_quantile(self.act_ms, 0.95),
             latency_ms=_quantile(self.latency_ms, 0.5),
-            timing_ms={stage: float(np.median(spent)) for stage, spent in sorted(self.timing_ms.items())},
+            timing_ms={
+                stage: float(np.median(spent)) for stage, spent in sorted(self.timing_ms.items())
+            },
             transport=transport,
             actions_sha256=self.actions.hexdigest(),
         )
@@ -122,15 +151,18 @@ Phase = Literal["idle", "connect", "make", "env reset", "policy reset", "policy 
 class Diverged:
     """The outcome of an episode whose simulation diverged.
 
-    Its state or its reward is not a finite number, or the simulator raised an exception that says so.
+    Its state or its reward is not a finite number, or the simulator raised an exception that says
+    so.
     """
 
     error: VLAgentsError
-    result: EpisodeResult  # if the policy is the cause, as the simulation diverges again under the same actions
+    # If the policy is the cause, as the simulation diverges again under the same actions.
+    result: EpisodeResult
 
 
 Outcome = EpisodeResult | VLAgentsError | Diverged
-Watch = Callable[[Phase, int], None]  # called with the phase that begins and the number of steps so far
+# Called with the phase that begins and the number of steps so far.
+Watch = Callable[[Phase, int], None]
 
 _ACTING, _STEPPING = failures.policy_side("act"), failures.env_side("step")  # entered at each step
 
@@ -151,28 +183,29 @@ def run_episodes(
 ) -> list[Outcome]:
     """Play the episodes `keys` together, at most `env.num_envs`, each with its own session.
 
-    `agent.act_batch` is called for all sessions that have no rows of a chunk left. Either `agent` is a `RemoteAgent`
-    and `sessions` come from its `sessions(n)`, or it is an initialized policy in this process and they are copies of
-    it. A single session may be `agent` itself, whose `act` is then called. A finished episode is idle until all are.
-    The policy is reset with each further instruction of an environment with `several_tasks`.
+    `agent.act_batch` is called for all sessions that have no rows of a chunk left. Either `agent`
+    is a `RemoteAgent` and `sessions` come from its `sessions(n)`, or it is an initialized policy in
+    this process and they are copies of it. A single session may be `agent` itself, whose `act` is
+    then called. A finished episode is idle until all are. The policy is reset with each further
+    instruction of an environment with `several_tasks`.
 
     Args:
         sessions: The session of each episode.
         keys: Environment, number and seed of each episode.
         execute: The rows of each action chunk that are executed, open loop; None: all.
-        clock: Real-time mode, in which each episode's time passes while the policy computes (see `latency`); None: the
-            environments wait for the policy.
+        clock: Real-time mode, in which each episode's time passes while the policy computes (see
+            `latency`); None: the environments wait for the policy.
         reset_options: The options of each reset of an environment.
         policy_options: The options of each reset of the policy.
         observers: The observer of each episode, or none.
         watch: Called before each phase that may take long.
-        images: Whether the observers need the images of every step. If not, the environments may leave out those
-            between two requests to the policy, and after the last step.
+        images: Whether the observers need the images of every step. If not, the environments may
+            leave out those between two requests to the policy, and after the last step.
 
     Returns:
-        An outcome for each key. A policy error ends only its own episode, with status "policy_error". Where an episode
-        failed by another error, such as `PolicyUnavailable`, the error stands in place of the result; `Diverged` if its
-        simulation diverged.
+        An outcome for each key. A policy error ends only its own episode, with status
+        "policy_error". Where an episode failed by another error, such as `PolicyUnavailable`, the
+        error stands in place of the result; `Diverged` if its simulation diverged.
 
     Raises:
         ConfigError: The numbers of episodes and sessions differ, or there are fewer environments.
@@ -181,7 +214,8 @@ def run_episodes(
     """
     if not len(keys) == len(sessions) <= env.num_envs or not keys:
         raise ConfigError(
-            f"got {len(keys)} episodes and {len(sessions)} sessions for {env.num_envs} environments; "
+            f"got {len(keys)} episodes and {len(sessions)} sessions for {env.num_envs} "
+            "environments; "
             f"want one session an episode, and an environment for each"
         )
     watch("env reset", 0)
@@ -193,14 +227,19 @@ def run_episodes(
             options=[options_of_reset(env, key.episode, reset_options) for key in keys],
         )
         first = [
-            (failures.checked_obs(obs, contract, "reset"), failures.checked_instruction(text, "reset"))
+            (
+                failures.checked_obs(obs, contract, "reset"),
+                failures.checked_instruction(text, "reset"),
+            )
             for obs, text in zip(seen, env.instructions, strict=True)
         ]
     reset_ms = 1e3 * (perf_counter() - begun)
     executor = partial(ChunkExecutor, execute, clock, contract)
     watched = observers or [EpisodeObserver()] * len(keys)
     episodes = []
-    for i, (key, session, observer, (obs, text)) in enumerate(zip(keys, sessions, watched, first, strict=True)):
+    for i, (key, session, observer, (obs, text)) in enumerate(
+        zip(keys, sessions, watched, first, strict=True)
+    ):
         observer.add_observation(obs)
         stats = EpisodeStats(key, begun, instructions=[text], reset_ms=reset_ms)
         episodes.append(_Episode(i, session, stats, observer, executor, obs))
@@ -277,10 +316,15 @@ class _Episode:
                 latency_s = self._executor.latency_s(seconds)
                 self.stats.acted(answer, seconds, latency_s)
             rows = Act(check_action(answer.action, contract)).rows()
-            if self._width not in (None, rows.shape[1]):  # if the environment's contract states no size
-                raise InvalidAction(f"action: got {rows.shape}, want {self._width} numbers a row, as in the first")
+            # If the environment's contract states no size.
+            if self._width not in (None, rows.shape[1]):
+                raise InvalidAction(
+                    f"action: got {rows.shape}, want {self._width} numbers a row, as in the first"
+                )
             self._width = rows.shape[1]
-            ticks = list(self._executor.ticks(rows, latency_s or 0.0, answer.info, done=answer.done))
+            ticks = list(
+                self._executor.ticks(rows, latency_s or 0.0, answer.info, done=answer.done)
+            )
             self.observer.add_act(answer, sum(tick.waited for tick in ticks))
             self.ticks.extend(ticks)
             self._done = answer.done
@@ -288,7 +332,9 @@ class _Episode:
             self.failed(error)
 
     def stepped(self, step: failures.EnvStep, limit: int) -> None:
-        """Record that the next of `ticks` was executed; the episode may be over, also by the `limit` of steps."""
+        """Record that the next of `ticks` was executed; the episode may be over, also by the
+        `limit` of steps.
+        """
         self.observer.add_observation(step.obs)
         self.obs, stats = step.obs, self.stats
         tick = self._executed()
@@ -336,7 +382,9 @@ def _instructed(env: BatchEnv, playing: Sequence[_Episode]) -> list[_Episode]:
     return found
 
 
-def _reset_policy(agent: Agent, episodes: Sequence[_Episode], contract: Contract, options: Mapping[str, Any]) -> None:
+def _reset_policy(
+    agent: Agent, episodes: Sequence[_Episode], contract: Contract, options: Mapping[str, Any]
+) -> None:
     """Reset the session of each episode with its observation, in one message to a server."""
     keys, sessions = [one.stats.key for one in episodes], [one.session for one in episodes]
     first, texts = [one.obs for one in episodes], [one.stats.instructions[-1] for one in episodes]
@@ -370,7 +418,9 @@ def _request_actions(agent: Agent, episodes: Sequence[_Episode], contract: Contr
             else:
                 answers = agent.act_batch(requests, [episode.session for episode in episodes])
             if len(answers) != len(episodes):
-                raise PolicyFailed(f"act_batch: got {len(episodes)} observations, returned {len(answers)} actions")
+                raise PolicyFailed(
+                    f"act_batch: got {len(episodes)} observations, returned {len(answers)} actions"
+                )
     except VLAgentsError as error:
         answers = [error] * len(episodes)
     seconds = perf_counter() - begun
@@ -378,15 +428,20 @@ def _request_actions(agent: Agent, episodes: Sequence[_Episode], contract: Contr
         episode.answered(answer, contract, seconds)
 
 
-def _step(env: BatchEnv, episodes: Sequence[_Episode], playing: Sequence[_Episode], contract: Contract) -> None:
-    acts = [Act(episode.ticks[0].action) if episode.outcome is None else None for episode in episodes]
+def _step(
+    env: BatchEnv, episodes: Sequence[_Episode], playing: Sequence[_Episode], contract: Contract
+) -> None:
+    acts = [
+        Act(episode.ticks[0].action) if episode.outcome is None else None for episode in episodes
+    ]
     begun = perf_counter()
     try:
         with _STEPPING:
             seen, rewards, terminated, truncated, infos = env.step(acts)
             answers = list(zip(episodes, seen, rewards, terminated, truncated, infos, strict=True))
     except (EnvFailed, InvalidAction) as error:
-        if len(playing) > 1:  # of environments that one simulator runs: the error does not name the episode
+        # Of environments that one simulator runs: the error does not name the episode.
+        if len(playing) > 1:
             raise
         if failures.raised_by_divergence(error):
             playing[0].diverged(error)
@@ -403,7 +458,9 @@ def _step(env: BatchEnv, episodes: Sequence[_Episode], playing: Sequence[_Episod
                 with _STEPPING:
                     if isinstance(raised, BaseException):
                         raise raised
-                step = failures.checked_step(obs, reward, terminated, truncated, info, contract, images=env.looked_at)
+                step = failures.checked_step(
+                    obs, reward, terminated, truncated, info, contract, images=env.looked_at
+                )
             except VLAgentsError as error:
                 finite = raised is not None or failures.is_finite(obs, reward)
                 if not finite or failures.raised_by_divergence(error):
@@ -420,7 +477,11 @@ def transport_of(agent: Agent) -> str:
     return str(getattr(agent, "transport", "local"))
 
 
-def options_of_reset(env: Environment, episode: int, options: Mapping[str, Any] | None) -> dict[str, Any] | None:
-    """Return the options for the environment's reset: the user's `options` override the benchmark's."""
+def options_of_reset(
+    env: Environment, episode: int, options: Mapping[str, Any] | None
+) -> dict[str, Any] | None:
+    """Return the options for the environment's reset: the user's `options` override the
+    benchmark's.
+    """
     begin = {} if env.init_states is None else {"init_state": episode % env.init_states}
     return begin | dict(options or {}) or None

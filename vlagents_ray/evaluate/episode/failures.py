@@ -1,6 +1,8 @@
-"""The attribution of errors: exceptions of simulator, policy and settings, and checks of an environment's outputs.
+"""The attribution of errors: exceptions of simulator, policy and settings, and checks of an
+environment's outputs.
 
-Without these checks a wrong output would surface later, in the encoder or in the policy, as if it were an error there.
+Without these checks a wrong output would surface later, in the encoder or in the policy, as if it
+were an error there.
 """
 
 from __future__ import annotations
@@ -24,14 +26,18 @@ from vlagents_ray.interface import Obs
 from vlagents_ray.validation import check_observation
 
 Cause = Literal["user", "policy", "worker", "operator"]
-# Ends of messages about the policy's server: the likely causes, and how to find the line of a policy.
+# Ends of messages about the policy's server: the likely causes, and how to find the line of a
+# policy.
 _CURES: dict[type[errors.VLAgentsError], str] = {
     errors.ConnectionLost: (
-        "; if its server was not restarted, the policy ended its own process (os._exit, a crash in C code, or "
-        "exhausted memory): see the log of the server, or find the line in this process with --workers 0"
+        "; if its server was not restarted, the policy ended its own process (os._exit, a crash in "
+        "C code, or "
+        "exhausted memory): see the log of the server, or find the line in this process with "
+        "--workers 0"
     ),
     errors.DeadlineExceeded: (
-        "; the policy may hang or be too slow: raise policy_timeout_s, or see where it hangs in this process with "
+        "; the policy may hang or be too slow: raise policy_timeout_s, or see where it hangs in "
+        "this process with "
         "--workers 0"
     ),
 }
@@ -48,10 +54,12 @@ _USER = (
     errors.UnknownApp,
     errors.UnknownCheckpoint,
 )
-_WORKER = (errors.EnvFailed, errors.InvalidInput)  # InvalidInput here: an unusable observation of the environment
-_POLICY = (errors.UnknownSession, errors.NotReset)  # other `InvalidInput`, of the connection to the policy
-# These errors of an environment are no breakdown: they report settings, a breach of its contract, a missing package, or
-# a refused action.
+# InvalidInput here: an unusable observation of the environment.
+_WORKER = (errors.EnvFailed, errors.InvalidInput)
+# Other `InvalidInput`, of the connection to the policy.
+_POLICY = (errors.UnknownSession, errors.NotReset)
+# These errors of an environment are no breakdown: they report settings, a breach of its contract, a
+# missing package, or a refused action.
 _FROM_ENV = (
     errors.ConfigError,
     errors.ContractMismatch,
@@ -65,9 +73,9 @@ _FROM_ENV = (
 class Failure:
     """The cause of a failed attempt, and the side that can correct it.
 
-    "user": a mistake in the settings, which stops the evaluation; "policy": the connection to the policy; "worker": the
-    simulator or its process, which is then replaced, or a real robot; "operator": the operator repeats a trial of a
-    real robot.
+    "user": a mistake in the settings, which stops the evaluation; "policy": the connection to the
+    policy; "worker": the simulator or its process, which is then replaced, or a real robot;
+    "operator": the operator repeats a trial of a real robot.
     """
 
     cause: Cause
@@ -75,13 +83,18 @@ class Failure:
     message: str
     traceback: str = ""
     log: str = ""  # the end of the worker's log, if it broke
-    diverged: EpisodeResult | None = None  # if the simulation diverged: the result if the policy is the cause
+    # If the simulation diverged: the result if the policy is the cause.
+    diverged: EpisodeResult | None = None
     names_no_episode: bool = False  # whether another episode in the same simulator may be the cause
 
 
 def explain(error: errors.VLAgentsError) -> Failure:
-    """Return the failure for `error`. A `PolicyFailed` outside an episode means that the policy cannot start."""
-    cause: Cause = "worker" if isinstance(error, _WORKER) and not isinstance(error, _POLICY) else "policy"
+    """Return the failure for `error`. A `PolicyFailed` outside an episode means that the policy
+    cannot start.
+    """
+    cause: Cause = (
+        "worker" if isinstance(error, _WORKER) and not isinstance(error, _POLICY) else "policy"
+    )
     if isinstance(error, _USER):
         cause = "user"
     message = str(error)
@@ -95,7 +108,8 @@ def explain(error: errors.VLAgentsError) -> Failure:
 def explain_batch(error: errors.VLAgentsError, episodes: int) -> Failure:
     """Return the failure for an `error` that ended a number of `episodes` in one simulator.
 
-    An action that the simulator refuses and a simulation that diverges belong to one of them, which is not known.
+    An action that the simulator refuses and a simulation that diverges belong to one of them, which
+    is not known.
     """
     if episodes > 1 and (isinstance(error, errors.InvalidAction) or raised_by_divergence(error)):
         return replace(explain(error), cause="worker", names_no_episode=True)
@@ -103,7 +117,9 @@ def explain_batch(error: errors.VLAgentsError, episodes: int) -> Failure:
 
 
 class _Side:
-    """A context that attributes exceptions to one side; it has no state, and may be entered again."""
+    """A context that attributes exceptions to one side; it has no state, and may be entered
+    again.
+    """
 
     __slots__ = ("_what",)
 
@@ -115,7 +131,9 @@ class _Side:
 
 
 class env_side(_Side):  # noqa: N801 - a context manager
-    """Turn any exception of a simulator into `EnvFailed`, except for wrong settings and refused actions."""
+    """Turn any exception of a simulator into `EnvFailed`, except for wrong settings and refused
+    actions.
+    """
 
     def __exit__(self, _kind: object, error: BaseException | None, _trace: object) -> None:
         _raise_if_quit(error)
@@ -130,11 +148,15 @@ class policy_side(_Side):  # noqa: N801 - a context manager
     def __exit__(self, _kind: object, error: BaseException | None, _trace: object) -> None:
         _raise_if_quit(error)
         if isinstance(error, Exception) and not isinstance(error, errors.VLAgentsError):
-            raise errors.PolicyFailed(f"policy {self._what}: {type(error).__name__}: {error}") from error
+            raise errors.PolicyFailed(
+                f"policy {self._what}: {type(error).__name__}: {error}"
+            ) from error
 
 
 def _raise_if_quit(error: BaseException | None) -> None:
-    """Raise `KeyboardInterrupt` if the user has left a debugger: that is no error of either side."""
+    """Raise `KeyboardInterrupt` if the user has left a debugger: that is no error of either
+    side.
+    """
     if isinstance(error, BdbQuit):
         raise KeyboardInterrupt from error
 
@@ -150,7 +172,9 @@ class EnvStep(NamedTuple):
 
 
 def is_finite(obs: object, reward: object) -> bool:
-    """Return whether the numbers of a step's outputs are finite; those of a diverged simulation are not."""
+    """Return whether the numbers of a step's outputs are finite; those of a diverged simulation
+    are not.
+    """
     values: list[Any] = [reward]
     if isinstance(obs, Obs):
         values += [*obs.state.values(), 0 if obs.gripper is None else obs.gripper]
@@ -158,26 +182,34 @@ def is_finite(obs: object, reward: object) -> bool:
     return all(np.isfinite(array).all() for array in arrays if array.dtype.kind == "f")
 
 
-# Words of simulators that raise an exception instead of returning a NaN: MuJoCo's "Nan, Inf or huge value in QACC.
-# The simulation is unstable", dm_control's "Physics state is invalid", SciPy's "array must not contain infs or NaNs".
+# Words of simulators that raise an exception instead of returning a NaN: MuJoCo's "Nan, Inf or huge
+# value in QACC. The simulation is unstable", dm_control's "Physics state is invalid", SciPy's
+# "array must not contain infs or NaNs".
 _DIVERGENCE = re.compile(
-    r"\b(nans?|infs?|(non-?|not )finite|diverge[ds]?|divergence|unstable|physics state is invalid)\b",
+    r"\b(nans?|infs?|(non-?|not )finite|diverge[ds]?|divergence|unstable|physics state is "
+    r"invalid)\b",
     re.IGNORECASE,
 )
 
 
 def raised_by_divergence(error: errors.VLAgentsError) -> bool:
-    """Return whether a simulator raised `error` because its simulation diverged, by its type or its words."""
+    """Return whether a simulator raised `error` because its simulation diverged, by its type or
+    its words.
+    """
     if not isinstance(error, errors.EnvFailed):
         return False
-    of_numbers = isinstance(error.__cause__, FloatingPointError | OverflowError | np.linalg.LinAlgError)
+    of_numbers = isinstance(
+        error.__cause__, FloatingPointError | OverflowError | np.linalg.LinAlgError
+    )
     return of_numbers or _DIVERGENCE.search(str(error)) is not None
 
 
 def checked_instruction(instruction: object, where: str) -> str:
     """Return `instruction`; raises `EnvFailed` if it is not text."""
     if not isinstance(instruction, str):
-        raise errors.EnvFailed(f"env {where}: got the instruction {instruction!r}, want a str, empty if there is none")
+        raise errors.EnvFailed(
+            f"env {where}: got the instruction {instruction!r}, want a str, empty if there is none"
+        )
     return instruction
 
 
@@ -191,14 +223,19 @@ def checked_step(
     *,
     images: bool = True,
 ) -> EnvStep:
-    """Return the checked outputs of `EvalEnv.step`; without `images`, the environment may have left these out.
+    """Return the checked outputs of `EvalEnv.step`; without `images`, the environment may have left
+    these out.
 
     Raises:
-        EnvFailed: The observation does not fit the environment's own contract, the reward is not a finite number, or a
-            flag is not a bool.
+        EnvFailed: The observation does not fit the environment's own contract, the reward is not a
+            finite number, or a flag is not a bool.
     """
     if not isinstance(info, (dict, Mapping)) or "success" not in info:
-        got = f"info with {sorted(map(str, info))}" if isinstance(info, Mapping) else f"{type(info).__name__} as info"
+        got = (
+            f"info with {sorted(map(str, info))}"
+            if isinstance(info, Mapping)
+            else f"{type(info).__name__} as info"
+        )
         raise errors.EnvFailed(f"env step: got {got}, want 'success' among it; see EvalEnv.step")
     return EnvStep(
         checked_obs(obs, contract, "step", images=images),
@@ -213,29 +250,41 @@ def checked_obs(obs: object, contract: Contract, where: str, *, images: bool = T
     """Return `obs`, checked against the environment's own `contract`.
 
     Raises:
-        ContractMismatch: The first observation does not fit: every episode would fail in the same way.
+        ContractMismatch: The first observation does not fit: every episode would fail in the same
+            way.
         EnvFailed: A number is not finite, or a later observation does not fit.
     """
-    wrong: type[errors.VLAgentsError] = errors.ContractMismatch if where == "reset" else errors.EnvFailed
+    wrong: type[errors.VLAgentsError] = (
+        errors.ContractMismatch if where == "reset" else errors.EnvFailed
+    )
     if not isinstance(obs, Obs):
-        raise wrong(f"env {where}: got {type(obs).__name__} in place of the observation, want an Obs")
+        raise wrong(
+            f"env {where}: got {type(obs).__name__} in place of the observation, want an Obs"
+        )
     for name, part in (("cameras", obs.cameras), ("state", obs.state), ("info", obs.info)):
         if not isinstance(part, (dict, Mapping)):  # testing for a dict first is faster
-            raise wrong(f"env {where}: got {type(part).__name__} as the observation's {name}, want a dict")
+            raise wrong(
+                f"env {where}: got {type(part).__name__} as the observation's {name}, want a dict"
+            )
     try:
         check_observation(obs, contract if images else replace(contract, cameras=None))
     except errors.InvalidObservation as error:
         if not is_finite(obs, 0.0):
             wrong = errors.EnvFailed
-        raise wrong(f"env {where}: the observation does not fit the env's own contract: {error}") from error
+        raise wrong(
+            f"env {where}: the observation does not fit the env's own contract: {error}"
+        ) from error
     except TypeError as error:  # such as a gripper that is not a number
-        raise wrong(f"env {where}: got {obs.gripper!r} as the gripper, want a number in [0, 1]") from error
+        raise wrong(
+            f"env {where}: got {obs.gripper!r} as the gripper, want a number in [0, 1]"
+        ) from error
     return obs
 
 
 def _number(reward: Any) -> float:
     try:
-        if math.isfinite(reward):  # a diverged simulation; neither the results file nor JSON has a NaN
+        # A diverged simulation; neither the results file nor JSON has a NaN.
+        if math.isfinite(reward):
             return float(reward)
     except (TypeError, ValueError):
         pass

@@ -1,9 +1,10 @@
 """Real-time evaluation: the environment's clock runs while the policy computes.
 
-The clock is simulated, so the speed of the machine does not matter. An answer that took L seconds comes ceil(L * hz)
-ticks after its observation. The environment is stepped through these ticks with the actions that
-`ClockConfig.meanwhile` selects, and then with the answer's rows, beginning with the row that the chunk player would
-begin with (`vlagents_ray.chunking.buffer.ChunkBuffer`). A synchronous evaluation is the case L = 0.
+The clock is simulated, so the speed of the machine does not matter. An answer that took L seconds
+comes ceil(L * hz) ticks after its observation. The environment is stepped through these ticks with
+the actions that `ClockConfig.meanwhile` selects, and then with the answer's rows, beginning with
+the row that the chunk player would begin with (`vlagents_ray.chunking.buffer.ChunkBuffer`). A
+synchronous evaluation is the case L = 0.
 """
 
 from __future__ import annotations
@@ -45,20 +46,32 @@ class ChunkExecutor:
             env: The contract of the environment.
 
         Raises:
-            ConfigError: The rate of the clock, or the action that holds the robot before the first answer, is unknown.
+            ConfigError: The rate of the clock, or the action that holds the robot before the first
+                answer, is unknown.
         """
         self._execute = execute
         self._real_time = clock is not None
         self._clock = _SYNCHRONOUS if clock is None else clock
         self._hz = self._clock.hz or env.control_hz or 0.0
         if self._real_time and not self._hz:
-            raise ConfigError("clock: got no hz, and the env's contract states no control_hz; give clock.hz, in 1/s")
-        self._spec = env.action
-        self._still = stopping(env.action) if self._clock.meanwhile == "chunk" else self._clock.meanwhile
-        if self._clock.latency != 0 and self._clock.neutral is None and stopping(env.action) != "zero":
             raise ConfigError(
-                "clock: the env's contract does not say that its actions are relative, so that zeros may be a pose to "
-                "go to; give clock.neutral, the action that is executed before the first answer comes"
+                "clock: got no hz, and the env's contract states no control_hz; give clock.hz, in "
+                "1/s"
+            )
+        self._spec = env.action
+        self._still = (
+            stopping(env.action) if self._clock.meanwhile == "chunk" else self._clock.meanwhile
+        )
+        if (
+            self._clock.latency != 0
+            and self._clock.neutral is None
+            and stopping(env.action) != "zero"
+        ):
+            raise ConfigError(
+                "clock: the env's contract does not say that its actions are relative, so that "
+                "zeros may be a pose to "
+                "go to; give clock.neutral, the action that is executed before the first answer "
+                "comes"
             )
         self._plan = ChunkBuffer()
         self._last: np.ndarray | None = None  # (D,) action
@@ -71,13 +84,21 @@ class ChunkExecutor:
         return measured_s if self._clock.latency == "measured" else self._clock.latency
 
     def request_info(self) -> dict[str, Any]:
-        """Return the `Obs.info` for real-time chunking: the remaining rows; {} if there are none or it is off."""
+        """Return the `Obs.info` for real-time chunking: the remaining rows; {} if there are none
+        or it is off.
+        """
         return self._plan.continuation(self._delay.ticks) if self._clock.real_time_chunking else {}
 
     def ticks(
-        self, rows: np.ndarray, latency_s: float, info: Mapping[str, Any] | None = None, *, done: bool = False
+        self,
+        rows: np.ndarray,
+        latency_s: float,
+        info: Mapping[str, Any] | None = None,
+        *,
+        done: bool = False,
     ) -> Iterator[Tick]:
-        """Return the ticks until the next request, after an answer of `rows`, (H, D), with `latency_s` and `info`.
+        """Return the ticks until the next request, after an answer of `rows`, (H, D), with
+        `latency_s` and `info`.
 
         After an answer with `done` there is no next request: all its rows are executed.
 
@@ -90,8 +111,10 @@ class ChunkExecutor:
             return
         if self._clock.real_time_chunking and not done and len(rows) <= (execute or len(rows)):
             raise ConfigError(
-                f"clock.real_time_chunking: got chunks of {len(rows)} rows, all of which are executed before the next "
-                "request, so that nothing is left to continue; give an `execute` below that, and none in the policy"
+                f"clock.real_time_chunking: got chunks of {len(rows)} rows, all of which are "
+                "executed before the next "
+                "request, so that nothing is left to continue; give an `execute` below that, and "
+                "none in the policy"
             )
         wait = math.ceil(latency_s * self._hz - _EXACTLY)
         self._delay.add(wait)
@@ -118,7 +141,11 @@ class ChunkExecutor:
             if step is None:
                 tick = Tick(self._held(dim), waited=True, held=True)
                 # A held relative action moves the robot on, so that it counts as a row.
-                if self._clock.meanwhile == "hold" and self._plan.executed > 0 and stopping(self._spec) == "zero":
+                if (
+                    self._clock.meanwhile == "hold"
+                    and self._plan.executed > 0
+                    and stopping(self._spec) == "zero"
+                ):
                     self._plan.advance()
                 yield tick
             else:
@@ -130,7 +157,9 @@ class ChunkExecutor:
         given = self._clock.neutral
         start = neutral(self._spec, dim) if given is None else np.asarray(given, np.float32)
         if start.shape != (dim,):
-            raise ConfigError(f"clock.neutral: got {len(start)} numbers, the policy's actions have {dim}")
+            raise ConfigError(
+                f"clock.neutral: got {len(start)} numbers, the policy's actions have {dim}"
+            )
         if self._last is None:
             return start
         if self._still == "hold":

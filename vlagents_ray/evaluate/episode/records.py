@@ -43,33 +43,57 @@ class EpisodeResult:
     latency_ms: float | None = None  # real-time mode: median of the latencies of acts
     ticks_waited: int = 0  # real-time mode: steps between an observation and its answer
     ticks_held: int = 0  # of these, ticks with no row of a chunk left
-    timing_ms: dict[str, float] = field(default_factory=dict)  # medians of the times in `act.info["timing"]`
+    # Medians of the times in `act.info["timing"]`.
+    timing_ms: dict[str, float] = field(default_factory=dict)
     transport: str = "local"
     checkpoint: str | None = None  # the checkpoint that the policy's reset returned
     weights: str | None = None  # digest of the loaded weights, for a policy that reports it
     revision: str | None = None  # their commit on the hub, if they were in its cache
-    policy_version: int | None = None  # of the weights that computed the last act; 0 is the loaded checkpoint
-    policy_fingerprint: str | None = None  # of that version, computed by the replica from the weights in memory
+    # Of the weights that computed the last act; 0 is the loaded checkpoint.
+    policy_version: int | None = None
+    # Of that version, computed by the replica from the weights in memory.
+    policy_fingerprint: str | None = None
     first_policy_version: int | None = None  # of the weights that computed the first act
-    actions_sha256: str | None = None  # digest of the executed actions, (steps, D) little-endian float32, row by row
+    # Digest of the executed actions, (steps, D) little-endian float32, row by row.
+    actions_sha256: str | None = None
 
     @property
     def full_key(self) -> str:
-        """The key with the beginning of the digest of its weights, which are not known before the episode."""
+        """The key with the beginning of the digest of its weights, which are not known before
+        the episode.
+        """
         digits = (self.weights or "").rpartition(":")[2][:_DIGITS]
         return f"{self.key}~{digits}" if digits else str(self.key)
 
     @property
     def outcome(self) -> dict[str, Any]:
-        """Return the fields that are equal in all runs of one key: all except times and transport."""
-        return {one.name: getattr(self, one.name) for one in fields(self) if one.name not in _CIRCUMSTANCES}
+        """Return the fields that are equal in all runs of one key: all except times and
+        transport.
+        """
+        return {
+            one.name: getattr(self, one.name)
+            for one in fields(self)
+            if one.name not in _CIRCUMSTANCES
+        }
 
 
 # "weights" is checked separately, and other versions of the weights show in the actions.
 _CIRCUMSTANCES = {
-    "seconds", "reset_ms", "env_step_ms", "env_seconds", "policy_ms", "policy_p95_ms", "policy_seconds", "timing_ms",
-    "transport", "weights", "revision", "policy_version", "policy_fingerprint", "first_policy_version",
-}  # fmt: skip
+    "seconds",
+    "reset_ms",
+    "env_step_ms",
+    "env_seconds",
+    "policy_ms",
+    "policy_p95_ms",
+    "policy_seconds",
+    "timing_ms",
+    "transport",
+    "weights",
+    "revision",
+    "policy_version",
+    "policy_fingerprint",
+    "first_policy_version",
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,10 +128,14 @@ class EpisodeObserver:
         """Add an observation, beginning with that of the reset."""
 
     def add_act(self, act: Act, ticks_waited: int = 0) -> None:
-        """Add an answer of the policy; some or all rows of its action are executed after `ticks_waited` other ones."""
+        """Add an answer of the policy; some or all rows of its action are executed after
+        `ticks_waited` other ones.
+        """
 
     def add_action(self, action: np.ndarray, reward: float, success: bool) -> None:
-        """Add an executed action, (D,), with its reward and success; its next observation was added before."""
+        """Add an executed action, (D,), with its reward and success; its next observation was
+        added before.
+        """
 
 
 def version_of(act: Act) -> int | None:

@@ -1,4 +1,6 @@
-"""A second pass over an episode by its actions, which renders the images that the first pass left out."""
+"""A second pass over an episode by its actions, which renders the images that the first pass
+left out.
+"""
 
 from __future__ import annotations
 
@@ -52,7 +54,8 @@ class PlayedEpisode(EpisodeObserver):
     """The actions and outcomes of an episode, with digests in place of images."""
 
     def __init__(self) -> None:
-        self._seen: list[tuple[dict[str, Any], dict[str, Any]]] = []  # numbers and images of each observation, by name
+        # Numbers and images of each observation, by name.
+        self._seen: list[tuple[dict[str, Any], dict[str, Any]]] = []
         self._done: list[tuple[np.ndarray, float, bool]] = []  # (D,) action, reward, success
 
     @property
@@ -67,23 +70,33 @@ class PlayedEpisode(EpisodeObserver):
         self._done.append((np.array(action), reward, success))
 
     def play_again(
-        self, env: BatchEnv, seed: int, options: Options | None, watch: Watch, record: Callable[[Obs], None]
+        self,
+        env: BatchEnv,
+        seed: int,
+        options: Options | None,
+        watch: Watch,
+        record: Callable[[Obs], None],
     ) -> str | None:
-        """Begin the episode in the first environment again, execute its actions, and render each observation.
+        """Begin the episode in the first environment again, execute its actions, and render each
+        observation.
 
-        State, gripper, reward and success of every step, and the images of the first pass, must be equal to the bit, so
-        that the new images show this episode.
+        State, gripper, reward and success of every step, and the images of the first pass, must be
+        equal to the bit, so that the new images show this episode.
 
         Returns:
             The first difference, which ends the pass; None if there is none.
         """
-        played = play_actions(env, seed, options, (action for action, _, _ in self._done), images=True, watch=watch)
+        played = play_actions(
+            env, seed, options, (action for action, _, _ in self._done), images=True, watch=watch
+        )
         try:
             for number, (obs, step) in enumerate(played):
                 record(obs)
                 then, now = self._seen[number], _digests(obs)
                 parts = [(kind, name) for kind in (0, 1) for name in then[kind]]
-                differs = next((name for kind, name in parts if then[kind][name] != now[kind].get(name)), None)
+                differs = next(
+                    (name for kind, name in parts if then[kind][name] != now[kind].get(name)), None
+                )
                 if step is not None and (step.reward, step.success) != self._done[number - 1][1:]:
                     differs = "reward or success"
                 if differs is not None:
@@ -94,10 +107,13 @@ class PlayedEpisode(EpisodeObserver):
         return None
 
 
-SecondPass = Callable[[PlayedEpisode, Callable[[Obs], None]], str | None]  # `play_again` with the environment
+# `play_again` with the environment.
+SecondPass = Callable[[PlayedEpisode, Callable[[Obs], None]], str | None]
 
 
 def _digests(obs: Obs) -> tuple[dict[str, Any], dict[str, Any]]:
-    numbers: dict[str, Any] = {f"state {name!r}": part.tobytes() for name, part in obs.state.items()}
+    numbers: dict[str, Any] = {
+        f"state {name!r}": part.tobytes() for name, part in obs.state.items()
+    }
     images = {f"image {name!r}": zlib.crc32(one.tobytes()) for name, one in obs.cameras.items()}
     return numbers | {"the gripper": obs.gripper}, images

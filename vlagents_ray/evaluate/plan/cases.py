@@ -87,12 +87,16 @@ class EvalCase:
 
     @cached_property
     def kind(self) -> str:
-        """Fingerprint of the worker settings; cases with the same value can share a worker process."""
+        """Fingerprint of the worker settings; cases with the same value can share a worker
+        process.
+        """
         return fingerprint(self.worker.model_dump())
 
     @cached_property
     def place(self) -> str:
-        """Fingerprint of the environment; a worker plays cases with the same value without making another one."""
+        """Fingerprint of the environment; a worker plays cases with the same value without
+        making another one.
+        """
         return fingerprint([self.env, self.suite.env_options, self.suite.num_envs, self.kind])
 
     @cached_property
@@ -106,15 +110,28 @@ class EvalCase:
 
 
 def env_program(cell: EvalCase, code: Callable[[str], Program] = code_of_class) -> Program:
-    """Return the files of a cell's environment, or of its robot; `code` returns those of a class."""
+    """Return the files of a cell's environment, or of its robot; `code` returns those of a
+    class.
+    """
     if cell.robot is not None:
         return code(cell.on_robot[0].arm or "")
     cls = env_class(cell.env)
-    settings = with_defaults(cls, cell.suite.env_options) | {"reset_options": cell.suite.reset_options}
+    settings = with_defaults(cls, cell.suite.env_options) | {
+        "reset_options": cell.suite.reset_options
+    }
     task = env_task(cell.env) or ""
-    namespace = task.rpartition(":")[0] or task.rpartition("/")[0]  # of an id of Gymnasium; this module registers it
-    modules = [f"{cls.__module__}:{cls.__name__}", cell.suite.env_options.get("module") or namespace]
-    found = {name: digest for module in modules if isinstance(module, str) for name, digest in code(module).items()}
+    # Of an id of Gymnasium; this module registers it.
+    namespace = task.rpartition(":")[0] or task.rpartition("/")[0]
+    modules = [
+        f"{cls.__module__}:{cls.__name__}",
+        cell.suite.env_options.get("module") or namespace,
+    ]
+    found = {
+        name: digest
+        for module in modules
+        if isinstance(module, str)
+        for name, digest in code(module).items()
+    }
     return found | files_named(settings, folders=False)
 
 
@@ -125,9 +142,10 @@ def contender(policy: str, step: int | None) -> str:
 def cells(config: EvalConfig) -> list[EvalCase]:
     """Return every cell of `config`: by checkpoint, then by suite and env.
 
-    Raises `UnknownEnv` for an unknown env. Raises `ConfigError` for an env that is listed twice under one name, or in
-    two equal suites, as their episodes would have the same keys; and for names that differ only in characters that file
-    names cannot have, as their episodes would have the same files.
+    Raises `UnknownEnv` for an unknown env. Raises `ConfigError` for an env that is listed twice
+    under one name, or in two equal suites, as their episodes would have the same keys; and for
+    names that differ only in characters that file names cannot have, as their episodes would have
+    the same files.
     """
     robot, envs = config.real_robot, []
     for suite in config.suites:
@@ -135,7 +153,9 @@ def cells(config: EvalConfig) -> list[EvalCase]:
             tasks = expand(pattern) if robot is None else fnmatch.filter(robot.tasks, pattern)
             if robot is not None and not tasks:
                 have = sorted(robot.tasks)
-                raise UnknownEnv(f"{pattern!r}: matches none of the plan's `robot.tasks`, which are {have}")
+                raise UnknownEnv(
+                    f"{pattern!r}: matches none of the plan's `robot.tasks`, which are {have}"
+                )
             envs += [(suite, env) for env in tasks]
     contenders: list[tuple[PolicyConfig, int | None]] = []
     for policy in config.policies:
@@ -148,15 +168,21 @@ def cells(config: EvalConfig) -> list[EvalCase]:
     ]
     names = Counter(cell.name for cell in found)
     if twice := sorted({env for (_, _, env), number in names.items() if number > 1}):
-        raise ConfigError(f"suites: {twice} are in two suites of one name; give each suite another `name`")
+        raise ConfigError(
+            f"suites: {twice} are in two suites of one name; give each suite another `name`"
+        )
     folders: dict[tuple[str, ...], tuple[str, ...]] = {}
     for name in names:
         if (other := folders.setdefault(tuple(plain(part) for part in name), name)) != name:
-            raise ConfigError(f"{' '.join(name)!r} and {' '.join(other)!r} would share files; give one another name")
+            raise ConfigError(
+                f"{' '.join(name)!r} and {' '.join(other)!r} would share files; give one another "
+                "name"
+            )
     prints = Counter(cell.fingerprint for cell in found)
     if twice := sorted({cell.env for cell in found if prints[cell.fingerprint] > 1}):
         raise ConfigError(
-            f"suites: {twice} stand in two suites with the same settings, so that these are the same episodes; "
+            f"suites: {twice} stand in two suites with the same settings, so that these are the "
+            "same episodes; "
             f"leave them out of one of the two"
         )
     return found
@@ -180,5 +206,7 @@ def expand(pattern: str) -> list[str]:
     suite = env_suite(pattern)
     known = [f"{suite}/{task}" for task in cls.tasks()]
     if not (found := fnmatch.filter(known, pattern)):
-        raise UnknownEnv(f"{pattern!r}: matches none of the tasks of {suite!r}, which knows {known}")
+        raise UnknownEnv(
+            f"{pattern!r}: matches none of the tasks of {suite!r}, which knows {known}"
+        )
     return found

@@ -47,7 +47,8 @@ Hertz = Annotated[float, Field(gt=0, le=10_000)]
 
 
 class _PlanModel(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True, hide_input_in_errors=True)  # errors are logged
+    # Errors are logged.
+    model_config = ConfigDict(extra="forbid", frozen=True, hide_input_in_errors=True)
 
 
 class StepRange(_PlanModel):
@@ -69,19 +70,24 @@ class PolicyConfig(_PlanModel):
     """A policy, its source or address, and the checkpoints to evaluate."""
 
     name: Name = "policy"  # in the results; two policies of one evaluation have different names
-    # A registered policy or a deployment file, which `vlagents-ray eval` serves for the length of the run.
+    # A registered policy or a deployment file, which `vlagents-ray eval` serves for the length of
+    # the run.
     source: str | None = None
-    url: str | None = None  # of a running server: "http://gpu-box:8000", or "serve://NAME" in this cluster
+    # Of a running server: "http://gpu-box:8000", or "serve://NAME" in this cluster.
+    url: str | None = None
     config: dict[str, JsonValue] = {}  # settings of the policy, over a deployment file's own
     options: dict[str, JsonValue] = {}  # passed to every `reset` of the policy
     checkpoint: str | None = None  # that the server loads; each episode's result names its own
-    # A sweep over checkpoints: a list, or {first, last, every}; each is chosen by the reset option `checkpoint_step`.
+    # A sweep over checkpoints: a list, or {first, last, every}; each is chosen by the reset option
+    # `checkpoint_step`.
     steps: list[Step] = Field(default=[], max_length=MOST_STEPS_NAMED)
-    # The policy's present weights; their version replaces the checkpoint. Episodes of other weights are refused.
+    # The policy's present weights; their version replaces the checkpoint. Episodes of other weights
+    # are refused.
     pushed_weights: PushedWeights | None = None
     execute: Rows | None = None  # rows executed of each action chunk; None = all
-    # The codec of images over a network. JPEG changes them a little, so it must be set explicitly; the others do not,
-    # and "exact" takes the faster of raw and lossless, so that results never depend on the link.
+    # The codec of images over a network. JPEG changes them a little, so it must be set explicitly;
+    # the others do not, and "exact" takes the faster of raw and lossless, so that results never
+    # depend on the link.
     codec: Literal["exact", "raw", "lossless", "jpeg"] = "exact"
     transport: TransportName = "auto"
 
@@ -93,7 +99,9 @@ class PolicyConfig(_PlanModel):
         given = StepRange.model_validate(steps)
         steps_named = range(given.first, given.last + 1, given.every)
         if len(steps_named) > MOST_STEPS_NAMED:
-            raise ValueError(f"expected at most {MOST_STEPS_NAMED} steps, got {len(steps_named)}; raise `every`")
+            raise ValueError(
+                f"expected at most {MOST_STEPS_NAMED} steps, got {len(steps_named)}; raise `every`"
+            )
         return list(steps_named)
 
     @field_validator("steps")
@@ -106,7 +114,10 @@ class PolicyConfig(_PlanModel):
     @model_validator(mode="after")
     def _consistent(self) -> Self:
         if self.steps and self.pushed_weights is not None:
-            raise ValueError("got steps and pushed_weights, want one of them: each names checkpoints in the results")
+            raise ValueError(
+                "got steps and pushed_weights, want one of them: each names checkpoints in the "
+                "results"
+            )
         ours = {"seed", "env", "contract"} | ({"checkpoint_step"} if self.steps else set())
         if taken := sorted(ours & self.options.keys()):
             raise ValueError(f"options: {taken} are set episode by episode; leave them out")
@@ -119,7 +130,8 @@ class WorkerConfig(_PlanModel):
     cpus: Resources = 0.5  # low, so that workers and policy fit on a small machine
     gpus: Resources = 0.0
     threads: Annotated[int, Field(ge=1, le=MOST_CPUS)] = 1  # of OpenMP, MKL, llvmpipe and the like
-    # Ray's; its env_vars override the thread settings. A simulator with other packages names their Python, with Ray in
+    # Ray's; its env_vars override the thread settings. A simulator with other packages names their
+    # Python, with Ray in
     # it: {"py_executable": "/envs/rcs/bin/python"}.
     runtime_env: dict[str, JsonValue] = {}
 
@@ -131,13 +143,16 @@ class WorkerConfig(_PlanModel):
 
 
 class ClockConfig(_PlanModel):
-    """Real-time mode: the env's clock runs while the policy computes (see `vlagents_ray.evaluate.episode.latency`)."""
+    """Real-time mode: the env's clock runs while the policy computes (see
+    `vlagents_ray.evaluate.episode.latency`).
+    """
 
-    # s that each answer takes: "measured" as it comes, transport included, or injected, which repeats exactly.
+    # s that each answer takes: "measured" as it comes, transport included, or injected, which
+    # repeats exactly.
     latency: Literal["measured"] | Annotated[float, Field(ge=0, le=3600)] = "measured"
-    # The action between observation and answer. "chunk": the rest of the last chunk, then a stop of the robot: "zero"
-    # for relative actions, else "hold"; "hold": the last action again; "zero": no motion, the gripper as it was
-    # commanded.
+    # The action between observation and answer. "chunk": the rest of the last chunk, then a stop of
+    # the robot: "zero" for relative actions, else "hold"; "hold": the last action again; "zero": no
+    # motion, the gripper as it was commanded.
     meanwhile: Literal["chunk", "hold", "zero"] = "chunk"
     hz: Hertz | None = None  # ticks per second; None: the env's control_hz
     align: bool = True  # drop the rows for ticks at which others were executed before the answer
@@ -148,17 +163,23 @@ class ClockConfig(_PlanModel):
 
 
 class StopConfig(_PlanModel):
-    """The rule by which a cell stops early (see `confidence_sequence`): `target`, `width`, or whichever comes first."""
+    """The rule by which a cell stops early (see `confidence_sequence`): `target`, `width`, or
+    whichever comes first.
+    """
 
-    error_rate: float = Field(default=0.05, gt=0, lt=1)  # of each cell's confidence sequence, over all looks together
-    target: float | None = Field(default=None, ge=0, le=1)  # stop when this success rate is excluded
+    # Of each cell's confidence sequence, over all looks together.
+    error_rate: float = Field(default=0.05, gt=0, lt=1)
+    # Stop when this success rate is excluded.
+    target: float | None = Field(default=None, ge=0, le=1)
     width: float | None = Field(default=None, gt=0, lt=1)  # stop when the interval is narrower
     at_least: Count = 1  # episodes
 
     @model_validator(mode="after")
     def _some_end(self) -> Self:
         if self.target is None and self.width is None:
-            raise ValueError("got neither target nor width, want one or both: the first that is reached ends it")
+            raise ValueError(
+                "got neither target nor width, want one or both: the first that is reached ends it"
+            )
         return self
 
 
@@ -166,12 +187,14 @@ class SuiteConfig(_PlanModel):
     """Environments that are evaluated with the same settings."""
 
     name: str = ""  # in the results; an env may be in two suites of different names and settings
-    envs: list[Name] = Field(min_length=1)  # registered names, "maniskill/PushCube-v1", or patterns, "libero/*"
+    # Registered names, "maniskill/PushCube-v1", or patterns, "libero/*".
+    envs: list[Name] = Field(min_length=1)
     env_options: dict[str, JsonValue] = {}  # passed to the constructor
     reset_options: dict[str, JsonValue] = {}  # passed to every `reset` of the env
     episodes: Count = 10  # of each env and seed
     seeds: list[Seed] = Field(default=[0], min_length=1)  # episode i uses seed + i
-    num_envs: Rows = 1  # that one worker steps together, in one simulator if it can (ManiSkill on a GPU)
+    # That one worker steps together, in one simulator if it can (ManiSkill on a GPU)
+    num_envs: Rows = 1
     worker: WorkerConfig | None = None  # None: `EvalConfig.worker`
     clock: ClockConfig | None = None  # real-time mode; None: the env waits for the policy
 
@@ -186,13 +209,15 @@ class SuiteConfig(_PlanModel):
     def _consistent(self) -> Self:
         if self.clock is not None and self.clock.latency == "measured" and self.num_envs > 1:
             raise ValueError(
-                f"num_envs: got {self.num_envs} with a measured clock.latency, which would be that of the whole batch; "
+                f"num_envs: got {self.num_envs} with a measured clock.latency, which would be that "
+                "of the whole batch; "
                 f"want 1, or a latency in seconds"
             )
         for low, high in itertools.pairwise(sorted(self.seeds)):
             if high - low < self.episodes:
                 raise ValueError(
-                    f"seeds: {low} and {high} with {self.episodes} episodes each would play some twice; "
+                    f"seeds: {low} and {high} with {self.episodes} episodes each would play some "
+                    "twice; "
                     f"want them {self.episodes} or more apart"
                 )
         return self
@@ -203,7 +228,8 @@ class TrackingConfig(_PlanModel):
 
     project: Name = "vlagents-ray"
     group: str | None = None  # of runs; default: the name of the folder of results
-    videos: Annotated[int, Field(ge=0, le=MOST_EPISODES)] = 4  # of each cell that are uploaded, failures first
+    # Of each cell that are uploaded, failures first.
+    videos: Annotated[int, Field(ge=0, le=MOST_EPISODES)] = 4
 
 
 class RobotTask(_PlanModel):
@@ -217,9 +243,12 @@ class RobotTask(_PlanModel):
 
 
 class RobotConfig(_PlanModel):
-    """The robot of an evaluation, its control loop, and its tasks (see `vlagents_ray.evaluate.robot`)."""
+    """The robot of an evaluation, its control loop, and its tasks (see
+    `vlagents_ray.evaluate.robot`).
+    """
 
-    arm: str | None = None  # "module:Class" of the robot, or an arm by name; None: the plan is played in simulation
+    # "module:Class" of the robot, or an arm by name; None: the plan is played in simulation.
+    arm: str | None = None
     tasks: dict[Name, RobotTask] = Field(min_length=1)
     # Draws the order of policies; None: a key is drawn, and kept in the folder of results.
     key: Annotated[str, Field(min_length=8)] | None = None
@@ -232,7 +261,8 @@ class RobotConfig(_PlanModel):
     max_step: Annotated[float, Field(gt=0, le=1e6)] | None = None
     measure: str | None = None  # the part of the state that is the measured pose
     limits: str | None = None  # a file of `Limits.read`, without the soft start
-    accept_misfit: bool = False  # play although the training's statistics do not fit the arm; the log shows it
+    # Play although the training's statistics do not fit the arm; the log shows it.
+    accept_misfit: bool = False
     silent_s: Seconds = 2.0  # a server that is silent for longer ends the trial, which is repeated
 
 
@@ -242,16 +272,20 @@ class EvalConfig(_PlanModel):
     policies: list[PolicyConfig] = Field(min_length=1)
     suites: list[SuiteConfig] = Field(min_length=1)
     out: Path
-    # Environments rolled out in parallel, each in a Ray actor. 0: one after another in this process, without Ray.
+    # Environments rolled out in parallel, each in a Ray actor. 0: one after another in this
+    # process, without Ray.
     # None: 0 for a short evaluation, else 1 (see `chosen_workers`).
     workers: Workers | None = None
     video: EpisodeChoice = "failures"  # of which episodes there are videos
-    record: EpisodeChoice = "none"  # of which there are trajectories: numbers and the policy's images
+    # Of which there are trajectories: numbers and the policy's images.
+    record: EpisodeChoice = "none"
     resume: bool = False
-    accept_changes: bool = False  # resume although files of policy or environment changed; the report shows it
+    # Resume although files of policy or environment changed; the report shows it.
+    accept_changes: bool = False
     worker: WorkerConfig = WorkerConfig()
     stop: StopConfig | None = None  # early stopping; None: every episode is played
-    track: list[Name] = []  # trackers that show rates and videos beside `out`, against the training step
+    # Trackers that show rates and videos beside `out`, against the training step.
+    track: list[Name] = []
     tracking: TrackingConfig = TrackingConfig()
     robot: RobotConfig | None = None  # a real robot and its tasks
 

@@ -12,13 +12,16 @@ from vlagents_ray.evaluate.plan.cases import EvalCase
 
 @dataclass(frozen=True, slots=True)
 class EpisodeKey:
-    """Everything that determines an episode: two runs of one key give the same episode on any machine."""
+    """Everything that determines an episode: two runs of one key give the same episode on any
+    machine.
+    """
 
     env: str  # full name, suite and task
     episode: int  # its number within the env, from 0
     seed: int  # of the resets of env and policy
     settings: str  # fingerprint of everything else that changes the outcome
-    policy_seed: int | None = None  # of the policy's reset, for episodes that share the env's; None: `seed`
+    # Of the policy's reset, for episodes that share the env's; None: `seed`.
+    policy_seed: int | None = None
 
     def __str__(self) -> str:
         policy = "" if self.policy_seed is None else f"/{self.policy_seed}"
@@ -32,7 +35,8 @@ class Job:
     key: EpisodeKey
     cell: EvalCase
     attempt: int = 1
-    alone: bool = False  # whether it is played without others in its simulator, so that an error names this episode
+    # Whether it is played without others in its simulator, so that an error names this episode.
+    alone: bool = False
 
     def again(self, *, alone: bool = False) -> Job:
         """Return the next attempt at the same episode, which stays `alone`."""
@@ -70,23 +74,31 @@ class JobQueue:
         self._of(job).appendleft(job)
 
     def take(self, kind: str, made: str | None, working: Mapping[str, int]) -> tuple[Job, ...]:
-        """Return the next jobs for a worker of `kind` with the env at place `made`; none if no job of its kind waits.
+        """Return the next jobs for a worker of `kind` with the env at place `made`; none if no job
+        of its kind waits.
 
-        They are of one cell, as many as it plays at once. A worker keeps its env while that has episodes; then it takes
-        the place with the most waiting jobs for each worker, by `working`, the number of busy workers at each place.
+        They are of one cell, as many as it plays at once. A worker keeps its env while that has
+        episodes; then it takes the place with the most waiting jobs for each worker, by `working`,
+        the number of busy workers at each place.
         """
         if made is not None and self._waiting.get(made):
             return self._first(made)
-        waiting = {place: len(jobs) for place, jobs in self._waiting.items() if jobs and self._kinds[place] == kind}
+        waiting = {
+            place: len(jobs)
+            for place, jobs in self._waiting.items()
+            if jobs and self._kinds[place] == kind
+        }
         if not waiting:
             return ()
         return self._first(max(waiting, key=lambda one: waiting[one] / (1 + working.get(one, 0))))
 
-    def needs_worker(self, workers: Mapping[str, int], unoccupied: Mapping[str, int]) -> EvalCase | None:
+    def needs_worker(
+        self, workers: Mapping[str, int], unoccupied: Mapping[str, int]
+    ) -> EvalCase | None:
         """Return a cell for one more worker; None if the `unoccupied` ones suffice.
 
-        Both arguments count workers by kind. The cell is of the kind with the most waiting jobs for each of the
-        `workers`.
+        Both arguments count workers by kind. The cell is of the kind with the most waiting jobs for
+        each of the `workers`.
         """
         waiting: Counter[str] = Counter()
         for place, jobs in self._waiting.items():
@@ -96,7 +108,11 @@ class JobQueue:
         if not short:
             return None
         kind = max(short, key=lambda one: waiting[one] / (1 + workers.get(one, 0)))
-        return next(jobs[0].cell for place, jobs in self._waiting.items() if jobs and self._kinds[place] == kind)
+        return next(
+            jobs[0].cell
+            for place, jobs in self._waiting.items()
+            if jobs and self._kinds[place] == kind
+        )
 
     def drop(self, settings: str) -> int:
         """Remove the waiting jobs of the cell with this fingerprint; returns their number."""
@@ -110,7 +126,12 @@ class JobQueue:
         taken = [jobs.popleft()]
         cell = taken[0].cell
         number = 1 if taken[0].alone else cell.suite.num_envs
-        while jobs and len(taken) < number and jobs[0].cell.fingerprint == cell.fingerprint and not jobs[0].alone:
+        while (
+            jobs
+            and len(taken) < number
+            and jobs[0].cell.fingerprint == cell.fingerprint
+            and not jobs[0].alone
+        ):
             taken.append(jobs.popleft())
         return tuple(taken)
 

@@ -1,7 +1,7 @@
 """Geometry of the page's charts, in SVG's units; `templates/charts.html.j2` draws them.
 
-Colours are the classes c0 to c5 of the stylesheet, which has them for light, dark and print. Lines also differ in their
-dashes, for readers who cannot distinguish the colours.
+Colours are the classes c0 to c5 of the stylesheet, which has them for light, dark and print. Lines
+also differ in their dashes, for readers who cannot distinguish the colours.
 """
 
 from __future__ import annotations
@@ -43,7 +43,9 @@ def bounds(values: tuple[float, float] | None) -> str:
 
 
 def interval_name(rate: Rate) -> str:
-    """Return the kind of that interval: a confidence sequence if cells could stop early, else Wilson's."""
+    """Return the kind of that interval: a confidence sequence if cells could stop early, else
+    Wilson's.
+    """
     if rate.error_rate is None:
         return "95 % Wilson interval"
     return f"{100 * (1 - rate.error_rate):g} % confidence sequence"
@@ -145,7 +147,9 @@ class RateChart:
 
 @dataclass(frozen=True, slots=True)
 class BarChart:
-    """Bars made of parts, all on one scale. A bar is (name, its sum, [(style, value, width in per cent)])."""
+    """Bars made of parts, all on one scale. A bar is (name, its sum, [(style, value, width in
+    per cent)]).
+    """
 
     title: str
     legend: list[Style]
@@ -154,7 +158,9 @@ class BarChart:
 
 @dataclass(frozen=True, slots=True)
 class Glyph:
-    """A dot with its interval on an axis, for the cell of a table; decoration, as the numbers are beside it."""
+    """A dot with its interval on an axis, for the cell of a table; decoration, as the numbers
+    are beside it.
+    """
 
     axis: str
     range: str | None
@@ -163,7 +169,9 @@ class Glyph:
 
 
 def rate_chart(series: Sequence[Series], x_label: str, title: str) -> RateChart:
-    """Return the lines of `series`, in their order, on a common axis from the least x to the largest."""
+    """Return the lines of `series`, in their order, on a common axis from the least x to the
+    largest.
+    """
     most = max((x for one in series for x, _ in one.points), default=0.0)
     least = min((x for one in series for x, _ in one.points), default=0.0)
     left, right = (least - 1, most + 1) if least == most else (least, most)
@@ -176,17 +184,24 @@ def rate_chart(series: Sequence[Series], x_label: str, title: str) -> RateChart:
         known = [(x, rate) for x, rate in one.points if rate.rate is not None]
         bounds = [(rate.rate or 0.0, *rate.interval) for _, rate in known]
         rates, lows, highs = (
-            [(x_of(x), PLOT.y(shares[i])) for (x, _), shares in zip(known, bounds, strict=True)] for i in range(3)
+            [(x_of(x), PLOT.y(shares[i])) for (x, _), shares in zip(known, bounds, strict=True)]
+            for i in range(3)
         )
         dots = [
-            (x_of(x), PLOT.y(rate.rate or 0.0), f"{one.name}, {short(x)}: {percent(rate)} % ({interval(rate)})")
+            (
+                x_of(x),
+                PLOT.y(rate.rate or 0.0),
+                f"{one.name}, {short(x)}: {percent(rate)} % ({interval(rate)})",
+            )
             for x, rate in known
             if not one.level
         ]
         style = Style(one.name, f"c{index % _COLOURS}", _DASHES[index % len(_DASHES)])
         band = f"{_path([*lows, *reversed(highs)])}Z"
         lines.append(Curve(style, _path(rates) if known else None, band if known else None, dots))
-    return RateChart(title, x_label, [(x_of(tick), short(tick)) for tick in ticks(left, right)], lines)
+    return RateChart(
+        title, x_label, [(x_of(tick), short(tick)) for tick in ticks(left, right)], lines
+    )
 
 
 def bar_chart(rows: Mapping[str, Mapping[str, float]], title: str) -> BarChart:
@@ -198,7 +213,10 @@ def bar_chart(rows: Mapping[str, Mapping[str, float]], title: str) -> BarChart:
         (
             name,
             sum(parts.values()),
-            [(styles[part], value, 100 * value / longest if longest else 0.0) for part, value in parts.items()],
+            [
+                (styles[part], value, 100 * value / longest if longest else 0.0)
+                for part, value in parts.items()
+            ],
         )
         for name, parts in rows.items()
     ]
@@ -210,26 +228,40 @@ def interval_glyph(rate: Rate) -> Glyph:
     axis = f"M{_EDGE} 8H{_GLYPH - _EDGE}"
     if rate.rate is None:
         return Glyph(axis, None, None)
-    low, dot, high = (_EDGE + (_GLYPH - 2 * _EDGE) * value for value in (rate.interval[0], rate.rate, rate.interval[1]))
+    low, dot, high = (
+        _EDGE + (_GLYPH - 2 * _EDGE) * value
+        for value in (rate.interval[0], rate.rate, rate.interval[1])
+    )
     return Glyph(axis, f"M{low:.1f} 8H{high:.1f}", dot)
 
 
 def difference_limit(intervals: Iterable[tuple[float, float]]) -> float:
-    """Return the largest difference on the common axis of these intervals, which is symmetric around 0."""
+    """Return the largest difference on the common axis of these intervals, which is symmetric
+    around 0.
+    """
     largest = max((abs(bound) for interval in intervals for bound in interval), default=1.0)
     return next(limit for limit in _LIMITS if limit >= largest)
 
 
-def difference_glyph(difference: float, interval: tuple[float, float], limit: float, *, decided: bool) -> Glyph:
-    """Return a difference of rates and its interval on an axis from -`limit` to `limit`, with a mark at 0."""
+def difference_glyph(
+    difference: float, interval: tuple[float, float], limit: float, *, decided: bool
+) -> Glyph:
+    """Return a difference of rates and its interval on an axis from -`limit` to `limit`, with a
+    mark at 0.
+    """
     middle = _GLYPH / 2
-    left, dot, right = (middle + (middle - _EDGE) * value / limit for value in (interval[0], difference, interval[1]))
+    left, dot, right = (
+        middle + (middle - _EDGE) * value / limit
+        for value in (interval[0], difference, interval[1])
+    )
     axis = f"M{_EDGE} 8H{_GLYPH - _EDGE}M{middle:.1f} 2V14"
     return Glyph(axis, f"M{left:.1f} 8H{right:.1f}", dot, decided)
 
 
 def difference_labels(limit: float) -> tuple[str, str, str]:
-    """Return the labels of that axis at its left end, its middle and its right end, in percentage points."""
+    """Return the labels of that axis at its left end, its middle and its right end, in
+    percentage points.
+    """
     return f"{MINUS}{100 * limit:g}", "0", f"+{100 * limit:g}"
 
 
@@ -239,7 +271,11 @@ def ticks(low: float, high: float, most: int = 6) -> list[float]:
         return [low]
     rough = (high - low) / most
     magnitude = 10 ** math.floor(math.log10(rough))
-    distance = next(factor * magnitude for factor in (1, 2, 2.5, 5, 10) if factor * magnitude >= rough * (1 - 1e-9))
+    distance = next(
+        factor * magnitude
+        for factor in (1, 2, 2.5, 5, 10)
+        if factor * magnitude >= rough * (1 - 1e-9)
+    )
     first, last = math.ceil(low / distance - 1e-9), math.floor(high / distance + 1e-9)
     return [distance * step for step in range(first, last + 1)]
 

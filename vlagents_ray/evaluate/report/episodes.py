@@ -27,7 +27,12 @@ MOST_LISTED = 20_000  # episodes
 AT_ONCE = 500  # rows when the page opens; its script shows more
 MOST_ERRORS = 500
 MOST_LOGS = 50
-_OUTCOMES = {"success": "solved", "failure": "not solved", "policy_error": "policy error", "infra_failed": "lost"}
+_OUTCOMES = {
+    "success": "solved",
+    "failure": "not solved",
+    "policy_error": "policy error",
+    "infra_failed": "lost",
+}
 
 Found = tuple[CellResults, Episode]
 
@@ -83,7 +88,8 @@ class Errors:
     """Errors of the policies, and failures of infrastructure."""
 
     of_policies: list[tuple[tuple[str, str, str], int]]  # ((policy id, task, error), episodes)
-    attempts: list[tuple[CellResults, Attempt]]  # the first `MOST_LOGS` that failed by infrastructure
+    # The first `MOST_LOGS` that failed by infrastructure.
+    attempts: list[tuple[CellResults, Attempt]]
     failed: int  # attempts
     repeated: int  # attempts
     lost: int  # episodes
@@ -97,10 +103,13 @@ class Gallery:
         self._budget = budget if inline else 0
         self.inlined = 0
         self.linked = 0
-        self.outside: set[str] = set()  # paths that are symbolic links out of their folder of results: not shown
+        # Paths that are symbolic links out of their folder of results: not shown.
+        self.outside: set[str] = set()
 
     def cards(self, found: Sequence[Found], most: int) -> list[Card]:
-        """Return at most `most` of these episodes with a video, from tasks and policies in turns."""
+        """Return at most `most` of these episodes with a video, from tasks and policies in
+        turns.
+        """
         by_cell: dict[str, list[Found]] = {}
         for cell, one in found:
             if one.videos:
@@ -132,7 +141,11 @@ class Gallery:
     def link(self, video: str) -> str | None:
         """Return the page's link to the file; None without one."""
         path = self._file(video)
-        return None if path is None else quote(Path(os.path.relpath(path, self._page.parent.resolve())).as_posix())
+        return (
+            None
+            if path is None
+            else quote(Path(os.path.relpath(path, self._page.parent.resolve())).as_posix())
+        )
 
     def _file(self, video: str) -> Path | None:
         try:
@@ -157,14 +170,25 @@ def episodes(results: Results, gallery: Gallery) -> Episodes | None:
         words = f"({_OUTCOMES[kind]})" if one.beyond else _OUTCOMES[kind]
         style = {"success": "good", "failure": None}.get(kind, "bad")
         links = [(number, gallery.link(video)) for number, video in enumerate(one.videos, 1)]
-        rows.append(EpisodeRow(cell, one, words, style, [(number, link) for number, link in links if link is not None]))
+        rows.append(
+            EpisodeRow(
+                cell,
+                one,
+                words,
+                style,
+                [(number, link) for number, link in links if link is not None],
+            )
+        )
     return Episodes(rows, len(found) - len(rows), all(one.counts for _, one in found), cards)
 
 
 def failures(results: Results, gallery: Gallery) -> Failures | None:
     """Return the episodes that were not solved; None if there are none."""
     found = [
-        (cell, one) for cell in results.cells for one in cell.episodes if one.counts and not one.result.success_once
+        (cell, one)
+        for cell in results.cells
+        for one in cell.episodes
+        if one.counts and not one.result.success_once
     ]
     if not found:
         return None
@@ -199,6 +223,10 @@ def last_frame(video: Path) -> np.ndarray | None:
 
 
 def poster(frame: np.ndarray) -> str:
-    """Return a data: URL of `frame`, (H, W, 3) uint8 RGB, as a JPEG; a large frame is scaled down."""
+    """Return a data: URL of `frame`, (H, W, 3) uint8 RGB, as a JPEG; a large frame is scaled
+    down.
+    """
     stride = -(-max(frame.shape[:2]) // POSTER)
-    return data_url("image/jpeg", encode_jpeg(np.ascontiguousarray(frame[::stride, ::stride]), quality=75))
+    return data_url(
+        "image/jpeg", encode_jpeg(np.ascontiguousarray(frame[::stride, ::stride]), quality=75)
+    )

@@ -1,4 +1,6 @@
-"""The interface of a page that shows an evaluation while it runs, which a plug-in registers in `vlagents_ray.pages`."""
+"""The interface of a page that shows an evaluation while it runs, which a plug-in registers in
+`vlagents_ray.pages`.
+"""
 
 from __future__ import annotations
 
@@ -17,7 +19,11 @@ class EvaluationPage(ABC):
 
     @abstractmethod
     def serve(
-        self, document: ResultsDocument, apps: Collection[str], address: tuple[str, int], keys: Keys | None
+        self,
+        document: ResultsDocument,
+        apps: Collection[str],
+        address: tuple[str, int],
+        keys: Keys | None,
     ) -> AbstractContextManager[str]:
         """Serve the page for the length of the context, which yields its URL.
 
@@ -28,5 +34,6 @@ class EvaluationPage(ABC):
             keys: The accepted keys; None admits all clients, which only loopback allows.
 
         Raises:
-            ConfigError: Other machines would reach the page without a key, or the address is in use.
+            ConfigError: Other machines would reach the page without a key, or the address is in
+                use.
         """

@@ -1,8 +1,9 @@
 """`report.html`: an evaluation as one self-contained page.
 
 Python computes the content: this module, `success` and `episodes`, with the geometry of `charts`.
-`templates/page.html.j2` is the page, `sections.html.j2` has a macro for each of its sections, `elements.html.j2` and
-`charts.html.j2` have their common parts. `report.css` and `report.js` are written into the page.
+`templates/page.html.j2` is the page, `sections.html.j2` has a macro for each of its sections,
+`elements.html.j2` and `charts.html.j2` have their common parts. `report.css` and `report.js` are
+written into the page.
 """
 
 from __future__ import annotations
@@ -22,9 +23,22 @@ from markupsafe import Markup
 from vlagents_ray.evaluate.artifacts.storage import storing, whole
 from vlagents_ray.evaluate.plan.config import EvalConfig
 from vlagents_ray.evaluate.report import charts
-from vlagents_ray.evaluate.report.charts import BarChart, duration, interval, number, percent, quantity
+from vlagents_ray.evaluate.report.charts import (
+    BarChart,
+    duration,
+    interval,
+    number,
+    percent,
+    quantity,
+)
 from vlagents_ray.evaluate.report.episodes import AT_ONCE, Gallery, episodes, errors, failures
-from vlagents_ray.evaluate.report.success import Comparisons, compare_all, learning_curves, success_table, totals
+from vlagents_ray.evaluate.report.success import (
+    Comparisons,
+    compare_all,
+    learning_curves,
+    success_table,
+    totals,
+)
 from vlagents_ray.evaluate.results.changes import Change
 from vlagents_ray.evaluate.results.comparison import clock_gaps
 from vlagents_ray.evaluate.results.reader import CellResults, Results, Run, by_timing, rate_of
@@ -62,14 +76,19 @@ class Section(NamedTuple):
         return self.title.lower().replace(" ", "-")
 
 
-def write_report(results: Results, path: Path, *, inline: bool = False, accept_changes: bool = False) -> Path:
-    """Write the report of one folder, or of several (`combined`), to the HTML file `path`, whole or not at all.
+def write_report(
+    results: Results, path: Path, *, inline: bool = False, accept_changes: bool = False
+) -> Path:
+    """Write the report of one folder, or of several (`combined`), to the HTML file `path`, whole or
+    not at all.
 
-    With `inline`, videos are in the page, up to `episodes.BUDGET` bytes; others are links, relative to `path`. Missing
-    folders are made. With `accept_changes`, policies are compared although something changed between them (`compare`),
-    and the page shows these changes. Returns `path`.
+    With `inline`, videos are in the page, up to `episodes.BUDGET` bytes; others are links, relative
+    to `path`. Missing folders are made. With `accept_changes`, policies are compared although
+    something changed between them (`compare`), and the page shows these changes. Returns `path`.
     """
-    text = report(summarize(results), Gallery(results, path, inline=inline), accept_changes=accept_changes)
+    text = report(
+        summarize(results), Gallery(results, path, inline=inline), accept_changes=accept_changes
+    )
     with storing(path.parent), whole(path) as part:
         part.write_text(text, encoding="utf-8")
     return path
@@ -82,7 +101,11 @@ def report(summary: Summary, gallery: Gallery, *, accept_changes: bool = False) 
         _answer(summary, compared) or _solved(summary),
         Figure(number(total.episodes, 0), "episodes", f"of {number(total.planned, 0)} planned"),
         Figure(number(total.steps, 0), "env steps", f"{number(summary.steps_per_second)} a second"),
-        Figure(duration(summary.wall_seconds), "wall time", f"{quantity(total.retries, 'attempt')} repeated"),
+        Figure(
+            duration(summary.wall_seconds),
+            "wall time",
+            f"{quantity(total.retries, 'attempt')} repeated",
+        ),
     ]
     sections = [
         Section("Success", "success", success_table(summary)),
@@ -112,13 +135,18 @@ def report(summary: Summary, gallery: Gallery, *, accept_changes: bool = False) 
 
 
 def _answer(summary: Summary, compared: Comparisons | None) -> Figure | None:
-    """Return the headline of a comparison of two policy ids, which is their difference; None for any other report.
+    """Return the headline of a comparison of two policy ids, which is their difference; None for
+    any other report.
 
-    The rate of the better one would be too high, as it is chosen by its rate. Differences do not allow for cells that
-    may stop early.
+    The rate of the better one would be too high, as it is chosen by its rate. Differences do not
+    allow for cells that may stop early.
     """
     may_stop = any(group.success_once.error_rate is not None for group in summary.cells)
-    differences = [] if compared is None else [row for part in compared.parts for row in (*part.shown, *part.folded)]
+    differences = (
+        []
+        if compared is None
+        else [row for part in compared.parts for row in (*part.shown, *part.folded)]
+    )
     if may_stop or len(differences) != 1:
         return None
     [difference] = differences
@@ -143,18 +171,30 @@ def _solved(summary: Summary) -> Figure:
         name += f", {timing}"
     once = part.success_once
     if once.pooled:
-        return Figure(f"{percent(once)} %", name, f"{charts.interval_name(once)} {interval(once)} %")
+        return Figure(
+            f"{percent(once)} %", name, f"{charts.interval_name(once)} {interval(once)} %"
+        )
     cells = by_timing(summary.results.of(best))[timing]
     rates = [rate for cell in cells if (rate := rate_of([cell], "success_once")).rate is not None]
     low, high = (percent(pick(rates, key=lambda rate: rate.rate or 0.0)) for pick in (min, max))
-    return Figure(f"{low} to {high} %", name, f"{quantity(len(cells), 'task')} that stopped apart: no rate in common")
+    return Figure(
+        f"{low} to {high} %",
+        name,
+        f"{quantity(len(cells), 'task')} that stopped apart: no rate in common",
+    )
 
 
 @cache
 def _templates() -> Environment:
     # Names and errors are foreign text, so every value in a template is escaped.
     loader = PackageLoader(__package__ or "")
-    env = Environment(loader=loader, autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
+    env = Environment(
+        loader=loader,
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
     formats = (
         "bounds",
         "difference_limit",
@@ -169,21 +209,32 @@ def _templates() -> Environment:
         "quantity",
     )
     env.filters.update({name: getattr(charts, name) for name in formats})
-    env.filters.update(interval_glyph=charts.interval_glyph, px=charts.px, json=partial(json.dumps, ensure_ascii=False))
-    env.globals.update(difference_glyph=charts.difference_glyph, difference_labels=charts.difference_labels)
+    env.filters.update(
+        interval_glyph=charts.interval_glyph,
+        px=charts.px,
+        json=partial(json.dumps, ensure_ascii=False),
+    )
+    env.globals.update(
+        difference_glyph=charts.difference_glyph, difference_labels=charts.difference_labels
+    )
     env.globals.update(PLOT=charts.PLOT, AT_ONCE=AT_ONCE, NONE=charts.NONE, MINUS=charts.MINUS)
     for kind in ("css", "js"):  # our own files, not templates: nothing in them is escaped
-        env.globals[kind] = Markup((files(__package__ or "") / f"report.{kind}").read_text("utf-8").strip())  # noqa: S704
+        env.globals[kind] = Markup(  # noqa: S704
+            (files(__package__ or "") / f"report.{kind}").read_text("utf-8").strip()
+        )
     return env
 
 
 @dataclass(frozen=True, slots=True)
 class Latency:
-    """The stages of an answer of each policy, and the env's times: medians over the episodes' medians."""
+    """The stages of an answer of each policy, and the env's times: medians over the episodes'
+    medians.
+    """
 
     chart: BarChart | None  # None: no server reported its stages
     stages: list[str]  # that any policy has
-    rows: list[tuple[str, list[float | None], float | None, int]]  # (policy id, ms, the env's reset in ms, answers)
+    # (policy id, ms, the env's reset in ms, answers)
+    rows: list[tuple[str, list[float | None], float | None, int]]
     transports: list[str]
     timed: int  # policy ids with stages; the chart shows the first `MOST_BARS`
 
@@ -191,12 +242,18 @@ class Latency:
 def latency(summary: Summary) -> Latency | None:
     """Return the latencies; None if no episode was played."""
     results = summary.results
-    by_name = {name: [one for cell in results.of(name) for one in cell.counted] for name in results.contenders}
+    by_name = {
+        name: [one for cell in results.of(name) for one in cell.counted]
+        for name in results.contenders
+    }
     if not (played := {name: counted for name, counted in by_name.items() if counted}):
         return None
     spent: dict[str, dict[str, float]] = {}
     for name, counted in played.items():
-        known = {stage: median(one.timing_ms.get(key) for one in counted) for key, stage in STAGES.items()}
+        known = {
+            stage: median(one.timing_ms.get(key) for one in counted)
+            for key, stage in STAGES.items()
+        }
         spent[name] = {stage: ms for stage, ms in known.items() if ms is not None}
     timed = {name: found for name, found in spent.items() if found}
     bars = dict(list(timed.items())[:MOST_BARS])
@@ -239,7 +296,8 @@ class Configuration:
     runs: tuple[Run, ...]
     changes: list[Change]  # of files or weights, between episodes
     programs: list[tuple[str, Mapping[str, str]]]  # (env, digests of its files)
-    checkpoints: list[tuple[str, str]]  # (policy id, checkpoint, commit, digest or version of its weights)
+    # (policy id, checkpoint, commit, digest or version of its weights)
+    checkpoints: list[tuple[str, str]]
     workers: list[tuple[str, str, str, str, int]]  # (host, policy, transport, renderer, workers)
     versions: list[Mapping[str, Any]]  # of each folder
     policies: list[tuple[str, str]]  # (name, metadata as YAML)
@@ -250,7 +308,8 @@ class Configuration:
 class Repeat:
     """The arguments of the commands that repeat the evaluation and this page."""
 
-    runs: list[tuple[str, bool]]  # (settings as YAML, whether they lack a policy that Python code made)
+    # (settings as YAML, whether they lack a policy that Python code made)
+    runs: list[tuple[str, bool]]
     folders: list[str]
 
 
@@ -277,7 +336,12 @@ def configuration(results: Results) -> Configuration:
     named: list[tuple[str, str]] = []
     for cell in results.cells:
         commit = stated(cell, "revision")
-        found = (stated(cell, "checkpoint"), commit and f"commit {commit}", stated(cell, "weights"), pushed_of(cell))
+        found = (
+            stated(cell, "checkpoint"),
+            commit and f"commit {commit}",
+            stated(cell, "weights"),
+            pushed_of(cell),
+        )
         named += [(cell.contender, one) for one in found if one is not None]
     workers: dict[tuple[str, str, str, str], set[tuple[int, int]]] = {}
     for one in results.workers:
@@ -287,10 +351,15 @@ def configuration(results: Results) -> Configuration:
     return Configuration(
         results.runs,
         results.accepted_changes,
-        list({cell.env: (cell.env, cell.program) for cell in results.cells if cell.program}.values()),
+        list(
+            {cell.env: (cell.env, cell.program) for cell in results.cells if cell.program}.values()
+        ),
         list(dict.fromkeys(named)),
         [(*where, len(alike)) for where, alike in sorted(workers.items())],
-        [{name: value for name, value in run.versions.items() if value is not None} for run in last],
+        [
+            {name: value for name, value in run.versions.items() if value is not None}
+            for run in last
+        ],
         [(name, _yaml(metadata)) for name, metadata in results.policies.items()],
         [(str(run.config.get("out")), _yaml(run.config)) for run in last],
     )
@@ -301,17 +370,23 @@ def repeat(results: Results) -> Repeat:
     runs = []
     for run in _last_runs(results):  # without addresses of policies that were served for the run
         config = EvalConfig.model_validate(run.config)
-        document = config.model_dump(mode="json", exclude_defaults=True, exclude={"out", "resume", "accept_changes"})
+        document = config.model_dump(
+            mode="json", exclude_defaults=True, exclude={"out", "resume", "accept_changes"}
+        )
         for policy in document["policies"]:
             if policy.get("source") is not None:
                 policy.pop("url", None)
-        lacks_a_policy = any(not {"source", "url"} & policy.keys() for policy in document["policies"])
+        lacks_a_policy = any(
+            not {"source", "url"} & policy.keys() for policy in document["policies"]
+        )
         runs.append((_yaml(document), lacks_a_policy))
     return Repeat(runs, folders)
 
 
 def _last_runs(results: Results) -> list[Run]:
-    """Return the last run of each folder; earlier runs had the same settings, as far as results depend on them."""
+    """Return the last run of each folder; earlier runs had the same settings, as far as results
+    depend on them.
+    """
     return list({run.config.get("out"): run for run in results.runs}.values())
 
 

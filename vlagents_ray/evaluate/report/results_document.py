@@ -30,14 +30,16 @@ WAITING, ENDED, STOPPED = "waiting", "ended", "stopped"
 class ResultsDocument:
     """Describes the results of an evaluation or a training, which any process may be writing.
 
-    `read` and `video` are called on one thread. Numbers are computed from the folder by the report's code, so they
-    include earlier runs and, in a training, earlier versions. Results are read only when `read` is called.
+    `read` and `video` are called on one thread. Numbers are computed from the folder by the
+    report's code, so they include earlier runs and, in a training, earlier versions. Results are
+    read only when `read` is called.
     """
 
     reason = ""
     """The error that ended the evaluation."""
 
-    goes_on = False  # whether further evaluations follow each other, as those of a training's checkpoints
+    # Whether further evaluations follow each other, as those of a training's checkpoints.
+    goes_on = False
 
     def __init__(self, out: Path) -> None:
         """Describe the results in the folder `out`, which need not exist yet."""
@@ -47,7 +49,8 @@ class ResultsDocument:
         self._read_at, self._took_s = float("-inf"), 0.0
 
     def read(self) -> dict[str, Any]:
-        """Return {"evaluation": the document}; the same object as before if nothing in it has changed.
+        """Return {"evaluation": the document}; the same object as before if nothing in it has
+        changed.
 
         It may take as long as reading the folder of results, on average at most 4 % of a core.
         """
@@ -60,7 +63,9 @@ class ResultsDocument:
         return self._document
 
     def video(self, number: int) -> Path | None:
-        """Return the file of a video in the document; None if there is none, or it is a link out of the folder."""
+        """Return the file of a video in the document; None if there is none, or it is a link out
+        of the folder.
+        """
         if not 0 <= number < len(self._numbers):
             return None
         try:
@@ -70,7 +75,9 @@ class ResultsDocument:
         return path if path.is_file() else None
 
     def is_due(self, *, rested: bool) -> bool:
-        """Return whether to read the results; `rested` is whether that keeps to the share of a core."""
+        """Return whether to read the results; `rested` is whether that keeps to the share of a
+        core.
+        """
         return rested
 
     def state(self, results: Results | None) -> str:
@@ -90,14 +97,22 @@ class ResultsDocument:
             played = sum(one.run == run.run for cell in cells for one in cell.episodes)
             left = sum(_planned(cell) - _done(cell) for cell in cells)
             left_s = seconds_left(left, played, time.time() - run.started)
-        failed = [(cell, one) for cell in cells for one in cell.episodes if not (one.beyond or one.result.success_once)]
+        failed = [
+            (cell, one)
+            for cell in cells
+            for one in cell.episodes
+            if not (one.beyond or one.result.success_once)
+        ]
         failed.sort(key=lambda found: found[1].finished, reverse=True)
-        curves: dict[str, list[dict[str, Any]]] = {}  # the success rate at each step or version of a policy
+        # The success rate at each step or version of a policy.
+        curves: dict[str, list[dict[str, Any]]] = {}
         for contender in contenders:
             mine = [cell for cell in cells if cell.contender == contender]
             if mine[0].step is not None:
                 whole = all(_done(cell) == _planned(cell) for cell in mine)
-                point = {"step": mine[0].step, "whole": whole} | _rate(rate_of(mine, "success_once"))
+                point = {"step": mine[0].step, "whole": whole} | _rate(
+                    rate_of(mine, "success_once")
+                )
                 curves.setdefault(mine[0].policy, []).append(point)
         return {
             "name": self._out.name,
@@ -111,7 +126,12 @@ class ResultsDocument:
             "planned": sum(_planned(cell) for cell in cells),
             "retries": sum(attempt.retried for cell in cells for attempt in cell.attempts),
             "cells": [
-                {"policy": cell.contender, "task": cell.task, "done": _done(cell), "planned": _planned(cell)}
+                {
+                    "policy": cell.contender,
+                    "task": cell.task,
+                    "done": _done(cell),
+                    "planned": _planned(cell),
+                }
                 | {"stopped": cell.stopped_at is not None, "sequence": cell.stop is not None}
                 | _rate(rate_of([cell], "success_once"))
                 for cell in cells
@@ -149,7 +169,13 @@ def _planned(cell: CellResults) -> int:
 
 def _rate(rate: Rate) -> dict[str, Any]:
     low, high = rate.interval
-    return {"successes": rate.successes, "episodes": rate.episodes, "rate": rate.rate, "low": low, "high": high}
+    return {
+        "successes": rate.successes,
+        "episodes": rate.episodes,
+        "rate": rate.rate,
+        "low": low,
+        "high": high,
+    }
 
 
 class ProgressDocument(ResultsDocument, Progress):

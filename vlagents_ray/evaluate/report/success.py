@@ -15,7 +15,8 @@ from vlagents_ray.evaluate.results.statistics import ERROR_RATE, Pairs, Rate
 from vlagents_ray.evaluate.results.summary import TOTAL, Group, Summary, group_of, summarize
 
 MOST_PAIRS = 15  # shown unfolded: those of six policy ids
-MOST_COMPARED = 780  # pairs, those of 40 policy ids; of more, such as a whole training's, only the main ones
+# pairs, those of 40 policy ids; of more, such as a whole training's, only the main ones.
+MOST_COMPARED = 780
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,7 +44,8 @@ class LearningCurve:
     """Success over the training step."""
 
     chart: RateChart
-    rows: list[tuple[str, float | None, Rate]]  # (policy, step, rate); no step: a policy without checkpoints
+    # (policy, step, rate); no step: a policy without checkpoints.
+    rows: list[tuple[str, float | None, Rate]]
 
 
 def success_table(summary: Summary) -> SuccessTable:
@@ -60,11 +62,17 @@ def success_table(summary: Summary) -> SuccessTable:
 
 def learning_curves(summary: Summary) -> list[LearningCurve]:
     """Return success over the training steps of each policy with several; empty if none has."""
-    return [curve for title, cells in _parts_with_a_rate(summary) if (curve := _learning_curve(title, cells))]
+    return [
+        curve
+        for title, cells in _parts_with_a_rate(summary)
+        if (curve := _learning_curve(title, cells))
+    ]
 
 
 def _blocks(summary: Summary) -> Iterator[Block]:
-    """Yield tasks in the order of the plan, the sum of each suite after its tasks, and last the sum of all."""
+    """Yield tasks in the order of the plan, the sum of each suite after its tasks, and last the
+    sum of all.
+    """
     cells: dict[str, dict[str, list[Group]]] = {}
     order = {name: number for number, name in enumerate(summary.results.contenders)}
 
@@ -79,7 +87,9 @@ def _blocks(summary: Summary) -> Iterator[Block]:
         if len(cells) > 1 and len(envs) > 1:
             of_suite = [cell for cell in summary.results.cells if cell.suite == suite]
             yield Block(
-                f"all of {suite or 'the nameless suite'}", in_order(_by_policy_id(of_suite, suite)), is_sum=True
+                f"all of {suite or 'the nameless suite'}",
+                in_order(_by_policy_id(of_suite, suite)),
+                is_sum=True,
             )
     timings = by_timing(summary.results.cells)
     for timing, found in timings.items():
@@ -99,7 +109,9 @@ def _by_policy_id(cells: Sequence[CellResults], suite: str) -> list[Group]:
 
 
 def _parts_with_a_rate(summary: Summary) -> Iterator[tuple[str, list[CellResults]]]:
-    """Yield the cells of each chart: all, and each suite; single tasks if a suite has no common rate."""
+    """Yield the cells of each chart: all, and each suite; single tasks if a suite has no common
+    rate.
+    """
     timings = by_timing(summary.results.cells)
     for timing, cells in timings.items():
         suffix = "" if len(timings) == 1 else f", {timing}"
@@ -122,7 +134,9 @@ def _all_have_rates(cells: Sequence[CellResults]) -> bool:
 
 
 def _learning_curve(title: str, cells: Sequence[CellResults]) -> LearningCurve | None:
-    """Return a curve for each policy with several steps, a level line for each other; None if no policy has several."""
+    """Return a curve for each policy with several steps, a level line for each other; None if no
+    policy has several.
+    """
     by_policy: dict[str, dict[int, list[CellResults]]] = {}
     without_steps: dict[str, list[CellResults]] = {}
     for cell in cells:
@@ -133,15 +147,23 @@ def _learning_curve(title: str, cells: Sequence[CellResults]) -> LearningCurve |
     if not (swept := {policy: found for policy, found in by_policy.items() if len(found) > 1}):
         return None
     lines = [
-        Series(policy, [(step, rate_of(group, "success_once")) for step, group in sorted(found.items())])
+        Series(
+            policy,
+            [(step, rate_of(group, "success_once")) for step, group in sorted(found.items())],
+        )
         for policy, found in swept.items()
     ]
-    first, last = min(min(found) for found in swept.values()), max(max(found) for found in swept.values())
+    first, last = (
+        min(min(found) for found in swept.values()),
+        max(max(found) for found in swept.values()),
+    )
     levels = []
     for policy, group in without_steps.items():
         rate = rate_of(group, "success_once")
         levels.append(Series(f"{policy} (no steps)", [(first, rate), (last, rate)], level=True))
-    rows: list[tuple[str, float | None, Rate]] = [(line.name, None, line.points[0][1]) for line in levels]
+    rows: list[tuple[str, float | None, Rate]] = [
+        (line.name, None, line.points[0][1]) for line in levels
+    ]
     rows += [(line.name, step, rate) for line in lines for step, rate in line.points]
     pushed = all("pushed_weights" in cell.settings for cell in cells if cell.step is not None)
     of_axis = "version of the weights" if pushed else "training step"
@@ -184,12 +206,15 @@ class Comparisons:
 
 @dataclass(frozen=True, slots=True)
 class Family:
-    """The comparisons of the episodes with one timing, whose p-values are adjusted for one another."""
+    """The comparisons of the episodes with one timing, whose p-values are adjusted for one
+    another.
+    """
 
     timing: str
     comparisons: list[Comparison]  # the main ones first
     main: int  # the number of these
-    left_out: int  # pairs beyond the main ones, if there are very many; their number is in the adjustment
+    # Pairs beyond the main ones, if there are very many; their number is in the adjustment.
+    left_out: int
     reasons: list[str]  # reasons why other pairs are not compared
 
 
@@ -204,7 +229,8 @@ def families(summary: Summary, *, accept_changes: bool = False) -> list[Family]:
         pairs, reasons = comparable(results, wanted, accept_changes=accept_changes)
         asked = _asked_first(of_timing, pairs)
         ordered = [*asked, *(pair for pair in _later_first(results, pairs) if pair not in asked)]
-        # Whether a pair is the main one depends on the rates, so the adjustment is for all that could have been.
+        # Whether a pair is the main one depends on the rates, so the adjustment is for all that
+        # could have been.
         chosen_of = None if len(wanted) == len(every) else len(every)
         compared = comparisons(results, ordered, chosen_of=chosen_of, accept_changes=accept_changes)
         found.append(Family(timing, compared, len(asked), len(every) - len(wanted), reasons))
@@ -214,7 +240,9 @@ def families(summary: Summary, *, accept_changes: bool = False) -> list[Family]:
 def families_json(summary: Summary, *, accept_changes: bool = False) -> list[dict[str, Any]]:
     """Return the comparisons of the page for JSON, each with its timing."""
     found = families(summary, accept_changes=accept_changes)
-    return [one.to_json() | {"timing": family.timing} for family in found for one in family.comparisons]
+    return [
+        one.to_json() | {"timing": family.timing} for family in found for one in family.comparisons
+    ]
 
 
 def compare_all(summary: Summary, *, accept_changes: bool = False) -> Comparisons | None:
@@ -249,7 +277,9 @@ def _difference(one: Comparison, line: Line) -> Difference:
 
 
 def _asked_first(summary: Summary, pairs: Sequence[tuple[str, str]]) -> list[tuple[str, str]]:
-    """Return each checkpoint with the one before it, and the best of all with the best of each other policy."""
+    """Return each checkpoint with the one before it, and the best of all with the best of each
+    other policy.
+    """
     cells = {cell.contender: (cell.policy, cell.step) for cell in summary.results.cells}
     known = dict.fromkeys(_later_first(summary.results, pairs))
     asked = [
@@ -261,7 +291,9 @@ def _asked_first(summary: Summary, pairs: Sequence[tuple[str, str]]) -> list[tup
     for name in summary.best:
         leaders.setdefault(cells[name][0], name)
     best = summary.best[0]
-    asked += [pair for pair in known if best in pair and all(one in leaders.values() for one in pair)]
+    asked += [
+        pair for pair in known if best in pair and all(one in leaders.values() for one in pair)
+    ]
     return [pair for pair in dict.fromkeys(asked) if pair in known]
 
 

@@ -1,4 +1,6 @@
-"""An evaluation on a terminal: its progress, live or in plain lines, and the table of results at its end."""
+"""An evaluation on a terminal: its progress, live or in plain lines, and the table of results at
+its end.
+"""
 
 from __future__ import annotations
 
@@ -20,14 +22,21 @@ from vlagents_ray.evaluate.plan.jobs import Job
 from vlagents_ray.evaluate.results.comparison import clock_gaps
 from vlagents_ray.evaluate.results.database import RUNNING
 from vlagents_ray.evaluate.results.statistics import Rate, confidence_sequence
-from vlagents_ray.evaluate.results.summary import Group, Summary, cause_of, errors_of_policies, pushed_of
+from vlagents_ray.evaluate.results.summary import (
+    Group,
+    Summary,
+    cause_of,
+    errors_of_policies,
+    pushed_of,
+)
 
 LINE_EVERY_S = 5.0
 MOST_ROWS = 12
 
 
 class Progress:
-    """The callbacks of a running evaluation, from one thread. This class shows nothing: override some.
+    """The callbacks of a running evaluation, from one thread. This class shows nothing: override
+    some.
 
     The classes of `progress_for` show them: live on a terminal, in plain lines elsewhere.
     """
@@ -99,7 +108,9 @@ class _CountedProgress(Progress):
         before = self._rates[cell.fingerprint]
         successes, episodes = before.successes + bool(result.success_once), before.episodes + 1
         error_rate = before.error_rate  # of a cell that may stop early
-        bounds = None if error_rate is None else confidence_sequence(successes, episodes, error_rate)
+        bounds = (
+            None if error_rate is None else confidence_sequence(successes, episodes, error_rate)
+        )
         self._rates[cell.fingerprint] = Rate(successes, episodes, bounds, error_rate)
         if result.status == "policy_error":
             error = (result.error or "").strip().partition("\n")[0]
@@ -121,17 +132,24 @@ class _CountedProgress(Progress):
         self._print(f"{name}: certain enough, stopped after {at} of {cell.planned} episodes")
 
     def _print(self, text: str) -> None:
-        self._console.print(text, markup=False, highlight=False, soft_wrap=not self._console.is_terminal)
+        self._console.print(
+            text, markup=False, highlight=False, soft_wrap=not self._console.is_terminal
+        )
 
     def _rows(self) -> list[tuple[str, str, str]]:
-        """Return (name, "done/planned", success so far), of many cells only for those being played."""
+        """Return (name, "done/planned", success so far), of many cells only for those being
+        played.
+        """
         done = {cell: self._rates[cell].episodes + self._infra_failed[cell] for cell in self._cells}
         cells = list(self._cells)
         if len(cells) > MOST_ROWS:
-            cells = [cell for cell in cells if 0 < done[cell] < self._cells[cell].planned][:MOST_ROWS]
+            cells = [cell for cell in cells if 0 < done[cell] < self._cells[cell].planned][
+                :MOST_ROWS
+            ]
         rows = []
         for cell in cells:
-            name = " ".join(filter(None, self._cells[cell].name[self._alone :]))  # of one policy, without its id
+            # Of one policy, without its id.
+            name = " ".join(filter(None, self._cells[cell].name[self._alone :]))
             rows.append((name, f"{done[cell]}/{self._cells[cell].planned}", str(self._rates[cell])))
         return rows
 
@@ -143,7 +161,9 @@ class _CountedProgress(Progress):
             if (left_s := seconds_left(self._left, self._played, elapsed_s)) is not None:
                 parts.append(f"{datetime.timedelta(seconds=round(left_s))} left")
         if self._retries:
-            parts.append(f"{self._retries} infrastructure {'retry' if self._retries == 1 else 'retries'}")
+            parts.append(
+                f"{self._retries} infrastructure {'retry' if self._retries == 1 else 'retries'}"
+            )
         if any(self._infra_failed.values()):
             parts.append(f"{sum(self._infra_failed.values())} infrastructure failures")
         return " · ".join(parts)
@@ -154,7 +174,9 @@ class LiveProgress(_CountedProgress):
 
     def __init__(self, console: Console) -> None:
         super().__init__(console)
-        self._live = Live(console=console, auto_refresh=True, refresh_per_second=4, get_renderable=self._drawing)
+        self._live = Live(
+            console=console, auto_refresh=True, refresh_per_second=4, get_renderable=self._drawing
+        )
 
     def begin(self, cells: Sequence[EvalCase], recorded: Mapping[str, Rate], left: int) -> None:
         super().begin(cells, recorded, left)
@@ -192,17 +214,23 @@ class LineProgress(_CountedProgress):
 
 
 def progress_for(console: Console) -> Progress:
-    """Choose the display for `console`: a live table on a terminal, else a line every five seconds."""
+    """Choose the display for `console`: a live table on a terminal, else a line every five
+    seconds.
+    """
     return LiveProgress(console) if console.is_terminal else LineProgress(console)
 
 
 def seconds_left(episodes: int, played: int, elapsed_s: float) -> float | None:
-    """Estimate the time of `episodes` further episodes, s; None if none are left or none was played."""
+    """Estimate the time of `episodes` further episodes, s; None if none are left or none was
+    played.
+    """
     return episodes * elapsed_s / played if episodes > 0 and played else None
 
 
 def results_table(summary: Summary) -> Table:
-    """Make a table of success, length and speed: for each policy id a row for each env, and one for all together."""
+    """Make a table of success, length and speed: for each policy id a row for each env, and one
+    for all together.
+    """
     names, error_rate = summary.results.contenders, summary.total.success_once.error_rate
     interval = "the Wilson 95 % interval"
     if error_rate is not None:
@@ -219,9 +247,13 @@ def results_table(summary: Summary) -> Table:
     for name, total in zip(names, summary.totals, strict=True):
         groups = [(group, "") for group in summary.cells if group.contender == name]
         parts = summary.parts(name)
-        totals = [(total, "")] if len(parts) == 1 else [(part, timing) for timing, part in parts.items()]
+        totals = (
+            [(total, "")] if len(parts) == 1 else [(part, timing) for timing, part in parts.items()]
+        )
         for group, timing in [*groups, *totals] if len(groups) > 1 else groups:
-            table.add_row(*([name] if len(names) > 1 else []), *_cells(group, timing, some_lost=some_lost))
+            table.add_row(
+                *([name] if len(names) > 1 else []), *_cells(group, timing, some_lost=some_lost)
+            )
         table.add_section()
     return table
 
@@ -255,33 +287,61 @@ def print_summary(console: Console, summary: Summary) -> None:
             f"the policy for {summary.policy_busy:.0%} of one replica's"
         )
     if total.policy_errors:
-        lines.append(f"{total.policy_errors} episodes ended by an error of the policy; they count as no success")
+        lines.append(
+            f"{total.policy_errors} episodes ended by an error of the policy; they count as no "
+            "success"
+        )
     if total.retries:
         lines.append(f"{total.retries} attempts lost to infrastructure and repeated")
     if total.infra_failures:
-        lines.append(f"{total.infra_failures} episodes lost to infrastructure, in no rate; --resume tries them again")
-        lines.append("once with lost: the bounds if all lost episodes had failed, or had been solved")
+        lines.append(
+            f"{total.infra_failures} episodes lost to infrastructure, in no rate; --resume tries "
+            "them again"
+        )
+        lines.append(
+            "once with lost: the bounds if all lost episodes had failed, or had been solved"
+        )
     lines += [f"accepted change: {change}" for change in summary.results.accepted_changes]
-    pushed = {cell.contender: words for cell in summary.results.cells if (words := pushed_of(cell)) is not None}
+    pushed = {
+        cell.contender: words
+        for cell in summary.results.cells
+        if (words := pushed_of(cell)) is not None
+    }
     lines += [f"{name}: weights pushed by a learner, {words}" for name, words in pushed.items()]
     for one in (group for group in summary.cells if group.stopped):
-        name, error_rate = " ".join(filter(None, (one.contender, one.suite, one.env))), one.success_once.error_rate or 0
-        lines.append(f"{name}: stopped after {one.episodes} of {one.planned} (error rate {100 * error_rate:.2g} %)")
+        name, error_rate = (
+            " ".join(filter(None, (one.contender, one.suite, one.env))),
+            one.success_once.error_rate or 0,
+        )
+        lines.append(
+            f"{name}: stopped after {one.episodes} of {one.planned} (error rate "
+            f"{100 * error_rate:.2g} %)"
+        )
     parts = [part for name in summary.results.contenders for part in summary.parts(name).values()]
     if not all(part.success_once.pooled for part in parts):
-        lines.append("cells that stopped after different numbers of episodes have no rate in common: quote each alone")
+        lines.append(
+            "cells that stopped after different numbers of episodes have no rate in common: quote "
+            "each alone"
+        )
     for gap in clock_gaps(summary.results):  # as in the report, on the episodes of both clocks
         counted = [one for cell in gap.cells for one in cell.counted]
-        steps = max(1, sum(one.steps for one in counted))  # 0 if the policy failed before the first step of each
-        waited, held = (sum(getattr(one, what) for one in counted) for what in ("ticks_waited", "ticks_held"))
+        # 0 if the policy failed before the first step of each.
+        steps = max(1, sum(one.steps for one in counted))
+        waited, held = (
+            sum(getattr(one, what) for one in counted) for what in ("ticks_waited", "ticks_held")
+        )
         low, high = gap.total.interval
         lines.append(
-            f"{gap.a}: {100 * (gap.total.pairs.difference or 0):+.1f} points to the synchronous score "
+            f"{gap.a}: {100 * (gap.total.pairs.difference or 0):+.1f} points to the synchronous "
+            "score "
             f"({100 * low:+.1f} to {100 * high:+.1f}, {gap.total.pairs.total} pairs); "
-            f"{waited / steps:.0%} of its ticks waited for an answer, {held / steps:.0%} with nothing to execute"
+            f"{waited / steps:.0%} of its ticks waited for an answer, {held / steps:.0%} with "
+            "nothing to execute"
         )
     if summary.state != "complete":
-        lines.append("still running" if summary.state == RUNNING else f"{summary.state}: go on with --resume")
+        lines.append(
+            "still running" if summary.state == RUNNING else f"{summary.state}: go on with --resume"
+        )
     lines.append(f"results: {summary.out}")
     written = {"report": summary.out / FILE, "videos": summary.out / "videos"}
     lines += [f"{name}: {path}" for name, path in written.items() if path.exists()]
@@ -295,7 +355,11 @@ def _cells(group: Group, timing: str, *, some_lost: bool) -> list[str]:
         " ".join(filter(None, (group.suite, group.env, timing))),
         f"{group.episodes}/{group.planned}",
         str(group.success_once),
-        *(["-" if bounds is None else f"{100 * bounds[0]:.0f} to {100 * bounds[1]:.0f}%"] if some_lost else []),
+        *(
+            ["-" if bounds is None else f"{100 * bounds[0]:.0f} to {100 * bounds[1]:.0f}%"]
+            if some_lost
+            else []
+        ),
         "-" if group.success_at_end.rate is None else f"{group.success_at_end.rate:.0%}",
         _number(group.mean_steps),
         _number(group.policy_ms, 2),

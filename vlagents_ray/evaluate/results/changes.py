@@ -1,4 +1,6 @@
-"""Changes of the program of an evaluation: the files and weights of its policies and environments."""
+"""Changes of the program of an evaluation: the files and weights of its policies and
+environments.
+"""
 
 from __future__ import annotations
 
@@ -12,11 +14,17 @@ IDENTITY = ("policy", "checkpoint", "weights")  # of a policy's metadata
 _OF_CHECKPOINT = {"checkpoint", "checkpoint_step"}  # settings that the identity's "checkpoint" has
 _SWEPT = "checkpoint: "  # prefix of a file that each step of a sweep has
 _DIGITS = 12  # of a digest that a person reads
-MIX = "bring the old files back, give a new folder (--out), or mix both and have the report say so (--accept-changes)"
+MIX = (
+    "bring the old files back, give a new folder (--out), or mix both and have the report say "
+    "so "
+    "(--accept-changes)"
+)
 
 
 class EnvStatement(NamedTuple):
-    """The description and the contract of an environment, as JSON values; empty if no worker has made it."""
+    """The description and the contract of an environment, as JSON values; empty if no worker has
+    made it.
+    """
 
     description: Mapping[str, Any]  # `EvalEnv.describe()`, such as the simulator's version
     contract: Mapping[str, Any]
@@ -37,7 +45,9 @@ class Change:
         return self.subject == f"env {env}" and self.name.startswith(kinds)
 
     def is_setting_of(self, policy: str) -> bool:
-        """Return whether the settings of this policy or of its wrappers changed (`policy_changes`)."""
+        """Return whether the settings of this policy or of its wrappers changed
+        (`policy_changes`).
+        """
         return self.subject == f"policy {policy}" and self.name.startswith("its ")
 
     def __str__(self) -> str:
@@ -49,7 +59,9 @@ def listed(changes: Sequence[Change]) -> str:
     return "\n".join(f"- {one}" for one in changes)
 
 
-def program_changes(subject: str, was: Mapping[str, str] | None, now: Mapping[str, str] | None) -> list[Change]:
+def program_changes(
+    subject: str, was: Mapping[str, str] | None, now: Mapping[str, str] | None
+) -> list[Change]:
     """Compare two programs by file; no changes are known if one of them is None."""
     if was is None or now is None:
         return []
@@ -58,22 +70,29 @@ def program_changes(subject: str, was: Mapping[str, str] | None, now: Mapping[st
 
 
 def env_changes(env: str, was: EnvStatement, now: EnvStatement) -> list[Change]:
-    """Compare what an environment states about itself; no changes are known if it has stated nothing."""
+    """Compare what an environment states about itself; no changes are known if it has stated
+    nothing.
+    """
     changes: list[Change] = []
     for kind in EnvStatement._fields:
         before, after = getattr(was, kind), getattr(now, kind)
         if not before or not after:
             continue
-        names = sorted(name for name in before.keys() | after.keys() if before.get(name) != after.get(name))
+        names = sorted(
+            name for name in before.keys() | after.keys() if before.get(name) != after.get(name)
+        )
         changes += [
-            Change(f"env {env}", f"its {kind} {name!r}", repr(before.get(name)), repr(after.get(name)))
+            Change(
+                f"env {env}", f"its {kind} {name!r}", repr(before.get(name)), repr(after.get(name))
+            )
             for name in names
         ]
     return changes
 
 
 def changed(known: Mapping[str, Any], now: Mapping[str, Any], *, swept: bool) -> str | None:
-    """Return the field of a policy's identity that differs between two metadata of its server, or None.
+    """Return the field of a policy's identity that differs between two metadata of its server, or
+    None.
 
     In a sweep (`swept`) sessions choose their checkpoint, whatever the server's is.
     """
@@ -84,9 +103,15 @@ def changed(known: Mapping[str, Any], now: Mapping[str, Any], *, swept: bool) ->
     return None if not found else "weights" if found[-1].name == "weights" else "program"
 
 
-def policy_changes(subject: str, known: Mapping[str, Any], now: Mapping[str, Any], *, swept: bool) -> list[Change]:
-    """Compare files, settings and weights that two metadata of a policy's server state; the weights come last."""
-    found = program_changes(subject, policy_program(known, swept=swept), policy_program(now, swept=swept))
+def policy_changes(
+    subject: str, known: Mapping[str, Any], now: Mapping[str, Any], *, swept: bool
+) -> list[Change]:
+    """Compare files, settings and weights that two metadata of a policy's server state; the
+    weights come last.
+    """
+    found = program_changes(
+        subject, policy_program(known, swept=swept), policy_program(now, swept=swept)
+    )
     found += _settings_changes(subject, known, now)
     before, after = ((metadata.get("weights") or {}).get("digest") for metadata in (known, now))
     if not swept and before and after and before != after:
@@ -94,7 +119,9 @@ def policy_changes(subject: str, known: Mapping[str, Any], now: Mapping[str, Any
     return found
 
 
-def _settings_changes(subject: str, known: Mapping[str, Any], now: Mapping[str, Any]) -> list[Change]:
+def _settings_changes(
+    subject: str, known: Mapping[str, Any], now: Mapping[str, Any]
+) -> list[Change]:
     """Compare the settings of a policy and its wrappers, such as those in a deployment file."""
     changes: list[Change] = []
     before, after = known.get("config"), now.get("config")
@@ -114,7 +141,9 @@ def _settings_changes(subject: str, known: Mapping[str, Any], now: Mapping[str, 
 def policy_program(metadata: Mapping[str, Any], *, swept: bool) -> dict[str, str] | None:
     if (program := metadata.get("program")) is None:
         return None
-    return {name: value for name, value in program.items() if not (swept and name.startswith(_SWEPT))}
+    return {
+        name: value for name, value in program.items() if not (swept and name.startswith(_SWEPT))
+    }
 
 
 def program_id(program: Mapping[str, str] | None) -> str | None:

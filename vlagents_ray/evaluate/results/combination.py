@@ -28,14 +28,17 @@ def require_distinct(folders: Iterable[Path]) -> None:
 def combined(folders: Sequence[Results]) -> Results:
     """Combine the results of several folders.
 
-    If two folders have a policy in the same env, or with other files, or with other weights under the same checkpoint's
-    name, the folder's name is appended: "pi0 (second)".
+    If two folders have a policy in the same env, or with other files, or with other weights under
+    the same checkpoint's name, the folder's name is appended: "pi0 (second)".
 
     Raises:
-        ConfigError: There is no folder, or two of them are parts of one evaluation, which are merged, not compared.
+        ConfigError: There is no folder, or two of them are parts of one evaluation, which are
+            merged, not compared.
     """
     if not folders:
-        raise ConfigError("report: got no folder, want one or more that evaluations wrote their results to")
+        raise ConfigError(
+            "report: got no folder, want one or more that evaluations wrote their results to"
+        )
     if len(folders) == 1:
         return folders[0]
     require_distinct(results.out for results in folders)
@@ -54,7 +57,9 @@ def combined(folders: Sequence[Results]) -> Results:
     for results, home, label in zip(folders, homes, labels, strict=True):
         names = {}
         for cell in results.cells:
-            names[cell.policy] = f"{cell.policy} ({label})" if cell.policy in clashing else cell.policy
+            names[cell.policy] = (
+                f"{cell.policy} ({label})" if cell.policy in clashing else cell.policy
+            )
         earlier_runs = len(runs)
         prefix = home.relative_to(base)
         for cell in results.cells:
@@ -62,9 +67,13 @@ def combined(folders: Sequence[Results]) -> Results:
             for episode in cell.episodes:
                 videos = tuple(str(prefix / video) for video in episode.videos)
                 episodes.append(replace(episode, run=episode.run + earlier_runs, videos=videos))
-            attempts = [replace(attempt, run=attempt.run + earlier_runs) for attempt in cell.attempts]
+            attempts = [
+                replace(attempt, run=attempt.run + earlier_runs) for attempt in cell.attempts
+            ]
             renamed = names[cell.policy]
-            cells.append(replace(cell, policy=renamed, episodes=tuple(episodes), attempts=tuple(attempts)))
+            cells.append(
+                replace(cell, policy=renamed, episodes=tuple(episodes), attempts=tuple(attempts))
+            )
         for policy, of_server in results.policies.items():
             policies[names.get(policy, policy)] = of_server
         for worker in results.workers:
@@ -82,26 +91,39 @@ def _require_different_evaluations(folders: Sequence[Results]) -> None:
         for cell in results.cells:
             if (first := first_folders.setdefault(cell.cell, results.out)) is not results.out:
                 raise ConfigError(
-                    f"report: {first} and {results.out} both have {cell.contender!r} in {cell.env!r} with the same "
-                    f"settings; put parts of one evaluation into one folder first: `vlagents-ray merge {first} "
-                    f"{results.out} --out OUT`, with --accept-changes if code or weights changed between them"
+                    f"report: {first} and {results.out} both have {cell.contender!r} in "
+                    f"{cell.env!r} with the same "
+                    "settings; put parts of one evaluation into one folder first: `vlagents-ray "
+                    f"merge {first} "
+                    f"{results.out} --out OUT`, with --accept-changes if code or weights changed "
+                    "between them"
                 )
 
 
 def _clashing_policies(folders: Sequence[Results]) -> set[str]:
-    """Return the policies that are not the same in all folders, or are in one env more than once."""
+    """Return the policies that are not the same in all folders, or are in one env more than
+    once.
+    """
     all_cells = [cell for results in folders for cell in results.cells]
     counts = Counter((cell.contender, cell.suite, cell.env) for cell in all_cells)
-    clashing = {cell.policy for cell in all_cells if counts[cell.contender, cell.suite, cell.env] > 1}
+    clashing = {
+        cell.policy for cell in all_cells if counts[cell.contender, cell.suite, cell.env] > 1
+    }
     weights_by_checkpoint: dict[tuple[str, str | None], str] = {}  # by policy id and checkpoint
     for cell in all_cells:
         weights, checkpoint = stated(cell, "weights"), stated(cell, "checkpoint")
-        if weights is not None and weights_by_checkpoint.setdefault((cell.contender, checkpoint), weights) != weights:
+        if (
+            weights is not None
+            and weights_by_checkpoint.setdefault((cell.contender, checkpoint), weights) != weights
+        ):
             clashing.add(cell.policy)
     swept = {cell.policy for cell in all_cells if cell.step is not None}
     metadata: dict[str, dict[str, Any]] = {}  # of the first folder with the policy
     for results in folders:
         for name, of_server in results.policies.items():
-            if changed(metadata.setdefault(name, of_server), of_server, swept=name in swept) is not None:
+            if (
+                changed(metadata.setdefault(name, of_server), of_server, swept=name in swept)
+                is not None
+            ):
                 clashing.add(name)
     return clashing

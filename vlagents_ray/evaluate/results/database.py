@@ -1,7 +1,8 @@
 """results.db: its tables, its lock, and its opening for the one writing evaluation and for readers.
 
-Its journal is SQLite's rollback journal, with locks of the file system: hosts may share the folder, which a write-ahead
-log forbids (https://www.sqlite.org/wal.html). A commit takes a few milliseconds, and each episode has one.
+Its journal is SQLite's rollback journal, with locks of the file system: hosts may share the folder,
+which a write-ahead log forbids (https://www.sqlite.org/wal.html). A commit takes a few
+milliseconds, and each episode has one.
 """
 
 from __future__ import annotations
@@ -25,39 +26,102 @@ VERSION = 1
 
 SCHEMA = """
 CREATE TABLE runs (
-    run INTEGER PRIMARY KEY, started REAL NOT NULL, ended REAL, state TEXT NOT NULL,
-    config TEXT NOT NULL, versions TEXT NOT NULL, changes TEXT
+    run INTEGER PRIMARY KEY,
+    started REAL NOT NULL,
+    ended REAL,
+    state TEXT NOT NULL,
+    config TEXT NOT NULL,
+    versions TEXT NOT NULL,
+    changes TEXT
 );
 CREATE TABLE policies (name TEXT PRIMARY KEY, metadata TEXT NOT NULL);
 CREATE TABLE cells (
-    cell TEXT PRIMARY KEY, policy TEXT NOT NULL, step INTEGER, suite TEXT NOT NULL, env TEXT NOT NULL,
-    planned INTEGER NOT NULL, seeds TEXT NOT NULL, stop TEXT, settings TEXT NOT NULL, described TEXT, contract TEXT,
-    code TEXT, program TEXT
+    cell TEXT PRIMARY KEY,
+    policy TEXT NOT NULL,
+    step INTEGER,
+    suite TEXT NOT NULL,
+    env TEXT NOT NULL,
+    planned INTEGER NOT NULL,
+    seeds TEXT NOT NULL,
+    stop TEXT,
+    settings TEXT NOT NULL,
+    described TEXT,
+    contract TEXT,
+    code TEXT,
+    program TEXT
 );
 CREATE TABLE episodes (
-    key TEXT PRIMARY KEY, cell TEXT NOT NULL REFERENCES cells, env TEXT NOT NULL, episode INTEGER NOT NULL,
-    seed INTEGER NOT NULL, status TEXT NOT NULL, success_once INTEGER, success_at_end INTEGER, first_success INTEGER,
-    steps INTEGER NOT NULL, episode_return REAL NOT NULL, ending TEXT NOT NULL, instruction TEXT NOT NULL,
-    error TEXT, seconds REAL NOT NULL, reset_ms REAL, env_step_ms REAL, env_seconds REAL, acts INTEGER NOT NULL,
-    policy_ms REAL, policy_p95_ms REAL, policy_seconds REAL, latency_ms REAL,
-    ticks_waited INTEGER NOT NULL, ticks_held INTEGER NOT NULL,
-    timing_ms TEXT NOT NULL, transport TEXT NOT NULL, checkpoint TEXT, weights TEXT, revision TEXT,
-    policy_version INTEGER, policy_fingerprint TEXT, first_policy_version INTEGER,
-    actions_sha256 TEXT, videos TEXT NOT NULL, trajectory TEXT, env_program TEXT, policy_program TEXT,
-    attempts INTEGER NOT NULL, run INTEGER NOT NULL REFERENCES runs, finished REAL NOT NULL
+    key TEXT PRIMARY KEY,
+    cell TEXT NOT NULL REFERENCES cells,
+    env TEXT NOT NULL,
+    episode INTEGER NOT NULL,
+    seed INTEGER NOT NULL,
+    status TEXT NOT NULL,
+    success_once INTEGER,
+    success_at_end INTEGER,
+    first_success INTEGER,
+    steps INTEGER NOT NULL,
+    episode_return REAL NOT NULL,
+    ending TEXT NOT NULL,
+    instruction TEXT NOT NULL,
+    error TEXT,
+    seconds REAL NOT NULL,
+    reset_ms REAL,
+    env_step_ms REAL,
+    env_seconds REAL,
+    acts INTEGER NOT NULL,
+    policy_ms REAL,
+    policy_p95_ms REAL,
+    policy_seconds REAL,
+    latency_ms REAL,
+    ticks_waited INTEGER NOT NULL,
+    ticks_held INTEGER NOT NULL,
+    timing_ms TEXT NOT NULL,
+    transport TEXT NOT NULL,
+    checkpoint TEXT,
+    weights TEXT,
+    revision TEXT,
+    policy_version INTEGER,
+    policy_fingerprint TEXT,
+    first_policy_version INTEGER,
+    actions_sha256 TEXT,
+    videos TEXT NOT NULL,
+    trajectory TEXT,
+    env_program TEXT,
+    policy_program TEXT,
+    attempts INTEGER NOT NULL,
+    run INTEGER NOT NULL REFERENCES runs,
+    finished REAL NOT NULL
 );
 CREATE INDEX episodes_of_cells ON episodes (cell, checkpoint);
 CREATE TABLE attempts (
-    key TEXT NOT NULL, cell TEXT NOT NULL REFERENCES cells, attempt INTEGER NOT NULL,
-    run INTEGER NOT NULL REFERENCES runs, at REAL NOT NULL, cause TEXT NOT NULL, code TEXT NOT NULL,
-    error TEXT NOT NULL, traceback TEXT NOT NULL, log TEXT NOT NULL, retried INTEGER NOT NULL
+    key TEXT NOT NULL,
+    cell TEXT NOT NULL REFERENCES cells,
+    attempt INTEGER NOT NULL,
+    run INTEGER NOT NULL REFERENCES runs,
+    at REAL NOT NULL,
+    cause TEXT NOT NULL,
+    code TEXT NOT NULL,
+    error TEXT NOT NULL,
+    traceback TEXT NOT NULL,
+    log TEXT NOT NULL,
+    retried INTEGER NOT NULL
 );
 CREATE TABLE tracked (
-    tracker TEXT NOT NULL, what TEXT NOT NULL, episodes INTEGER NOT NULL, PRIMARY KEY (tracker, what)
+    tracker TEXT NOT NULL,
+    what TEXT NOT NULL,
+    episodes INTEGER NOT NULL,
+    PRIMARY KEY (tracker, what)
 );
 CREATE TABLE workers (
-    run INTEGER NOT NULL REFERENCES runs, at REAL NOT NULL, host TEXT NOT NULL, node TEXT, pid INTEGER NOT NULL,
-    policy TEXT NOT NULL, transport TEXT NOT NULL, renderer TEXT
+    run INTEGER NOT NULL REFERENCES runs,
+    at REAL NOT NULL,
+    host TEXT NOT NULL,
+    node TEXT,
+    pid INTEGER NOT NULL,
+    policy TEXT NOT NULL,
+    transport TEXT NOT NULL,
+    renderer TEXT
 );
 """
 
@@ -74,31 +138,45 @@ def insert(db: sqlite3.Connection, table: str, row: Mapping[str, Any]) -> None:
 
 
 def require_readable(out: Path, db: sqlite3.Connection) -> None:
-    """Raise `ConfigError` for a results file of another version, or with other columns than this version's.
+    """Raise `ConfigError` for a results file of another version, or with other columns than this
+    version's.
 
-    A file from elsewhere may have any text as names of columns, by which `merge` inserts rows, and views or triggers,
-    which would run arbitrary SQL when a table is read or written.
+    A file from elsewhere may have any text as names of columns, by which `merge` inserts rows, and
+    views or triggers, which would run arbitrary SQL when a table is read or written.
     """
-    begins = {"table": "CREATE TABLE", "index": "CREATE INDEX"}  # a virtual table is also listed as a table
-    for kind, name, sql in db.execute("SELECT type, name, sql FROM sqlite_master WHERE sql IS NOT NULL"):
+    # A virtual table is also listed as a table.
+    begins = {"table": "CREATE TABLE", "index": "CREATE INDEX"}
+    for kind, name, sql in db.execute(
+        "SELECT type, name, sql FROM sqlite_master WHERE sql IS NOT NULL"
+    ):
         if kind not in begins or not str(sql).startswith(begins[kind]):
             raise ConfigError(
-                f"{out / FILE}: got {name!r}, which is a {kind} that no evaluation makes: do not trust its author"
+                f"{out / FILE}: got {name!r}, which is a {kind} that no evaluation makes: do not "
+                "trust its author"
             )
     if not db.execute("SELECT count(*) FROM sqlite_master").fetchone()[0]:
         raise ConfigError(
-            f"{out / FILE}: expected a database of results, got an empty file, as of a copy that was cut off; copy it "
+            f"{out / FILE}: expected a database of results, got an empty file, as of a copy that "
+            "was cut off; copy it "
             f"again, or choose another folder"
         )
     if (version := db.execute("PRAGMA user_version").fetchone()[0]) != VERSION:
-        raise ConfigError(f"{out / FILE}: got version {version} of the results, want {VERSION}; choose another folder")
+        raise ConfigError(
+            f"{out / FILE}: got version {version} of the results, want {VERSION}; choose another "
+            "folder"
+        )
     for table, known in _known_columns().items():
         there = _columns(db, table)
         unknown, missing = there - known, known - there
         if unknown or missing:
-            got = f"the unknown columns {sorted(unknown)}" if unknown else f"none of the columns {sorted(missing)}"
+            got = (
+                f"the unknown columns {sorted(unknown)}"
+                if unknown
+                else f"none of the columns {sorted(missing)}"
+            )
             raise ConfigError(
-                f"{out / FILE}: got {got} in its table {table!r}, want those of this version of vlagents-ray; read it "
+                f"{out / FILE}: got {got} in its table {table!r}, want those of this version of "
+                "vlagents-ray; read it "
                 f"with the version that wrote it"
             )
 
@@ -107,7 +185,9 @@ def require_readable(out: Path, db: sqlite3.Connection) -> None:
 def _known_columns() -> dict[str, set[str]]:
     with contextlib.closing(sqlite3.connect(":memory:")) as db:
         create(db)
-        tables = [name for (name,) in db.execute("SELECT name FROM sqlite_master WHERE type = 'table'")]
+        tables = [
+            name for (name,) in db.execute("SELECT name FROM sqlite_master WHERE type = 'table'")
+        ]
         return {table: _columns(db, table) for table in tables}
 
 
@@ -145,20 +225,25 @@ def lock(out: Path) -> int:
                 time.sleep(_AGAIN_S)
                 continue
             os.close(file)
-            raise ConfigError(f"{out}: another evaluation is writing there; wait, or choose another folder") from error
+            raise ConfigError(
+                f"{out}: another evaluation is writing there; wait, or choose another folder"
+            ) from error
         except OSError as error:
             os.close(file)
             if error.errno not in _NO_LOCKS:
                 raise
             raise ConfigError(
-                f"{out}: its file system knows no locks ({error.strerror}), so that two evaluations could write to one "
+                f"{out}: its file system knows no locks ({error.strerror}), so that two "
+                "evaluations could write to one "
                 f"folder; choose another one with --out (Lustre: have it mounted with `-o flock`)"
             ) from error
         return file
 
 
 def is_locked(out: Path) -> bool:
-    """Return whether an evaluation holds the lock of the folder `out`; True if that cannot be determined."""
+    """Return whether an evaluation holds the lock of the folder `out`; True if that cannot be
+    determined.
+    """
     try:
         file = os.open(out / LOCK, os.O_RDONLY)
     except FileNotFoundError:

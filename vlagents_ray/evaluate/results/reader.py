@@ -17,7 +17,13 @@ from vlagents_ray.evaluate.plan.cases import contender
 from vlagents_ray.evaluate.plan.config import StopConfig
 from vlagents_ray.evaluate.plan.jobs import EpisodeKey
 from vlagents_ray.evaluate.results.changes import Change
-from vlagents_ray.evaluate.results.database import FILE, RUNNING, is_locked, read_only, require_readable
+from vlagents_ray.evaluate.results.database import (
+    FILE,
+    RUNNING,
+    is_locked,
+    read_only,
+    require_readable,
+)
 from vlagents_ray.evaluate.results.statistics import Rate, Stopping, place_in_plan, pooled
 
 KILLED = "killed"  # the state of a run that ended without saying so
@@ -37,12 +43,15 @@ class Episode:
     finished: float  # seconds since 1970
     env_program: str | None = None  # digest of the files of its environment, None if installed
     policy_program: str | None = None  # the same for its policy
-    beyond: bool = False  # whether it comes after the end of its stopped cell, or is no longer planned
+    # Whether it comes after the end of its stopped cell, or is no longer planned.
+    beyond: bool = False
     unplanned: bool = False  # the latter of the two
 
     @property
     def counts(self) -> bool:
-        """Whether the episode is in the rates: not if it failed by infrastructure, or is `beyond`."""
+        """Whether the episode is in the rates: not if it failed by infrastructure, or is
+        `beyond`.
+        """
         return self.result.status != "infra_failed" and not self.beyond
 
 
@@ -65,7 +74,9 @@ class Attempt:
 
 @dataclass(frozen=True, slots=True)
 class Worker(WorkerInfo):
-    """A worker's connection to a policy or creation of an env; a worker may have several entries."""
+    """A worker's connection to a policy or creation of an env; a worker may have several
+    entries.
+    """
 
     run: int
     at: float  # seconds since 1970
@@ -78,7 +89,8 @@ class Run:
     run: int
     started: float  # seconds since 1970
     ended: float | None  # None: it runs, or was killed
-    state: str  # "complete", "interrupted", "out of time", "stopped" by an error, "running", or "killed"
+    # "complete", "interrupted", "out of time", "stopped" by an error, "running", or "killed".
+    state: str
     config: dict[str, Any]
     versions: dict[str, Any]
     changes: tuple[Change, ...] = ()  # accepted changes in the program since earlier runs
@@ -102,7 +114,8 @@ class CellResults:
     episodes: tuple[Episode, ...]  # by seed
     attempts: tuple[Attempt, ...]
     stop: StopConfig | None = None  # the rule by which it could stop early
-    stopped_at: int | None = None  # the number of episodes after which it stopped; later ones are kept, not counted
+    # The number of episodes after which it stopped; later ones are kept, not counted.
+    stopped_at: int | None = None
 
     @property
     def contender(self) -> str:
@@ -132,9 +145,11 @@ class Results:
     out: Path  # the folder
     cells: tuple[CellResults, ...]  # in the order of the plan
     runs: tuple[Run, ...]
-    policies: dict[str, dict[str, Any]]  # the metadata of each policy's server, by the policy's name
+    # The metadata of each policy's server, by the policy's name.
+    policies: dict[str, dict[str, Any]]
     workers: tuple[Worker, ...] = ()  # in the order of time
-    parts: tuple[Path, ...] = ()  # the folders, below `out`, if several were read as one (`combined`)
+    # The folders, below `out`, if several were read as one (`combined`)
+    parts: tuple[Path, ...] = ()
 
     @property
     def accepted_changes(self) -> list[Change]:
@@ -152,7 +167,8 @@ class Results:
             One consistent state of the results.
 
         Raises:
-            ConfigError: The folder holds no results, or they are of another version, or cannot be read.
+            ConfigError: The folder holds no results, or they are of another version, or cannot be
+                read.
         """
         out = Path(out)
         written = is_locked(out)
@@ -162,7 +178,9 @@ class Results:
                 episodes.setdefault(row["cell"], []).append(episode_of(row))
             attempts: dict[str, list[Attempt]] = {}
             for row in table(db, "attempts"):
-                attempts.setdefault(row["cell"], []).append(Attempt(**row | {"retried": bool(row["retried"])}))
+                attempts.setdefault(row["cell"], []).append(
+                    Attempt(**row | {"retried": bool(row["retried"])})
+                )
             runs = []
             for row in table(db, "runs"):
                 parsed = {name: json.loads(row[name]) for name in ("config", "versions")}
@@ -172,11 +190,17 @@ class Results:
             return cls(
                 out,
                 tuple(
-                    _cell(row, tuple(episodes.get(row["cell"], ())), tuple(attempts.get(row["cell"], ())))
+                    _cell(
+                        row,
+                        tuple(episodes.get(row["cell"], ())),
+                        tuple(attempts.get(row["cell"], ())),
+                    )
                     for row in table(db, "cells")
                 ),
                 tuple(
-                    replace(run, state=KILLED) if run.state == RUNNING and not (written and run is runs[-1]) else run
+                    replace(run, state=KILLED)
+                    if run.state == RUNNING and not (written and run is runs[-1])
+                    else run
                     for run in runs
                 ),
                 {row["name"]: json.loads(row["metadata"]) for row in table(db, "policies")},
@@ -185,9 +209,17 @@ class Results:
 
     @property
     def contenders(self) -> list[str]:
-        """The policy ids: policies without steps first, then the checkpoints of each policy by their step."""
-        policies = {policy: number for number, policy in enumerate(dict.fromkeys(cell.policy for cell in self.cells))}
-        ordered = sorted(self.cells, key=lambda cell: (cell.step is not None, policies[cell.policy], cell.step or 0))
+        """The policy ids: policies without steps first, then the checkpoints of each policy by
+        their step.
+        """
+        policies = {
+            policy: number
+            for number, policy in enumerate(dict.fromkeys(cell.policy for cell in self.cells))
+        }
+        ordered = sorted(
+            self.cells,
+            key=lambda cell: (cell.step is not None, policies[cell.policy], cell.step or 0),
+        )
         return list(dict.fromkeys(cell.contender for cell in ordered))
 
     def of(self, contender: str) -> list[CellResults]:
@@ -195,10 +227,12 @@ class Results:
         return [cell for cell in self.cells if cell.contender == contender]
 
     def file(self, path: str) -> Path:
-        """Return the absolute path of an episode's file with the relative `path`; it need not exist.
+        """Return the absolute path of an episode's file with the relative `path`; it need not
+        exist.
 
         Raises:
-            ConfigError: The path leads out of the folder of results, or follows a symbolic link out of it.
+            ConfigError: The path leads out of the folder of results, or follows a symbolic link out
+                of it.
         """
         home = next((one for one in self.parts if (self.out / path).is_relative_to(one)), self.out)
         return inside(home, str((self.out / path).relative_to(home)))
@@ -220,10 +254,17 @@ class Results:
         Raises:
             ConfigError: No cell is left.
         """
-        left = [one for one in self.cells if contender in (None, one.contender) and env in (None, one.env)]
+        left = [
+            one
+            for one in self.cells
+            if contender in (None, one.contender) and env in (None, one.env)
+        ]
         if not left:
             have = sorted({f"{one.contender} in {one.env}" for one in self.cells})
-            raise ConfigError(f"{self.out}: has nothing of {contender or 'any policy'} in {env or 'any env'}: {have}")
+            raise ConfigError(
+                f"{self.out}: has nothing of {contender or 'any policy'} in {env or 'any env'}: "
+                f"{have}"
+            )
         return self.among(left)
 
 
@@ -231,7 +272,9 @@ class Results:
 def reading(out: Path) -> Iterator[sqlite3.Connection]:
     """Read one consistent state of all tables in `out`, even while an evaluation writes."""
     if not (out / FILE).is_file():
-        raise ConfigError(f"{out}: got no {FILE} there, want a folder that an evaluation wrote its results to")
+        raise ConfigError(
+            f"{out}: got no {FILE} there, want a folder that an evaluation wrote its results to"
+        )
     try:
         with closing(read_only(out)) as db:
             require_readable(out, db)
@@ -240,10 +283,12 @@ def reading(out: Path) -> Iterator[sqlite3.Connection]:
             db.execute("BEGIN")
             yield db
     except sqlite3.DatabaseError as error:
-        if getattr(error, "sqlite_errorcode", None) == _SQLITE_FULL:  # where the caller writes a copy
+        # Where the caller writes a copy.
+        if getattr(error, "sqlite_errorcode", None) == _SQLITE_FULL:
             raise
         raise ConfigError(
-            f"{out / FILE}: cannot be read ({error}); if its evaluation was killed, --resume mends it; else take a "
+            f"{out / FILE}: cannot be read ({error}); if its evaluation was killed, --resume mends "
+            "it; else take a "
             f"copy of the whole folder from where it was written"
         ) from error
 
@@ -254,7 +299,9 @@ def table(db: sqlite3.Connection, name: str, order: str = "rowid") -> Iterator[d
 
 
 def episode_of(row: dict[str, Any]) -> Episode:
-    """Return the episode of a row of the table; raises `ConfigError` for a path that leads out of the folder."""
+    """Return the episode of a row of the table; raises `ConfigError` for a path that leads out
+    of the folder.
+    """
     names = {field.name for field in fields(EpisodeResult)}
     known = {name: value for name, value in row.items() if name in names and name != "key"}
     for name in ("success_once", "success_at_end"):
@@ -264,18 +311,24 @@ def episode_of(row: dict[str, Any]) -> Episode:
     videos = tuple(require_below(path) for path in json.loads(row["videos"]))
     trajectory = None if row["trajectory"] is None else require_below(row["trajectory"])
     programs = row["env_program"], row["policy_program"]
-    return Episode(result, videos, trajectory, row["attempts"], row["run"], row["finished"], *programs)
+    return Episode(
+        result, videos, trajectory, row["attempts"], row["run"], row["finished"], *programs
+    )
 
 
-def _cell(row: dict[str, Any], episodes: tuple[Episode, ...], attempts: tuple[Attempt, ...]) -> CellResults:
+def _cell(
+    row: dict[str, Any], episodes: tuple[Episode, ...], attempts: tuple[Attempt, ...]
+) -> CellResults:
     seeds, rule = json.loads(row.pop("seeds")), row.pop("stop")
     names = ("settings", "described", "contract", "code", "program")
     parsed = {name: json.loads(row[name] or "{}") for name in names}
     each = row["planned"] // len(seeds)
-    # After a resumption with fewer episodes, the others that were already played would be a biased selection.
+    # After a resumption with fewer episodes, the others that were already played would be a biased
+    # selection.
     outside = [place_in_plan(one.result.key, seeds, each) is None for one in episodes]
     episodes = tuple(
-        replace(one, beyond=is_outside, unplanned=is_outside) for one, is_outside in zip(episodes, outside, strict=True)
+        replace(one, beyond=is_outside, unplanned=is_outside)
+        for one, is_outside in zip(episodes, outside, strict=True)
     )
     stop, stopped_at = None, None
     if rule is not None:
@@ -283,17 +336,27 @@ def _cell(row: dict[str, Any], episodes: tuple[Episode, ...], attempts: tuple[At
         stopping = Stopping(stop, seeds, row["planned"])
         stopping.add_all(episode.result for episode in episodes)
         stopped_at = stopping.at
-        episodes = tuple(replace(one, beyond=one.beyond or not stopping.counts(one.result.key)) for one in episodes)
-    return CellResults(**row | parsed, episodes=episodes, attempts=attempts, stop=stop, stopped_at=stopped_at)
+        episodes = tuple(
+            replace(one, beyond=one.beyond or not stopping.counts(one.result.key))
+            for one in episodes
+        )
+    return CellResults(
+        **row | parsed, episodes=episodes, attempts=attempts, stop=stop, stopped_at=stopped_at
+    )
 
 
 def rate_of(cells: Sequence[CellResults], what: Literal["success_once", "success_at_end"]) -> Rate:
-    """Return the success rate of one cell, or of several together, with bounds that hold if cells could stop early.
+    """Return the success rate of one cell, or of several together, with bounds that hold if cells
+    could stop early.
 
     Cells without a common rate (`have_common_rate`) are counted, and their rate is None.
     """
-    counts = [(sum(bool(getattr(one, what)) for one in cell.counted), len(cell.counted)) for cell in cells]
-    successes, episodes = (sum(column) for column in zip(*counts, strict=True)) if counts else (0, 0)
+    counts = [
+        (sum(bool(getattr(one, what)) for one in cell.counted), len(cell.counted)) for cell in cells
+    ]
+    successes, episodes = (
+        (sum(column) for column in zip(*counts, strict=True)) if counts else (0, 0)
+    )
     together = have_common_rate(cells)
     if not (rules := [cell.stop for cell in cells if cell.stop is not None]):
         return Rate(successes, episodes, pooled=together)
@@ -304,8 +367,9 @@ def rate_of(cells: Sequence[CellResults], what: Literal["success_once", "success
 def have_common_rate(cells: Sequence[CellResults]) -> bool:
     """Return whether the episodes of these cells may be counted in one rate.
 
-    Cells that stopped after different numbers of episodes may not, as their outcomes would determine their weights; nor
-    may cells with different clocks, as success in real time differs from success while the env waits.
+    Cells that stopped after different numbers of episodes may not, as their outcomes would
+    determine their weights; nor may cells with different clocks, as success in real time differs
+    from success while the env waits.
     """
     return len({cell.stopped_at for cell in cells}) <= 1 and len(by_timing(cells)) <= 1
 
@@ -314,7 +378,9 @@ SYNCHRONOUS, REAL_TIME = "synchronous", "in real time"
 
 
 def by_timing(cells: Sequence[CellResults]) -> dict[str, list[CellResults]]:
-    """Group the cells by their clock: "synchronous" first, then "in real time", or one such group for each clock."""
+    """Group the cells by their clock: "synchronous" first, then "in real time", or one such
+    group for each clock.
+    """
     clocks: dict[str, list[CellResults]] = {}
     for cell in sorted(cells, key=lambda cell: cell.settings.get("clock") is not None):
         clocks.setdefault(json.dumps(cell.settings.get("clock"), sort_keys=True), []).append(cell)
@@ -322,20 +388,28 @@ def by_timing(cells: Sequence[CellResults]) -> dict[str, list[CellResults]]:
     found = {}
     for clock, members in clocks.items():
         suites = ", ".join(dict.fromkeys(cell.suite or "the nameless suite" for cell in members))
-        name = SYNCHRONOUS if clock == "null" else REAL_TIME if len(running) == 1 else f"{REAL_TIME} ({suites})"
+        name = (
+            SYNCHRONOUS
+            if clock == "null"
+            else REAL_TIME
+            if len(running) == 1
+            else f"{REAL_TIME} ({suites})"
+        )
         found[name] = members
     return found
 
 
 def synchronous_twin(results: Results, cell: CellResults) -> CellResults | None:
-    """Find the synchronous counterpart of a cell in real time: the cell that differs only in its clock.
+    """Find the synchronous counterpart of a cell in real time: the cell that differs only in its
+    clock.
 
     Args:
         results: The results with both cells.
         cell: Any cell of them.
 
     Returns:
-        The cell in which the env waited for the policy; None if there is none, or if `cell` is synchronous itself.
+        The cell in which the env waited for the policy; None if there is none, or if `cell` is
+        synchronous itself.
     """
     if cell.settings["clock"] is None:
         return None

@@ -1,11 +1,12 @@
 """Statistics of success: rates, their paired comparison, and valid early stopping.
 
-A confidence sequence holds at all numbers of episodes together: the chance that it ever misses the true rate is at most
-the error rate, so the evaluation may stop after any episode. An interval for a fixed number of episodes, such as
-Wilson's, is not valid then.
+A confidence sequence holds at all numbers of episodes together: the chance that it ever misses the
+true rate is at most the error rate, so the evaluation may stop after any episode. An interval for a
+fixed number of episodes, such as Wilson's, is not valid then.
 
-Quick episodes end first, and failures take longest, so the finished episodes are a biased sample. Therefore only an
-unbroken prefix of the planned order counts, and the end of a cell depends on its outcomes alone.
+Quick episodes end first, and failures take longest, so the finished episodes are a biased sample.
+Therefore only an unbroken prefix of the planned order counts, and the end of a cell depends on its
+outcomes alone.
 """
 
 from __future__ import annotations
@@ -30,8 +31,9 @@ _PSEUDO_EPISODES = 2.0
 def wilson(successes: int, trials: int, z: float = Z_95) -> tuple[float, float]:
     """Compute the Wilson score interval of a success probability.
 
-    E. B. Wilson, "Probable Inference, the Law of Succession, and Statistical Inference", JASA 22 (1927). Unlike the
-    textbook interval it stays inside [0, 1] and is accurate for few episodes and for rates of 0 % and 100 %.
+    E. B. Wilson, "Probable Inference, the Law of Succession, and Statistical Inference", JASA 22
+    (1927). Unlike the textbook interval it stays inside [0, 1] and is accurate for few episodes and
+    for rates of 0 % and 100 %.
 
     Args:
         successes: The number of trials that succeeded.
@@ -45,7 +47,9 @@ def wilson(successes: int, trials: int, z: float = Z_95) -> tuple[float, float]:
         InvalidInput: `successes` is not in 0 … `trials`.
     """
     if not 0 <= successes <= trials:
-        raise InvalidInput(f"wilson: got {successes} successes in {trials} trials, want 0 <= successes <= trials")
+        raise InvalidInput(
+            f"wilson: got {successes} successes in {trials} trials, want 0 <= successes <= trials"
+        )
     if trials == 0:
         return 0.0, 1.0
     rate = successes / trials
@@ -64,10 +68,12 @@ class Rate:
 
     successes: int
     episodes: int
-    # If an evaluation could stop early: the confidence sequence (`confidence_sequence`), and its error rate.
+    # If an evaluation could stop early: the confidence sequence (`confidence_sequence`), and its
+    # error rate.
     bounds: tuple[float, float] | None = None
     error_rate: float | None = None
-    pooled: bool = True  # False: the cells of these episodes have no common rate, so that `rate` is None
+    # False: the cells of these episodes have no common rate, so that `rate` is None.
+    pooled: bool = True
 
     @property
     def rate(self) -> float | None:
@@ -76,7 +82,9 @@ class Rate:
 
     @property
     def interval(self) -> tuple[float, float]:
-        """(low, high): the Wilson 95 % interval, unless there are other `bounds`; (0, 1) if there is no common rate."""
+        """(low, high): the Wilson 95 % interval, unless there are other `bounds`; (0, 1) if
+        there is no common rate.
+        """
         if not self.pooled:
             return 0.0, 1.0
         return wilson(self.successes, self.episodes) if self.bounds is None else self.bounds
@@ -84,7 +92,8 @@ class Rate:
     def to_json(self) -> dict[str, Any]:
         """Return the fields for JSON: `successes`, `episodes`, `rate`, and the interval.
 
-        The interval is `wilson_95` or, if the evaluation could stop early, `confidence_sequence` with its `error_rate`.
+        The interval is `wilson_95` or, if the evaluation could stop early, `confidence_sequence`
+        with its `error_rate`.
         """
         counts = {"successes": self.successes, "episodes": self.episodes, "rate": self.rate}
         if self.bounds is None:
@@ -100,7 +109,8 @@ class Rate:
 
 @dataclass(frozen=True, slots=True)
 class Pairs:
-    """Counts of the episodes that both A and B played, by the policy that solved the task. Counts can be added.
+    """Counts of the episodes that both A and B played, by the policy that solved the task. Counts
+    can be added.
 
     Raises:
         InvalidInput: A number is negative.
@@ -117,7 +127,10 @@ class Pairs:
 
     def __add__(self, other: Pairs) -> Pairs:
         return Pairs(
-            self.both + other.both, self.only_a + other.only_a, self.only_b + other.only_b, self.neither + other.neither
+            self.both + other.both,
+            self.only_a + other.only_a,
+            self.only_b + other.only_b,
+            self.neither + other.neither,
         )
 
     @property
@@ -136,24 +149,37 @@ class Pairs:
         return mcnemar(self.only_a, self.only_b)
 
     def to_json(self) -> dict[str, Any]:
-        """Return the four numbers, with `pairs` (their sum), `difference` and `p_value`, for JSON."""
-        counts = {"both": self.both, "only_a": self.only_a, "only_b": self.only_b, "neither": self.neither}
-        return counts | {"pairs": self.total, "difference": self.difference, "p_value": self.p_value}
+        """Return the four numbers, with `pairs` (their sum), `difference` and `p_value`, for
+        JSON.
+        """
+        counts = {
+            "both": self.both,
+            "only_a": self.only_a,
+            "only_b": self.only_b,
+            "neither": self.neither,
+        }
+        return counts | {
+            "pairs": self.total,
+            "difference": self.difference,
+            "p_value": self.p_value,
+        }
 
 
 def mcnemar(only_a: int, only_b: int, *, mid: bool = False) -> float:
-    """Test the hypothesis that A and B solve equally many episodes, from those that only one of them solved.
+    """Test the hypothesis that A and B solve equally many episodes, from those that only one of
+    them solved.
 
-    The test is exact: under the hypothesis each such episode is A's or B's with probability 1/2, whatever the tasks
-    are, so that tasks of different difficulty may be pooled. Q. McNemar, "Note on the sampling error of the difference
-    between correlated proportions or percentages", Psychometrika 12 (1947).
+    The test is exact: under the hypothesis each such episode is A's or B's with probability 1/2,
+    whatever the tasks are, so that tasks of different difficulty may be pooled. Q. McNemar, "Note
+    on the sampling error of the difference between correlated proportions or percentages",
+    Psychometrika 12 (1947).
 
     Args:
         only_a: The number of episodes that A solved and B did not.
         only_b: The number of episodes that B solved and A did not.
-        mid: Count the observed table half, which is less conservative, and no longer exact. M. W. Fagerland,
-            S. Lydersen, P. Laake, "The McNemar test for binary matched-pairs data", BMC Medical Research Methodology
-            13:91 (2013).
+        mid: Count the observed table half, which is less conservative, and no longer exact. M. W.
+            Fagerland, S. Lydersen, P. Laake, "The McNemar test for binary matched-pairs data", BMC
+            Medical Research Methodology 13:91 (2013).
 
     Returns:
         The two-sided p-value, in (0, 1].
@@ -164,11 +190,13 @@ def mcnemar(only_a: int, only_b: int, *, mid: bool = False) -> float:
     if min(only_a, only_b) < 0:
         raise InvalidInput(f"mcnemar: got {only_a} and {only_b} episodes, want no count below 0")
     n = only_a + only_b
-    ways = tail = 1  # to choose k of n, and up to k of n: integers, exact for any number of episodes
+    # To choose k of n, and up to k of n: integers, exact for any number of episodes.
+    ways = tail = 1
     for k in range(min(only_a, only_b)):
         ways = ways * (n - k) // (k + 1)
         tail += ways
-    if mid and n and only_a == only_b:  # both tails contain the observed table, of which half is counted
+    # Both tails contain the observed table, of which half is counted.
+    if mid and n and only_a == only_b:
         return 1.0 - ways / (2 << n)
     return min(1.0, (2 * tail - ways * mid) / (1 << n))
 
@@ -176,42 +204,54 @@ def mcnemar(only_a: int, only_b: int, *, mid: bool = False) -> float:
 def difference_interval(strata: Sequence[Pairs]) -> tuple[float, float]:
     """Compute the 95 % interval of a difference of success rates on the same episodes.
 
-    Its bounds are percentiles of a paired bootstrap: episodes are drawn again with both of their outcomes, env by env
-    (a stratum each), as an evaluation has the same number of episodes of an env however often it is repeated. B. Efron,
-    R. J. Tibshirani, "An Introduction to the Bootstrap" (1993), chapters 8 and 13.
+    Its bounds are percentiles of a paired bootstrap: episodes are drawn again with both of their
+    outcomes, env by env (a stratum each), as an evaluation has the same number of episodes of an
+    env however often it is repeated. B. Efron, R. J. Tibshirani, "An Introduction to the Bootstrap"
+    (1993), chapters 8 and 13.
 
-    It adds two episodes, half a one of each outcome: else 20 of 20 against none, or no episode that distinguishes A
-    from B, would give an interval of zero width, which claims certainty. A. Agresti, Y. Min, "Simple improved
-    confidence intervals for comparing matched proportions", Statistics in Medicine 24 (2005).
+    It adds two episodes, half a one of each outcome: else 20 of 20 against none, or no episode that
+    distinguishes A from B, would give an interval of zero width, which claims certainty. A.
+    Agresti, Y. Min, "Simple improved confidence intervals for comparing matched proportions",
+    Statistics in Medicine 24 (2005).
 
-    No random generator is used: the limit of infinitely many draws is the distribution of a sum of independent steps of
-    +1, -1 and 0, whose characteristic function is a product.
+    No random generator is used: the limit of infinitely many draws is the distribution of a sum of
+    independent steps of +1, -1 and 0, whose characteristic function is a product.
 
     Args:
         strata: The episodes of each env.
 
     Returns:
-        (low, high) of the success rate of A minus that of B, each in [-1, 1]; (-1, 1) without episodes.
+        (low, high) of the success rate of A minus that of B, each in [-1, 1]; (-1, 1) without
+        episodes.
     """
     if (n := sum(one.total for one in strata)) == 0:
         return -1.0, 1.0
-    turns = np.exp(2j * np.pi * np.arange(2 * n + 1) / (2 * n + 1))  # (2n + 1,), one for each sum from -n to n
+    # (2n + 1,), one for each sum from -n to n.
+    turns = np.exp(2j * np.pi * np.arange(2 * n + 1) / (2 * n + 1))
     transformed = np.ones_like(turns)
     for one in strata:
-        more = _PSEUDO_EPISODES / 4 * one.total / n  # of each outcome: in proportion to the env's episodes
-        a, b = ((only + more) / (one.total + 4 * more) if one.total else 0.0 for only in (one.only_a, one.only_b))
+        # Of each outcome: in proportion to the env's episodes.
+        more = _PSEUDO_EPISODES / 4 * one.total / n
+        a, b = (
+            (only + more) / (one.total + 4 * more) if one.total else 0.0
+            for only in (one.only_a, one.only_b)
+        )
         transformed *= (a * turns + b / turns + (1 - a - b)) ** one.total
-    chances = np.fft.fftshift(np.fft.fft(transformed).real).clip(min=0.0)  # in proportion, of -n, …, n
-    low, high = np.searchsorted(np.cumsum(chances) / chances.sum(), [ERROR_RATE / 2, 1 - ERROR_RATE / 2]) - n
+    # In proportion, of -n, …, n.
+    chances = np.fft.fftshift(np.fft.fft(transformed).real).clip(min=0.0)
+    low, high = (
+        np.searchsorted(np.cumsum(chances) / chances.sum(), [ERROR_RATE / 2, 1 - ERROR_RATE / 2])
+        - n
+    )
     return float(low / n), float(high / n)
 
 
 def holm(p_values: Sequence[float]) -> list[float]:
     """Adjust p-values for their number, by Holm's method.
 
-    If every hypothesis with an adjusted p-value below 5 % is rejected, the chance that any of these rejections is wrong
-    is at most 5 %, however the tests depend on one another. S. Holm, "A simple sequentially rejective multiple test
-    procedure", Scandinavian Journal of Statistics 6 (1979).
+    If every hypothesis with an adjusted p-value below 5 % is rejected, the chance that any of these
+    rejections is wrong is at most 5 %, however the tests depend on one another. S. Holm, "A simple
+    sequentially rejective multiple test procedure", Scandinavian Journal of Statistics 6 (1979).
 
     Args:
         p_values: One for each test, in [0, 1].
@@ -230,17 +270,21 @@ def holm(p_values: Sequence[float]) -> list[float]:
 _HALVINGS = 60  # of an interval of length 1: below the resolution of a float
 
 
-def confidence_sequence(successes: int, trials: int, error_rate: float = 0.05) -> tuple[float, float]:
+def confidence_sequence(
+    successes: int, trials: int, error_rate: float = 0.05
+) -> tuple[float, float]:
     """Compute an interval of a success probability that is valid after every trial together.
 
-    It is {p : (n + 1) C(n, s) p^s (1 - p)^(n - s) > error_rate}: H. Robbins, "Statistical Methods Related to the Law of
-    the Iterated Logarithm", Ann. Math. Statist. 41 (1970). It is the beta-binomial mixture martingale with a
-    uniform prior, of which J. Ville's inequality (1939) bounds the chance to ever reach 1 / error_rate.
+    It is {p : (n + 1) C(n, s) p^s (1 - p)^(n - s) > error_rate}: H. Robbins, "Statistical Methods
+    Related to the Law of the Iterated Logarithm", Ann. Math. Statist. 41 (1970). It is the
+    beta-binomial mixture martingale with a uniform prior, of which J. Ville's inequality (1939)
+    bounds the chance to ever reach 1 / error_rate.
 
     Args:
         successes: The number of trials that succeeded so far.
         trials: The number of trials so far.
-        error_rate: The largest chance, in (0, 1), that the interval misses the probability at any number of trials.
+        error_rate: The largest chance, in (0, 1), that the interval misses the probability at any
+            number of trials.
 
     Returns:
         (low, high), each in [0, 1]; (0, 1) when there are no trials.
@@ -250,11 +294,18 @@ def confidence_sequence(successes: int, trials: int, error_rate: float = 0.05) -
     """
     if not 0 <= successes <= trials:
         raise InvalidInput(
-            f"confidence_sequence: got {successes} successes in {trials} trials, want 0 <= successes <= trials"
+            f"confidence_sequence: got {successes} successes in {trials} trials, want 0 <= "
+            "successes <= trials"
         )
     failures = trials - successes
-    # log of (n + 1) C(n, s) / error_rate; s log p + (n - s) log(1 - p) must be at least its negative
-    room = math.lgamma(trials + 2) - math.lgamma(successes + 1) - math.lgamma(failures + 1) - math.log(error_rate)
+    # log of (n + 1) C(n, s) / error_rate; s log p + (n - s) log(1 - p) must be at least its
+    # negative
+    room = (
+        math.lgamma(trials + 2)
+        - math.lgamma(successes + 1)
+        - math.lgamma(failures + 1)
+        - math.log(error_rate)
+    )
 
     def possible(p: float) -> bool:
         log_p = successes * math.log(p) if successes else 0.0
@@ -268,23 +319,29 @@ def confidence_sequence(successes: int, trials: int, error_rate: float = 0.05) -
 
 
 def pooled(counts: Sequence[tuple[int, int]], error_rate: float) -> tuple[float, float]:
-    """Return bounds (low, high) of the success rate of several cells, each weighted by its episodes.
+    """Return bounds (low, high) of the success rate of several cells, each weighted by its
+    episodes.
 
-    `counts` are the (successes, trials) of each cell. Stopping determines the weights, so each cell gets an equal share
-    of the error rate: then all their bounds hold at once, and so does any weighted mean.
+    `counts` are the (successes, trials) of each cell. Stopping determines the weights, so each cell
+    gets an equal share of the error rate: then all their bounds hold at once, and so does any
+    weighted mean.
     """
     counts = [one for one in counts if one[1]]
     if not (total := sum(trials for _, trials in counts)):
         return 0.0, 1.0
     bounds = [(*confidence_sequence(s, n, error_rate / len(counts)), n / total) for s, n in counts]
-    return sum(low * share for low, _, share in bounds), sum(high * share for _, high, share in bounds)
+    return sum(low * share for low, _, share in bounds), sum(
+        high * share for _, high, share in bounds
+    )
 
 
 class Stopping:
     """Decides when one cell stops, from its episodes in any order."""
 
     def __init__(self, stop: StopConfig, seeds: Sequence[int], planned: int) -> None:
-        """Start without an outcome; `seeds` and `planned` episodes (of all seeds together) are those of the cell."""
+        """Start without an outcome; `seeds` and `planned` episodes (of all seeds together) are
+        those of the cell.
+        """
         self._stop = stop
         self._seeds = list(seeds)
         self._each = planned // len(seeds)
@@ -298,7 +355,9 @@ class Stopping:
             self.add(result)
 
     def add(self, result: EpisodeResult) -> None:
-        """Add the outcome of an episode. One that failed by infrastructure has none yet, and is awaited."""
+        """Add the outcome of an episode. One that failed by infrastructure has none yet, and is
+        awaited.
+        """
         place = place_in_plan(result.key, self._seeds, self._each)
         if place is not None and result.success_once is not None:
             self._outcomes[place] = result.success_once
@@ -307,7 +366,9 @@ class Stopping:
             self._begun += 1
             low, high = confidence_sequence(self._successes, self._begun, self._stop.error_rate)
             target, width = self._stop.target, self._stop.width
-            certain = (target is not None and not low <= target <= high) or (width is not None and high - low < width)
+            certain = (target is not None and not low <= target <= high) or (
+                width is not None and high - low < width
+            )
             if self._begun >= self._stop.at_least and certain:
                 self.at = self._begun
 
@@ -318,9 +379,13 @@ class Stopping:
 
 
 def place_in_plan(key: EpisodeKey, seeds: Sequence[int], each: int) -> int | None:
-    """Return the index of an episode in its cell's part of `jobs.plan`; None if it is no longer planned."""
+    """Return the index of an episode in its cell's part of `jobs.plan`; None if it is no longer
+    planned.
+    """
     first = key.seed - key.episode
-    return seeds.index(first) * each + key.episode if first in seeds and key.episode < each else None
+    return (
+        seeds.index(first) * each + key.episode if first in seeds and key.episode < each else None
+    )
 
 
 def _boundary(possible: Callable[[float], bool], inside: float, outside: float) -> float:

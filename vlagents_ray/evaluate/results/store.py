@@ -1,7 +1,7 @@
 """Writes `results.db`: the state of an evaluation in SQLite, with one transaction for each episode.
 
-A commit survives the end of its process at any time, so an evaluation that is killed and resumed has each episode
-exactly once. Read it with `vlagents_ray.evaluate.results.reader`.
+A commit survives the end of its process at any time, so an evaluation that is killed and resumed
+has each episode exactly once. Read it with `vlagents_ray.evaluate.results.reader`.
 """
 
 from __future__ import annotations
@@ -35,7 +35,15 @@ from vlagents_ray.evaluate.results.changes import (
     program_changes,
     program_id,
 )
-from vlagents_ray.evaluate.results.database import FILE, RUNNING, WAIT_S, create, insert, lock, require_readable
+from vlagents_ray.evaluate.results.database import (
+    FILE,
+    RUNNING,
+    WAIT_S,
+    create,
+    insert,
+    lock,
+    require_readable,
+)
 from vlagents_ray.naming import did_you_mean
 
 log = logging.getLogger(__name__)
@@ -48,8 +56,9 @@ class Store(AbstractContextManager["Store"]):
         """Open or begin the results in `config.out`.
 
         Raises:
-            ConfigError: There are results and `config.resume` is off, they have other settings or another program and
-                `config.accept_changes` is off, or another evaluation is writing to them.
+            ConfigError: There are results and `config.resume` is off, they have other settings or
+                another program and `config.accept_changes` is off, or another evaluation is writing
+                to them.
             StorageFailed: The folder cannot be written to.
         """
         self.cells = cells(config)
@@ -60,10 +69,12 @@ class Store(AbstractContextManager["Store"]):
         self._run = 0
         self._accepts = config.accept_changes
         self._changes: list[Change] = []  # accepted in this run
-        self._accepted: set[Hashable] = set()  # policies, cells and places whose change was accepted in this run
+        # policies, cells and places whose change was accepted in this run.
+        self._accepted: set[Hashable] = set()
         self._policy_programs: dict[str, str | None] = {}  # by policy; of this run
         self._cell = {cell.fingerprint: cell for cell in self.cells}
-        self._weights: dict[Hashable, str] = {}  # by cell, and by (policy, step, checkpoint); read when first needed
+        # By cell, and by (policy, step, checkpoint); read when first needed.
+        self._weights: dict[Hashable, str] = {}
         self._made: set[str] = set()  # places whose env is known to be that of earlier runs
         try:
             with storing(config.out):
@@ -79,11 +90,20 @@ class Store(AbstractContextManager["Store"]):
         self._db.close()
         os.close(self._lock)
 
-    def begin_run(self, config: EvalConfig, versions: dict[str, Any], started: float | None = None) -> None:
+    def begin_run(
+        self, config: EvalConfig, versions: dict[str, Any], started: float | None = None
+    ) -> None:
         """Record that a run over the plan begins, or began at `started`, s since 1970."""
         with self._db:
-            row = (time.time() if started is None else started, RUNNING, config.model_dump_json(), canonical(versions))
-            cursor = self._db.execute("INSERT INTO runs (started, state, config, versions) VALUES (?, ?, ?, ?)", row)
+            row = (
+                time.time() if started is None else started,
+                RUNNING,
+                config.model_dump_json(),
+                canonical(versions),
+            )
+            cursor = self._db.execute(
+                "INSERT INTO runs (started, state, config, versions) VALUES (?, ?, ?, ?)", row
+            )
             self._run = int(cursor.lastrowid or 0)
             self._write_changes()
             programs = [(canonical(cell.program), cell.fingerprint) for cell in self.cells]
@@ -91,11 +111,19 @@ class Store(AbstractContextManager["Store"]):
 
     def end_run(self, state: str) -> None:
         with self._db:
-            self._db.execute("UPDATE runs SET ended = ?, state = ? WHERE run = ?", (time.time(), state, self._run))
+            self._db.execute(
+                "UPDATE runs SET ended = ?, state = ? WHERE run = ?",
+                (time.time(), state, self._run),
+            )
 
     def finished(self) -> set[str]:
         """Return the keys of the episodes that will not be played again."""
-        return {key for (key,) in self._db.execute("SELECT key FROM episodes WHERE status != 'infra_failed'")}
+        return {
+            key
+            for (key,) in self._db.execute(
+                "SELECT key FROM episodes WHERE status != 'infra_failed'"
+            )
+        }
 
     def record(
         self,
@@ -109,25 +137,33 @@ class Store(AbstractContextManager["Store"]):
 
         It replaces one that failed by infrastructure; any other is not changed.
 
-        Raises `ConfigError` if it was played by another checkpoint than earlier episodes of its cell, as after a swap,
-        by other weights of the same name, or by other weights than the pushed ones of its cell: a rate has one
-        checkpoint.
+        Raises `ConfigError` if it was played by another checkpoint than earlier episodes of its
+        cell, as after a swap, by other weights of the same name, or by other weights than the
+        pushed ones of its cell: a rate has one checkpoint.
         """
         cell = self._cell[result.key.settings]
         want = cell.policy.pushed_weights
         acted = (result.first_policy_version, result.policy_version, result.policy_fingerprint)
-        if want and result.policy_version is not None and acted != (want.version, want.version, want.fingerprint):
+        if (
+            want
+            and result.policy_version is not None
+            and acted != (want.version, want.version, want.fingerprint)
+        ):
             raise WeightsLost(
-                f"policy: {result.key} was played by versions {acted[0]} to {acted[1]} of the weights ({acted[2]}), "
-                f"want {want.version} ({want.fingerprint}); push nothing while a version is evaluated, and let the "
+                f"policy: {result.key} was played by versions {acted[0]} to {acted[1]} of the "
+                f"weights ({acted[2]}), "
+                f"want {want.version} ({want.fingerprint}); push nothing while a version is "
+                "evaluated, and let the "
                 f"policy's `options` ask for no other"
             )
         known = self._db.execute(
-            "SELECT checkpoint FROM episodes WHERE cell = ? AND checkpoint IS NOT NULL LIMIT 1", (result.key.settings,)
+            "SELECT checkpoint FROM episodes WHERE cell = ? AND checkpoint IS NOT NULL LIMIT 1",
+            (result.key.settings,),
         ).fetchone()
         if known is not None and result.checkpoint not in (None, known[0]):
             raise ConfigError(
-                f"policy: {result.key} was played by checkpoint {result.checkpoint!r}, the results in {self._out} "
+                f"policy: {result.key} was played by checkpoint {result.checkpoint!r}, the results "
+                f"in {self._out} "
                 f"are of {known[0]!r}; serve that one again, or choose another out folder"
             )
         self._require_same_weights(result)
@@ -148,7 +184,9 @@ class Store(AbstractContextManager["Store"]):
             "finished": time.time() if finished is None else finished,
         }
         with self._db:
-            self._db.execute("DELETE FROM episodes WHERE key = ? AND status = 'infra_failed'", (row["key"],))
+            self._db.execute(
+                "DELETE FROM episodes WHERE key = ? AND status = 'infra_failed'", (row["key"],)
+            )
             insert(self._db, "episodes", row)
 
     def _require_same_weights(self, result: EpisodeResult) -> None:
@@ -165,12 +203,22 @@ class Store(AbstractContextManager["Store"]):
         for of in (cell.fingerprint, (cell.policy.name, cell.step, result.checkpoint)):
             known = self._weights.setdefault(of, result.weights)
             if result.weights != known:
-                change = Change(f"policy {cell.contender}", result.checkpoint or "weights", known, result.weights)
-                self._accept_or_raise(of, [change], f"{result.key} was played by other weights than the results in")
+                change = Change(
+                    f"policy {cell.contender}",
+                    result.checkpoint or "weights",
+                    known,
+                    result.weights,
+                )
+                self._accept_or_raise(
+                    of, [change], f"{result.key} was played by other weights than the results in"
+                )
                 self._weights[of] = result.weights
 
-    def _accept_or_raise(self, what: Hashable, changes: list[Change], where: str, cure: str = MIX) -> None:
-        """Record changes since earlier runs, once for each `what` in a run; raise `ConfigError` unless they are
+    def _accept_or_raise(
+        self, what: Hashable, changes: list[Change], where: str, cure: str = MIX
+    ) -> None:
+        """Record changes since earlier runs, once for each `what` in a run; raise `ConfigError`
+        unless they are
         accepted.
 
         A second change within a run means that processes have different files.
@@ -192,9 +240,18 @@ class Store(AbstractContextManager["Store"]):
 
     def record_attempt(self, job: Job, failure: Failure, *, retried: bool) -> None:
         where = (str(job.key), job.key.settings, job.attempt, self._run, time.time())
-        why = (failure.cause, failure.code, failure.message, failure.traceback, failure.log, retried)
+        why = (
+            failure.cause,
+            failure.code,
+            failure.message,
+            failure.traceback,
+            failure.log,
+            retried,
+        )
         with self._db:
-            self._db.execute("INSERT INTO attempts VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)", where + why)
+            self._db.execute(
+                "INSERT INTO attempts VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)", where + why
+            )
 
     def note_worker(self, where: WorkerInfo) -> None:
         with self._db:
@@ -203,14 +260,17 @@ class Store(AbstractContextManager["Store"]):
     def note_env(self, place: str, made: EnvInfo) -> None:
         """Record the description, contract and code of the env of the cells at `place`.
 
-        Raises `ConfigError` if description or contract differ from an earlier run, as after an update of the simulator,
-        or if the worker has other files than the process that made the plan.
+        Raises `ConfigError` if description or contract differ from an earlier run, as after an
+        update of the simulator, or if the worker has other files than the process that made the
+        plan.
         """
         [cell, *_] = [cell for cell in self.cells if cell.place == place]
         odd = program_changes(f"env {cell.env}", cell.program, made.program)
-        if any(one.was is not None for one in odd):  # the environment itself may write a file that its settings name
+        # The environment itself may write a file that its settings name.
+        if any(one.was is not None for one in odd):
             raise ConfigError(
-                f"the worker on {made.host} has other files than this process, or they were edited since the start:\n"
+                f"the worker on {made.host} has other files than this process, or they were edited "
+                "since the start:\n"
                 f"{listed(odd)}\ngive both the same files, and go on with --resume"
             )
         self._require_same_env(cell, made)
@@ -223,10 +283,14 @@ class Store(AbstractContextManager["Store"]):
             )
 
     def _require_same_env(self, cell: EvalCase, made: EnvInfo) -> None:
-        if cell.place in self._made:  # by another worker of this run; descriptions may differ between nodes
+        # By another worker of this run; descriptions may differ between nodes.
+        if cell.place in self._made:
             return
         self._made.add(cell.place)
-        now = EnvStatement(json.loads(json.dumps(made.described, default=str)), json.loads(canonical(made.contract)))
+        now = EnvStatement(
+            json.loads(json.dumps(made.described, default=str)),
+            json.loads(canonical(made.contract)),
+        )
         changes: dict[Change, None] = {}
         for other in self.cells:  # also those of other policies, which are compared with this one
             if other.place != cell.place:
@@ -235,17 +299,22 @@ class Store(AbstractContextManager["Store"]):
             if (known := self._db.execute(query, (other.fingerprint,)).fetchone()) is not None:
                 was = EnvStatement(*map(json.loads, known))
                 changes |= dict.fromkeys(env_changes(cell.env, was, now))
-        self._accept_or_raise(cell.place, list(changes), "the environment is not that of the results in")
+        self._accept_or_raise(
+            cell.place, list(changes), "the environment is not that of the results in"
+        )
 
     def note_policy(self, name: str, metadata: dict[str, Any]) -> None:
-        """Record the metadata of a policy's server; raises `ConfigError` if it is another policy than before."""
+        """Record the metadata of a policy's server; raises `ConfigError` if it is another policy
+        than before.
+        """
         row = self._db.execute("SELECT metadata FROM policies WHERE name = ?", (name,)).fetchone()
         known = None if row is None else json.loads(row[0])
         swept = any(cell.step is not None for cell in self.cells if cell.policy.name == name)
         if known is not None:
             if (what := changed(known, metadata, swept=swept)) in ("policy", "checkpoint"):
                 raise ConfigError(
-                    f"policy {name!r}: the server has {what} {metadata.get(what)!r}, the results in {self._out} are of "
+                    f"policy {name!r}: the server has {what} {metadata.get(what)!r}, the results "
+                    f"in {self._out} are of "
                     f"{known.get(what)!r}; serve that one again, or choose another out folder"
                 )
             odd = policy_changes(f"policy {name}", known, metadata, swept=swept)
@@ -256,7 +325,8 @@ class Store(AbstractContextManager["Store"]):
             self._db.execute("INSERT OR REPLACE INTO policies VALUES (?, ?)", (name, value))
 
     def _open(self, config: EvalConfig) -> sqlite3.Connection:
-        db = sqlite3.connect(self._out / FILE, timeout=WAIT_S)  # by default each commit reaches the disk
+        # By default each commit reaches the disk.
+        db = sqlite3.connect(self._out / FILE, timeout=WAIT_S)
         try:
             if db.execute("PRAGMA user_version").fetchone()[0] == 0:
                 create(db)
@@ -267,9 +337,16 @@ class Store(AbstractContextManager["Store"]):
                 for cell in self.cells:
                     identity = (cell.policy.name, cell.step, cell.suite.name, cell.env)
                     extent = (cell.planned, canonical(cell.suite.seeds), stop)
-                    row = (cell.fingerprint, *identity, canonical(cell.settings), *extent, canonical(cell.program))
+                    row = (
+                        cell.fingerprint,
+                        *identity,
+                        canonical(cell.settings),
+                        *extent,
+                        canonical(cell.program),
+                    )
                     db.execute(
-                        "INSERT INTO cells (cell, policy, step, suite, env, settings, planned, seeds, stop, program)"
+                        "INSERT INTO cells (cell, policy, step, suite, env, settings, planned, "
+                        "seeds, stop, program)"
                         " VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?)"
                         " ON CONFLICT DO UPDATE SET planned = ?, seeds = ?, stop = ?",
                         row + extent,
@@ -280,7 +357,10 @@ class Store(AbstractContextManager["Store"]):
         return db
 
     def _require_resumable(self, db: sqlite3.Connection, config: EvalConfig) -> None:
-        runs, episodes = (db.execute(f"SELECT COUNT(*) FROM {table}").fetchone()[0] for table in ("runs", "episodes"))  # noqa: S608
+        runs, episodes = (
+            db.execute(f"SELECT COUNT(*) FROM {table}").fetchone()[0]  # noqa: S608
+            for table in ("runs", "episodes")
+        )
         causes = {cause for (cause,) in db.execute("SELECT DISTINCT cause FROM attempts")}
         if not runs and config.resume:
             others = [file.parent.name for file in self._out.parent.glob(f"*/{FILE}")]
@@ -309,28 +389,41 @@ class Store(AbstractContextManager["Store"]):
         for cell in self.cells:
             query = "SELECT program FROM cells WHERE env = ? AND program IS NOT NULL AND cell = ?"
             if (row := db.execute(query, (cell.env, cell.fingerprint)).fetchone()) is not None:
-                programs |= dict.fromkeys(program_changes(f"env {cell.env}", json.loads(row[0]), cell.program))
+                programs |= dict.fromkeys(
+                    program_changes(f"env {cell.env}", json.loads(row[0]), cell.program)
+                )
         self._accept_or_raise(
             "plan",
             lacking,
             "this plan is not that of the results in",
-            "plan all of it; give a new folder (--out); or go on with this plan and have the report say so "
+            "plan all of it; give a new folder (--out); or go on with this plan and have the "
+            "report say so "
             "(--accept-changes)",
         )
-        self._accept_or_raise("program", list(programs), "the environment is not that of the results in")
+        self._accept_or_raise(
+            "program", list(programs), "the environment is not that of the results in"
+        )
 
     def _other_plan(self, db: sqlite3.Connection, config: EvalConfig) -> list[Change]:
-        """Return the cells and episodes of the results that this plan lacks, and other rules of early stopping.
+        """Return the cells and episodes of the results that this plan lacks, and other rules of
+        early stopping.
 
-        A plan may grow, also by steps of a policy, which `--watch` adds one after the other. A trainer evaluates
-        versions of policies one after the other into one folder, each with its plan, so cells of other policies are
-        not missing.
+        A plan may grow, also by steps of a policy, which `--watch` adds one after the other. A
+        trainer evaluates versions of policies one after the other into one folder, each with its
+        plan, so cells of other policies are not missing.
         """
         trained = all(cell.policy.pushed_weights for cell in self.cells)
         policies = {cell.policy.name for cell in self.cells}
         mine = {(cell.policy.name, cell.suite.name, cell.env) for cell in self.cells}
-        rows = db.execute("SELECT DISTINCT policy, suite, env FROM cells WHERE cell IN (SELECT cell FROM episodes)")
-        gone = [" ".join(filter(None, row)) for row in rows if row not in mine and (row[0] in policies or not trained)]
+        rows = db.execute(
+            "SELECT DISTINCT policy, suite, env FROM cells WHERE cell IN (SELECT cell FROM "
+            "episodes)"
+        )
+        gone = [
+            " ".join(filter(None, row))
+            for row in rows
+            if row not in mine and (row[0] in policies or not trained)
+        ]
         changes = [Change("plan", name, "in it", None) for name in gone]
         rule = _rule(config)
         for cell in self.cells:
@@ -345,8 +438,11 @@ def _rule(config: EvalConfig) -> str | None:
     return config.stop.model_dump_json() if config.stop else None
 
 
-def _plan_changes(cell: EvalCase, rule: str | None, planned: int, seeds_json: str, stop: str | None) -> list[Change]:
-    """Return what the plan of a cell leaves out of the results, or another rule of early stopping than `stop`.
+def _plan_changes(
+    cell: EvalCase, rule: str | None, planned: int, seeds_json: str, stop: str | None
+) -> list[Change]:
+    """Return what the plan of a cell leaves out of the results, or another rule of early stopping
+    than `stop`.
 
     Otherwise an evaluation could end where its rate looks good.
     """
@@ -364,19 +460,28 @@ def _plan_changes(cell: EvalCase, rule: str | None, planned: int, seeds_json: st
 
 
 def _differences(db: sqlite3.Connection, cell: EvalCase) -> list[str]:
-    """Return the settings of `cell` that differ from those in the results, a sentence each; none for a new cell.
+    """Return the settings of `cell` that differ from those in the results, a sentence each; none
+    for a new cell.
 
     The first seeds must be the same: else episode 3 would be two episodes.
     """
     row = db.execute(
-        "SELECT settings, seeds FROM cells WHERE policy = ? AND step IS ? AND suite = ? AND env = ?",
+        "SELECT settings, seeds FROM cells"
+        " WHERE policy = ? AND step IS ? AND suite = ? AND env = ?",
         (cell.policy.name, cell.step, cell.suite.name, cell.env),
     ).fetchone()
     if row is None:
         return []
     stored, seeds = map(json.loads, row)
-    differing = [(name, stored.get(name), value) for name, value in cell.settings.items() if stored.get(name) != value]
+    differing = [
+        (name, stored.get(name), value)
+        for name, value in cell.settings.items()
+        if stored.get(name) != value
+    ]
     if any(old != new for old, new in zip(seeds, cell.suite.seeds, strict=False)):
         differing.append(("seeds", seeds, cell.suite.seeds))
     where = " ".join(filter(None, cell.name))
-    return [f"{where}: {name}: the results have {old!r}, now it is {new!r}" for name, old, new in differing]
+    return [
+        f"{where}: {name}: the results have {old!r}, now it is {new!r}"
+        for name, old, new in differing
+    ]

@@ -14,7 +14,13 @@ import numpy as np
 from vlagents_ray.evaluate.artifacts.storage import whole
 from vlagents_ray.evaluate.episode.records import EpisodeResult
 from vlagents_ray.evaluate.results.comparison import gap_to_synchronous
-from vlagents_ray.evaluate.results.reader import CellResults, Results, by_timing, have_common_rate, rate_of
+from vlagents_ray.evaluate.results.reader import (
+    CellResults,
+    Results,
+    by_timing,
+    have_common_rate,
+    rate_of,
+)
 from vlagents_ray.evaluate.results.statistics import Rate
 
 FILE = "summary.json"
@@ -26,7 +32,8 @@ Stated = Literal["checkpoint", "weights", "revision"]  # of an episode's result
 class Group:
     """Aggregates over the episodes of one cell, or of several.
 
-    Rates count an error of the policy as a failure. Episodes that failed by infrastructure are in no rate.
+    Rates count an error of the policy as a failure. Episodes that failed by infrastructure are in
+    no rate.
     """
 
     contender: str  # the policy id: its name, with "@STEP" in a sweep; or "total"
@@ -52,7 +59,8 @@ class Group:
         return self.success_once.episodes
 
     def with_lost(self, rate: Rate) -> tuple[float, float] | None:
-        """Return the bounds of one of the rates with lost episodes: all of them failures, or all successes.
+        """Return the bounds of one of the rates with lost episodes: all of them failures, or all
+        successes.
 
         Losses may depend on the policy, such as those of a simulator that its actions break.
 
@@ -66,14 +74,19 @@ class Group:
 
     def to_json(self) -> dict[str, Any]:
         """Return the fields for JSON, with `episodes`, and the bounds `with_lost` of each rate."""
-        rates = {"success_once": self.success_once.to_json(), "success_at_end": self.success_at_end.to_json()}
+        rates = {
+            "success_once": self.success_once.to_json(),
+            "success_at_end": self.success_at_end.to_json(),
+        }
         lost = {name: self.with_lost(getattr(self, name)) for name in rates}
         return asdict(self) | {"episodes": self.episodes} | rates | {"with_lost": lost}
 
 
 @dataclass(frozen=True, slots=True)
 class Summary:
-    """The outcome of an evaluation, as `evaluate` returns it; `to_json` is the content of summary.json."""
+    """The outcome of an evaluation, as `evaluate` returns it; `to_json` is the content of
+    summary.json.
+    """
 
     results: Results
     cells: tuple[Group, ...]
@@ -107,13 +120,16 @@ class Summary:
     def best(self) -> list[str]:
         """The policy ids, the best first, by the mean success rate of their cells with one clock.
 
-        The clock is the first of `by_timing`: that of the episodes that waited for the policy, if there are any.
+        The clock is the first of `by_timing`: that of the episodes that waited for the policy, if
+        there are any.
         """
         rates: dict[str, list[float]] = {name: [] for name in self.results.contenders}
         timings = list(by_timing(self.results.cells).values())
         for cell in timings[0] if timings else []:
             rates[cell.contender].append(rate_of([cell], "success_once").rate or 0.0)
-        means = {name: sum(values) / len(values) if values else 0.0 for name, values in rates.items()}
+        means = {
+            name: sum(values) / len(values) if values else 0.0 for name, values in rates.items()
+        }
         return sorted(means, key=lambda name: -means[name])
 
     @property
@@ -123,23 +139,31 @@ class Summary:
 
     @property
     def steps_per_second(self) -> float | None:
-        """Env steps of all workers together per second of `wall_seconds`; None if no time has passed."""
+        """Env steps of all workers together per second of `wall_seconds`; None if no time has
+        passed.
+        """
         return self.total.steps / self.wall_seconds if self.wall_seconds else None
 
     @property
     def rollout_steps_per_second(self) -> float | None:
-        """Env steps of all workers together per second of `rollout_seconds`; None if no time has passed."""
+        """Env steps of all workers together per second of `rollout_seconds`; None if no time has
+        passed.
+        """
         return self.total.steps / self.rollout_seconds if self.rollout_seconds else None
 
     @property
     def env_busy(self) -> float | None:
-        """The share of the workers' time in which they reset and stepped environments; None on a robot."""
+        """The share of the workers' time in which they reset and stepped environments; None on a
+        robot.
+        """
         played = [one for one in self._counted if one.env_seconds is not None]
         return _share([one.env_seconds for one in played], sum(one.seconds for one in played))
 
     @property
     def policy_busy(self) -> float | None:
-        """The share of `rollout_seconds` in which policies computed, above 1 with several replicas; None as above."""
+        """The share of `rollout_seconds` in which policies computed, above 1 with several
+        replicas; None as above.
+        """
         return _share([one.policy_seconds for one in self._counted], self.rollout_seconds)
 
     @property
@@ -155,9 +179,12 @@ class Summary:
             | {"settings": cell.settings, "env": cell.env}
             | {"described": cell.described, "contract": cell.contract, "code": cell.code}
             | {"program": cell.program}
-            | {"stopped_at": cell.stopped_at, "gap_to_synchronous": gap_to_synchronous(self.results, cell)}
+            | {
+                "stopped_at": cell.stopped_at,
+                "gap_to_synchronous": gap_to_synchronous(self.results, cell),
+            }
             for group, cell in zip(self.cells, self.results.cells, strict=True)
-        ]  # fmt: skip
+        ]
         last = self.results.runs[-1]
         return {
             "state": self.state,
@@ -183,7 +210,8 @@ def summarize(results: Results) -> Summary:
     for run in results.runs:
         played = [one for cell in results.cells for one in cell.episodes if one.run == run.run]
         last = max((one.finished for one in played), default=run.started)
-        wall_s += (last if run.ended is None else run.ended) - run.started  # a killed one ended with its last episode
+        # A killed one ended with its last episode.
+        wall_s += (last if run.ended is None else run.ended) - run.started
         rollout_s += last - min((one.finished - one.result.seconds for one in played), default=last)
     return Summary(
         results,
@@ -195,31 +223,48 @@ def summarize(results: Results) -> Summary:
 
 
 def stated(cell: CellResults, what: Stated) -> str | None:
-    """Return the checkpoint, the digest of the weights, or the weights' commit on the hub; None if none was stated."""
+    """Return the checkpoint, the digest of the weights, or the weights' commit on the hub; None
+    if none was stated.
+    """
     found: list[str | None] = [getattr(one, what) for one in cell.counted]
     return next((one for one in found if one is not None), None)
 
 
 def pushed_of(cell: CellResults) -> str | None:
-    """Return the pushed weights of a cell's episodes, in words; None if only the checkpoint's weights acted.
+    """Return the pushed weights of a cell's episodes, in words; None if only the checkpoint's
+    weights acted.
 
     The rate of a cell of several versions describes none of them.
     """
-    named = {one.policy_version: one.policy_fingerprint for one in cell.counted if one.policy_version is not None}
-    numbers = {one.first_policy_version for one in cell.counted if one.first_policy_version is not None} | named.keys()
+    named = {
+        one.policy_version: one.policy_fingerprint
+        for one in cell.counted
+        if one.policy_version is not None
+    }
+    numbers = {
+        one.first_policy_version for one in cell.counted if one.first_policy_version is not None
+    } | named.keys()
     if not any(numbers):
         return None
     first, last = min(numbers), max(numbers)
-    return f"version {last} ({named[last]})" if first == last else f"versions {first} to {last}, one after the other"
+    return (
+        f"version {last} ({named[last]})"
+        if first == last
+        else f"versions {first} to {last}, one after the other"
+    )
 
 
 def cause_of(error: str) -> str:
-    """Return the first line of an error, without the numbers and ids in which errors of one cause differ."""
+    """Return the first line of an error, without the numbers and ids in which errors of one
+    cause differ.
+    """
     return re.sub(r"[0-9a-f]{8,}|\d+(\.\d+)?", "…", error.strip().partition("\n")[0])
 
 
 def errors_of_policies(results: Results) -> list[tuple[tuple[str, str, str], int]]:
-    """Return errors that ended episodes: (policy id, task, an error of the cause), and the number of episodes."""
+    """Return errors that ended episodes: (policy id, task, an error of the cause), and the
+    number of episodes.
+    """
     found: dict[tuple[str, str, str], list[str]] = {}
     for cell in results.cells:
         for one in cell.counted:
@@ -254,7 +299,9 @@ def group_of(name: tuple[str, str, str], cells: Sequence[CellResults]) -> Group:
         success_at_end=rate_of(cells, "success_at_end"),
         policy_errors=sum(one.status == "policy_error" for one in finished),
         infra_failures=sum(
-            one.result.status == "infra_failed" and not one.beyond for cell in cells for one in cell.episodes
+            one.result.status == "infra_failed" and not one.beyond
+            for cell in cells
+            for one in cell.episodes
         ),
         retries=sum(attempt.retried for cell in cells for attempt in cell.attempts),
         steps=sum(one.steps for one in finished),

@@ -38,14 +38,23 @@ SCENES = "scenes"
 _KEPT_QUALITY = 92  # JPEG, of the start pictures
 _OUTCOMES: dict[str, Outcome] = {"s": "success", "f": "failure", "p": "partial", "r": "repeat"}
 _Phase = Literal["scene", "playing", "verdict", "next", "end"]
-_CHOICES: dict[str, set[str]] = {"scene": {"ready", "end"}, "playing": {"stop"}, "verdict": {*_OUTCOMES.values()}}
+_CHOICES: dict[str, set[str]] = {
+    "scene": {"ready", "end"},
+    "playing": {"stop"},
+    "verdict": {*_OUTCOMES.values()},
+}
 _AWAY_S = 3.0  # time without a request of the page after which the operator counts as away
 _LOOK_S = 0.1  # period of live pictures while the scene is set
 _BODY = 10_000  # bytes of an answer
 _PAGE_QUALITY = 80
-_FILES = {"operator.html": "text/html", "operator.css": "text/css", "operator.js": "text/javascript"}
+_FILES = {
+    "operator.html": "text/html",
+    "operator.css": "text/css",
+    "operator.js": "text/javascript",
+}
 _HEADERS = {
-    "content-security-policy": "default-src 'none'; script-src 'self'; style-src 'self'; connect-src 'self'; "
+    "content-security-policy": "default-src 'none'; script-src 'self'; style-src 'self'; "
+    "connect-src 'self'; "
     "img-src 'self' data:; base-uri 'none'; form-action 'none'; frame-ancestors 'none'",
     "cache-control": "no-store",
     "referrer-policy": "no-referrer",
@@ -66,7 +75,8 @@ class VisibleTrial:
     setup: str  # instructions for setting the scene
     seconds: float  # after which the trial ends
     rubric: Mapping[str, float]  # points by part of the task
-    start: Mapping[str, Path] = field(default_factory=dict)  # the JPEG of each camera at the scene's first start
+    # The JPEG of each camera at the scene's first start.
+    start: Mapping[str, Path] = field(default_factory=dict)
     message: str = ""  # end of the last attempt, if it has no verdict
 
     def to_json(self) -> dict[str, Any]:
@@ -83,14 +93,15 @@ class Verdict:
     note: str = ""  # for "repeat" the reason, which is required
 
     def score(self, rubric: Mapping[str, float]) -> float:
-        """Return the share of the rubric's points that were earned: 1 for a success, 0 for a failure.
+        """Return the share of the rubric's points that were earned: 1 for a success, 0 for a
+        failure.
 
         Args:
             rubric: The points by part of the task.
 
         Raises:
-            ConfigError: A partial success has a part that is not in the rubric, or there is no rubric; or a repetition
-                has no reason.
+            ConfigError: A partial success has a part that is not in the rubric, or there is no
+                rubric; or a repetition has no reason.
         """
         if self.outcome == "repeat" and not self.note.strip():
             raise ConfigError("verdict: got a repetition without a reason, want one in words")
@@ -98,7 +109,9 @@ class Verdict:
             return float(self.outcome == "success")
         if not rubric or (unknown := sorted(set(self.earned) - rubric.keys())):
             got = f"the parts {unknown}" if rubric else "a partial success"
-            raise ConfigError(f"verdict: got {got}, want some of the rubric's {sorted(rubric)}; see `robot.tasks`")
+            raise ConfigError(
+                f"verdict: got {got}, want some of the rubric's {sorted(rubric)}; see `robot.tasks`"
+            )
         return sum(rubric[part] for part in set(self.earned)) / sum(rubric.values())
 
 
@@ -117,7 +130,9 @@ class Operator(Protocol):
         """
 
     def watch(self, obs: Obs) -> None:
-        """Show an observation of the running trial; called at each control tick, so it must return at once."""
+        """Show an observation of the running trial; called at each control tick, so it must
+        return at once.
+        """
 
     def stops(self) -> bool:
         """Return whether to stop the running trial, also because the operator's page was closed."""
@@ -150,13 +165,18 @@ def save_start(out: Path, place: str, obs: Obs) -> None:
 
 
 def save_overlay(start: Path, now: np.ndarray) -> Path:
-    """Save the mean of a start picture and the camera's present picture, beside the former's folder.
+    """Save the mean of a start picture and the camera's present picture, beside the former's
+    folder.
 
     Returns:
         The new JPEG; it has the size of `now`, and only `now` if the sizes differ.
     """
     before = decode(start.read_bytes())
-    mean = now if before.shape != now.shape else ((before.astype(np.uint16) + now) // 2).astype(np.uint8)
+    mean = (
+        now
+        if before.shape != now.shape
+        else ((before.astype(np.uint16) + now) // 2).astype(np.uint8)
+    )
     path = start.parent.with_name(f"overlay-{start.name}")
     with whole(path) as part:
         part.write_bytes(encode_jpeg(mean, _KEPT_QUALITY))
@@ -167,7 +187,8 @@ class TerminalOperator(Operator):
     """An operator at a terminal. Enter stops a running trial.
 
     Args:
-        ask: Prints a question and returns the typed line, as `input` does; raises `EOFError` at the end of the input.
+        ask: Prints a question and returns the typed line, as `input` does; raises `EOFError` at the
+            end of the input.
         say: Prints a line.
         stopping: Returns whether to stop the running trial; by default, whether Enter was pressed.
     """
@@ -189,7 +210,10 @@ class TerminalOperator(Operator):
             self._say(f"  {line}")
         while True:
             try:
-                typed = self._ask("Enter when the scene is ready, l to look at it over the start picture, q to end: ")
+                typed = self._ask(
+                    "Enter when the scene is ready, l to look at it over the start picture, q to "
+                    "end: "
+                )
             except EOFError:
                 return False
             if typed.strip().lower() in ("", "q"):
@@ -205,7 +229,11 @@ class TerminalOperator(Operator):
 
     def judge(self, trial: VisibleTrial, ending: str) -> Verdict:
         self._say(f"trial {trial.number} has ended: {ending}")
-        choices = "s success, f failure, p partial, r repeat" if trial.rubric else "s success, f failure, r repeat"
+        choices = (
+            "s success, f failure, p partial, r repeat"
+            if trial.rubric
+            else "s success, f failure, r repeat"
+        )
         while True:
             try:
                 outcome = _OUTCOMES.get(self._ask(f"verdict ({choices}): ").strip().lower())
@@ -213,10 +241,17 @@ class TerminalOperator(Operator):
                     continue
                 earned = []
                 for part, points in trial.rubric.items() if outcome == "partial" else ():
-                    if self._ask(f"  {part} ({points:g} points), reached? y/n: ").strip().lower().startswith("y"):
+                    if (
+                        self._ask(f"  {part} ({points:g} points), reached? y/n: ")
+                        .strip()
+                        .lower()
+                        .startswith("y")
+                    ):
                         earned.append(part)
                 verdict = Verdict(
-                    outcome, tuple(earned), self._ask("why: " if outcome == "repeat" else "note: ").strip()
+                    outcome,
+                    tuple(earned),
+                    self._ask("why: " if outcome == "repeat" else "note: ").strip(),
                 )
             except EOFError:
                 raise KeyboardInterrupt from None
@@ -236,7 +271,9 @@ class TerminalOperator(Operator):
 
 
 def _enter_pressed() -> bool:
-    """Return whether a line was typed at the terminal; False if the input is no terminal, which is not read ahead."""
+    """Return whether a line was typed at the terminal; False if the input is no terminal, which
+    is not read ahead.
+    """
     if not sys.stdin.isatty() or not select.select([sys.stdin], [], [], 0)[0]:
         return False
     sys.stdin.readline()
@@ -246,9 +283,9 @@ def _enter_pressed() -> bool:
 class PageOperator(Operator):
     """An operator at a page in the browser. Use as a context manager: the page is served within it.
 
-    The page is on the loopback interface, and requires the random part of its address. A running trial is stopped if
-    the page has sent no request for 3 s, as when it was closed. At the end of the context an open page shows whether
-    the evaluation is complete.
+    The page is on the loopback interface, and requires the random part of its address. A running
+    trial is stopped if the page has sent no request for 3 s, as when it was closed. At the end of
+    the context an open page shows whether the evaluation is complete.
 
     Args:
         say: Prints a line: the page's address.
@@ -293,7 +330,9 @@ class PageOperator(Operator):
         )
         self._server = uvicorn.Server(settings)
         self._thread = threading.Thread(
-            target=lambda: asyncio.run(self._server.serve([listening])), name="vlagents-ray-operator", daemon=True
+            target=lambda: asyncio.run(self._server.serve([listening])),
+            name="vlagents-ray-operator",
+            daemon=True,
         )
         self._thread.start()
         self._say(f"the operator's page: {self.url}")
@@ -305,7 +344,9 @@ class PageOperator(Operator):
             if kind is None:
                 self._ending = "The evaluation is complete: close this page"
             elif issubclass(kind, KeyboardInterrupt):
-                self._ending = "The evaluation was interrupted: --resume goes on with it, at a new address"
+                self._ending = (
+                    "The evaluation was interrupted: --resume goes on with it, at a new address"
+                )
             else:
                 self._ending = "The evaluation ended with an error: see the terminal"
         if self._is_watched():
@@ -350,7 +391,9 @@ class PageOperator(Operator):
         name = http.path_params.get("name", "operator.html")
         if name not in _FILES:
             return PlainTextResponse("not found", 404)
-        text = (package_files("vlagents_ray.evaluate.robot") / "page" / name).read_text(encoding="utf-8")
+        text = (package_files("vlagents_ray.evaluate.robot") / "page" / name).read_text(
+            encoding="utf-8"
+        )
         return Response(text, media_type=_FILES[name], headers=_HEADERS)
 
     async def _state(self, _: Request) -> Response:
@@ -358,14 +401,21 @@ class PageOperator(Operator):
         obs = self._obs
         with self._changed:
             shown = None if self._trial is None else self._trial.to_json()
-            state = {"phase": self._phase, "trial": shown, "ending": self._ending, "answered": self._answer is not None}
+            state = {
+                "phase": self._phase,
+                "trial": shown,
+                "ending": self._ending,
+                "answered": self._answer is not None,
+            }
         cameras = [] if obs is None else sorted(distinct(obs.cameras).values())
         sent = BackgroundTask(self._end_shown.set) if state["phase"] == "end" else None
         return JSONResponse(state | {"cameras": cameras}, background=sent)
 
     async def _camera(self, http: Request) -> Response:
         obs = self._obs
-        names = {} if obs is None else {name: camera for camera, name in distinct(obs.cameras).items()}
+        names = (
+            {} if obs is None else {name: camera for camera, name in distinct(obs.cameras).items()}
+        )
         camera = names.get(http.path_params["name"])
         if obs is None or camera is None:
             return PlainTextResponse("not found", 404)
@@ -375,7 +425,11 @@ class PageOperator(Operator):
     async def _start(self, http: Request) -> Response:
         trial = self._trial
         path = None if trial is None else trial.start.get(http.path_params["name"])
-        return PlainTextResponse("not found", 404) if path is None else FileResponse(path, headers=_HEADERS)
+        return (
+            PlainTextResponse("not found", 404)
+            if path is None
+            else FileResponse(path, headers=_HEADERS)
+        )
 
     async def _take(self, http: Request) -> Response:
         """Accept an answer, unless it is for another trial or question than the present one."""
@@ -396,7 +450,11 @@ class PageOperator(Operator):
             return PlainTextResponse("want phase, trial, attempt, do, earned, note", 400)
         with self._changed:
             trial = self._trial
-            if trial is None or about != (self._phase, trial.number, trial.attempt) or self._answer is not None:
+            if (
+                trial is None
+                or about != (self._phase, trial.number, trial.attempt)
+                or self._answer is not None
+            ):
                 return PlainTextResponse("the trial has gone on meanwhile", 409)
             if answer["do"] not in (choices := _CHOICES.get(self._phase, set())):
                 return PlainTextResponse(f"do: want one of {sorted(choices)}", 400)
@@ -411,4 +469,6 @@ class PageOperator(Operator):
 
 
 def _verdict(answer: dict[str, Any]) -> Verdict:
-    return Verdict(answer["do"], tuple(map(str, answer.get("earned", ()))), str(answer.get("note", "")))
+    return Verdict(
+        answer["do"], tuple(map(str, answer.get("earned", ()))), str(answer.get("note", ""))
+    )

@@ -1,8 +1,10 @@
-"""Runs the trials of an evaluation on a robot, and writes the results when all of them have their verdicts.
+"""Runs the trials of an evaluation on a robot, and writes the results when all of them have their
+verdicts.
 
-Until then there are two files in place of results.db. The log, `trials.jsonl`, has a line for each attempt at a
-trial, with its verdict. The policy, its checkpoint and its timing are in `trials.hidden.jsonl`, which the operator does
-not open. A line of the log has the hash of its hidden line, so neither can be changed later without the other.
+Until then there are two files in place of results.db. The log, `trials.jsonl`, has a line for each
+attempt at a trial, with its verdict. The policy, its checkpoint and its timing are in
+`trials.hidden.jsonl`, which the operator does not open. A line of the log has the hash of its
+hidden line, so neither can be changed later without the other.
 """
 
 from __future__ import annotations
@@ -34,8 +36,21 @@ from vlagents_ray.evaluate.results.database import FILE as RESULTS
 from vlagents_ray.evaluate.results.statistics import Stopping
 from vlagents_ray.evaluate.results.store import Store
 from vlagents_ray.evaluate.results.summary import Summary
-from vlagents_ray.evaluate.robot.operator import Operator, Verdict, VisibleTrial, save_start, start_pictures
-from vlagents_ray.evaluate.robot.trial import PlayedTrial, Trial, WatchedRobot, play, rehearse, schedule
+from vlagents_ray.evaluate.robot.operator import (
+    Operator,
+    Verdict,
+    VisibleTrial,
+    save_start,
+    start_pictures,
+)
+from vlagents_ray.evaluate.robot.trial import (
+    PlayedTrial,
+    Trial,
+    WatchedRobot,
+    play,
+    rehearse,
+    schedule,
+)
 from vlagents_ray.evaluate.run import conclude
 from vlagents_ray.evaluate.workers.rollout import AgentFactory, agents
 from vlagents_ray.registry import require
@@ -44,7 +59,9 @@ from vlagents_ray.robot.loop import Robot, opened, robot_named
 LOG = "trials.jsonl"
 HIDDEN = "trials.hidden.jsonl"
 KEY = "trials.key"
-_BLOCK = 16384  # bytes: hidden lines have a multiple of this length, so that the size of the file reveals no policy
+# bytes: hidden lines have a multiple of this length, so that the size of the file reveals no
+# policy.
+_BLOCK = 16384
 _KILLED = "the evaluation ended before the verdict"
 
 
@@ -55,7 +72,8 @@ class LoggedTrial:
     trial: int
     attempt: int
     at: float  # s since 1970, of its end
-    seen: dict[str, Any]  # in plain text: outcome, earned, score, note; or `again`, the reason of a repetition
+    # In plain text: outcome, earned, score, note; or `again`, the reason of a repetition.
+    seen: dict[str, Any]
     hidden: dict[str, Any]  # what reveals the policy
 
     @property
@@ -71,8 +89,8 @@ class TrialLog(contextlib.AbstractContextManager["TrialLog"]):
         """Open or begin the log in `config.out`.
 
         Raises:
-            ConfigError: There is a log and `config.resume` is off, or it has another plan or key; there are results of
-                a simulation; or another evaluation writes to the folder.
+            ConfigError: There is a log and `config.resume` is off, or it has another plan or key;
+                there are results of a simulation; or another evaluation writes to the folder.
             StorageFailed: The folder cannot be written to.
         """
         self._path = config.out / LOG
@@ -81,16 +99,23 @@ class TrialLog(contextlib.AbstractContextManager["TrialLog"]):
             config.out.mkdir(parents=True, exist_ok=True)
             resumed = self._path.exists() and self._path.stat().st_size > 0
             if not resumed and (config.out / RESULTS).exists():
-                raise ConfigError(f"{config.out}: has results of another evaluation; choose another out folder")
+                raise ConfigError(
+                    f"{config.out}: has results of another evaluation; choose another out folder"
+                )
             if resumed and not config.resume:
-                raise ConfigError(f"{config.out}: already has trials; resume them (--resume), or choose another folder")
+                raise ConfigError(
+                    f"{config.out}: already has trials; resume them (--resume), or choose another "
+                    "folder"
+                )
             self.key = _key(config)
         with contextlib.ExitStack() as files:
             with storing(config.out):
                 self._log = files.enter_context(_JsonLines(self._path))
                 self._hidden = files.enter_context(_JsonLines(config.out / HIDDEN, mode=0o600))
             self._log.lock()
-            plan = canonical([[cell.fingerprint, *cell.name, cell.planned, cell.suite.seeds] for cell in cells])
+            plan = canonical(
+                [[cell.fingerprint, *cell.name, cell.planned, cell.suite.seeds] for cell in cells]
+            )
             self._read(config, hmac.digest(self.key, plan.encode(), hashlib.sha256).hex())
             self._files = files.pop_all()
 
@@ -127,7 +152,9 @@ class TrialLog(contextlib.AbstractContextManager["TrialLog"]):
             self._write({"plan": identity, "at": self.started}, plan)
             return
         if not hmac.compare_digest(lines[0]["plan"], identity):
-            raise ConfigError(f"{self._path}: is of another plan, robot or key; take those, or another out folder")
+            raise ConfigError(
+                f"{self._path}: is of another plan, robot or key; take those, or another out folder"
+            )
         self.started = float(lines[0]["at"])
         begun: set[tuple[int, int]] = set()
         for line in lines[1:]:
@@ -141,10 +168,13 @@ class TrialLog(contextlib.AbstractContextManager["TrialLog"]):
             hidden = hidden_lines.get(line.pop("hidden"))
             if hidden is None:
                 raise ConfigError(
-                    f"{self._path}: the hidden line of trial {attempt[0]} is missing in {HIDDEN}, or was changed; "
+                    f"{self._path}: the hidden line of trial {attempt[0]} is missing in {HIDDEN}, "
+                    "or was changed; "
                     "restore both files from one copy, or choose another out folder"
                 )
-            self.attempts.append(LoggedTrial(*attempt, line.pop("at"), seen=line, hidden=json.loads(hidden)))
+            self.attempts.append(
+                LoggedTrial(*attempt, line.pop("at"), seen=line, hidden=json.loads(hidden))
+            )
         for attempt in begun:
             self.end(*attempt, {"again": _KILLED, "cause": "operator"}, {})
 
@@ -153,7 +183,8 @@ class TrialLog(contextlib.AbstractContextManager["TrialLog"]):
             if hidden is not None:
                 text = json.dumps(hidden, default=str).encode()
                 text += b" " * (-len(text) % _BLOCK)
-                self._hidden.append(text)  # before the line that has its hash, since the process may be killed
+                # Before the line that has its hash, since the process may be killed.
+                self._hidden.append(text)
                 line = {**line, "hidden": _hash(self.key, text)}
             self._log.append(canonical(line).encode())
 
@@ -172,7 +203,8 @@ class _JsonLines(contextlib.AbstractContextManager["_JsonLines"]):
             fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError as error:
             raise ConfigError(
-                f"{self._path}: another evaluation is writing there; wait for it, or choose another folder"
+                f"{self._path}: another evaluation is writing there; wait for it, or choose "
+                "another folder"
             ) from error
 
     def read(self) -> list[bytes]:
@@ -202,9 +234,13 @@ def logged_plan(out: Path, key: str | None) -> EvalConfig:
         plan = json.loads(hidden_lines[first["hidden"]])
         return EvalConfig.model_validate(plan["config"])
     except FileNotFoundError as error:
-        raise ConfigError(f"{error.filename}: is missing; want the folder of an evaluation on a robot") from error
+        raise ConfigError(
+            f"{error.filename}: is missing; want the folder of an evaluation on a robot"
+        ) from error
     except (KeyError, ValueError) as error:
-        raise ConfigError(f"{out / LOG}: cannot be read with this key; want the `robot.key` of its plan") from error
+        raise ConfigError(
+            f"{out / LOG}: cannot be read with this key; want the `robot.key` of its plan"
+        ) from error
 
 
 def _hash(key: bytes, line: bytes) -> str:
@@ -230,37 +266,45 @@ def _key(config: EvalConfig) -> bytes:
 
 
 RECORDINGS = "recordings"
-_LOGGERS = ("vlagents_ray", "ray", "ray.serve", "websockets", "asyncio")  # their messages may name a policy
+# Their messages may name a policy.
+_LOGGERS = ("vlagents_ray", "ray", "ray.serve", "websockets", "asyncio")
 
 
 class TrialsInterrupted(KeyboardInterrupt):
-    """The operator or a signal ended an evaluation on a robot; `resume` continues with the next trial.
+    """The operator or a signal ended an evaluation on a robot; `resume` continues with the next
+    trial.
 
     It has no results, as further trials would not be blind.
     """
 
 
 def evaluate_on_robot(
-    config: EvalConfig, operator: Operator, *, robot: Robot | None = None, agent_factory: AgentFactory | None = None
+    config: EvalConfig,
+    operator: Operator,
+    *,
+    robot: Robot | None = None,
+    agent_factory: AgentFactory | None = None,
 ) -> Summary:
     """Play every trial of `config` that has no result yet, and write the results to `config.out`.
 
-    A trial's policy is drawn (`schedule`). Until the last verdict only the hidden file in the folder names it
-    (`TrialLog`), and no output or log does; results.db, summary.json and report.html are written at the end, as for a
-    simulation. With `config.stop`, a task ends once all its cells have stopped, since trials of the remaining
-    ones would reveal their policy.
+    A trial's policy is drawn (`schedule`). Until the last verdict only the hidden file in the
+    folder names it (`TrialLog`), and no output or log does; results.db, summary.json and
+    report.html are written at the end, as for a simulation. With `config.stop`, a task ends once
+    all its cells have stopped, since trials of the remaining ones would reveal their policy.
 
     Args:
         config: The policies, with their URLs, and the plan, with `robot`.
         operator: The operator at the robot.
         robot: The robot; by default one of the class `config.robot.arm`.
-        agent_factory: Called with a policy to make its agent for a trial, in place of a connection to its `url`.
+        agent_factory: Called with a policy to make its agent for a trial, in place of a connection
+            to its `url`.
 
     Returns:
         The summary of all results in `config.out`.
 
     Raises:
-        ConfigError: The settings are invalid or contradict the log in `config.out`, or a policy changed between trials.
+        ConfigError: The settings are invalid or contradict the log in `config.out`, or a policy
+            changed between trials.
         MissingDependency: Trials are to be recorded, and the extra "record" is not installed.
         StorageFailed: The disk is full, or cannot be written to.
         TrialsInterrupted: The operator ended the evaluation, or Ctrl-C did.
@@ -273,7 +317,9 @@ def evaluate_on_robot(
     factory = agent_factory or agents(config, None, "robot")
     with contextlib.ExitStack() as stack:
         if robot is None:
-            robot = stack.enter_context(opened(robot_named("--robot", str(planned[0].on_robot[0].arm))))
+            robot = stack.enter_context(
+                opened(robot_named("--robot", str(planned[0].on_robot[0].arm)))
+            )
         log = stack.enter_context(TrialLog(config, planned))
         trials = schedule(planned, log.key)
         run = _RemainingTrials(config, operator, WatchedRobot(robot), factory, log, trials)
@@ -282,7 +328,8 @@ def evaluate_on_robot(
                 run.play()
         except KeyboardInterrupt:
             raise TrialsInterrupted(
-                f"interrupted after {len(log.finished)} of {len(trials)} trials; go on with --resume --out {config.out}"
+                f"interrupted after {len(log.finished)} of {len(trials)} trials; go on with "
+                f"--resume --out {config.out}"
             ) from None
     return _write_results(config, planned, log, "complete")
 
@@ -314,11 +361,16 @@ def planned_cells(config: EvalConfig) -> list[EvalCase]:
         ConfigError: The plan has no robot, or settings without meaning on one.
     """
     if config.real_robot is None:
-        raise ConfigError("robot: got no robot, want `robot: {tasks: …}` in the plan and the class of one (--robot)")
+        raise ConfigError(
+            "robot: got no robot, want `robot: {tasks: …}` in the plan and the class of one "
+            "(--robot)"
+        )
     if any(policy.pushed_weights is not None for policy in config.policies):
         raise ConfigError("pushed_weights: got some with a robot, want checkpoints; leave them out")
     if config.track:
-        raise ConfigError(f"track: got {config.track} with a robot, want none: rates tell policies before the end")
+        raise ConfigError(
+            f"track: got {config.track} with a robot, want none: rates tell policies before the end"
+        )
     return cells(config)
 
 
@@ -333,7 +385,8 @@ class _RemainingTrials:
     _log: TrialLog
     _trials: Sequence[Trial]
     _message: str = ""  # for the operator, about the last trial
-    _stopping: dict[tuple[str, str], dict[str, Stopping]] = dataclasses.field(default_factory=dict)  # by task and cell
+    # By task and cell.
+    _stopping: dict[tuple[str, str], dict[str, Stopping]] = dataclasses.field(default_factory=dict)
 
     def __post_init__(self) -> None:
         for trial in self._trials:
@@ -346,18 +399,25 @@ class _RemainingTrials:
             self._count(trial, result_of(trial, logged))
 
     def play(self) -> None:
-        left = [trial for trial in self._trials if trial.number not in self._log.finished and not self._is_over(trial)]
+        left = [
+            trial
+            for trial in self._trials
+            if trial.number not in self._log.finished and not self._is_over(trial)
+        ]
         if not left:
             return
         obs = self._robot.observe()
         policies = {trial.job.cell.contender: trial.job.cell for trial in left}
-        for _, cell in sorted(policies.items(), key=lambda one: one[0]):  # an order that reveals nothing
+        # An order that reveals nothing.
+        for _, cell in sorted(policies.items(), key=lambda one: one[0]):
             try:
                 rehearse(cell, self._robot, self._factory, self._operator, obs)
             except ContractMismatch as error:
                 raise ContractMismatch(
-                    f"a policy of this plan does not fit the robot. It is not named here, as the trials are blind; "
-                    f"`vlagents-ray robot URL --robot {cell.on_robot[0].arm}` compares one policy with the robot, "
+                    "a policy of this plan does not fit the robot. It is not named here, as the "
+                    "trials are blind; "
+                    f"`vlagents-ray robot URL --robot {cell.on_robot[0].arm}` compares one policy "
+                    "with the robot, "
                     f"before any motion.\n{error}"
                 ) from None
             except VLAgentsError as error:
@@ -377,18 +437,24 @@ class _RemainingTrials:
         self._log.begin(trial.number, attempt)
         try:
             name = f"trial{trial.number:04d}-{attempt}"
-            recording = None if self._config.record == "none" else self._config.out / RECORDINGS / name
+            recording = (
+                None if self._config.record == "none" else self._config.out / RECORDINGS / name
+            )
             played = play(trial, self._robot, self._factory, self._operator, recording)
         except VLAgentsError as error:
             failure = explain(error)
             why, cause = f"it could not be played ({failure.code})", "policy"
             if failure.code == "env_failed":
                 why, cause = failure.message, "worker"
-            self._log.end(trial.number, attempt, {"again": why, "cause": cause}, dataclasses.asdict(failure))
+            self._log.end(
+                trial.number, attempt, {"again": why, "cause": cause}, dataclasses.asdict(failure)
+            )
             return
         self._require_same_policy(trial, played)
         if played.result.status == "policy_error":
-            self._record(trial, attempt, played, Verdict("failure", note=played.ending), played.result)
+            self._record(
+                trial, attempt, played, Verdict("failure", note=played.ending), played.result
+            )
             self._message = f"trial {trial.number}: {played.ending}, so it counts as a failure"
             return
         self._message = ""
@@ -399,11 +465,24 @@ class _RemainingTrials:
             return
         # A partial success counts as a failure in success rates; its score is stored as the return.
         success, steps = verdict.outcome == "success", played.result.steps
-        judged: dict[str, Any] = {"success_once": success, "success_at_end": success, "episode_return": score}
-        result = dataclasses.replace(played.result, first_success=steps if success else None, **judged)
+        judged: dict[str, Any] = {
+            "success_once": success,
+            "success_at_end": success,
+            "episode_return": score,
+        }
+        result = dataclasses.replace(
+            played.result, first_success=steps if success else None, **judged
+        )
         self._record(trial, attempt, played, verdict, result)
 
-    def _record(self, trial: Trial, attempt: int, played: PlayedTrial, verdict: Verdict, result: EpisodeResult) -> None:
+    def _record(
+        self,
+        trial: Trial,
+        attempt: int,
+        played: PlayedTrial,
+        verdict: Verdict,
+        result: EpisodeResult,
+    ) -> None:
         seen = {
             "outcome": verdict.outcome,
             "earned": sorted(set(verdict.earned)),
@@ -440,7 +519,9 @@ class _RemainingTrials:
         )
 
     def _require_same_policy(self, trial: Trial, played: PlayedTrial) -> None:
-        """Raise `ConfigError` if the policy has changed, without naming the policy or its trials."""
+        """Raise `ConfigError` if the policy has changed, without naming the policy or its
+        trials.
+        """
         cell = trial.job.cell
         now = {name: getattr(played.result, name) for name in ("checkpoint", "weights")}
         for number, logged in self._log.finished.items():
@@ -450,10 +531,18 @@ class _RemainingTrials:
             what = changed(logged.hidden["metadata"], played.metadata, swept=cell.step is not None)
             if what is None and other.contender == cell.contender:
                 before = logged.hidden["result"]
-                what = next((name for name in now if now[name] and before[name] and now[name] != before[name]), None)
+                what = next(
+                    (
+                        name
+                        for name in now
+                        if now[name] and before[name] and now[name] != before[name]
+                    ),
+                    None,
+                )
             if what is not None:
                 raise ConfigError(
-                    f"the {what} of a policy has changed since its earlier trials; serve all policies as before and go "
+                    f"the {what} of a policy has changed since its earlier trials; serve all "
+                    "policies as before and go "
                     "on with --resume, or choose another out folder"
                 )
 
@@ -462,7 +551,9 @@ def result_of(trial: Trial, logged: LoggedTrial) -> EpisodeResult:
     fields = dict(logged.hidden["result"])
     fields["key"] = EpisodeKey(**fields["key"])
     if fields["key"] != trial.job.key:
-        raise ConfigError(f"trial {trial.number}: its result is of another plan; choose another out folder")
+        raise ConfigError(
+            f"trial {trial.number}: its result is of another plan; choose another out folder"
+        )
     return EpisodeResult(**fields)
 
 
@@ -480,8 +571,12 @@ def _quiet() -> Iterator[None]:
             logger.setLevel(levels[name])
 
 
-def _write_results(config: EvalConfig, planned: Sequence[EvalCase], log: TrialLog, state: str) -> Summary:
-    """Write results.db from the whole log, as an evaluation in simulation does, in place of an earlier one."""
+def _write_results(
+    config: EvalConfig, planned: Sequence[EvalCase], log: TrialLog, state: str
+) -> Summary:
+    """Write results.db from the whole log, as an evaluation in simulation does, in place of an
+    earlier one.
+    """
     trials = schedule(planned, log.key)
     with storing(config.out):
         (config.out / RESULTS).unlink(missing_ok=True)
@@ -496,7 +591,9 @@ def _write_results(config: EvalConfig, planned: Sequence[EvalCase], log: TrialLo
             if not logged.finished:
                 by_operator = logged.seen["cause"] == "operator"
                 again = Failure("operator", "trial_repeated", logged.seen["again"])
-                store.record_attempt(job, again if by_operator else Failure(**logged.hidden), retried=True)
+                store.record_attempt(
+                    job, again if by_operator else Failure(**logged.hidden), retried=True
+                )
                 continue
             if logged.hidden["metadata"]:
                 store.note_policy(trial.job.cell.policy.name, logged.hidden["metadata"])

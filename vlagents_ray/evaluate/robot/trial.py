@@ -17,7 +17,13 @@ import numpy as np
 from vlagents_ray.chunking.control import Control
 from vlagents_ray.chunking.player import ChunkPlayer, PlayerSettings
 from vlagents_ray.client.commands import Command, CommandInbox
-from vlagents_ray.errors import CheckpointFailed, EnvFailed, InvalidAction, PolicyFailed, PolicyUnavailable
+from vlagents_ray.errors import (
+    CheckpointFailed,
+    EnvFailed,
+    InvalidAction,
+    PolicyFailed,
+    PolicyUnavailable,
+)
 from vlagents_ray.evaluate.episode.episode import EpisodeStats, transport_of
 from vlagents_ray.evaluate.episode.failures import env_side, policy_side
 from vlagents_ray.evaluate.episode.records import EpisodeResult
@@ -60,13 +66,15 @@ class Trial:
 
 
 def schedule(cells: Iterable[EvalCase], key: bytes) -> list[Trial]:
-    """Draw the order of all trials: task by task, scene by scene, and in each scene every policy once.
+    """Draw the order of all trials: task by task, scene by scene, and in each scene every policy
+    once.
 
-    With k policies, each k scenes of a task in a row have the rows of a k x k Latin square in a drawn order, whose
-    columns are the policies in a drawn order. The fewer than k scenes that remain of each task share one such square:
-    they have those of its rows that the remaining scenes of the tasks before had least often, drawn among equals. So
-    each policy is first, second, and so on equally often, and the counts differ by at most one in each task, and in the
-    whole plan. Seeds begin no new square. The draw depends on the key and the names of policies, suites and
+    With k policies, each k scenes of a task in a row have the rows of a k x k Latin square in a
+    drawn order, whose columns are the policies in a drawn order. The fewer than k scenes that
+    remain of each task share one such square: they have those of its rows that the remaining scenes
+    of the tasks before had least often, drawn among equals. So each policy is first, second, and so
+    on equally often, and the counts differ by at most one in each task, and in the whole plan.
+    Seeds begin no new square. The draw depends on the key and the names of policies, suites and
     environments, by HMAC-SHA256.
 
     Args:
@@ -85,7 +93,9 @@ def schedule(cells: Iterable[EvalCase], key: bytes) -> list[Trial]:
         suite = next(iter(contenders.values())).suite
         scenes = list(itertools.product(suite.seeds, range(suite.episodes)))
         orders = _orders(key, task, contenders, len(scenes), rows_used)
-        for number, ((seed, episode), order) in enumerate(zip(scenes, orders, strict=True), start=1):
+        for number, ((seed, episode), order) in enumerate(
+            zip(scenes, orders, strict=True), start=1
+        ):
             for name in order:
                 cell = contenders[name]
                 job = Job(EpisodeKey(cell.env, episode, seed + episode, cell.fingerprint), cell)
@@ -99,7 +109,8 @@ def _orders(
     """Yield the order of the policies in each scene of a task.
 
     Args:
-        rows_used: How often the last scenes of the tasks before had each row of their common square; it is updated.
+        rows_used: How often the last scenes of the tasks before had each row of their common
+            square; it is updated.
     """
     size = len(names)
     for first in range(0, scenes, size):
@@ -115,8 +126,12 @@ def _orders(
 
 
 def _drawn(key: bytes, what: list[str | int], names: Iterable[str]) -> list[str]:
-    """Return the names in the order of their authentication codes, independent of the plan's order."""
-    return sorted(names, key=lambda name: hmac.digest(key, canonical([*what, name]).encode(), hashlib.sha256))
+    """Return the names in the order of their authentication codes, independent of the plan's
+    order.
+    """
+    return sorted(
+        names, key=lambda name: hmac.digest(key, canonical([*what, name]).encode(), hashlib.sha256)
+    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -132,7 +147,8 @@ class WatchedRobot(RobotWrapper):
     """A robot whose errors become `EnvFailed`, and whose steps are counted."""
 
     stats: EpisodeStats | None = None  # of the running trial
-    step_due: bool = False  # whether the player has returned the next action; the way to the rest pose has no steps
+    # Whether the player has returned the next action; the way to the rest pose has no steps.
+    step_due: bool = False
 
     def observe(self) -> Obs:
         with env_side("robot, observe"):
@@ -152,7 +168,9 @@ class WatchedRobot(RobotWrapper):
 
 
 class _OperatorStop(CommandInbox):
-    """The operator's stop button, which the control loop reads before each motion, also on the way to the rest pose."""
+    """The operator's stop button, which the control loop reads before each motion, also on the
+    way to the rest pose.
+    """
 
     def __init__(self, operator: Operator) -> None:
         super().__init__()
@@ -201,7 +219,11 @@ class _CountingPlayer(ChunkPlayer):
 
 
 def play(
-    trial: Trial, robot: WatchedRobot, factory: AgentFactory, operator: Operator, recording: Path | None
+    trial: Trial,
+    robot: WatchedRobot,
+    factory: AgentFactory,
+    operator: Operator,
+    recording: Path | None,
 ) -> PlayedTrial:
     """Play one attempt at a trial, and always stop the robot at its end.
 
@@ -213,7 +235,9 @@ def play(
     deadline_s = _deadline_s(settings)
     stats = robot.stats = EpisodeStats(trial.job.key, instructions=[task.instruction])
     hangs_s = max(0.2, 5 / settings.hz) + deadline_s
-    watchdog = robot_watchdog(robot, lambda _: robot.stop(), {"server": settings.silent_s, "loop": hangs_s})
+    watchdog = robot_watchdog(
+        robot, lambda _: robot.stop(), {"server": settings.silent_s, "loop": hangs_s}
+    )
     stopped = False
 
     def until() -> bool:
@@ -224,7 +248,9 @@ def play(
     with contextlib.ExitStack() as stack:
         stack.callback(setattr, robot, "stats", None)
         agent, player = stack.enter_context(_player(cell, factory, stats, robot, operator))
-        recorder = None if recording is None else stack.enter_context(Recorder(recording, settings.hz))
+        recorder = (
+            None if recording is None else stack.enter_context(Recorder(recording, settings.hz))
+        )
         failed, report = None, LoopReport(settings.hz)
         try:
             report = run_loop(
@@ -239,7 +265,8 @@ def play(
                 recorder=recorder,
                 until=until,
                 commands=_OperatorStop(operator),
-                # The rehearsal has compared the numbers; what the policy does in a trial is its result.
+                # The rehearsal has compared the numbers; what the policy does in a trial is its
+                # result.
                 fit=fit_of(player, robot, trained=Trained()),
             )
         except CheckpointFailed:
@@ -253,21 +280,28 @@ def play(
                 raise PolicyUnavailable(f"the policy's server was silent: {bark}")
             raise EnvFailed(f"robot: the control loop was held up: {bark}")
         if 2 * report.safe.get("lost", 0) > report.jitter.get("ticks", 0):
-            raise PolicyUnavailable(f"the policy's server could not be reached: {report.reasons['lost']}")
+            raise PolicyUnavailable(
+                f"the policy's server could not be reached: {report.reasons['lost']}"
+            )
         stats.ending = "policy_done" if report.done else "terminated" if stopped else "truncated"
         stats.ticks_held = report.safe_ticks
         result = stats.result(transport_of(agent), failed)
         # Without whether the policy considered the task finished, as only some policies ever do.
         over = _STOPPED if stopped else "the trial is over"
         ending = over if failed is None else "the policy failed"
-        return PlayedTrial(replace(result, env_seconds=None), dict(getattr(agent, "metadata", {})), ending)
+        return PlayedTrial(
+            replace(result, env_seconds=None), dict(getattr(agent, "metadata", {})), ending
+        )
 
 
-def rehearse(cell: EvalCase, robot: WatchedRobot, factory: AgentFactory, operator: Operator, obs: Obs) -> None:
+def rehearse(
+    cell: EvalCase, robot: WatchedRobot, factory: AgentFactory, operator: Operator, obs: Obs
+) -> None:
     """Run a policy once, without moving the robot.
 
-    A mistake in the settings, or a policy that does not fit the robot, shows before the first trial. Work done on the
-    first call, such as compilation, does not slow the first trial, which would reveal which policy is running.
+    A mistake in the settings, or a policy that does not fit the robot, shows before the first
+    trial. Work done on the first call, such as compilation, does not slow the first trial, which
+    would reveal which policy is running.
     """
     settings, task = cell.on_robot
     unused = EpisodeStats(EpisodeKey(cell.env, 0, 0, cell.fingerprint))
@@ -287,9 +321,15 @@ def rehearse(cell: EvalCase, robot: WatchedRobot, factory: AgentFactory, operato
 
 @contextlib.contextmanager
 def _player(
-    cell: EvalCase, factory: AgentFactory, stats: EpisodeStats, robot: WatchedRobot, operator: Operator
+    cell: EvalCase,
+    factory: AgentFactory,
+    stats: EpisodeStats,
+    robot: WatchedRobot,
+    operator: Operator,
 ) -> Iterator[tuple[Agent, ChunkPlayer]]:
-    """Yield a policy's agent and its player with the plan's settings; both are closed at the end."""
+    """Yield a policy's agent and its player with the plan's settings; both are closed at the
+    end.
+    """
     settings, _ = cell.on_robot
     agent = factory(cell.policy)
     with contextlib.ExitStack() as unplayed:

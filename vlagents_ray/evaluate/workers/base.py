@@ -19,34 +19,50 @@ from vlagents_ray.evaluate.plan.jobs import Job, JobQueue
 from vlagents_ray.evaluate.workers.rollout import Heartbeat, Report
 from vlagents_ray.ray_tools.private import node_of_this_process
 
-SHORT_STEPS = 10_000  # planned steps up to which Ray's start, some seconds, is a large part of the time
+# Planned steps up to which Ray's start, some seconds, is a large part of the time.
+SHORT_STEPS = 10_000
 _STEPS = 300  # of an episode, if the options of its environment name no `max_steps`
 SIGNAL_S = 0.2  # s by which a signal may reach this process later than a worker
 VARIABLES = "env_vars"  # in Ray's runtime environment
 
 
 def chosen_workers(config: EvalConfig) -> int:
-    """Return `config.workers` or, if that is None, 0 for a short evaluation that needs no Ray, else 1.
+    """Return `config.workers` or, if that is None, 0 for a short evaluation that needs no Ray, else
+    1.
 
-    A single worker plays one episode after another, as this process does, so that Ray adds its start and a message to
-    each act. In return a simulator that crashes or hangs is replaced, which a long evaluation needs. Ray is also chosen
-    if this process is in a cluster or `RAY_ADDRESS` names one, and for workers with a GPU.
+    A single worker plays one episode after another, as this process does, so that Ray adds its
+    start and a message to each act. In return a simulator that crashes or hangs is replaced, which
+    a long evaluation needs. Ray is also chosen if this process is in a cluster or `RAY_ADDRESS`
+    names one, and for workers with a GPU.
 
     Raises:
         ConfigError: `config.workers` is 0, and something needs Ray.
     """
-    planned, urls = cells(config), [url for one in config.policies for url in (one.url, one.source) if url]
+    planned, urls = (
+        cells(config),
+        [url for one in config.policies for url in (one.url, one.source) if url],
+    )
     needs = [f"{url} is inside a Ray cluster" for url in urls if url.startswith("serve://")]
     packages = {name for cell in planned for name in cell.worker.runtime_env} - {VARIABLES}
     needs += [f"a worker's runtime_env has {name!r}" for name in sorted(packages)]
     if config.workers == 0 and needs:
-        raise ConfigError(f"workers: got 0, which plays in this process without Ray, but {needs[0]}; want 1 or more")
+        raise ConfigError(
+            f"workers: got 0, which plays in this process without Ray, but {needs[0]}; want 1 or "
+            "more"
+        )
     if config.workers is not None:
         return config.workers
     limits = [(cell.planned, cell.suite.env_options.get("max_steps")) for cell in planned]
-    steps = sum(episodes * (limit if isinstance(limit, int) else _STEPS) for episodes, limit in limits)
+    steps = sum(
+        episodes * (limit if isinstance(limit, int) else _STEPS) for episodes, limit in limits
+    )
     in_cluster = node_of_this_process() is not None or bool(os.environ.get("RAY_ADDRESS"))
-    return int(bool(needs) or in_cluster or any(cell.worker.gpus for cell in planned) or steps > SHORT_STEPS)
+    return int(
+        bool(needs)
+        or in_cluster
+        or any(cell.worker.gpus for cell in planned)
+        or steps > SHORT_STEPS
+    )
 
 
 @dataclass(slots=True, eq=False)
@@ -66,11 +82,14 @@ class WorkerHandle:
     heartbeat: Heartbeat = field(default_factory=lambda: Heartbeat("idle", 0.0, 0))
     heartbeat_at: float = 0.0  # time of the last answer
     process: dict[str, Any] = field(default_factory=dict)  # the answer of `ready()`
-    node: str | None = None  # Ray's id of the node it runs on or, while it starts, is requested on; None: any node
+    # Ray's id of the node it runs on or, while it starts, is requested on; None: any node.
+    node: str | None = None
 
 
 class Workers(contextlib.AbstractContextManager["Workers"]):
-    """The workers of an evaluation, wherever they play. Use it as a context manager, whose end ends them."""
+    """The workers of an evaluation, wherever they play. Use it as a context manager, whose end
+    ends them.
+    """
 
     def __init__(self) -> None:
         self._workers: list[WorkerHandle] = []
@@ -80,7 +99,9 @@ class Workers(contextlib.AbstractContextManager["Workers"]):
         return any(worker.jobs for worker in self._workers)
 
     def kinds(self, *, occupied: bool = True) -> Counter[str]:
-        """Return the number of workers by kind; with `occupied` False, of those without jobs, which may be starting."""
+        """Return the number of workers by kind; with `occupied` False, of those without jobs,
+        which may be starting.
+        """
         return Counter(worker.kind for worker in self._workers if occupied or not worker.jobs)
 
     def idle(self) -> list[WorkerHandle]:
@@ -108,19 +129,27 @@ class Workers(contextlib.AbstractContextManager["Workers"]):
         """Close the simulators of idle workers, as some need this for a clean exit."""
 
 
-def dispatch(pool: Workers, queue: JobQueue, begin: Callable[[tuple[Job, ...]], None] = lambda _jobs: None) -> None:
-    """Hand waiting jobs to idle workers, and start workers while more are needed; `begin` is called with the jobs."""
+def dispatch(
+    pool: Workers, queue: JobQueue, begin: Callable[[tuple[Job, ...]], None] = lambda _jobs: None
+) -> None:
+    """Hand waiting jobs to idle workers, and start workers while more are needed; `begin` is
+    called with the jobs.
+    """
     for worker in pool.idle():
         working = Counter(one.jobs[0].cell.place for one in pool._workers if one.jobs)
         if jobs := queue.take(worker.kind, worker.env_place, working):
             begin(jobs)
             pool.dispatch(worker, jobs)
-    while (cell := queue.needs_worker(pool.kinds(), pool.kinds(occupied=False))) is not None and pool.free_slot():
+    while (
+        cell := queue.needs_worker(pool.kinds(), pool.kinds(occupied=False))
+    ) is not None and pool.free_slot():
         pool.start(cell)
 
 
 def phase_limits_s(config: EvalConfig) -> dict[Phase, float]:
-    """Return the time limits of the phases of an episode, s; that of other phases is `config.env_timeout_s`."""
+    """Return the time limits of the phases of an episode, s; that of other phases is
+    `config.env_timeout_s`.
+    """
     return {
         "connect": config.connect_timeout_s + config.policy_timeout_s,
         "make": config.make_timeout_s,
@@ -148,7 +177,8 @@ class FailedAttempts:
         self._policy_errors += 1
         if self._policy_errors == self._config.abort_after:
             raise PolicyFailed(
-                f"{self._policy_errors} episodes in a row ended by an error of the policy: {error.strip()}; mend the "
+                f"{self._policy_errors} episodes in a row ended by an error of the policy: "
+                f"{error.strip()}; mend the "
                 f"policy and evaluate it with a new --out, or raise abort_after"
             )
 
@@ -156,10 +186,12 @@ class FailedAttempts:
         """Note that an episode was lost, its last attempt to `failure`.
 
         Raises:
-            VLAgentsError: The failure, if too many episodes in a row were lost; the message ends with the `cure`.
+            VLAgentsError: The failure, if too many episodes in a row were lost; the message ends
+                with the `cure`.
         """
         self._lost += 1
         if self._lost == self._config.abort_after:
             raise from_code(
-                failure.code, f"{self._lost} episodes in a row lost to infrastructure; {cure}: {failure.message}"
+                failure.code,
+                f"{self._lost} episodes in a row lost to infrastructure; {cure}: {failure.message}",
             )

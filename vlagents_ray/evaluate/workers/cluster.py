@@ -35,7 +35,9 @@ TIMEOUT_S = 5.0  # s for another node to read it
 
 @contextmanager
 def ray_cluster(config: EvalConfig) -> Iterator[None]:
-    """Join the cluster that `RAY_ADDRESS` names or start a local one, unless this process is in one; leave it after."""
+    """Join the cluster that `RAY_ADDRESS` names or start a local one, unless this process is in
+    one; leave it after.
+    """
     with ExitStack() as stack:
         if os.environ.get("RAY_ADDRESS"):
             stack.enter_context(joined())
@@ -48,22 +50,29 @@ def ray_cluster(config: EvalConfig) -> Iterator[None]:
 
 
 def most_cpus(config: EvalConfig) -> float:
-    """Return the largest number of CPUs that any worker of the evaluation requests; a share of one may be requested."""
+    """Return the largest number of CPUs that any worker of the evaluation requests; a share of
+    one may be requested.
+    """
     return max(worker.cpus for worker in _kinds(config))
 
 
 def most_gpus(config: EvalConfig) -> float:
-    """Return the largest number of GPUs that any worker of the evaluation requests; a share of one may be requested."""
+    """Return the largest number of GPUs that any worker of the evaluation requests; a share of
+    one may be requested.
+    """
     return max(worker.gpus for worker in _kinds(config))
 
 
 def runtime_env(cell: EvalCase) -> dict[str, Any]:
-    """Return Ray's runtime environment of a worker: its thread settings, and no GPUs if it requests none.
+    """Return Ray's runtime environment of a worker: its thread settings, and no GPUs if it requests
+    none.
 
-    No secret may be in it: Ray writes runtime environments to logs that every user of a machine can read.
+    No secret may be in it: Ray writes runtime environments to logs that every user of a machine can
+    read.
     """
     given: dict[str, Any] = dict(cell.worker.runtime_env)
-    hides_gpus = not cell.worker.gpus and bool(cell.policy.url or cell.policy.source)  # or it is in the worker
+    # Or it is in the worker.
+    hides_gpus = not cell.worker.gpus and bool(cell.policy.url or cell.policy.source)
     variables = dict.fromkeys(THREAD_VARIABLES, str(cell.worker.threads))
     if hides_gpus:  # Ray does not hide GPUs from an actor that requests none
         variables[GPUS] = ""
@@ -71,12 +80,15 @@ def runtime_env(cell: EvalCase) -> dict[str, Any]:
 
 
 def unused_gpus(cell: EvalCase, where: WorkerInfo) -> str | None:
-    """Return a warning that the workers of `cell` render in software in a cluster with GPUs; None if they do not."""
+    """Return a warning that the workers of `cell` render in software in a cluster with GPUs;
+    None if they do not.
+    """
     gpus = 0 if cell.worker.gpus else ray.cluster_resources().get("GPU", 0)
     if not gpus:
         return None
     return (
-        f"{cell.env} draws on {where.renderer}, as its workers have no GPU; the cluster has {gpus:g}: {SHARE}, "
+        f"{cell.env} draws on {where.renderer}, as its workers have no GPU; the cluster has "
+        f"{gpus:g}: {SHARE}, "
         f"see docs/cluster/scaling.md"
     )
 
@@ -95,7 +107,8 @@ class Placement:
         self._replicas: dict[str, ReplicaNodes] = {}  # nodes of the replicas, by application
 
     def node(self, url: str | None, workers: Mapping[str | None, int]) -> str | None:
-        """Return Ray's id of the node for one more worker of the policy at `url`; None for any node.
+        """Return Ray's id of the node for one more worker of the policy at `url`; None for any
+        node.
 
         `workers` is the number of workers on each node: nodes with many replicas get many.
         """
@@ -107,19 +120,24 @@ class Placement:
 
 
 def fewest(replicas: Mapping[str, int], workers: Mapping[str | None, int]) -> str | None:
-    """Return the node with the fewest workers for each replica after one more is placed there; the first of equals."""
+    """Return the node with the fewest workers for each replica after one more is placed there;
+    the first of equals.
+    """
     return min(replicas, key=lambda node: (workers.get(node, 0) + 1) / replicas[node], default=None)
 
 
 def strategy(node: str | None) -> Any:
-    """Return Ray's scheduling strategy for a worker on `node`, or on another node if that one is full or gone."""
+    """Return Ray's scheduling strategy for a worker on `node`, or on another node if that one is
+    full or gone.
+    """
     if node is None:
         return "SPREAD"
     return NodeAffinitySchedulingStrategy(node, soft=True, _spill_on_unavailable=True)
 
 
 class CapacityMonitor:
-    """Decides whether an evaluation continues while the cluster has no room for some of its workers.
+    """Decides whether an evaluation continues while the cluster has no room for some of its
+    workers.
 
     It continues as long as other workers play: a worker's node may have been lost, and may return.
     """
@@ -150,8 +168,10 @@ class CapacityMonitor:
         self._warned = True
         want = {"CPU": worker.cpus, "GPU": worker.gpus}
         message = (
-            f"the cluster found no room for a worker in {self._config.place_timeout_s:g} s: each needs {want}, "
-            f"free are {ray.available_resources()} of {ray.cluster_resources()}; lower `workers` or "
+            f"the cluster found no room for a worker in {self._config.place_timeout_s:g} s: each "
+            f"needs {want}, "
+            f"free are {ray.available_resources()} of {ray.cluster_resources()}; lower `workers` "
+            "or "
             f"`worker.cpus`, or raise `place_timeout_s` if the cluster is still growing"
         )
         if idle_too_long:
@@ -173,7 +193,11 @@ def tail_at(host: str, paths: Sequence[str]) -> str:
     """Return `tail` of files on any host of the cluster; "" if the host is lost."""
     if host == socket.gethostname():
         return tail(paths)
-    nodes = [node["NodeID"] for node in ray.nodes() if node["Alive"] and node["NodeManagerHostname"] == host]
+    nodes = [
+        node["NodeID"]
+        for node in ray.nodes()
+        if node["Alive"] and node["NodeManagerHostname"] == host
+    ]
     if not nodes:
         return ""
     there = NodeAffinitySchedulingStrategy(nodes[0], soft=False)

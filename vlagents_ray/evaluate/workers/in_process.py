@@ -31,11 +31,17 @@ _STACK_LINES = 6  # the innermost three calls
 class InProcessWorkers(Workers):
     """One worker, which plays while it is waited for.
 
-    A call that hangs is reported, but no time limit can end it. A signal ends it, with `KeyboardInterrupt`: the thread
-    that plays is the one that would look at the event of `stop_signals`.
+    A call that hangs is reported, but no time limit can end it. A signal ends it, with
+    `KeyboardInterrupt`: the thread that plays is the one that would look at the event of
+    `stop_signals`.
     """
 
-    def __init__(self, config: EvalConfig, agent_factory: AgentFactory, recorders: RecorderFactory = Recording) -> None:
+    def __init__(
+        self,
+        config: EvalConfig,
+        agent_factory: AgentFactory,
+        recorders: RecorderFactory = Recording,
+    ) -> None:
         super().__init__()
         self._config = config
         self._make = functools.partial(Rollout, config, agent_factory, recorders)
@@ -53,7 +59,9 @@ class InProcessWorkers(Workers):
 
     def start(self, cell: EvalCase) -> None:
         self._variables.enter_context(variables(cell.worker.runtime_env.get(VARIABLES) or {}))  # type: ignore[arg-type]
-        self._workers.append(WorkerHandle(cell.worker, cell.kind, actor=None, starting=self, started_at=0.0))
+        self._workers.append(
+            WorkerHandle(cell.worker, cell.kind, actor=None, starting=self, started_at=0.0)
+        )
 
     def dispatch(self, worker: WorkerHandle, jobs: tuple[Job, ...]) -> None:
         worker.jobs = jobs
@@ -91,7 +99,8 @@ def _exits_raised() -> Iterator[None]:
     end_process, process, thread = os._exit, os.getpid(), threading.get_ident()
 
     def end(status: int) -> NoReturn:
-        if (os.getpid(), threading.get_ident()) != (process, thread):  # a child, or the watcher of Ray
+        # A child, or the watcher of Ray.
+        if (os.getpid(), threading.get_ident()) != (process, thread):
             end_process(status)
         caller = sys._getframe(1)
         line = f"{os.path.basename(caller.f_code.co_filename)}:{caller.f_lineno}"
@@ -106,7 +115,9 @@ def _exits_raised() -> Iterator[None]:
 
 @contextlib.contextmanager
 def _hangs_reported(rollout: Rollout, config: EvalConfig) -> Iterator[None]:
-    """Log the line at which a phase of an episode has exceeded its time limit, once for each such phase."""
+    """Log the line at which a phase of an episode has exceeded its time limit, once for each
+    such phase.
+    """
     ended, limits_s = threading.Event(), phase_limits_s(config)
 
     def watch() -> None:
@@ -118,7 +129,8 @@ def _hangs_reported(rollout: Rollout, config: EvalConfig) -> Iterator[None]:
             if heartbeat.phase != "idle" and heartbeat.age_s > limit_s and phase != reported:
                 reported = phase
                 log.warning(
-                    "%s after %d steps has taken longer than %g s, and may hang; Ctrl-C ends the evaluation. It is "
+                    "%s after %d steps has taken longer than %g s, and may hang; Ctrl-C ends the "
+                    "evaluation. It is "
                     "at\n%s",
                     *phase,
                     limit_s,
@@ -133,7 +145,9 @@ def _hangs_reported(rollout: Rollout, config: EvalConfig) -> Iterator[None]:
 
 
 def workers_class(config: EvalConfig, stack: contextlib.ExitStack) -> Callable[..., Workers]:
-    """Return the class of the workers: without Ray if `config.workers` is 0, else in a cluster that `stack` leaves."""
+    """Return the class of the workers: without Ray if `config.workers` is 0, else in a cluster
+    that `stack` leaves.
+    """
     if config.workers == 0:
         return InProcessWorkers
     from vlagents_ray.evaluate.workers import cluster, pool

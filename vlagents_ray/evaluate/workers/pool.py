@@ -23,7 +23,13 @@ from vlagents_ray.evaluate.plan.cases import EvalCase
 from vlagents_ray.evaluate.plan.config import EvalConfig
 from vlagents_ray.evaluate.plan.jobs import Job
 from vlagents_ray.evaluate.workers.base import SIGNAL_S, WorkerHandle, Workers, phase_limits_s
-from vlagents_ray.evaluate.workers.cluster import CapacityMonitor, Placement, runtime_env, strategy, tail_at
+from vlagents_ray.evaluate.workers.cluster import (
+    CapacityMonitor,
+    Placement,
+    runtime_env,
+    strategy,
+    tail_at,
+)
 from vlagents_ray.evaluate.workers.rollout import AgentFactory, Heartbeat, Report, Rollout
 from vlagents_ray.ray_tools.head_monitor import HeadMonitor, head_is_gone
 
@@ -33,7 +39,8 @@ GRACE_S = 5.0  # s that a call past its deadline has to fail by itself
 KILL_S = 3.0  # s for Ray to register that workers are to be killed
 CLOSE_S = 10.0  # s for workers to close their simulators when they end
 MOST_FAILED_STARTS = 3  # in a row; workers that fail together, as with their node, count as one
-UNREACHABLE_S = 60.0  # s without further requests to a host that did not return a lost worker's logs
+# S without further requests to a host that did not return a lost worker's logs.
+UNREACHABLE_S = 60.0
 
 log = logging.getLogger(__name__)
 
@@ -41,21 +48,30 @@ log = logging.getLogger(__name__)
 class WorkerPool(Workers):
     """Up to `config.workers` workers. Use it as a context manager: its end kills every worker.
 
-    While the head of the cluster does not answer, the existing workers continue, and no others are started.
+    While the head of the cluster does not answer, the existing workers continue, and no others are
+    started.
     """
 
-    def __init__(self, config: EvalConfig, agent_factory: AgentFactory, recorders: RecorderFactory = Recording) -> None:
+    def __init__(
+        self,
+        config: EvalConfig,
+        agent_factory: AgentFactory,
+        recorders: RecorderFactory = Recording,
+    ) -> None:
         super().__init__()
         self._config, self._recorders = config, recorders
         self._actor_class = ray.remote(concurrency_groups={"watch": 1})(Rollout)
         self._agent_factory = agent_factory
         # from this process's environment, which workers on other nodes do not inherit
         self._credentials = Credentials()
-        self._head = HeadMonitor("what was played is kept: go on with --resume when there is a cluster again")
+        self._head = HeadMonitor(
+            "what was played is kept: go on with --resume when there is a cluster again"
+        )
         self._placement = Placement()
         self._failed_starts = 0
         self._failed_start = 0.0  # time of the last one
-        self._unreachable: dict[str, float] = {}  # by silent host: time until which no request is sent
+        # By silent host: time until which no request is sent.
+        self._unreachable: dict[str, float] = {}
         self._capacity = CapacityMonitor(config)
         self._limits_s = phase_limits_s(config)
         self._leaving: list[tuple[Any, float]] = []  # actors that are ending, and since when
@@ -64,8 +80,8 @@ class WorkerPool(Workers):
         if kind is ClusterLost:  # nothing can kill them; Ray ends them when the head is lost
             return
         actors = [worker.actor for worker in self._workers] + [actor for actor, _ in self._leaving]
-        # A Ray cluster that is being stopped, for instance with its job, does not answer; the results must still be
-        # kept.
+        # A Ray cluster that is being stopped, for instance with its job, does not answer; the
+        # results must still be kept.
         killing = threading.Thread(target=_kill, args=(actors,), daemon=True)
         killing.start()
         killing.join(KILL_S)
@@ -86,7 +102,9 @@ class WorkerPool(Workers):
         return True
 
     def start(self, cell: EvalCase) -> None:
-        node = self._placement.node(cell.policy.url, Counter(worker.node for worker in self._workers))
+        node = self._placement.node(
+            cell.policy.url, Counter(worker.node for worker in self._workers)
+        )
         options = {
             "num_cpus": cell.worker.cpus,
             "num_gpus": cell.worker.gpus,
@@ -94,9 +112,15 @@ class WorkerPool(Workers):
             "scheduling_strategy": strategy(node),
             "runtime_env": runtime_env(cell),
         }
-        actor = self._actor_class.options(**options).remote(self._config, self._agent_factory, self._recorders)
+        actor = self._actor_class.options(**options).remote(
+            self._config, self._agent_factory, self._recorders
+        )
         starting, now = actor.ready.remote(self._credentials), monotonic()
-        self._workers.append(WorkerHandle(cell.worker, cell.kind, actor, starting=starting, started_at=now, node=node))
+        self._workers.append(
+            WorkerHandle(
+                cell.worker, cell.kind, actor, starting=starting, started_at=now, node=node
+            )
+        )
 
     def dispatch(self, worker: WorkerHandle, jobs: tuple[Job, ...]) -> None:
         phase: Phase = "env reset" if worker.env_place == jobs[0].cell.place else "make"
@@ -106,7 +130,8 @@ class WorkerPool(Workers):
         worker.running = worker.actor.run.remote(jobs)
 
     def wait(self, timeout_s: float) -> Iterator[tuple[Job, Report]]:
-        """Yield the reports that arrive within `timeout_s`, including those of workers that died or hung.
+        """Yield the reports that arrive within `timeout_s`, including those of workers that died or
+        hung.
 
         Such a worker is killed, as is one that reports that its simulator broke.
 
@@ -114,10 +139,16 @@ class WorkerPool(Workers):
             ClusterLost: The head of the cluster has not answered for long.
         """
         self._head.answers()
-        refs = {ref: one for one in self._workers for ref in (one.starting, one.running, one.query) if ref is not None}
+        refs = {
+            ref: one
+            for one in self._workers
+            for ref in (one.starting, one.running, one.query)
+            if ref is not None
+        }
         if refs:
             done, waiting = ray.wait(list(refs), num_returns=1, timeout=timeout_s)
-            # take all that have arrived: each pass looks at every worker, so it must not serve only one
+            # take all that have arrived: each pass looks at every worker, so it must not serve only
+            # one
             if done and waiting:
                 done += ray.wait(waiting, num_returns=len(waiting), timeout=0)[0]
             for ref in done:
@@ -159,11 +190,18 @@ class WorkerPool(Workers):
                 reports = [Report(failure=Failure("worker", EnvFailed.code, reason))] * len(jobs)
             if reports[0].env is not None:
                 worker.env_place = jobs[0].cell.place
-            broken = [one.failure for one in reports if one.failure is not None and one.failure.cause == "worker"]
+            broken = [
+                one.failure
+                for one in reports
+                if one.failure is not None and one.failure.cause == "worker"
+            ]
             if broken:
                 self._kill_worker(worker)
                 with_log = self._with_log(broken[0], worker)
-                reports = [replace(one, failure=with_log) if one.failure in broken else one for one in reports]
+                reports = [
+                    replace(one, failure=with_log) if one.failure in broken else one
+                    for one in reports
+                ]
             yield from zip(jobs, reports, strict=True)
 
     def _started(self, worker: WorkerHandle) -> None:
@@ -173,7 +211,9 @@ class WorkerPool(Workers):
             if worker.started_at > self._failed_start:
                 self._failed_starts, self._failed_start = self._failed_starts + 1, monotonic()
             if self._failed_starts >= MOST_FAILED_STARTS:
-                raise EnvFailed(f"workers do not start, {self._failed_starts} in a row: {error}") from error
+                raise EnvFailed(
+                    f"workers do not start, {self._failed_starts} in a row: {error}"
+                ) from error
             self._kill_worker(worker)
         else:
             log.info("worker %s", worker.process)
@@ -186,7 +226,8 @@ class WorkerPool(Workers):
         now = monotonic()
         if self.busy:
             self._capacity.note_playing()
-        # Kill workers that do not end by themselves: they hold resources that their successors wait for.
+        # Kill workers that do not end by themselves: they hold resources that their successors wait
+        # for.
         for actor, since in self._leaving:
             if now - since > CLOSE_S:
                 ray.kill(actor)
@@ -194,11 +235,15 @@ class WorkerPool(Workers):
         for worker in list(self._workers):
             if worker.starting is not None:
                 if self._capacity.timed_out(worker.started_at) and self._head.answers():
-                    self._capacity.report_shortage(worker.config, sum(one.starting is None for one in self._workers))
+                    self._capacity.report_shortage(
+                        worker.config, sum(one.starting is None for one in self._workers)
+                    )
             elif worker.jobs:
                 if (reason := self._overdue(worker, now)) is not None:
                     self._kill_worker(worker)
-                    failure = self._with_log(Failure("worker", EnvFailed.code, reason, worker.heartbeat.stack), worker)
+                    failure = self._with_log(
+                        Failure("worker", EnvFailed.code, reason, worker.heartbeat.stack), worker
+                    )
                     yield from ((job, Report(failure=failure)) for job in worker.jobs)
                 elif worker.query is None and now - worker.queried_at > watch_s(len(self._workers)):
                     worker.queried_at = now
@@ -210,21 +255,29 @@ class WorkerPool(Workers):
         limit_s = self._limits_s.get(heartbeat.phase, env_s)
         if heartbeat.age_s > limit_s + GRACE_S:
             return (
-                f"{heartbeat.phase} after {heartbeat.steps} steps took longer than {limit_s:g} s; the worker was killed"
+                f"{heartbeat.phase} after {heartbeat.steps} steps took longer than {limit_s:g} "
+                "s; the worker was killed"
             )
-        # A simulator that hangs in C code holds the interpreter's lock, so that no call is answered.
+        # A simulator that hangs in C code holds the interpreter's lock, so that no call is
+        # answered.
         silent_s = now - worker.heartbeat_at
         if silent_s > max(limit_s, env_s) + GRACE_S + watch_s(len(self._workers)):
-            return f"no sign of life for {silent_s:.0f} s, last seen in {heartbeat.phase}; the worker was killed"
+            return (
+                f"no sign of life for {silent_s:.0f} s, last seen in {heartbeat.phase}; the "
+                "worker was killed"
+            )
         return None
 
     def _with_log(self, failure: Failure, worker: WorkerHandle) -> Failure:
-        """Add the worker's log to the failure; a lost node is awaited only once, whatever its number of workers."""
+        """Add the worker's log to the failure; a lost node is awaited only once, whatever its
+        number of workers.
+        """
         host: str = worker.process["host"]
         if monotonic() < self._unreachable.get(host, 0.0) or not self._head.answers():
             return failure
         sleep(SIGNAL_S)
-        if head_is_gone():  # Slurm signals all of a job at once; Ray's calls would block until it kills this process
+        # Slurm signals all of a job at once; Ray's calls would block until it kills this process.
+        if head_is_gone():
             return failure
         try:
             return replace(failure, log=tail_at(host, worker.process["logs"]))
@@ -240,7 +293,8 @@ def watch_s(workers: int) -> float:
 
 def _kill(actors: list[Any]) -> None:
     for actor in actors:
-        if not ray.is_initialized():  # `__exit__` has stopped waiting; a call to Ray now would start another cluster
+        # `__exit__` has stopped waiting; a call to Ray now would start another cluster.
+        if not ray.is_initialized():
             return
         with contextlib.suppress(RayError):  # it ends with this process in any case
             ray.kill(actor)

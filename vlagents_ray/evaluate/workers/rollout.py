@@ -1,7 +1,8 @@
-"""The code of a worker process: an environment or a batch of them, an agent, and one episode after another.
+"""The code of a worker process: an environment or a batch of them, an agent, and one episode after
+another.
 
-`Rollout` is plain Python; `vlagents_ray.evaluate.workers.pool` makes a Ray actor of it. It reports the failures of an
-episode instead of raising them, so that no exception has to survive pickling.
+`Rollout` is plain Python; `vlagents_ray.evaluate.workers.pool` makes a Ray actor of it. It reports
+the failures of an episode instead of raising them, so that no exception has to survive pickling.
 """
 
 from __future__ import annotations
@@ -28,9 +29,20 @@ from vlagents_ray.envs import make_env
 from vlagents_ray.envs.base import BatchEnv, SequentialBatch, make_batch
 from vlagents_ray.envs.graphics import require_own
 from vlagents_ray.errors import ConfigError, EnvFailed, MissingDependency, VLAgentsError
-from vlagents_ray.evaluate.artifacts.recorder import Artifacts, EpisodeRecorder, RecorderFactory, Recording
+from vlagents_ray.evaluate.artifacts.recorder import (
+    Artifacts,
+    EpisodeRecorder,
+    RecorderFactory,
+    Recording,
+)
 from vlagents_ray.evaluate.episode import episode
-from vlagents_ray.evaluate.episode.failures import Failure, env_side, explain, explain_batch, policy_side
+from vlagents_ray.evaluate.episode.failures import (
+    Failure,
+    env_side,
+    explain,
+    explain_batch,
+    policy_side,
+)
 from vlagents_ray.evaluate.episode.records import EnvInfo, EpisodeResult, WorkerInfo
 from vlagents_ray.evaluate.plan.cases import EvalCase, env_program
 from vlagents_ray.evaluate.plan.config import EvalConfig, PolicyConfig
@@ -70,7 +82,8 @@ class Report:
     failure: Failure | None = None
     artifacts: Artifacts = field(default_factory=Artifacts)
     env: EnvInfo | None = None  # if an environment was made for the job
-    policy: dict[str, Any] | None = None  # metadata of the policy ({} for a local one), if the connection is new
+    # Metadata of the policy ({} for a local one), if the connection is new.
+    policy: dict[str, Any] | None = None
     worker: WorkerInfo | None = None  # if `env` or `policy` is new
 
 
@@ -87,7 +100,12 @@ class Heartbeat:
 class Rollout:
     """Plays jobs. Keeps its agent and its environment until a job needs another."""
 
-    def __init__(self, config: EvalConfig, agent_factory: AgentFactory, recorders: RecorderFactory = Recording) -> None:
+    def __init__(
+        self,
+        config: EvalConfig,
+        agent_factory: AgentFactory,
+        recorders: RecorderFactory = Recording,
+    ) -> None:
         self._config, self._agent_factory, self._recorders = config, agent_factory, recorders
         self._agent: Agent | None = None
         self._policy: str | None = None  # the policy of the agent
@@ -104,21 +122,31 @@ class Rollout:
     def ready(self, credentials: Credentials) -> dict[str, Any]:
         """Return the process's host and id, and its log files, as soon as it runs.
 
-        The driver's API key is passed by this call, which goes straight to this process: the cluster's head stores the
-        arguments of an actor's constructor, and logs its runtime environment.
+        The driver's API key is passed by this call, which goes straight to this process: the
+        cluster's head stores the arguments of an actor's constructor, and logs its runtime
+        environment.
         """
         credentials.become_default()
-        return {"pid": os.getpid(), "host": socket.gethostname(), "node": this_node(), "logs": own_logs()}
+        return {
+            "pid": os.getpid(),
+            "host": socket.gethostname(),
+            "node": this_node(),
+            "logs": own_logs(),
+        }
 
     def progress(self) -> Heartbeat:
         """Return the current phase; called from another thread during `run`."""
         phase, since, steps = self._current_phase
         age_s = monotonic() - since
         frame = sys._current_frames().get(self._thread) if age_s > LONG_S else None
-        return Heartbeat(phase, age_s, steps, "".join(traceback.format_stack(frame)) if frame else "")
+        return Heartbeat(
+            phase, age_s, steps, "".join(traceback.format_stack(frame)) if frame else ""
+        )
 
     def run(self, jobs: tuple[Job, ...]) -> list[Report]:
-        """Play the episodes of one cell, in parallel if there are several; return a report for each."""
+        """Play the episodes of one cell, in parallel if there are several; return a report for
+        each.
+        """
         self._thread = threading.get_ident()
         found: dict[str, Any] = {}  # fields of the first report, whatever the outcome
         try:
@@ -127,7 +155,9 @@ class Rollout:
             reports = [Report(failure=explain_batch(error, len(jobs)))] * len(jobs)
         finally:
             self._set_phase("idle", 0)
-        if any(report.failure is not None and report.failure.cause == "policy" for report in reports):
+        if any(
+            report.failure is not None and report.failure.cause == "policy" for report in reports
+        ):
             self._broken_agents += 1
             self._drop_agent()
         elif any(report.result is not None for report in reports):
@@ -158,8 +188,13 @@ class Rollout:
             require_match(agent.contract, env.contract, f"{cell.policy.name!r} in {cell.env!r}: ")
             if (renderer := env.renderer()) is not None:
                 require_own(renderer)
-            name, where = None if renderer is None else renderer.name, (socket.gethostname(), this_node(), os.getpid())
-            found["worker"] = WorkerInfo(*where, cell.policy.name, episode.transport_of(agent), name)
+            name, where = (
+                None if renderer is None else renderer.name,
+                (socket.gethostname(), this_node(), os.getpid()),
+            )
+            found["worker"] = WorkerInfo(
+                *where, cell.policy.name, episode.transport_of(agent), name
+            )
         with contextlib.ExitStack() as stack:
             made = (self._recorders(self._config, env.contract.control_hz) for _ in jobs)
             recordings = [stack.enter_context(contextlib.closing(one)) for one in made]
@@ -175,24 +210,34 @@ class Rollout:
                 policy_options=cell.policy_options,
                 observers=recordings,
                 watch=self._set_phase,
-                images=wanted == "all" or (wanted == "failures" and self._renders_at_once(agent, env, cell.policy)),
+                images=wanted == "all"
+                or (wanted == "failures" and self._renders_at_once(agent, env, cell.policy)),
             )
             reports = []
             for job, outcome, recording in zip(jobs, outcomes, recordings, strict=True):
                 if isinstance(outcome, EpisodeResult):
-                    report = Report(result=outcome, artifacts=self._finished(env, job, outcome, recording))
+                    report = Report(
+                        result=outcome, artifacts=self._finished(env, job, outcome, recording)
+                    )
                 elif isinstance(outcome, episode.Diverged):
-                    report = Report(failure=replace(explain(outcome.error), diverged=outcome.result))
+                    report = Report(
+                        failure=replace(explain(outcome.error), diverged=outcome.result)
+                    )
                 else:
                     report = Report(failure=explain(outcome))
                 reports.append(report)
             return reports
 
-    def _finished(self, env: BatchEnv, job: Job, result: EpisodeResult, recording: EpisodeRecorder) -> Artifacts:
+    def _finished(
+        self, env: BatchEnv, job: Job, result: EpisodeResult, recording: EpisodeRecorder
+    ) -> Artifacts:
         """Return the artifacts of an episode; if images are missing, play it again."""
         options = episode.options_of_reset(env, job.key.episode, job.cell.suite.reset_options)
         kept = recording.finish(
-            result, lambda played, record: played.play_again(env, job.key.seed, options, self._set_phase, record)
+            result,
+            lambda played, record: played.play_again(
+                env, job.key.seed, options, self._set_phase, record
+            ),
         )
         self._repeatable = self._repeatable and kept.not_repeatable is None
         self._surplus += 1 if result.success_once else -1
@@ -201,17 +246,26 @@ class Rollout:
     def _renders_at_once(self, agent: Agent, env: BatchEnv, policy: PolicyConfig) -> bool:
         """Return whether each step is rendered as it is played, if only failures need images.
 
-        The alternative is to play the failed ones again. That saves nothing if the policy gets each image, and costs
-        more than it saves if most fail; environments that one simulator runs together cannot be played again alone.
+        The alternative is to play the failed ones again. That saves nothing if the policy gets each
+        image, and costs more than it saves if most fail; environments that one simulator runs
+        together cannot be played again alone.
         """
         rows = policy.execute or (agent.contract.chunk if agent.contract is not None else None)
-        return rows == 1 or self._surplus < 0 or not self._repeatable or not isinstance(env, SequentialBatch)
+        return (
+            rows == 1
+            or self._surplus < 0
+            or not self._repeatable
+            or not isinstance(env, SequentialBatch)
+        )
 
     def _sessions_of(self, agent: Agent, env: BatchEnv, number: int) -> list[Agent]:
         if env.num_envs == 1:
             return [agent]
         if (sessions := getattr(agent, "sessions", None)) is None:
-            raise ConfigError("num_envs: got more than 1 for a policy in the worker's own process; give it a `url`")
+            raise ConfigError(
+                "num_envs: got more than 1 for a policy in the worker's own process; give it a "
+                "`url`"
+            )
         if number > len(self._sessions):
             self._sessions += sessions(number - len(self._sessions))
         return self._sessions[:number]
@@ -229,7 +283,8 @@ class Rollout:
         try:
             with policy_side("initialize"), used_checkpoints() as found:
                 agent.initialize()
-                _metadata(agent)  # fetches the metadata, which checks that the server runs and has the policy
+                # Fetches the metadata, which checks that the server runs and has the policy.
+                _metadata(agent)
         except VLAgentsError:
             agent.close()
             raise
@@ -277,7 +332,9 @@ def _metadata(agent: Agent) -> dict[str, Any]:
 
 
 def own_logs() -> list[str]:
-    """Return the files of this process's standard output and error; in a Ray worker, Ray's log files."""
+    """Return the files of this process's standard output and error; in a Ray worker, Ray's log
+    files.
+    """
     found = []
     for number in (1, 2):
         with contextlib.suppress(OSError):  # no /proc
@@ -285,18 +342,27 @@ def own_logs() -> list[str]:
     return [path for path in dict.fromkeys(found) if Path(path).is_file()]
 
 
-def agents(config: EvalConfig, own: OwnAgents = None, rank: RankName = "simulation") -> AgentFactory:
-    """Return the factory that a worker calls: `own`, that of a policy's name in it, or one of `RemoteAgent`s."""
+def agents(
+    config: EvalConfig, own: OwnAgents = None, rank: RankName = "simulation"
+) -> AgentFactory:
+    """Return the factory that a worker calls: `own`, that of a policy's name in it, or one of
+    `RemoteAgent`s.
+    """
     if callable(own):
         return lambda _policy: own()
     made = own or {}
     for policy in config.policies:
         if policy.url is None and policy.name not in made:
-            raise ConfigError(f"policy {policy.name!r}: got no url, want that of its server, as http://localhost:8000")
+            raise ConfigError(
+                f"policy {policy.name!r}: got no url, want that of its server, as "
+                "http://localhost:8000"
+            )
     return functools.partial(_agent, config, made, rank)
 
 
-def _agent(config: EvalConfig, own: Mapping[str, Callable[[], Agent]], rank: RankName, policy: PolicyConfig) -> Agent:
+def _agent(
+    config: EvalConfig, own: Mapping[str, Callable[[], Agent]], rank: RankName, policy: PolicyConfig
+) -> Agent:
     if policy.name in own:
         return own[policy.name]()
     return RemoteAgent(
@@ -306,12 +372,15 @@ def _agent(config: EvalConfig, own: Mapping[str, Callable[[], Agent]], rank: Ran
         connect_timeout_s=config.connect_timeout_s,
         codec=policy.codec,
         rank=rank,
-        resume=False,  # an interrupted episode is played again, so that its result depends only on its key
+        # An interrupted episode is played again, so that its result depends only on its key.
+        resume=False,
     )
 
 
 def factory_programs(config: EvalConfig, own: OwnAgents) -> dict[str, Program]:
-    """Return the files of the agents that are made in the workers, by policy; served policies state theirs."""
+    """Return the files of the agents that are made in the workers, by policy; served policies
+    state theirs.
+    """
     if callable(own):
         program = factory_program(own)
         return {policy.name: program for policy in config.policies}
@@ -319,7 +388,9 @@ def factory_programs(config: EvalConfig, own: OwnAgents) -> dict[str, Program]:
 
 
 def factory_program(make: Callable[[], Agent]) -> Program:
-    """Return the files of the module that defines `make`, and those that the arguments of a `partial` name."""
+    """Return the files of the module that defines `make`, and those that the arguments of a
+    `partial` name.
+    """
     settings: dict[str, Any] = {}
     if isinstance(make, functools.partial):
         settings = {**{str(i): value for i, value in enumerate(make.args)}, **make.keywords}

@@ -24,7 +24,8 @@ log = logging.getLogger(__name__)
 STEP = "{step}"  # the placeholder in a checkpoint's name
 _HUB_ID = re.compile(r"[\w.-]+/[\w.-]+")
 _INDEX = ".safetensors.index.json"
-_COMPARED = 64  # compared elements of each tensor: enough to distinguish trained weights from random ones
+# Compared elements of each tensor: enough to distinguish trained weights from random ones.
+_COMPARED = 64
 _LISTED = 8
 
 
@@ -38,7 +39,9 @@ _used: ContextVar[list[Path] | None] = ContextVar("_used", default=None)
 
 @contextmanager
 def used_checkpoints() -> Iterator[list[Path]]:
-    """Yield a list of the paths that `find_checkpoint` finds in this context; a path within another replaces it."""
+    """Yield a list of the paths that `find_checkpoint` finds in this context; a path within
+    another replaces it.
+    """
     found: list[Path] = []
     token = _used.set(found)
     try:
@@ -48,11 +51,14 @@ def used_checkpoints() -> Iterator[list[Path]]:
 
 
 def find_checkpoint(name: str, step: int | None = None, needs: Iterable[str] = ()) -> Path:
-    """Return the folder or file of a checkpoint: a path on this machine, or a hub id, downloaded if it is not cached.
+    """Return the folder or file of a checkpoint: a path on this machine, or a hub id, downloaded if
+    it is not cached.
 
     Args:
-        name: The path, or a hub id, optionally with a commit, a tag or a branch: `org/name@REVISION`.
-        step: Replaces `{step}` in `name`, with leading zeros to six digits if only that path exists.
+        name: The path, or a hub id, optionally with a commit, a tag or a branch:
+            `org/name@REVISION`.
+        step: Replaces `{step}` in `name`, with leading zeros to six digits if only that path
+            exists.
         needs: Files (or glob patterns) that a folder must hold.
 
     Raises:
@@ -67,7 +73,8 @@ def find_checkpoint(name: str, step: int | None = None, needs: Iterable[str] = (
         path = _from_hub(name)
     if path.is_dir() and (missing := [pattern for pattern in needs if not any(path.glob(pattern))]):
         raise ConfigError(
-            f"checkpoint {path}: misses {missing}, has {sorted(p.name for p in path.iterdir())[:20]}; "
+            f"checkpoint {path}: misses {missing}, has "
+            f"{sorted(p.name for p in path.iterdir())[:20]}; "
             f"is it a checkpoint of this family, and whole?"
         )
     if (used := _used.get()) is not None and path not in used:
@@ -76,7 +83,9 @@ def find_checkpoint(name: str, step: int | None = None, needs: Iterable[str] = (
 
 
 def _holds(folder: Path, path: Path) -> bool:
-    """Return whether `path` is in the folder, or is the folder under another name, as behind a link `last`."""
+    """Return whether `path` is in the folder, or is the folder under another name, as behind a
+    link `last`.
+    """
     if not folder.is_dir():
         return False
     # A file in the hub's cache is a link to a place outside of its folder.
@@ -84,7 +93,9 @@ def _holds(folder: Path, path: Path) -> bool:
     return any(folder.resolve() in (place, *place.parents) for place in places)
 
 
-def find_adapter(source: str, checkpoint: str, base: Sequence[Path], digest_of_base: str) -> tuple[Adapter, Path]:
+def find_adapter(
+    source: str, checkpoint: str, base: Sequence[Path], digest_of_base: str
+) -> tuple[Adapter, Path]:
     """Find a LoRA adapter.
 
     Args:
@@ -101,28 +112,39 @@ def find_adapter(source: str, checkpoint: str, base: Sequence[Path], digest_of_b
     """
     folder = find_checkpoint(source, needs=FILES)
     if not folder.is_dir():
-        raise ConfigError(f"{folder}: got a file, want the folder with {', '.join(FILES)}, as PEFT saves it")
+        raise ConfigError(
+            f"{folder}: got a file, want the folder with {', '.join(FILES)}, as PEFT saves it"
+        )
     trained_on = base_of(folder)
     if trained_on is not None and _is_other(trained_on, checkpoint, base, digest_of_base):
         raise ConfigError(
-            f"{folder}: was trained on {trained_on!r}, want an adapter of {checkpoint!r}, the policy's checkpoint; "
-            f"if these are the same weights, name it so as base_model_name_or_path in its adapter_config.json"
+            f"{folder}: was trained on {trained_on!r}, want an adapter of {checkpoint!r}, the "
+            "policy's checkpoint; "
+            "if these are the same weights, name it so as base_model_name_or_path in its "
+            "adapter_config.json"
         )
     own = digest([folder])
     both = hashlib.sha256(f"{digest_of_base} {own}".encode()).hexdigest()
-    return Adapter(source, f"{own.partition(':')[0]}:{both}", both[:DIGITS], revision(folder)), folder
+    return Adapter(
+        source, f"{own.partition(':')[0]}:{both}", both[:DIGITS], revision(folder)
+    ), folder
 
 
 def _is_other(trained_on: str, checkpoint: str, base: Sequence[Path], digest_of_base: str) -> bool:
-    """Return whether the base that an adapter names is known to differ from `checkpoint`, at the paths `base`."""
-    path = Path(os.path.expanduser(trained_on))  # unlike Path's own methods, os.path raises neither for
+    """Return whether the base that an adapter names is known to differ from `checkpoint`, at the
+    paths `base`.
+    """
+    # Unlike Path's own methods, os.path raises neither for.
+    path = Path(os.path.expanduser(trained_on))
     if os.path.exists(path):  # unknown users nor for folders that are not visible here
         ours = {parent for one in base for parent in (one.resolve(), *one.resolve().parents)}
         return path.resolve() not in ours and digest([path]) != digest_of_base
     names = [name.partition("@")[0] for name in (trained_on, checkpoint)]
     if all(_HUB_ID.fullmatch(name) for name in names) and not Path(checkpoint).exists():
         return names[0] != names[1]
-    log.warning("adapter: whether its base %r is the checkpoint %r cannot be told from their names", *names)
+    log.warning(
+        "adapter: whether its base %r is the checkpoint %r cannot be told from their names", *names
+    )
     return False
 
 
@@ -137,18 +159,23 @@ def _from_hub(name: str) -> Path:
     hub = require("huggingface_hub")
     repository, at, wanted = name.partition("@")
     if at and not wanted:
-        raise ConfigError(f"checkpoint {name!r}: got no revision after the @, want a commit, a tag or a branch")
+        raise ConfigError(
+            f"checkpoint {name!r}: got no revision after the @, want a commit, a tag or a branch"
+        )
     try:
         path = Path(hub.snapshot_download(repository, revision=wanted or None))
     except Exception as error:  # of many classes: no such id, no access, no network, offline mode
         if type(error).__name__ == "RevisionNotFoundError":
             raise ConfigError(
-                f"checkpoint {name!r}: {repository} has no revision {wanted!r}, want one of its commits, or of its "
+                f"checkpoint {name!r}: {repository} has no revision {wanted!r}, want one of its "
+                "commits, or of its "
                 f"branches and tags, which are {_revisions(hub, repository)}"
             ) from error
         raise ConfigError(
-            f"checkpoint {name!r}: neither a path here nor to be had from the hub ({type(error).__name__}); "
-            f"download it to a folder and name that, or check the id (org/name or org/name@COMMIT), the network and "
+            f"checkpoint {name!r}: neither a path here nor to be had from the hub "
+            f"({type(error).__name__}); "
+            "download it to a folder and name that, or check the id (org/name or "
+            "org/name@COMMIT), the network and "
             f"your token"
         ) from error
     log.info("checkpoint %s: commit %s", name, path.name)
@@ -188,20 +215,28 @@ def _safetensors(folder: Path) -> list[Path]:
     for index in sorted(folder.glob(f"*{_INDEX}")):
         names = set(json.loads(index.read_text(encoding="utf-8"))["weight_map"].values())
         if absent := sorted(name for name in names if not (folder / name).is_file()):
-            raise ConfigError(f"checkpoint {folder}: {index.name} names {absent}, which are missing; copy all of it")
+            raise ConfigError(
+                f"checkpoint {folder}: {index.name} names {absent}, which are missing; copy all of "
+                "it"
+            )
         return [folder / name for name in sorted(names)]
     found = sorted(folder.glob("*.safetensors"))
     if len(found) != 1:
-        raise ConfigError(f"checkpoint {folder}: got {[p.name for p in found]}, want one .safetensors file or an index")
+        raise ConfigError(
+            f"checkpoint {folder}: got {[p.name for p in found]}, want one .safetensors file or an "
+            "index"
+        )
     return found
 
 
 def require_loaded(model: Any, saved: SavedTensors | Mapping[str, Any]) -> None:
-    """Raise `ConfigError` unless every parameter and saved buffer of `model` has the checkpoint's value.
+    """Raise `ConfigError` unless every parameter and saved buffer of `model` has the checkpoint's
+    value.
 
-    Names and shapes are compared, and 64 elements of each tensor, up to the model's dtype. A parameter that is tied to
-    another one may be absent. Some libraries continue with random weights if they cannot load the
-    checkpoint's: the result looks like a bad policy, and is hard to diagnose.
+    Names and shapes are compared, and 64 elements of each tensor, up to the model's dtype. A
+    parameter that is tied to another one may be absent. Some libraries continue with random weights
+    if they cannot load the checkpoint's: the result looks like a bad policy, and is hard to
+    diagnose.
     """
     torch = require("torch")
     names = set(saved)
@@ -211,51 +246,70 @@ def require_loaded(model: Any, saved: SavedTensors | Mapping[str, Any]) -> None:
         tied.setdefault(tensor.data_ptr() if tensor.numel() else id(tensor), set()).add(name)
     absent, different = [], []
     for name, tensor in state.items():
-        source = next((n for n in (name, *sorted(tied.get(tensor.data_ptr(), ()))) if n in names), None)
+        source = next(
+            (n for n in (name, *sorted(tied.get(tensor.data_ptr(), ()))) if n in names), None
+        )
         if source is None:
             absent.append(name)
         elif not _same(torch, tensor.detach(), saved[source]):
             different.append(name)
     if absent or different:
         raise ConfigError(
-            f"the checkpoint does not fill the model: {len(absent)} parameters are not in it {absent[:_LISTED]}, "
-            f"{len(different)} are not what it holds {different[:_LISTED]}; it has {len(names)}, the model "
+            f"the checkpoint does not fill the model: {len(absent)} parameters are not in it "
+            f"{absent[:_LISTED]}, "
+            f"{len(different)} are not what it holds {different[:_LISTED]}; it has {len(names)}, "
+            "the model "
             f"{len(state)}: is it a checkpoint of this model and this version of its library?"
         )
 
 
 def from_pretrained(cls: Any, path: Path, **options: Any) -> Any:
-    """Return `cls.from_pretrained(path, **options)`; raises `ConfigError` if a parameter is not in the checkpoint.
+    """Return `cls.from_pretrained(path, **options)`; raises `ConfigError` if a parameter is not in
+    the checkpoint.
 
-    From version 5 on transformers renames parameters as it reads them, so `require_loaded`, which compares names,
-    cannot check its models; but transformers reports the parameters without values.
+    From version 5 on transformers renames parameters as it reads them, so `require_loaded`, which
+    compares names, cannot check its models; but transformers reports the parameters without values.
     """
     try:
         model, said = cls.from_pretrained(path, output_loading_info=True, **options)
-    except (OSError, RuntimeError, ValueError) as error:  # raised for files that are incomplete or in another format
-        raise ConfigError(f"checkpoint {path}: {cls.__name__} does not load: {str(error).strip()[:500]}") from error
-    lacks = {key: sorted(map(str, said[key]))[:_LISTED] for key in ("missing_keys", "mismatched_keys") if said[key]}
+    except (OSError, RuntimeError, ValueError) as error:
+        # raised for files that are incomplete or in another format
+        raise ConfigError(
+            f"checkpoint {path}: {cls.__name__} does not load: {str(error).strip()[:500]}"
+        ) from error
+    lacks = {
+        key: sorted(map(str, said[key]))[:_LISTED]
+        for key in ("missing_keys", "mismatched_keys")
+        if said[key]
+    }
     if lacks:
         raise ConfigError(
-            f"checkpoint {path}: it does not fill {cls.__name__}: {lacks}; is it a checkpoint of this model?"
+            f"checkpoint {path}: it does not fill {cls.__name__}: {lacks}; is it a checkpoint of "
+            "this model?"
         )
     return model
 
 
 def require_filled(params: Mapping[str, Any], wanted: Mapping[str, Any]) -> None:
-    """Raise `ConfigError` unless the nested `params` are arrays with exactly the names and shapes in `wanted`.
+    """Raise `ConfigError` unless the nested `params` are arrays with exactly the names and shapes
+    in `wanted`.
 
     This check is for JAX, whose loaders return only values from the checkpoint.
     """
     have, want = dict(_leaves(params)), dict(_leaves(wanted))
     absent = sorted(name for name in want if not hasattr(have.get(name), "__array__"))
     unknown = sorted(set(have) - set(want))
-    different = sorted(name for name in want if name not in absent and have[name].shape != want[name].shape)
+    different = sorted(
+        name for name in want if name not in absent and have[name].shape != want[name].shape
+    )
     if absent or unknown or different:
         raise ConfigError(
-            f"the checkpoint does not fill the model: {len(absent)} parameters are not in it {absent[:_LISTED]}, "
-            f"{len(different)} have another shape {different[:_LISTED]}, {len(unknown)} are not the model's "
-            f"{unknown[:_LISTED]}: is it a checkpoint of this model and this version of its library?"
+            f"the checkpoint does not fill the model: {len(absent)} parameters are not in it "
+            f"{absent[:_LISTED]}, "
+            f"{len(different)} have another shape {different[:_LISTED]}, {len(unknown)} are not "
+            "the model's "
+            f"{unknown[:_LISTED]}: is it a checkpoint of this model and this version of its "
+            "library?"
         )
 
 

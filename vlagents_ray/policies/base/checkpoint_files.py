@@ -1,7 +1,8 @@
-"""Checks of a checkpoint's files without a model: whether they are complete, and which weights they hold.
+"""Checks of a checkpoint's files without a model: whether they are complete, and which weights they
+hold.
 
-`unfinished` examines only the files, and reports nothing in doubt. `weights_of` identifies weights by a digest
-that takes seconds, and by the commit on the hub.
+`unfinished` examines only the files, and reports nothing in doubt. `weights_of` identifies weights
+by a digest that takes seconds, and by the commit on the hub.
 """
 
 from __future__ import annotations
@@ -19,24 +20,37 @@ from pathlib import Path
 from typing import BinaryIO
 
 # Names that trainers give to files in progress: orbax' folders, and the usual suffixes.
-TEMPORARY = ("*.orbax-checkpoint-tmp*", "*.tmp", "*.tmp-*", "*.part", "*.partial", "*.incomplete", "tmp-*", ".tmp*")
+TEMPORARY = (
+    "*.orbax-checkpoint-tmp*",
+    "*.tmp",
+    "*.tmp-*",
+    "*.part",
+    "*.partial",
+    "*.incomplete",
+    "tmp-*",
+    ".tmp*",
+)
 
-_TEXT = (".json", ".yaml", ".yml", ".txt", ".md", ".jinja")  # written along with weights, and often before them
+# Written along with weights, and often before them.
+_TEXT = (".json", ".yaml", ".yml", ".txt", ".md", ".jinja")
 
 METHOD = "sampled-sha256"
 _WHOLE = 2**20  # bytes; a file up to this size is read in full
 _BLOCK, _BLOCKS = 4096, 256
 _LONGEST_HEADER = 10**8  # bytes; the limit of safetensors
 _COMMIT = re.compile(r"[0-9a-f]{40}")
-_BESIDE = (".md", ".gitattributes", ".log")  # files about a checkpoint, which do not affect its behaviour
+# Files about a checkpoint, which do not affect its behaviour.
+_BESIDE = (".md", ".gitattributes", ".log")
 
 
 def unfinished(path: Path) -> str | None:
-    """Return the sign that a checkpoint, a file or a folder, is incomplete; None if there is no sign.
+    """Return the sign that a checkpoint, a file or a folder, is incomplete; None if there is no
+    sign.
 
-    A .safetensors file must have the length in its header, an index may name only existing files, JSON must be valid,
-    and a zip file, as written by torch.save, must end with its directory. Files of other kinds give no sign: the caller
-    must also check that they no longer grow. A folder without weights is incomplete.
+    A .safetensors file must have the length in its header, an index may name only existing files,
+    JSON must be valid, and a zip file, as written by torch.save, must end with its directory. Files
+    of other kinds give no sign: the caller must also check that they no longer grow. A folder
+    without weights is incomplete.
     """
     try:
         entries = [path, *sorted(path.rglob("*"))] if path.is_dir() else [path]
@@ -100,7 +114,11 @@ def _zip(file: Path) -> str | None:
         begins = opened.read(4)
     if not begins:
         return "is empty"
-    return "is a zip file without its end" if begins == b"PK\x03\x04" and not zipfile.is_zipfile(file) else None
+    return (
+        "is a zip file without its end"
+        if begins == b"PK\x03\x04" and not zipfile.is_zipfile(file)
+        else None
+    )
 
 
 _CHECKS: dict[str, Callable[[Path], str | None]] = {
@@ -115,22 +133,27 @@ _CHECKS: dict[str, Callable[[Path], str | None]] = {
 
 
 def weights_of(paths: Sequence[Path]) -> dict[str, str | None] | None:
-    """Return `Agent.weights_id` of files and folders, of which the first is the policy's own; None if there are none.
+    """Return `Agent.weights_id` of files and folders, of which the first is the policy's own; None
+    if there are none.
 
-    The digest covers all of them, the revision only the first: later ones, such as an encoder's, may come from another
-    repository.
+    The digest covers all of them, the revision only the first: later ones, such as an encoder's,
+    may come from another repository.
     """
     return {"digest": digest(paths), "revision": revision(paths[0])} if paths else None
 
 
 def digest(paths: Iterable[Path]) -> str:
-    """Return `sampled-sha256:` and 64 hexadecimal digits, which are equal for equal files with equal names.
+    """Return `sampled-sha256:` and 64 hexadecimal digits, which are equal for equal files with
+    equal names.
 
-    The digest covers the name and the size of each file, in a folder sorted by name, and part of its
-    content: all of it up to 1 MiB; of a larger .safetensors file the header and 4 KiB in the middle of each tensor; of
-    a zip file, as written by torch.save, the directory with the CRC-32 of each part; of any other file 256 blocks of 4
-    KiB at equal distances. Different weights, statistics or settings therefore have different digests, but a deliberate
-    change of a few bytes may go unnoticed. Hidden files and READMEs do not count.
+    The digest covers the name and the size of each file, in a folder sorted by name, and part of
+    its
+    content: all of it up to 1 MiB; of a larger .safetensors file the header and 4 KiB in the middle
+        of each tensor; of
+    a zip file, as written by torch.save, the directory with the CRC-32 of each part; of any other
+    file 256 blocks of 4 KiB at equal distances. Different weights, statistics or settings therefore
+    have different digests, but a deliberate change of a few bytes may go unnoticed. Hidden files
+    and READMEs do not count.
     """
     found = hashlib.sha256()
     for path in paths:
@@ -146,7 +169,9 @@ def digest(paths: Iterable[Path]) -> str:
 
 
 def revision(path: Path) -> str | None:
-    """Return the commit of the hub's repository if `path` is in a snapshot of the hub's cache, else None."""
+    """Return the commit of the hub's repository if `path` is in a snapshot of the hub's cache,
+    else None.
+    """
     parts = path.absolute().parts
     commits = [commit for folder, commit in itertools.pairwise(parts) if folder == "snapshots"]
     return next((commit for commit in commits if _COMMIT.fullmatch(commit)), None)
@@ -160,7 +185,9 @@ def files_in(path: Path) -> list[Path]:
 
 
 def _below(folder: Path, above: frozenset[str]) -> Iterator[Path]:
-    """Yield the files of a folder that count, following links as loaders do; `above` are the folder's parents."""
+    """Yield the files of a folder that count, following links as loaders do; `above` are the
+    folder's parents.
+    """
     within = above | {os.path.realpath(folder)}
     with contextlib.suppress(OSError):  # unreadable or gone
         for entry in list(folder.iterdir()):
@@ -184,7 +211,9 @@ def _parts(file: Path, opened: BinaryIO, size: int) -> Iterator[bytes]:
             yield opened.read(length)
     elif zipfile.is_zipfile(file):
         with contextlib.suppress(zipfile.BadZipFile), zipfile.ZipFile(file) as archive:
-            yield json.dumps([[one.filename, one.file_size, one.CRC] for one in archive.infolist()]).encode()
+            yield json.dumps(
+                [[one.filename, one.file_size, one.CRC] for one in archive.infolist()]
+            ).encode()
     else:
         for i in range(_BLOCKS):
             opened.seek((size - _BLOCK) * i // (_BLOCKS - 1))
@@ -192,7 +221,8 @@ def _parts(file: Path, opened: BinaryIO, size: int) -> Iterator[bytes]:
 
 
 def _header(opened: BinaryIO) -> tuple[bytes, list[tuple[int, int]]] | None:
-    """Return the header of a .safetensors file, and the start and length of a block in the middle of each tensor.
+    """Return the header of a .safetensors file, and the start and length of a block in the middle
+    of each tensor.
 
     Returns None if the file has another format.
     """
@@ -200,7 +230,10 @@ def _header(opened: BinaryIO) -> tuple[bytes, list[tuple[int, int]]] | None:
         return None
     text = opened.read(length)
     try:
-        blocks = [(max(begin, (begin + end - _BLOCK) // 2), min(_BLOCK, end - begin)) for begin, end in _places(text)]
+        blocks = [
+            (max(begin, (begin + end - _BLOCK) // 2), min(_BLOCK, end - begin))
+            for begin, end in _places(text)
+        ]
     except (ValueError, KeyError, TypeError, AttributeError):
         return None
     return text, [(8 + length + start, size) for start, size in blocks]

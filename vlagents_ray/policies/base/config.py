@@ -17,80 +17,115 @@ NoiseLevel = Annotated[
     float,
     Field(
         ge=0,
-        description="randomness of the flow's steps in acts whose log-probability a learner requests, usually "
+        description="randomness of the flow's steps in acts whose log-probability a learner "
+        "requests, usually "
         "0.5; 0: none is offered",
     ),
 ]
 
-Guidance = Annotated[float, Field(gt=0, description="real-time chunking: largest weight of the old plan")]
+Guidance = Annotated[
+    float, Field(gt=0, description="real-time chunking: largest weight of the old plan")
+]
 
 
 class ModelConfig(BaseModel, extra="forbid"):
-    """The settings of a model: its checkpoint, its device, its inputs, and how its chunks become actions."""
+    """The settings of a model: its checkpoint, its device, its inputs, and how its chunks become
+    actions.
+    """
 
     checkpoint: str = Field(
         min_length=1,
-        description="folder or file, or hub id: org/name, org/name@COMMIT; `{step}` stands for checkpoint_step",
+        description="folder or file, or hub id: org/name, org/name@COMMIT; `{step}` stands for "
+        "checkpoint_step",
     )
-    checkpoint_step: int | None = Field(default=None, ge=0, description="the training step that replaces `{step}`")
-    device: str = Field(default="auto", description="'auto' (an accelerator if there is one), 'cpu', 'cuda', 'cuda:1'")
-    dtype: DType = Field(default="auto", description="of the weights; 'auto': the family's own choice")
+    checkpoint_step: int | None = Field(
+        default=None, ge=0, description="the training step that replaces `{step}`"
+    )
+    device: str = Field(
+        default="auto",
+        description="'auto' (an accelerator if there is one), 'cpu', 'cuda', 'cuda:1'",
+    )
+    dtype: DType = Field(
+        default="auto", description="of the weights; 'auto': the family's own choice"
+    )
     matmul: Matmul = Field(
         default="high",
-        description="products of float32 matrices on a GPU: 'high' in TF32, which keeps 10 bits of their inputs; "
-        "'highest' in float32, several times slower; of the whole process, in which the last policy to load decides",
+        description="products of float32 matrices on a GPU: 'high' in TF32, which keeps 10 bits of "
+        "their inputs; "
+        "'highest' in float32, several times slower; of the whole process, in which the last "
+        "policy to load decides",
     )
     quantization: Quantization | None = Field(
         default=None,
-        description="keep the weights of linear layers in 8 bits (torchao): a quarter to a half of their memory, and "
+        description="keep the weights of linear layers in 8 bits (torchao): a quarter to a half of "
+        "their memory, and "
         "other actions, so compare them before use",
     )
     adapters: dict[str, str] = Field(
         default={},
-        description="LoRA adapters by name, PEFT's folders or hub ids, that sessions may act with over the checkpoint; "
+        description="LoRA adapters by name, PEFT's folders or hub ids, that sessions may act with "
+        "over the checkpoint; "
         "usually set by the `checkpoints` of a deployment",
     )
     compile: CompileMode = Field(
         default="auto",
-        description="'graphs': CUDA graphs of the forward pass for each of `batch_sizes`; true: on a GPU also of "
-        "what torch.compile makes of it, if that is faster, and on a CPU that alone; what fails, or computes something "
-        "else, runs without; 'require': true, with an error then; 'auto': 'graphs' on a GPU, false on a CPU, with "
+        description="'graphs': CUDA graphs of the forward pass for each of `batch_sizes`; true: on "
+        "a GPU also of "
+        "what torch.compile makes of it, if that is faster, and on a CPU that alone; what fails, "
+        "or computes something "
+        "else, runs without; 'require': true, with an error then; 'auto': 'graphs' on a GPU, false "
+        "on a CPU, with "
         "adapters, or if the family has none",
     )
     seed: int = Field(default=0, ge=0, description="mixed with the seed of each episode")
 
     cameras: dict[str, str] | None = Field(
-        default=None, description="the model's name of each camera -> ours; unset: the family's convention"
+        default=None,
+        description="the model's name of each camera -> ours; unset: the family's convention",
     )
     state: list[str] | None = Field(
         default=None,
-        description="parts of the proprioception that make up the model's state vector, in its order; "
-        "'gripper' stands for `Obs.gripper`, 'gripper_closed' for 1 minus that; unset: the family's convention",
+        description="parts of the proprioception that make up the model's state vector, in its "
+        "order; "
+        "'gripper' stands for `Obs.gripper`, 'gripper_closed' for 1 minus that; unset: the "
+        "family's convention",
     )
 
     actions: Literal["chunk", "queue", "ensemble"] = Field(
         default="chunk",
-        description="an `act` returns: a whole chunk; the next row of one that is kept here, where the model is asked "
-        "every `execute` acts; or one row, the model being asked at each act and the chunks averaged",
+        description="an `act` returns: a whole chunk; the next row of one that is kept here, where "
+        "the model is asked "
+        "every `execute` acts; or one row, the model being asked at each act and the chunks "
+        "averaged",
     )
-    execute: int | None = Field(default=None, ge=1, description="rows of each chunk that are used; unset: all")
+    execute: int | None = Field(
+        default=None, ge=1, description="rows of each chunk that are used; unset: all"
+    )
     ensemble_m: float = Field(
-        default=0.01, description="weights exp(-m * i) of the average, oldest first (ACT, arXiv 2304.13705)"
+        default=0.01,
+        description="weights exp(-m * i) of the average, oldest first (ACT, arXiv 2304.13705)",
     )
 
-    max_samples: int = Field(default=1024, ge=0, description="of its distribution that an observation may ask for")
-    max_rows: int = Field(default=64, ge=1, description="rows in one forward pass, at most; samples count as rows")
+    max_samples: int = Field(
+        default=1024, ge=0, description="of its distribution that an observation may ask for"
+    )
+    max_rows: int = Field(
+        default=64, ge=1, description="rows in one forward pass, at most; samples count as rows"
+    )
     batch_sizes: list[int] | None = Field(
         default=None,
-        description="the only numbers of rows to run, ascending; each is run, or compiled, when the model is loaded, "
-        "smaller batches are padded; unset: if the model is compiled those of the deployment's `batch`, else any",
+        description="the only numbers of rows to run, ascending; each is run, or compiled, when "
+        "the model is loaded, "
+        "smaller batches are padded; unset: if the model is compiled those of the deployment's "
+        "`batch`, else any",
     )
 
     @model_validator(mode="after")
     def _step_has_a_place(self) -> Self:
         if (STEP in self.checkpoint) != (self.checkpoint_step is not None):
             raise ValueError(
-                f"checkpoint {self.checkpoint!r} and checkpoint_step {self.checkpoint_step}: give both the place "
+                f"checkpoint {self.checkpoint!r} and checkpoint_step {self.checkpoint_step}: give "
+                "both the place "
                 f"{STEP} and the step that belongs there, or neither"
             )
         return self
@@ -98,15 +133,22 @@ class ModelConfig(BaseModel, extra="forbid"):
     @model_validator(mode="after")
     def _chunks_of_an_ensemble_overlap(self) -> Self:
         if self.actions == "ensemble" and self.execute == 1:
-            raise ValueError("execute: got 1 with actions 'ensemble', which leaves nothing to average; leave it out")
+            raise ValueError(
+                "execute: got 1 with actions 'ensemble', which leaves nothing to average; leave it "
+                "out"
+            )
         return self
 
     @model_validator(mode="after")
     def _adapters_are_added_to_eager_whole_layers(self) -> Self:
-        for name, value in (("compile", self.compile not in (False, "auto")), ("quantization", self.quantization)):
+        for name, value in (
+            ("compile", self.compile not in (False, "auto")),
+            ("quantization", self.quantization),
+        ):
             if self.adapters and value:
                 raise ValueError(
-                    f"adapters and {name}: got both, want one of them; merge an adapter into its base to have "
+                    f"adapters and {name}: got both, want one of them; merge an adapter into its "
+                    "base to have "
                     f"{name} for it"
                 )
         return self
@@ -115,17 +157,25 @@ class ModelConfig(BaseModel, extra="forbid"):
     @classmethod
     def _ascending(cls, sizes: list[int] | None) -> list[int] | None:
         if sizes is not None and (not sizes or sizes[0] < 1 or sizes != sorted(set(sizes))):
-            raise ValueError(f"got {sizes}, want ascending positive numbers, such as [1, 2, 4, 8, 16]")
+            raise ValueError(
+                f"got {sizes}, want ascending positive numbers, such as [1, 2, 4, 8, 16]"
+            )
         return sizes
 
     def compile_on(self, device: str) -> CompileMode:
-        """Return `compile` for a model on a kind of device, such as "cuda", in the place of "auto"."""
+        """Return `compile` for a model on a kind of device, such as "cuda", in the place of
+        "auto".
+        """
         graphs: CompileMode = "graphs" if device == "cuda" and not self.adapters else False
         return graphs if self.compile == "auto" else self.compile
 
     def with_sizes(self, sizes: Sequence[int]) -> Self:
         """Return the settings with these `batch_sizes`, unless they name others."""
-        return self if self.batch_sizes is not None else self.model_copy(update={"batch_sizes": list(sizes)})
+        return (
+            self
+            if self.batch_sizes is not None
+            else self.model_copy(update={"batch_sizes": list(sizes)})
+        )
 
     @property
     def rows(self) -> int:

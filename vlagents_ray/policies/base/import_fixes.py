@@ -1,11 +1,14 @@
-"""Fixes for torchvision and LeRobot if their wheels do not fit this machine, applied when they are imported.
+"""Fixes for torchvision and LeRobot if their wheels do not fit this machine, applied when they are
+imported.
 
-PyPI's torchvision for Linux is compiled against CUDA. Its operators do not load beside a CPU-only torch, and `import
-torchvision` fails. LeRobot 0.4.4 reads videos with torchcodec, which needs an installed FFmpeg, or with torchvision's
-`VideoReader`, which newer versions lack. If the wheels fit, nothing is changed.
+PyPI's torchvision for Linux is compiled against CUDA. Its operators do not load beside a CPU-only
+torch, and `import torchvision` fails. LeRobot 0.4.4 reads videos with torchcodec, which needs an
+installed FFmpeg, or with torchvision's `VideoReader`, which newer versions lack. If the wheels fit,
+nothing is changed.
 
-`vlagents-ray env make` copies this file, which imports nothing of this package, into the environments that it makes,
-with a `.pth` file that calls `install`, so that LeRobot's own commands also work there.
+`vlagents-ray env make` copies this file, which imports nothing of this package, into the
+environments that it makes, with a `.pth` file that calls `install`, so that LeRobot's own commands
+also work there.
 """
 
 from __future__ import annotations
@@ -28,7 +31,10 @@ _operators: list[Any] = []  # operators live as long as the object that defined 
 
 def install() -> None:
     """Fix later imports of torchvision and of LeRobot's `video_utils`; imports nothing itself."""
-    if not any(isinstance(finder, _Finder) or type(finder).__name__ == _Finder.__name__ for finder in sys.meta_path):
+    if not any(
+        isinstance(finder, _Finder) or type(finder).__name__ == _Finder.__name__
+        for finder in sys.meta_path
+    ):
         sys.meta_path.insert(0, _Finder())
 
 
@@ -47,7 +53,9 @@ class _Finder:
 
 
 def _torchvision(execute: Execute, module: ModuleType) -> None:
-    """Declare the missing operators that the import looks up; calls of them still raise an error."""
+    """Declare the missing operators that the import looks up; calls of them still raise an
+    error.
+    """
     torch = importlib.import_module("torch")
     try:
         execute(module)
@@ -73,10 +81,14 @@ def _video_utils(execute: Execute, module: Any) -> None:
         try:
             importlib.import_module("torchcodec.decoders")
         except (ImportError, OSError, RuntimeError) as error:
-            log.warning("torchcodec does not load (%s); videos are read with PyAV", str(error).partition("\n")[0])
+            log.warning(
+                "torchcodec does not load (%s); videos are read with PyAV",
+                str(error).partition("\n")[0],
+            )
             module.get_safe_default_codec = lambda: "pyav"
     else:
-        module.get_safe_default_codec = lambda: "pyav"  # LeRobot's own function warns at every import
+        # LeRobot's own function warns at every import.
+        module.get_safe_default_codec = lambda: "pyav"
     if not hasattr(importlib.import_module("torchvision.io"), "VideoReader"):
         module.decode_video_frames_torchvision = decode_frames
 
@@ -88,9 +100,14 @@ _FIXES: dict[str, Callable[[Execute, ModuleType], None]] = {
 
 
 def decode_frames(
-    video_path: Path | str, timestamps: Sequence[float], tolerance_s: float, *_: object, **__: object
+    video_path: Path | str,
+    timestamps: Sequence[float],
+    tolerance_s: float,
+    *_: object,
+    **__: object,
 ) -> Any:
-    """Return the frames nearest to `timestamps`, s, as LeRobot's `decode_video_frames_torchvision` does.
+    """Return the frames nearest to `timestamps`, s, as LeRobot's `decode_video_frames_torchvision`
+    does.
 
     Returns:
         (N, 3, H, W) float32 in [0, 1].
@@ -103,13 +120,15 @@ def decode_frames(
     with av.open(str(video_path)) as container:
         stream = container.streams.video[0]
         first = max(0.0, min(timestamps) - tolerance_s)
-        container.seek(int(first / stream.time_base), stream=stream)  # to the key frame at or before that time
+        # To the key frame at or before that time.
+        container.seek(int(first / stream.time_base), stream=stream)
         for frame in container.decode(stream):
             frames.append(frame)
             if frame.time >= max(timestamps) - tolerance_s:
                 break
     nearest: list[Any] = [
-        min(frames, key=lambda frame: abs(frame.time - wanted), default=None) for wanted in timestamps
+        min(frames, key=lambda frame: abs(frame.time - wanted), default=None)
+        for wanted in timestamps
     ]
     off = [
         wanted

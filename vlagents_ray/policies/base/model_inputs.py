@@ -1,4 +1,6 @@
-"""The rows of a model, and their inputs from an observation: cameras, state vector, and requests in `Obs.info`."""
+"""The rows of a model, and their inputs from an observation: cameras, state vector, and requests
+in `Obs.info`.
+"""
 
 from __future__ import annotations
 
@@ -21,25 +23,30 @@ T = TypeVar("T")
 GRIPPER = "gripper"  # the part of the state that is `Obs.gripper`
 CLOSED = "gripper_closed"  # the part that is the closedness: 1 - `Obs.gripper`
 KEPT = 256  # cached instructions with their tokens: more than a server has tasks
-KEPT_CHARACTERS = 1000  # characters of a cached instruction, which clients choose: the cache takes at most about 10 MB
+# Characters of a cached instruction, which clients choose: the cache takes at most about 10 MB.
+KEPT_CHARACTERS = 1000
 
 
 @dataclass(frozen=True, slots=True)
 class Row:
     """One chunk to compute: the session's own, or a sample of its distribution."""
 
-    frames: tuple[Any, ...]  # the results of `ModelPolicy.perceive` for the last observations, oldest first
+    # The results of `ModelPolicy.perceive` for the last observations, oldest first.
+    frames: tuple[Any, ...]
     instruction: str
     rng: np.random.Generator  # of the session, so that other rows have no influence
-    leftover: np.ndarray | None = None  # (H', D) float32, real-time chunking: see LEFTOVER in the interface
+    # (H', D) float32, real-time chunking: see LEFTOVER in the interface.
+    leftover: np.ndarray | None = None
     delay: int = 0  # DELAY: the number of first rows of the chunk that are the leftover's
     info: Mapping[str, Any] = field(default_factory=dict)  # the observation's info
     # the session's memory, for families that store more than frames
     memory: dict[str, Any] = field(default_factory=dict)
     want: tuple[str, ...] = ()  # requested outputs of the chunk, from the contract's `behaviour`
-    # whether to draw from the distribution, for samples and requested outputs; if not, the likeliest chunk
+    # whether to draw from the distribution, for samples and requested outputs; if not, the
+    # likeliest chunk
     sample: bool = False
-    adapter: str = ""  # fingerprint of the session's adapter, see `ModelPolicy.adapters`; empty: no adapter
+    # Fingerprint of the session's adapter, see `ModelPolicy.adapters`; empty: no adapter.
+    adapter: str = ""
 
     def noise(self, *shape: int) -> np.ndarray:
         """Draw standard normal numbers, float32, which are the same on every device."""
@@ -59,7 +66,8 @@ def shared_frames(rows: Sequence[Row]) -> tuple[list[int], list[int]]:
     """Return the rows to encode: the samples of a session share the observations of its row.
 
     Returns:
-        The indices of rows with distinct observations, and for each row the index of its observations among them.
+        The indices of rows with distinct observations, and for each row the index of its
+        observations among them.
     """
     places: dict[int, int] = {}
     firsts: list[int] = []
@@ -70,16 +78,20 @@ def shared_frames(rows: Sequence[Row]) -> tuple[list[int], list[int]]:
     return firsts, [places[id(row.frames)] for row in rows]
 
 
-def choose_cameras(chosen: Mapping[str, str] | None, usual: Mapping[str, str], known: Sequence[str]) -> dict[str, str]:
-    """Map the model's name of each camera to the observation's: `chosen`, or the family's usual mapping.
+def choose_cameras(
+    chosen: Mapping[str, str] | None, usual: Mapping[str, str], known: Sequence[str]
+) -> dict[str, str]:
+    """Map the model's name of each camera to the observation's: `chosen`, or the family's usual
+    mapping.
 
-    `known` are the model's cameras, in the order of the result. An unknown or missing camera raises `ConfigError`; it
-    is never replaced by zeros.
+    `known` are the model's cameras, in the order of the result. An unknown or missing camera raises
+    `ConfigError`; it is never replaced by zeros.
     """
     mapping = usual if chosen is None else chosen
     if set(mapping) != set(known):
         raise ConfigError(
-            f"cameras: got {sorted(mapping)}, want {sorted(known)}, the checkpoint's own names, each with the name of "
+            f"cameras: got {sorted(mapping)}, want {sorted(known)}, the checkpoint's own names, "
+            "each with the name of "
             f"one of yours, as in cameras: {{{', '.join(f'{name}: …' for name in known)}}}"
         )
     return {name: mapping[name] for name in known}
@@ -107,8 +119,12 @@ def state_vector(obs: Obs, parts: Sequence[str], dim: int | None = None) -> np.n
     for part in parts:
         if part in (GRIPPER, CLOSED):
             if obs.gripper is None:
-                raise InvalidObservation("gripper: got none, want a number in [0, 1] where 1 = open")
-            found.append(np.array([obs.gripper if part == GRIPPER else 1.0 - obs.gripper], np.float32))
+                raise InvalidObservation(
+                    "gripper: got none, want a number in [0, 1] where 1 = open"
+                )
+            found.append(
+                np.array([obs.gripper if part == GRIPPER else 1.0 - obs.gripper], np.float32)
+            )
         elif part in obs.state:
             found.append(np.asarray(obs.state[part], np.float32))
         else:
@@ -116,7 +132,8 @@ def state_vector(obs: Obs, parts: Sequence[str], dim: int | None = None) -> np.n
     vector = np.concatenate(found) if found else np.zeros(0, np.float32)
     if dim is not None and vector.shape != (dim,):
         raise InvalidObservation(
-            f"state: got {len(vector)} numbers from {list(parts)}, want {dim}, as the checkpoint was trained; "
+            f"state: got {len(vector)} numbers from {list(parts)}, want {dim}, as the checkpoint "
+            "was trained; "
             f"set the policy's `state` to the parts that it was trained with"
         )
     return vector
@@ -128,20 +145,26 @@ def needs_gripper(parts: Sequence[str]) -> bool:
 
 
 def state_specs(parts: Sequence[str], dim: int | None = None) -> dict[str, StateSpec]:
-    """Return the states of a contract: the parts, and the length of a part that is the whole vector."""
+    """Return the states of a contract: the parts, and the length of a part that is the whole
+    vector.
+    """
     own = [part for part in parts if part not in (GRIPPER, CLOSED)]
-    return {part: StateSpec(dim=dim if list(parts) == own and len(own) == 1 else None) for part in own}
+    return {
+        part: StateSpec(dim=dim if list(parts) == own and len(own) == 1 else None) for part in own
+    }
 
 
 def wanted_samples(obs: Obs, config: ModelConfig) -> int:
     if (samples := count_in(obs, SAMPLES)) > config.max_samples:
         raise InvalidObservation(
-            f"info[{SAMPLES!r}]: got {samples}, want at most {config.max_samples}; ask for fewer, or set the policy's "
+            f"info[{SAMPLES!r}]: got {samples}, want at most {config.max_samples}; ask for fewer, "
+            "or set the policy's "
             f"`max_samples`"
         )
     if samples and config.actions != "chunk":
         raise InvalidObservation(
-            f"info[{SAMPLES!r}]: got {samples} with actions: {config.actions}, want none; samples are of whole chunks, "
+            f"info[{SAMPLES!r}]: got {samples} with actions: {config.actions}, want none; samples "
+            "are of whole chunks, "
             f"so set the policy's `actions` to 'chunk'"
         )
     return samples
@@ -153,7 +176,8 @@ def wanted_behaviour(obs: Obs) -> tuple[str, ...]:
         return ()
     if obs.info.get(LEFTOVER) is not None:
         raise InvalidObservation(
-            f"info[{WANT!r}]: got it with {LEFTOVER!r}, want one of them; a chunk that continues a plan is not drawn "
+            f"info[{WANT!r}]: got it with {LEFTOVER!r}, want one of them; a chunk that continues a "
+            "plan is not drawn "
             f"from the policy's distribution"
         )
     return tuple(obs.info[WANT])
@@ -169,7 +193,9 @@ def leftover_plan(obs: Obs, contract: Contract | None) -> np.ndarray:
         left = np.zeros(0, np.float32)  # not numbers: refused below
     if left.ndim != 2 or dim not in (None, left.shape[1]) or not np.isfinite(left).all():
         got = given.shape if isinstance(given, np.ndarray) else type(given).__name__
-        raise InvalidObservation(f"info[{LEFTOVER!r}]: got {got}, want (H, {dim or 'D'}) finite float32")
+        raise InvalidObservation(
+            f"info[{LEFTOVER!r}]: got {got}, want (H, {dim or 'D'}) finite float32"
+        )
     return left
 
 
@@ -181,10 +207,11 @@ def count_in(obs: Obs, name: str) -> int:
 
 
 def resize_with_pad(image: np.ndarray, height: int, width: int) -> np.ndarray:
-    """Scale the whole (H, W, 3) uint8 image and centre it on black (height, width, 3); always returns a copy.
+    """Scale the whole (H, W, 3) uint8 image and centre it on black (height, width, 3); always
+    returns a copy.
 
-    Bilinear, by Pillow, and rounded as in openpi's `image_tools.resize_with_pad`, which produced the training images of
-    its policies.
+    Bilinear, by Pillow, and rounded as in openpi's `image_tools.resize_with_pad`, which produced
+    the training images of its policies.
     """
     have_height, have_width = image.shape[:2]
     if (have_height, have_width) == (height, width):
@@ -192,7 +219,9 @@ def resize_with_pad(image: np.ndarray, height: int, width: int) -> np.ndarray:
     ratio = max(have_width / width, have_height / height)
     inner_height, inner_width = max(1, int(have_height / ratio)), max(1, int(have_width / ratio))
     pil = require("PIL.Image")
-    small = pil.fromarray(np.ascontiguousarray(image)).resize((inner_width, inner_height), pil.Resampling.BILINEAR)
+    small = pil.fromarray(np.ascontiguousarray(image)).resize(
+        (inner_width, inner_height), pil.Resampling.BILINEAR
+    )
     padded = np.zeros((height, width, 3), np.uint8)
     top, left = (height - inner_height) // 2, (width - inner_width) // 2
     padded[top : top + inner_height, left : left + inner_width] = small
@@ -200,6 +229,8 @@ def resize_with_pad(image: np.ndarray, height: int, width: int) -> np.ndarray:
 
 
 def keeping_tokens(tokenize: Callable[[str], T]) -> Callable[[str], T]:
-    """Return `tokenize` with a cache of its results for recent instructions, except for very long ones."""
+    """Return `tokenize` with a cache of its results for recent instructions, except for very
+    long ones.
+    """
     kept = lru_cache(maxsize=KEPT)(tokenize)
     return lambda text: kept(text) if len(text) <= KEPT_CHARACTERS else tokenize(text)

@@ -1,4 +1,6 @@
-"""The base of policies that are models: sessions, history, chunks and samples around one forward pass."""
+"""The base of policies that are models: sessions, history, chunks and samples around one forward
+pass.
+"""
 
 from __future__ import annotations
 
@@ -19,10 +21,31 @@ import numpy as np
 
 from vlagents_ray.chunking.buffer import ENSEMBLE, Chunk, ChunkBuffer
 from vlagents_ray.contract import CameraSpec, Contract
-from vlagents_ray.errors import ConfigError, InvalidAction, InvalidObservation, NotReset, NotTrainable, PolicyFailed
-from vlagents_ray.interface import BEHAVIOUR, DELAY, DISTRIBUTION, EXECUTED, LEFTOVER, Act, Agent, Obs
+from vlagents_ray.errors import (
+    ConfigError,
+    InvalidAction,
+    InvalidObservation,
+    NotReset,
+    NotTrainable,
+    PolicyFailed,
+)
+from vlagents_ray.interface import (
+    BEHAVIOUR,
+    DELAY,
+    DISTRIBUTION,
+    EXECUTED,
+    LEFTOVER,
+    Act,
+    Agent,
+    Obs,
+)
 from vlagents_ray.policies.adapters import ADAPTER, DIGITS, Adapters
-from vlagents_ray.policies.base.accelerator import free_memory, gpu_timer, is_out_of_memory, set_matmul
+from vlagents_ray.policies.base.accelerator import (
+    free_memory,
+    gpu_timer,
+    is_out_of_memory,
+    set_matmul,
+)
 from vlagents_ray.policies.base.checkpoint import find_adapter, used_checkpoints
 from vlagents_ray.policies.base.checkpoint_files import weights_of
 from vlagents_ray.policies.base.config import ModelConfig
@@ -38,14 +61,21 @@ from vlagents_ray.policies.base.model_inputs import (
     wanted_samples,
 )
 from vlagents_ray.policies.compilation import Compilation, quantize
-from vlagents_ray.policies.loading import COMPILED_SIZES, LoadingReport, current_report, report_progress
+from vlagents_ray.policies.loading import (
+    COMPILED_SIZES,
+    LoadingReport,
+    current_report,
+    report_progress,
+)
 from vlagents_ray.policies.outcomes import attempt
 from vlagents_ray.validation import check_action
 from vlagents_ray.weights.trainable import from_host, named_values, to_host
 
 logger = logging.getLogger(__name__)
 
-_FASTER = 0.9  # share of one pass's time that several may take: what they save has to exceed what measurements vary by
+# Share of one pass's time that several may take: what they save has to exceed what measurements
+# vary by.
+_FASTER = 0.9
 
 T = TypeVar("T")
 
@@ -72,35 +102,44 @@ class PolicyEpisode:
     plan: ChunkBuffer  # the actions still to be returned, where single ones are
     memory: dict[str, Any] = field(default_factory=dict)
     adapter: str = ""  # fingerprint of its adapter; empty: none
-    prompt: Any = None  # the instruction's tokens, of families that compute them when the episode begins
+    # The instruction's tokens, of families that compute them when the episode begins.
+    prompt: Any = None
 
 
 class ModelPolicy(Agent, abc.ABC):
-    """The base class of the model families. A family defines `load`, `perceive`, `predict` and its contract.
+    """The base class of the model families. A family defines `load`, `perceive`, `predict` and its
+    contract.
 
-    The model computes one row for each observation, all sessions of a batch in one forward pass of at most
-    `config.rows` rows. A session's noise is drawn from its own generator, seeded by the config's seed and the
-    episode's.
+    The model computes one row for each observation, all sessions of a batch in one forward pass of
+    at most `config.rows` rows. A session's noise is drawn from its own generator, seeded by the
+    config's seed and the episode's.
     """
 
     shared: ClassVar[tuple[str, ...]] = ("config", "model", "compilation", "adapters", "report")
-    network: ClassVar[str | None] = None  # the attribute whose linear layers `quantization` may keep in 8 bits
-    adaptable: ClassVar[bool] = False  # whether `predict` runs `network` within `self.adapters.rows`
+    # The attribute whose linear layers `quantization` may keep in 8 bits.
+    network: ClassVar[str | None] = None
+    # Whether `predict` runs `network` within `self.adapters.rows`.
+    adaptable: ClassVar[bool] = False
 
     def __init__(self, config: Any) -> None:
         self.config: ModelConfig = config
         self.model: Any = None
-        self.compilation = Compilation(self.config.compile)  # `load` marks the model's cores with it
+        # `load` marks the model's cores with it.
+        self.compilation = Compilation(self.config.compile)
         self.adapters = Adapters()
         self.report = LoadingReport(lambda _: None, COMPILED_SIZES)  # the server's, once loaded
         self.episode: PolicyEpisode | None = None
         if self.config.adapters and not self.adaptable:
-            raise ConfigError(f"adapters: {type(self).__name__} does not offer them; merge each into its base")
+            raise ConfigError(
+                f"adapters: {type(self).__name__} does not offer them; merge each into its base"
+            )
 
     def loaded(self) -> Any:
         """Return `self.model`; raises `PolicyFailed` before `initialize`."""
         if self.model is None:
-            raise PolicyFailed(f"{type(self).__name__}: act before initialize; the checkpoint is not loaded")
+            raise PolicyFailed(
+                f"{type(self).__name__}: act before initialize; the checkpoint is not loaded"
+            )
         return self.model
 
     @property
@@ -110,23 +149,31 @@ class ModelPolicy(Agent, abc.ABC):
 
     @property
     def most_rows(self) -> int:
-        """The largest number of rows of one forward pass: the config's, or fewer if more did not fit into memory."""
+        """The largest number of rows of one forward pass: the config's, or fewer if more did not
+        fit into memory.
+        """
         return min(self.config.rows, self.report.most_rows or self.config.rows)
 
     @property
     def state_dim(self) -> int | None:
-        """The length of the model's state vector, once loaded; for the warm-up where its parts may have any length."""
+        """The length of the model's state vector, once loaded; for the warm-up where its parts
+        may have any length.
+        """
         return None
 
     def offered(self, names: tuple[str, ...]) -> tuple[str, ...] | None:
-        """Return the names for the contract's `behaviour`; None without any, or if an act is not a whole chunk."""
+        """Return the names for the contract's `behaviour`; None without any, or if an act is not
+        a whole chunk.
+        """
         return names if names and self.config.actions == "chunk" else None
 
     def chunk(self, horizon: int) -> int:
         """Return, for the contract, how many of the model's `horizon` rows an `act` returns."""
         return min(self.config.execute or horizon, horizon) if self.config.actions == "chunk" else 1
 
-    def stated(self, cameras: Mapping[str, str], parts: Sequence[str], horizon: int | None, **facts: Any) -> Contract:
+    def stated(
+        self, cameras: Mapping[str, str], parts: Sequence[str], horizon: int | None, **facts: Any
+    ) -> Contract:
         """Return the contract of a model.
 
         Args:
@@ -136,7 +183,8 @@ class ModelPolicy(Agent, abc.ABC):
             facts: Further fields of the contract, or other values of these.
         """
         usual: dict[str, Any] = {
-            "cameras": {ours: CameraSpec() for ours in cameras.values()},  # of any size: families resize them
+            # Of any size: families resize them.
+            "cameras": {ours: CameraSpec() for ours in cameras.values()},
             "state": state_specs(parts, self.state_dim),
             "gripper": needs_gripper(parts),
             "instruction": True,
@@ -151,20 +199,25 @@ class ModelPolicy(Agent, abc.ABC):
 
     @abc.abstractmethod
     def perceive(self, obs: Obs) -> Any:
-        """Convert and resize an observation for the history, as `Agent.prepare` does, whose rules apply.
+        """Convert and resize an observation for the history, as `Agent.prepare` does, whose rules
+        apply.
 
-        `self` is the session's copy, in an episode. An error fails the request of that session only.
+        `self` is the session's copy, in an episode. An error fails the request of that session
+        only.
         """
 
     @abc.abstractmethod
     def predict(self, rows: Sequence[Row]) -> Sequence[Prediction | Exception]:
-        """Compute one chunk for each row, all in one forward pass. A row's result must not depend on the others."""
+        """Compute one chunk for each row, all in one forward pass. A row's result must not
+        depend on the others.
+        """
 
     def initialize(self) -> None:
-        """Load the checkpoint; with `batch_sizes`, run each of them once, or compile the model's cores for it.
+        """Load the checkpoint; with `batch_sizes`, run each of them once, or compile the model's
+        cores for it.
 
-        Without, one row and a full batch run on an accelerator, so that a missing kernel, or too little memory, is not
-        first found by a robot.
+        Without, one row and a full batch run on an accelerator, so that a missing kernel, or too
+        little memory, is not first found by a robot.
         """
         with current_report() as self.report:
             self.model = self._load_with_adapters() if self.config.adapters else self.load()
@@ -175,8 +228,10 @@ class ModelPolicy(Agent, abc.ABC):
             quantize(self, self.config.quantization)
             if self.report.accelerated and self.compilation.mode not in (True, "require"):
                 logger.warning(
-                    "quantization %r without compile: true: each product first writes its weights in 16 or 32 bits, "
-                    "which takes longer than without quantization; set compile: true, or leave quantization out",
+                    "quantization %r without compile: true: each product first writes its weights "
+                    "in 16 or 32 bits, "
+                    "which takes longer than without quantization; set compile: true, or leave "
+                    "quantization out",
                     self.config.quantization,
                 )
         self._warm_up()
@@ -189,12 +244,14 @@ class ModelPolicy(Agent, abc.ABC):
         seeds, cores = itertools.count(), self.compilation.mode and self.compilation.cores
         for number, size in enumerate(reversed(sizes) if cores else sizes, 1):
             report_progress(
-                f"{'compiling' if self.config.compile else 'running'} {size} rows ({number} of {len(sizes)})"
+                f"{'compiling' if self.config.compile else 'running'} {size} rows ({number} of "
+                f"{len(sizes)})"
             )
             if cores:
                 self.compilation.add_size(size, partial(self._run_examples, size, seeds))
             elif self.config.batch_sizes and self.report.accelerated:
-                self._run_examples(size, seeds)  # which also loads kernels, so its duration is not that of later ones
+                # Which also loads kernels, so its duration is not that of later ones.
+                self._run_examples(size, seeds)
             self._run_examples(size, seeds)
         if sizes:
             free_memory()  # which a full batch took, and usual ones do not need
@@ -205,47 +262,65 @@ class ModelPolicy(Agent, abc.ABC):
 
     def _decide_on_compiling(self) -> None:
         """Set `compile` to what it means for the loaded model and its device."""
-        kind = next((device["kind"] for device in self.report.devices if device["kind"] != "cpu"), "cpu")
+        kind = next(
+            (device["kind"] for device in self.report.devices if device["kind"] != "cpu"), "cpu"
+        )
         mode = self.config.compile_on(kind)
         if self.config.compile == "auto":
             mode = mode if self.compilation.cores else False
             why = (kind, len(self.compilation.cores), len(self.config.adapters))
             logger.info("compile: auto: %s, on %r, with %d cores and %d adapters", mode, *why)
         elif mode == "graphs" and kind != "cuda":
-            raise ConfigError(f"compile: graphs: got a model on {kind!r}, want 'cuda'; leave it out")
+            raise ConfigError(
+                f"compile: graphs: got a model on {kind!r}, want 'cuda'; leave it out"
+            )
         self.compilation.mode = mode
         self.config = self.config.model_copy(update={"compile": mode})
         if mode:
             self.config = self.config.with_sizes(self.report.batch_sizes)
 
     def reset(self, obs: Obs, instruction: str | None, **kwargs: Any) -> dict[str, Any]:
-        """Begin the episode with `kwargs["seed"]`, an int, by default 0, and the adapter named `kwargs["adapter"]`."""
+        """Begin the episode with `kwargs["seed"]`, an int, by default 0, and the adapter named
+        `kwargs["adapter"]`.
+        """
         contract = self.contract
         if contract is not None and contract.instruction and not instruction:
-            raise InvalidObservation("instruction: got none, want what the robot is to do, in words")
+            raise InvalidObservation(
+                "instruction: got none, want what the robot is to do, in words"
+            )
         adapter = self.adapters.named(kwargs.get(ADAPTER))
         self._begin(instruction or "", int(kwargs.get("seed") or 0), adapter.fingerprint)
         self.notice(obs)
         return adapter.identity
 
     def notice(self, obs: Obs) -> None:
-        """Update the session's memory from an observation; called for each one, also if no chunk is requested."""
+        """Update the session's memory from an observation; called for each one, also if no chunk
+        is requested.
+        """
 
     def observe(self, obs: Obs) -> None:
         self.notice(obs)
         self._begun().frames.append(self.perceive(obs))
 
     def prepare(self, obs: Obs) -> Any:
-        """Return the result of `perceive` on the observation; None if actions of an earlier chunk may be left."""
+        """Return the result of `perceive` on the observation; None if actions of an earlier
+        chunk may be left.
+        """
         return None if self.config.actions == "queue" and self.history == 1 else self.perceive(obs)
 
     def act_batch(self, obs: Sequence[Obs], sessions: Sequence[Agent]) -> list[Act | Exception]:
-        """Return a chunk (H, D), or one action (D,), for each session, from one forward pass for all that need one."""
-        wanted = [attempt(self._rows, one, session) for one, session in zip(obs, sessions, strict=True)]
+        """Return a chunk (H, D), or one action (D,), for each session, from one forward pass for
+        all that need one.
+        """
+        wanted = [
+            attempt(self._rows, one, session) for one, session in zip(obs, sessions, strict=True)
+        ]
         rows = [row for own in wanted if not isinstance(own, Exception) for row in own]
         found = iter(self._forward(rows))
         return [
-            own if isinstance(own, Exception) else self._act(session, list(itertools.islice(found, len(own))))  # type: ignore[arg-type]
+            own
+            if isinstance(own, Exception)
+            else self._act(session, list(itertools.islice(found, len(own))))  # type: ignore[arg-type]
             for own, session in zip(wanted, sessions, strict=True)
         ]
 
@@ -260,17 +335,23 @@ class ModelPolicy(Agent, abc.ABC):
             self._warm_up()
 
     def close(self) -> None:
-        self.model, self.adapters, self.compilation = None, Adapters(), Compilation(self.config.compile)
+        self.model, self.adapters, self.compilation = (
+            None,
+            Adapters(),
+            Compilation(self.config.compile),
+        )
 
     def _trainable(self) -> Any:
         if (kind := self.config.quantization) is not None:
             raise NotTrainable(
-                f"quantization {kind!r}: weights of 8 bits cannot be replaced by a learner's; leave it out"
+                f"quantization {kind!r}: weights of 8 bits cannot be replaced by a learner's; "
+                "leave it out"
             )
         return self.adapters.trainable if self.config.adapters else super()._trainable()
 
     def adapt(self, adapter: str, folder: Path) -> None:
-        """Check the files beside an adapter in its folder, and keep the statistics that normalise its rows.
+        """Check the files beside an adapter in its folder, and keep the statistics that normalise
+        its rows.
 
         Args:
             adapter: The adapter's fingerprint, as in `Row.adapter`.
@@ -285,14 +366,19 @@ class ModelPolicy(Agent, abc.ABC):
             self.model = self.load()
         weights = weights_of(base) or {}
         digest = weights.get("digest") or ""
-        find = partial(find_adapter, checkpoint=self.config.checkpoint, base=base, digest_of_base=digest)
-        self.adapters.load(attrgetter(self.network or "")(self), self.config.adapters, find, self.adapt)
+        find = partial(
+            find_adapter, checkpoint=self.config.checkpoint, base=base, digest_of_base=digest
+        )
+        self.adapters.load(
+            attrgetter(self.network or "")(self), self.config.adapters, find, self.adapt
+        )
         self.adapters.base = digest.rpartition(":")[2][:DIGITS]
         self.weights_id = {**weights, "adapters": self.adapters.ids} if base else None
         return self.model
 
     def _begin(self, instruction: str, seed: int, adapter: str = "") -> None:
-        seeds = [self.config.seed, seed % 2**64]  # numpy accepts no negative seed; no two int64 share a number
+        # Numpy accepts no negative seed; no two int64 share a number.
+        seeds = [self.config.seed, seed % 2**64]
         self.episode = PolicyEpisode(
             instruction,
             deque(maxlen=self.history),
@@ -304,11 +390,15 @@ class ModelPolicy(Agent, abc.ABC):
 
     def _begun(self) -> PolicyEpisode:
         if self.episode is None:
-            raise NotReset(f"{type(self).__name__}: act before reset; call reset(obs, instruction) first")
+            raise NotReset(
+                f"{type(self).__name__}: act before reset; call reset(obs, instruction) first"
+            )
         return self.episode
 
     def _rows(self, obs: Obs, session: ModelPolicy) -> list[Row]:
-        """Return the rows to compute for a session: none while actions are left, else its chunk, then its samples."""
+        """Return the rows to compute for a session: none while actions are left, else its chunk,
+        then its samples.
+        """
         episode = session._begun()
         samples, want = wanted_samples(obs, self.config), wanted_behaviour(obs)
         session.notice(obs)
@@ -334,7 +424,8 @@ class ModelPolicy(Agent, abc.ABC):
         )
         if not samples:
             return [own]
-        seeds = episode.draws.integers(2**63, size=samples)  # one each, as they may be computed in several passes
+        # One each, as they may be computed in several passes.
+        seeds = episode.draws.integers(2**63, size=samples)
         return [own, *(drawn(own, np.random.default_rng(seed)) for seed in seeds)]
 
     def _act(self, session: ModelPolicy, found: list[Prediction | Exception]) -> Act | Exception:
@@ -367,10 +458,17 @@ class ModelPolicy(Agent, abc.ABC):
         drawn = np.stack([self._used(sample.actions) for sample in samples])
         mean = drawn.mean(0) if own.mean is None else self._used(own.mean)
         std = drawn.std(0) if own.std is None else self._used(own.std)
-        return {"mean": mean, "std": std, "samples": drawn, **_stacked([sample.behaviour for sample in samples])}
+        return {
+            "mean": mean,
+            "std": std,
+            "samples": drawn,
+            **_stacked([sample.behaviour for sample in samples]),
+        }
 
     def _forward(self, rows: list[Row]) -> list[Prediction | Exception]:
-        """Compute all rows; if the memory of an accelerator is exhausted, in smaller forward passes from then on."""
+        """Compute all rows; if the memory of an accelerator is exhausted, in smaller forward
+        passes from then on.
+        """
         while True:
             before = [row.rng.bit_generator.state for row in rows]
             try:
@@ -383,13 +481,16 @@ class ModelPolicy(Agent, abc.ABC):
                 row.rng.bit_generator.state = state
 
     def _lower_rows(self, rows: int, error: Exception) -> bool:
-        """Halve the largest forward pass after one of up to `rows` rows did not fit; return whether it was over 1."""
+        """Halve the largest forward pass after one of up to `rows` rows did not fit; return
+        whether it was over 1.
+        """
         self.report.on_out_of_memory()
         tried = min(self.most_rows, self._size(rows))
         fits = [size for size in self.config.batch_sizes or (tried // 2,) if 0 < size <= tried // 2]
         said = f"of at most {fits[-1]} rows from now on" if fits else "no smaller one is possible"
         logger.error(
-            "out of memory in a forward pass of %d rows: %s. Lower batch.max_size, max_rows or batch_sizes, or free "
+            "out of memory in a forward pass of %d rows: %s. Lower batch.max_size, max_rows or "
+            "batch_sizes, or free "
             "memory of the device (%s)",
             tried,
             said,
@@ -409,7 +510,8 @@ class ModelPolicy(Agent, abc.ABC):
         found: list[Prediction | Exception] = []
         for size in self._split(len(rows)):
             part = rows[len(found) : len(found) + size]
-            spare = self.padded(part)[len(part) :]  # copies, so that their noise is not the session's
+            # copies, so that their noise is not the session's.
+            spare = self.padded(part)[len(part) :]
             filled = [*part, *(copy.deepcopy(row, {id(row.frames): row.frames}) for row in spare)]
             began = time.perf_counter()
             with self.report.timer():
@@ -417,19 +519,26 @@ class ModelPolicy(Agent, abc.ABC):
             shortest, took = self.report.pass_s, time.perf_counter() - began
             shortest[len(filled)] = min(took, shortest.get(len(filled), took))
             if len(results) != len(filled):
-                raise PolicyFailed(f"predict: got {len(filled)} rows, returned {len(results)} chunks")
+                raise PolicyFailed(
+                    f"predict: got {len(filled)} rows, returned {len(results)} chunks"
+                )
             found += results[: len(part)]
         return found
 
     def _split(self, rows: int) -> list[int]:
-        """Return the numbers of rows of the passes for a batch: one, or several if it is too large or they are faster.
+        """Return the numbers of rows of the passes for a batch: one, or several if it is too large
+        or they are faster.
 
-        With `batch_sizes`, 9 rows may take longer as a pass of 16 than as one of 8 and one of 1. On a CPU, where the
-        time of a pass depends on what else runs, only the number of passes counts.
+        With `batch_sizes`, 9 rows may take longer as a pass of 16 than as one of 8 and one of 1. On
+        a CPU, where the time of a pass depends on what else runs, only the number of passes counts.
         """
         most = self.most_rows
         whole, rest = divmod(rows, most)
-        pass_s = {size: self.report.pass_s.get(size) for size in self.config.batch_sizes or () if size <= most}
+        pass_s = {
+            size: self.report.pass_s.get(size)
+            for size in self.config.batch_sizes or ()
+            if size <= most
+        }
         if rest and self.report.accelerated and pass_s and None not in pass_s.values():
             return [most] * whole + fastest_split(rest, tuple(pass_s.items()))
         return [most] * whole + [rest] * bool(rest)
@@ -440,11 +549,14 @@ class ModelPolicy(Agent, abc.ABC):
             if isinstance(prediction, Exception):
                 raise prediction
         if any("jax" in device for device in self.report.devices) and size <= self.most_rows:
-            for few in (few for few in self.config.batch_sizes or () if few < size):  # JAX compiles for each such pair
-                self.predict([*rows[:few], *(drawn(rows[0], row.rng) for row in rows[few:])])  # its duration is another
+            # JAX compiles for each such pair.
+            for few in (few for few in self.config.batch_sizes or () if few < size):
+                # Its duration is another.
+                self.predict([*rows[:few], *(drawn(rows[0], row.rng) for row in rows[few:])])
 
     def observations_of(self, rows: Sequence[Row]) -> tuple[list[int], list[int]]:
-        """Return the rows to encode, padded to one of `batch_sizes`, and for each row the place of its observations.
+        """Return the rows to encode, padded to one of `batch_sizes`, and for each row the place of
+        its observations.
 
         As many observations as rows are those of the rows: 0, 1, …, which needs no gathering.
         """
@@ -453,7 +565,9 @@ class ModelPolicy(Agent, abc.ABC):
         return (each, each) if len(firsts) == len(rows) else (firsts, owners)
 
     def _example(self, seed: int, instruction: str = "warm up") -> Row:
-        """Return a row for the warm-up: random images, and a random state near zero, that fit the contract."""
+        """Return a row for the warm-up: random images, and a random state near zero, that fit
+        the contract.
+        """
         rng, contract = np.random.default_rng(seed), self.contract or Contract()
         lengths = {name: part.dim or 1 for name, part in (contract.state or {}).items()}
         unstated = [name for name, part in (contract.state or {}).items() if part.dim is None]
@@ -465,7 +579,10 @@ class ModelPolicy(Agent, abc.ABC):
                 for name, one in (contract.cameras or {}).items()
             },
             gripper=float(rng.random()),
-            state={name: rng.uniform(-0.1, 0.1, length).astype(np.float32) for name, length in lengths.items()},
+            state={
+                name: rng.uniform(-0.1, 0.1, length).astype(np.float32)
+                for name, length in lengths.items()
+            },
         )
         session = copy.copy(self)
         session._begin(instruction, seed, self.adapters.example(seed))
@@ -474,7 +591,9 @@ class ModelPolicy(Agent, abc.ABC):
 
 
 def _stacked(stated: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """Return one mapping for several of the same names: arrays get a first dimension, mappings are mapped alike."""
+    """Return one mapping for several of the same names: arrays get a first dimension, mappings
+    are mapped alike.
+    """
     columns = {name: [one[name] for one in stated] for name in stated[0]}
     return {
         name: _stacked(values) if isinstance(values[0], Mapping) else np.stack(values)
@@ -488,11 +607,14 @@ def fastest_split(rows: int, pass_s: tuple[tuple[int, float], ...]) -> list[int]
 
     Args:
         rows: The number of all rows, at most the largest size.
-        pass_s: The sizes of passes, to which smaller ones are padded, and how long each takes, s; ascending by size.
+        pass_s: The sizes of passes, to which smaller ones are padded, and how long each takes, s;
+            ascending by size.
     """
     best: list[tuple[float, list[int]]] = [(0.0, [])]
     for count in range(1, rows + 1):
         splits = ((size, took, *best[max(0, count - size)]) for size, took in pass_s)
-        best.append(min((took + others, [*sizes, min(size, count)]) for size, took, others, sizes in splits))
+        best.append(
+            min((took + others, [*sizes, min(size, count)]) for size, took, others, sizes in splits)
+        )
     one_s = next(took for size, took in pass_s if size >= rows)
     return best[rows][1] if best[rows][0] < _FASTER * one_s else [rows]

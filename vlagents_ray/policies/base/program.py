@@ -1,4 +1,6 @@
-"""Digests of the files of a policy or an environment: the code of its class, and the files in its settings."""
+"""Digests of the files of a policy or an environment: the code of its class, and the files in
+its settings.
+"""
 
 from __future__ import annotations
 
@@ -19,27 +21,35 @@ from typing import Any
 from vlagents_ray.policies.base.checkpoint import STEP, at_step
 from vlagents_ray.policies.base.checkpoint_files import METHOD, digest, files_in
 
-_PACKAGE = "vlagents_ray"  # its classes are identified by the version of this package, which results record
-_LIBRARIES = tuple(Path(sysconfig.get_path(name)).resolve() for name in ("stdlib", "platstdlib", "purelib", "platlib"))
+# Its classes are identified by the version of this package, which results record.
+_PACKAGE = "vlagents_ray"
+_LIBRARIES = tuple(
+    Path(sysconfig.get_path(name)).resolve()
+    for name in ("stdlib", "platstdlib", "purelib", "platlib")
+)
 _SITES = {"site-packages", "dist-packages"}
-_LISTED = 32  # largest number of files of a folder with their own digests; a larger folder has a single one
+# Largest number of files of a folder with their own digests; a larger folder has a single one.
+_LISTED = 32
 _LONGEST = 4096  # characters of a path
 
 Program = dict[str, str]  # digest, or the version of an installed package, by name
 
 
 def code_of_class(target: str) -> Program:
-    """Return the digests of the module of "module:Class", and of all modules that it imports, directly or indirectly.
+    """Return the digests of the module of "module:Class", and of all modules that it imports,
+    directly or indirectly.
 
-    Modules are found as Python's `import` would find them, but nothing is imported: import statements are read from the
-    source, including those within functions. Installed packages and the standard library do not count. A class in an
-    installed package is identified by the version of its distribution; a class of this package has no entry.
+    Modules are found as Python's `import` would find them, but nothing is imported: import
+    statements are read from the source, including those within functions. Installed packages and
+    the standard library do not count. A class in an installed package is identified by the version
+    of its distribution; a class of this package has no entry.
 
     Args:
         target: "module:Class" or "module".
 
     Returns:
-        `sha256:` and 64 digits for each file, by its path below the folder from which Python imports it.
+        `sha256:` and 64 digits for each file, by its path below the folder from which Python
+        imports it.
     """
     module = target.partition(":")[0]
     top = module.partition(".")[0]
@@ -63,25 +73,32 @@ def code_of_class(target: str) -> Program:
         if file.suffix == ".py":
             waiting += _imports(content, inside)
     if not found and top != "__main__":
-        found = {name: f"version {version(name)}" for name in sorted(set(_distributions().get(top, ())))}
+        found = {
+            name: f"version {version(name)}" for name in sorted(set(_distributions().get(top, ())))
+        }
     return found
 
 
-# Takes half a second, since it reads the list of files of each installed package, and runs for each env.
+# Takes half a second, since it reads the list of files of each installed package, and runs for each
+# env.
 _distributions = functools.cache(packages_distributions)
 
 
 loaded_code = functools.cache(code_of_class)
-"""`code_of_class` with the result of the first call in this process: later edits do not change running code."""
+"""`code_of_class` with the result of the first call in this process: later edits do not change
+running code.
+"""
 
 
 def files_named(settings: Mapping[str, Any], *, folders: bool = True) -> Program:
-    """Return the digests of the files that settings name, by setting and path: "checkpoint: runs/a/w.npz".
+    """Return the digests of the files that settings name, by setting and path: "checkpoint:
+    runs/a/w.npz".
 
     Args:
-        settings: Each text that is the path of an existing file or folder counts, with `{step}` replaced by
-            the setting `checkpoint_step`.
-        folders: Whether the files of folders count. A folder that holds the working directory never does.
+        settings: Each text that is the path of an existing file or folder counts, with `{step}`
+            replaced by the setting `checkpoint_step`.
+        folders: Whether the files of folders count. A folder that holds the working directory never
+            does.
     """
     step = settings.get("checkpoint_step")
     found: Program = {}
@@ -108,17 +125,23 @@ def with_defaults(cls: type[Any], settings: Mapping[str, Any]) -> dict[str, Any]
     fields = getattr(getattr(cls, "Config", None), "model_fields", {})
     defaults = {name: field.default for name, field in fields.items()}
     parameters = inspect.signature(cls.__init__).parameters.values()
-    defaults |= {one.name: one.default for one in parameters if one.default is not inspect.Parameter.empty}
+    defaults |= {
+        one.name: one.default for one in parameters if one.default is not inspect.Parameter.empty
+    }
     return {**defaults, **settings}
 
 
 def _file(name: str) -> Path | None:
-    """Return the file that `import name` would execute; None if there is none, or if it is installed."""
+    """Return the file that `import name` would execute; None if there is none, or if it is
+    installed.
+    """
     if name == "__main__":
         path = getattr(sys.modules[name], "__file__", None)
         return None if path is None else Path(path)
     spec = _spec(name)
-    return None if spec is None or not spec.has_location or spec.origin is None else Path(spec.origin)
+    return (
+        None if spec is None or not spec.has_location or spec.origin is None else Path(spec.origin)
+    )
 
 
 def _spec(name: str) -> ModuleSpec | None:
@@ -137,14 +160,20 @@ def _spec(name: str) -> ModuleSpec | None:
 
 
 def _is_own(file: Path) -> bool:
-    """Return whether a file is outside of installed packages, this package and the standard library."""
+    """Return whether a file is outside of installed packages, this package and the standard
+    library.
+    """
     path = file.resolve()
     here = Path(__file__).resolve().parents[2]
-    return not _SITES & set(path.parts) and not any(path.is_relative_to(one) for one in (*_LIBRARIES, here))
+    return not _SITES & set(path.parts) and not any(
+        path.is_relative_to(one) for one in (*_LIBRARIES, here)
+    )
 
 
 def _imports(source: bytes, package: str) -> Iterator[str]:
-    """Yield the full names of the modules that a source may import; `package` is the package of the source."""
+    """Yield the full names of the modules that a source may import; `package` is the package of
+    the source.
+    """
     try:
         tree = ast.parse(source)
     except (SyntaxError, ValueError):  # importing it raises the same error
@@ -153,7 +182,9 @@ def _imports(source: bytes, package: str) -> Iterator[str]:
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names)
         elif isinstance(node, ast.ImportFrom):
-            parts = package.split(".")[: len(package.split(".")) - node.level + 1] if node.level else []
+            parts = (
+                package.split(".")[: len(package.split(".")) - node.level + 1] if node.level else []
+            )
             if base := ".".join([*parts, *([node.module] if node.module else [])]):
                 yield base
                 yield from (f"{base}.{alias.name}" for alias in node.names if alias.name != "*")
@@ -176,5 +207,6 @@ def _existing(text: str) -> Path | None:
     try:
         path = Path(text).expanduser()
         return path if path.exists() else None
-    except (OSError, RuntimeError):  # a name too long for the file system, or `~` of an unknown user
+    except (OSError, RuntimeError):
+        # a name too long for the file system, or `~` of an unknown user
         return None

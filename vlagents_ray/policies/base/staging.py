@@ -1,7 +1,8 @@
 """The inputs of rows on their way to the policy's device, where they are stacked into a batch.
 
-On a GPU, the threads that prepare observations copy each row as soon as it is prepared, from pinned memory and on a
-stream of their own: the copies for the next batch run while a batch computes, and the policy's thread waits for none.
+On a GPU, the threads that prepare observations copy each row as soon as it is prepared, from pinned
+memory and on a stream of their own: the copies for the next batch run while a batch computes, and
+the policy's thread waits for none.
 """
 
 from __future__ import annotations
@@ -14,11 +15,14 @@ import numpy as np
 from vlagents_ray.policies.base.accelerator import is_out_of_memory
 from vlagents_ray.registry import require
 
-_ALIGNED = 16  # bytes: tensors of all types begin at a multiple, and a GPU copies in words of this size
+# bytes: tensors of all types begin at a multiple, and a GPU copies in words of this size.
+_ALIGNED = 16
 
 
 class StagedRow(dict[str, np.ndarray]):
-    """The arrays of a row by name, with one copy of all of them on the device; a pickle has the arrays alone."""
+    """The arrays of a row by name, with one copy of all of them on the device; a pickle has the
+    arrays alone.
+    """
 
     def __init__(self, arrays: Mapping[str, np.ndarray]) -> None:
         super().__init__({name: np.asarray(array, order="C") for name, array in arrays.items()})
@@ -44,9 +48,13 @@ class Staging:
         self._batch: Any = None  # (rows, bytes) uint8: the memory of the last batch on a CPU
 
     def upload(self, array: np.ndarray) -> Any:
-        """Return an array as a tensor on the device; on a GPU, the copy is part of the current stream."""
+        """Return an array as a tensor on the device; on a GPU, the copy is part of the current
+        stream.
+        """
         tensor = require("torch").from_numpy(array)
-        return (tensor if self._stream is None else tensor.pin_memory()).to(self.device, non_blocking=True)
+        return (tensor if self._stream is None else tensor.pin_memory()).to(
+            self.device, non_blocking=True
+        )
 
     def stage(self, arrays: Mapping[str, np.ndarray]) -> StagedRow:
         """Begin to copy the arrays of one row to the device; several threads may call it.
@@ -58,7 +66,8 @@ class Staging:
         try:
             self._copy(row)
         except RuntimeError as error:
-            if not is_out_of_memory(error):  # otherwise `stack` copies it, where a policy frees memory
+            # Otherwise `stack` copies it, where a policy frees memory.
+            if not is_out_of_memory(error):
                 raise
         return row
 
@@ -69,8 +78,8 @@ class Staging:
 
         Args:
             rows: The rows of the batch.
-            keep: Whether later batches have them too, as those of a history; otherwise their copies are freed, so that
-                a GPU has those of waiting requests alone.
+            keep: Whether later batches have them too, as those of a history; otherwise their copies
+                are freed, so that a GPU has those of waiting requests alone.
 
         Raises:
             ValueError: The rows have arrays of different names, shapes or types.
@@ -78,7 +87,9 @@ class Staging:
         torch, layout = require("torch"), rows[0].layout
         for row in rows:
             if row.layout != layout:
-                raise ValueError(f"stack: got rows of {layout} and {row.layout}, want the same arrays in each")
+                raise ValueError(
+                    f"stack: got rows of {layout} and {row.layout}, want the same arrays in each"
+                )
             if row.block is None:  # of an earlier batch, or of a session that another replica began
                 self._copy(row)
         blocks, memory = [row.block for row in rows], None
@@ -88,7 +99,11 @@ class Staging:
                 current.wait_event(row.copied)
                 row.block.record_stream(current)  # its memory is the other stream's
         elif self.device.type == "cpu":  # where fresh memory costs more than the copies
-            if self._batch is None or self._batch.shape[1] != len(blocks[0]) or len(self._batch) < len(blocks):
+            if (
+                self._batch is None
+                or self._batch.shape[1] != len(blocks[0])
+                or len(self._batch) < len(blocks)
+            ):
                 with torch.inference_mode(False):  # so that any later batch may be written
                     self._batch = torch.empty(len(blocks), len(blocks[0]), dtype=torch.uint8)
             memory = self._batch[: len(blocks)]
@@ -96,7 +111,9 @@ class Staging:
         for row in () if keep else rows:
             row.block = row.copied = None
         starts = zip(_starts(rows[0]), rows[0].items(), strict=False)
-        parts = {name: (batch[:, start : start + array.nbytes], array) for start, (name, array) in starts}
+        parts = {
+            name: (batch[:, start : start + array.nbytes], array) for start, (name, array) in starts
+        }
         return {
             name: part.view(getattr(torch, array.dtype.name)).view(len(rows), *array.shape)
             for name, (part, array) in parts.items()

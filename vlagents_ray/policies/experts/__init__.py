@@ -1,7 +1,8 @@
 """Scripted experts: small classes that solve simulated tasks without learning.
 
-`EXPERTS` maps the full name of an env, or of a suite, to "module:Class"; the full name has priority. A
-module is imported when the first of its experts is used. Experts for more simulators are in `examples/experts`.
+`EXPERTS` maps the full name of an env, or of a suite, to "module:Class"; the full name has
+priority. A module is imported when the first of its experts is used. Experts for more simulators
+are in `examples/experts`.
 """
 
 from __future__ import annotations
@@ -34,17 +35,25 @@ class Expert(Protocol):
 
 
 def expert_class(env_name: str) -> type[Expert]:
-    """Return the expert for an env, e.g. "tabletop/slide"; raises `ContractMismatch` if there is none."""
+    """Return the expert for an env, e.g. "tabletop/slide"; raises `ContractMismatch` if there is
+    none.
+    """
     if (target := EXPERTS.get(env_name) or EXPERTS.get(env_suite(env_name))) is None:
         raise ContractMismatch(
-            f"no scripted expert for env {env_name!r}: there are experts for {sorted(EXPERTS)}; choose one of these "
-            f"envs, set `expert` to one of examples/experts, 'experts.pusht:PushTExpert', or choose another policy"
+            f"no scripted expert for env {env_name!r}: there are experts for {sorted(EXPERTS)}; "
+            "choose one of these "
+            "envs, set `expert` to one of examples/experts, 'experts.pusht:PushTExpert', or "
+            "choose another policy"
         )
     return named_class(target)
 
 
-def sim_vector(obs: Obs, size: int, env_name: str, cure: str = "this expert cannot act on images") -> np.ndarray:
-    """Return `info["sim_state"]` of an observation, (`size`,); raises `InvalidObservation` if there is none."""
+def sim_vector(
+    obs: Obs, size: int, env_name: str, cure: str = "this expert cannot act on images"
+) -> np.ndarray:
+    """Return `info["sim_state"]` of an observation, (`size`,); raises `InvalidObservation` if
+    there is none.
+    """
     state = obs.info.get("sim_state")
     if not isinstance(state, np.ndarray) or state.shape != (size,):
         got = f"shape {state.shape}" if isinstance(state, np.ndarray) else type(state).__name__

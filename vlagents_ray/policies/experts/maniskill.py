@@ -29,7 +29,9 @@ class _CubeExpert:
 
 
 class PushCube(_CubeExpert):
-    """Moves around and behind the cube, down to the table, and pushes it along x onto the target."""
+    """Moves around and behind the cube, down to the table, and pushes it along x onto the
+    target.
+    """
 
     _SIZE = 35
     _BEHIND_M = 0.12  # distance of the tool behind the cube before the push
@@ -55,9 +57,12 @@ class PushCube(_CubeExpert):
         if self._phase == "down":
             return self._hand.move(tool, low, _CLOSED)
         if self._phase == "push":
-            # near the end of its reach the arm lags behind, so the cube must slide the last centimetres
+            # near the end of its reach the arm lags behind, so the cube must slide the last
+            # centimetres
             speed = 0.8 if goal[0] > self._FAR_M else 0.5
-            return self._hand.move(tool, np.array([goal[0], goal[1], self._LOW_M]), _CLOSED, limit=speed)
+            return self._hand.move(
+                tool, np.array([goal[0], goal[1], self._LOW_M]), _CLOSED, limit=speed
+            )
         return self._hand.move(tool, tool, _CLOSED)
 
 
@@ -70,7 +75,8 @@ class PickCube(_CubeExpert):
     _GIVE_UP_STEPS = 8  # without contact on both fingers; then it tries again from above
 
     def act(self, obs: Obs) -> Act:
-        # qpos 9, qvel 9, grasped 1, tool pose 7, goal 3, cube pose 7, tool to cube 3, cube to goal 3
+        # qpos 9, qvel 9, grasped 1, tool pose 7, goal 3, cube pose 7, tool to cube 3, cube to goal
+        # 3
         state = self._state(obs)
         grasped, tool, goal, cube = state[18] > 0.5, state[19:22], state[26:29], state[29:32]
         if self._phase == "over" and np.linalg.norm(tool[:2] - cube[:2]) < 0.01:
@@ -104,7 +110,9 @@ class _Hand:
         self._scale = 1.0
 
     def move(self, tool: np.ndarray, target: np.ndarray, gripper: float, limit: float = 1.0) -> Act:
-        """Return an action from `tool` towards `target`, (3,) m, of at most `limit` units along each axis."""
+        """Return an action from `tool` towards `target`, (3,) m, of at most `limit` units along
+        each axis.
+        """
         moved_m = np.inf if self._at is None else float(np.linalg.norm(tool - self._at))
         stuck = moved_m < self._STUCK_M and self._commanded_m > 10 * self._STUCK_M
         self._scale = max(self._scale / 2, 0.1) if stuck else min(self._scale * 2, 1.0)

@@ -1,7 +1,8 @@
-"""An expert for the tabletop that uses only the camera image, the gripper's proprioception and the instruction.
+"""An expert for the tabletop that uses only the camera image, the gripper's proprioception and the
+instruction.
 
-Like a calibrated robot cell, it knows the pose of the camera (see `vlagents_ray.envs.tabletop`) and the height of
-a puck. It locates objects in the image.
+Like a calibrated robot cell, it knows the pose of the camera (see `vlagents_ray.envs.tabletop`) and
+the height of a puck. It locates objects in the image.
 """
 
 from __future__ import annotations
@@ -23,7 +24,8 @@ _HUES = {"red": 1.0, "yellow": 46.0, "green": 133.0, "blue": 216.0, "purple": 27
 _HUE_TOLERANCE = 20.0  # degrees
 _PASTEL, _FULL = (0.15, 0.5), (0.55, 1.0)  # saturation of pads and of pucks
 _PUCK_HEIGHT = 0.03  # m
-_PUCK_REACH, _PAD_REACH = 0.034, 0.06  # m, largest distance of a puck's or a pad's pixels from its centre
+# m, largest distance of a puck's or a pad's pixels from its centre.
+_PUCK_REACH, _PAD_REACH = 0.034, 0.06
 
 _TRAVEL_Z, _GRASP_Z = 0.10, 0.006  # m, of the fingertips
 _AWAY = (0.0, 0.20, 0.16)  # m, a position in which the gripper occludes no objects
@@ -66,7 +68,9 @@ class TabletopExpert:
 
     def act(self, obs: Obs) -> Act:
         if not self._plan:
-            raise NotReset(f"{self._env_name}: act before reset; call reset(obs, instruction) first")
+            raise NotReset(
+                f"{self._env_name}: act before reset; call reset(obs, instruction) first"
+            )
         if "xyzrpy" not in obs.state:
             raise MissingState("xyzrpy", have=obs.state)
         if obs.gripper is None:
@@ -84,7 +88,9 @@ class TabletopExpert:
         offset /= max(1.0, float(np.abs(offset).max()))  # slower, to stay on the straight line
         return Act(np.append(offset, self._plan[0].grip).astype(np.float32), done=done)
 
-    def _after(self, plan_so_far: list[Waypoint], obs: Obs, position: np.ndarray, opening: float) -> list[Waypoint]:
+    def _after(
+        self, plan_so_far: list[Waypoint], obs: Obs, position: np.ndarray, opening: float
+    ) -> list[Waypoint]:
         """Return the remaining plan after its first waypoint has been reached."""
         if plan_so_far[0].looks:
             return plan(_image(obs), self._instruction)
@@ -127,7 +133,8 @@ def _parse(instruction: str) -> tuple[str, str, str]:
         if match and all(colour in _HUES for colour in match.groups()):
             return kind, match[1], match[match.re.groups]
     raise InvalidObservation(
-        f"tabletop expert: got instruction {instruction!r}, want one like 'put the red puck on the blue pad', "
+        f"tabletop expert: got instruction {instruction!r}, want one like 'put the red puck on the "
+        "blue pad', "
         f"'slide ... onto ...', 'stack ...' or 'lift ...', with colours of {sorted(_HUES)}"
     )
 
@@ -165,11 +172,18 @@ class _SeenObject:
         self, colour: str, kind: str, saturation: tuple[float, float], reach: float, z: float
     ) -> tuple[float, float]:
         off = np.abs((self._hue - _HUES[colour] + 180) % 360 - 180)
-        fits = (off < _HUE_TOLERANCE) & (self._saturation > saturation[0]) & (self._saturation <= saturation[1])
+        fits = (
+            (off < _HUE_TOLERANCE)
+            & (self._saturation > saturation[0])
+            & (self._saturation <= saturation[1])
+        )
         if np.count_nonzero(fits) < 3:
-            raise InvalidObservation(f"tabletop expert: sees no {colour} {kind}; is this image the tabletop's 'front'?")
+            raise InvalidObservation(
+                f"tabletop expert: sees no {colour} {kind}; is this image the tabletop's 'front'?"
+            )
         u, v = self._u[fits], self._v[fits]
-        # the blurred edge of a puck looks like a pad: the median ignores these few pixels, the mean is more precise
+        # the blurred edge of a puck looks like a pad: the median ignores these few pixels, the mean
+        # is more precise
         near = np.hypot(u - np.median(u), v - np.median(v)) < reach * self._scale
         x = (float(u[near].mean()) - self._centre[0]) / self._scale
         y = ((self._centre[1] - float(v[near].mean())) / self._scale - z * _DEEP) / _UP

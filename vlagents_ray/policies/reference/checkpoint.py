@@ -1,4 +1,6 @@
-"""A checkpoint of the reference policy: a folder with `model.safetensors`, and `config.json`, see `Checkpoint`."""
+"""A checkpoint of the reference policy: a folder with `model.safetensors`, and `config.json`,
+see `Checkpoint`.
+"""
 
 from __future__ import annotations
 
@@ -13,7 +15,8 @@ from vlagents_ray.errors import ConfigError, InvalidObservation
 
 CAMERAS = ("scene", "wrist")  # the model's, in the order of its image encoders
 CONFIG, WEIGHTS = "config.json", "model.safetensors"
-_LEAST_STD = 1e-2  # of a number of the state, so that one that never changed in training stays near zero
+# Of a number of the state, so that one that never changed in training stays near zero.
+_LEAST_STD = 1e-2
 
 
 class NetworkSizes(BaseModel, extra="forbid", frozen=True):
@@ -64,9 +67,13 @@ class Checkpoint(BaseModel, extra="forbid", frozen=True):
         """
         said = words_of(instruction)
         if unknown := [word for word in said if word not in self.words]:
-            raise InvalidObservation(f"instruction: got {unknown[0]!r} in {instruction!r}, want words of {self.words}")
+            raise InvalidObservation(
+                f"instruction: got {unknown[0]!r} in {instruction!r}, want words of {self.words}"
+            )
         if not 0 < len(said) <= self.sizes.longest:
-            raise InvalidObservation(f"instruction: got {len(said)} words, want 1 to {self.sizes.longest}")
+            raise InvalidObservation(
+                f"instruction: got {len(said)} words, want 1 to {self.sizes.longest}"
+            )
         tokens = np.zeros(self.sizes.longest, np.int64)
         tokens[: len(said)] = [self.words.index(word) + 1 for word in said]
         return tokens
@@ -97,4 +104,6 @@ def read_checkpoint(folder: Path) -> Checkpoint:
     try:
         return Checkpoint.model_validate_json((folder / CONFIG).read_text(encoding="utf-8"))
     except ValidationError as error:
-        raise ConfigError(f"{folder / CONFIG}: is no checkpoint of the reference policy: {error}") from error
+        raise ConfigError(
+            f"{folder / CONFIG}: is no checkpoint of the reference policy: {error}"
+        ) from error

@@ -1,7 +1,8 @@
 """The network of the reference policy."""
 
 # mypy: disable-error-code="misc"
-# torch's own types are not read, so that its classes are of type Any, which mypy would not have subclassed.
+# torch's own types are not read, so that its classes are of type Any, which mypy would not have
+# subclassed.
 
 from __future__ import annotations
 
@@ -19,11 +20,14 @@ from vlagents_ray.weights.safetensors import read_values
 
 _TIMES = 32  # frequencies of the flow's time, from 1 to 1000 rad
 _CONTRAST = 1e-2  # added to a patch's variance, so that the noise of an empty one is not made large
-_SHARPNESS = 12.0  # of the attention to images: the score of a token that is exactly what a query asks for
+# Of the attention to images: the score of a token that is exactly what a query asks for.
+_SHARPNESS = 12.0
 
 
 def _mlp(width: int) -> nn.Sequential:
-    return nn.Sequential(nn.LayerNorm(width), nn.Linear(width, 2 * width), nn.GELU(), nn.Linear(2 * width, width))
+    return nn.Sequential(
+        nn.LayerNorm(width), nn.Linear(width, 2 * width), nn.GELU(), nn.Linear(2 * width, width)
+    )
 
 
 def _inverse_norms(vectors: Tensor) -> Tensor:
@@ -33,14 +37,19 @@ def _inverse_norms(vectors: Tensor) -> Tensor:
 class _Eye(nn.Module):
     """Turns the images of a camera into tokens, and those into keys and values for each look.
 
-    Patches are normalised before and after their projection (arXiv 2302.01327), as they differ by few pixels.
+    Patches are normalised before and after their projection (arXiv 2302.01327), as they differ by
+    few pixels.
     """
 
     def __init__(self, sizes: NetworkSizes) -> None:
         super().__init__()
         width, pixels = sizes.token_width, 3 * sizes.patch**2
-        self.cut = nn.Unfold(sizes.patch, padding=(sizes.patch - sizes.stride) // 2, stride=sizes.stride)
-        self.patches = nn.Sequential(nn.LayerNorm(pixels, _CONTRAST), nn.Linear(pixels, width), nn.LayerNorm(width))
+        self.cut = nn.Unfold(
+            sizes.patch, padding=(sizes.patch - sizes.stride) // 2, stride=sizes.stride
+        )
+        self.patches = nn.Sequential(
+            nn.LayerNorm(pixels, _CONTRAST), nn.Linear(pixels, width), nn.LayerNorm(width)
+        )
         self.places = nn.Parameter(0.02 * torch.randn((sizes.side // sizes.stride) ** 2, width))
         self.mix = _mlp(width)
         self.keys = nn.Sequential(nn.LayerNorm(width), nn.Linear(width, 2 * sizes.looks * width))
@@ -56,15 +65,24 @@ class _Look(nn.Module):
 
     def __init__(self, sizes: NetworkSizes) -> None:
         super().__init__()
-        self.ask = nn.Sequential(nn.LayerNorm(sizes.width), nn.Linear(sizes.width, len(CAMERAS) * sizes.token_width))
+        self.ask = nn.Sequential(
+            nn.LayerNorm(sizes.width), nn.Linear(sizes.width, len(CAMERAS) * sizes.token_width)
+        )
         self.answer = nn.Linear(len(CAMERAS) * (sizes.token_width + 2), sizes.width)
         self.among = nn.Linear(sizes.queries, sizes.queries)
         self.mix = _mlp(sizes.width)
 
-    def forward(self, queries: Tensor, seen: Sequence[tuple[Tensor, Tensor]], grid: Tensor) -> Tensor:
+    def forward(
+        self, queries: Tensor, seen: Sequence[tuple[Tensor, Tensor]], grid: Tensor
+    ) -> Tensor:
         found = []
         for asked, (keys, values) in zip(self.ask(queries).chunk(len(seen), -1), seen, strict=True):
-            cosines = asked @ keys.transpose(1, 2) * _inverse_norms(asked) * _inverse_norms(keys).transpose(1, 2)
+            cosines = (
+                asked
+                @ keys.transpose(1, 2)
+                * _inverse_norms(asked)
+                * _inverse_norms(keys).transpose(1, 2)
+            )
             scores = (_SHARPNESS * cosines).softmax(-1)
             found += [scores @ values, scores @ grid.to(scores.dtype)]
         queries = queries + self.answer(torch.cat(found, -1))
@@ -89,9 +107,10 @@ class _Block(nn.Module):
 class ReferenceNetwork(nn.Module):
     """Looks for what the instruction names, and turns noise into the actions towards it.
 
-    Queries read the words, so that each stands for a thing or a deed that is named. They look at the images twice: a
-    query's attention to a camera's tokens gives what it found, and its place. All of them and the robot's state make
-    the context, from which a small network computes the velocity of the flow (arXiv 2210.02747).
+    Queries read the words, so that each stands for a thing or a deed that is named. They look at
+    the images twice: a query's attention to a camera's tokens gives what it found, and its place.
+    All of them and the robot's state make the context, from which a small network computes the
+    velocity of the flow (arXiv 2210.02747).
     """
 
     def __init__(self, sizes: NetworkSizes) -> None:
@@ -106,19 +125,26 @@ class ReferenceNetwork(nn.Module):
         self.looks = nn.ModuleList(_Look(sizes) for _ in range(sizes.looks))
         self.context = nn.Linear(sizes.queries * width + sizes.state, 2 * sizes.head)
         self.noisy = nn.Linear(sizes.horizon * sizes.action, sizes.head)
-        self.when = nn.Sequential(nn.Linear(2 * _TIMES, sizes.head), nn.SiLU(), nn.Linear(sizes.head, sizes.head))
+        self.when = nn.Sequential(
+            nn.Linear(2 * _TIMES, sizes.head), nn.SiLU(), nn.Linear(sizes.head, sizes.head)
+        )
         self.why = nn.Linear(2 * sizes.head, sizes.head)
         self.blocks = nn.ModuleList(_Block(sizes.head) for _ in range(sizes.blocks))
         self.result = nn.Linear(sizes.head, sizes.horizon * sizes.action)
         side = torch.linspace(-1, 1, sizes.side // sizes.stride)
-        self.register_buffer("grid", torch.cartesian_prod(side, side).flip(-1), persistent=False)  # (tokens, 2): x, y
+        # (tokens, 2): x, y.
+        self.register_buffer("grid", torch.cartesian_prod(side, side).flip(-1), persistent=False)
 
     def encode(self, tokens: Tensor, state: Tensor, *images: Tensor) -> Tensor:
-        """Return the context (P, 2 * head) of words (P, L) int64, states (P, S) and images (P, 3, S, S) in [-1, 1]."""
+        """Return the context (P, 2 * head) of words (P, L) int64, states (P, S) and images (P,
+        3, S, S) in [-1, 1].
+        """
         words = self.words(tokens) + self.order
         keys, values = self.read(words).chunk(2, -1)
         scores = self.queries @ keys.transpose(1, 2) / math.sqrt(self.sizes.width)
-        queries = self.queries + scores.masked_fill(tokens[:, None] == 0, -math.inf).softmax(-1) @ values
+        queries = (
+            self.queries + scores.masked_fill(tokens[:, None] == 0, -math.inf).softmax(-1) @ values
+        )
         queries = queries + self.understand(queries) + self.feel(state)[:, None]
         seen = [eye(image) for eye, image in zip(self.eyes, images, strict=True)]
         for number, look in enumerate(self.looks):
@@ -126,7 +152,9 @@ class ReferenceNetwork(nn.Module):
         return silu(self.context(torch.cat([queries.flatten(1), state], -1)))
 
     def velocity(self, context: Tensor, actions: Tensor, times: Tensor) -> Tensor:
-        """Return the velocity, noise minus actions, of noisy actions (B, H, D) at times (B,), 1 being noise."""
+        """Return the velocity, noise minus actions, of noisy actions (B, H, D) at times (B,), 1
+        being noise.
+        """
         # Not a buffer, which a network of bfloat16 would round: the largest rate by several rad.
         angles = times[:, None].float() * torch.logspace(0, 3, _TIMES, device=times.device)
         when = torch.cat([angles.sin(), angles.cos()], -1).to(context.dtype)
@@ -137,15 +165,21 @@ class ReferenceNetwork(nn.Module):
         return self.result(hidden).unflatten(-1, actions.shape[1:])
 
 
-def flow_velocity(network: ReferenceNetwork, inputs: Mapping[str, Tensor]) -> Callable[[Tensor, float], Tensor]:
-    """Return the velocity for a learner, as a function of noisy actions (B, H, D) and time; inputs are encoded once.
+def flow_velocity(
+    network: ReferenceNetwork, inputs: Mapping[str, Tensor]
+) -> Callable[[Tensor, float], Tensor]:
+    """Return the velocity for a learner, as a function of noisy actions (B, H, D) and time; inputs
+    are encoded once.
 
     Args:
         network: The network.
-        inputs: "tokens" (B, L), "images" (B, cameras, 3, S, S) as `pixels` returns them, and "state" (B, S).
+        inputs: "tokens" (B, L), "images" (B, cameras, 3, S, S) as `pixels` returns them, and
+            "state" (B, S).
     """
     context = network.encode(inputs["tokens"], inputs["state"], *inputs["images"].unbind(1))
-    return lambda actions, time: network.velocity(context, actions, actions.new_full((len(actions),), time))
+    return lambda actions, time: network.velocity(
+        context, actions, actions.new_full((len(actions),), time)
+    )
 
 
 def read_network(sizes: NetworkSizes, folder: Path) -> ReferenceNetwork:
@@ -158,8 +192,12 @@ def read_network(sizes: NetworkSizes, folder: Path) -> ReferenceNetwork:
     try:
         with (folder / WEIGHTS).open("rb") as file:
             values = read_values(file)
-        network.load_state_dict({name: torch.from_numpy(value.copy()) for name, value in values.items()})
+        network.load_state_dict(
+            {name: torch.from_numpy(value.copy()) for name, value in values.items()}
+        )
     except (VLAgentsError, RuntimeError) as error:
         said = " ".join(str(error).split())[:300]
-        raise ConfigError(f"{folder / WEIGHTS}: cannot be read: {said}; copy the checkpoint again") from error
+        raise ConfigError(
+            f"{folder / WEIGHTS}: cannot be read: {said}; copy the checkpoint again"
+        ) from error
     return network

@@ -12,7 +12,14 @@ from pydantic import Field
 from vlagents_ray.contract import ActionSpec, Contract
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.interface import Obs
-from vlagents_ray.policies.base import ModelConfig, ModelPolicy, Prediction, Row, model_inputs, shared_frames
+from vlagents_ray.policies.base import (
+    ModelConfig,
+    ModelPolicy,
+    Prediction,
+    Row,
+    model_inputs,
+    shared_frames,
+)
 from vlagents_ray.policies.base.accelerator import torch_device, torch_dtype
 from vlagents_ray.policies.base.checkpoint import find_checkpoint
 from vlagents_ray.policies.base.config import Guidance, NoiseLevel
@@ -34,7 +41,9 @@ from vlagents_ray.registry import require
 class ReferencePasses(FlowPasses):
     """The passes of a `ReferenceNetwork`; actions stay in float32 between the steps."""
 
-    def encode(self, tokens: Any, mask: Any, cameras: Any, state: Any, *images: Any) -> tuple[Any, Any]:
+    def encode(
+        self, tokens: Any, mask: Any, cameras: Any, state: Any, *images: Any
+    ) -> tuple[Any, Any]:
         return self.model.encode(tokens, state, *images), tokens
 
     def velocity(self, encoded: Any, seen: Any, state: Any, actions: Any, times: Any) -> Any:
@@ -45,7 +54,8 @@ class ReferenceConfig(ModelConfig):
     """Settings of the reference policy, in addition to those of all models."""
 
     embodiment: str | None = Field(
-        default=None, description="the robot, as the checkpoint names it; unset: the only one that it has"
+        default=None,
+        description="the robot, as the checkpoint names it; unset: the only one that it has",
     )
     steps: int = Field(default=5, ge=1, description="steps of the flow")
     guidance: Guidance = 5.0
@@ -66,7 +76,9 @@ class LoadedReference:
 
 
 class Reference(ModelPolicy):
-    """The reference policy: chunks by flow matching, with one forward pass for all sessions of a batch."""
+    """The reference policy: chunks by flow matching, with one forward pass for all sessions of a
+    batch.
+    """
 
     Config: ClassVar[type] = ReferenceConfig
     trainable = network = "model.network"
@@ -96,13 +108,17 @@ class Reference(ModelPolicy):
         return self.config.actions == "chunk"
 
     def load(self) -> LoadedReference:
-        folder = find_checkpoint(self.config.checkpoint, self.config.checkpoint_step, needs=[CONFIG, WEIGHTS])
+        folder = find_checkpoint(
+            self.config.checkpoint, self.config.checkpoint_step, needs=[CONFIG, WEIGHTS]
+        )
         checkpoint = read_checkpoint(folder)
         known, name = checkpoint.embodiments, self.config.embodiment
         if name is None and len(known) == 1:
             [name] = known
         if name is None or name not in known:
-            raise ConfigError(f"embodiment: got {name!r}, want one of {sorted(known)}, those of {folder}")
+            raise ConfigError(
+                f"embodiment: got {name!r}, want one of {sorted(known)}, those of {folder}"
+            )
         robot = known[name]
         device = torch_device(self.config.device)
         from vlagents_ray.policies.reference.network import read_network  # imports torch
@@ -127,9 +143,15 @@ class Reference(ModelPolicy):
         """Return the network's inputs for one row."""
         model = self.loaded()
         sizes, found = model.checkpoint.sizes, model_inputs.camera_images(obs, model.cameras)
-        images = np.stack([model_inputs.resize_with_pad(found[name], sizes.side, sizes.side) for name in CAMERAS])
-        state = normalised(model.robot, model_inputs.state_vector(obs, self.state, self.state_dim), sizes.state)
-        staged: StagedRow = model.staging.stage({"tokens": self._begun().prompt, "images": images, "state": state})
+        images = np.stack(
+            [model_inputs.resize_with_pad(found[name], sizes.side, sizes.side) for name in CAMERAS]
+        )
+        state = normalised(
+            model.robot, model_inputs.state_vector(obs, self.state, self.state_dim), sizes.state
+        )
+        staged: StagedRow = model.staging.stage(
+            {"tokens": self._begun().prompt, "images": images, "state": state}
+        )
         return staged
 
     def predict(self, rows: Sequence[Row]) -> list[Prediction]:
@@ -138,7 +160,9 @@ class Reference(ModelPolicy):
         with torch.inference_mode():
             inputs = self._inputs([rows[i] for i in firsts])
             tokens = inputs["tokens"]
-            cameras = [torch.ones(len(tokens), dtype=torch.bool, device=tokens.device)] * len(CAMERAS)
+            cameras = [torch.ones(len(tokens), dtype=torch.bool, device=tokens.device)] * len(
+                CAMERAS
+            )
             flows, stated = model.passes.chunks(
                 rows,
                 [inputs["images"].unbind(1), cameras, tokens, tokens != 0, inputs["state"]],

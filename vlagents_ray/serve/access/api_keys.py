@@ -1,10 +1,12 @@
 """API keys and their permissions, without sockets or Ray.
 
-A key is 256 random bits (`vlagents_ray.serve.access.key_store.new_key`); the server stores its SHA-256. Slow password
-hashes are necessary only for passwords that people choose, since those can be guessed. These keys are random, and a
-slow hash at every request would take longer than the policy. Therefore users cannot choose keys.
+A key is 256 random bits (`vlagents_ray.serve.access.key_store.new_key`); the server stores its
+SHA-256. Slow password hashes are necessary only for passwords that people choose, since those can
+be guessed. These keys are random, and a slow hash at every request would take longer than the
+policy. Therefore users cannot choose keys.
 
-Limits apply per replica and per gateway: two replicas together allow a key twice its rate and sessions.
+Limits apply per replica and per gateway: two replicas together allow a key twice its rate and
+sessions.
 """
 
 from __future__ import annotations
@@ -34,9 +36,11 @@ logger = logging.getLogger(__name__)
 
 FILE_VARIABLE, TEXT_VARIABLE = "VLAGENTS_RAY_KEYS_FILE", "VLAGENTS_RAY_KEYS"
 _KEY_PROTOCOL = "vlagents.key."  # prefix of the WebSocket subprotocol that contains a key
-_THROTTLED_S = (0.05, 1.0)  # minimum and maximum time for which senders with a key over its rate are not read
+# Minimum and maximum time for which senders with a key over its rate are not read.
+_THROTTLED_S = (0.05, 1.0)
 _CHECK_S = 1.0  # minimum time between two checks of the file
-_WAIT_S = 0.25  # for a check: a network drive that hangs delays one request, possibly on the policy's thread
+# For a check: a network drive that hangs delays one request, possibly on the policy's thread.
+_WAIT_S = 0.25
 _CLOSE_S = 300.0  # time for which the keys stay valid while the file cannot be read
 _REMIND_S = 60.0  # time between two log lines about an unreadable file
 _UNREAD = object()  # the state of a file that could not be read: each check tries again
@@ -52,12 +56,15 @@ class NoKey(enum.Enum):
 class Keys:
     """The keys of a server, read again when their file changes; thread-safe.
 
-    If the file is deleted, all keys are refused. If it cannot be read or parsed, the keys stay valid for `_CLOSE_S`, so
-    that an editing mistake or a short failure of a network drive stops no robot; the log and a metric report it at
-    once. After that time all keys are refused until the file can be read, as some may have been revoked.
+    If the file is deleted, all keys are refused. If it cannot be read or parsed, the keys stay
+    valid for `_CLOSE_S`, so that an editing mistake or a short failure of a network drive stops no
+    robot; the log and a metric report it at once. After that time all keys are refused until the
+    file can be read, as some may have been revoked.
     """
 
-    def __init__(self, read: Callable[[], str], changed: Callable[[], object], where: str = "keys") -> None:
+    def __init__(
+        self, read: Callable[[], str], changed: Callable[[], object], where: str = "keys"
+    ) -> None:
         """Read the keys.
 
         Args:
@@ -68,10 +75,12 @@ class Keys:
         self._read, self._changed, self._where = read, changed, where
         self._keys: dict[bytes, Key] = {}
         self._buckets: dict[str, TokenBucket] = {}
-        self._unread_until: dict[str, float] = {}  # time before which the senders with a key are not read, s
+        # Time before which the senders with a key are not read, s.
+        self._unread_until: dict[str, float] = {}
         self._held: Counter[str] = Counter()  # number of connections, by the key's name
         self._checked = float("-inf")
-        self._unreadable: float | None = None  # time since which the file is unreadable, s; None if it is readable
+        # Time since which the file is unreadable, s; None if it is readable.
+        self._unreadable: float | None = None
         self._reminded = 0.0
         self._hung: threading.Thread | None = None  # a check that has not returned
         self._lock = threading.Lock()
@@ -81,13 +90,17 @@ class Keys:
 
     @classmethod
     def from_file(cls, path: str | Path) -> Keys:
-        """Read the keys from a file, which is then checked for changes; raise `ConfigError` if it is not a key file."""
+        """Read the keys from a file, which is then checked for changes; raise `ConfigError` if
+        it is not a key file.
+        """
         file = Path(path)
         return cls(lambda: read_text(file), lambda: _stamp(file), where=f"keys file {file}")
 
     @classmethod
     def from_text(cls, text: str) -> Keys:
-        """Read the keys from the text of a key file; they cannot be revoked while this process runs."""
+        """Read the keys from the text of a key file; they cannot be revoked while this process
+        runs.
+        """
         return cls(lambda: text, lambda: None)
 
     def check(self, token: str | None, app: str) -> Caller:
@@ -100,14 +113,16 @@ class Keys:
         if not token:
             self.audit.refused("", "no key")
             raise Unauthorized(
-                f"this server needs an API key: set {KEY_VARIABLE}, or api_key= (Python, C++), the option `key` "
+                f"this server needs an API key: set {KEY_VARIABLE}, or api_key= (Python, C++), the "
+                "option `key` "
                 f"(TypeScript) or the header 'Authorization: Bearer KEY' (HTTP)"
             )
         self._refresh()
         digest = hashlib.sha256(token.encode(errors="surrogateescape")).digest()
         found: bytes | None = None
         keys = self._keys  # another thread may replace the attribute
-        for known in keys:  # compares with all of them, so that the duration reveals nothing about the keys
+        # Compares with all of them, so that the duration reveals nothing about the keys.
+        for known in keys:
             if hmac.compare_digest(known, digest):
                 found = known
         if found is None:
@@ -137,22 +152,30 @@ class Keys:
                 self._unread_until[key.name] = now + min(most_s, max(least_s, wait_s))
         if wait_s > 0:
             error = TooManyRequests(
-                f"key {key.name!r}: over {key.rate:g} requests a second; wait {wait_s:.2g} s, send fewer, or ask the "
+                f"key {key.name!r}: over {key.rate:g} requests a second; wait {wait_s:.2g} s, send "
+                "fewer, or ask the "
                 f"operator of the server for a key with a higher rate"
             )
             error.retry_after_s = wait_s
             raise error
 
     def throttled_s(self, name: str) -> float:
-        """Return the time for which the key's senders are not read, s; 0 unless one exceeded the key's rate."""
+        """Return the time for which the key's senders are not read, s; 0 unless one exceeded the
+        key's rate.
+        """
         return max(0.0, self._unread_until.get(name, 0.0) - time.monotonic())
 
     def hold(self, name: str, number: int, most: int | None) -> None:
-        """Count `number` more connections of a key; over `most` count none and raise `TooManyRequests`."""
+        """Count `number` more connections of a key; over `most` count none and raise
+        `TooManyRequests`.
+        """
         with self._lock:
             held = self._held[name] + number
             if most is not None and number > 0 and held > most:
-                raise TooManyRequests(f"key {name!r} has {held - number} connections here and may hold {most} sessions")
+                raise TooManyRequests(
+                    f"key {name!r} has {held - number} connections here and may hold {most} "
+                    "sessions"
+                )
             self._held[name] = held
             if held <= 0:
                 del self._held[name]
@@ -173,17 +196,23 @@ class Keys:
                 return
             self._checked = now
             if self._hung is None:
-                reader = threading.Thread(target=self._read_again, args=(now,), name="keys", daemon=True)
+                reader = threading.Thread(
+                    target=self._read_again, args=(now,), name="keys", daemon=True
+                )
                 reader.start()
                 reader.join(_WAIT_S)
                 self._hung = reader if reader.is_alive() else None
             elif self._hung.is_alive():
-                self._handle_unreadable(TimeoutError(f"no answer of its file system for {_WAIT_S:g} s"), now)
+                self._handle_unreadable(
+                    TimeoutError(f"no answer of its file system for {_WAIT_S:g} s"), now
+                )
             else:
                 self._hung = None
 
     def _read_again(self, now: float) -> None:
-        """Read the file if it has changed; runs on a separate thread, which a network drive may block."""
+        """Read the file if it has changed; runs on a separate thread, which a network drive may
+        block.
+        """
         try:
             if (state := self._changed()) == self._state:
                 return
@@ -203,16 +232,26 @@ class Keys:
         left_s = _CLOSE_S - (now - since)
         if left_s <= 0 and self._keys:
             self._keys = {}
-            logger.critical("all keys are refused: for %g s no key file could be read: %s", _CLOSE_S, error)
+            logger.critical(
+                "all keys are refused: for %g s no key file could be read: %s", _CLOSE_S, error
+            )
         elif first or now - self._reminded >= _REMIND_S:
-            until = f"the keys stay as they were for {left_s:.0f} s more" if left_s > 0 else "all keys are refused"
+            until = (
+                f"the keys stay as they were for {left_s:.0f} s more"
+                if left_s > 0
+                else "all keys are refused"
+            )
             logger.error("the key file cannot be read; %s: %s", until, error)
         else:
             return
         self._reminded = now
 
     def _load(self, text: str | None) -> None:
-        self._keys = {} if text is None else {bytes.fromhex(key.sha256): key for key in parse_keys(text, self._where)}
+        self._keys = (
+            {}
+            if text is None
+            else {bytes.fromhex(key.sha256): key for key in parse_keys(text, self._where)}
+        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -237,7 +276,8 @@ class Caller:
         return 0 if key is None else key.sessions
 
     def admit(self, *, free: bool = False, scope: str | None = None) -> None:
-        """Check the key, and its `scope` if one is given, before each request; count the request unless it is `free`.
+        """Check the key, and its `scope` if one is given, before each request; count the request
+        unless it is `free`.
 
         Raises:
             Unauthorized: The key is revoked or has expired.
@@ -251,7 +291,9 @@ class Caller:
             raise
 
     def refusal(self, scope: str | None = None) -> str | None:
-        """Return the reason why the key is no longer valid or lacks the `scope`; None if it is valid."""
+        """Return the reason why the key is no longer valid or lacks the `scope`; None if it is
+        valid.
+        """
         try:
             self._admit(free=True, scope=scope)
         except VLAgentsError as error:
@@ -261,8 +303,8 @@ class Caller:
     def throttled_s(self) -> float:
         """Return for how long no sender with this key is read, s; 0 if the key is within its rate.
 
-        Receiving a refused message costs time on any connection, so the pause applies to the key, not to one
-        connection.
+        Receiving a refused message costs time on any connection, so the pause applies to the key,
+        not to one connection.
         """
         return self._keys.throttled_s(self.name)
 
@@ -270,12 +312,16 @@ class Caller:
         """Raise `TooManyRequests` for a new connection while senders with this key are not read."""
         if (wait_s := self.throttled_s()) > 0:
             self._keys.audit.refused(self.name, TooManyRequests.code)
-            error = TooManyRequests(f"key {self.name!r}: over its rate; connect again after {wait_s:.2g} s")
+            error = TooManyRequests(
+                f"key {self.name!r}: over its rate; connect again after {wait_s:.2g} s"
+            )
             error.retry_after_s = wait_s
             raise error
 
     def hold(self, number: int = 1) -> None:
-        """Count `number` more (or, negative, fewer) connections; raise `TooManyRequests` over the key's sessions."""
+        """Count `number` more (or, negative, fewer) connections; raise `TooManyRequests` over
+        the key's sessions.
+        """
         try:
             self._keys.hold(self.name, number, self.sessions)
         except TooManyRequests as error:
@@ -289,21 +335,30 @@ class Caller:
     def _admit(self, free: bool, scope: str | None = None) -> None:
         key = self._keys.key(self._digest)
         if key is None or key.revoked:
-            raise Unauthorized(f"key {self.name!r} was revoked; ask the operator of the server for another")
+            raise Unauthorized(
+                f"key {self.name!r} was revoked; ask the operator of the server for another"
+            )
         if key.expires is not None and time.time() >= key.expires:
-            raise Unauthorized(f"key {self.name!r} has expired; ask the operator of the server for another")
+            raise Unauthorized(
+                f"key {self.name!r} has expired; ask the operator of the server for another"
+            )
         if key.apps and self.app not in key.apps:
             raise Forbidden(f"key {self.name!r} is for {sorted(key.apps)}, not for {self.app!r}")
         if scope is not None and scope not in key.scopes:
-            raise Forbidden(f"key {self.name!r}: lacks the scope {scope!r}; use one of `keys new NAME --scope {scope}`")
+            raise Forbidden(
+                f"key {self.name!r}: lacks the scope {scope!r}; use one of `keys new NAME --scope "
+                f"{scope}`"
+            )
         if not free:
             self._keys.take(key)
 
 
 def load_keys(file: str | None = None, environment: Mapping[str, str] = os.environ) -> Keys | None:
-    """Load the keys in `file` or, if it is None, those that the environment names; return None without either.
+    """Load the keys in `file` or, if it is None, those that the environment names; return None
+    without either.
 
-    In the environment, `VLAGENTS_RAY_KEYS_FILE` is the path of a key file, `VLAGENTS_RAY_KEYS` its text.
+    In the environment, `VLAGENTS_RAY_KEYS_FILE` is the path of a key file, `VLAGENTS_RAY_KEYS` its
+    text.
     """
     if file or (file := environment.get(FILE_VARIABLE)):
         return Keys.from_file(file)
@@ -312,10 +367,12 @@ def load_keys(file: str | None = None, environment: Mapping[str, str] = os.envir
 
 
 def token_of(headers: Mapping[str, str]) -> str | None:
-    """Return the key of a request: `Authorization: Bearer KEY`, `Authorization: Api-Key KEY` or `x-api-key: KEY`.
+    """Return the key of a request: `Authorization: Bearer KEY`, `Authorization: Api-Key KEY` or
+    `x-api-key: KEY`.
 
-    openpi's client sends the second form. A page in a browser, which cannot set headers of a WebSocket, sends the key
-    among its subprotocols, as `vlagents.key.KEY`. The names in `headers` must be in lower case.
+    openpi's client sends the second form. A page in a browser, which cannot set headers of a
+    WebSocket, sends the key among its subprotocols, as `vlagents.key.KEY`. The names in `headers`
+    must be in lower case.
     """
     kind, _, token = headers.get("authorization", "").strip().partition(" ")
     if kind.lower() in ("bearer", "api-key") and token.strip():
@@ -325,13 +382,16 @@ def token_of(headers: Mapping[str, str]) -> str | None:
     return headers.get("x-api-key") or next(stated, None)
 
 
-Identity = Caller | NoKey  # the sender of requests: the holder of a key, or the reason why none is needed
+# The sender of requests: the holder of a key, or the reason why none is needed.
+Identity = Caller | NoKey
 
 _CALLER: ContextVar[Identity] = ContextVar("vlagents_ray_caller")
 
 
 def current_caller() -> Identity:
-    """Return the caller of the request that this task processes; raise `LookupError` outside `on_behalf_of`."""
+    """Return the caller of the request that this task processes; raise `LookupError` outside
+    `on_behalf_of`.
+    """
     return _CALLER.get()
 
 
@@ -346,7 +406,9 @@ def on_behalf_of(caller: Identity) -> Iterator[None]:
 
 
 def _stamp(file: Path) -> object:
-    """Return an object that changes when the file is written or replaced; None if the file is gone."""
+    """Return an object that changes when the file is written or replaced; None if the file is
+    gone.
+    """
     try:
         stat = file.stat()
     except FileNotFoundError:
@@ -355,12 +417,16 @@ def _stamp(file: Path) -> object:
 
 
 def require_access(host: str, keys: Keys | None, insecure: bool) -> None:
-    """Raise `ConfigError` if the server would accept other machines without keys and `insecure` does not allow that."""
+    """Raise `ConfigError` if the server would accept other machines without keys and `insecure`
+    does not allow that.
+    """
     if keys is None and not insecure and not is_loopback(host):
         raise ConfigError(
             f"host {host}: any client that reaches this server could command the policy. Make keys "
-            f"(`vlagents-ray keys new NAME --keys keys.json`) and serve with `--keys keys.json` (in a deployment file: "
-            f"`access: {{keys_file: PATH}}` under `args`); or use `--insecure` (`access: {{insecure: true}}`)"
+            "(`vlagents-ray keys new NAME --keys keys.json`) and serve with `--keys keys.json` "
+            "(in a deployment file: "
+            f"`access: {{keys_file: PATH}}` under `args`); or use `--insecure` (`access: "
+            f"{{insecure: true}}`)"
         )
 
 
@@ -368,8 +434,10 @@ def require_watch_keys(host: str, keys: Keys | None) -> None:
     """Raise `ConfigError` if other machines would reach a page on `host` without a key."""
     if keys is None and not is_loopback(host):
         raise ConfigError(
-            f"live page on {host}: without keys all cameras would be public. Make a key (`vlagents-ray keys new NAME "
-            f"--scope watch --file keys.json`) and set VLAGENTS_RAY_KEYS_FILE=keys.json; or stay on loopback, and look "
+            f"live page on {host}: without keys all cameras would be public. Make a key "
+            "(`vlagents-ray keys new NAME "
+            "--scope watch --file keys.json`) and set VLAGENTS_RAY_KEYS_FILE=keys.json; or stay "
+            "on loopback, and look "
             f"at it through `ssh -L`"
         )
 
@@ -378,8 +446,10 @@ def warn_of_plain_http(host: str) -> None:
     """Log a warning if API keys would cross a network unencrypted."""
     if not is_loopback(host):
         logger.warning(
-            "host %s: API keys cross the network unencrypted, where others may read them. Serve with --tls-cert and "
-            "--tls-key, or state that TLS ends elsewhere, with --plain-http (`access: {plain_http: true}`)",
+            "host %s: API keys cross the network unencrypted, where others may read them. Serve "
+            "with --tls-cert and "
+            "--tls-key, or state that TLS ends elsewhere, with --plain-http (`access: {plain_http: "
+            "true}`)",
             host,
         )
 
@@ -389,28 +459,36 @@ class ScopeCheck:
     """The check of the keys and scopes of requests to one endpoint."""
 
     subject: str  # the subject of the endpoint, for the error message
-    open_to_network: bool  # whether other machines reach this server without a key; requests are then refused
+    # Whether other machines reach this server without a key; requests are then refused.
+    open_to_network: bool
 
     def require(self, scope: str) -> None:
         """Check the key of the current request, and its scope.
 
         Raises:
             Unauthorized: The key is revoked or has expired.
-            Forbidden: The key lacks the scope, or the server has no keys and is open to other machines.
+            Forbidden: The key lacks the scope, or the server has no keys and is open to other
+                machines.
         """
         caller = current_caller()
         if isinstance(caller, Caller):
             caller.admit(free=True, scope=scope)
         elif self.open_to_network:
             raise Forbidden(
-                f"{self.subject}: not on a server with `--insecure`; make a key with `vlagents-ray keys new "
-                f"NAME --scope {scope}` and serve with `--keys`, or serve on loopback without `--insecure`"
+                f"{self.subject}: not on a server with `--insecure`; make a key with `vlagents-ray "
+                "keys new "
+                f"NAME --scope {scope}` and serve with `--keys`, or serve on loopback without "
+                "`--insecure`"
             )
 
     def may(self, scope: str) -> bool:
         """Return whether the current request has the scope, as `require` checks it."""
         caller = current_caller()
-        return caller.refusal(scope) is None if isinstance(caller, Caller) else not self.open_to_network
+        return (
+            caller.refusal(scope) is None
+            if isinstance(caller, Caller)
+            else not self.open_to_network
+        )
 
 
 def caller_name() -> str:

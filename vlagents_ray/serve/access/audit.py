@@ -1,4 +1,5 @@
-"""Audit log of API keys, `vlagents_ray.serve.audit`: one line per key and kind of event, not one per request.
+"""Audit log of API keys, `vlagents_ray.serve.audit`: one line per key and kind of event, not one
+per request.
 
     key arm-1: let in by websocket
     key arm-1: reset session 'robot-1'
@@ -6,9 +7,9 @@
     key (none): refused: an unknown key
     key lab: pressed 'pause' for session 'arm-1/7f3a'
 
-A kind of event is logged at once, and again after `_EVERY_S` at the earliest, with the number of omitted events. Only
-the buttons of the live page are always logged, also on a server without keys. The log contains names of keys, never
-keys. Refusals have the level WARNING, all other events INFO.
+A kind of event is logged at once, and again after `_EVERY_S` at the earliest, with the number of
+omitted events. Only the buttons of the live page are always logged, also on a server without keys.
+The log contains names of keys, never keys. Refusals have the level WARNING, all other events INFO.
 """
 
 from __future__ import annotations
@@ -25,7 +26,9 @@ _EVERY_S = 10.0
 
 
 def write_audit() -> None:
-    """Write this log to stderr, which Ray stores per process, unless logging is already configured."""
+    """Write this log to stderr, which Ray stores per process, unless logging is already
+    configured.
+    """
     logger.setLevel(logging.INFO)
     if not logger.hasHandlers():
         handler = logging.StreamHandler()
@@ -34,20 +37,27 @@ def write_audit() -> None:
 
 
 def log_pressed(name: str, what: str) -> None:
-    """Log every command of the key `name` to a session; an empty name means a server without keys."""
+    """Log every command of the key `name` to a session; an empty name means a server without
+    keys.
+    """
     logger.info("key %s: pressed %s", name or "(none)", what)
 
 
 class Audit:
-    """Writes the audit log; thread-safe. Only names of known keys are passed, which bounds the number of kinds."""
+    """Writes the audit log; thread-safe. Only names of known keys are passed, which bounds the
+    number of kinds.
+    """
 
     def __init__(self) -> None:
-        # By name and event: time of the last line, s, monotonic, and the number of events since then.
+        # By name and event: time of the last line, s, monotonic, and the number of events since
+        # then.
         self._kinds: dict[tuple[str, str], tuple[float, int]] = {}
         self._lock = threading.Lock()
 
     def did(self, name: str, what: str, of: str) -> None:
-        """Log that the key `name` did `what` ("let in by", "reset session"); `of` is the object of this event."""
+        """Log that the key `name` did `what` ("let in by", "reset session"); `of` is the object
+        of this event.
+        """
         if (more := self._due(name, what)) is not None:
             logger.info("key %s: %s %s%s", name, what, of, more)
 
@@ -57,7 +67,9 @@ class Audit:
             logger.warning("key %s: refused: %s%s", name or "(none)", why, more)
 
     def _due(self, name: str, what: str) -> str | None:
-        """Return the suffix of the line to log, or None if such an event was logged within `_EVERY_S`."""
+        """Return the suffix of the line to log, or None if such an event was logged within
+        `_EVERY_S`.
+        """
         now = time.monotonic()
         with self._lock:
             logged, left_out = self._kinds.get((name, what), (-math.inf, 0))

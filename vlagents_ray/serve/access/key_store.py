@@ -1,9 +1,11 @@
-"""The file of API keys: a JSON document with the hash and the permissions of each key, without the keys themselves.
+"""The file of API keys: a JSON document with the hash and the permissions of each key, without the
+keys themselves.
 
     {"keys": [{"name": "arm-1", "sha256": "9f86…", "apps": ["pi0"], "rate": 60, "sessions": 2,
                "rank": "robot", "scopes": ["weights"], "expires": 1798675200, "revoked": false}]}
 
-All fields but `name` and `sha256` are optional. `rate` is in requests/s, `expires` in seconds since 1970 (UTC).
+All fields but `name` and `sha256` are optional. `rate` is in requests/s, `expires` in seconds since
+1970 (UTC).
 """
 
 from __future__ import annotations
@@ -28,8 +30,8 @@ from vlagents_ray.protocol.messages import RANKS, RankName
 
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
 _SHA256 = re.compile(r"[0-9a-f]{64}")
-# Rights of a key in addition to using the policy: push new weights; watch all sessions on the live page; press its
-# buttons, which pause or stop a robot, or mark or save its episode.
+# Rights of a key in addition to using the policy: push new weights; watch all sessions on the live
+# page; press its buttons, which pause or stop a robot, or mark or save its episode.
 SCOPES = ("weights", "watch", "operate")
 _PREFIX = "vlr_"  # allows scanners of repositories and logs to find leaked keys
 
@@ -43,7 +45,8 @@ class Key:
     apps: tuple[str, ...] = ()  # the applications that the key is for; empty for all
     rate: float | None = None  # maximum rate, requests/s
     sessions: int | None = None  # maximum number of sessions at once
-    rank: RankName | None = None  # "simulation" for all requests of the key; otherwise each request states its class
+    # "simulation" for all requests of the key; otherwise each request states its class.
+    rank: RankName | None = None
     scopes: tuple[str, ...] = ()  # some of `SCOPES`
     expires: float | None = None  # time of expiry, s since 1970
     revoked: bool = False
@@ -51,23 +54,43 @@ class Key:
     def __post_init__(self) -> None:
         """Raise `ConfigError` if a field is invalid."""
         if not isinstance(self.name, str) or not _NAME.fullmatch(self.name):
-            raise ConfigError(f"key name: got {self.name!r}, want 1 to 64 letters, digits, '.', '_' or '-'")
+            raise ConfigError(
+                f"key name: got {self.name!r}, want 1 to 64 letters, digits, '.', '_' or '-'"
+            )
         if not isinstance(self.sha256, str) or not _SHA256.fullmatch(self.sha256):
-            raise ConfigError(f"key {self.name!r}: sha256: want 64 hexadecimal digits, as `keys new` makes them")
+            raise ConfigError(
+                f"key {self.name!r}: sha256: want 64 hexadecimal digits, as `keys new` makes them"
+            )
         if not all(isinstance(app, str) for app in self.apps):
-            raise ConfigError(f"key {self.name!r}: apps: got {self.apps!r}, want names of applications")
-        for field, kinds in (("rate", (int, float)), ("sessions", (int,)), ("expires", (int, float))):
+            raise ConfigError(
+                f"key {self.name!r}: apps: got {self.apps!r}, want names of applications"
+            )
+        for field, kinds in (
+            ("rate", (int, float)),
+            ("sessions", (int,)),
+            ("expires", (int, float)),
+        ):
             value = getattr(self, field)
-            if value is not None and (isinstance(value, bool) or not isinstance(value, kinds) or not 0 < value < 1e12):
-                raise ConfigError(f"key {self.name!r}: {field}: got {value!r}, want a positive number")
+            if value is not None and (
+                isinstance(value, bool) or not isinstance(value, kinds) or not 0 < value < 1e12
+            ):
+                raise ConfigError(
+                    f"key {self.name!r}: {field}: got {value!r}, want a positive number"
+                )
         if self.rank is not None and self.rank not in RANKS:
             meant = did_you_mean(str(self.rank), RANKS)
-            raise ConfigError(f"key {self.name!r}: rank: got {self.rank!r}, want one of {list(RANKS)}{meant}")
+            raise ConfigError(
+                f"key {self.name!r}: rank: got {self.rank!r}, want one of {list(RANKS)}{meant}"
+            )
         if unknown := sorted(map(str, set(self.scopes) - set(SCOPES))):
             meant = "".join(did_you_mean(scope, SCOPES) for scope in unknown)
-            raise ConfigError(f"key {self.name!r}: scopes: got {unknown}, want some of {list(SCOPES)}{meant}")
+            raise ConfigError(
+                f"key {self.name!r}: scopes: got {unknown}, want some of {list(SCOPES)}{meant}"
+            )
         if not isinstance(self.revoked, bool):
-            raise ConfigError(f"key {self.name!r}: revoked: got {self.revoked!r}, want true or false")
+            raise ConfigError(
+                f"key {self.name!r}: revoked: got {self.revoked!r}, want true or false"
+            )
 
 
 def parse_keys(text: str, where: str = "keys") -> list[Key]:
@@ -80,28 +103,37 @@ def parse_keys(text: str, where: str = "keys") -> list[Key]:
         entries = document["keys"]
     except (ValueError, TypeError, KeyError, RecursionError) as error:
         raise ConfigError(
-            f'{where}: expected a JSON document {{"keys": [...]}}, as `vlagents-ray keys new` writes it ({error})'
+            f'{where}: expected a JSON document {{"keys": [...]}}, as `vlagents-ray keys new` '
+            f"writes it ({error})"
         ) from error
     if not isinstance(entries, list):
         raise ConfigError(f"keys: got {type(entries).__name__}, want a list")
     keys = [_parse(entry) for entry in entries]
     names = [key.name for key in keys]
     if double := sorted({name for name in names if names.count(name) > 1}):
-        raise ConfigError(f"keys: {double} stand there more than once; each needs a name of its own")
+        raise ConfigError(
+            f"keys: {double} stand there more than once; each needs a name of its own"
+        )
     return keys
 
 
 def _parse(entry: Any) -> Key:
     if not isinstance(entry, dict) or not {"name", "sha256"} <= entry.keys():
-        raise ConfigError(f"keys: got {shown(entry)}, want an object with 'name' and 'sha256' at least")
+        raise ConfigError(
+            f"keys: got {shown(entry)}, want an object with 'name' and 'sha256' at least"
+        )
     known = {field.name for field in fields(Key)}
     if unknown := entry.keys() - known:
         meant = "".join(did_you_mean(field, known) for field in unknown)
-        raise ConfigError(f"key {entry['name']!r}: unknown {sorted(unknown)}, want some of {sorted(known)}{meant}")
+        raise ConfigError(
+            f"key {entry['name']!r}: unknown {sorted(unknown)}, want some of {sorted(known)}{meant}"
+        )
     lists = {field: entry.get(field) or [] for field in ("apps", "scopes")}
     for field, values in lists.items():
         if not isinstance(values, list) or not all(isinstance(value, str) for value in values):
-            raise ConfigError(f"key {entry['name']!r}: {field}: got {values!r}, want a list of names")
+            raise ConfigError(
+                f"key {entry['name']!r}: {field}: got {values!r}, want a list of names"
+            )
     return Key(**{**entry, **{field: tuple(values) for field, values in lists.items()}})
 
 
@@ -111,10 +143,13 @@ def read_text(file: Path) -> str:
         return file.read_text(encoding="utf-8")
     except OSError as error:
         raise ConfigError(
-            f"keys file {file}: cannot be read ({error.strerror}); `vlagents-ray keys new` makes one"
+            f"keys file {file}: cannot be read ({error.strerror}); `vlagents-ray keys new` makes "
+            "one"
         ) from error
     except UnicodeDecodeError as error:
-        raise ConfigError(f"keys file {file}: cannot be read, as it is not UTF-8 ({error.reason})") from error
+        raise ConfigError(
+            f"keys file {file}: cannot be read, as it is not UTF-8 ({error.reason})"
+        ) from error
 
 
 def read_keys(file: Path) -> list[Key]:
@@ -136,18 +171,22 @@ def new_key(file: Path, name: str, **allowed: Any) -> str:
         allowed: The other fields of `Key`.
 
     Raises:
-        ConfigError: The name is in use, a field is invalid, the key would have expired already, or the file cannot be
-            changed.
+        ConfigError: The name is in use, a field is invalid, the key would have expired already, or
+            the file cannot be changed.
     """
     expires = allowed.get("expires")
     if expires is not None and expires <= time.time():
-        raise ConfigError(f"key {name!r}: expires: expected a time in the future, got {expires:.0f} s since 1970")
+        raise ConfigError(
+            f"key {name!r}: expires: expected a time in the future, got {expires:.0f} s since 1970"
+        )
     token = _PREFIX + secrets.token_urlsafe(32)
     key = Key(name, hashlib.sha256(token.encode()).hexdigest(), **allowed)
 
     def add(keys: list[Key]) -> list[Key]:
         if any(other.name == name and not other.revoked for other in keys):
-            raise ConfigError(f"key {name!r} is there already; choose another name, or revoke it first")
+            raise ConfigError(
+                f"key {name!r} is there already; choose another name, or revoke it first"
+            )
         return [*(other for other in keys if other.name != name), key]
 
     _change(file, add)
@@ -155,12 +194,16 @@ def new_key(file: Path, name: str, **allowed: Any) -> str:
 
 
 def revoke(file: Path, name: str) -> None:
-    """Mark a key as revoked, which running servers detect within seconds; raise `ConfigError` for an unknown name."""
+    """Mark a key as revoked, which running servers detect within seconds; raise `ConfigError`
+    for an unknown name.
+    """
 
     def mark(keys: list[Key]) -> list[Key]:
         if all(key.name != name for key in keys):
             have = sorted(key.name for key in keys)
-            raise ConfigError(f"no key {name!r} in {file}; there are {have}{did_you_mean(name, have)}")
+            raise ConfigError(
+                f"no key {name!r} in {file}; there are {have}{did_you_mean(name, have)}"
+            )
         return [replace(key, revoked=True) if key.name == name else key for key in keys]
 
     _change(file, mark)
@@ -169,13 +212,15 @@ def revoke(file: Path, name: str) -> None:
 def _change(file: Path, change: Callable[[list[Key]], list[Key]]) -> None:
     """Read, change and replace the file as a whole, so that a server never reads a partial file.
 
-    The new file has the owner of the old one; otherwise a server could not read it, and would accept the old keys for
-    some time. If the owner cannot be preserved, nothing is changed and `ConfigError` is raised.
+    The new file has the owner of the old one; otherwise a server could not read it, and would
+    accept the old keys for some time. If the owner cannot be preserved, nothing is changed and
+    `ConfigError` is raised.
     """
     with _locked(file) as folder:
         keys = change(read_keys(file))
         stated = [
-            {name: value for name, value in asdict(key).items() if value not in (None, (), False)} for key in keys
+            {name: value for name, value in asdict(key).items() if value not in (None, (), False)}
+            for key in keys
         ]
         text = json.dumps({"keys": stated}, indent=2) + "\n"
         descriptor, name = tempfile.mkstemp(dir=file.parent, prefix=f".{file.name}.")
@@ -193,7 +238,9 @@ def _change(file: Path, change: Callable[[list[Key]], list[Key]]) -> None:
 
 
 def _belong(descriptor: int, file: Path) -> None:
-    """Give the open file `descriptor` the owner, group and mode of `file`, which it is about to replace."""
+    """Give the open file `descriptor` the owner, group and mode of `file`, which it is about to
+    replace.
+    """
     try:
         old = file.stat()
     except FileNotFoundError:
@@ -206,14 +253,17 @@ def _belong(descriptor: int, file: Path) -> None:
         os.fchmod(descriptor, old.st_mode & 0o777)
     except OSError as error:
         raise ConfigError(
-            f"keys file {file}: is user {old.st_uid}'s (group {old.st_gid}), which a new one cannot be made "
+            f"keys file {file}: is user {old.st_uid}'s (group {old.st_gid}), which a new one "
+            "cannot be made "
             f"({error.strerror}); nothing was changed: run this as that user, or as root"
         ) from error
 
 
 @contextlib.contextmanager
 def _locked(file: Path) -> Iterator[int]:
-    """Hold a lock on the file's folder, whose descriptor is yielded, so that no change of two commands is lost."""
+    """Hold a lock on the file's folder, whose descriptor is yielded, so that no change of two
+    commands is lost.
+    """
     try:
         descriptor = os.open(file.parent, os.O_RDONLY)
     except OSError as error:

@@ -1,12 +1,14 @@
-"""Check of requests from pages in a browser, which can reach a server on their machine like any other program.
+"""Check of requests from pages in a browser, which can reach a server on their machine like any
+other program.
 
 A server with API keys needs no such check, since the page also needs a key.
 
-A browser sends the site of the requesting page in `origin`, and the host name of the server in `host`. Only pages at
-this server's address are accepted: another site can let its own name resolve to this machine once its page is loaded
-(DNS rebinding), and requests of that page to that name have no `origin`. Therefore a request is refused if its `host`
-is a name that others could own. Accepted are addresses, names without a dot, names of private networks, this machine's
-own name and those in `access.hosts`. Programs that send no `host` are not browsers.
+A browser sends the site of the requesting page in `origin`, and the host name of the server in
+`host`. Only pages at this server's address are accepted: another site can let its own name resolve
+to this machine once its page is loaded (DNS rebinding), and requests of that page to that name have
+no `origin`. Therefore a request is refused if its `host` is a name that others could own. Accepted
+are addresses, names without a dot, names of private networks, this machine's own name and those in
+`access.hosts`. Programs that send no `host` are not browsers.
 """
 
 from __future__ import annotations
@@ -19,36 +21,45 @@ from urllib.parse import urlsplit
 
 from vlagents_ray.errors import Forbidden
 
-_PRIVATE = (".localhost", ".local", ".internal", ".lan", ".home.arpa", ".svc")  # suffixes outside of the public DNS
+# Suffixes outside of the public DNS.
+_PRIVATE = (".localhost", ".local", ".internal", ".lan", ".home.arpa", ".svc")
 _LONGEST = 260  # maximum length of a DNS name (253 characters) and a port
 
 
 def require_own_page(headers: Mapping[str, str], hosts: Collection[str] = ()) -> None:
-    """Refuse requests from pages of other sites: raise `Forbidden` if the page belongs, or could belong, to one.
+    """Refuse requests from pages of other sites: raise `Forbidden` if the page belongs, or could
+    belong, to one.
 
-    Names of `headers` are in lower case, as are `hosts`, further host names of this server, without a port.
+    Names of `headers` are in lower case, as are `hosts`, further host names of this server, without
+    a port.
     """
     origin, host = headers.get("origin"), headers.get("host")
     if origin is not None and not _is_own(origin, host):
         raise Forbidden(
-            f"origin {origin[:100]!r}: a page of another site reaches no robot, not even with a key; let the program "
+            f"origin {origin[:100]!r}: a page of another site reaches no robot, not even with a "
+            "key; let the program "
             f"behind that page send the request"
         )
     if host is not None and not _is_ours(host, hosts):
         raise Forbidden(
-            f"host {host[:100]!r}: a name that could be another site's, which has it lead here; if it is the server's, "
-            f"state it under `access: {{hosts: [...]}}`, use the server's address, or serve with keys"
+            f"host {host[:100]!r}: a name that could be another site's, which has it lead here; if "
+            "it is the server's, "
+            f"state it under `access: {{hosts: [...]}}`, use the server's address, or serve with "
+            "keys"
         )
 
 
 def require_same_origin(headers: Mapping[str, str]) -> None:
-    """Refuse GETs from other sites' pages, including those without `origin`, such as image requests.
+    """Refuse GETs from other sites' pages, including those without `origin`, such as image
+    requests.
 
     Raises:
         Forbidden: The browser reports that another site's page sent the request.
     """
     if (site := headers.get("sec-fetch-site", "none")) not in ("same-origin", "none"):
-        raise Forbidden(f"sec-fetch-site: got {site[:40]!r}, want 'same-origin'; open the live page itself")
+        raise Forbidden(
+            f"sec-fetch-site: got {site[:40]!r}, want 'same-origin'; open the live page itself"
+        )
 
 
 def _is_own(origin: str, host: str | None) -> bool:
@@ -68,7 +79,9 @@ def _is_ours(host: str, hosts: Collection[str]) -> bool:
 
 @lru_cache(maxsize=64)  # every request of a robot has the same header
 def _name_of(host: str) -> tuple[str, bool]:
-    """Return the name in a `host` header, without the port, and whether no other site can own it."""
+    """Return the name in a `host` header, without the port, and whether no other site can own
+    it.
+    """
     try:
         name = (urlsplit(f"//{host}").hostname or "").rstrip(".")
     except ValueError:  # the header holds no valid host

@@ -27,57 +27,81 @@ POLICY, GATEWAY = "Policy", "Gateway"  # the deployments of an application
 
 Port = Annotated[int, Field(ge=1, le=65_535)]
 # Links are not followed: the interpreter of a virtual environment links to that of its creator.
-AbsolutePath = Annotated[str, AfterValidator(lambda path: os.path.abspath(os.path.expanduser(path)))]
+AbsolutePath = Annotated[
+    str, AfterValidator(lambda path: os.path.abspath(os.path.expanduser(path)))
+]
 
 
 class _DeploymentModel(BaseModel):
-    model_config = ConfigDict(extra="forbid", hide_input_in_errors=True)  # errors are logged; inputs may be secret
+    # Errors are logged; inputs may be secret.
+    model_config = ConfigDict(extra="forbid", hide_input_in_errors=True)
 
 
 class EnvironmentArgs(_DeploymentModel):
-    """The Python environment of a policy; by default the policy runs in the replica, in the cluster's environment."""
+    """The Python environment of a policy; by default the policy runs in the replica, in the
+    cluster's environment.
+    """
 
     python: AbsolutePath | None = Field(
         default=None,
-        description="interpreter of a virtual environment, on every node the same; a relative path is one from the "
+        description="interpreter of a virtual environment, on every node the same; a relative path "
+        "is one from the "
         "working directory",
     )
     process: Literal["auto", "replica", "child"] = Field(
         default="auto",
-        description="with `python`: is the replica itself to run there (same Python minor and Ray as the cluster's), "
+        description="with `python`: is the replica itself to run there (same Python minor and Ray "
+        "as the cluster's), "
         "or a child process behind it? auto: the replica where it can",
     )
-    env_vars: dict[str, str] = Field(default_factory=dict, description="variables of the policy's process")
+    env_vars: dict[str, str] = Field(
+        default_factory=dict, description="variables of the policy's process"
+    )
 
     @model_validator(mode="after")
     def _one(self) -> EnvironmentArgs:
         if self.python is None and self.process != "auto":
-            raise ValueError(f"process: got {self.process!r} without `python`; name an interpreter, or leave it out")
-        # The check also covers a child process: Serve shows the deployment, and a child may become a replica.
+            raise ValueError(
+                f"process: got {self.process!r} without `python`; name an interpreter, or leave it "
+                "out"
+            )
+        # The check also covers a child process: Serve shows the deployment, and a child may become
+        # a replica.
         require_no_secrets({"env_vars": self.env_vars})
         return self
 
     def runtime_env(self) -> dict[str, Any]:
-        """Return Ray's `runtime_env` of the replica; empty if the policy runs in a child process."""
+        """Return Ray's `runtime_env` of the replica; empty if the policy runs in a child
+        process.
+        """
         stated = {"py_executable": self.python, "env_vars": self.env_vars}
-        return {} if self.process == "child" else {name: value for name, value in stated.items() if value}
+        return (
+            {}
+            if self.process == "child"
+            else {name: value for name, value in stated.items() if value}
+        )
 
 
 class BatchArgs(_DeploymentModel):
     """The settings of the batch queue of one replica."""
 
-    max_size: int = Field(default=16, ge=1, le=MOST_ROWS, description="observations in one forward pass, at most")
+    max_size: int = Field(
+        default=16, ge=1, le=MOST_ROWS, description="observations in one forward pass, at most"
+    )
     sizes: list[Annotated[int, Field(le=MOST_ROWS)]] | None = Field(
         default=None,
-        description="for compiled models: the only batch sizes to run, ascending; smaller batches are padded up to "
+        description="for compiled models: the only batch sizes to run, ascending; smaller batches "
+        "are padded up to "
         "the next one. The largest is max_size, which may then be left out",
     )
     patience: float = Field(
         default=0.1,
         ge=0,
         le=1,
-        description="how long a batch may wait for simulations that were in the batch before and are coming back, as "
-        "a share of that batch's duration; robots that act again at once wait for one another while that saves time. 0 "
+        description="how long a batch may wait for simulations that were in the batch before and "
+        "are coming back, as "
+        "a share of that batch's duration; robots that act again at once wait for one another "
+        "while that saves time. 0 "
         "never waits, nor does a lone session",
     )
 
@@ -86,124 +110,180 @@ class BatchArgs(_DeploymentModel):
         if self.sizes is None:
             return self
         if not self.sizes or self.sizes[0] < 1 or self.sizes != sorted(set(self.sizes)):
-            raise ValueError(f"sizes: got {self.sizes}, want ascending positive numbers, such as [1, 2, 4, 8, 16]")
+            raise ValueError(
+                f"sizes: got {self.sizes}, want ascending positive numbers, such as [1, 2, 4, 8, "
+                "16]"
+            )
         if "max_size" in self.model_fields_set and self.max_size != self.sizes[-1]:
-            raise ValueError(f"max_size {self.max_size} is not the largest of sizes {self.sizes}; leave it out")
+            raise ValueError(
+                f"max_size {self.max_size} is not the largest of sizes {self.sizes}; leave it out"
+            )
         self.max_size = self.sizes[-1]
         return self
 
 
 class CheckpointArgs(_DeploymentModel):
-    """The checkpoints that a session may choose, as in `reset(..., checkpoint="late")` or `checkpoint_step=20000`."""
+    """The checkpoints that a session may choose, as in `reset(..., checkpoint="late")` or
+    `checkpoint_step=20000`.
+    """
 
     choices: dict[str, dict[str, Any]] = Field(
         default_factory=dict,
-        description="by name, the settings that take the place of those in `config`; or `adapter` alone, a PEFT folder "
+        description="by name, the settings that take the place of those in `config`; or `adapter` "
+        "alone, a PEFT folder "
         "or hub id (org/name, org/name@COMMIT) of a LoRA adapter over the checkpoint in `config`",
     )
-    steps: bool = Field(default=False, description="any step of a checkpoint whose path holds {step}")
+    steps: bool = Field(
+        default=False, description="any step of a checkpoint whose path holds {step}"
+    )
     loaded: int = Field(
-        default=2, ge=1, le=1_000_000, description="checkpoints in the memory of one replica at once, at most"
+        default=2,
+        ge=1,
+        le=1_000_000,
+        description="checkpoints in the memory of one replica at once, at most",
     )
 
     @field_validator("choices")
     @classmethod
     def _adapters_stand_alone(cls, choices: dict[str, dict[str, Any]]) -> dict[str, dict[str, Any]]:
         for name, settings in choices.items():
-            if ADAPTER in settings and (len(settings) > 1 or not isinstance(settings[ADAPTER], str)):
+            if ADAPTER in settings and (
+                len(settings) > 1 or not isinstance(settings[ADAPTER], str)
+            ):
                 raise ValueError(
-                    f"{name}: got {settings}, want {{{ADAPTER}: FOLDER or org/name@COMMIT}} alone; it is used with the "
+                    f"{name}: got {settings}, want {{{ADAPTER}: FOLDER or org/name@COMMIT}} alone; "
+                    "it is used with the "
                     f"settings in `config`"
                 )
         return choices
 
-    def of(self, make: Callable[[Mapping[str, Any]], Agent], config: Mapping[str, Any]) -> Checkpoints:
-        """Return the checkpoints of a policy that `make` builds; `config` are the deployment's own settings of it."""
+    def of(
+        self, make: Callable[[Mapping[str, Any]], Agent], config: Mapping[str, Any]
+    ) -> Checkpoints:
+        """Return the checkpoints of a policy that `make` builds; `config` are the deployment's
+        own settings of it.
+        """
         return Checkpoints(make, config, self.choices, steps=self.steps, loaded=self.loaded)
 
 
 class SessionArgs(_DeploymentModel):
     """The limits of the sessions of one replica."""
 
-    limit: int = Field(default=1000, ge=1, le=1_000_000, description="sessions held at once; the next reset gets 503")
+    limit: int = Field(
+        default=1000,
+        ge=1,
+        le=1_000_000,
+        description="sessions held at once; the next reset gets 503",
+    )
     idle_s: float = Field(
-        default=600.0, gt=0, le=MOST_S, description="a session that sends nothing for so long is forgotten"
+        default=600.0,
+        gt=0,
+        le=MOST_S,
+        description="a session that sends nothing for so long is forgotten",
     )
 
 
 class StreamArgs(_DeploymentModel):
     """Each replica's own port for WebSockets, which avoids the proxy.
 
-    Clients get its address from the metadata; clients that cannot reach it (a firewall, a tunnel) use the proxy.
+    Clients get its address from the metadata; clients that cannot reach it (a firewall, a tunnel)
+    use the proxy.
     """
 
     enabled: bool = True
     ports: tuple[Port, Port] | None = Field(
-        default=None, description="first and last port to choose from; unset: any. Each replica of a node takes one"
+        default=None,
+        description="first and last port to choose from; unset: any. Each replica of a node takes "
+        "one",
     )
 
     @model_validator(mode="after")
     def _ascending(self) -> StreamArgs:
         if self.ports is not None and self.ports[0] > self.ports[1]:
-            raise ValueError(f"ports: got {list(self.ports)}, want the first and the last one, such as [9000, 9015]")
+            raise ValueError(
+                f"ports: got {list(self.ports)}, want the first and the last one, such as [9000, "
+                "9015]"
+            )
         return self
 
 
 class LimitArgs(_DeploymentModel):
-    """The size limits of a request, over which it gets 413, and the time limits of clients and of the policy."""
+    """The size limits of a request, over which it gets 413, and the time limits of clients and
+    of the policy.
+    """
 
     slow_s: float = Field(
         default=30.0,
         gt=0,
         le=MOST_S,
-        description="a request's body has to be here, a WebSocket's reply to be taken in this time; else its "
+        description="a request's body has to be here, a WebSocket's reply to be taken in this "
+        "time; else its "
         "connection is cut",
     )
     act_s: float = Field(
         default=CallLimits().act_s,
         gt=0,
         le=MOST_S,
-        description="a batch of acts, or a reset, that takes longer, and longer than ten times the longest so far, "
+        description="a batch of acts, or a reset, that takes longer, and longer than ten times the "
+        "longest so far, "
         "makes the replica unhealthy: Serve replaces it, and sessions go on elsewhere",
     )
     warm_up_s: float = Field(
         default=CallLimits().warm_up_s,
         gt=0,
         le=MOST_S,
-        description="the same for the first two resets and batches, of each of `batch.sizes`, which may compile",
+        description="the same for the first two resets and batches, of each of `batch.sizes`, "
+        "which may compile",
     )
     load_s: float = Field(
-        default=CallLimits().load_s, gt=0, le=MOST_S, description="that loading a checkpoint may take"
+        default=CallLimits().load_s,
+        gt=0,
+        le=MOST_S,
+        description="that loading a checkpoint may take",
     )
     body_bytes: int = Field(default=DEFAULT_LIMITS.body_bytes, ge=1024, le=MOST_BYTES)
     reply_bytes: int = Field(
         default=DEFAULT_LIMITS.reply_bytes,
         ge=1024,
         le=DEFAULT_LIMITS.body_bytes,  # no client reads a longer reply
-        description="of the action and the info of one reply; a policy that returns more has failed (500)",
+        description="of the action and the info of one reply; a policy that returns more has "
+        "failed (500)",
     )
     decoded_bytes: int = Field(
         default=DEFAULT_LIMITS.decoded_bytes,
         ge=1024,
         le=MOST_BYTES,
-        description="of the images and bytes of one request, decoded, each as often as it is named; with the rate of a "
+        description="of the images and bytes of one request, decoded, each as often as it is "
+        "named; with the rate of a "
         "key it bounds what that has decoded in a second",
     )
     in_flight_bytes: int = Field(
         default=DEFAULT_LIMITS.in_flight_bytes,
         ge=1024,
         le=MOST_BYTES,
-        description="of all messages that a replica works on, encoded and decoded; over it the next ones get 503. A "
+        description="of all messages that a replica works on, encoded and decoded; over it the "
+        "next ones get 503. A "
         "quarter is kept for robots",
     )
-    pixels: int = Field(default=DEFAULT_LIMITS.pixels, ge=1, le=MOST_BYTES, description="of one image")
+    pixels: int = Field(
+        default=DEFAULT_LIMITS.pixels, ge=1, le=MOST_BYTES, description="of one image"
+    )
     cameras: int = Field(default=DEFAULT_LIMITS.cameras, ge=0, le=1_000_000)
     state_values: int = Field(
-        default=DEFAULT_LIMITS.state_values, ge=0, le=1_000_000, description="of one part of the proprioception"
+        default=DEFAULT_LIMITS.state_values,
+        ge=0,
+        le=1_000_000,
+        description="of one part of the proprioception",
     )
-    depth: int = Field(default=DEFAULT_LIMITS.depth, ge=1, le=1_000_000, description="nesting of info and kwargs")
-    items: int = Field(default=DEFAULT_LIMITS.items, ge=1, le=1_000_000, description="values in info and kwargs")
-    text: int = Field(default=DEFAULT_LIMITS.text, ge=1, le=1_000_000, description="characters of an instruction")
+    depth: int = Field(
+        default=DEFAULT_LIMITS.depth, ge=1, le=1_000_000, description="nesting of info and kwargs"
+    )
+    items: int = Field(
+        default=DEFAULT_LIMITS.items, ge=1, le=1_000_000, description="values in info and kwargs"
+    )
+    text: int = Field(
+        default=DEFAULT_LIMITS.text, ge=1, le=1_000_000, description="characters of an instruction"
+    )
 
     def limits(self) -> Limits:
         """Return the limits of the decoders."""
@@ -219,16 +299,22 @@ class AccessArgs(_DeploymentModel):
 
     keys_file: str | None = Field(
         default=None,
-        description="path of the API keys, on every node the same; unset: what VLAGENTS_RAY_KEYS_FILE or "
+        description="path of the API keys, on every node the same; unset: what "
+        "VLAGENTS_RAY_KEYS_FILE or "
         "VLAGENTS_RAY_KEYS say where the replica runs",
     )
-    insecure: bool = Field(default=False, description="accept clients on other machines without keys")
+    insecure: bool = Field(
+        default=False, description="accept clients on other machines without keys"
+    )
     plain_http: bool = Field(
-        default=False, description="keys may cross the network unencrypted: no warning (TLS ends elsewhere, a VPN)"
+        default=False,
+        description="keys may cross the network unencrypted: no warning (TLS ends elsewhere, "
+        "a VPN)",
     )
     hosts: list[Annotated[str, AfterValidator(str.lower)]] = Field(
         default_factory=list,
-        description="without keys: names in the public DNS by which clients reach the server; its addresses, names "
+        description="without keys: names in the public DNS by which clients reach the server; its "
+        "addresses, names "
         "without a dot and those of private networks need not be stated",
     )
 
@@ -248,7 +334,9 @@ class AccessArgs(_DeploymentModel):
 
 
 class AutoscalingArgs(_DeploymentModel):
-    """The number of replicas by measured load over all transports, see `vlagents_ray.serve.scaling.autoscaling`."""
+    """The number of replicas by measured load over all transports, see
+    `vlagents_ray.serve.scaling.autoscaling`.
+    """
 
     min_replicas: int = Field(default=1, ge=0, le=MOST_WORKERS)
     max_replicas: int = Field(default=1, ge=1, le=MOST_WORKERS)
@@ -265,14 +353,22 @@ class AutoscalingArgs(_DeploymentModel):
     target_sessions: float | None = Field(
         default=None, gt=0, le=1_000_000, description="sessions of a replica; unset: any number"
     )
-    look_back_s: float = Field(default=15.0, gt=0, le=MOST_S, description="load is averaged over this time")
-    upscale_delay_s: float = Field(default=10.0, ge=0, le=MOST_S, description="more must be wanted for this long")
-    downscale_delay_s: float = Field(default=300.0, ge=0, le=MOST_S, description="less must be wanted for this long")
+    look_back_s: float = Field(
+        default=15.0, gt=0, le=MOST_S, description="load is averaged over this time"
+    )
+    upscale_delay_s: float = Field(
+        default=10.0, ge=0, le=MOST_S, description="more must be wanted for this long"
+    )
+    downscale_delay_s: float = Field(
+        default=300.0, ge=0, le=MOST_S, description="less must be wanted for this long"
+    )
 
     @model_validator(mode="after")
     def _ordered(self) -> AutoscalingArgs:
         if self.min_replicas > self.max_replicas:
-            raise ValueError(f"min_replicas {self.min_replicas} is over max_replicas {self.max_replicas}")
+            raise ValueError(
+                f"min_replicas {self.min_replicas} is over max_replicas {self.max_replicas}"
+            )
         return self
 
     def options(self) -> dict[str, Any]:
@@ -310,7 +406,8 @@ class ServerArgs(_DeploymentModel):
     config: dict[str, Any] = Field(default_factory=dict, description="the policy's own settings")
     wrappers: list[str | dict[str, dict[str, Any]]] = Field(
         default=[],
-        description="what changes the policy's observations, the first being the nearest to the robot: names, or "
+        description="what changes the policy's observations, the first being the nearest to the "
+        "robot: names, or "
         "{name: settings}",
     )
     checkpoints: CheckpointArgs = CheckpointArgs()
@@ -324,11 +421,16 @@ class ServerArgs(_DeploymentModel):
     access: AccessArgs = AccessArgs()
     stream: StreamArgs = StreamArgs()
     resources: ResourceArgs = ResourceArgs()
-    environment: EnvironmentArgs = Field(default=EnvironmentArgs(), description="the Python that the policy runs in")
-    dialects: DialectArgs = Field(default=DialectArgs(), description="other systems' clients that may connect")
+    environment: EnvironmentArgs = Field(
+        default=EnvironmentArgs(), description="the Python that the policy runs in"
+    )
+    dialects: DialectArgs = Field(
+        default=DialectArgs(), description="other systems' clients that may connect"
+    )
     parts: PartArgs = Field(
         default=PartArgs(),
-        description="parts of the replica that plug-ins add; null turns one off that is on by default",
+        description="parts of the replica that plug-ins add; null turns one off that is on by "
+        "default",
     )
 
     @property
@@ -339,11 +441,17 @@ class ServerArgs(_DeploymentModel):
         return max(self.autoscaling.min_replicas, self.autoscaling.initial_replicas or 0)
 
     def code(self) -> tuple[GitState | None, Program]:
-        """Return the git state of the policy's code, and the digests of its files and of those of its wrappers."""
+        """Return the git state of the policy's code, and the digests of its files and of those
+        of its wrappers.
+        """
         policy = target_of("policies", self.policy)
-        wrappers = [name for one in self.wrappers for name in ([one] if isinstance(one, str) else one)]
+        wrappers = [
+            name for one in self.wrappers for name in ([one] if isinstance(one, str) else one)
+        ]
         classes = [policy, *(target_of("wrappers", name) for name in wrappers)]
-        return code_of(policy), {name: of for one in classes for name, of in loaded_code(one).items()}
+        return code_of(policy), {
+            name: of for one in classes for name, of in loaded_code(one).items()
+        }
 
     @model_validator(mode="after")
     def _one_scaling(self) -> ServerArgs:

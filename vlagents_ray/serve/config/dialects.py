@@ -1,7 +1,8 @@
-"""The settings under `args.dialects` in a deployment file; a dialect that is not named there is off.
+"""The settings under `args.dialects` in a deployment file; a dialect that is not named there is
+off.
 
-Each dialect defines its own settings as `Config` of its class. This module defines the settings that they share, and
-the section of all dialects by name: a registered name, or "module:Class".
+Each dialect defines its own settings as `Config` of its class. This module defines the settings
+that they share, and the section of all dialects by name: a registered name, or "module:Class".
 """
 
 from __future__ import annotations
@@ -35,7 +36,9 @@ class DialectConfig(BaseModel, extra="forbid"):
         description="how the client's observations become ours: a preset's name, or an object, see "
         "vlagents_ray.wire.mapping; unset: the client uses our names",
     )
-    rank: RankName = Field(default="robot", description="class of its requests: robots go before simulations")
+    rank: RankName = Field(
+        default="robot", description="class of its requests: robots go before simulations"
+    )
 
     @field_validator("mapping")
     @classmethod
@@ -52,10 +55,13 @@ class DialectConfig(BaseModel, extra="forbid"):
 class PortConfig(DialectConfig):
     """The settings of all dialects that have their own port."""
 
-    port: int = Field(ge=1, le=65535, description="that clients connect to; a taken one fails the deployment")
+    port: int = Field(
+        ge=1, le=65535, description="that clients connect to; a taken one fails the deployment"
+    )
     host: str | None = Field(
         default=None,
-        description="the address that it listens at; default: that of the server which `vlagents-ray serve` starts, "
+        description="the address that it listens at; default: that of the server which "
+        "`vlagents-ray serve` starts, "
         "and 127.0.0.1 under `serve deploy`",
     )
 
@@ -64,7 +70,8 @@ class KeylessPortConfig(PortConfig):
     """The settings of a dialect with its own port, whose protocol has no field for an API key."""
 
     without_key: bool = Field(
-        default=False, description="with API keys on: accept clients here without one, as the protocol has no key"
+        default=False,
+        description="with API keys on: accept clients here without one, as the protocol has no key",
     )
 
 
@@ -89,13 +96,17 @@ class DialectArgs(RegisteredArgs):
         return {name: one for name, one in self.on().items() if isinstance(one, PortConfig)}
 
     def at_root(self) -> list[str]:
-        """Return the dialects at the root: the first one that has a root, and others with the same protocol there."""
+        """Return the dialects at the root: the first one that has a root, and others with the
+        same protocol there.
+        """
         roots = {name: getattr(dialect_class(name), "root", "") for name in self.on()}
         first = next(filter(None, roots.values()), None)
         return [name for name, root in roots.items() if root == first]
 
     def describe(self) -> dict[str, Any]:
-        """Describe the enabled dialects for the metadata: addresses, clients and mapping by name."""
+        """Describe the enabled dialects for the metadata: addresses, clients and mapping by
+        name.
+        """
         found: dict[str, Any] = {}
         for name, config in self.on().items():
             cls, mapping = dialect_class(name), config.keys()
@@ -110,7 +121,9 @@ class DialectArgs(RegisteredArgs):
         return found
 
     def require_fit(self, contract: Contract | None) -> None:
-        """Raise `ConfigError` if the policy needs a part of the observation that a dialect's mapping lacks."""
+        """Raise `ConfigError` if the policy needs a part of the observation that a dialect's
+        mapping lacks.
+        """
         found = [
             f"- dialects.{name}: {line}"
             for name, config in self.on().items()
@@ -129,11 +142,12 @@ class DialectArgs(RegisteredArgs):
 def read_mapping(value: str | Mapping[str, Any]) -> KeyMapping:
     """Read a mapping.
 
-    The presets are the mappings of known clients. Each dialect defines its own, with the units and orders of its
-    system's examples.
+    The presets are the mappings of known clients. Each dialect defines its own, with the units and
+    orders of its system's examples.
 
     Args:
-        value: A preset's name, or an object. The fields of an object with `preset` override those of that preset.
+        value: A preset's name, or an object. The fields of an object with `preset` override those
+            of that preset.
 
     Raises:
         ConfigError: The preset is unknown, or the object is invalid.
@@ -160,11 +174,15 @@ def _preset(name: object) -> Mapping[str, Any]:
             return of_dialect[name]
     known = presets()
     meant = did_you_mean(str(name), known)
-    raise ConfigError(f"mapping: got {name!r}, want one of the presets {sorted(known)}, or an object{meant}")
+    raise ConfigError(
+        f"mapping: got {name!r}, want one of the presets {sorted(known)}, or an object{meant}"
+    )
 
 
 def _presets_by_dialect() -> Iterator[Mapping[str, Mapping[str, Any]]]:
-    """Yield the presets of each dialect; one that cannot be imported is left out, and its error is logged."""
+    """Yield the presets of each dialect; one that cannot be imported is left out, and its error
+    is logged.
+    """
     for name in names("dialects"):
         try:
             dialect = dialect_class(name)

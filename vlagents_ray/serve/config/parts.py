@@ -24,7 +24,8 @@ class PartArgs(RegisteredArgs):
     def on(self) -> dict[str, Any]:
         """Return the settings of the enabled parts, by name, in the order of the registry.
 
-        A part that is on by default is on where its plug-in is installed: a policy's own Python may lack it.
+        A part that is on by default is on where its plug-in is installed: a policy's own Python may
+        lack it.
         """
         settings = dict(self.model_extra or {})
         for name, entry in entries(self.kind).items():

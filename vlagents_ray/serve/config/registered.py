@@ -13,7 +13,8 @@ from vlagents_ray.registry import names, registered_class
 
 
 class RegisteredArgs(BaseModel, extra="allow"):
-    """A section of a deployment file with a key for each class that is on: a registered name, or "module:Class".
+    """A section of a deployment file with a key for each class that is on: a registered name, or
+    "module:Class".
 
     A class whose value is null is off.
     """
@@ -28,7 +29,9 @@ class RegisteredArgs(BaseModel, extra="allow"):
         """Check each class's settings by its `Config`; raise the errors of all of them together."""
         if not isinstance(data, Mapping):
             return data
-        fields: dict[str, Any] = {str(name): (cls.config_of(str(name)) | None, None) for name in data}
+        fields: dict[str, Any] = {
+            str(name): (cls.config_of(str(name)) | None, None) for name in data
+        }
         read = create_model("_Registered", **fields).model_validate(data)
         settings = {name: getattr(read, name) for name in fields}
         in_order = dict.fromkeys((*names(cls.kind), *settings))
@@ -41,14 +44,17 @@ class RegisteredArgs(BaseModel, extra="allow"):
         config = getattr(named, "Config", None)
         if not (isinstance(config, type) and issubclass(config, cls.config_base)):
             raise ConfigError(
-                f"{name}: {named.__module__}.{named.__qualname__} has no Config; want a subclass of {cls.base}, whose "
+                f"{name}: {named.__module__}.{named.__qualname__} has no Config; want a subclass "
+                f"of {cls.base}, whose "
                 f"Config is a {cls.config_base.__name__}"
             )
         return config
 
     def on(self) -> dict[str, Any]:
         """Return the settings of the classes that are on, by name, in the order of the registry."""
-        return {name: config for name, config in (self.model_extra or {}).items() if config is not None}
+        return {
+            name: config for name, config in (self.model_extra or {}).items() if config is not None
+        }
 
     @classmethod
     def registered_fields(cls) -> dict[str, FieldInfo]:

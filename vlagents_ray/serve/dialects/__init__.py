@@ -1,1 +1,3 @@
-"""Protocols of other systems, so that their clients can use the server without changes; see `base`."""
+"""Protocols of other systems, so that their clients can use the server without changes; see
+`base`.
+"""

@@ -1,11 +1,12 @@
 """The base classes of all dialects, which are other systems' protocols.
 
-A dialect is an `HttpDialect` for plain requests over HTTP, a `RouteDialect` for WebSockets and anything else on the
-server's own port, or a `PortDialect` for a protocol that needs its own port. CONTRIBUTING.md has the steps to add one;
-a third-party package has an entry point in the group `vlagents_ray.dialects`, or a deployment file names the class, as
-`my_package:MyDialect`.
+A dialect is an `HttpDialect` for plain requests over HTTP, a `RouteDialect` for WebSockets and
+anything else on the server's own port, or a `PortDialect` for a protocol that needs its own port.
+CONTRIBUTING.md has the steps to add one; a third-party package has an entry point in the group
+`vlagents_ray.dialects`, or a deployment file names the class, as `my_package:MyDialect`.
 
-The following is a complete dialect, for clients that post `{"q": [...], "task": "..."}` and read a list of numbers::
+The following is a complete dialect, for clients that post `{"q": [...], "task": "..."}` and read a
+list of numbers::
 
     from vlagents_ray.serve.config.dialects import DialectConfig, MappingSetting
     from vlagents_ray.serve.dialects.base import HttpDialect
@@ -22,11 +23,15 @@ The following is a complete dialect, for clients that post `{"q": [...], "task":
         paths = {"POST /plain": "act"}
 
         async def act(self, http):
-            return await self.answer(http, self.decode, lambda rows: json_numpy.dumps(rows[0].tolist()).encode())
+            return await self.answer(http, self.decode, self.encode)
 
         @staticmethod
         def decode(data, budget):
             return json_numpy.loads(data, budget.limits)
+
+        @staticmethod
+        def encode(rows):
+            return json_numpy.dumps(rows[0].tolist()).encode()
 
 `tests/serve/dialects/test_third_party.py` runs this example.
 """
@@ -62,10 +67,25 @@ from vlagents_ray.errors import (
 )
 from vlagents_ray.interface import Obs
 from vlagents_ray.protocol.frames import Decoded
-from vlagents_ray.protocol.messages import DEFAULT_LIMITS, SESSION_HEADER, Budget, Limits, Op, RankName, Reply, Request
+from vlagents_ray.protocol.messages import (
+    DEFAULT_LIMITS,
+    SESSION_HEADER,
+    Budget,
+    Limits,
+    Op,
+    RankName,
+    Reply,
+    Request,
+)
 from vlagents_ray.registry import dialect_class
 from vlagents_ray.serve.access.api_keys import Identity, NoKey, caller_name, current_caller
-from vlagents_ray.serve.config.dialects import DialectArgs, DialectConfig, KeylessPortConfig, PortConfig, read_mapping
+from vlagents_ray.serve.config.dialects import (
+    DialectArgs,
+    DialectConfig,
+    KeylessPortConfig,
+    PortConfig,
+    read_mapping,
+)
 from vlagents_ray.serve.endpoints.http_messages import (
     LONG_BYTES,
     problem_response,
@@ -83,12 +103,15 @@ from vlagents_ray.serve.requests import Message
 T = TypeVar("T")
 Stream = Callable[[WebSocket], Awaitable[None]]
 Check = Callable[[str | None], Identity]
-"""Returns the caller that a client's API key belongs to, or raises `Unauthorized` or `Forbidden`; None means no key."""
+"""Returns the caller that a client's API key belongs to, or raises `Unauthorized` or
+`Forbidden`; None means no key.
+"""
 
 logger = logging.getLogger(__name__)
 
 Connect = Callable[[str | None, RankName | None], RemoteAgent]
-"""Connects to the application for one client, with its API key and the most urgent class that the key allows; None
+"""Connects to the application for one client, with its API key and the most urgent class that the
+key allows; None
 stands for no key, and for any class."""
 
 # WebSocket close codes
@@ -125,7 +148,8 @@ class GatewayContext:
 
 
 class Dialect(abc.ABC):
-    """A dialect that is enabled in a deployment; its two kinds are `RouteDialect` and `PortDialect`.
+    """A dialect that is enabled in a deployment; its two kinds are `RouteDialect` and
+    `PortDialect`.
 
     Its name in the deployment is also the transport in statistics.
     """
@@ -133,16 +157,22 @@ class Dialect(abc.ABC):
     Config: ClassVar[type[DialectConfig]] = DialectConfig
     clients: ClassVar[str]  # the system whose clients it serves, as named in `/docs`
     summary: ClassVar[str] = ""  # text of `/docs` about sessions, episodes and errors
-    requires: ClassVar[Sequence[str]] = ()  # modules of optional packages, without which a deployment is refused
-    presets: ClassVar[Mapping[str, Mapping[str, Any]]] = {}  # mappings that deployment files may name
+    # Modules of optional packages, without which a deployment is refused.
+    requires: ClassVar[Sequence[str]] = ()
+    # Mappings that deployment files may name.
+    presets: ClassVar[Mapping[str, Mapping[str, Any]]] = {}
 
-    def __init__(self, name: str, config: DialectConfig, context: ReplicaContext | GatewayContext) -> None:
+    def __init__(
+        self, name: str, config: DialectConfig, context: ReplicaContext | GatewayContext
+    ) -> None:
         self.name, self.config, self.context = name, config, context
         self.mapping = config.keys() or read_mapping(_OUR_NAMES)
 
     @classmethod
     def lacks(cls, config: DialectConfig, contract: Contract | None) -> list[str]:
-        """Return the policy's inputs that these clients never send, one sentence each with its remedy."""
+        """Return the policy's inputs that these clients never send, one sentence each with its
+        remedy.
+        """
         mapping = config.keys()
         return [] if mapping is None else mapping.lacks(contract)
 
@@ -152,13 +182,17 @@ class Dialect(abc.ABC):
         """Return the `paths` or the `address` at which clients connect, for the metadata."""
 
     def read(self, theirs: Any) -> tuple[Obs, str | None]:
-        """Convert a client's observation, a map, to `Obs`, and return it with the instruction, or None without one."""
+        """Convert a client's observation, a map, to `Obs`, and return it with the instruction,
+        or None without one.
+        """
         if not isinstance(theirs, dict):
             raise MalformedMessage(f"observation: got {type(theirs).__name__}, want a map")
         return self.mapping.obs(theirs, self.context.limits, self.context.contract)
 
     def rows(self, reply: Reply) -> np.ndarray:
-        """Return the action in the reply to an act, (H, D) float32, in the client's gripper convention."""
+        """Return the action in the reply to an act, (H, D) float32, in the client's gripper
+        convention.
+        """
         if reply.act is None:
             raise VLAgentsError("act: answered without an action")
         contract = self.context.contract
@@ -168,7 +202,8 @@ class Dialect(abc.ABC):
 class RouteDialect(Dialect):
     """A dialect over HTTP or WebSocket, on the server's own port, in each replica."""
 
-    paths: ClassVar[Mapping[str, str]]  # "POST /act" or "WS /openpi" -> name of the method that serves the path
+    # "POST /act" or "WS /openpi" -> name of the method that serves the path.
+    paths: ClassVar[Mapping[str, str]]
     root: ClassVar[str] = ""  # protocol at the server's root, if its clients connect there
     context: ReplicaContext
 
@@ -180,12 +215,16 @@ class RouteDialect(Dialect):
         """Return the routes of the dialect's paths, without the root."""
         served = ((*path.split(), getattr(self, name)) for path, name in self.paths.items())
         return [
-            WebSocketRoute(path, handler) if method == "WS" else Route(path, handler, methods=[method])
+            WebSocketRoute(path, handler)
+            if method == "WS"
+            else Route(path, handler, methods=[method])
             for method, path, handler in served
         ]
 
     def at_root(self, sharing: Sequence[Any]) -> Stream:
-        """Serve WebSockets at the server's root for all dialects with this protocol there, beginning with this one."""
+        """Serve WebSockets at the server's root for all dialects with this protocol there,
+        beginning with this one.
+        """
         raise NotImplementedError(f"{self.name} states a root and does not serve it")
 
     def sender(self, session_id: str = "") -> Sender:
@@ -194,30 +233,51 @@ class RouteDialect(Dialect):
         The sender does not count requests for the key, as `decoded` has counted them.
         """
         caller, connected = current_caller(), not session_id
-        return Sender(self.context.engine, self.name, session_id, caller=caller, connected=connected, counted=True)
+        return Sender(
+            self.context.engine,
+            self.name,
+            session_id,
+            caller=caller,
+            connected=connected,
+            counted=True,
+        )
 
     def gate(self, *, counted: bool = False) -> Sender:
         """Return a sender whose `admission` provides the budget for decoding messages.
 
         `counted` is whether each message was counted for the key when it arrived.
         """
-        return Sender(self.context.engine, self.name, caller=current_caller(), connected=False, counted=counted)
+        return Sender(
+            self.context.engine,
+            self.name,
+            caller=current_caller(),
+            connected=False,
+            counted=counted,
+        )
 
     def session(self, sender: Sender, name: str = "") -> ImplicitSession:
-        """Return a session of that sender, which begins without a reset by the client; by default its own session."""
+        """Return a session of that sender, which begins without a reset by the client; by
+        default its own session.
+        """
         return ImplicitSession(self.context.engine, sender, self.config.rank, name)
 
-    async def receive(self, socket: WebSocket, gate: Sender) -> tuple[bytes | None, MessageAdmission] | None:
-        """Wait for the next message of a WebSocket, and before that until the key of its `gate` is within its rate.
+    async def receive(
+        self, socket: WebSocket, gate: Sender
+    ) -> tuple[bytes | None, MessageAdmission] | None:
+        """Wait for the next message of a WebSocket, and before that until the key of its `gate` is
+        within its rate.
 
-        Returns the message, or None for a text message, and its admission; None if the client is gone.
+        Returns the message, or None for a text message, and its admission; None if the client is
+        gone.
         """
         await gate.wait_unthrottled()
         event = await socket.receive()
         if event["type"] == "websocket.disconnect":
             return None
         data = event.get("bytes")
-        return data, gate.admission(self.context.limits, 0 if data is None else len(data), self.config.rank)
+        return data, gate.admission(
+            self.context.limits, 0 if data is None else len(data), self.config.rank
+        )
 
     def arrived(self) -> Message:
         """Create the `Message` of an observation that has just arrived."""
@@ -233,9 +293,12 @@ class PortDialect(Dialect):
 
     def __init__(self, name: str, config: PortConfig, context: GatewayContext) -> None:
         super().__init__(name, config, context)
-        if isinstance(config, KeylessPortConfig) and not (isinstance(context.check, NoKey) or config.without_key):
+        if isinstance(config, KeylessPortConfig) and not (
+            isinstance(context.check, NoKey) or config.without_key
+        ):
             raise ConfigError(
-                f"dialects.{name}: the server requires API keys, and this protocol has none; remove the dialect, or "
+                f"dialects.{name}: the server requires API keys, and this protocol has none; "
+                "remove the dialect, or "
                 "accept all clients that reach its port, with without_key: true"
             )
 
@@ -248,7 +311,8 @@ class PortDialect(Dialect):
     def serve(self, listener: socket.socket) -> None:
         """Start to accept clients, and return.
 
-        The socket `listener` is bound to the port and does not listen yet; the dialect must close it.
+        The socket `listener` is bound to the port and does not listen yet; the dialect must close
+        it.
         """
 
     @abc.abstractmethod
@@ -261,7 +325,9 @@ class PortDialect(Dialect):
 
 
 class Root(WebSocketRoute):
-    """The application's root, with or without a slash at its end: `ws://host:port`, `ws://host:port/app`."""
+    """The application's root, with or without a slash at its end: `ws://host:port`,
+    `ws://host:port/app`.
+    """
 
     def matches(self, scope: Scope) -> tuple[Match, Scope]:
         """Match a WebSocket at the root."""
@@ -284,7 +350,9 @@ def dialect_routes(args: DialectArgs, context: ReplicaContext) -> list[BaseRoute
     return routes
 
 
-async def decoded(read: Callable[[bytes, Budget], T], data: bytes | None, admission: MessageAdmission) -> T:
+async def decoded(
+    read: Callable[[bytes, Budget], T], data: bytes | None, admission: MessageAdmission
+) -> T:
     """Decode a message with `read`, counting it as one request of the key even if it is invalid.
 
     `data` of None is a WebSocket's text, which is refused.
@@ -297,7 +365,9 @@ async def decoded(read: Callable[[bytes, Budget], T], data: bytes | None, admiss
 
 
 async def accept_or_refuse(websocket: WebSocket, context: ReplicaContext) -> bool:
-    """Accept a WebSocket; return False if it was refused, as the policy is not ready or the replica is full."""
+    """Accept a WebSocket; return False if it was refused, as the policy is not ready or the
+    replica is full.
+    """
     try:
         context.engine.require_ready()
         sessions = context.engine.sessions
@@ -305,7 +375,9 @@ async def accept_or_refuse(websocket: WebSocket, context: ReplicaContext) -> boo
             raise sessions.full()
     except VLAgentsError as error:
         if "websocket.http.response" in (websocket.scope.get("extensions") or {}):
-            await websocket.send_denial_response(problem_response(error, "", PolicyUnavailable.status))
+            await websocket.send_denial_response(
+                problem_response(error, "", PolicyUnavailable.status)
+            )
         else:
             await websocket.accept()
             await websocket.close(TRY_AGAIN_LATER, str(error)[:120])
@@ -315,7 +387,8 @@ async def accept_or_refuse(websocket: WebSocket, context: ReplicaContext) -> boo
 
 
 class ImplicitEpisode:
-    """Decides when an episode begins in a protocol without reset: at the first observation and each new instruction.
+    """Decides when an episode begins in a protocol without reset: at the first observation and each
+    new instruction.
 
     An observation without an instruction keeps the previous instruction.
     """
@@ -329,10 +402,14 @@ class ImplicitEpisode:
         return not self.begun or (instruction is not None and instruction != self.instruction)
 
     def opening(self, instruction: str | None, contract: Contract | None) -> str | None:
-        """Return the instruction for the reset; raise `InvalidObservation` if the policy needs one and none is set."""
+        """Return the instruction for the reset; raise `InvalidObservation` if the policy needs
+        one and none is set.
+        """
         instruction = self.instruction if instruction is None else instruction
         if instruction is None and contract is not None and contract.instruction:
-            raise InvalidObservation("instruction: got none, the policy needs one; send it with the observation")
+            raise InvalidObservation(
+                "instruction: got none, the policy needs one; send it with the observation"
+            )
         return instruction
 
     def began(self, instruction: str | None) -> None:
@@ -354,17 +431,25 @@ class ImplicitSession:
         self.episode = ImplicitEpisode()
         self._engine, self._sender, self._rank, self._name = engine, sender, rank, name
 
-    async def act(self, message: Message, obs: Obs, instruction: str | None, request_id: str) -> Reply:
+    async def act(
+        self, message: Message, obs: Obs, instruction: str | None, request_id: str
+    ) -> Reply:
         """Return the policy's reply to an observation; see `act_together`."""
         (reply,) = await act_together(message, [SessionObs(self, obs, instruction)], request_id)
         return reply
 
     async def close(self) -> None:
         """End the session."""
-        await self._sender.ask(self._sender.message("close"), Decoded([self._request("close", None, None, "")], {}))
+        await self._sender.ask(
+            self._sender.message("close"), Decoded([self._request("close", None, None, "")], {})
+        )
 
-    def _request(self, op: Op, obs: Obs | None, instruction: str | None, request_id: str) -> Request:
-        return Request(op, obs, instruction, session=self._name, rank=self._rank, request_id=request_id)
+    def _request(
+        self, op: Op, obs: Obs | None, instruction: str | None, request_id: str
+    ) -> Request:
+        return Request(
+            op, obs, instruction, session=self._name, rank=self._rank, request_id=request_id
+        )
 
 
 class SessionObs(NamedTuple):
@@ -375,22 +460,33 @@ class SessionObs(NamedTuple):
     instruction: str | None
 
 
-async def act_together(message: Message, seen: Sequence[SessionObs], request_id: str) -> list[Reply]:
-    """Return the policy's reply to each observation in a client's message; their acts are queued together.
+async def act_together(
+    message: Message, seen: Sequence[SessionObs], request_id: str
+) -> list[Reply]:
+    """Return the policy's reply to each observation in a client's message; their acts are queued
+    together.
 
-    A session whose episode begins is reset first. One that was removed because it was idle is reset again, which is
-    safe since the observation was not acted on.
+    A session whose episode begins is reset first. One that was removed because it was idle is reset
+    again, which is safe since the observation was not acted on.
 
     Raises:
         VLAgentsError: The first error among the replies.
     """
     await _reset([one for one in seen if one.session.episode.begins(one.instruction)], request_id)
     replies = await _ask(message, "act", seen, [None] * len(seen), request_id)
-    if forgotten := [i for i, reply in enumerate(replies) if isinstance(reply.error, UnknownSession)]:
-        logger.info("%s: a session was forgotten; it begins again (request %s)", message.transport, request_id)
+    if forgotten := [
+        i for i, reply in enumerate(replies) if isinstance(reply.error, UnknownSession)
+    ]:
+        logger.info(
+            "%s: a session was forgotten; it begins again (request %s)",
+            message.transport,
+            request_id,
+        )
         again = [seen[i] for i in forgotten]
         await _reset(again, request_id)
-        repeated = await _ask(seen[0].session._sender.message(), "act", again, [None] * len(again), request_id)
+        repeated = await _ask(
+            seen[0].session._sender.message(), "act", again, [None] * len(again), request_id
+        )
         for i, reply in zip(forgotten, repeated, strict=True):
             replies[i] = reply
     raise_first(reply.error for reply in replies)
@@ -400,7 +496,9 @@ async def act_together(message: Message, seen: Sequence[SessionObs], request_id:
 async def _reset(seen: Sequence[SessionObs], request_id: str) -> None:
     if not seen:
         return
-    openings = [one.session.episode.opening(one.instruction, one.session._engine.contract) for one in seen]
+    openings = [
+        one.session.episode.opening(one.instruction, one.session._engine.contract) for one in seen
+    ]
     for session, _, _ in seen:
         session.episode.end()
     resets = seen[0].session._sender.message("reset", seen[0].session._rank)
@@ -414,9 +512,15 @@ async def _reset(seen: Sequence[SessionObs], request_id: str) -> None:
 
 
 async def _ask(
-    message: Message, op: Op, seen: Sequence[SessionObs], instructions: Sequence[str | None], request_id: str
+    message: Message,
+    op: Op,
+    seen: Sequence[SessionObs],
+    instructions: Sequence[str | None],
+    request_id: str,
 ) -> list[Reply]:
-    names = [request_id] if len(seen) == 1 else [f"{request_id}-{place}" for place in range(len(seen))]
+    names = (
+        [request_id] if len(seen) == 1 else [f"{request_id}-{place}" for place in range(len(seen))]
+    )
     requests = [
         one.session._request(op, one.obs, instruction, name)
         for one, instruction, name in zip(seen, instructions, names, strict=True)
@@ -434,15 +538,15 @@ def raise_first(results: Iterable[object]) -> None:
 class HttpDialect(RouteDialect):
     """A dialect of HTTP requests.
 
-    A request without the header `x-session-id` is an episode of one step. With the header it belongs to that session,
-    in which each new instruction begins an episode, as does a request to a path of `end_episode`. Errors have their
-    status and a problem+json document.
+    A request without the header `x-session-id` is an episode of one step. With the header it
+    belongs to that session, in which each new instruction begins an episode, as does a request to a
+    path of `end_episode`. Errors have their status and a problem+json document.
     """
 
     def __init__(self, name: str, config: DialectConfig, context: ReplicaContext) -> None:
         super().__init__(name, config, context)
-        # Sessions by caller and session id in the engine. A new key with the name of a revoked one continues the
-        # sessions of that name, but not with the revoked key.
+        # Sessions by caller and session id in the engine. A new key with the name of a revoked one
+        # continues the sessions of that name, but not with the revoked key.
         self._kept: dict[tuple[Identity, str], ImplicitSession] = {}
 
     async def answer(
@@ -454,8 +558,9 @@ class HttpDialect(RouteDialect):
     ) -> Response:
         """Answer one request.
 
-        `read` decodes the body to the client's observation, within a budget; it may run on another thread. `write`
-        encodes the action, (H, D) float32 in the client's convention, as the body of the reply.
+        `read` decodes the body to the client's observation, within a budget; it may run on another
+        thread. `write` encodes the action, (H, D) float32 in the client's convention, as the body
+        of the reply.
         """
         name = request_id(http)
         message = self.arrived()
@@ -467,7 +572,11 @@ class HttpDialect(RouteDialect):
             theirs = await decoded(read, body, admission)
             obs, instruction = self.read(theirs)
             message.decoded_alike()
-            session = await self._kept_session(session_id(http)) if SESSION_HEADER in http.headers else None
+            session = (
+                await self._kept_session(session_id(http))
+                if SESSION_HEADER in http.headers
+                else None
+            )
             if session is None or not session.episode.begun:
                 self.mapping.warn_of_unread_cameras(theirs, self.name)
             if session is not None:
@@ -490,12 +599,16 @@ class HttpDialect(RouteDialect):
             admission.release()
 
     async def end_episode(self, http: HttpRequest) -> Response:
-        """Answer `{}`, and make the next observation of the session in the header begin an episode."""
+        """Answer `{}`, and make the next observation of the session in the header begin an
+        episode.
+        """
         (await self._kept_session(session_id(http))).episode.end()
         return Response(b"{}", media_type="application/json")
 
     async def _kept_session(self, name: str) -> ImplicitSession:
-        """Return the session that a client names, which exists as long as it exists in an engine."""
+        """Return the session that a client names, which exists as long as it exists in an
+        engine.
+        """
         sessions = self.context.engine.sessions
         if len(self._kept) > 2 * len(sessions) + 16:
             self._kept = {kept: one for kept, one in self._kept.items() if kept[1] in sessions}
@@ -504,7 +617,8 @@ class HttpDialect(RouteDialect):
         if known not in self._kept or known[1] not in sessions:
             session = self.session(sender)
             finder = self.context.engine.finder
-            if finder is not None and known[1] not in sessions:  # another replica has served it so far
+            # Another replica has served it so far.
+            if finder is not None and known[1] not in sessions:
                 over: asyncio.Future[None] = asyncio.get_running_loop().create_future()
                 if finder.fetch(known[1], partial(settle, over, None), caller_name()):
                     await over

@@ -1,4 +1,6 @@
-"""The Serve deployment of the dialects with their own port: a separate process, which is a client of the replicas."""
+"""The Serve deployment of the dialects with their own port: a separate process, which is a
+client of the replicas.
+"""
 
 from __future__ import annotations
 
@@ -25,7 +27,9 @@ _ANSWER_S = 30.0
 
 
 class Gateway:
-    """Reserves its ports at the start; it is RUNNING and accepts clients only when the policy can act."""
+    """Reserves its ports at the start; it is RUNNING and accepts clients only when the policy
+    can act.
+    """
 
     async def __init__(self, args: dict[str, Any]) -> None:  # type: ignore[misc]  # Serve awaits it
         self._dialects: list[PortDialect] = []
@@ -39,7 +43,9 @@ class Gateway:
             write_audit()
         for one in wanted.values():
             require_access(one.host or LOOPBACK, keys, args.access.insecure)
-        listeners = {name: reserve(name, one.host or LOOPBACK, one.port) for name, one in wanted.items()}
+        listeners = {
+            name: reserve(name, one.host or LOOPBACK, one.port) for name, one in wanted.items()
+        }
         try:
             app = serve.get_replica_context().app_name
             contract = wait_for_policy(app)
@@ -66,13 +72,19 @@ class Gateway:
             raise
 
     async def description(self) -> dict[str, Any]:
-        """Return the description of the dialects for the metadata of replicas, see `DialectArgs.describe`."""
+        """Return the description of the dialects for the metadata of replicas, see
+        `DialectArgs.describe`.
+        """
         return self._description
 
     def check_health(self) -> None:
-        """Raise an error if a dialect no longer accepts clients; Serve calls this, and then replaces the gateway."""
+        """Raise an error if a dialect no longer accepts clients; Serve calls this, and then
+        replaces the gateway.
+        """
         if failed := [dialect.name for dialect in self._dialects if not dialect.alive()]:
-            raise PolicyUnavailable(f"the gateway no longer accepts clients of {failed}; its log has the details")
+            raise PolicyUnavailable(
+                f"the gateway no longer accepts clients of {failed}; its log has the details"
+            )
 
     async def __del__(self) -> None:
         closing = [asyncio.to_thread(dialect.close) for dialect in getattr(self, "_dialects", [])]
@@ -85,9 +97,12 @@ def wait_for_policy(app: str) -> Contract | None:
         return agent.contract
 
 
-def _connect(app: str, rank: RankName, keyed: bool, key: str | None, allowed: RankName | None) -> RemoteAgent:
-    # The gateway itself enforces the permissions of the key, in `GatewaySessions`, as not every transport to a replica
-    # contains the key. Shared memory of a replica requires a key, which some clients lack; the handle does not.
+def _connect(
+    app: str, rank: RankName, keyed: bool, key: str | None, allowed: RankName | None
+) -> RemoteAgent:
+    # The gateway itself enforces the permissions of the key, in `GatewaySessions`, as not every
+    # transport to a replica contains the key. Shared memory of a replica requires a key, which some
+    # clients lack; the handle does not.
     return RemoteAgent(
         f"serve://{app}",
         transport="handle" if keyed and key is None else "auto",

@@ -1,12 +1,14 @@
-"""Access control of a replica's HTTP paths and WebSockets: API keys, time limits for slow clients, and their end.
+"""Access control of a replica's HTTP paths and WebSockets: API keys, time limits for slow clients,
+and their end.
 
-The middleware wraps an ASGI application, so that all of its paths, including the dialects, are protected in the same
-way. Some paths require no key: `/healthz` reports only whether the policy is ready, or the step of loading that it has
-reached, and `public` ones are pages without data. A WebSocket is refused before it is accepted.
+The middleware wraps an ASGI application, so that all of its paths, including the dialects, are
+protected in the same way. Some paths require no key: `/healthz` reports only whether the policy is
+ready, or the step of loading that it has reached, and `public` ones are pages without data. A
+WebSocket is refused before it is accepted.
 
-When the client of a WebSocket leaves, the task that serves it is cancelled, as Serve cancels requests over HTTP. None
-of the client's waiting requests is executed then. When the replica stops (`Shutdown`), the messages that have arrived
-are answered before a WebSocket ends.
+When the client of a WebSocket leaves, the task that serves it is cancelled, as Serve cancels
+requests over HTTP. None of the client's waiting requests is executed then. When the replica stops
+(`Shutdown`), the messages that have arrived are answered before a WebSocket ends.
 """
 
 from __future__ import annotations
@@ -43,9 +45,11 @@ _STOPPING = "the replica is stopping; connect again"
 
 
 class Shutdown:
-    """The end of a replica, before which its WebSockets and incomplete uploads end; its methods are thread-safe.
+    """The end of a replica, before which its WebSockets and incomplete uploads end; its methods are
+    thread-safe.
 
-    A WebSocket is a request for Serve, which ends a replica after its last request, and kills it after a time limit.
+    A WebSocket is a request for Serve, which ends a replica after its last request, and kills it
+    after a time limit.
     """
 
     def __init__(self) -> None:
@@ -63,7 +67,9 @@ class Shutdown:
 
 
 class AccessMiddleware:
-    """Accepts requests with a valid key, or all requests if the server has no keys; cuts off slow clients."""
+    """Accepts requests with a valid key, or all requests if the server has no keys; cuts off
+    slow clients.
+    """
 
     def __init__(
         self,
@@ -82,10 +88,12 @@ class AccessMiddleware:
 
         Args:
             keys: The server's keys; None if it has none.
-            slow_s: Maximum time that a request may take to arrive, or a WebSocket's client to accept a message, s.
+            slow_s: Maximum time that a request may take to arrive, or a WebSocket's client to
+                accept a message, s.
             idle_s: Maximum time that a WebSocket may be silent, s.
             hosts: Further host names of the server, see `require_own_page`.
-            admission: The memory in flight of the replica, which also counts incomplete messages of WebSockets.
+            admission: The memory in flight of the replica, which also counts incomplete messages of
+                WebSockets.
             shutdown: The end of the replica; by default it has none.
             public: The paths of pages without data, which need no key.
         """
@@ -107,10 +115,12 @@ class AccessMiddleware:
             if _is_page(scope, self._public):
                 pass
             elif self._keys is None:
-                require_own_page(headers, self._hosts)  # a page that the robot's user opens can reach loopback
+                # A page that the robot's user opens can reach loopback.
+                require_own_page(headers, self._hosts)
             else:
                 key = caller = self._keys.check(token_of(headers), self._name)
-                if (wait_s := key.throttled_s()) > 0:  # bounds how often the key's requests are refused
+                # Bounds how often the key's requests are refused.
+                if (wait_s := key.throttled_s()) > 0:
                     await asyncio.sleep(wait_s)
                     key.require_unthrottled()
                 if scope["type"] == "http":
@@ -133,11 +143,15 @@ class AccessMiddleware:
             else:
                 await self._app(scope, receive, send)
 
-    async def _run_websocket(self, caller: Identity, scope: Scope, receive: Receive, send: Send) -> None:
+    async def _run_websocket(
+        self, caller: Identity, scope: Scope, receive: Receive, send: Send
+    ) -> None:
         frames: IncomingFrames | None = scope.get(SCOPE_KEY)
         if frames is not None:
             frames.supervise(caller, self._admission)
-        socket = _TimedWebSocket(caller, self._slow_s, self._idle_s, receive, send, frames, self._shutdown)
+        socket = _TimedWebSocket(
+            caller, self._slow_s, self._idle_s, receive, send, frames, self._shutdown
+        )
         await socket.run(self._app, scope)
 
 
@@ -149,13 +163,17 @@ def _is_page(scope: Scope, public: Collection[str]) -> bool:
 
 
 def _has_body(scope: Scope, most: int = 0) -> bool:
-    """Return whether a body of more than `most` bytes, or of unstated length, follows the headers."""
+    """Return whether a body of more than `most` bytes, or of unstated length, follows the
+    headers.
+    """
     headers = headers_of(scope)
     stated = headers.get("content-length", "0")
     return "transfer-encoding" in headers or not stated.isdecimal() or int(stated) > most
 
 
-async def _refuse(error: VLAgentsError, request_id: str, scope: Scope, receive: Receive, send: Send) -> None:
+async def _refuse(
+    error: VLAgentsError, request_id: str, scope: Scope, receive: Receive, send: Send
+) -> None:
     answer = problem_response(error, request_id)
     if isinstance(error, Unauthorized):
         answer.headers["www-authenticate"] = 'Bearer realm="vlagents_ray"'
@@ -164,7 +182,8 @@ async def _refuse(error: VLAgentsError, request_id: str, scope: Scope, receive: 
     if scope["type"] == "websocket":
         await receive()  # the "websocket.connect" message
         if "websocket.http.response" not in scope.get("extensions", {}):
-            await send({"type": "websocket.close", "code": _POLICY_VIOLATION})  # before acceptance it means HTTP 403
+            # Before acceptance it means HTTP 403.
+            await send({"type": "websocket.close", "code": _POLICY_VIOLATION})
             return
     await answer(scope, receive, send)
 
@@ -172,7 +191,9 @@ async def _refuse(error: VLAgentsError, request_id: str, scope: Scope, receive: 
 async def _run_upload(
     app: ASGIApp, scope: Scope, receive: Receive, send: Send, slow_s: float, shutdown: Shutdown
 ) -> None:
-    """Serve an HTTP request whose body must arrive within `slow_s`, and before the replica stops."""
+    """Serve an HTTP request whose body must arrive within `slow_s`, and before the replica
+    stops.
+    """
     task, loop = asyncio.current_task(), asyncio.get_running_loop()
     begun = loop.time()
     refusal: Response | None = None
@@ -183,7 +204,9 @@ async def _run_upload(
         nonlocal refusal, timer
         waited_s = loop.time() - begun
         if waited_s > slow_s:
-            late = MalformedMessage(f"body: not here within {slow_s:g} s; is the connection that slow?")
+            late = MalformedMessage(
+                f"body: not here within {slow_s:g} s; is the connection that slow?"
+            )
             refusal = problem_response(late, uuid.uuid4().hex, _TIMEOUT)
         elif shutdown.is_due(waited_s):
             refusal = problem_response(PolicyUnavailable(_STOPPING), uuid.uuid4().hex)
@@ -221,10 +244,12 @@ async def _run_upload(
 
 
 class _TimedWebSocket:
-    """A WebSocket that ends with its client and its replica, and if its key becomes invalid or its client is too slow.
+    """A WebSocket that ends with its client and its replica, and if its key becomes invalid or its
+    client is too slow.
 
-    Messages are read ahead of the application, so that the end of the client is noticed while the application acts.
-    `IncomingFrames` limits the number of messages that the application has not taken.
+    Messages are read ahead of the application, so that the end of the client is noticed while the
+    application acts. `IncomingFrames` limits the number of messages that the application has not
+    taken.
     """
 
     def __init__(
@@ -242,9 +267,12 @@ class _TimedWebSocket:
         self._receive, self._send = receive, send
         self._loop = asyncio.get_running_loop()
         self._messages: asyncio.Queue[Message | Exception] = asyncio.Queue()  # read ahead
-        self._silent_since: float | None = None  # start of the wait for the next message, s; None if there is no wait
-        self._sending_since: float | None = None  # start of the current sending, s; None if there is none
-        self._end: tuple[int, str] | None = None  # close code and reason, once the WebSocket has to end
+        # Start of the wait for the next message, s; None if there is no wait.
+        self._silent_since: float | None = None
+        # Start of the current sending, s; None if there is none.
+        self._sending_since: float | None = None
+        # Close code and reason, once the WebSocket has to end.
+        self._end: tuple[int, str] | None = None
         self._is_cancelled = False  # whether the application's task was cancelled
         self._is_closed = False  # whether either side has closed the WebSocket
 
@@ -257,14 +285,17 @@ class _TimedWebSocket:
                 task.cancel()
 
         def tick() -> None:
-            self._timer = self._loop.call_later(_TICK_S, tick)  # first, so that an error below cannot stop the checks
+            # first, so that an error below cannot stop the checks.
+            self._timer = self._loop.call_later(_TICK_S, tick)
             if (cause := self._close_cause()) is not None:
                 self._end = cause
                 self._timer.cancel()
                 cancel()
             elif self._end is None and self._shutdown.is_due(self._silent_s()):
                 self._end = _SERVICE_RESTART, _STOPPING
-                self._messages.put_nowait({"type": "websocket.disconnect", "code": _SERVICE_RESTART})
+                self._messages.put_nowait(
+                    {"type": "websocket.disconnect", "code": _SERVICE_RESTART}
+                )
 
         self._timer = self._loop.call_later(_TICK_S, tick)
         reading = self._loop.create_task(self._read_ahead(cancel))
@@ -287,7 +318,8 @@ class _TimedWebSocket:
             closing = self._frames.end(code, reason)
         else:
             closing = self._send({"type": "websocket.close", "code": code, "reason": reason[:120]})
-        with suppress(asyncio.TimeoutError, RuntimeError):  # the client does not read, or closed the connection
+        # The client does not read, or closed the connection.
+        with suppress(asyncio.TimeoutError, RuntimeError):
             await asyncio.wait_for(closing, _TICK_S)
 
     async def _read_ahead(self, client_left: Callable[[], None]) -> None:
@@ -327,7 +359,10 @@ class _TimedWebSocket:
 
     def _close_cause(self) -> tuple[int, str] | None:
         """Return the close code and the reason if the WebSocket has to end at once."""
-        if self._sending_since is not None and self._loop.time() - self._sending_since > self._slow_s:
+        if (
+            self._sending_since is not None
+            and self._loop.time() - self._sending_since > self._slow_s
+        ):
             return _POLICY_VIOLATION, "replies are not taken"
         if self._frames is not None and self._frames.arriving_s > self._slow_s:
             return _POLICY_VIOLATION, f"a message took longer than {self._slow_s:g} s"
@@ -341,8 +376,8 @@ class _TimedWebSocket:
 def _cancel_again(over: bool) -> None:
     """Cancel the receiver again if it missed its cancellation.
 
-    Before Python 3.12, `asyncio.wait_for` drops a cancellation that coincides with the awaited event, such as the
-    message of a client whose key has just been revoked.
+    Before Python 3.12, `asyncio.wait_for` drops a cancellation that coincides with the awaited
+    event, such as the message of a client whose key has just been revoked.
     """
     if over:
         raise asyncio.CancelledError

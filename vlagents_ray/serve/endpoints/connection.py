@@ -1,8 +1,9 @@
-"""Servers and connections that are read by the thread of the batch queue: shared memory, plasma, own WebSockets.
+"""Servers and connections that are read by the thread of the batch queue: shared memory, plasma,
+own WebSockets.
 
-That thread accepts clients, reads and decodes their messages, and submits the requests, so that a request needs no
-thread switch; while a batch runs for milliseconds, another thread does this (`vlagents_ray.serve.queue.poller`).
-Answers are written by the thread that produced them.
+That thread accepts clients, reads and decodes their messages, and submits the requests, so that a
+request needs no thread switch; while a batch runs for milliseconds, another thread does this
+(`vlagents_ray.serve.queue.poller`). Answers are written by the thread that produced them.
 """
 
 from __future__ import annotations
@@ -41,7 +42,8 @@ logger = logging.getLogger(__name__)
 BACKLOG = 128
 MOST_UNANSWERED = 256  # unanswered messages of a client; further ones stay unread in its connection
 POLICY_VIOLATION, INTERNAL_ERROR, _SERVICE_RESTART = 1008, 1011, 1012  # WebSocket close codes
-# Maximum number of connections that a server accepts in a second; each takes some time of the policy's thread.
+# Maximum number of connections that a server accepts in a second; each takes some time of the
+# policy's thread.
 _ACCEPTED_PER_S = 200.0
 # Reasons for not polling a connection.
 DECODING, THROTTLED = "a frame is decoded on another thread", "the key is over its rate"
@@ -55,19 +57,26 @@ _POLL_MS = 2
 LEAST_WAIT_S = 1e-3  # a shorter wait cannot be distinguished from the time to read a message
 
 Control = Sequence[tuple[int, int, bytes]]
-Admit = Callable[[str | None], Caller]  # returns the caller with that key; raises `Unauthorized` or `Forbidden`
+# Returns the caller with that key; raises `Unauthorized` or `Forbidden`.
+Admit = Callable[[str | None], Caller]
 
 
 class ReadBuffer(threading.local):
-    """Memory of `size` bytes for each thread to read into: new memory would cost as much as copying from here."""
+    """Memory of `size` bytes for each thread to read into: new memory would cost as much as
+    copying from here.
+    """
 
     def __init__(self, size: int) -> None:
         self._view = memoryview(bytearray(size))
 
-    def receive(self, connection: socket.socket, size: int, space: int = STAMP_SPACE) -> tuple[memoryview, Control]:
-        """Read at most `size` bytes, and `space` bytes of control data, from a connection that is readable.
+    def receive(
+        self, connection: socket.socket, size: int, space: int = STAMP_SPACE
+    ) -> tuple[memoryview, Control]:
+        """Read at most `size` bytes, and `space` bytes of control data, from a connection that is
+        readable.
 
-        The bytes are valid until this thread reads again; there are none if the connection has ended.
+        The bytes are valid until this thread reads again; there are none if the connection has
+        ended.
         """
         count, control, _, _ = connection.recvmsg_into([self._view[:size]], space)
         return self._view[:count], control
@@ -83,7 +92,8 @@ class PolledConnection(ABC):
         self._connection = connection
         self.caller: Identity | None = None  # None until the client has sent its key
         self._sender: Sender | None = None  # None until then as well
-        self._sending = threading.Lock()  # guards sending: other threads send answers, or end the connection
+        # Guards sending: other threads send answers, or end the connection.
+        self._sending = threading.Lock()
         self._ended = False
         self._polled = True  # whether the poller watches the connection
         self._unpolled_for: set[str] = set()  # reasons for not polling the connection
@@ -104,7 +114,9 @@ class PolledConnection(ABC):
         """Free the memory of a connection before it is closed; called with the lock held."""
 
     def _send_close(self, code: int, reason: str) -> None:  # noqa: B027 - not all protocols have close codes
-        """Send a close code and its reason, if the protocol has close codes; called with the lock held."""
+        """Send a close code and its reason, if the protocol has close codes; called with the
+        lock held.
+        """
 
     def _continue(self) -> None:
         """Poll again if no reason against it is left; called on the polling thread."""
@@ -113,7 +125,9 @@ class PolledConnection(ABC):
             self._poller.watch(self._connection, self.ready)
 
     def ready(self) -> None:
-        """Read the connection; the batch queue calls this. As `_run`, with one call less for each message."""
+        """Read the connection; the batch queue calls this. As `_run`, with one call less for
+        each message.
+        """
         try:
             self._read()
         except Exception:
@@ -121,7 +135,9 @@ class PolledConnection(ABC):
             self.disconnect()
 
     def _run(self, callback: Callable[[], None]) -> None:
-        """Run a callback of the poller; an unexpected error ends this connection, and nothing else."""
+        """Run a callback of the poller; an unexpected error ends this connection, and nothing
+        else.
+        """
         try:
             callback()
         except Exception:
@@ -148,7 +164,9 @@ class PolledConnection(ABC):
         self._continue()
 
     def _is_throttled(self) -> bool:
-        """Return whether the client's key is over its rate; if so, schedule the next reading of the connection."""
+        """Return whether the client's key is over its rate; if so, schedule the next reading of
+        the connection.
+        """
         if THROTTLED in self._unpolled_for:
             return True
         if self._ended or self._sender is None or (wait_s := self._sender.throttled_s()) <= 0:
@@ -163,7 +181,8 @@ class PolledConnection(ABC):
             self._continue()
 
     def _may_read_again(self) -> bool:
-        """Return whether a pause for the rate of the key is over; disconnect a client that has hung up.
+        """Return whether a pause for the rate of the key is over; disconnect a client that has hung
+        up.
 
         Its unread messages would be refused one by one, which delays the key's other connections.
         """
@@ -179,17 +198,23 @@ class PolledConnection(ABC):
         admission: MessageAdmission,
         submit: Callable[[Decoded], None],
     ) -> None:
-        """Decode a message with `read`, on another thread if that is slow, and `submit` its requests."""
+        """Decode a message with `read`, on another thread if that is slow, and `submit` its
+        requests.
+        """
         try:
             decoded = read(admission)
         except NeedsDecodingThread:
             self._pause(DECODING)
             then = partial(self._decoded, message, submit)
-            admission.decode_on_thread(read).add_done_callback(lambda done: self._call_soon(partial(then, done.result)))
+            admission.decode_on_thread(read).add_done_callback(
+                lambda done: self._call_soon(partial(then, done.result))
+            )
         else:
             submit(decoded)
 
-    def _decoded(self, message: Message, submit: Callable[[Decoded], None], result: Callable[[], Decoded]) -> None:
+    def _decoded(
+        self, message: Message, submit: Callable[[Decoded], None], result: Callable[[], Decoded]
+    ) -> None:
         """Submit the requests that another thread has decoded; called on the polling thread."""
         try:
             if not self._ended:
@@ -199,10 +224,14 @@ class PolledConnection(ABC):
             self._write(message)
         self._resume(DECODING)
 
-    def overdue(self, now: float, refusal: Callable[[Caller], str | None]) -> tuple[str, int] | None:
-        """Return a reason and a close code if the connection has to end; called periodically, on any thread.
+    def overdue(
+        self, now: float, refusal: Callable[[Caller], str | None]
+    ) -> tuple[str, int] | None:
+        """Return a reason and a close code if the connection has to end; called periodically, on
+        any thread.
 
-        `now` is the time of `time.monotonic`, s; `refusal` returns the reason why a key is no longer valid, or None.
+        `now` is the time of `time.monotonic`, s; `refusal` returns the reason why a key is no
+        longer valid, or None.
         """
         reason = refusal(self.caller) if isinstance(self.caller, Caller) else None
         return None if reason is None else (reason, POLICY_VIOLATION)
@@ -217,13 +246,17 @@ class PolledConnection(ABC):
                     self._connection.shutdown(socket.SHUT_RDWR)
 
     def announce_end(self, reason: str, code: int) -> None:
-        """Send the close code and its reason after the answers, and leave the connection open; on any thread."""
+        """Send the close code and its reason after the answers, and leave the connection open;
+        on any thread.
+        """
         with self._sending:
             if not self._ended:
                 self._send_close(code, reason)
 
     def wait_answered(self, until: float) -> None:  # noqa: B027 - needed only where the kernel may discard answers
-        """Wait until the client has all answers, but at most until a time of `time.monotonic`, s."""
+        """Wait until the client has all answers, but at most until a time of `time.monotonic`,
+        s.
+        """
 
     def disconnect(self) -> None:
         """Stop polling the connection and close it; call this on the polling thread."""
@@ -253,22 +286,26 @@ def _descriptor() -> BinaryIO:
 
 
 class PolledServer(ABC, Generic[C]):
-    """Listens from `open` on; the polling thread of the batch queue accepts clients and reads all connections.
+    """Listens from `open` on; the polling thread of the batch queue accepts clients and reads all
+    connections.
 
     Args:
-        admit: Returns the caller that a key belongs to, or raises for an invalid key; or the reason why no key is
-            needed.
+        admit: Returns the caller that a key belongs to, or raises for an invalid key; or the reason
+            why no key is needed.
         listener: A non-blocking socket.
     """
 
     name: ClassVar[str]
 
-    def __init__(self, engine: Engine, limits: Limits, admit: Admit | NoKey, listener: socket.socket) -> None:
+    def __init__(
+        self, engine: Engine, limits: Limits, admit: Admit | NoKey, listener: socket.socket
+    ) -> None:
         self.engine, self.limits, self.admit = engine, limits, admit
         self._clients: set[C] = set()
         self._listener = listener
         self._accepting = TokenBucket(_ACCEPTED_PER_S, time.monotonic())
-        # Without a free descriptor a client could not even be refused, and the listener would stay readable.
+        # Without a free descriptor a client could not even be refused, and the listener would stay
+        # readable.
         self._spare = _descriptor()
 
     @abstractmethod
@@ -296,7 +333,8 @@ class PolledServer(ABC, Generic[C]):
             client.release()
 
     def accept(self) -> None:
-        """Accept one client; errors (an aborted connection, EMFILE) never stop the listener, which is readable.
+        """Accept one client; errors (an aborted connection, EMFILE) never stop the listener, which
+        is readable.
 
         Clients above the rate of `_ACCEPTED_PER_S` wait in the listener's backlog.
         """
@@ -326,7 +364,9 @@ class PolledServer(ABC, Generic[C]):
         self.engine.queue.poller.watch(self._listener, self.accept)
 
     def close_overdue(self) -> None:
-        """Close the connections that are overdue, or whose key is no longer valid; may be called on any thread."""
+        """Close the connections that are overdue, or whose key is no longer valid; may be called
+        on any thread.
+        """
         now = time.monotonic()
         refusal = cache(Caller.refusal)  # evaluated once for all connections of a key
         for client in list(self._clients):
@@ -344,7 +384,8 @@ class PolledServer(ABC, Generic[C]):
         self._clients.add(client)
 
 
-# The time that a message has waited in its socket, which may be seconds if the reading thread is busy.
+# The time that a message has waited in its socket, which may be seconds if the reading thread is
+# busy.
 
 
 def enable_timestamps(connection: socket.socket) -> None:
@@ -354,7 +395,9 @@ def enable_timestamps(connection: socket.socket) -> None:
 
 
 def time_in_socket_s(control: Control) -> float:
-    """Return how long the message with this control data has waited, s; 0 if that is negligible or unknown."""
+    """Return how long the message with this control data has waited, s; 0 if that is negligible
+    or unknown.
+    """
     for level, kind, data in control:
         if level == socket.SOL_SOCKET and kind == _TIMESTAMP and len(data) == _STAMP.size:
             seconds, nanoseconds = _STAMP.unpack(data)
@@ -373,12 +416,12 @@ def has_unread(connection: socket.socket) -> bool:
 def wait_delivered(connection: socket.socket, until: float) -> None:
     """Wait until the client's machine has received all that was sent over a TCP connection.
 
-    If bytes of the client are unread, or arrive later, the kernel resets a connection that is closed, and discards the
-    answers that it has not yet delivered.
+    If bytes of the client are unread, or arrive later, the kernel resets a connection that is
+    closed, and discards the answers that it has not yet delivered.
 
     Args:
-        until: Time of `time.monotonic` until which to wait, s. The wait also ends with the connection, which the client
-            or another thread may end.
+        until: Time of `time.monotonic` until which to wait, s. The wait also ends with the
+            connection, which the client or another thread may end.
     """
     ended = select.poll()
     ended.register(connection, 0)  # reports errors and the end of both directions
@@ -387,7 +430,9 @@ def wait_delivered(connection: socket.socket, until: float) -> None:
 
 
 def _has_undelivered(connection: socket.socket) -> bool:
-    """Return whether the peer's machine has not acknowledged all bytes that were sent over a TCP connection."""
+    """Return whether the peer's machine has not acknowledged all bytes that were sent over a TCP
+    connection.
+    """
     waiting = array("i", [0])
     fcntl.ioctl(connection, termios.TIOCOUTQ, waiting)
     return waiting[0] > 0
@@ -396,5 +441,6 @@ def _has_undelivered(connection: socket.socket) -> bool:
 def _has_hung_up(connection: socket.socket) -> bool:
     """Return whether the peer has closed its end; there may be unread messages."""
     poller = select.poll()
-    poller.register(connection, getattr(select, "POLLRDHUP", 0))  # a full hang-up is reported in any case
+    # A full hang-up is reported in any case.
+    poller.register(connection, getattr(select, "POLLRDHUP", 0))
     return bool(poller.poll(0))

@@ -1,4 +1,6 @@
-"""`GET /docs`: one page that describes how clients use this server, and loads nothing from the network."""
+"""`GET /docs`: one page that describes how clients use this server, and loads nothing from the
+network.
+"""
 
 from __future__ import annotations
 
@@ -7,9 +9,16 @@ import json
 import re
 from typing import Any
 
+from vlagents_ray.docstrings import summary_of
 from vlagents_ray.errors import BY_CODE
 from vlagents_ray.protocol.frames import CONTENT_TYPE
-from vlagents_ray.protocol.messages import DEADLINE_HEADER, RANK_HEADER, REQUEST_ID_HEADER, SESSION_HEADER, STEP_HEADER
+from vlagents_ray.protocol.messages import (
+    DEADLINE_HEADER,
+    RANK_HEADER,
+    REQUEST_ID_HEADER,
+    SESSION_HEADER,
+    STEP_HEADER,
+)
 
 STYLE = """
 :root { color-scheme: light dark; font: 16px/1.5 system-ui, sans-serif; }
@@ -78,10 +87,16 @@ _TIMING = """\
 
 
 def docs_page(metadata: dict[str, Any]) -> str:
-    """Return the page as HTML, from the document of `GET /v1/metadata`, in which dialects and parts have entries."""
+    """Return the page as HTML, from the document of `GET /v1/metadata`, in which dialects and
+    parts have entries.
+    """
     policy = html.escape(str(metadata["policy"]))
     dialects = "".join(
-        f"`{', '.join(one.get('paths') or [one['address']])}`\n    Clients of {one['clients']}. {one['summary']}\n"
+        (
+            f"`{', '.join(one.get('paths') or [one['address']])}`\n    Clients of "
+            f"{one['clients']}. "
+            f"{one['summary']}\n"
+        )
         for one in (metadata.get("dialects") or {}).values()
     )
     pages = "".join(
@@ -90,7 +105,7 @@ def docs_page(metadata: dict[str, Any]) -> str:
         if part.keys() >= {"page", "summary"}
     )
     errors = "".join(
-        f"{cls.status} `{code}`\n    {(cls.__doc__ or '').strip().partition(chr(10))[0]}\n"
+        f"{cls.status} `{code}`\n    {summary_of(cls)}\n"
         for code, cls in sorted(BY_CODE.items(), key=lambda item: (item[1].status, item[0]))
     )
     return f"""<!doctype html><html lang="en"><head><meta charset="utf-8">
@@ -121,4 +136,6 @@ transport, class and outcome, latency, time by stage, batch sizes, queue depth, 
 def _entries(text: str) -> str:
     """Return a list of entries as HTML, from plain text with `code` in backquotes."""
     marked = re.sub(r"`([^`]+)`", r"<code>\1</code>", html.escape(text))
-    return "<dl>" + re.sub(r"(\S.*)\n((?: {4}.*\n)*)", r"<dt>\1</dt>\n<dd>\2</dd>\n", marked) + "</dl>"
+    return (
+        "<dl>" + re.sub(r"(\S.*)\n((?: {4}.*\n)*)", r"<dt>\1</dt>\n<dd>\2</dd>\n", marked) + "</dl>"
+    )

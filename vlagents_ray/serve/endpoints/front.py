@@ -1,6 +1,7 @@
 """Middleware that a replica's server runs before Serve's own code, for each connection.
 
-Serve loads it by `RAY_SERVE_HTTP_PROXY_CALLBACK_IMPORT_PATH`: see `vlagents_ray.serve.launch.haproxy`.
+Serve loads it by `RAY_SERVE_HTTP_PROXY_CALLBACK_IMPORT_PATH`: see
+`vlagents_ray.serve.launch.haproxy`.
 """
 
 from __future__ import annotations
@@ -22,7 +23,8 @@ from vlagents_ray.serve.endpoints.http_messages import problem_response
 from vlagents_ray.serve.endpoints.incoming_frames import SCOPE_KEY, IncomingFrames
 
 _MESSAGE_TOO_BIG = 1009  # WebSocket close code
-_DRAINED_BYTES = 8 * STREAM_BYTES  # maximum number of bytes that are discarded after a message that was too large
+# Maximum number of bytes that are discarded after a message that was too large.
+_DRAINED_BYTES = 8 * STREAM_BYTES
 _DRAINED_S = 5.0  # maximum time of discarding
 
 
@@ -32,7 +34,8 @@ def middlewares() -> list[Middleware]:
 
 
 class FrontMiddleware:
-    """Refuses headers that are not UTF-8, which Serve decodes; limits the frames of WebSockets, see `IncomingFrames`.
+    """Refuses headers that are not UTF-8, which Serve decodes; limits the frames of WebSockets, see
+    `IncomingFrames`.
 
     A client can read the reason for a close code, although it is still sending.
     """
@@ -49,7 +52,9 @@ class FrontMiddleware:
             except UnicodeDecodeError:
                 if scope["type"] == "websocket":
                     await receive()  # the "websocket.connect" message
-                refused = problem_response(MalformedMessage(f"header {shown(name)}: want UTF-8"), "")
+                refused = problem_response(
+                    MalformedMessage(f"header {shown(name)}: want UTF-8"), ""
+                )
                 await refused(scope, receive, send)
                 return
         if scope["type"] != "websocket":
@@ -58,7 +63,10 @@ class FrontMiddleware:
 
         async def received() -> Message:
             message = await receive()
-            if message["type"] == "websocket.disconnect" and message.get("code") == _MESSAGE_TOO_BIG:
+            if (
+                message["type"] == "websocket.disconnect"
+                and message.get("code") == _MESSAGE_TOO_BIG
+            ):
                 self._drain(receive)
             return message
 
@@ -73,8 +81,9 @@ class FrontMiddleware:
     def _drain(self, receive: Receive) -> None:
         """Discard incoming bytes, since closing a socket with unread bytes resets the connection.
 
-        The reset would discard the close code on its way. uvicorn closes the socket after this callback; a duplicate
-        keeps the connection open. ASGI does not expose the socket; uvicorn's bound method `receive` has its transport.
+        The reset would discard the close code on its way. uvicorn closes the socket after this
+        callback; a duplicate keeps the connection open. ASGI does not expose the socket; uvicorn's
+        bound method `receive` has its transport.
         """
         transport: Any = getattr(getattr(receive, "__self__", None), "transport", None)
         connection = None if transport is None else transport.get_extra_info("socket")

@@ -1,9 +1,9 @@
 """The HTTP endpoint: HTTP and WebSocket on one port, as an ASGI application over an engine.
 
     POST /v1/reset, /v1/act, /v1/close   multipart/form-data, application/json, or one binary frame
-    WS   /v1/stream                      sessions that end with the connection; binary frames or probes
-    WS   /v1/weights                     new weights from a learner, see `vlagents_ray.serve.endpoints.weights`
-    GET  /healthz, /v1/metadata, /docs
+    WS   /v1/stream                      sessions that end with the connection; binary frames or
+    probes WS   /v1/weights                     new weights from a learner, see
+    `vlagents_ray.serve.endpoints.weights` GET  /healthz, /v1/metadata, /docs
 
 Errors over HTTP are problem+json with a stable code; over WebSocket they are reply frames.
 """
@@ -52,14 +52,15 @@ def build_http_app(
 ) -> Starlette:
     """Build the ASGI application of a replica.
 
-    It must run behind a `vlagents_ray.serve.endpoints.access_middleware.AccessMiddleware`, which identifies the caller
-    of each request: without one, requests fail.
+    It must run behind a `vlagents_ray.serve.endpoints.access_middleware.AccessMiddleware`, which
+    identifies the caller of each request: without one, requests fail.
 
     Args:
         metadata: Returns the document of `GET /v1/metadata`.
         machine_metadata: Returns the metadata for a caller on the machine with the given boot id.
-        more: The routes of other systems' clients, learners and viewers, see `vlagents_ray.serve.dialects`,
-            `vlagents_ray.serve.endpoints.weights` and `vlagents_ray.serve.replica.part`.
+        more: The routes of other systems' clients, learners and viewers, see
+            `vlagents_ray.serve.dialects`, `vlagents_ray.serve.endpoints.weights` and
+            `vlagents_ray.serve.replica.part`.
     """
     server = _HttpEndpoint(engine, metadata, limits, machine_metadata)
     app = Starlette(
@@ -71,7 +72,10 @@ def build_http_app(
             Route("/docs", server.docs),
             *more,
         ],
-        exception_handlers={HTTPException: _http_problem, VLAgentsError: http_messages.answer_error},
+        exception_handlers={
+            HTTPException: _http_problem,
+            VLAgentsError: http_messages.answer_error,
+        },
     )
     app.router.redirect_slashes = False  # many clients drop the body of a redirected POST
     app.router.default = partial(_no_such_path, app.router.default)
@@ -86,7 +90,9 @@ class _HttpEndpoint:
     machine_metadata: Callable[[str], Awaitable[dict[str, Any]]] | None
 
     async def health(self, http: HttpRequest) -> Response:
-        """Reply whether the policy is ready, or its step of loading, and nothing else: this path needs no key."""
+        """Reply whether the policy is ready, or its step of loading, and nothing else: this path
+        needs no key.
+        """
         try:
             ready = await asyncio.wait_for(asyncio.to_thread(lambda: self.engine.ready), _HEALTH_S)
         except asyncio.TimeoutError:  # the policy's own check hangs
@@ -105,7 +111,9 @@ class _HttpEndpoint:
         return self._when_ready(http, lambda: JSONResponse(plain_values(self.metadata())))
 
     async def docs(self, http: HttpRequest) -> Response:
-        return self._when_ready(http, lambda: http_messages.html_response(docs_page(self.metadata()), styles=[STYLE]))
+        return self._when_ready(
+            http, lambda: http_messages.html_response(docs_page(self.metadata()), styles=[STYLE])
+        )
 
     def _when_ready(self, http: HttpRequest, answer: Callable[[], Response]) -> Response:
         try:
@@ -122,9 +130,15 @@ class _HttpEndpoint:
             name, headers = http_messages.request_id(http), http_messages.headers_of(http.scope)
             try:
                 session_id = http_messages.session_id(http)
-                sender = Sender(self.engine, "http", session_id, caller=current_caller(), connected=False)
-                admission = sender.admission(self.limits, rank=headers.get(messages.RANK_HEADER, "robot"))
-                decoded = await http_messages.read_requests(op, _timed(http, incoming), admission, name)
+                sender = Sender(
+                    self.engine, "http", session_id, caller=current_caller(), connected=False
+                )
+                admission = sender.admission(
+                    self.limits, rank=headers.get(messages.RANK_HEADER, "robot")
+                )
+                decoded = await http_messages.read_requests(
+                    op, _timed(http, incoming), admission, name
+                )
                 incoming.decoded(decoded)
                 if decoded.requests:
                     name = decoded.requests[0].request_id
@@ -133,7 +147,9 @@ class _HttpEndpoint:
                     raise error
                 if CONTENT_TYPE in headers.get("accept", "") or len(replies) > 1:
                     return Response(incoming.frame(), media_type=CONTENT_TYPE)
-                step = {} if replies[0].step is None else {messages.STEP_HEADER: str(replies[0].step)}
+                step = (
+                    {} if replies[0].step is None else {messages.STEP_HEADER: str(replies[0].step)}
+                )
                 return Response(incoming.document(), headers=step, media_type="application/json")
             except ClientDisconnect:
                 incoming.record_failure("disconnected")
@@ -146,7 +162,9 @@ class _HttpEndpoint:
         return handle
 
     async def stream(self, socket: WebSocket) -> None:
-        """Serve one WebSocket, whose sessions end with it; a malformed request gets an error and affects no session."""
+        """Serve one WebSocket, whose sessions end with it; a malformed request gets an error and
+        affects no session.
+        """
         sender = Sender(self.engine, "websocket", caller=current_caller())
         await socket.accept()
         if len(self.engine.sessions) >= self.engine.sessions.limit:
@@ -168,7 +186,9 @@ class _HttpEndpoint:
             sender.release()
 
     async def _answer(self, sender: Sender, frame: bytes | None) -> bytes:
-        """Return the answer to a message of a WebSocket, a frame or a probe; None is a text message."""
+        """Return the answer to a message of a WebSocket, a frame or a probe; None is a text
+        message.
+        """
         if frame is not None and messages.is_probe(frame):
             try:
                 messages.read_probe(frame, sender.admission(self.limits, len(frame), "simulation"))
@@ -191,7 +211,9 @@ class _HttpEndpoint:
 
 
 def _timed(http: HttpRequest, incoming: Incoming) -> HttpRequest:
-    """Return a request whose times start when its body has arrived, so that the upload counts as network time."""
+    """Return a request whose times start when its body has arrived, so that the upload counts as
+    network time.
+    """
 
     async def receive() -> Message:
         message = await http.receive()
@@ -202,7 +224,9 @@ def _timed(http: HttpRequest, incoming: Incoming) -> HttpRequest:
 
 
 async def _no_such_path(of_http: ASGIApp, scope: Scope, receive: Receive, send: Send) -> None:
-    """Refuse an unknown path: Starlette would refuse a WebSocket with 403, which means an invalid key."""
+    """Refuse an unknown path: Starlette would refuse a WebSocket with 403, which means an
+    invalid key.
+    """
     if scope["type"] == "websocket":
         await http_messages.deny(WebSocket(scope, receive, send), UnknownApp(_NO_PATH))
     else:
@@ -215,6 +239,8 @@ async def _http_problem(http: HttpRequest, error: Exception) -> Response:
     if refused.status_code == 404:
         return http_messages.problem_response(UnknownApp(_NO_PATH), http_messages.request_id(http))
     cause = MalformedMessage(f"{refused.detail}; GET /docs lists what there is")
-    response = http_messages.problem_response(cause, http_messages.request_id(http), refused.status_code)
+    response = http_messages.problem_response(
+        cause, http_messages.request_id(http), refused.status_code
+    )
     response.headers.update(refused.headers or {})
     return response

@@ -1,4 +1,6 @@
-"""Decoding of HTTP requests: forms, JSON documents and frames, within the limits of the deployment."""
+"""Decoding of HTTP requests: forms, JSON documents and frames, within the limits of the
+deployment.
+"""
 
 from __future__ import annotations
 
@@ -28,7 +30,12 @@ from vlagents_ray.errors import (
     VLAgentsError,
 )
 from vlagents_ray.protocol.frames import CONTENT_TYPE, Decoded, check_request, decode_requests
-from vlagents_ray.protocol.json_messages import CAMERA_PREFIX, PROBLEM_TYPE, problem, request_from_parts
+from vlagents_ray.protocol.json_messages import (
+    CAMERA_PREFIX,
+    PROBLEM_TYPE,
+    problem,
+    request_from_parts,
+)
 from vlagents_ray.protocol.messages import (
     DEADLINE_HEADER,
     MOST_DEADLINE_MS,
@@ -45,7 +52,8 @@ from vlagents_ray.serve.engine.admission import MessageAdmission
 
 logger = logging.getLogger(__name__)
 
-LONG_BYTES = 512 * 1024  # longer JSON or msgpack is decoded on another thread, to keep the event loop responsive
+# Longer JSON or msgpack is decoded on another thread, to keep the event loop responsive.
+LONG_BYTES = 512 * 1024
 _POLICY_VIOLATION = 1008  # WebSocket close code
 _GZIP = b"\x1f\x8b"  # the first bytes of a gzip file
 _HEADERS = "vlagents_ray.headers"  # key of the decoded headers in an ASGI scope
@@ -59,8 +67,11 @@ class _Refused(MultiPartException):
         self.error = error
 
 
-async def read_requests(op: Op, http: HttpRequest, admission: MessageAdmission, name: str) -> Decoded:
-    """Read the requests of a POST to the path of `op`; the first one gets the id `name` if it has none.
+async def read_requests(
+    op: Op, http: HttpRequest, admission: MessageAdmission, name: str
+) -> Decoded:
+    """Read the requests of a POST to the path of `op`; the first one gets the id `name` if it has
+    none.
 
     An error that concerns the whole body is raised.
     """
@@ -82,20 +93,28 @@ async def read_requests(op: Op, http: HttpRequest, admission: MessageAdmission, 
             decoded = Decoded([await admission.decoded(read, long=len(body) > LONG_BYTES)], {})
         else:
             raise MalformedMessage(
-                f"content-type: got {kind or 'none'!r}, want multipart/form-data, application/json or {CONTENT_TYPE}"
+                f"content-type: got {kind or 'none'!r}, want multipart/form-data, application/json "
+                f"or {CONTENT_TYPE}"
             )
     _read_headers(op, decoded.requests, headers, name, limits)
     return decoded
 
 
-def _read_headers(op: Op, requests: list[Request], headers: dict[str, str], name: str, limits: Limits) -> None:
+def _read_headers(
+    op: Op, requests: list[Request], headers: dict[str, str], name: str, limits: Limits
+) -> None:
     """Check the requests, and add the deadline, step and class in the headers to them."""
     stated = headers.get(REQUEST_ID_HEADER, "")
     if not is_name(stated):
         raise MalformedMessage(
-            f"header {REQUEST_ID_HEADER}: got {stated[:40]!r}, want 1 to 128 visible ASCII characters"
+            f"header {REQUEST_ID_HEADER}: got {stated[:40]!r}, want 1 to 128 visible ASCII "
+            "characters"
         )
-    deadline, rank, step = headers.get(DEADLINE_HEADER), headers.get(RANK_HEADER), headers.get(STEP_HEADER)
+    deadline, rank, step = (
+        headers.get(DEADLINE_HEADER),
+        headers.get(RANK_HEADER),
+        headers.get(STEP_HEADER),
+    )
     stated_by_headers: dict[str, Any] = {}
     for place, request in enumerate(requests):
         if request.op != op:
@@ -119,7 +138,9 @@ async def _read_form(op: Op, http: HttpRequest, admission: MessageAdmission) -> 
     files: dict[str, bytes] = {}
     try:
         async with HttpRequest(http.scope, _limited(http, admission)).form(
-            max_files=limits.cameras + 1, max_fields=limits.cameras + 1, max_part_size=limits.body_bytes
+            max_files=limits.cameras + 1,
+            max_fields=limits.cameras + 1,
+            max_part_size=limits.body_bytes,
         ) as form:
             for name, part in form.multi_items():
                 data = part if isinstance(part, str) else await part.read()
@@ -140,11 +161,15 @@ async def _read_form(op: Op, http: HttpRequest, admission: MessageAdmission) -> 
         raise MalformedMessage(f"form: {text}") from error
     if document is None:
         raise MalformedMessage("form: no part 'obs'; send a JSON document, {} at least")
-    return await admission.decoded(partial(request_from_parts, op, document, files), long=len(document) > LONG_BYTES)
+    return await admission.decoded(
+        partial(request_from_parts, op, document, files), long=len(document) > LONG_BYTES
+    )
 
 
 def _limited(http: HttpRequest, admission: MessageAdmission) -> Receive:
-    """Return a `receive` that limits the whole body: the parser limits only single parts, and files not at all."""
+    """Return a `receive` that limits the whole body: the parser limits only single parts, and
+    files not at all.
+    """
     size, limit = 0, admission.limits.body_bytes
 
     async def receive() -> Message:
@@ -187,7 +212,8 @@ def _wrong_part(name: str) -> str:
         return f"the part {name!r} names no camera, want 'cameras.<name>'"
     if name.startswith(CAMERA_PREFIX):
         return (
-            f"the part {name[:80]!r} is text, want a file: send it with a filename, as curl -F {name[:80]}=@FILE does"
+            f"the part {name[:80]!r} is text, want a file: send it with a filename, as curl -F "
+            f"{name[:80]}=@FILE does"
         )
     return f"unknown part {name[:80]!r}, want 'obs' and files 'cameras.<name>'"
 
@@ -196,21 +222,29 @@ def _require_uncompressed(http: HttpRequest) -> None:
     coding = headers_of(http.scope).get("content-encoding", "identity").strip().lower()
     if coding not in ("", "identity"):
         raise MalformedMessage(
-            f"content-encoding: got {coding[:40]!r}, want none; send the body as it is (images are compressed already)"
+            f"content-encoding: got {coding[:40]!r}, want none; send the body as it is (images are "
+            "compressed already)"
         )
 
 
 def headers_of(scope: Scope) -> dict[str, str]:
-    """Return the headers of a request by lower-case name, decoded once; of equal names the last one counts."""
+    """Return the headers of a request by lower-case name, decoded once; of equal names the last
+    one counts.
+    """
     headers: dict[str, str] | None = scope.get(_HEADERS)
     if headers is None:
-        headers = {name.decode("latin-1").lower(): value.decode("latin-1") for name, value in scope["headers"]}
+        headers = {
+            name.decode("latin-1").lower(): value.decode("latin-1")
+            for name, value in scope["headers"]
+        }
         scope[_HEADERS] = headers
     return headers
 
 
 def session_id(http: HttpRequest) -> str:
-    """Return the session id, which every request must have in its header; raise `MalformedMessage` without one."""
+    """Return the session id, which every request must have in its header; raise
+    `MalformedMessage` without one.
+    """
     name = headers_of(http.scope).get(SESSION_HEADER, "")
     if not name or not is_name(name):
         raise MalformedMessage(
@@ -227,24 +261,31 @@ def _positive(text: str) -> float:
         value = -1.0
     if not 0 < value < MOST_DEADLINE_MS:
         raise MalformedMessage(
-            f"header {DEADLINE_HEADER}: got {text[:40]!r}, want milliseconds above 0 and below {MOST_DEADLINE_MS:g}"
+            f"header {DEADLINE_HEADER}: got {text[:40]!r}, want milliseconds above 0 and below "
+            f"{MOST_DEADLINE_MS:g}"
         )
     return value
 
 
 def _whole(text: str) -> int:
     if not text.isdecimal() or len(text) > 19:
-        raise MalformedMessage(f"header {STEP_HEADER}: got {text[:40]!r}, want what the last answer's header says")
+        raise MalformedMessage(
+            f"header {STEP_HEADER}: got {text[:40]!r}, want what the last answer's header says"
+        )
     return int(text)
 
 
 def request_id(http: HttpRequest) -> str:
-    """Return the request id from the caller or, without one, from Serve, which returns it in a header."""
+    """Return the request id from the caller or, without one, from Serve, which returns it in a
+    header.
+    """
     return named(headers_of(http.scope).get(REQUEST_ID_HEADER, ""))
 
 
 def named(shown: str) -> str:
-    """Return the request id of a header, or a new one if the header is empty, invalid, or could forge a log line."""
+    """Return the request id of a header, or a new one if the header is empty, invalid, or could
+    forge a log line.
+    """
     return shown if shown and is_name(shown) else uuid.uuid4().hex
 
 
@@ -254,14 +295,18 @@ async def answer_error(http: HttpRequest, error: Exception) -> Response:
 
 
 async def deny(socket: WebSocket, error: VLAgentsError) -> None:
-    """Refuse a WebSocket before it is accepted, with the error as an HTTP response if the server supports that."""
+    """Refuse a WebSocket before it is accepted, with the error as an HTTP response if the server
+    supports that.
+    """
     if "websocket.http.response" in (socket.scope.get("extensions") or {}):
         await socket.send_denial_response(problem_response(error, ""))
     else:
         await socket.close(_POLICY_VIOLATION)
 
 
-def html_response(html: str, *, styles: Sequence[str] = (), scripts: Sequence[str] = (), more: str = "") -> Response:
+def html_response(
+    html: str, *, styles: Sequence[str] = (), scripts: Sequence[str] = (), more: str = ""
+) -> Response:
     """Return a page that loads nothing from other servers, and that no other site's page may frame.
 
     Args:
@@ -276,7 +321,9 @@ def html_response(html: str, *, styles: Sequence[str] = (), scripts: Sequence[st
     ]
     policy = ["default-src 'none'", *policy, *filter(None, [more])]
     headers = {
-        "content-security-policy": "; ".join([*policy, "base-uri 'none'; form-action 'none'; frame-ancestors 'none'"]),
+        "content-security-policy": "; ".join(
+            [*policy, "base-uri 'none'; form-action 'none'; frame-ancestors 'none'"]
+        ),
         "cache-control": "no-cache",
         "referrer-policy": "no-referrer",
         "x-content-type-options": "nosniff",
@@ -297,7 +344,9 @@ def public_problem(error: Exception, what: str, request_id: str) -> VLAgentsErro
 
 
 def problem_response(error: VLAgentsError, request_id: str, status: int | None = None) -> Response:
-    """Return the problem document of an error, with the status of the error unless another is given."""
+    """Return the problem document of an error, with the status of the error unless another is
+    given.
+    """
     document = problem(error, request_id)
     if status is not None:
         document["status"] = status

@@ -1,8 +1,9 @@
 """The frames of one WebSocket of uvicorn, between its socket and uvicorn's own protocol.
 
-The limits of a key and of the replica's memory apply to whole messages. Below them, uvicorn buffers up to 16 MiB of a
-message, inflates compressed ones, and parses and answers control frames; and Serve takes each complete message from
-uvicorn at once, whether or not the application reads it. `IncomingFrames` therefore passes bytes on to uvicorn only
+The limits of a key and of the replica's memory apply to whole messages. Below them, uvicorn buffers
+up to 16 MiB of a message, inflates compressed ones, and parses and answers control frames; and
+Serve takes each complete message from uvicorn at once, whether or not the application reads it.
+`IncomingFrames` therefore passes bytes on to uvicorn only
 
 - as long as few messages wait for the application,
 - as long as the client's key is within its rate, as its messages would only wait to be refused,
@@ -24,7 +25,12 @@ from starlette.types import Receive
 from websockets.frames import Close, Frame, Opcode
 
 from vlagents_ray.errors import VLAgentsError
-from vlagents_ray.protocol.websocket_frames import CONTROL_FRAMES, CONTROL_FRAMES_PER_S, HEAD_BYTES, frame_size
+from vlagents_ray.protocol.websocket_frames import (
+    CONTROL_FRAMES,
+    CONTROL_FRAMES_PER_S,
+    HEAD_BYTES,
+    frame_size,
+)
 from vlagents_ray.serve.access.api_keys import Caller, Identity
 from vlagents_ray.serve.engine.admission import Admission, ArrivingBytes
 from vlagents_ray.serve.token_bucket import TokenBucket
@@ -45,33 +51,40 @@ class IncomingFrames(asyncio.Protocol):
     All methods run on the event loop of the connection, except those that say otherwise.
     """
 
-    def __init__(self, protocol: Any, transport: asyncio.Transport, discard_rest: Callable[[], None]) -> None:
+    def __init__(
+        self, protocol: Any, transport: asyncio.Transport, discard_rest: Callable[[], None]
+    ) -> None:
         """Take the place of uvicorn's `protocol` at its `transport`; nothing is read until `open`.
 
         Args:
-            discard_rest: Discards bytes that still arrive when the connection is closed, so that the client reads the
-                close code.
+            discard_rest: Discards bytes that still arrive when the connection is closed, so that
+                the client reads the close code.
         """
         self._protocol, self._transport, self._discard_rest = protocol, transport, discard_rest
         self._loop = asyncio.get_running_loop()
         self._unparsed = b""  # received bytes that were not passed on: at most those of one read
         self._frame_left = 0  # bytes of the current frame that were not passed on
-        self._is_data = self._is_last = False  # whether the current frame is of a message, and whether it is its last
+        # Whether the current frame is of a message, and whether it is its last.
+        self._is_data = self._is_last = False
         self._has_message = False  # whether a complete message has arrived
         self._partial_bytes = 0  # size of the received part of a message
-        self._waiting: deque[int] = deque()  # sizes of the messages that the application has not read
+        # Sizes of the messages that the application has not read.
+        self._waiting: deque[int] = deque()
         self._control_frames = TokenBucket(CONTROL_FRAMES_PER_S, time.monotonic(), CONTROL_FRAMES)
-        self._arriving_since: float | None = None  # time since which a part of a message or frame waits for its rest, s
+        # Time since which a part of a message or frame waits for its rest, s.
+        self._arriving_since: float | None = None
         self._ended = False
         self._caller: Caller | None = None
-        self._end_of_throttling: asyncio.TimerHandle | None = None  # None while the key is within its rate
+        # None while the key is within its rate.
+        self._end_of_throttling: asyncio.TimerHandle | None = None
         self._memory: ArrivingBytes | None = None
         transport.pause_reading()
         transport.set_protocol(self)
 
     @classmethod
     def attach(cls, receive: Receive, discard_rest: Callable[[], None]) -> IncomingFrames | None:
-        """Return the frames of the WebSocket with this `receive`, without compression; None if uvicorn is not below.
+        """Return the frames of the WebSocket with this `receive`, without compression; None if
+        uvicorn is not below.
 
         ASGI exposes no connection; uvicorn's bound method `receive` has its protocol.
         """
@@ -91,7 +104,9 @@ class IncomingFrames(asyncio.Protocol):
     # Called by the middleware that identifies the caller, on any thread.
 
     def supervise(self, caller: Identity, admission: Admission | None) -> None:
-        """Count messages for the key of `caller`, and their bytes as in flight; call this before `open`."""
+        """Count messages for the key of `caller`, and their bytes as in flight; call this before
+        `open`.
+        """
         robot, key = True, None
         if isinstance(caller, Caller):
             self._caller = caller
@@ -105,7 +120,9 @@ class IncomingFrames(asyncio.Protocol):
             self._loop.call_soon_threadsafe(self._note_taken)
 
     async def end(self, code: int, reason: str) -> None:
-        """End a connection with a part of a message, behind which uvicorn would not find the client's close frame."""
+        """End a connection with a part of a message, behind which uvicorn would not find the
+        client's close frame.
+        """
 
         async def end() -> None:
             self._discard_rest()
@@ -147,7 +164,8 @@ class IncomingFrames(asyncio.Protocol):
     def connection_lost(self, exc: Exception | None) -> None:
         """Free the memory of a connection that has ended.
 
-        A part of a message counts as a message of its key, and so does a connection without any message.
+        A part of a message counts as a message of its key, and so does a connection without any
+        message.
         """
         if self._partial_bytes or not self._has_message:
             self._charge()
@@ -161,7 +179,9 @@ class IncomingFrames(asyncio.Protocol):
             self._pass_on()
 
     def _is_paused(self) -> bool:
-        """Return whether the server must not read now; a key over its rate is read again when its pause is over."""
+        """Return whether the server must not read now; a key over its rate is read again when
+        its pause is over.
+        """
         if self._end_of_throttling is not None or len(self._waiting) >= _WAITING_MESSAGES:
             return True
         wait_s = 0.0 if self._caller is None else self._caller.throttled_s()
@@ -179,7 +199,10 @@ class IncomingFrames(asyncio.Protocol):
         while self._unparsed and not self._ended and not self._is_paused():
             if not self._frame_left and not self._begin_frame():
                 break
-            part, self._unparsed = self._unparsed[: self._frame_left], self._unparsed[self._frame_left :]
+            part, self._unparsed = (
+                self._unparsed[: self._frame_left],
+                self._unparsed[self._frame_left :],
+            )
             self._frame_left -= len(part)
             if self._is_data:
                 self._partial_bytes += len(part)
@@ -189,7 +212,8 @@ class IncomingFrames(asyncio.Protocol):
                     self._has_message = True
             if self._hold_memory():
                 self._protocol.data_received(part)
-            if self._protocol.conn.parser_exc is not None:  # an invalid frame: uvicorn closes the connection
+            # An invalid frame: uvicorn closes the connection.
+            if self._protocol.conn.parser_exc is not None:
                 self._charge()
                 self._end_reading()
         self._update()
@@ -203,15 +227,22 @@ class IncomingFrames(asyncio.Protocol):
         opcode, self._is_last = head[0] & 0x0F, bool(head[0] & 0x80)
         self._is_data = not opcode & _CONTROL_OPCODES
         is_small_fragment = size < _FRAGMENT_BYTES and (opcode == Opcode.CONT or not self._is_last)
-        if (is_small_fragment or not self._is_data) and self._control_frames.take(time.monotonic()) > 0:
+        if (is_small_fragment or not self._is_data) and self._control_frames.take(
+            time.monotonic()
+        ) > 0:
             self._charge()
-            self._end(_POLICY_VIOLATION, f"more than {CONTROL_FRAMES} control frames or small fragments at once")
+            self._end(
+                _POLICY_VIOLATION,
+                f"more than {CONTROL_FRAMES} control frames or small fragments at once",
+            )
             return False
         self._frame_left = size
         return True
 
     def _hold_memory(self) -> bool:
-        """Count the bytes that wait as in flight; return False if there is no room for them, and end the connection."""
+        """Count the bytes that wait as in flight; return False if there is no room for them, and
+        end the connection.
+        """
         if self._memory is None:
             return True
         try:
@@ -223,7 +254,9 @@ class IncomingFrames(asyncio.Protocol):
         return True
 
     def _update(self) -> None:
-        """Read from the socket only if the next bytes can be passed on, and note since when a part waits."""
+        """Read from the socket only if the next bytes can be passed on, and note since when a
+        part waits.
+        """
         if self._ended or self._transport.is_closing():
             return
         if self._memory is not None:
@@ -231,7 +264,8 @@ class IncomingFrames(asyncio.Protocol):
         is_paused = self._is_paused()
         if is_paused:
             self._transport.pause_reading()
-        elif not self._protocol.read_paused:  # otherwise uvicorn resumes when its own queue is empty
+        elif not self._protocol.read_paused:
+            # otherwise uvicorn resumes when its own queue is empty
             self._transport.resume_reading()
         is_arriving = bool(self._partial_bytes or self._frame_left or self._unparsed)
         if is_paused or not is_arriving:
@@ -248,7 +282,9 @@ class IncomingFrames(asyncio.Protocol):
     def _give_up(self) -> None:
         """End the connection since a whole message needs the memory; called on any thread."""
         with contextlib.suppress(RuntimeError):  # the event loop is closed
-            self._loop.call_soon_threadsafe(self._end, _TRY_AGAIN_LATER, "a complete message needs the memory")
+            self._loop.call_soon_threadsafe(
+                self._end, _TRY_AGAIN_LATER, "a complete message needs the memory"
+            )
 
     def _end(self, code: int, reason: str) -> None:
         if self._ended or self._transport.is_closing():

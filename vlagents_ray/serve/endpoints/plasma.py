@@ -1,15 +1,17 @@
 """The endpoint for processes of the Ray cluster on this node: frames in mutable plasma objects.
 
-The replica keeps a pool of observation channels (mutable objects, on which Ray's `Channel` is built) and leases them to
-clients. A client writes its frames into one as raw bytes, so that nothing is unpickled and the client may use another
-version of numpy. The rest is `vlagents_ray.serve.endpoints.shm`: a message on a Unix socket announces a frame, the
-policy thread reads the frame and replies, and the end of the connection, whatever its cause, returns the channel to the
-pool.
+The replica keeps a pool of observation channels (mutable objects, on which Ray's `Channel` is
+built) and leases them to clients. A client writes its frames into one as raw bytes, so that nothing
+is unpickled and the client may use another version of numpy. The rest is
+`vlagents_ray.serve.endpoints.shm`: a message on a Unix socket announces a frame, the policy thread
+reads the frame and replies, and the end of the connection, whatever its cause, returns the channel
+to the pool.
 
-A socket accompanies the channel because Ray's readers wait by polling (an idle `Channel.read` takes one CPU, with a
-timeout or without) and do not notice the death of the writer. The channels are pooled because Ray frees a channel's
-memory only when all processes that registered as its readers or writers have ended. The socket is in Ray's own folder,
-beside the object store's, so that it is reachable wherever the store is, including other network namespaces.
+A socket accompanies the channel because Ray's readers wait by polling (an idle `Channel.read` takes
+one CPU, with a timeout or without) and do not notice the death of the writer. The channels are
+pooled because Ray frees a channel's memory only when all processes that registered as its readers
+or writers have ended. The socket is in Ray's own folder, beside the object store's, so that it is
+reachable wherever the store is, including other network namespaces.
 """
 
 from __future__ import annotations
@@ -40,7 +42,9 @@ from vlagents_ray.serve.engine.engine import Engine
 
 logger = logging.getLogger(__name__)
 
-_SHARE = 0.5  # maximum share of the node's object store; beyond the store's size Ray silently puts channels on disk
+# Maximum share of the node's object store; beyond the store's size Ray silently puts channels on
+# disk.
+_SHARE = 0.5
 _LEAST = 64 * 1024  # minimum size of a channel, bytes
 _HEADER = 64  # size of Ray's own metadata, bytes
 _CLAIM_S = 60.0  # time after which an unclaimed lease is ended, since its client is gone
@@ -55,14 +59,21 @@ class Channel:
     leased: float = 0.0  # time of the latest lease, s, monotonic
 
     def read(self) -> np.ndarray:
-        """Return a copy of the frame, (N,) uint8, without waiting; raise `MalformedMessage` if there is none."""
+        """Return a copy of the frame, (N,) uint8, without waiting; raise `MalformedMessage` if
+        there is none.
+        """
         found = self._take()
-        if found.metadata != PlasmaAddress.TAG:  # Ray's parser below trusts its input, as everywhere
-            raise MalformedMessage("plasma: what the channel holds is no frame; is this a client of vlagents_ray?")
+        # Ray's parser below trusts its input, as everywhere.
+        if found.metadata != PlasmaAddress.TAG:
+            raise MalformedMessage(
+                "plasma: what the channel holds is no frame; is this a client of vlagents_ray?"
+            )
         return np.frombuffer(b"".join(private.channel_pieces(found.data)), np.uint8)
 
     def intact(self) -> bool:
-        """Discard an unread frame; return False if the writer was killed during a write, which locks the channel."""
+        """Discard an unread frame; return False if the writer was killed during a write, which
+        locks the channel.
+        """
         with contextlib.suppress(MalformedMessage):
             self._take()
         try:
@@ -79,7 +90,9 @@ class Channel:
         try:
             return private.read_channel(self.ref)
         except RayChannelTimeoutError as error:
-            raise MalformedMessage("plasma: a message came without a frame in its channel") from error
+            raise MalformedMessage(
+                "plasma: a message came without a frame in its channel"
+            ) from error
 
 
 class Pool:
@@ -101,8 +114,11 @@ class Pool:
         Raises:
             MessageTooLarge: `length` is over `limits.body_bytes`, or the object store is too small.
         """
-        if length > 2 * self._limits.body_bytes:  # includes Ray's framing; the decoder checks the exact limit
-            raise MessageTooLarge(f"frame: got {length} bytes, the limit is {self._limits.body_bytes}")
+        # Includes Ray's framing; the decoder checks the exact limit.
+        if length > 2 * self._limits.body_bytes:
+            raise MessageTooLarge(
+                f"frame: got {length} bytes, the limit is {self._limits.body_bytes}"
+            )
         with self._lock:
             oldest = time.monotonic() - _CLAIM_S
             for lost in [key for key, channel in self._leased.items() if channel.leased < oldest]:
@@ -136,20 +152,28 @@ class Pool:
             self._free.append(channel)
             return
         logger.warning(
-            "plasma: a client was killed while it wrote; its channel of %d bytes is lost until this replica ends",
+            "plasma: a client was killed while it wrote; its channel of %d bytes is lost until "
+            "this replica ends",
             channel.capacity,
         )
 
     def _create(self, capacity: int) -> Channel:
-        """Create a channel without the lock, which the policy thread needs: allocation can be slow."""
+        """Create a channel without the lock, which the policy thread needs: allocation can be
+        slow.
+        """
         here = ray.get_runtime_context().get_node_id()
-        store: float = next(one["Resources"]["object_store_memory"] for one in ray.nodes() if one["NodeID"] == here)
+        store: float = next(
+            one["Resources"]["object_store_memory"] for one in ray.nodes() if one["NodeID"] == here
+        )
         with self._lock:
             if self._bytes + capacity > _SHARE * store:
                 raise MessageTooLarge(
-                    f"plasma: no room for a channel of {capacity} bytes: this node's object store has {store:.0f}, "
-                    f"a replica's channels may take {_SHARE:.0%} of it and take {self._bytes}; start Ray with a larger "
-                    f"object_store_memory (`ray start --object-store-memory BYTES`), or use transport 'shm'"
+                    f"plasma: no room for a channel of {capacity} bytes: this node's object store "
+                    f"has {store:.0f}, "
+                    f"a replica's channels may take {_SHARE:.0%} of it and take {self._bytes}; "
+                    "start Ray with a larger "
+                    "object_store_memory (`ray start --object-store-memory BYTES`), or use "
+                    "transport 'shm'"
                 )
             self._bytes += capacity
         try:
@@ -173,7 +197,8 @@ class PlasmaServer(UnixServer):
             engine, NoKey.INSIDE, limits, partial(LeasedChannel, self.pool, engine.admission)
         )  # the cluster needs no key
         folder = private.plasma_folder()
-        # The name is no longer than that of the store's socket in the same folder, since socket paths are limited.
+        # The name is no longer than that of the store's socket in the same folder, since socket
+        # paths are limited.
         self._path = folder / f"vla{secrets.token_hex(4)}"
         self.plasma = PlasmaAddress(str(self._path), ray.get_runtime_context().get_node_id())
 
@@ -189,7 +214,9 @@ class PlasmaServer(UnixServer):
         super().open()
 
     def close(self) -> None:
-        """Close the listener and all connections, and remove the socket; call this after the engine has ended."""
+        """Close the listener and all connections, and remove the socket; call this after the
+        engine has ended.
+        """
         super().close()
         self._path.unlink(missing_ok=True)
 
@@ -201,10 +228,16 @@ class LeasedChannel:
         self._pool, self._admission = pool, admission
         self._channel: Channel | None = None
 
-    def read(self, message: memoryview, descriptors: list[int]) -> tuple[np.ndarray, bool, memoryview]:
-        """Return a copy of the frame in the message's channel, whether it is compact, and the rest of the message."""
+    def read(
+        self, message: memoryview, descriptors: list[int]
+    ) -> tuple[np.ndarray, bool, memoryview]:
+        """Return a copy of the frame in the message's channel, whether it is compact, and the
+        rest of the message.
+        """
         if len(message) < PlasmaAddress.REQUEST.size:
-            raise MalformedMessage(f"plasma: got {len(message)} bytes, want at least {PlasmaAddress.REQUEST.size}")
+            raise MalformedMessage(
+                f"plasma: got {len(message)} bytes, want at least {PlasmaAddress.REQUEST.size}"
+            )
         key, flags = PlasmaAddress.REQUEST.unpack_from(message)
         if self._channel is None or self._channel.ref.binary() != key:
             self.free()

@@ -1,9 +1,11 @@
-"""The endpoints for processes on the same machine: messages on Unix sockets that locate observations in shared memory.
+"""The endpoints for processes on the same machine: messages on Unix sockets that locate
+observations in shared memory.
 
 A `Payload` reads that memory: the client's memory files, or channels in the node's object store
-(`vlagents_ray.serve.endpoints.plasma`). For memory files, a client connects to an abstract socket whose unguessable
-name is in the metadata, and passes files that it writes its frames into. Neither side creates a file name, so that
-memory and socket are freed when their processes end for any reason. Only processes of the same user may connect.
+(`vlagents_ray.serve.endpoints.plasma`). For memory files, a client connects to an abstract socket
+whose unguessable name is in the metadata, and passes files that it writes its frames into. Neither
+side creates a file name, so that memory and socket are freed when their processes end for any
+reason. Only processes of the same user may connect.
 """
 
 from __future__ import annotations
@@ -28,7 +30,15 @@ import numpy as np
 from vlagents_ray.errors import MalformedMessage, MessageTooLarge, PolicyUnavailable, VLAgentsError
 from vlagents_ray.protocol import shm_layout
 from vlagents_ray.protocol.frames import Decoded, decode_requests, encode_replies
-from vlagents_ray.protocol.messages import OPS, Limits, LocalAddress, Op, Reply, boot_id, peer_process
+from vlagents_ray.protocol.messages import (
+    OPS,
+    Limits,
+    LocalAddress,
+    Op,
+    Reply,
+    boot_id,
+    peer_process,
+)
 from vlagents_ray.serve.access.api_keys import Caller, NoKey
 from vlagents_ray.serve.endpoints.connection import (
     BACKLOG,
@@ -54,11 +64,13 @@ from vlagents_ray.serve.requests import Message
 logger = logging.getLogger(__name__)
 
 _MESSAGE_BYTES = 256 * 1024
-_CONTROL = socket.CMSG_SPACE(struct.calcsize("i")) + STAMP_SPACE  # room for one descriptor and the time stamp
+# Room for one descriptor and the time stamp.
+_CONTROL = socket.CMSG_SPACE(struct.calcsize("i")) + STAMP_SPACE
 _INLINE = 64 * 1024  # a longer reply is sent in a memory file
 _KEY_S = 5.0  # time within which a client must send its key
 _KEY_BYTES = 4096  # maximum size of a key
-_MAX_VIEWS = 8  # number of memory files with views held by the policy above which requests are copied
+# Number of memory files with views held by the policy above which requests are copied.
+_MAX_VIEWS = 8
 
 _read_buffer = ReadBuffer(_MESSAGE_BYTES)  # each message is processed before the next one is read
 
@@ -66,14 +78,19 @@ _read_buffer = ReadBuffer(_MESSAGE_BYTES)  # each message is processed before th
 class Payload(Protocol):
     """The memory outside of the messages that holds the requests of one connection."""
 
-    def read(self, message: memoryview, descriptors: list[int]) -> tuple[np.ndarray, bool, memoryview]:
-        """Return the memory of a message, whether it is in compact form, and the text for that form.
+    def read(
+        self, message: memoryview, descriptors: list[int]
+    ) -> tuple[np.ndarray, bool, memoryview]:
+        """Return the memory of a message, whether it is in compact form, and the text for that
+        form.
 
         The descriptors in use are removed from `descriptors`.
         """
 
     def freed(self) -> int:
-        """Return a bit field: bit n is set if memory n is free for the client and no reply has reported that."""
+        """Return a bit field: bit n is set if memory n is free for the client and no reply has
+        reported that.
+        """
 
     def free(self) -> None:
         """Free the memory of a closed connection."""
@@ -90,7 +107,9 @@ class UnixServer(PolledServer["UnixConnection"]):
         payload: Callable[[], Payload],
         ops: Sequence[Op] = OPS,
     ) -> None:
-        """Create the server; `payload` creates the payload of a connection, and `ops` are the accepted operations."""
+        """Create the server; `payload` creates the payload of a connection, and `ops` are the
+        accepted operations.
+        """
         listener = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET | socket.SOCK_NONBLOCK)
         super().__init__(engine, limits, admit, listener)
         self.payload, self.ops = payload, ops
@@ -98,11 +117,17 @@ class UnixServer(PolledServer["UnixConnection"]):
     def _add_client(self, connection: socket.socket) -> None:
         pid, uid = peer_process(connection)
         if uid != os.getuid():
-            logger.warning("the process %d of user %d tried to connect, which is not this server's user", pid, uid)
+            logger.warning(
+                "the process %d of user %d tried to connect, which is not this server's user",
+                pid,
+                uid,
+            )
             connection.close()
             return
         if len(self._clients) >= self.engine.sessions.limit:
-            full = PolicyUnavailable(f"this replica has {len(self._clients)} local clients, its limit of sessions")
+            full = PolicyUnavailable(
+                f"this replica has {len(self._clients)} local clients, its limit of sessions"
+            )
             with contextlib.suppress(OSError):  # the client is already gone
                 connection.send(LocalAddress.REPLY.pack(0, 0) + encode_replies([Reply(error=full)]))
             connection.close()
@@ -177,9 +202,16 @@ class UnixConnection(PolledConnection):
             self._pause(BACKLOGGED)
 
     def _receive(
-        self, sender: Sender, message: Message, waited_s: float, data: memoryview, descriptors: list[int]
+        self,
+        sender: Sender,
+        message: Message,
+        waited_s: float,
+        data: memoryview,
+        descriptors: list[int],
     ) -> None:
-        try:  # only locates the memory; a client's new memory file is kept even if the message is refused
+        # Only locates the memory; a client's new memory file is kept even if the message is
+        # refused.
+        try:
             memory, compact_form, text = self._payload.read(data, descriptors)
         except VLAgentsError:
             sender.count_message()
@@ -187,7 +219,9 @@ class UnixConnection(PolledConnection):
         if not compact_form:
             admission = sender.admission(self._limits)
             submit = partial(self._submit, sender, message, admission, waited_s)
-            self._decode(message, partial(decode_requests, memory.data, ops=self._ops), admission, submit)
+            self._decode(
+                message, partial(decode_requests, memory.data, ops=self._ops), admission, submit
+            )
             return
         if sender.rated:
             sender.count_message()
@@ -196,7 +230,12 @@ class UnixConnection(PolledConnection):
         sender.send(message, decoded, self._write, waited_s=waited_s)
 
     def _submit(
-        self, sender: Sender, message: Message, admission: MessageAdmission, waited_s: float, decoded: Decoded
+        self,
+        sender: Sender,
+        message: Message,
+        admission: MessageAdmission,
+        waited_s: float,
+        decoded: Decoded,
     ) -> None:
         message.decoded(decoded)
         if DECODING in self._unpolled_for:
@@ -204,7 +243,9 @@ class UnixConnection(PolledConnection):
         sender.send(message, decoded, self._write, admission=admission, waited_s=waited_s)
 
     def _authenticate(self, message: bytes) -> Sender | None:
-        """Read the key from the first message; if it is refused, check it again at later ones, `REFUSALS` times."""
+        """Read the key from the first message; if it is refused, check it again at later ones,
+        `REFUSALS` times.
+        """
         if isinstance(self._admit, NoKey):
             raise TypeError(f"a key, although none is asked for: {self._admit.value}")
         first, self._key = self._key is None, self._key or message
@@ -214,17 +255,24 @@ class UnixConnection(PolledConnection):
         self.caller, self._sender = caller, Sender(self._engine, self._name, caller=caller)
         return None if first else self._sender
 
-    def overdue(self, now: float, refusal: Callable[[Caller], str | None]) -> tuple[str, int] | None:
-        """Return a reason to end the connection, as in `PolledConnection`; a client must send its key within 5 s."""
+    def overdue(
+        self, now: float, refusal: Callable[[Caller], str | None]
+    ) -> tuple[str, int] | None:
+        """Return a reason to end the connection, as in `PolledConnection`; a client must send
+        its key within 5 s.
+        """
         if self._sender is not None:
             return super().overdue(now, refusal)
         with self._sending:
             late = now - self._connected_at > _KEY_S and not self._ended
-            return ("no key", POLICY_VIOLATION) if late and not has_unread(self._connection) else None
+            return (
+                ("no key", POLICY_VIOLATION) if late and not has_unread(self._connection) else None
+            )
 
     def _discard(self) -> None:
         self._payload.free()
-        # With messages unread, the kernel would report a reset to the client before the answers that it has not read.
+        # With messages unread, the kernel would report a reset to the client before the answers
+        # that it has not read.
         with contextlib.suppress(OSError):
             self._connection.shutdown(socket.SHUT_RD)
             while self._connection.recv(1):
@@ -259,7 +307,8 @@ class UnixConnection(PolledConnection):
                     socket.send_fds(self._connection, [header], [descriptor])
                 finally:
                     os.close(descriptor)
-            except OSError as error:  # the client is gone, or does not read its replies: `ready` handles the end
+            except OSError as error:
+                # the client is gone, or does not read its replies: `ready` handles the end
                 logger.info("local client: %s", error)
                 with contextlib.suppress(OSError):  # the connection is already closed
                     self._connection.shutdown(socket.SHUT_RDWR)
@@ -270,7 +319,9 @@ class ShmServer(UnixServer):
 
     name: ClassVar[str] = "shm"
 
-    def __init__(self, engine: Engine, limits: Limits, admit: Admit | NoKey, ops: Sequence[Op] = OPS) -> None:
+    def __init__(
+        self, engine: Engine, limits: Limits, admit: Admit | NoKey, ops: Sequence[Op] = OPS
+    ) -> None:
         """Create the server and the address for the metadata; see `UnixServer`."""
         super().__init__(engine, admit, limits, partial(MemoryFiles, limits, engine.admission), ops)
         self.address = LocalAddress(
@@ -285,24 +336,35 @@ class ShmServer(UnixServer):
 
 
 class MemoryFiles:
-    """A `Payload`: the memory files of one client, read in place and returned when no view is left."""
+    """A `Payload`: the memory files of one client, read in place and returned when no view is
+    left.
+    """
 
     def __init__(self, limits: Limits, admission: Admission) -> None:
         self._limits, self._admission = limits, admission
         self._files: dict[int, mmap.mmap] = {}
-        self._views: dict[int, weakref.ref[np.ndarray]] = {}  # the array over each file, until it is garbage-collected
+        # The array over each file, until it is garbage-collected.
+        self._views: dict[int, weakref.ref[np.ndarray]] = {}
         self._freed: set[int] = set()  # freed files that no reply has reported yet
 
-    def read(self, message: memoryview, descriptors: list[int]) -> tuple[np.ndarray, bool, memoryview]:
-        """Return the frame in the message's memory file, whether it is compact, and the rest of the message."""
+    def read(
+        self, message: memoryview, descriptors: list[int]
+    ) -> tuple[np.ndarray, bool, memoryview]:
+        """Return the frame in the message's memory file, whether it is compact, and the rest of
+        the message.
+        """
         if len(message) < LocalAddress.REQUEST.size:
-            raise MalformedMessage(f"local: got {len(message)} bytes, want at least {LocalAddress.REQUEST.size}")
+            raise MalformedMessage(
+                f"local: got {len(message)} bytes, want at least {LocalAddress.REQUEST.size}"
+            )
         number, flags, length = LocalAddress.REQUEST.unpack_from(message)
         if descriptors:
             self._add(number, descriptors.pop(0))
         file = self._files.get(number)
         if file is None or length > len(file):
-            raise MalformedMessage(f"local: {length} bytes in memory file {number}, which is not there or shorter")
+            raise MalformedMessage(
+                f"local: {length} bytes in memory file {number}, which is not there or shorter"
+            )
         # The memory in place: the client does not write into it until a reply reports it as freed.
         memory = np.frombuffer(file, np.uint8, length)
         if len(self._views) < _MAX_VIEWS:
@@ -333,12 +395,14 @@ class MemoryFiles:
             most_bytes = 2 * self._limits.body_bytes
             if size > most_bytes:
                 raise MessageTooLarge(
-                    f"local: expected a message of at most {most_bytes} bytes, got {size}; send smaller images, or "
+                    f"local: expected a message of at most {most_bytes} bytes, got {size}; send "
+                    "smaller images, or "
                     f"raise `limits.body_bytes` of the deployment"
                 )
             if number >= LocalAddress.FILES:
                 raise MessageTooLarge(
-                    f"local: expected at most {LocalAddress.FILES} memory files of a connection, got one more"
+                    f"local: expected at most {LocalAddress.FILES} memory files of a connection, "
+                    "got one more"
                 )
             # Reading beyond the end of a file that has shrunk would kill this process.
             if not fcntl.fcntl(descriptor, fcntl.F_GET_SEALS) & fcntl.F_SEAL_SHRINK:
@@ -354,9 +418,11 @@ class MemoryFiles:
 
 
 def counted_array(admission: Admission, size: int, read: Callable[[], np.ndarray]) -> np.ndarray:
-    """Return the array of `size` bytes that `read` creates, counted as in flight for as long as anything views it.
+    """Return the array of `size` bytes that `read` creates, counted as in flight for as long as
+    anything views it.
 
-    Raises the errors of `Admission.hold`, before the array is created; the share of robots is not used.
+    Raises the errors of `Admission.hold`, before the array is created; the share of robots is not
+    used.
     """
     admission.hold(size, False, 0)
     try:

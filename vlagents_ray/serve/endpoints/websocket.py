@@ -2,10 +2,11 @@
 
 Large messages are not copied, and a client that reads slowly delays no other client.
 
-The metadata contains the port and an unguessable path, so that only clients that may read the metadata can use the
-port; with API keys, the handshake must also contain one. Messages are those of `WS /v1/stream` on the server's port,
-which remains for clients that cannot reach this one. As for local clients, the policy thread reads the sockets (see
-`vlagents_ray.serve.endpoints.connection`) and decodes the messages.
+The metadata contains the port and an unguessable path, so that only clients that may read the
+metadata can use the port; with API keys, the handshake must also contain one. Messages are those of
+`WS /v1/stream` on the server's port, which remains for clients that cannot reach this one. As for
+local clients, the policy thread reads the sockets (see `vlagents_ray.serve.endpoints.connection`)
+and decodes the messages.
 """
 
 from __future__ import annotations
@@ -75,7 +76,8 @@ from vlagents_ray.serve.token_bucket import TokenBucket
 logger = logging.getLogger(__name__)
 
 _READ_BYTES = 1024 * 1024  # maximum size of a read; room for a message with two or three raw images
-_FRAMES_PER_READ = 16  # maximum number of frames that are read from a connection before others have their turn
+# Maximum number of frames that are read from a connection before others have their turn.
+_FRAMES_PER_READ = 16
 _DISCARD_BYTES = 64 * 1024  # maximum size of a read after an invalid message
 _SLOW_S = 10.0  # maximum time without progress for a client that does not read all replies at once
 _MAX_HANDSHAKES = 64  # maximum number of connections without a completed handshake
@@ -86,8 +88,14 @@ _END_OF_HEADERS = b"\r\n\r\n"
 _GOING_AWAY, _UNSUPPORTED_DATA, _TRY_AGAIN_LATER = 1001, 1003, 1013  # close codes
 _REFUSED = "its handshake is refused"  # a further reason for not polling a connection
 
-# The kernel detects that a peer has disappeared: after 20 s of silence it sends three probes, 5 s apart.
-_KEEPALIVE = (("TCP_KEEPIDLE", 20), ("TCP_KEEPINTVL", 5), ("TCP_KEEPCNT", 3), ("TCP_USER_TIMEOUT", 35_000))
+# The kernel detects that a peer has disappeared: after 20 s of silence it sends three probes, 5 s
+# apart.
+_KEEPALIVE = (
+    ("TCP_KEEPIDLE", 20),
+    ("TCP_KEEPINTVL", 5),
+    ("TCP_KEEPCNT", 3),
+    ("TCP_USER_TIMEOUT", 35_000),
+)
 
 read_buffer = ReadBuffer(_READ_BYTES)
 
@@ -125,12 +133,14 @@ class WebSocketServer(PolledServer["WebSocketConnection"]):
         self.slow_s, self.idle_s = slow_s, idle_s
         self._hosts = hosts
         self.path = messages.STREAM_PATH + secrets.token_urlsafe(24)
-        self._handshaking: dict[WebSocketConnection, None] = {}  # before their handshake, in order of arrival
+        # Before their handshake, in order of arrival.
+        self._handshaking: dict[WebSocketConnection, None] = {}
         self.address = messages.StreamAddress(self._listener.getsockname()[1], self.path)
 
     def open(self) -> None:
         """Accept clients; call this before the engine starts."""
-        enable_timestamps(self._listener)  # accepted connections inherit it; the kernel enables it after a moment
+        # Accepted connections inherit it; the kernel enables it after a moment.
+        enable_timestamps(self._listener)
         super().open()
 
     def identify(self, client: WebSocketConnection, request: Handshake) -> Identity:
@@ -140,7 +150,8 @@ class WebSocketServer(PolledServer["WebSocketConnection"]):
             UnknownApp: The path is another one.
             Unauthorized: The key is missing, unknown, revoked or expired.
             Forbidden: The key is for other applications, or the page is another site's.
-            TooManyRequests: The key has as many connections as it may hold sessions, or is over its rate.
+            TooManyRequests: The key has as many connections as it may hold sessions, or is over its
+                rate.
             PolicyUnavailable: The replica has as many connections as it may hold sessions.
         """
         if not secrets.compare_digest(request.path.encode(), self.path.encode()):
@@ -189,14 +200,16 @@ class WebSocketConnection(PolledConnection):
         self._arrived = 0.0  # arrival time of the bytes read last, s
         self._protocol = ServerProtocol(max_size=messages.STREAM_BYTES)  # guarded by the lock
         self._head = b""  # received part of the handshake
-        self._refused_for_s = 0.0  # time after which the handshake is no longer over the rate of its key
+        # Time after which the handshake is no longer over the rate of its key.
+        self._refused_for_s = 0.0
         self._frame_head = b""  # received part of a frame's head, until the head is complete
         self._frame_left = 0  # unread bytes of the current frame, once its head is complete
         self._control_frames = TokenBucket(CONTROL_FRAMES_PER_S, time.monotonic(), CONTROL_FRAMES)
         self._received = ReceiveBuffer(messages.STREAM_BYTES)
         self._out = SendBuffer(connection, self._sending, messages.STREAM_BYTES)
         self._paused = False  # whether too many messages are unanswered; guarded by the lock
-        # Received but unprocessed frames, their arrival times, s, and the admissions of those received in parts.
+        # Received but unprocessed frames, their arrival times, s, and the admissions of those
+        # received in parts.
         self._frames: deque[tuple[Frame, float, MessageAdmission | None]] = deque()
         self._partial: MessageAdmission | None = None  # admission of a partly received message
         self._arriving: ArrivingBytes | None = None  # its bytes
@@ -204,8 +217,8 @@ class WebSocketConnection(PolledConnection):
         self._messages = 0  # number received so far
         self._ending = False  # whether `end` was called, so that arriving bytes are ignored
         self._discarded = 0  # unread bytes after an invalid message
-        # For `overdue` only: messages at its last call, time of the last change, and arrival of the current partial
-        # message, s.
+        # For `overdue` only: messages at its last call, time of the last change, and arrival of the
+        # current partial message, s.
         self._seen, self._quiet_since, self._part_since = 0, time.monotonic(), float("inf")
 
     def _read(self) -> None:
@@ -214,7 +227,9 @@ class WebSocketConnection(PolledConnection):
             frames += 1
 
     def _read_part(self) -> bool:
-        """Read the handshake or a part of a frame; return whether more may be read, since a frame is complete."""
+        """Read the handshake or a part of a frame; return whether more may be read, since a
+        frame is complete.
+        """
         if self._sender is not None and self._sender.rated and self._is_throttled():
             return False
         data: bytes | memoryview
@@ -230,11 +245,16 @@ class WebSocketConnection(PolledConnection):
             data = b""
         if closing:
             self._discarded += len(data)
-        if self._ending or self._discarded > self._limits.body_bytes or not (data or (self._sender and not closing)):
+        if (
+            self._ending
+            or self._discarded > self._limits.body_bytes
+            or not (data or (self._sender and not closing))
+        ):
             self.disconnect()
         elif self._sender is None:
             self._receive_handshake(data)
-        elif not closing:  # unread bytes would reset the connection before the client reads the close code
+        elif not closing:
+            # unread bytes would reset the connection before the client reads the close code
             if self._frame_left:
                 self._frame_left -= len(data)
             self._receive(data)
@@ -253,8 +273,8 @@ class WebSocketConnection(PolledConnection):
     def _bytes_to_read(self) -> int:
         """Return how many bytes to read now: at most the handshake, and then at most one frame.
 
-        What follows stays in the socket until it is known whether the client may send more. Raises `BlockingIOError` if
-        the socket is empty.
+        What follows stays in the socket until it is known whether the client may send more. Raises
+        `BlockingIOError` if the socket is empty.
         """
         if self._sender is None:
             coming = self._connection.recv(_HANDSHAKE_BYTES, socket.MSG_PEEK)
@@ -296,11 +316,16 @@ class WebSocketConnection(PolledConnection):
                 self.end(f"more than {CONTROL_FRAMES} control frames at once")
                 return
         if was_open and self._protocol.state is State.CLOSING and self._protocol.close_rcvd is None:
-            self._charge_abuse()  # an invalid frame, behind which up to `limits.body_bytes` are discarded
+            # An invalid frame, behind which up to `limits.body_bytes` are discarded.
+            self._charge_abuse()
         self._process_frames()
         if self._received.size and self._sender is not None and not self._ended:
             self._hold_partial(self._sender)
-        if not data or self._protocol.state is State.CLOSED or self._protocol.close_rcvd is not None:
+        if (
+            not data
+            or self._protocol.state is State.CLOSED
+            or self._protocol.close_rcvd is not None
+        ):
             self.disconnect()
             return
         with self._sending:
@@ -309,13 +334,17 @@ class WebSocketConnection(PolledConnection):
             self._pause(BACKLOGGED)
 
     def _charge_abuse(self) -> None:
-        """Charge a message to the key, as for a message that is refused, before the connection ends."""
+        """Charge a message to the key, as for a message that is refused, before the connection
+        ends.
+        """
         if self._sender is not None:
             with contextlib.suppress(VLAgentsError):
                 self._sender.count_message()
 
     def _hold_partial(self, sender: Sender) -> None:
-        """Count a partly received message for its key before the rest is read, and its bytes as they arrive."""
+        """Count a partly received message for its key before the rest is read, and its bytes as
+        they arrive.
+        """
         try:
             if self._partial is None:
                 admission = sender.admission(self._limits)
@@ -332,15 +361,21 @@ class WebSocketConnection(PolledConnection):
             if sender.refused_too_often:
                 self.end(REFUSED)
         except VLAgentsError as error:
-            self.end(str(error), _TRY_AGAIN_LATER if isinstance(error, Overloaded) else POLICY_VIOLATION)
+            self.end(
+                str(error), _TRY_AGAIN_LATER if isinstance(error, Overloaded) else POLICY_VIOLATION
+            )
 
     def _give_up(self) -> None:
         """End the connection, as a complete message needs the memory; called on any thread."""
         self._call_soon(partial(self.end, "a complete message needs the memory", _TRY_AGAIN_LATER))
 
     def _is_backlogged(self) -> bool:
-        """Return whether the client has too many unanswered messages or bytes; the caller holds the lock."""
-        return self._unanswered >= MOST_UNANSWERED or self._unanswered_bytes > self._limits.body_bytes
+        """Return whether the client has too many unanswered messages or bytes; the caller holds
+        the lock.
+        """
+        return (
+            self._unanswered >= MOST_UNANSWERED or self._unanswered_bytes > self._limits.body_bytes
+        )
 
     def _discard(self) -> None:
         if not self._messages:  # a connection without a message costs as much as one
@@ -351,11 +386,14 @@ class WebSocketConnection(PolledConnection):
         self._received.discard()
         self._out.close()
 
-    def overdue(self, now: float, refusal: Callable[[Caller], str | None]) -> tuple[str, int] | None:
-        """Return a reason and a close code if the connection is too slow or has to end; see `PolledConnection`.
+    def overdue(
+        self, now: float, refusal: Callable[[Caller], str | None]
+    ) -> tuple[str, int] | None:
+        """Return a reason and a close code if the connection is too slow or has to end; see
+        `PolledConnection`.
 
-        Time counts against the client only if the server has read all bytes that arrived: a slow policy keeps the
-        thread from reading.
+        Time counts against the client only if the server has read all bytes that arrived: a slow
+        policy keeps the thread from reading.
         """
         if (cause := super().overdue(now, refusal)) is not None:
             return cause
@@ -413,14 +451,17 @@ class WebSocketConnection(PolledConnection):
         return True
 
     def _refuse_handshake(self) -> None:
-        """Refuse the handshake; if the key is over its rate, after a moment, which bounds the rate of refusals."""
+        """Refuse the handshake; if the key is over its rate, after a moment, which bounds the
+        rate of refusals.
+        """
         self._pause(_REFUSED)
 
         def refuse() -> None:
             with self._sending:
                 if not self._ended:
                     self._flush()
-                    with contextlib.suppress(OSError):  # closing a socket with unread bytes resets the connection
+                    # Closing a socket with unread bytes resets the connection.
+                    with contextlib.suppress(OSError):
                         self._connection.recv(_HANDSHAKE_BYTES)
             self.disconnect()
 
@@ -450,7 +491,9 @@ class WebSocketConnection(PolledConnection):
             raise VLAgentsError("stream: a message before the handshake was accepted")
         if frame.opcode is Opcode.CONT or not frame.fin:
             with self._sending:
-                self._protocol.fail(_UNSUPPORTED_DATA, "messages in fragments; send each in one frame")
+                self._protocol.fail(
+                    _UNSUPPORTED_DATA, "messages in fragments; send each in one frame"
+                )
                 self._flush()
             self._charge_abuse()
             return
@@ -477,9 +520,17 @@ class WebSocketConnection(PolledConnection):
             self._is_throttled()
 
     def _submit(
-        self, sender: Sender, message: Message, admission: MessageAdmission, size: int, arrived: float, decoded: Decoded
+        self,
+        sender: Sender,
+        message: Message,
+        admission: MessageAdmission,
+        size: int,
+        arrived: float,
+        decoded: Decoded,
     ) -> None:
-        """Send the requests of a message to the engine; their deadlines count from the arrival of the message."""
+        """Send the requests of a message to the engine; their deadlines count from the arrival
+        of the message.
+        """
         message.decoded(decoded)
         waited_s = time.perf_counter() - arrived
         size += sum(map(image_bytes, decoded.requests))
@@ -525,11 +576,14 @@ class WebSocketConnection(PolledConnection):
 class SendBuffer:
     """The unsent bytes of one connection.
 
-    Call the methods with the connection's lock held; the thread that sends to a slow client acquires the same lock.
+    Call the methods with the connection's lock held; the thread that sends to a slow client
+    acquires the same lock.
     """
 
     def __init__(self, connection: socket.socket, lock: threading.Lock, limit: int) -> None:
-        """Create an empty buffer; a client is cut off if more than `limit` bytes wait, or it reads none for 10 s."""
+        """Create an empty buffer; a client is cut off if more than `limit` bytes wait, or it
+        reads none for 10 s.
+        """
         self._connection, self._lock, self._limit = connection, lock, limit
         self._unsent = bytearray()
         self._rest: threading.Thread | None = None  # sends the rest to a slow client
@@ -539,7 +593,8 @@ class SendBuffer:
     def send(self, data: bytes, *, last: bool = False) -> None:
         """Send as many bytes as the connection accepts now; a thread sends the rest later.
 
-        After the `last` bytes the client reads the end of the connection, which stays open for reading.
+        After the `last` bytes the client reads the end of the connection, which stays open for
+        reading.
         """
         if self._closed:
             return
@@ -549,13 +604,17 @@ class SendBuffer:
             self._send_now()
             if self._unsent:
                 self._slow = True
-                self._rest = threading.Thread(target=self._send_rest, name="send-slowly", daemon=True)
+                self._rest = threading.Thread(
+                    target=self._send_rest, name="send-slowly", daemon=True
+                )
                 self._rest.start()
         elif len(self._unsent) > self._limit:
             self._disconnect()
 
     def wait_sent(self, until: float) -> None:
-        """Wait until the kernel has all bytes, but at most until a time of `time.monotonic`, s; without the lock."""
+        """Wait until the kernel has all bytes, but at most until a time of `time.monotonic`, s;
+        without the lock.
+        """
         if self._rest is not None:
             self._rest.join(max(0.0, until - time.monotonic()))
 
@@ -568,7 +627,8 @@ class SendBuffer:
             sent = self._connection.send(self._unsent) if self._unsent else 0
         except BlockingIOError:
             return
-        except OSError as error:  # the client is gone; the reading thread handles the end of the connection
+        except OSError as error:
+            # the client is gone; the reading thread handles the end of the connection
             logger.info("client: %s", error)
             sent = len(self._unsent)
         del self._unsent[:sent]
@@ -612,4 +672,6 @@ def _bind(host: str, ports: tuple[int, int] | None) -> socket.socket:
             refusal = error
         else:
             return listener
-    raise ConfigError(f"stream: cannot listen at {host}, ports {first} to {last} ({refusal}); choose other ones")
+    raise ConfigError(
+        f"stream: cannot listen at {host}, ports {first} to {last} ({refusal}); choose other ones"
+    )

@@ -1,16 +1,18 @@
-"""The endpoint for learners on other machines: new weights in the safetensors format, over a WebSocket.
+"""The endpoint for learners on other machines: new weights in the safetensors format, over a
+WebSocket.
 
-    WS   /v1/weights?mode=keep   a header, then the bytes of the values in parts; each is acknowledged
-    GET  /v1/weights             the newest version of each replica
-    POST /v1/weights/sleep       no acts, and less memory, until "wake"; see `vlagents_ray.serve.weights.Rest`
-    POST /v1/weights/restore     the memory back, still without acts
-    POST /v1/weights/wake        acts again
+    WS   /v1/weights?mode=keep   a header, then the bytes of the values in parts; each is
+    acknowledged GET  /v1/weights             the newest version of each replica
+    POST /v1/weights/sleep       no acts, and less memory, until "wake"; see
+    `vlagents_ray.serve.weights.Rest` POST /v1/weights/restore     the memory back, still without
+    acts POST /v1/weights/wake        acts again
 
-One connection is one push, which ends with it, so that all of its parts reach one replica, and no data of a push remain
-if its learner dies. A learner sends the values when the header is acknowledged, and has at most 16 parts of 1 MiB
-without an answer, so that no proxy on the way buffers many. The header is checked against the policy's own weights,
-whose size bounds the push, before memory is allocated. Keys need the scope "weights"; without keys, only processes of
-this machine may push.
+One connection is one push, which ends with it, so that all of its parts reach one replica, and no
+data of a push remain if its learner dies. A learner sends the values when the header is
+acknowledged, and has at most 16 parts of 1 MiB without an answer, so that no proxy on the way
+buffers many. The header is checked against the policy's own weights, whose size bounds the push,
+before memory is allocated. Keys need the scope "weights"; without keys, only processes of this
+machine may push.
 """
 
 from __future__ import annotations
@@ -29,7 +31,14 @@ from starlette.responses import JSONResponse, Response
 from starlette.routing import BaseRoute, Route, WebSocketRoute
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
-from vlagents_ray.errors import InvalidInput, MalformedMessage, MessageTooLarge, Overloaded, VLAgentsError, shown
+from vlagents_ray.errors import (
+    InvalidInput,
+    MalformedMessage,
+    MessageTooLarge,
+    Overloaded,
+    VLAgentsError,
+    shown,
+)
 from vlagents_ray.protocol.json_messages import problem
 from vlagents_ray.serve.access.api_keys import Caller, ScopeCheck, current_caller
 from vlagents_ray.serve.endpoints.http_messages import deny
@@ -49,7 +58,9 @@ class ReceivesWeights(Protocol):
     """The replicas of a policy, of which one receives new weights for all."""
 
     def read_header(self, header: bytes, options: PushOptions) -> dict[str, ValueSpec]:
-        """Return the types and shapes of the announced values; raise an error if they do not fit the policy."""
+        """Return the types and shapes of the announced values; raise an error if they do not fit
+        the policy.
+        """
 
     async def push_received(self, named: Mapping[str, Any], options: PushOptions) -> PushResult:
         """Make all replicas act with new weights."""
@@ -61,10 +72,13 @@ class ReceivesWeights(Protocol):
         """Return the newest version of each replica."""
 
 
-def weights_routes(replicas: ReceivesWeights, slow_s: float, *, open_to_network: bool) -> list[BaseRoute]:
+def weights_routes(
+    replicas: ReceivesWeights, slow_s: float, *, open_to_network: bool
+) -> list[BaseRoute]:
     """Return the routes for new weights, each part of which must arrive within `slow_s`, s.
 
-    Pushes are refused if the server is `open_to_network`, i.e. if other machines reach it without a key.
+    Pushes are refused if the server is `open_to_network`, i.e. if other machines reach it without a
+    key.
     """
     endpoint = _WeightsEndpoint(replicas, slow_s, open_to_network)
     return [
@@ -102,7 +116,9 @@ class _WeightsEndpoint:
         try:
             answer = await self._pushed(socket)
         except WebSocketDisconnect:
-            logger.info("a push of weights ended before all of them had arrived; nothing was changed")
+            logger.info(
+                "a push of weights ended before all of them had arrived; nothing was changed"
+            )
             return
         except VLAgentsError as error:
             answer = problem(error)
@@ -124,19 +140,26 @@ class _WeightsEndpoint:
             if isinstance(caller, Caller):
                 caller.admit()  # a push counts as one request
                 caller.note("pushes weights:", f"mode {options.mode}")
-            reader = ValuesReader(await asyncio.to_thread(self._replicas.read_header, header, options))
+            reader = ValuesReader(
+                await asyncio.to_thread(self._replicas.read_header, header, options)
+            )
             begun = time.monotonic()
             while reader.received < reader.size:
                 await socket.send_text(json.dumps({"received": reader.received}))
                 reader.add(await self._message(socket))
                 if time.monotonic() - begun > self._slow_s + reader.received / LEAST_RATE:
                     raise MalformedMessage(
-                        f"weights: got {reader.received} bytes in {time.monotonic() - begun:.0f} s, want at least "
+                        f"weights: got {reader.received} bytes in {time.monotonic() - begun:.0f} "
+                        "s, want at least "
                         f"{LEAST_RATE} a second; another push may wait"
                     )
             # When all values have arrived, the push does not depend on the learner's connection.
             pushed = await asyncio.shield(self._replicas.push_received(reader.values(), options))
-            return {"version": pushed.version, "fingerprint": pushed.fingerprint, "replicas": len(pushed.replicas)}
+            return {
+                "version": pushed.version,
+                "fingerprint": pushed.fingerprint,
+                "replicas": len(pushed.replicas),
+            }
         finally:
             self._receiving = False
 
@@ -154,20 +177,27 @@ class _WeightsEndpoint:
         if part is None:
             raise MalformedMessage("weights: got a text message, want a binary one")
         if len(part) > MESSAGE_BYTES:
-            raise MessageTooLarge(f"weights: got a part of {len(part)} bytes, the limit is {MESSAGE_BYTES}")
+            raise MessageTooLarge(
+                f"weights: got a part of {len(part)} bytes, the limit is {MESSAGE_BYTES}"
+            )
         if not part:
-            raise MalformedMessage("weights: got an empty message, want a header or a part of the values")
+            raise MalformedMessage(
+                "weights: got an empty message, want a header or a part of the values"
+            )
         return part
 
 
 def _rest(step: Any, query: Mapping[str, str]) -> Rest:
-    """Return a step of a rest, with the options in the query of its URL, such as `offload=false&at_most_s=60`."""
+    """Return a step of a rest, with the options in the query of its URL, such as
+    `offload=false&at_most_s=60`.
+    """
     read: dict[str, Callable[[str], Any]] = {"offload": _TRUTH.__getitem__, "at_most_s": float}
     try:
         return Rest(step, **{name: read[name](value) for name, value in query.items()})
     except (KeyError, ValueError) as error:
         raise InvalidInput(
-            f"rest: got {step[:20]!r}, {shown(dict(query), 99)}, want sleep, restore or wake, offload=true or "
+            f"rest: got {step[:20]!r}, {shown(dict(query), 99)}, want sleep, restore or wake, "
+            "offload=true or "
             f"false, and at_most_s=SECONDS"
         ) from error
 
@@ -177,7 +207,10 @@ def _options(query: Mapping[str, str]) -> PushOptions:
     stated: dict[str, Any] = {}
     for name, value in query.items():
         if name not in {field.name for field in fields(PushOptions)}:
-            raise InvalidInput(f"weights: got the option {name[:40]!r}, want mode, partial, allow_same, pin or version")
+            raise InvalidInput(
+                f"weights: got the option {name[:40]!r}, want mode, partial, allow_same, pin or "
+                "version"
+            )
         if name == "mode":
             stated[name] = value
         elif name == "version" and value.isdecimal() and len(value) <= _DIGITS:

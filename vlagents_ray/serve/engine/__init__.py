@@ -1,1 +1,3 @@
-"""The engine: it checks requests, puts them into the batch queue, runs batches, and builds replies."""
+"""The engine: it checks requests, puts them into the batch queue, runs batches, and builds
+replies.
+"""

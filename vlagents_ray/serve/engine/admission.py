@@ -1,14 +1,18 @@
-"""Admission of messages to a replica before they are decoded: rate limits, memory limits, and the decoding thread.
+"""Admission of messages to a replica before they are decoded: rate limits, memory limits, and the
+decoding thread.
 
-A message has a `MessageAdmission` from its arrival until it is answered. Decoders use it as their `Budget`, so that
-these limits apply before anything is decoded:
+A message has a `MessageAdmission` from its arrival until it is answered. Decoders use it as their
+`Budget`, so that these limits apply before anything is decoded:
 
-- The message counts towards the rate limit of the caller's key before any of it is parsed, and each further request
-  in it when its header is parsed (429).
-- Its decoded size is bounded by `limits.decoded_bytes` (413). With the rate limit, that bounds a key's bytes a second.
-- All messages of a replica together take at most `limits.in_flight_bytes`; a quarter is reserved for robots (503).
-- Images of more than a megapixel or 8 ms and headers of more than 64 KiB are decoded on separate threads, those of
-  simulations on half of the cores, so that neither the policy's thread nor an event loop waits for them.
+- The message counts towards the rate limit of the caller's key before any of it is parsed, and each
+  further request in it when its header is parsed (429).
+- Its decoded size is bounded by `limits.decoded_bytes` (413). With the rate limit, that bounds a
+  key's bytes a second.
+- All messages of a replica together take at most `limits.in_flight_bytes`; a quarter is reserved
+  for robots (503).
+- Images of more than a megapixel or 8 ms and headers of more than 64 KiB are decoded on separate
+  threads, those of simulations on half of the cores, so that neither the policy's thread nor an
+  event loop waits for them.
 """
 
 from __future__ import annotations
@@ -28,10 +32,12 @@ from vlagents_ray.protocol.messages import Budget, Limits, Request
 
 T = TypeVar("T")
 
-# Above these another thread decodes: a megapixel of decoded bytes, and the time in which one core decodes such a JPEG.
+# Above these another thread decodes: a megapixel of decoded bytes, and the time in which one core
+# decodes such a JPEG.
 INLINE_BYTES = 3 * 2**20
 INLINE_S = 8e-3
-REQUEST_BYTES = 2048  # memory of a request from its arrival until its answer, without images and arrays
+# Memory of a request from its arrival until its answer, without images and arrays.
+REQUEST_BYTES = 2048
 _ROBOTS_SHARE = 0.25  # share of the bytes in flight that is reserved for robots
 _KEYS_SHARE = 0.5  # share of the bytes that the other keys leave free, which one key may take
 
@@ -41,29 +47,38 @@ class NeedsDecodingThread(Exception):
 
 
 class Admission:
-    """The bytes in flight of one replica, and the threads that decode large messages. Thread-safe."""
+    """The bytes in flight of one replica, and the threads that decode large messages.
+    Thread-safe.
+    """
 
     def __init__(self, in_flight_bytes: int) -> None:
-        # Number of bytes in flight that all messages may take together, by whether it is a robot's that needs more.
+        # Number of bytes in flight that all messages may take together, by whether it is a robot's
+        # that needs more.
         self._most = {True: in_flight_bytes, False: int(in_flight_bytes * (1 - _ROBOTS_SHARE))}
         self.held = 0  # number of bytes in flight
-        self.messages: dict[weakref.ref[Any], int] = {}  # bytes to release with each message that has no admission
-        self._held_by: Counter[str] = Counter()  # number of bytes in flight by the name of their key
-        self._arriving: dict[ArrivingBytes, int] = {}  # number of bytes of incomplete messages, the oldest first
+        # Bytes to release with each message that has no admission.
+        self.messages: dict[weakref.ref[Any], int] = {}
+        # Number of bytes in flight by the name of their key.
+        self._held_by: Counter[str] = Counter()
+        # Number of bytes of incomplete messages, the oldest first.
+        self._arriving: dict[ArrivingBytes, int] = {}
         self._arriving_by: Counter[str | None] = Counter()  # the same by the name of their key
         # Reentrant: the garbage collector may release a message within the sections that it guards.
         self._lock = threading.RLock()
-        self._threads: dict[bool, ThreadPoolExecutor] = {}  # the thread pools for robots and (False) for others
+        # The thread pools for robots and (False) for others.
+        self._threads: dict[bool, ThreadPoolExecutor] = {}
         self._closed = False
 
     def hold(self, size: int, robot: bool, message_bytes: int, key: str | None = None) -> None:
-        """Count `size` more bytes as in flight for a message that already holds `message_bytes` bytes.
+        """Count `size` more bytes as in flight for a message that already holds `message_bytes`
+        bytes.
 
         If there is no room, incomplete messages are given up first.
 
         Args:
             robot: Whether the message may use the bytes reserved for robots.
-            key: The name of the sender's key, which may take a share of what other keys leave free; None without one.
+            key: The name of the sender's key, which may take a share of what other keys leave free;
+                None without one.
 
         Raises:
             Overloaded: The bytes in flight leave no room at the moment.
@@ -73,7 +88,8 @@ class Admission:
         alone = most if key is None else int(most * _KEYS_SHARE)
         if message_bytes + size > alone:
             raise MessageTooLarge(
-                f"message: takes {message_bytes + size} bytes, decoded, and all in flight may take {alone}; send fewer "
+                f"message: takes {message_bytes + size} bytes, decoded, and all in flight may take "
+                f"{alone}; send fewer "
                 f"requests at once, or raise `limits.in_flight_bytes`"
             )
         given_up: list[ArrivingBytes] = []
@@ -90,8 +106,10 @@ class Admission:
             arriving.give_up()
         if not has_room:
             raise Overloaded(
-                f"the messages in flight here take {held} bytes, and may take {most}, of which one key may take half "
-                f"of what other keys leave free; send the request again after {Overloaded.retry_after_s:g} s, or raise "
+                f"the messages in flight here take {held} bytes, and may take {most}, of which one "
+                "key may take half "
+                "of what other keys leave free; send the request again after "
+                f"{Overloaded.retry_after_s:g} s, or raise "
                 f"`limits.in_flight_bytes`"
             )
 
@@ -101,7 +119,9 @@ class Admission:
             self._count(-size, key)
 
     def resize(self, arriving: ArrivingBytes, size: int) -> None:
-        """Count `size` bytes of incomplete messages in place of those counted before; raise `Overloaded`."""
+        """Count `size` bytes of incomplete messages in place of those counted before; raise
+        `Overloaded`.
+        """
         most = self._most[arriving.robot]
         with self._lock:
             more = size - self._arriving.get(arriving, 0)
@@ -109,7 +129,9 @@ class Admission:
             if has_room:
                 self._resize(arriving, size)
         if not has_room:
-            raise Overloaded("the messages in flight leave no room for one that arrives slowly; send it again")
+            raise Overloaded(
+                "the messages in flight leave no room for one that arrives slowly; send it again"
+            )
 
     def _room(self, most: int, key: str | None) -> int:
         """Return how many bytes a sender may take; the caller holds the lock."""
@@ -122,10 +144,14 @@ class Admission:
         by_others = self.held - self._held_by[key] - arriving_of_others
         return int(_KEYS_SHARE * (most - by_others)) - self._held_by[key]
 
-    def _largest_arriving(self, size: int, most: int, robot: bool, key: str | None) -> ArrivingBytes | None:
-        """Return incomplete messages to give up: of the key with most bytes, or of a key over its share.
+    def _largest_arriving(
+        self, size: int, most: int, robot: bool, key: str | None
+    ) -> ArrivingBytes | None:
+        """Return incomplete messages to give up: of the key with most bytes, or of a key over its
+        share.
 
-        None if there are none, or only those of robots and the bytes are for a simulation. The caller holds the lock.
+        None if there are none, or only those of robots and the bytes are for a simulation. The
+        caller holds the lock.
         """
         candidates = [arriving for arriving in self._arriving if robot or not arriving.robot]
         if key is not None and size > self._room_of_key(most, key):
@@ -151,7 +177,9 @@ class Admission:
                 del self._held_by[key]
 
     def release_with(self, message: weakref.ref[Any]) -> None:
-        """Release the bytes of a message that is answered or dropped: the callback of the weak references to it."""
+        """Release the bytes of a message that is answered or dropped: the callback of the weak
+        references to it.
+        """
         size = self.messages.pop(message, 0)
         with self._lock:
             self.held -= size
@@ -177,21 +205,28 @@ class Admission:
 
 
 class ArrivingBytes:
-    """The bytes of a connection's messages that are incomplete, or not read by the application. Thread-safe."""
+    """The bytes of a connection's messages that are incomplete, or not read by the application.
+    Thread-safe.
+    """
 
-    def __init__(self, admission: Admission, key: str | None, robot: bool, give_up: Callable[[], None]) -> None:
+    def __init__(
+        self, admission: Admission, key: str | None, robot: bool, give_up: Callable[[], None]
+    ) -> None:
         """Hold no bytes yet.
 
         Args:
             key: The name of the connection's key; None without one.
             robot: Whether the bytes reserved for robots may be used.
-            give_up: Ends the connection, as a complete message needs the memory; called on any thread.
+            give_up: Ends the connection, as a complete message needs the memory; called on any
+                thread.
         """
         self.key, self.robot, self.give_up = key, robot, give_up
         self._admission = admission
 
     def resize(self, size: int) -> None:
-        """Count `size` bytes in place of those counted before; raise `Overloaded` if there is no room for more."""
+        """Count `size` bytes in place of those counted before; raise `Overloaded` if there is no
+        room for more.
+        """
         self._admission.resize(self, size)
 
     def release(self) -> None:
@@ -231,11 +266,14 @@ class MessageAdmission(Budget):
         """Create the admission of one message.
 
         Args:
-            admit: Counts a "message", or a further request of an op, for the sender's key, or raises an error; returns
-                False if the request is scheduled after those of robots. None if the sender has no key.
-            size: Bytes of the message itself, which the replica keeps while it works on the message.
+            admit: Counts a "message", or a further request of an op, for the sender's key, or
+                raises an error; returns False if the request is scheduled after those of robots.
+                None if the sender has no key.
+            size: Bytes of the message itself, which the replica keeps while it works on the
+                message.
             robot: Whether the message may use the bytes reserved for robots.
-            inline: Whether the first decoding thread also has other work, so that large messages are decoded elsewhere.
+            inline: Whether the first decoding thread also has other work, so that large messages
+                are decoded elsewhere.
             keep_files: Whether `files` keeps the files of the message's images.
             key: The name of the sender's key; None without one.
         """
@@ -252,7 +290,9 @@ class MessageAdmission(Budget):
         self._inline = inline
 
     def begin_message(self) -> None:
-        """Count the message, as in `Budget`, but only once if it is decoded again on another thread."""
+        """Count the message, as in `Budget`, but only once if it is decoded again on another
+        thread.
+        """
         if self._admit is not None:
             if not self._refusals:
                 self._refusals.append(self._refusal_of(self._admit, "message"))
@@ -260,7 +300,9 @@ class MessageAdmission(Budget):
                 raise refusal
 
     def parse(self, size: int) -> None:
-        """Count the memory for JSON, as in `Budget`; raise `NeedsDecodingThread` on a thread with other work."""
+        """Count the memory for JSON, as in `Budget`; raise `NeedsDecodingThread` on a thread
+        with other work.
+        """
         if self._inline:
             raise NeedsDecodingThread
         super().parse(size)
@@ -287,12 +329,16 @@ class MessageAdmission(Budget):
         self._held += size
 
     def grow(self, size: int) -> None:
-        """Count the message as in flight with `size` bytes, including those counted before; raise as `receive`."""
+        """Count the message as in flight with `size` bytes, including those counted before;
+        raise as `receive`.
+        """
         if size > self._held:
             self.receive(size - self._held)
 
     def hold(self, size: int) -> None:
-        """Count bytes to be allocated, as in `Budget`; raise `NeedsDecodingThread` if that takes too long here."""
+        """Count bytes to be allocated, as in `Budget`; raise `NeedsDecodingThread` if that takes
+        too long here.
+        """
         self.count(size)
         if self._inline and self._decoded + size > INLINE_BYTES:
             raise NeedsDecodingThread
@@ -301,7 +347,9 @@ class MessageAdmission(Budget):
 
     @contextlib.contextmanager
     def decoding(self, seconds: float, scratch_bytes: int) -> Iterator[None]:
-        """Count the decoding of images, as in `Budget`; raise `NeedsDecodingThread` if it takes too long here."""
+        """Count the decoding of images, as in `Budget`; raise `NeedsDecodingThread` if it takes
+        too long here.
+        """
         self._decoding_s += seconds
         if self._inline and self._decoding_s > INLINE_S:
             raise NeedsDecodingThread
@@ -314,7 +362,9 @@ class MessageAdmission(Budget):
                 self._held -= scratch_bytes
 
     def decode_on_thread(self, read: Callable[[Budget], T]) -> Future[T]:
-        """Decode with `read` on a decoding thread, and return the future; raise `PolicyUnavailable` after `close`."""
+        """Decode with `read` on a decoding thread, and return the future; raise
+        `PolicyUnavailable` after `close`.
+        """
         self._admission.release(self._decoded, self._key)
         self._held -= self._decoded
         self._decoded = 0
@@ -325,7 +375,9 @@ class MessageAdmission(Budget):
         return self._admission.submit(lambda: read(self), self._robot)
 
     async def decoded(self, read: Callable[[Budget], T], *, long: bool = False) -> T:
-        """Decode with `read` and return the result; if it is `long` or the images are large, use another thread."""
+        """Decode with `read` and return the result; if it is `long` or the images are large, use
+        another thread.
+        """
         if not long:
             try:
                 return read(self)

@@ -1,7 +1,8 @@
 """The core of a replica, without Ray: one policy, its sessions and its batch queue.
 
-Every endpoint (HTTP, WebSocket, a Serve handle, …) decodes a message, and its `Sender` submits the requests to the
-engine. The engine runs the policy's thread, which takes batches from the queue, runs them, and finishes their requests.
+Every endpoint (HTTP, WebSocket, a Serve handle, …) decodes a message, and its `Sender` submits the
+requests to the engine. The engine runs the policy's thread, which takes batches from the queue,
+runs them, and finishes their requests.
 """
 
 from __future__ import annotations
@@ -32,7 +33,13 @@ from vlagents_ray.serve.engine.admission import Admission
 from vlagents_ray.serve.engine.metrics_buffer import MetricsBuffer
 from vlagents_ray.serve.engine.observer import Observers
 from vlagents_ray.serve.engine.pauses import PauseDetector
-from vlagents_ray.serve.engine.responses import build_reply, public_error, raised_at, require_serializable, timing
+from vlagents_ray.serve.engine.responses import (
+    build_reply,
+    public_error,
+    raised_at,
+    require_serializable,
+    timing,
+)
 from vlagents_ray.serve.models.checkpoints import Checkpoints
 from vlagents_ray.serve.models.loaded_model import LoadedModel, Loader
 from vlagents_ray.serve.models.model_manager import ModelManager, too_late
@@ -40,7 +47,14 @@ from vlagents_ray.serve.queue.batch_queue import BatchQueue, Taken
 from vlagents_ray.serve.queue.call_limits import CallLimits, PolicyCall, PolicyCalls
 from vlagents_ray.serve.queue.poller import Poller
 from vlagents_ray.serve.queue.preparation import Preparations
-from vlagents_ray.serve.requests import NOWHERE, CheckpointChoice, Opening, Origin, PendingRequest, Rank
+from vlagents_ray.serve.requests import (
+    NOWHERE,
+    CheckpointChoice,
+    Opening,
+    Origin,
+    PendingRequest,
+    Rank,
+)
 from vlagents_ray.serve.sessions import DrainList, Session, SessionFinder, SessionTable
 from vlagents_ray.serve.weights import Rest, WeightsVersion, WeightUpdates, follows
 
@@ -48,11 +62,15 @@ logger = logging.getLogger(__name__)
 
 Acting = tuple[PendingRequest, Session[LoadedModel]]
 
-_WORKING = 0.5  # share of a batch's time that the policy's thread computes, over which it is busy rather than waits
+# Share of a batch's time that the policy's thread computes, over which it is busy rather than
+# waits.
+_WORKING = 0.5
 
 
 class Engine:
-    """Serves an agent, or agents of several checkpoints, to many sessions, from `start` (which loads) to `close`."""
+    """Serves an agent, or agents of several checkpoints, to many sessions, from `start` (which
+    loads) to `close`.
+    """
 
     def __init__(
         self,
@@ -79,11 +97,13 @@ class Engine:
             agent: The agent, or the checkpoints that sessions can choose from.
             max_batch_size: Maximum number of observations in a batch.
             patience: See `BatchQueue`.
-            batch_sizes: Sizes to which batches are padded; the largest one is `max_batch_size`. Without them, a
-                compiled policy that names no sizes is compiled for 1, 2, 4, … `max_batch_size`.
+            batch_sizes: Sizes to which batches are padded; the largest one is `max_batch_size`.
+                Without them, a compiled policy that names no sizes is compiled for 1, 2, 4, …
+                `max_batch_size`.
             session_limit: Maximum number of sessions.
             session_idle_s: Time without a request after which a session may be dropped, s.
-            version: Version of the policy; sessions only move between replicas of equal version and settings.
+            version: Version of the policy; sessions only move between replicas of equal version and
+                settings.
             check: Raises an error if a policy with that contract cannot be served.
             limits: Time limits of the policy's calls, over which the engine is unhealthy.
             reply_bytes: Maximum size of a reply, bytes.
@@ -95,7 +115,9 @@ class Engine:
         """
         self._source = agent if isinstance(agent, Checkpoints) else Checkpoints(lambda _: agent)
         self.clock, self.finder = clock, finder
-        self.sessions: SessionTable[LoadedModel] = SessionTable(session_limit, session_idle_s, wall_clock)
+        self.sessions: SessionTable[LoadedModel] = SessionTable(
+            session_limit, session_idle_s, wall_clock
+        )
         self.calls, self.pauses = PolicyCalls(limits, clock), PauseDetector(clock)
         loader = Loader(self._source, version, batch_sizes, max_batch_size, check, self.calls)
         self.models = ModelManager(self._source, loader, self.sessions)
@@ -106,9 +128,11 @@ class Engine:
         self._preparations: Preparations | None = None  # None if the engine has no threads
         self._loading = self.models.loading()
         self._unready: VLAgentsError | None = self._loading  # error for clients
-        self._failure: PolicyFailed | None = None  # reason why the policy did not load, for the operator
+        # Reason why the policy did not load, for the operator.
+        self._failure: PolicyFailed | None = None
         self._hung: PolicyCall | None = None  # overdue call that `notice_hung` found
-        self.draining = False  # whether the replica will stop, so that replies request reconnections
+        # Whether the replica will stop, so that replies request reconnections.
+        self.draining = False
         self.drain_list = DrainList()  # connections to move only because others hold fewer sessions
         self.queue = BatchQueue(
             max_batch_size,
@@ -119,20 +143,27 @@ class Engine:
             poller=poller,
         )
         self._thread = threading.Thread(target=self._serve, name="policy", daemon=True)
-        self._started: Future[None] = Future()  # done when loading the policy has succeeded or failed
-        self.threaded = True  # whether that is the engine's own thread, and not the one that called `start`
+        # Done when loading the policy has succeeded or failed.
+        self._started: Future[None] = Future()
+        # Whether that is the engine's own thread, and not the one that called `start`.
+        self.threaded = True
         self.alive = False  # whether a thread takes batches from the queue
-        self._unsent: list[tuple[PendingRequest, Reply]] = []  # sent by another thread while the next batch runs
+        # Sent by another thread while the next batch runs.
+        self._unsent: list[tuple[PendingRequest, Reply]] = []
         self._answers = ThreadPoolExecutor(1, "policy-answers")
-        self._acting = threading.Lock()  # held while the policy's thread runs a batch, and while the policy sleeps
-        self.weights = WeightUpdates(lambda: self.models.own_weights, self.sessions.all, self._acting)
+        # Held while the policy's thread runs a batch, and while the policy sleeps.
+        self._acting = threading.Lock()
+        self.weights = WeightUpdates(
+            lambda: self.models.own_weights, self.sessions.all, self._acting
+        )
         self.observers = Observers()
 
     def start(self, *, threaded: bool = True) -> None:
         """Load the policy on its thread, and return when it can act.
 
         Args:
-            threaded: False if the calling thread is the policy's thread, and calls `queue.take` and `run` in turns.
+            threaded: False if the calling thread is the policy's thread, and calls `queue.take` and
+                `run` in turns.
 
         Raises:
             PolicyFailed: The policy does not load, or not within the time limit.
@@ -190,10 +221,14 @@ class Engine:
     def _without_late(self, taken: Taken) -> Taken:
         """Return the work without the requests that have become useless since they were taken."""
         now = self.clock()
-        late = [pending for pending in taken.batch if pending.loaded is None and pending.is_useless(now)]
+        late = [
+            pending for pending in taken.batch if pending.loaded is None and pending.is_useless(now)
+        ]
         for pending in late:
             pending.begun = False
-        return Taken([pending for pending in taken.batch if pending not in late], [*taken.expired, *late])
+        return Taken(
+            [pending for pending in taken.batch if pending not in late], [*taken.expired, *late]
+        )
 
     @property
     def ready(self) -> bool:
@@ -205,7 +240,9 @@ class Engine:
         return True
 
     def require_ready(self) -> None:
-        """Raise `PolicyUnavailable` while the policy loads, `PolicyFailed` if it did not load or its thread ended."""
+        """Raise `PolicyUnavailable` while the policy loads, `PolicyFailed` if it did not load or
+        its thread ended.
+        """
         if self._unready is not None:
             raise self.models.loading() if self._unready is self._loading else self._unready
         if not self.alive:
@@ -214,9 +251,11 @@ class Engine:
             self.calls.require_device()
 
     def check_health(self) -> None:
-        """Raise the full reason why the policy cannot act, including errors of the agents' own health checks.
+        """Raise the full reason why the policy cannot act, including errors of the agents' own
+        health checks.
 
-        The error is meant for the operator, and for the controller that replaces unhealthy replicas.
+        The error is meant for the operator, and for the controller that replaces unhealthy
+        replicas.
         """
         if self._failure is not None:
             raise self._failure
@@ -227,7 +266,8 @@ class Engine:
         self.models.check_health()
 
     def notice_hung(self) -> None:
-        """Refuse requests while a call of the policy exceeds its time limit, and answer the waiting ones with an error.
+        """Refuse requests while a call of the policy exceeds its time limit, and answer the waiting
+        ones with an error.
 
         This is called several times a second, on a thread that makes no calls of the policy.
         """
@@ -242,10 +282,13 @@ class Engine:
         refusal = PolicyUnavailable(f"{said}; the session begins again at another replica")
         if self._hung is None:
             self._hung, self._unready = call, refusal
-            logger.error("%s. This replica is not healthy until it does. Its thread:\n%s", said, call.stack())
+            logger.error(
+                "%s. This replica is not healthy until it does. Its thread:\n%s", said, call.stack()
+            )
             self.stats.hung(call.op)
-        # The policy may still act on the running batch, so its requests must not be sent again; waiting requests may
-        # be. This is repeated at each call, since a request that was checked before may be queued later.
+        # The policy may still act on the running batch, so its requests must not be sent again;
+        # waiting requests may be. This is repeated at each call, since a request that was checked
+        # before may be queued later.
         running, waiting = self.queue.clear()
         for pending in running:
             pending.fail(OutcomeUnknown(said))
@@ -253,7 +296,9 @@ class Engine:
             self._fail(pending, refusal)
 
     def drain(self) -> None:
-        """Request all clients, in their next replies, to reconnect to other replicas, since this one will stop."""
+        """Request all clients, in their next replies, to reconnect to other replicas, since this
+        one will stop.
+        """
         self.draining = True
 
     def close(self) -> None:
@@ -266,12 +311,16 @@ class Engine:
         self.models.close()
 
     def stop(self, timeout_s: float) -> None:
-        """Refuse all requests except those of the running batch, and wait at most `timeout_s` for its end."""
-        with suppress(Exception):  # the policy is loading, or its GPU has too little memory for it to wake
+        """Refuse all requests except those of the running batch, and wait at most `timeout_s`
+        for its end.
+        """
+        # The policy is loading, or its GPU has too little memory for it to wake.
+        with suppress(Exception):
             self.weights.rest(Rest("wake"))
         stopping = PolicyUnavailable("the replica is stopping; connect again")
         if self._failure is None:
-            self._unready = stopping  # otherwise the end of the policy's thread would be taken for a failure
+            # Otherwise the end of the policy's thread would be taken for a failure.
+            self._unready = stopping
         for pending in self.queue.close():
             self._fail(pending, stopping)
         if self._thread.ident is None:
@@ -281,11 +330,15 @@ class Engine:
 
     @property
     def contract(self) -> Contract | None:
-        """Contract of the deployment's own checkpoint; None until that is loaded, or if it has no contract."""
+        """Contract of the deployment's own checkpoint; None until that is loaded, or if it has
+        no contract.
+        """
         return self.models.contract
 
     def submit(self, requests: Sequence[PendingRequest]) -> None:
-        """Check requests, and queue them together; those that cannot be queued are finished with their errors."""
+        """Check requests, and queue them together; those that cannot be queued are finished with
+        their errors.
+        """
         ready: list[PendingRequest] = []
         for pending in requests:
             try:
@@ -303,22 +356,36 @@ class Engine:
                 self._fail(pending, error)
 
     def check(self, pending: PendingRequest) -> None:
-        """Check a request before it is queued, and record the server's decisions in it; raise if it is refused."""
+        """Check a request before it is queued, and record the server's decisions in it; raise if
+        it is refused.
+        """
         request, origin = pending.request, pending.origin
-        if request.op == "act" and origin.owner and not request.session and pending.session_id not in origin.sessions:
+        if (
+            request.op == "act"
+            and origin.owner
+            and not request.session
+            and pending.session_id not in origin.sessions
+        ):
             raise NotReset("act before reset: this connection has no session yet; reset first")
         self.require_ready()
         if request.op == "act":
             pending.session = session = self.sessions.get(pending.session_id)
             if session.agent is None:
-                raise NotReset(f"session {pending.session_id!r}: act before a successful reset; reset first")
-            if (step := request.step) is not None and step > session.steps and step > session.expected:
+                raise NotReset(
+                    f"session {pending.session_id!r}: act before a successful reset; reset first"
+                )
+            if (
+                (step := request.step) is not None
+                and step > session.steps
+                and step > session.expected
+            ):
                 raise session.wrong_step(step)
             if pending.episode is None:
                 known = origin.sessions.get(pending.session_id)
                 pending.episode = self._latest_episode(pending, session) if known is None else known
             if (pending.episode if step is None else step) >= session.expected:
-                session.origin = origin  # an act of an older episode, which will be refused, does not use the session
+                # An act of an older episode, which will be refused, does not use the session.
+                session.origin = origin
             if (model := session.model) is not None:  # another thread may set it to None
                 model.check(request)
                 pending.model = model
@@ -326,8 +393,11 @@ class Engine:
                 pending.preparation = self._preparations.begin(session.agent, request.obs)
         elif request.op == "reset":
             choice, kwargs = self._source.split_options(request.kwargs)
-            opening = Opening(choice, kwargs, follows(kwargs, by_default=pending.rank is not Rank.ROBOT))
-            if (model := self.models.loaded(choice)) is not None:  # otherwise it is checked after loading
+            opening = Opening(
+                choice, kwargs, follows(kwargs, by_default=pending.rank is not Rank.ROBOT)
+            )
+            # Otherwise it is checked after loading.
+            if (model := self.models.loaded(choice)) is not None:
                 model.check(request)
             session = self.sessions.open(pending.session_id, origin)
             opening.first = self.sessions.begin(session, request.step)
@@ -337,17 +407,21 @@ class Engine:
             self._bind(pending)
 
     def _latest_episode(self, pending: PendingRequest, session: Session[LoadedModel]) -> int:
-        """Return the step at which the episode began that an act belongs to whose connection has none.
+        """Return the step at which the episode began that an act belongs to whose connection has
+        none.
 
-        That is the session's latest one; but an act without a step does not belong to an episode that has begun since
-        the connection was opened, or over HTTP, since the act arrived, while it waited for a search of its session.
+        That is the session's latest one; but an act without a step does not belong to an episode
+        that has begun since the connection was opened, or over HTTP, since the act arrived, while
+        it waited for a search of its session.
         """
         if pending.request.step is None and session.last_reset > pending.latest_begin:
             raise session.wrong_episode()
         return session.expected
 
     def _bind(self, pending: PendingRequest) -> None:
-        """Record the session of a request as one of its connection's, with the episode that the request belongs to."""
+        """Record the session of a request as one of its connection's, with the episode that the
+        request belongs to.
+        """
         sessions, session_id = pending.origin.sessions, pending.session_id
         if pending.opening is not None:
             pending.episode = sessions.get(session_id)
@@ -360,7 +434,9 @@ class Engine:
             sessions.setdefault(session_id, None)
 
     def withdraw(self, *requests: PendingRequest) -> None:
-        """End requests without an answer, as `BatchQueue.withdraw` does, and undo resets that have not begun."""
+        """End requests without an answer, as `BatchQueue.withdraw` does, and undo resets that
+        have not begun.
+        """
         self.queue.withdraw(*requests)
         for pending in requests:
             pending.drop_preparation()
@@ -380,11 +456,17 @@ class Engine:
         pending.fail(error)
 
     def _seek(self, pending: PendingRequest, error: VLAgentsError) -> bool:
-        """Search for an act's session at other replicas, and queue the act again; return False if there is no search.
+        """Search for an act's session at other replicas, and queue the act again; return False if
+        there is no search.
 
         If its session is not found, the act fails with the `error`.
         """
-        if self.finder is None or pending.sought or pending.request.op != "act" or pending.is_abandoned:
+        if (
+            self.finder is None
+            or pending.sought
+            or pending.request.op != "act"
+            or pending.is_abandoned
+        ):
             return False
         if not isinstance(error, UnknownSession):
             return False
@@ -395,7 +477,8 @@ class Engine:
                 pending.fail(error)
                 return
             try:
-                if pending.session_id not in self.sessions:  # it stays elsewhere if its key has no room for it here
+                # It stays elsewhere if its key has no room for it here.
+                if pending.session_id not in self.sessions:
                     self.sessions.require_allowed(pending.origin)
                 self.check(pending)
                 self.queue.put(pending)
@@ -407,14 +490,22 @@ class Engine:
         if self.finder.fetch(pending.session_id, retry, searcher, partial(self._user_of, pending)):
             return True
         if self.draining:  # the replica has given its sessions to others
-            pending.fail(PolicyUnavailable("the replica is stopping; connect again, or send the same request again"))
+            pending.fail(
+                PolicyUnavailable(
+                    "the replica is stopping; connect again, or send the same request again"
+                )
+            )
             return True
         return False
 
-    def _user_of(self, pending: PendingRequest, state: dict[str, Any], began: float) -> Origin | None:
-        """Return the origin of an act if it can be executed on a session in that state, at another replica, else None.
+    def _user_of(
+        self, pending: PendingRequest, state: dict[str, Any], began: float
+    ) -> Origin | None:
+        """Return the origin of an act if it can be executed on a session in that state, at another
+        replica, else None.
 
-        If it cannot be, the session stays where it is. The session's episode `began` at that time, s.
+        If it cannot be, the session stays where it is. The session's episode `began` at that time,
+        s.
         """
         if pending.is_abandoned:
             return None
@@ -437,8 +528,10 @@ class Engine:
         self.queue.begin(taken.batch)
         try:
             self._run(taken.batch)
-        except BaseException as error:  # a policy that calls sys.exit() must not end the replica's only thread
-            if not self.threaded and not isinstance(error, SystemExit):  # Ctrl-C in the thread that called
+        except BaseException as error:
+            # a policy that calls sys.exit() must not end the replica's only thread
+            # Ctrl-C in the thread that called.
+            if not self.threaded and not isinstance(error, SystemExit):
                 raise
             logger.exception("the batch failed")
             for pending in taken.batch:
@@ -473,28 +566,41 @@ class Engine:
     def _reset(self, pending: PendingRequest, opening: Opening) -> None:
         """Begin the episode of a reset, and answer the reset.
 
-        A reset whose checkpoint is not loaded leaves the queue. It is queued again when the checkpoint is loaded, or
-        answered with an error if loading fails. Meanwhile the session may be reset again or closed, or its client may
-        stop waiting.
+        A reset whose checkpoint is not loaded leaves the queue. It is queued again when the
+        checkpoint is loaded, or answered with an error if loading fails. Meanwhile the session may
+        be reset again or closed, or its client may stop waiting.
         """
         session_id = pending.session_id
         if pending.loaded is None:
             if self.sessions.is_past(session_id, opening.first):
-                raise UnknownSession(f"session {session_id!r}: reset elsewhere, or ended, while this reset waited")
+                raise UnknownSession(
+                    f"session {session_id!r}: reset elsewhere, or ended, while this reset waited"
+                )
             session = self.sessions.open(session_id, pending.origin)
             session.agent, session.weights, session.follows = None, None, opening.follows
             session.steps, session.resetting = opening.first, pending
             session.first, session.moves = opening.first, 0
             session.expected = max(session.expected, opening.first)
-            session.began, session.last_reset = pending.arrived, max(session.last_reset, pending.arrived)
+            session.began, session.last_reset = (
+                pending.arrived,
+                max(session.last_reset, pending.arrived),
+            )
             is_abandoned = partial(self._is_abandoned, pending, session)
-            if self.models.hold(session, opening.choice, partial(self._requeue, pending), is_abandoned) is None:
-                pending.begun = False  # the policy does no work on it while its checkpoint is loaded
+            if (
+                self.models.hold(
+                    session, opening.choice, partial(self._requeue, pending), is_abandoned
+                )
+                is None
+            ):
+                # The policy does no work on it while its checkpoint is loaded.
+                pending.begun = False
                 return  # `_requeue` queues it again
         else:
             session = self.sessions.get(session_id)
             if session.resetting is not pending:
-                raise UnknownSession(f"session {session_id!r}: reset anew, or closed, while this reset waited")
+                raise UnknownSession(
+                    f"session {session_id!r}: reset anew, or closed, while this reset waited"
+                )
             if self._is_abandoned(pending, session):
                 self.models.release_model(session)
                 raise too_late(opening.choice)
@@ -502,14 +608,19 @@ class Engine:
         try:
             self._begin_episode(pending, opening, session)
         except BaseException:
-            self.models.release_model(session)  # otherwise the session would hold the model without an episode
+            # Otherwise the session would hold the model without an episode.
+            self.models.release_model(session)
             raise
 
-    def _begin_episode(self, pending: PendingRequest, opening: Opening, session: Session[LoadedModel]) -> None:
+    def _begin_episode(
+        self, pending: PendingRequest, opening: Opening, session: Session[LoadedModel]
+    ) -> None:
         """Begin an episode on the model that the session holds, and answer the request."""
         request, model = pending.request, session.model
         if model is None or request.obs is None:  # the decoder ensures the second condition
-            raise UnknownSession(f"session {pending.session_id!r}: closed before its reset was over")
+            raise UnknownSession(
+                f"session {pending.session_id!r}: closed before its reset was over"
+            )
         model.check(request)
         with model.busy, model.uncaptured, model.call("reset") as call:
             model.require_open()
@@ -531,7 +642,8 @@ class Engine:
             pending.finish(reply)
             return
         session.announced = True
-        if pending.origin.owner:  # the session's acts come over the same connection, to this replica
+        # The session's acts come over the same connection, to this replica.
+        if pending.origin.owner:
             pending.finish(reply)
             self.finder.announce(session.id, session.steps, lambda: None)
         else:  # the next act may come to a replica that still has an older episode
@@ -549,8 +661,14 @@ class Engine:
             pending.fail(reason)
 
     def _is_abandoned(self, pending: PendingRequest, session: Session[LoadedModel]) -> bool:
-        """Return whether the caller of that reset no longer waits, or the session was reset again."""
-        return pending.is_abandoned or pending.expired(self.clock()) or session.resetting is not pending
+        """Return whether the caller of that reset no longer waits, or the session was reset
+        again.
+        """
+        return (
+            pending.is_abandoned
+            or pending.expired(self.clock())
+            or session.resetting is not pending
+        )
 
     def _other(self, pending: PendingRequest) -> dict[str, Any]:
         """Run a request that is neither an act nor a reset, and return the info of its answer."""
@@ -560,8 +678,10 @@ class Engine:
         if request.op == "release":
             return {"released": self.sessions.release(session_id, request.kwargs["version"])}
         if request.op == "adopt":
-            self.sessions.free(session_id)  # the replica of this process reuses names, for sessions that it compares
-            # That replica decides which version of the weights acts: the session's may be older, or not held here.
+            # The replica of this process reuses names, for sessions that it compares.
+            self.sessions.free(session_id)
+            # That replica decides which version of the weights acts: the session's may be older, or
+            # not held here.
             self.adopt(session_id, {**request.kwargs, "parameters": self.weights.acting()})
         elif request.op == "observe":
             self._observe(pending)
@@ -572,12 +692,16 @@ class Engine:
             pending.origin.sessions.pop(session_id, None)
         return {}
 
-    def _ready(self, pending: PendingRequest) -> tuple[Session[LoadedModel], LoadedModel, WeightsVersion]:
+    def _ready(
+        self, pending: PendingRequest
+    ) -> tuple[Session[LoadedModel], LoadedModel, WeightsVersion]:
         session: Session[LoadedModel] | None = pending.session
-        if session is None or session.over:  # since the lookup it has ended, or arrived here from another replica
+        # Since the lookup it has ended, or arrived here from another replica.
+        if session is None or session.over:
             session = self.sessions.get(pending.session_id)
         model, weights = session.model, session.weights
-        if session.agent is None:  # an earlier reset in the queue failed, or still waits for its checkpoint
+        # An earlier reset in the queue failed, or still waits for its checkpoint.
+        if session.agent is None:
             raise NotReset(f"session {pending.session_id!r}: its last reset failed; reset again")
         step = pending.request.step
         if step is not None and step != session.steps:
@@ -586,13 +710,15 @@ class Engine:
             raise session.wrong_episode()
         if model is None or weights is None:
             raise UnknownSession(f"session {pending.session_id!r}: has just been closed; reset it")
-        if model is not pending.model:  # a reset before it in the queue chose another, or it has arrived since
+        # A reset before it in the queue chose another, or it has arrived since.
+        if model is not pending.model:
             model.check(pending.request)
         return session, model, weights
 
     def _observe(self, pending: PendingRequest) -> None:
         session, model, weights = self._ready(pending)
-        if session.agent is not None and pending.request.obs is not None:  # `_ready` and the decoder ensure both
+        # `_ready` and the decoder ensure both.
+        if session.agent is not None and pending.request.obs is not None:
             with model.busy, model.uncaptured, model.call("observe"):
                 model.require_open()
                 model.parameters.use(weights)
@@ -600,7 +726,8 @@ class Engine:
         pending.request.drop_observations()
 
     def _prepared(self, model: LoadedModel, acting: list[Acting]) -> tuple[list[Acting], float]:
-        """Finish the preparations of observations, and answer the requests whose preparation failed.
+        """Finish the preparations of observations, and answer the requests whose preparation
+        failed.
 
         Returns:
             The remaining requests, and the duration, s, which counts as inference.
@@ -614,9 +741,17 @@ class Engine:
             pending = acting[place][0]
             pending.request.drop_observations()
             pending.fail(public_error(error, pending))
-        return [one for place, one in enumerate(acting) if place not in errors], call.ended - call.began
+        return [
+            one for place, one in enumerate(acting) if place not in errors
+        ], call.ended - call.began
 
-    def _act(self, model: LoadedModel, weights: WeightsVersion, acting: Sequence[Acting], prepared_s: float) -> None:
+    def _act(
+        self,
+        model: LoadedModel,
+        weights: WeightsVersion,
+        acting: Sequence[Acting],
+        prepared_s: float,
+    ) -> None:
         """Answer the act requests of sessions with one version of one model's weights."""
         observations = [pending.request.obs for pending, _ in acting]
         agents = [session.agent for _, session in acting]
@@ -627,19 +762,22 @@ class Engine:
         rows = len(observations)
         call = model.call("act", rows if self._batch_sizes else None)
         slow = self.queue.window.slow
-        worked_s = time.thread_time() if slow else 0.0  # two calls would take a fiftieth of the fastest acts
+        # Two calls would take a fiftieth of the fastest acts.
+        worked_s = time.thread_time() if slow else 0.0
         try:
             with model.busy, model.uncaptured, call:
                 model.require_open()
                 model.parameters.use(weights)
                 results: Sequence[Act | Exception] = model.agent.act_batch(observations, agents)  # type: ignore[arg-type]
             if len(results) != rows:
-                raise PolicyFailed(f"act_batch: got {rows} observations, returned {len(results)} actions")
+                raise PolicyFailed(
+                    f"act_batch: got {rows} observations, returned {len(results)} actions"
+                )
         except Exception as error:  # noqa: BLE001 - becomes the replies
             results = [error] * rows
         worked_s = time.thread_time() - worked_s if slow else 0.0
-        # This is skipped for a lone act that succeeded like the one before: it would take a hundredth of the act's
-        # time.
+        # This is skipped for a lone act that succeeded like the one before: it would take a
+        # hundredth of the act's time.
         if len(acting) > 1 or isinstance(results[0], Exception) or model.calls.failed_batches:
             model.calls.record_batch(results[: len(acting)])
         del observations  # they may be in the sender's memory
@@ -648,14 +786,19 @@ class Engine:
         if padding:
             model.padding.check_results(results[len(acting) :])
             results = results[: len(acting)]
-        # Replies are sent while the next full batch runs: to simulations, and after a full batch to robots, too, if the
-        # policy leaves the interpreter to other threads while it waits for a GPU or another process. Beside one that
-        # computes in Python, the slowest robots would wait longer.
+        # Replies are sent while the next full batch runs: to simulations, and after a full batch to
+        # robots, too, if the policy leaves the interpreter to other threads while it waits for a
+        # GPU or another process. Beside one that computes in Python, the slowest robots would wait
+        # longer.
         defer = self.queue.full_batch_waits()
-        robots = len(acting) == self.queue.largest and worked_s < _WORKING * (call.ended - call.began)
+        robots = len(acting) == self.queue.largest and worked_s < _WORKING * (
+            call.ended - call.began
+        )
         unsent = []
         for (pending, session), result in zip(acting, results, strict=True):
-            reply = build_reply(pending, session, result, model.contract, self._reply_bytes, weights.info)
+            reply = build_reply(
+                pending, session, result, model.contract, self._reply_bytes, weights.info
+            )
             if reply.error is None:
                 reply.timing = timing(pending, call.began - prepared_s, call.ended)
                 reply.timing["batch_size"] = len(acting)
@@ -670,7 +813,9 @@ class Engine:
     # Sessions that move between replicas: their state is bytes and settings.
 
     def export(self, session_id: str) -> dict[str, Any]:
-        """Return the state that another replica needs to continue the session after its release here."""
+        """Return the state that another replica needs to continue the session after its release
+        here.
+        """
         session = self.sessions.get(session_id)
         model, weights = session.model, session.weights
         if session.agent is None or model is None or weights is None:
@@ -697,11 +842,12 @@ class Engine:
         Args:
             session_id: Id of the session.
             state: The `info` of the other replica's reply to "export".
-            timeout_s: Maximum time for loading the session's checkpoint, s; 0 if it must be loaded already.
+            timeout_s: Maximum time for loading the session's checkpoint, s; 0 if it must be loaded
+                already.
 
         Raises:
-            UnknownSession: The session has, or had, a newer state here, has begun a reset, or needs a checkpoint or a
-                version of the policy that is not available here.
+            UnknownSession: The session has, or had, a newer state here, has begun a reset, or needs
+                a checkpoint or a version of the policy that is not available here.
         """
         self.enter(self.prepare_adoption(session_id, state, timeout_s))
 
@@ -714,10 +860,12 @@ class Engine:
         origin: Origin = NOWHERE,
         weights: Mapping[str, Any] | None = None,
     ) -> Session[LoadedModel]:
-        """Create a copy of the session that cannot act before `enter`; if it is not needed, call `abandon`.
+        """Create a copy of the session that cannot act before `enter`; if it is not needed, call
+        `abandon`.
 
-        Its episode `began` at that time, s, of this engine's clock, or later. From now on it counts for the key of the
-        `origin`. `weights` are the values of its version of the weights, if that is not held here.
+        Its episode `began` at that time, s, of this engine's clock, or later. From now on it counts
+        for the key of the `origin`. `weights` are the values of its version of the weights, if that
+        is not held here.
         """
         self.require_ready()
         self.sessions.require_room(session_id)
@@ -735,11 +883,16 @@ class Engine:
         )
         self.sessions.expect(arriving)
         try:
-            model = self.models.adopt(arriving, CheckpointChoice(*state["choice"]), state["settings"], timeout_s)
+            model = self.models.adopt(
+                arriving, CheckpointChoice(*state["choice"]), state["settings"], timeout_s
+            )
             if tuple(state["version"]) != model.version:
-                raise UnknownSession(f"session {session_id!r}: of another version of the policy; reset it")
+                raise UnknownSession(
+                    f"session {session_id!r}: of another version of the policy; reset it"
+                )
             number, fingerprint = state["parameters"]
-            if weights is not None:  # the session holds the version until `find` returns it, or a newer one
+            # The session holds the version until `find` returns it, or a newer one.
+            if weights is not None:
                 arriving.weights = model.parameters.restore(number, fingerprint, weights)
             arriving.weights = model.parameters.find(number, fingerprint, follows=state["follows"])
             with model.busy, model.uncaptured, model.call("adopt", threading.get_ident()):
@@ -771,7 +924,9 @@ def _not_taken(pending: PendingRequest) -> VLAgentsError:
     """Return the error for a request that the policy has not received, and never will."""
     if pending.origin.ended:
         return ConnectionLost("its connection has ended: not acted on, and never will be")
-    return DeadlineExceeded(f"no action within {pending.request.deadline_ms:g} ms: dropped before inference")
+    return DeadlineExceeded(
+        f"no action within {pending.request.deadline_ms:g} ms: dropped before inference"
+    )
 
 
 def _send(answers: Sequence[tuple[PendingRequest, Reply]]) -> None:

@@ -1,7 +1,8 @@
 """Timings of requests and batches: reported in each reply, and buffered for the metrics exporter.
 
 Per request this costs two readings of the clock and one addition to a sample. The exporter thread
-(`vlagents_ray.serve.replica.metrics`) has little work left: requests may wait while it holds the interpreter lock.
+(`vlagents_ray.serve.replica.metrics`) has little work left: requests may wait while it holds the
+interpreter lock.
 """
 
 from __future__ import annotations
@@ -51,11 +52,14 @@ class Collected:
     gpu_ms: Sample[float] = field(default_factory=Sample)  # time of forward passes on the GPU
     padding: int = 0  # number of padding rows in all batches
     out_of_memory: int = 0  # forward passes that did not fit into memory
-    hung: Counter[str] = field(default_factory=Counter)  # calls of the policy that exceeded their limit, by op
+    # Calls of the policy that exceeded their limit, by op.
+    hung: Counter[str] = field(default_factory=Counter)
 
 
 class MetricsBuffer:
-    """A bounded buffer of metrics, which records requests and batches only after `enable`. Thread-safe."""
+    """A bounded buffer of metrics, which records requests and batches only after `enable`.
+    Thread-safe.
+    """
 
     def __init__(self) -> None:
         self.gpu_ms: float | None = None  # time of the last forward pass on a GPU

@@ -1,8 +1,9 @@
 """The interface of observers, the only access to the requests and the answers of an engine.
 
-An observer is called on the threads that process requests and answers: it copies data or keeps references, and leaves
-the rest to its own thread. Its memory is bounded: beyond a limit in bytes or entries it drops data. Requests that could
-not be decoded reach no observer. Parts of a replica add observers.
+An observer is called on the threads that process requests and answers: it copies data or keeps
+references, and leaves the rest to its own thread. Its memory is bounded: beyond a limit in bytes or
+entries it drops data. Requests that could not be decoded reach no observer. Parts of a replica add
+observers.
 """
 
 from __future__ import annotations
@@ -21,13 +22,19 @@ class Observer:
     """Observes decoded requests and their answers; a class overrides the methods that it needs."""
 
     def on_request(self, pending: PendingRequest) -> None:
-        """Observe a request before it is queued; its observation may be in memory that the client reuses."""
+        """Observe a request before it is queued; its observation may be in memory that the
+        client reuses.
+        """
 
     def before_answer(self, pending: PendingRequest, reply: Reply) -> None:
-        """Add to the info of an answer before it is sent; the live page sends commands to a robot this way."""
+        """Add to the info of an answer before it is sent; the live page sends commands to a
+        robot this way.
+        """
 
     def on_answer(self, pending: PendingRequest, reply: Reply) -> None:
-        """Observe an answer that was sent, with its complete `timing`; the request's observation has been dropped."""
+        """Observe an answer that was sent, with its complete `timing`; the request's observation
+        has been dropped.
+        """
 
     def close(self) -> None:
         """Write or export the kept data, and end."""
@@ -37,7 +44,8 @@ class Observers(Observer):
     """The observers of an engine, which are themselves one. Thread-safe."""
 
     def __init__(self) -> None:
-        self.any = False  # whether there are observers: without any, each request costs only this check
+        # Whether there are observers: without any, each request costs only this check.
+        self.any = False
         self._all: tuple[Observer, ...] = ()
         self._lock = threading.Lock()
 
@@ -54,7 +62,9 @@ class Observers(Observer):
             self.any = bool(self._all)
 
     def on_request(self, pending: PendingRequest) -> None:
-        """Call all observers with a request; their errors are logged, and do not affect the answer."""
+        """Call all observers with a request; their errors are logged, and do not affect the
+        answer.
+        """
         self._each(lambda observer: observer.on_request(pending))
 
     def before_answer(self, pending: PendingRequest, reply: Reply) -> None:

@@ -1,9 +1,10 @@
 """Pauses of the process, during which messages wait in sockets.
 
 Deadlines begin when a message arrives, and the kernel records that time for each message (see
-`vlagents_ray.serve.endpoints.connection`). Serve's HTTP server and Ray's own calls do not expose the record. After a
-pause of the whole process, the time is therefore looked up for HTTP requests; messages of the server's WebSockets and
-Ray's calls are assumed to have waited since the pause began.
+`vlagents_ray.serve.endpoints.connection`). Serve's HTTP server and Ray's own calls do not expose
+the record. After a pause of the whole process, the time is therefore looked up for HTTP requests;
+messages of the server's WebSockets and Ray's calls are assumed to have waited since the pause
+began.
 """
 
 from __future__ import annotations
@@ -21,22 +22,27 @@ from vlagents_ray.serve.periodic import Periodic
 _LAST_DATA = struct.Struct("@52xI")  # in TCP_INFO: time since data were last received, ms
 _CHECK_S = 0.1  # interval of the checks for a pause
 _PAUSE_S = 0.3  # time without a check above which the process was paused, rather than merely busy
-_BACKLOG_S = (0.5, 5.0)  # minimum and maximum time to read the backlog of a pause; it is half as long as the pause
+# Minimum and maximum time to read the backlog of a pause; it is half as long as the pause.
+_BACKLOG_S = (0.5, 5.0)
 
 # Ports of both ends of the current HTTP request's TCP connection, the server's first.
 _PORTS: ContextVar[tuple[int, int] | None] = ContextVar("vlagents_ray_ports", default=None)
 
 
 def note_connection(scope: Mapping[str, Any]) -> None:
-    """Record the connection of an HTTP request, for `PauseDetector.waited_s` in the same context."""
+    """Record the connection of an HTTP request, for `PauseDetector.waited_s` in the same
+    context.
+    """
     server, client = scope.get("server"), scope.get("client")
     _PORTS.set((server[1], client[1]) if server and client else None)
 
 
 def _since_last_data_s() -> float | None:
-    """Return the time since the connection of the current HTTP request received data, s; None if it is unknown.
+    """Return the time since the connection of the current HTTP request received data, s; None if it
+    is unknown.
 
-    Serve does not expose its sockets, so this searches all sockets of the process, which takes milliseconds.
+    Serve does not expose its sockets, so this searches all sockets of the process, which takes
+    milliseconds.
     """
     if (ports := _PORTS.get()) is None:
         return None
@@ -47,7 +53,9 @@ def _since_last_data_s() -> float | None:
                 try:
                     names = connection.getsockname(), connection.getpeername()
                     if tuple(name[1] for name in names if isinstance(name, tuple)) == ports:
-                        info = connection.getsockopt(socket.IPPROTO_TCP, socket.TCP_INFO, _LAST_DATA.size)
+                        info = connection.getsockopt(
+                            socket.IPPROTO_TCP, socket.TCP_INFO, _LAST_DATA.size
+                        )
                         milliseconds: int = _LAST_DATA.unpack(info)[0]
                         return milliseconds / 1e3
                 finally:
@@ -56,13 +64,16 @@ def _since_last_data_s() -> float | None:
 
 
 class PauseDetector:
-    """Detects pauses of the process (frozen or starved): between `start` and `stop` a thread checks the clock."""
+    """Detects pauses of the process (frozen or starved): between `start` and `stop` a thread
+    checks the clock.
+    """
 
     def __init__(self, clock: Callable[[], float]) -> None:
         self._clock = clock
         self._checks = Periodic(_CHECK_S)
         self._checked: float | None = None  # time of the last check
-        self._pause_began, self._backlog_until = 0.0, float("-inf")  # start of the latest pause, and end of its backlog
+        # Start of the latest pause, and end of its backlog.
+        self._pause_began, self._backlog_until = 0.0, float("-inf")
 
     def start(self) -> None:
         """Start checking for pauses."""
@@ -75,18 +86,25 @@ class PauseDetector:
         self._checked = None
 
     def check(self) -> None:
-        """Record the pause since the last check, if there was one; a pause during a backlog extends the backlog."""
+        """Record the pause since the last check, if there was one; a pause during a backlog
+        extends the backlog.
+        """
         now = self._clock()
         if self._checked is not None and (lasted_s := now - self._checked) > _PAUSE_S:
             if self._checked < self._backlog_until:
                 self._backlog_until += lasted_s
             else:
                 least_s, most_s = _BACKLOG_S
-                self._pause_began, self._backlog_until = self._checked, now + max(least_s, min(most_s, lasted_s / 2))
+                self._pause_began, self._backlog_until = (
+                    self._checked,
+                    now + max(least_s, min(most_s, lasted_s / 2)),
+                )
         self._checked = now
 
     def waited_s(self) -> float:
-        """Return how long a request that was just read may have waited, s: 0 unless there was a pause."""
+        """Return how long a request that was just read may have waited, s: 0 unless there was a
+        pause.
+        """
         if self._checked is None:
             return 0.0
         now = self._clock()

@@ -25,7 +25,8 @@ from vlagents_ray.validation import check_action
 
 logger = logging.getLogger(__name__)
 
-_LIBRARIES = (str(Path(__file__).parents[2]), sysconfig.get_path("stdlib"))  # of this package and Python's library
+# Of this package and Python's library.
+_LIBRARIES = (str(Path(__file__).parents[2]), sysconfig.get_path("stdlib"))
 
 
 def build_reply(
@@ -42,10 +43,12 @@ def build_reply(
         result: The policy's result, or the error that it raised.
         contract: The policy's contract, if it has one; the action is checked against it.
         limit: Maximum size of action and info together, bytes.
-        policy: Version of the weights that acted, for the info, unless the policy itself names one (as a proxy does).
+        policy: Version of the weights that acted, for the info, unless the policy itself names one
+            (as a proxy does).
 
     Returns:
-        The reply; it has an error if the policy raised one, or if its result is invalid or too large.
+        The reply; it has an error if the policy raised one, or if its result is invalid or too
+        large.
     """
     request_id = pending.request.request_id
     try:
@@ -53,14 +56,17 @@ def build_reply(
             raise result
         if not isinstance(result, Act):
             raise PolicyFailed(f"act: the policy returned {type(result).__name__}, want an Act")
-        if (size := getattr(result.action, "nbytes", 0)) > limit:  # before the action is copied and checked
+        # Before the action is copied and checked.
+        if (size := getattr(result.action, "nbytes", 0)) > limit:
             raise PolicyFailed(_too_large("action", size, limit))
         act = Act(check_action(result.action, contract), bool(result.done), result.info)
-        if act.action.nbytes > limit:  # the policy may return a list of numbers, which has no `nbytes`
+        # The policy may return a list of numbers, which has no `nbytes`.
+        if act.action.nbytes > limit:
             raise PolicyFailed(_too_large("action", act.action.nbytes, limit))
         if act.info:
             require_serializable(act.info, limit - act.action.nbytes)
-        act.info = {**policy, **(act.info or {})}  # the result's own info takes precedence; it may be None
+        # The result's own info takes precedence; it may be None.
+        act.info = {**policy, **(act.info or {})}
     except Exception as error:  # noqa: BLE001 - becomes the reply
         return Reply(request_id, error=public_error(error, pending))
     session.steps += 1
@@ -78,17 +84,25 @@ def public_error(error: Exception, pending: PendingRequest) -> VLAgentsError:
         raise KeyboardInterrupt from error
     request = pending.request
     logger.error(
-        "%s failed (session %s, request %s)", request.op, pending.session_id, request.request_id, exc_info=error
+        "%s failed (session %s, request %s)",
+        request.op,
+        pending.session_id,
+        request.request_id,
+        exc_info=error,
     )
     if request.request_id:
         details = f"the server's log has the details under request id {request.request_id}"
     else:
         details = "its process wrote the traceback to stderr"
-    return PolicyFailed(f"{request.op}: the policy raised {type(error).__name__}{raised_at(error)}; {details}")
+    return PolicyFailed(
+        f"{request.op}: the policy raised {type(error).__name__}{raised_at(error)}; {details}"
+    )
 
 
 def raised_at(error: Exception) -> str:
-    """Return the line of the user's own code that raised an error, " (my_policy.py:12)"; "" if there is none."""
+    """Return the line of the user's own code that raised an error, " (my_policy.py:12)"; "" if
+    there is none.
+    """
     for frame in reversed(traceback.extract_tb(error.__traceback__)):
         if not frame.filename.startswith(_LIBRARIES) and "site-packages" not in frame.filename:
             return f" ({Path(frame.filename).name}:{frame.lineno})"
@@ -96,15 +110,18 @@ def raised_at(error: Exception) -> str:
 
 
 def timing(pending: PendingRequest, began: float, ended: float) -> dict[str, Any]:
-    """Return how long a request waited for the policy's call, from `began` to `ended`, s, and how long it took, ms."""
+    """Return how long a request waited for the policy's call, from `began` to `ended`, s, and
+    how long it took, ms.
+    """
     return {"queue_ms": (began - pending.arrived) * 1e3, "inference_ms": (ended - began) * 1e3}
 
 
 def require_serializable(info: dict[str, Any], limit: int = DEFAULT_LIMITS.reply_bytes) -> None:
-    """Check that the info of a reply can be sent, so that an invalid one fails only the session's own request.
+    """Check that the info of a reply can be sent, so that an invalid one fails only the session's
+    own request.
 
-    Arrays are not copied. An info of more than `limit` bytes, or of more values than the client accepts, is refused,
-    since sending it would delay other replies.
+    Arrays are not copied. An info of more than `limit` bytes, or of more values than the client
+    accepts, is refused, since sending it would delay other replies.
 
     Raises:
         PolicyFailed: The info cannot be encoded, or is too large.
@@ -124,10 +141,14 @@ class _BoundedWriter(ValueWriter):
         self._bytes = self._values = self._depth = 0
 
     def value(self, value: Any) -> Any:
-        """Encode a value as `ValueWriter` does; raise `MessageTooLarge` before copying one over the limits."""
+        """Encode a value as `ValueWriter` does; raise `MessageTooLarge` before copying one over
+        the limits.
+        """
         self._values += 1
         if self._values > DEFAULT_LIMITS.items:
-            raise MessageTooLarge(f"info: more than {DEFAULT_LIMITS.items} values; send arrays instead of lists")
+            raise MessageTooLarge(
+                f"info: more than {DEFAULT_LIMITS.items} values; send arrays instead of lists"
+            )
         if value is None or isinstance(value, (int, float)):
             return value  # checked first: the abstract classes below take five times as long
         if isinstance(value, (np.ndarray, memoryview)):
@@ -136,7 +157,9 @@ class _BoundedWriter(ValueWriter):
             self._bytes += len(value)
         elif isinstance(value, (Mapping, Sequence)):
             if self._depth >= DEFAULT_LIMITS.depth:
-                raise MessageTooLarge(f"info: nested deeper than {DEFAULT_LIMITS.depth}; flatten it")
+                raise MessageTooLarge(
+                    f"info: nested deeper than {DEFAULT_LIMITS.depth}; flatten it"
+                )
             self._depth += 1
             written = super().value(value)
             self._depth -= 1

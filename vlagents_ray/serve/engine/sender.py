@@ -21,20 +21,23 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 
-REFUSALS = 8  # number of consecutive messages over the rate of the key after which a connection ends
+# Number of consecutive messages over the rate of the key after which a connection ends.
+REFUSALS = 8
 REFUSED = f"over the rate of its key {REFUSALS} times in a row; send less, or raise the rate"
 
 
 class Sender:
-    """Submits the requests of a connection, whose end also ends its sessions, or of a caller without a connection.
+    """Submits the requests of a connection, whose end also ends its sessions, or of a caller
+    without a connection.
 
-    A request names its session; if it does not, it is for `session_id`, the sender's own session. If the server has API
-    keys, a caller cannot reach sessions of other keys: the key's name is part of the session ids in the engine.
+    A request names its session; if it does not, it is for `session_id`, the sender's own session.
+    If the server has API keys, a caller cannot reach sessions of other keys: the key's name is part
+    of the session ids in the engine.
 
-    Each message is charged to the key before it is parsed, and each further request in it before it is submitted. The
-    charge for HTTP is made by the guard on arrival, then by the `admission`; for frames, by the `admission` alone; for
-    the compact form of shared memory, by `count_message`, then by `send`; for batches of a dialect, by the `admission`
-    of its gate, then by `count`.
+    Each message is charged to the key before it is parsed, and each further request in it before it
+    is submitted. The charge for HTTP is made by the guard on arrival, then by the `admission`; for
+    frames, by the `admission` alone; for the compact form of shared memory, by `count_message`,
+    then by `send`; for batches of a dialect, by the `admission` of its gate, then by `count`.
     """
 
     def __init__(
@@ -51,66 +54,93 @@ class Sender:
 
         Args:
             session_id: Name of the sender's own session; a random one by default.
-            caller: The authenticated caller, or the reason why none is needed. It has no default, so that an endpoint
-                without authentication fails.
+            caller: The authenticated caller, or the reason why none is needed. It has no default,
+                so that an endpoint without authentication fails.
             connected: Whether the sender has a connection, whose end also ends its sessions.
-            counted: Whether the first request of each message was charged to the key on arrival, as it is by default
-                for senders without a connection. Further requests of messages without an admission are charged by
-                `count`.
+            counted: Whether the first request of each message was charged to the key on arrival, as
+                it is by default for senders without a connection. Further requests of messages
+                without an admission are charged by `count`.
 
         Raises:
             TypeError: `caller` is neither a `Caller` nor a `NoKey`.
         """
         if not isinstance(caller, Caller | NoKey):
-            raise TypeError(f"caller: got {caller!r}, want a Caller, or a NoKey where none is asked for")
+            raise TypeError(
+                f"caller: got {caller!r}, want a Caller, or a NoKey where none is asked for"
+            )
         self._engine = engine
         self._session_id = session_id or uuid.uuid4().hex
         self._counted = not connected if counted is None else counted
-        self._asked_to_reconnect = False  # whether the client has to reconnect, so that its sessions move
+        # Whether the client has to reconnect, so that its sessions move.
+        self._asked_to_reconnect = False
         self._caller = caller if isinstance(caller, Caller) else None
         self.rated = self._caller is not None  # whether its key may be over a rate
-        self._paid = False  # whether a message without an admission, and with it its first request, was counted
+        # Whether a message without an admission, and with it its first request, was counted.
+        self._paid = False
         self._refused = 0  # number of consecutive refused messages
-        self._prefix = f"{caller.name}/" if isinstance(caller, Caller) else ""  # prefix of the sender's session ids
-        self.session_id = self._prefix + self._session_id  # id of the sender's own session in the engine
+        # Prefix of the sender's session ids.
+        self._prefix = f"{caller.name}/" if isinstance(caller, Caller) else ""
+        # Id of the sender's own session in the engine.
+        self.session_id = self._prefix + self._session_id
         owner = uuid.uuid4().hex if connected else ""
-        self._origin = Origin(transport, owner, self.session_id, self._caller, self._prefix, opened=engine.clock())
+        self._origin = Origin(
+            transport, owner, self.session_id, self._caller, self._prefix, opened=engine.clock()
+        )
 
     def message(self, op: str = "unknown", rank: str = "robot") -> Message:
         """Return a message that has just arrived from the sender, see `Message`."""
         return Message(self._engine.stats, self._origin.transport, op, rank)
 
     def admission(self, limits: Limits, size: int = 0, rank: str = "robot") -> MessageAdmission:
-        """Return the admission of a message of `size` bytes, which charges its requests to the key; see `counted`."""
+        """Return the admission of a message of `size` bytes, which charges its requests to the
+        key; see `counted`.
+        """
         robot, caller, counted = rank != "simulation", self._caller, self._counted
         keep = self._engine.observers.any
         if caller is None:
-            return MessageAdmission(self._engine.admission, limits, None, size, robot=robot, keep_files=keep)
+            return MessageAdmission(
+                self._engine.admission, limits, None, size, robot=robot, keep_files=keep
+            )
 
         def admit(op: object) -> bool:
             nonlocal counted
             free, counted = counted, False
-            return self._count_message(caller) if op == "message" and not free else self._count(caller, op, free)
+            return (
+                self._count_message(caller)
+                if op == "message" and not free
+                else self._count(caller, op, free)
+            )
 
         return MessageAdmission(
-            self._engine.admission, limits, admit, size, robot=robot, keep_files=keep, key=caller.name
+            self._engine.admission,
+            limits,
+            admit,
+            size,
+            robot=robot,
+            keep_files=keep,
+            key=caller.name,
         )
 
     def count(self, requests: int) -> None:
-        """Charge requests to the key before they are sent; raise `TooManyRequests` over its rate."""
+        """Charge requests to the key before they are sent; raise `TooManyRequests` over its
+        rate.
+        """
         if self._caller is not None:
             for _ in range(requests):
                 self._count(self._caller, "act", counted=False)
 
     def count_message(self) -> None:
-        """Charge a message without an admission to the key before it is parsed; raise `TooManyRequests`."""
+        """Charge a message without an admission to the key before it is parsed; raise
+        `TooManyRequests`.
+        """
         if self._caller is not None:
             self._paid = False
             self._count_message(self._caller)
             self._paid = True
 
     def throttled_s(self) -> float:
-        """Return for how long the server must not read from the sender, s; 0 if the key is within its rate.
+        """Return for how long the server must not read from the sender, s; 0 if the key is within
+        its rate.
 
         The pause slows down senders of a key whose messages are refused in any case.
         """
@@ -123,7 +153,9 @@ class Sender:
 
     @property
     def refused_too_often(self) -> bool:
-        """Return whether so many consecutive messages were refused that the connection has to end."""
+        """Return whether so many consecutive messages were refused that the connection has to
+        end.
+        """
         return self._refused >= REFUSALS
 
     def send(
@@ -138,9 +170,11 @@ class Sender:
         """Submit the requests of a message.
 
         Args:
-            then: Called with the message when all its answers have arrived, on the thread of the last one.
+            then: Called with the message when all its answers have arrived, on the thread of the
+                last one.
             admission: Admission of the message, which has already charged the requests to the key.
-            waited_s: Time that the message waited before it was read, s, which counts towards the deadlines.
+            waited_s: Time that the message waited before it was read, s, which counts towards the
+                deadlines.
         """
         engine, now, (requests, refused) = self._engine, self._engine.clock(), decoded
         watched = engine.observers.any
@@ -151,10 +185,15 @@ class Sender:
             if admission is not None:
                 admission.grow(size)
             elif requests:
-                is_robot = requests[0].rank == "robot" and (self._caller is None or self._caller.rank != "simulation")
+                is_robot = requests[0].rank == "robot" and (
+                    self._caller is None or self._caller.rank != "simulation"
+                )
                 engine.admission.hold(size, is_robot, 0)
-                # Also released if the requests are dropped without an answer, as those of an ended connection.
-                engine.admission.messages[weakref.ref(message, engine.admission.release_with)] = size
+                # Also released if the requests are dropped without an answer, as those of an ended
+                # connection.
+                engine.admission.messages[weakref.ref(message, engine.admission.release_with)] = (
+                    size
+                )
         except VLAgentsError as error:
             overloaded = error
         answered = partial(self._answered, then, admission, sent if watched else ())
@@ -186,13 +225,18 @@ class Sender:
         elif self._caller is None:
             engine.submit(sent)
         else:
-            engine.submit(self._admitted(self._caller, sent, admission is not None or self._counted))
+            engine.submit(
+                self._admitted(self._caller, sent, admission is not None or self._counted)
+            )
         for place, reply in refused.items():
             message.put(place, reply)
         return sent
 
-    def _admitted(self, caller: Caller, requests: list[PendingRequest], counted: bool) -> list[PendingRequest]:
-        """Return the requests that the caller's key allows, with its class; the others are finished with their errors.
+    def _admitted(
+        self, caller: Caller, requests: list[PendingRequest], counted: bool
+    ) -> list[PendingRequest]:
+        """Return the requests that the caller's key allows, with its class; the others are finished
+        with their errors.
 
         The guard of the HTTP server has already counted the first request of a message.
         """
@@ -222,7 +266,8 @@ class Sender:
             self._asked_to_reconnect = True
         if self._asked_to_reconnect or self._engine.draining:
             for reply in message.replies:
-                reply.draining = True  # the client reconnects, and its sessions move to another replica
+                # The client reconnects, and its sessions move to another replica.
+                reply.draining = True
         if admission is not None:
             admission.release()
         observers = self._engine.observers
@@ -232,17 +277,24 @@ class Sender:
         for pending in watched:
             observers.on_answer(pending, message.replies[pending.place])
 
-    async def ask(self, message: Message, decoded: Decoded, admission: MessageAdmission | None = None) -> list[Reply]:
+    async def ask(
+        self, message: Message, decoded: Decoded, admission: MessageAdmission | None = None
+    ) -> list[Reply]:
         """Submit the requests of a message, and wait for the replies until the requests' deadlines.
 
-        If a pause of the process delayed a request, the delay counts towards its deadline. When the caller stops
-        waiting (deadline, disconnect), its requests that no batch has taken are withdrawn.
+        If a pause of the process delayed a request, the delay counts towards its deadline. When the
+        caller stops waiting (deadline, disconnect), its requests that no batch has taken are
+        withdrawn.
         """
         loop = asyncio.get_running_loop()
         future: asyncio.Future[list[Reply]] = loop.create_future()
         waited_s = self._engine.pauses.waited_s()
         sent = self.send(
-            message, decoded, lambda done: settle(future, done.replies), admission=admission, waited_s=waited_s
+            message,
+            decoded,
+            lambda done: settle(future, done.replies),
+            admission=admission,
+            waited_s=waited_s,
         )
         timer = None
         if sent and all(request.deadline_ms is not None for request in decoded.requests):
@@ -257,30 +309,37 @@ class Sender:
                 timer.cancel()
 
     def _expire(self, message: Message, sent: Sequence[PendingRequest]) -> None:
-        """Answer the unanswered requests, whose deadlines have passed; withdraw those that have not begun."""
+        """Answer the unanswered requests, whose deadlines have passed; withdraw those that have
+        not begun.
+        """
         self._engine.withdraw(*sent)
         for pending in sent:
             after = f"no action within {pending.request.deadline_ms:g} ms"
             late: VLAgentsError = DeadlineExceeded(f"{after}: not acted on, and never will be")
             if pending.begun:
                 late = OutcomeUnknown(f"{after}, but the policy is at work on it")
-            pending.done(Reply(pending.request.request_id, error=late))  # ignored if the request has been answered
+            # Ignored if the request has been answered.
+            pending.done(Reply(pending.request.request_id, error=late))
 
     def release(self, *, for_good: bool = False) -> None:
         """End the sessions of a closed connection, unless its client has to reconnect elsewhere.
 
-        Its requests that no batch has taken are answered with an error, and are never executed or searched for.
+        Its requests that no batch has taken are answered with an error, and are never executed or
+        searched for.
 
-        The sessions of such a client are kept, for another replica to fetch. `for_good` ends them in any case, for
-        protocols without a request to reconnect.
+        The sessions of such a client are kept, for another replica to fetch. `for_good` ends them
+        in any case, for protocols without a request to reconnect.
         """
         self._origin.ended = True
         owner = self._origin.owner
         if owner and (for_good or not (self._asked_to_reconnect or self._engine.draining)):
-            self._engine.sessions.close_owned(owner, tuple(self._origin.sessions))  # a migrator's thread may add one
+            # A migrator's thread may add one.
+            self._engine.sessions.close_owned(owner, tuple(self._origin.sessions))
 
     def _count(self, caller: Caller, op: object, counted: bool) -> bool:
-        """Charge a request to the key unless it is `counted` or a close; return False if the key is for simulations."""
+        """Charge a request to the key unless it is `counted` or a close; return False if the key
+        is for simulations.
+        """
         caller.admit(free=counted or op == "close")
         return caller.rank != "simulation"
 

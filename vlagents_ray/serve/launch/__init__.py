@@ -1,1 +1,3 @@
-"""The start of a server: its Ray, HAProxy, ports and deployment file, and the check that it is ready."""
+"""The start of a server: its Ray, HAProxy, ports and deployment file, and the check that it is
+ready.
+"""

@@ -1,4 +1,6 @@
-"""Deployment files: Ray Serve's config files with the settings of this package under `args`, checked before a start."""
+"""Deployment files: Ray Serve's config files with the settings of this package under `args`,
+checked before a start.
+"""
 
 from __future__ import annotations
 
@@ -29,7 +31,8 @@ if TYPE_CHECKING:
     from ray.serve.schema import ServeDeploySchema
 
 IMPORT_PATH = "vlagents_ray.serve.app:build"
-_OUR_APP_KEYS = {"name", "route_prefix", "import_path", "args"}  # without those that Serve must apply
+# Without those that Serve must apply.
+_OUR_APP_KEYS = {"name", "route_prefix", "import_path", "args"}
 
 
 class HttpSettings(BaseModel, extra="allow"):
@@ -51,7 +54,9 @@ class Application(BaseModel, extra="allow"):
 
 
 class Deployment(BaseModel, extra="allow"):
-    """A deployment file: what this package reads of Serve's schema, which is read without importing Ray."""
+    """A deployment file: what this package reads of Serve's schema, which is read without
+    importing Ray.
+    """
 
     applications: list[Application] = Field(min_length=1)
     http_options: HttpSettings = HttpSettings()
@@ -62,19 +67,31 @@ class Deployment(BaseModel, extra="allow"):
         """Whether all applications are of this package, without settings that Serve must apply."""
         beside = self.model_extra or self.http_options.model_extra
         stated = [app.model_dump(exclude_defaults=True).keys() for app in self.applications]
-        return not beside and our_apps(self) == self.applications and all(keys <= _OUR_APP_KEYS for keys in stated)
+        return (
+            not beside
+            and our_apps(self) == self.applications
+            and all(keys <= _OUR_APP_KEYS for keys in stated)
+        )
 
     def for_serve(self) -> ServeDeploySchema:
-        """Return Serve's schema of the file; raises `ValidationError` if a setting of Serve is wrong."""
+        """Return Serve's schema of the file; raises `ValidationError` if a setting of Serve is
+        wrong.
+        """
         from ray.serve.schema import ServeDeploySchema  # takes a second
 
         return ServeDeploySchema.model_validate(self.model_dump(exclude_unset=True))
 
 
 def deployment(policy: str, *, step_follows: bool = False, **args: Any) -> Deployment:
-    """Return the deployment of one policy, as if read from a file by `read_deployment`; `args` are of `ServerArgs`."""
+    """Return the deployment of one policy, as if read from a file by `read_deployment`; `args`
+    are of `ServerArgs`.
+    """
     app = {"name": policy.rpartition(":")[2], "route_prefix": "/", "import_path": IMPORT_PATH}
-    return _checked({"applications": [app | {"args": {"policy": policy, **args}}]}, f"policy {policy!r}", step_follows)
+    return _checked(
+        {"applications": [app | {"args": {"policy": policy, **args}}]},
+        f"policy {policy!r}",
+        step_follows,
+    )
 
 
 def read_deployment(
@@ -85,8 +102,8 @@ def read_deployment(
     Args:
         source: A YAML file, or the name of a policy.
         overrides: The args of a policy that is given by its name.
-        step_follows: Whether `with_settings` sets `checkpoint_step` later, so that a checkpoint with `{step}` may lack
-            it.
+        step_follows: Whether `with_settings` sets `checkpoint_step` later, so that a checkpoint
+            with `{step}` may lack it.
 
     Raises:
         ConfigError: The file or a setting is invalid.
@@ -94,23 +111,33 @@ def read_deployment(
     path = Path(source)
     if path.suffix in (".yaml", ".yml"):
         if not path.is_file():
-            meant = did_you_mean(source, map(str, path.parent.glob("*.y*ml"))) or "; a checkout has deployments/"
+            meant = (
+                did_you_mean(source, map(str, path.parent.glob("*.y*ml")))
+                or "; a checkout has deployments/"
+            )
             raise ConfigError(f"deployment file {path.absolute()} does not exist{meant}")
         if overrides:
-            raise ConfigError(f"{source!r} holds the settings; edit it instead of giving {sorted(overrides)}")
+            raise ConfigError(
+                f"{source!r} holds the settings; edit it instead of giving {sorted(overrides)}"
+            )
         return _checked(read_yaml(path), source, step_follows)
     entry = find_entry("policies", source)
     if ":" not in source and entry is None:
         module = ".".join(path.parts).removesuffix(".py")
         if path.name and path.with_suffix(".py").is_file():
-            raise UnknownPolicy(f"policy: expected a class, such as '{module}:MyPolicy', got the module {source!r}")
+            raise UnknownPolicy(
+                f"policy: expected a class, such as '{module}:MyPolicy', got the module {source!r}"
+            )
         if "/" in source:
             raise UnknownPolicy(
-                f"policy: got {source!r}, want a policy or a deployment file; for a checkpoint, give the file of its "
+                f"policy: got {source!r}, want a policy or a deployment file; for a checkpoint, "
+                "give the file of its "
                 f"family, as in deployments/lerobot.yaml --set checkpoint={source}"
             )
         if path.is_dir():
-            raise UnknownPolicy(f"policy: expected a policy or a deployment file (.yaml), got the folder {source!r}")
+            raise UnknownPolicy(
+                f"policy: expected a policy or a deployment file (.yaml), got the folder {source!r}"
+            )
         policy_class(source)  # raises an error with the list of choices
     args = dict(overrides or {})
     if entry is not None and entry.weights and "checkpoint" not in args.get("config", {}):
@@ -119,7 +146,9 @@ def read_deployment(
 
 
 def _settings_of_checkout(policy: str) -> dict[str, Any]:
-    """Return the settings in the deployment file of a checkout that has this policy's weights; empty without one."""
+    """Return the settings in the deployment file of a checkout that has this policy's weights;
+    empty without one.
+    """
     for folder in (Path(), Path(vlagents_ray.__file__).parents[1]):
         file = folder / "deployments" / f"{policy}.yaml"
         if file.is_file():
@@ -129,17 +158,23 @@ def _settings_of_checkout(policy: str) -> dict[str, Any]:
 
 
 def policy_application(source: str, app: str | None = None) -> Application:
-    """Return one application of a deployment that serves a policy: the one named `app`, or the only one."""
+    """Return one application of a deployment that serves a policy: the one named `app`, or the
+    only one.
+    """
     ours: dict[str, Application] = {one.name: one for one in our_apps(read_deployment(source))}
     if app is None and len(ours) == 1:
         [app] = ours
     if app not in ours:
-        raise ConfigError(f"{source}: holds the policies {sorted(ours)}, got {app!r}; name one of them as the app")
+        raise ConfigError(
+            f"{source}: holds the policies {sorted(ours)}, got {app!r}; name one of them as the app"
+        )
     return ours[app]
 
 
 def with_gateways_at(config: Deployment, host: str) -> Deployment:
-    """Return the deployment, with `host` as the default host of dialects that have their own port."""
+    """Return the deployment, with `host` as the default host of dialects that have their own
+    port.
+    """
     changed = config.model_copy(deep=True)
     for app in our_apps(changed):
         for name in ServerArgs(**app.args).dialects.gateways():
@@ -148,10 +183,15 @@ def with_gateways_at(config: Deployment, host: str) -> Deployment:
 
 
 def with_dialect(config: Deployment, name: str, settings: Mapping[str, Any]) -> Deployment:
-    """Return the deployment of one application, with these settings of a dialect in place of the file's."""
+    """Return the deployment of one application, with these settings of a dialect in place of the
+    file's.
+    """
     changed = config.model_copy(deep=True)
     if len(our_apps(changed)) != 1:
-        raise ConfigError(f"--{name}-port: the file holds {len(our_apps(changed))} policies, want one; write it there")
+        raise ConfigError(
+            f"--{name}-port: the file holds {len(our_apps(changed))} policies, want one; write it "
+            "there"
+        )
     args = our_apps(changed)[0].args
     dialects = args.setdefault("dialects", {})
     dialects[name] = {**(dialects.get(name) or {}), **settings}
@@ -160,15 +200,20 @@ def with_dialect(config: Deployment, name: str, settings: Mapping[str, Any]) -> 
 
 
 def only_application(name: str, part: Deployment) -> Application:
-    """Return the application of a deployment for the policy `name`; raises `ConfigError` if it holds several."""
+    """Return the application of a deployment for the policy `name`; raises `ConfigError` if it
+    holds several.
+    """
     if len(part.applications) != 1:
         found = [one.name for one in part.applications]
-        raise ConfigError(f"{name}: holds {found}, want one application; serve it and give the URL of one of them")
+        raise ConfigError(
+            f"{name}: holds {found}, want one application; serve it and give the URL of one of them"
+        )
     return part.applications[0]
 
 
 def together(policies: Mapping[str, Deployment]) -> Deployment:
-    """Join several policies into one deployment, each as an application under its name, without dialects.
+    """Join several policies into one deployment, each as an application under its name, without
+    dialects.
 
     Raises:
         ConfigError: A part contains more than one application.
@@ -182,7 +227,11 @@ def together(policies: Mapping[str, Deployment]) -> Deployment:
 
 
 def with_settings(
-    config: Deployment, settings: Mapping[str, Any], *, steps: bool = False, step_follows: bool = False
+    config: Deployment,
+    settings: Mapping[str, Any],
+    *,
+    steps: bool = False,
+    step_follows: bool = False,
 ) -> Deployment:
     """Return the deployment, with these settings of its policies in place of the file's.
 
@@ -198,7 +247,8 @@ def with_settings(
 
 
 def with_replicas_on(config: Deployment, gpus: float) -> Deployment:
-    """Return the deployment with as many replicas as fit on `gpus`, each on one unless the file states another number.
+    """Return the deployment with as many replicas as fit on `gpus`, each on one unless the file
+    states another number.
 
     A policy is not changed if its file states the number of replicas, autoscaling, or zero GPUs.
     """
@@ -212,8 +262,12 @@ def with_replicas_on(config: Deployment, gpus: float) -> Deployment:
 
 
 def own_settings(app: Application) -> dict[str, Any]:
-    """Return the policy's settings: `config`, and `user_config`, which may change while the policy runs."""
-    beside = next((one.get("user_config") for one in app.deployments if one.get("name") == POLICY), None)
+    """Return the policy's settings: `config`, and `user_config`, which may change while the
+    policy runs.
+    """
+    beside = next(
+        (one.get("user_config") for one in app.deployments if one.get("name") == POLICY), None
+    )
     return {**app.args.get("config", {}), **(beside or {})}
 
 
@@ -221,13 +275,16 @@ def stated_contract(config: Deployment) -> Contract | None:
     """Return the contract of a deployment's policy, without loading the policy.
 
     Returns:
-        The contract; None if the policy has none before it is loaded, cannot be built here, or is one of several.
+        The contract; None if the policy has none before it is loaded, cannot be built here, or is
+        one of several.
     """
     app, *others = config.applications
     if others or app.import_path != IMPORT_PATH or app.runtime_env:
         return None
     args = ServerArgs(**app.args)
-    offered = args.checkpoints.of(partial(build_agent, args.policy, wrappers=args.wrappers), own_settings(app))
+    offered = args.checkpoints.of(
+        partial(build_agent, args.policy, wrappers=args.wrappers), own_settings(app)
+    )
     return _contract(args, offered, offered.settings(DEFAULT, offered.config))
 
 
@@ -237,7 +294,9 @@ def our_apps(config: Deployment) -> list[Application]:
 
 
 def _checked(document: object, source: str, step_follows: bool = False) -> Deployment:
-    """Return the document, with the `args` of this package and the settings of Serve checked before anything starts."""
+    """Return the document, with the `args` of this package and the settings of Serve checked
+    before anything starts.
+    """
     try:
         config = Deployment.model_validate(document)
         if not config.plain or len(config.applications) > 1:
@@ -249,7 +308,9 @@ def _checked(document: object, source: str, step_follows: bool = False) -> Deplo
         for app in config.applications:
             meant = did_you_mean(app.import_path, [IMPORT_PATH])
             if app.import_path != IMPORT_PATH and meant:
-                raise ConfigError(f"{source}: {app.name}: import_path: got {app.import_path!r}{meant}")
+                raise ConfigError(
+                    f"{source}: {app.name}: import_path: got {app.import_path!r}{meant}"
+                )
         for app in our_apps(config):
             args = ServerArgs(**app.args)
             # Relative paths refer to this process's folder, so Ray gets absolute ones.
@@ -257,18 +318,23 @@ def _checked(document: object, source: str, step_follows: bool = False) -> Deplo
                 app.args["environment"] = args.environment.model_dump(exclude_unset=True)
             if "parts" in app.args:
                 app.args["parts"] = args.parts.model_dump(exclude_unset=True)
-            _require_policy(args, own_settings(app), installed=not app.runtime_env, step_follows=step_follows)
+            _require_policy(
+                args, own_settings(app), installed=not app.runtime_env, step_follows=step_follows
+            )
     except ValidationError as error:
         model = ServerArgs if error.title == ServerArgs.__name__ else Deployment
         raise ConfigError(f"{source}: {wrong_settings(error, model)}") from error
     return config
 
 
-def _require_policy(args: ServerArgs, own: dict[str, Any], *, installed: bool, step_follows: bool) -> None:
-    """Build the policy in its environment, with each kind of settings, and check that the dialects fit its contract.
+def _require_policy(
+    args: ServerArgs, own: dict[str, Any], *, installed: bool, step_follows: bool
+) -> None:
+    """Build the policy in its environment, with each kind of settings, and check that the dialects
+    fit its contract.
 
-    A replica repeats the check. If the policy's packages are not `installed` here, the application's `runtime_env` adds
-    them. With `step_follows`, a missing step is set later.
+    A replica repeats the check. If the policy's packages are not `installed` here, the
+    application's `runtime_env` adds them. With `step_follows`, a missing step is set later.
     """
     if not installed:
         if args.environment.python is None:
@@ -286,7 +352,9 @@ def _require_policy(args: ServerArgs, own: dict[str, Any], *, installed: bool, s
 
 
 def _contract(args: ServerArgs, offered: Checkpoints, settings: dict[str, Any]) -> Contract | None:
-    """Build the policy in its environment with these settings, and return its contract, if it has one already."""
+    """Build the policy in its environment with these settings, and return its contract, if it
+    has one already.
+    """
     if args.environment.python is not None:
         return check_policy(args.environment, args.policy, settings, args.wrappers)
     return unloaded_contract(offered.make(settings))

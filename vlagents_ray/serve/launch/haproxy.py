@@ -1,7 +1,8 @@
-"""HAProxy in front of a server's replicas, with files and ports that no other server on the machine uses; its TLS.
+"""HAProxy in front of a server's replicas, with files and ports that no other server on the machine
+uses; its TLS.
 
-`python -m vlagents_ray.serve.launch.haproxy FOLDER`, which cluster/ray/environment.sh calls, writes the script that
-starts HAProxy on a cluster.
+`python -m vlagents_ray.serve.launch.haproxy FOLDER`, which cluster/ray/environment.sh calls, writes
+the script that starts HAProxy on a cluster.
 """
 
 from __future__ import annotations
@@ -39,31 +40,34 @@ _CIPHERS = "ECDHE+AESGCM:ECDHE+CHACHA20"  # for TLS 1.2: with forward secrecy, w
 _REPLICA_PORTS = 200  # size of the block of ports at which the replicas of one server listen
 _CONNECTIONS = 16384  # maximum number of connections, if the process may open that many
 _CONNECTIONS_PER_ADDRESS = 1000  # below a quarter of Serve's own maximum of 4096
-# Each connection of a client needs two descriptors, and one more for each where a listener is in front of Serve's port.
+# Each connection of a client needs two descriptors, and one more for each where a listener is in
+# front of Serve's port.
 _DESCRIPTORS_PER_CONNECTION = 4
 _LIMIT_PER_ADDRESS = (
     "    stick-table type ipv6 size 100k expire 1m store conn_cur",
     "    tcp-request connection track-sc0 src",
     f"    tcp-request connection reject if {{ sc0_conn_cur gt {_CONNECTIONS_PER_ADDRESS} }}",
 )
-# HAProxy's settings on every Serve cluster that robots connect to. The files in cluster/ contain the same settings,
-# for clusters that are started in another way.
+# HAProxy's settings on every Serve cluster that robots connect to. The files in cluster/ contain
+# the same settings, for clusters that are started in another way.
 ROBOTS = {
     "RAY_SERVE_ENABLE_HA_PROXY": "1",
-    # A session stays on its replica (by the header that the Python proxy's router also hashes), and a replica that
-    # joins or leaves affects only its own share of the sessions. Headers have a time limit; the replica limits the
-    # silence of a WebSocket. Serve copies the value into HAProxy's settings, so it may contain further lines.
+    # A session stays on its replica (by the header that the Python proxy's router also hashes), and
+    # a replica that joins or leaves affects only its own share of the sessions. Headers have a time
+    # limit; the replica limits the silence of a WebSocket. Serve copies the value into HAProxy's
+    # settings, so it may contain further lines.
     _BALANCE: "hdr(x-session-id)\n    hash-type consistent sdbm avalanche\n"
     "    timeout http-request 5s\n    timeout tunnel 24h\n",
     "RAY_SERVE_HAPROXY_TIMEOUT_CLIENT_S": "60",  # maximum pause of a client within a request
-    # When replicas change, a new HAProxy takes over and the old one keeps its connections: for a day instead of two
-    # minutes, after which it would close every robot's WebSocket.
+    # When replicas change, a new HAProxy takes over and the old one keeps its connections: for a
+    # day instead of two minutes, after which it would close every robot's WebSocket.
     "RAY_SERVE_HAPROXY_HARD_STOP_AFTER_S": "86400",
-    # Period of the health check of HAProxy and its actor; after three failures Serve restarts them, in about 2 s.
+    # Period of the health check of HAProxy and its actor; after three failures Serve restarts them,
+    # in about 2 s.
     "RAY_SERVE_PROXY_HEALTH_CHECK_PERIOD_S": "0.5",
-    # A replica that does not reply within 1 s, three times in a row, gets no new connections and sessions: within 5 s
-    # after it froze, when its clients reconnect (`vlagents_ray.client.connection.SILENT_S`). Serve's defaults take 15
-    # s.
+    # A replica that does not reply within 1 s, three times in a row, gets no new connections and
+    # sessions: within 5 s after it froze, when its clients reconnect
+    # (`vlagents_ray.client.connection.SILENT_S`). Serve's defaults take 15 s.
     _CHECK_INTERVAL: "1s",  # also the time limit of a reply
     _CHECK_FAILURES: "3",
     # HAProxy removes a leaving replica within a second; the default delays every stop by 30 s.
@@ -73,32 +77,43 @@ ROBOTS = {
 
 @dataclass(frozen=True, slots=True)
 class Tls:
-    """PEM files of a server; with `client_ca`, clients need a certificate signed by it (mutual TLS)."""
+    """PEM files of a server; with `client_ca`, clients need a certificate signed by it (mutual
+    TLS).
+    """
 
     certificate: Path
     key: Path
     client_ca: Path | None = None
 
     def check(self) -> None:
-        """Raise `ConfigError` if a file is missing or not valid PEM; call this before anything starts."""
+        """Raise `ConfigError` if a file is missing or not valid PEM; call this before anything
+        starts.
+        """
         context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
         try:
             context.load_cert_chain(self.certificate, self.key, password=_refuse_passwords)
         except (OSError, ValueError) as error:  # ssl.SSLError is an OSError
             raise ConfigError(
-                f"TLS: {self.certificate} and {self.key} are no certificate and its key without a password, "
+                f"TLS: {self.certificate} and {self.key} are no certificate and its key without a "
+                "password, "
                 f"both in PEM ({error})"
             ) from error
         try:
             if self.client_ca is not None:
                 context.load_verify_locations(self.client_ca)
         except OSError as error:
-            raise ConfigError(f"TLS: {self.client_ca} holds no certificates in PEM ({error})") from error
+            raise ConfigError(
+                f"TLS: {self.client_ca} holds no certificates in PEM ({error})"
+            ) from error
 
     def bundle(self, folder: Path) -> Path:
-        """Write certificate and key into one file for HAProxy, readable by its owner only, in a private `folder`."""
+        """Write certificate and key into one file for HAProxy, readable by its owner only, in a
+        private `folder`.
+        """
         file = folder / "tls.pem"
-        with os.fdopen(os.open(file, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600), "wb") as written:
+        with os.fdopen(
+            os.open(file, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600), "wb"
+        ) as written:
             written.write(self.certificate.read_bytes().rstrip() + b"\n" + self.key.read_bytes())
         return file
 
@@ -112,16 +127,18 @@ def _refuse_passwords() -> bytes:
 class PublicListener:
     """HAProxy's listener for clients, which forwards to Serve's own port on loopback.
 
-    Serve binds its replicas to the address at which HAProxy listens, so that other machines would reach them without
-    HAProxy and its encryption; and HAProxy connects to the replicas on its node at 127.0.0.1, regardless of that
-    address. Therefore everything runs on loopback, and only this listener is open to the network.
+    Serve binds its replicas to the address at which HAProxy listens, so that other machines would
+    reach them without HAProxy and its encryption; and HAProxy connects to the replicas on its node
+    at 127.0.0.1, regardless of that address. Therefore everything runs on loopback, and only this
+    listener is open to the network.
     """
 
     host: str
     port: int
     inside: int  # Serve's own port
     bundle: Path | None = None  # certificate and key; None if there is no encryption
-    client_ca: Path | None = None  # authority that signs the certificates of clients; None if clients need none
+    # Authority that signs the certificates of clients; None if clients need none.
+    client_ca: Path | None = None
 
     def settings(self) -> str:
         """Return a section of HAProxy's settings for this listener."""
@@ -130,21 +147,38 @@ class PublicListener:
             tls = f' ssl crt "{self.bundle}" ssl-min-ver TLSv1.2 ciphers {_CIPHERS} alpn http/1.1'
         if self.client_ca is not None:
             tls += f' ca-file "{self.client_ca}" verify required'
-        bind, server = f"bind {self.host}:{self.port}{tls}", f"server inside {LOOPBACK}:{self.inside}"
-        lines = ["listen outside", "    mode tcp", *_LIMIT_PER_ADDRESS, f"    {bind}", f"    {server}", ""]
+        bind, server = (
+            f"bind {self.host}:{self.port}{tls}",
+            f"server inside {LOOPBACK}:{self.inside}",
+        )
+        lines = [
+            "listen outside",
+            "    mode tcp",
+            *_LIMIT_PER_ADDRESS,
+            f"    {bind}",
+            f"    {server}",
+            "",
+        ]
         return "\n".join(lines)
 
     def require(self) -> None:
-        """Raise `ConfigError` if the environment, which the user may have set, lacks this listener's settings."""
-        if os.environ.get("RAY_SERVE_ENABLE_HA_PROXY") != "1" or self.settings() not in os.environ.get(_BALANCE, ""):
+        """Raise `ConfigError` if the environment, which the user may have set, lacks this
+        listener's settings.
+        """
+        if os.environ.get(
+            "RAY_SERVE_ENABLE_HA_PROXY"
+        ) != "1" or self.settings() not in os.environ.get(_BALANCE, ""):
             raise ConfigError(
-                f"host {self.host}: HAProxy as it is set up here cannot be told to let clients in there; "
+                f"host {self.host}: HAProxy as it is set up here cannot be told to let clients in "
+                "there; "
                 f"leave ray.init() and {_BALANCE} to this function"
             )
 
 
 def haproxy_binary() -> str | None:
-    """Return the HAProxy that the user names, that of `ray[serve]`'s package, or that on the PATH; None without any."""
+    """Return the HAProxy that the user names, that of `ray[serve]`'s package, or that on the
+    PATH; None without any.
+    """
     named = Path(os.environ.get(_BINARY) or "/")
     # The name may be that of another server's script, inherited by this process.
     ours = named.parent == Path(os.environ.get(MARK, "")) or (named.parent / _REFUSAL).exists()
@@ -162,14 +196,20 @@ def haproxy_binary() -> str | None:
             os.environ[_BINARY] = inherited
 
 
-def ingress_environment(folder: Path, binary: str, listener: PublicListener | None = None) -> dict[str, str]:
-    """Return the environment variables of a cluster whose ingress is this HAProxy, with files in `folder`."""
+def ingress_environment(
+    folder: Path, binary: str, listener: PublicListener | None = None
+) -> dict[str, str]:
+    """Return the environment variables of a cluster whose ingress is this HAProxy, with files in
+    `folder`.
+    """
     replicas = free_block(_REPLICA_PORTS)
     # On all addresses, as HAProxy's metrics and statistics listen on all.
     metrics, stats, fallback = (free_port(EVERYWHERE) for _ in range(3))
     return {
         **ROBOTS,
-        "RAY_SERVE_HTTP_PROXY_CALLBACK_IMPORT_PATH": "vlagents_ray.serve.endpoints.front:middlewares",
+        "RAY_SERVE_HTTP_PROXY_CALLBACK_IMPORT_PATH": (
+            "vlagents_ray.serve.endpoints.front:middlewares"
+        ),
         _BINARY: str(_launcher(folder, binary, limit_addresses=listener is None)),
         "RAY_SERVE_HAPROXY_METRICS_SOCKET_PATH": str(folder / "metrics"),
         "RAY_SERVE_HAPROXY_CONFIG_FILE_LOC": str(folder / "haproxy.cfg"),
@@ -188,31 +228,39 @@ def ingress_environment(folder: Path, binary: str, listener: PublicListener | No
 
 
 def _most_connections() -> int:
-    """Return the maximum number of connections; HAProxy does not start if it may not open enough descriptors."""
+    """Return the maximum number of connections; HAProxy does not start if it may not open enough
+    descriptors.
+    """
     _, most_descriptors = resource.getrlimit(resource.RLIMIT_NOFILE)
     if most_descriptors == resource.RLIM_INFINITY:
         return _CONNECTIONS
     return min(_CONNECTIONS, most_descriptors // _DESCRIPTORS_PER_CONNECTION)
 
 
-def _launcher(folder: Path, binary: str, *, alone: bool = True, limit_addresses: bool = True) -> Path:
-    """Write a script that starts HAProxy, with settings that Serve cannot express, and return its path.
+def _launcher(
+    folder: Path, binary: str, *, alone: bool = True, limit_addresses: bool = True
+) -> Path:
+    """Write a script that starts HAProxy, with settings that Serve cannot express, and return its
+    path.
 
-    If the server is `alone` on its Ray, metrics and statistics are on loopback, and the list of applications
-    (`/-/routes`) is hidden, in each of its encodings. `limit_addresses` is whether Serve's own port bounds the
-    connections of one address; a `PublicListener` in front of that port does it itself.
+    If the server is `alone` on its Ray, metrics and statistics are on loopback, and the list of
+    applications (`/-/routes`) is hidden, in each of its encodings. `limit_addresses` is whether
+    Serve's own port bounds the connections of one address; a `PublicListener` in front of that port
+    does it itself.
 
-    No WebSocket is compressed, since a replica would inflate a message before any limit applies. A handshake has no
-    body, as a replica would never answer it.
+    No WebSocket is compressed, since a replica would inflate a message before any limit applies. A
+    handshake has no body, as a replica would never answer it.
 
-    If the server is `alone`, its port is closed until the first replica runs: clients of other systems retry a refused
-    connection, but end at a refused handshake. `open_port` opens it at once.
+    If the server is `alone`, its port is closed until the first replica runs: clients of other
+    systems retry a refused connection, but end at a refused handshake. `open_port` opens it at
+    once.
 
-    If an application has no replica, Serve would hold its requests until there is one. Here they are held briefly, so
-    that an application scaled to zero starts a replica, and then get 503; WebSockets wait.
+    If an application has no replica, Serve would hold its requests until there is one. Here they
+    are held briefly, so that an application scaled to zero starts a replica, and then get 503;
+    WebSockets wait.
 
-    A session that has left an unresponsive replica does not return to it by its hash: it stays where it acts until
-    HAProxy is started again with other replicas.
+    A session that has left an unresponsive replica does not return to it by its hash: it stays
+    where it acts until HAProxy is started again with other replicas.
     """
     refusal = folder / _REFUSAL
     cause = NoReplica("no replica answers: the policy loads, or waits for resources; try again")
@@ -233,8 +281,17 @@ def _launcher(folder: Path, binary: str, *, alone: bool = True, limit_addresses:
     front = (
         *(_LIMIT_PER_ADDRESS if limit_addresses else ()),
         "    http-request del-header sec-websocket-extensions",
-        f"    http-request deny deny_status 400 if {is_handshake} {{ req.hdr_val(content-length) gt 0 }}",
-        f"    http-request deny deny_status 400 if {is_handshake} {{ req.hdr(transfer-encoding) -m found }}",
+        (
+            f"    http-request deny deny_status 400 if {is_handshake} {{ "
+            "req.hdr_val(content-length) "
+            f"gt 0 }}"
+        ),
+        (
+            f"    http-request deny deny_status 400 if {is_handshake} {{ "
+            "req.hdr(transfer-encoding) "
+            "-m "
+            f"found }}"
+        ),
     )
     front_lines = r"\n".join(front)
     changes = (
@@ -245,8 +302,15 @@ def _launcher(folder: Path, binary: str, *, alone: bool = True, limit_addresses:
         r"s/^backend .*$/&\n    acl replica_up always_false/",
         rf"s/^backend .*$/&\n    {wait} if {{ path_end \/healthz }}/",
         r"s/^    server (SERVE_REPLICA[^ ]*) .*$/    acl replica_up srv_is_up(\1)\n&/",
-        rf"s/^    server .* backup$/    {wait} if !replica_up !{{ hdr(upgrade) -m found }}\n& non-stick/",
-        r"s/^backend .*$/&\n    stick-table type string len 128 size 100k expire 1h\n    stick on hdr(x-session-id)/",
+        (
+            rf"s/^    server .* backup$/    {wait} if !replica_up !{{ hdr(upgrade) -m found }}\n& "
+            r"non-stick/"
+        ),
+        (
+            r"s/^backend .*$/&\n    stick-table type string len 128 size 100k expire 1h\n    stick "
+            r"on "
+            r"hdr(x-session-id)/"
+        ),
     )
     is_open = shlex.quote(str(folder / _OPEN))
     close_port = r"/^(frontend http_frontend|listen outside)$/,/^ *bind /s/^ *bind /    # &/"
@@ -273,18 +337,23 @@ def _launcher(folder: Path, binary: str, *, alone: bool = True, limit_addresses:
 
 
 def open_port(folder: Path) -> None:
-    """Open the port of a server without replicas from the start, such as one whose applications begin with none."""
+    """Open the port of a server without replicas from the start, such as one whose applications
+    begin with none.
+    """
     (folder / _OPEN).touch()
 
 
 def wait_for_haproxy(serve: Any, apps: Mapping[str, str], stats_port: int, deadline: float) -> None:
     """Wait until HAProxy forwards requests directly to every replica.
 
-    Before that, requests pass through Serve's Python proxy, as would a WebSocket that is opened then, until it ends.
+    Before that, requests pass through Serve's Python proxy, as would a WebSocket that is opened
+    then, until it ends.
     """
     while True:
         status = serve.status().applications
-        with urllib.request.urlopen(f"http://127.0.0.1:{stats_port}/stats;csv", timeout=5) as answer:
+        with urllib.request.urlopen(
+            f"http://127.0.0.1:{stats_port}/stats;csv", timeout=5
+        ) as answer:
             rows = list(csv.DictReader(answer.read().decode().removeprefix("# ").splitlines()))
         late = []
         for name in apps:

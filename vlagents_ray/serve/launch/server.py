@@ -1,7 +1,8 @@
-"""Start Ray and Serve here, or use a running cluster, and serve a deployment for the length of a context.
+"""Start Ray and Serve here, or use a running cluster, and serve a deployment for the length of a
+context.
 
-A server on its own Ray has HAProxy in front of its replicas if the binary is installed, with files and ports that no
-other server on the machine uses. Only HAProxy may listen on the network.
+A server on its own Ray has HAProxy in front of its replicas if the binary is installed, with files
+and ports that no other server on the machine uses. Only HAProxy may listen on the network.
 """
 
 from __future__ import annotations
@@ -42,17 +43,19 @@ from vlagents_ray.serve.ports import EVERYWHERE, HOST, LOOPBACK, free_port, is_f
 log = logging.getLogger(__name__)
 
 _SHUTDOWN_S = 30.0
-_PROXIES_S = 180.0  # time for Serve's proxies to listen; on a busy node, several are replaced before one does
+# Time for Serve's proxies to listen; on a busy node, several are replaced before one does.
+_PROXIES_S = 180.0
 _LOOK_S = 0.2  # interval of the checks which proxies Serve has
-_START_S, _GROW_S = 600.0, 3600.0  # time for a policy to become ready: here; on a cluster that may add a machine first
+# Time for a policy to become ready: here; on a cluster that may add a machine first.
+_START_S, _GROW_S = 600.0, 3600.0
 _REMIND_S = 30.0
 
 
 def wait_for_proxies(proxies: list[Any], look_again: Callable[[], list[Any]]) -> None:
     """Wait until each of the proxies listens; raise the error of a proxy that cannot listen.
 
-    Serve kills a proxy that does not start within some seconds, as on a busy node, and starts another one: `look_again`
-    returns the refs of the current ones.
+    Serve kills a proxy that does not start within some seconds, as on a busy node, and starts
+    another one: `look_again` returns the refs of the current ones.
     """
     deadline = time.monotonic() + _PROXIES_S
     while True:
@@ -60,7 +63,9 @@ def wait_for_proxies(proxies: list[Any], look_again: Callable[[], list[Any]]) ->
             ray.get(proxies, timeout=max(deadline - time.monotonic(), 0.0))
         except (ray.exceptions.GetTimeoutError, ray.exceptions.RayActorError) as error:
             if time.monotonic() >= deadline:
-                raise PolicyUnavailable(f"Serve's proxies do not listen within {_PROXIES_S:g} s") from error
+                raise PolicyUnavailable(
+                    f"Serve's proxies do not listen within {_PROXIES_S:g} s"
+                ) from error
             time.sleep(_LOOK_S)
             proxies = look_again()
         else:
@@ -68,13 +73,15 @@ def wait_for_proxies(proxies: list[Any], look_again: Callable[[], list[Any]]) ->
 
 
 def shut_down(client: Any) -> None:
-    """Shut Serve down like `serve.shutdown`, so that replicas drain and HAProxy stops, but without its error message.
+    """Shut Serve down like `serve.shutdown`, so that replicas drain and HAProxy stops, but without
+    its error message.
 
-    The controller ends itself during this call, which Ray would report as a failed task that will be retried. A signal
-    to the whole process group or service, such as systemd's SIGTERM, also ends Ray's head: then Serve can neither
-    answer nor continue, and the reaper ends its processes.
+    The controller ends itself during this call, which Ray would report as a failed task that will
+    be retried. A signal to the whole process group or service, such as systemd's SIGTERM, also ends
+    Ray's head: then Serve can neither answer nor continue, and the reaper ends its processes.
     """
-    for poll in private.long_polls(client):  # Ray would report a call in progress at the end as a failed task
+    # Ray would report a call in progress at the end as a failed task.
+    for poll in private.long_polls(client):
         poll.stop()
     client.shutdown_cached_handles()
     last = private.end_controller(client)
@@ -110,22 +117,24 @@ def running_server(
     tls: haproxy.Tls | None = None,
     ingress: bool = True,
 ) -> Iterator[Server]:
-    """Serve `config` for the length of the context, and stop on exit everything that was started here.
+    """Serve `config` for the length of the context, and stop on exit everything that was started
+    here.
 
     Args:
         config: The deployment.
-        host: The address to listen on, IPv4. Other than loopback addresses require `keys_file`, keys in the deployment,
-            or `insecure`.
+        host: The address to listen on, IPv4. Other than loopback addresses require `keys_file`,
+            keys in the deployment, or `insecure`.
         port: The port; 0 selects a free one.
-        address: A running Ray cluster, or "auto"; by default this process's cluster, or a new local one.
+        address: A running Ray cluster, or "auto"; by default this process's cluster, or a new local
+            one.
         num_cpus: Number of CPUs of a new local cluster.
         timeout_s: Time limit for the start; by default 600 s, with an `address` 3600 s.
         keys_file: Replaces `access.keys_file` of the applications.
         insecure: Whether other machines may connect without keys; replaces `access.insecure`.
         plain_http: Replaces `access.plain_http`.
         tls: The server's certificate and key.
-        ingress: Whether to serve HTTP. Without it, a new local cluster serves only its own processes, at `serve://APP`,
-            and starts and ends faster.
+        ingress: Whether to serve HTTP. Without it, a new local cluster serves only its own
+            processes, at `serve://APP`, and starts and ends faster.
 
     Raises:
         ConfigError: The deployment is invalid or fails.
@@ -133,7 +142,8 @@ def running_server(
     """
     if ":" in host:
         raise ConfigError(
-            f"host {host}: IPv6 is not supported; use an IPv4 address, or 0.0.0.0 for all of this machine"
+            f"host {host}: IPv6 is not supported; use an IPv4 address, or 0.0.0.0 for all of this "
+            "machine"
         )
     config = with_gateways_at(config, host)
     config = _access(config, keys_file, insecure, plain_http)
@@ -150,18 +160,22 @@ def running_server(
         ingress = ingress or not own or len(our_apps(config)) < len(config.applications)
         public = port or free_port(host)
         begins_empty = not all(map(_begins_with_replicas, config.applications))
-        http = stack.enter_context(_ray(address, host, public, tls, num_cpus, ingress, begins_empty))
+        http = stack.enter_context(
+            _ray(address, host, public, tls, num_cpus, ingress, begins_empty)
+        )
         location = "Disabled" if not ingress else "HeadOnly" if address is None else "EveryNode"
         client, proxies = private.start_serve(http, location)
         if running := sorted(serve.status().applications):
             raise ConfigError(
-                f"Serve runs {running} on this cluster already; use their URL (serve://{running[0]} inside the "
+                f"Serve runs {running} on this cluster already; use their URL "
+                f"(serve://{running[0]} inside the "
                 f"cluster), or `serve deploy` one file that holds those and yours"
             )
         stack.push(session.unless_lost(lambda: shut_down(client)))
         _require_gpus(config)
         deploy(client, config, own=own, ingress=ingress)
-        url = f"{'http' if tls is None else 'https'}://{LOOPBACK if host == EVERYWHERE else host}:{public}"
+        scheme = "http" if tls is None else "https"
+        url = f"{scheme}://{LOOPBACK if host == EVERYWHERE else host}:{public}"
         paths = {app.name: (app.route_prefix or "").rstrip("/") for app in config.applications}
         if timeout_s is None:
             timeout_s = _START_S if address is None else _GROW_S
@@ -172,14 +186,22 @@ def running_server(
         urls = {name: inside + path if ingress else None for name, path in paths.items()}
         wait_for_proxies(proxies, lambda: private.proxies_now(client))
         wait_until_ready(serve, urls, ours, deadline, functools.partial(_missing_gpus, config))
-        if ingress and address is None and (stats_port := os.environ.get("RAY_SERVE_HAPROXY_STATS_PORT")):
+        if (
+            ingress
+            and address is None
+            and (stats_port := os.environ.get("RAY_SERVE_HAPROXY_STATS_PORT"))
+        ):
             haproxy.wait_for_haproxy(serve, paths, int(stats_port), deadline)
         if own and ingress:
             session.announce(url, paths, ray.get_runtime_context().gcs_address)
-        yield Server(url, {name: url + path for name, path in paths.items()}, session.metrics_urls())
+        yield Server(
+            url, {name: url + path for name, path in paths.items()}, session.metrics_urls()
+        )
 
 
-def _access(config: Deployment, keys_file: Path | None, insecure: bool, plain_http: bool) -> Deployment:
+def _access(
+    config: Deployment, keys_file: Path | None, insecure: bool, plain_http: bool
+) -> Deployment:
     """Return the deployment with the access settings of the command line, if any."""
     if keys_file is not None and insecure:
         raise ConfigError("keys and insecure exclude each other; keep one")
@@ -187,7 +209,10 @@ def _access(config: Deployment, keys_file: Path | None, insecure: bool, plain_ht
     for app in our_apps(changed):
         access = dict(app.args.get("access") or {})
         if keys_file is not None or insecure:  # either option replaces both settings of the file
-            access |= {"insecure": insecure, "keys_file": None if keys_file is None else str(keys_file.absolute())}
+            access |= {
+                "insecure": insecure,
+                "keys_file": None if keys_file is None else str(keys_file.absolute()),
+            }
         if plain_http:
             access["plain_http"] = True
         if access:
@@ -198,10 +223,11 @@ def _access(config: Deployment, keys_file: Path | None, insecure: bool, plain_ht
 def deploy(client: Any, config: Deployment, *, own: bool, ingress: bool) -> None:
     """Deploy the applications, without waiting for them.
 
-    For a deployment file, Serve starts a process that imports the server again. On our `own` Ray, applications of this
-    package are built here instead, unless their file has settings that Serve must apply: such a file may also be
-    deployed again, and Serve would replace all replicas of an application that it did not build. Without `ingress`,
-    replicas end without waiting for requests, since their clients have already ended.
+    For a deployment file, Serve starts a process that imports the server again. On our `own` Ray,
+    applications of this package are built here instead, unless their file has settings that Serve
+    must apply: such a file may also be deployed again, and Serve would replace all replicas of an
+    application that it did not build. Without `ingress`, replicas end without waiting for requests,
+    since their clients have already ended.
     """
     from vlagents_ray.serve.app import application
 
@@ -209,17 +235,22 @@ def deploy(client: Any, config: Deployment, *, own: bool, ingress: bool) -> None
         client.deploy_apps(config.for_serve())
         return
     targets = [
-        serve.RunTarget(application(ServerArgs(**app.args), drains=ingress), app.name, app.route_prefix)
+        serve.RunTarget(
+            application(ServerArgs(**app.args), drains=ingress), app.name, app.route_prefix
+        )
         for app in config.applications
     ]
-    serve.run_many(targets, wait_for_ingress_deployment_creation=False, wait_for_applications_running=False)
+    serve.run_many(
+        targets, wait_for_ingress_deployment_creation=False, wait_for_applications_running=False
+    )
 
 
 def _require_gpus(config: Deployment, here: float | None = None) -> None:
-    """Raise `ConfigError` if the replicas need more GPUs than a Ray started here has, since they would wait forever.
+    """Raise `ConfigError` if the replicas need more GPUs than a Ray started here has, since they
+    would wait forever.
 
-    `here` is the number of GPUs that a new local Ray would have. An existing cluster may grow: there, missing GPUs
-    cause a warning, which is repeated while the replicas wait.
+    `here` is the number of GPUs that a new local Ray would have. An existing cluster may grow:
+    there, missing GPUs cause a warning, which is repeated while the replicas wait.
     """
     if here is None and not session.started_here():
         return
@@ -228,20 +259,25 @@ def _require_gpus(config: Deployment, here: float | None = None) -> None:
 
 
 def _missing_gpus(config: Deployment, here: float | None = None) -> str | None:
-    """Return a sentence about the GPUs that this machine, or the running cluster, lacks; None if it has enough."""
+    """Return a sentence about the GPUs that this machine, or the running cluster, lacks; None if
+    it has enough.
+    """
     wanted = {app.name: _gpus(ServerArgs(**app.args)) for app in our_apps(config)}
     there = ray.cluster_resources().get("GPU", 0.0) if here is None else here
     if sum(wanted.values()) <= there:
         return None
     where = "this machine" if here is not None or session.started_here() else "this cluster"
     return (
-        f"resources.num_gpus: the replicas of {wanted} need {sum(wanted.values()):g} GPUs, {where} has {there:g}; "
+        f"resources.num_gpus: the replicas of {wanted} need {sum(wanted.values()):g} GPUs, {where} "
+        f"has {there:g}; "
         f"want less (0 runs on the CPU), or add a machine that has them"
     )
 
 
 def _begins_with_replicas(app: Application) -> bool:
-    """Return whether an application gets a replica without a request; that of another package may not."""
+    """Return whether an application gets a replica without a request; that of another package
+    may not.
+    """
     return app.import_path == IMPORT_PATH and ServerArgs(**app.args).initial_replicas > 0
 
 
@@ -258,7 +294,11 @@ def _check_access(config: Deployment, host: str, insecure: bool, tls: haproxy.Tl
     """
     ours, plain = our_apps(config), False
     for app in config.applications:  # applications of other packages require no keys
-        access = AccessArgs(**app.args.get("access", {})) if app in ours else AccessArgs(insecure=insecure)
+        access = (
+            AccessArgs(**app.args.get("access", {}))
+            if app in ours
+            else AccessArgs(insecure=insecure)
+        )
         require_access(host, keys := access.keys() if app in ours else None, access.insecure)
         plain = plain or (keys is not None and not access.plain_http)
     if plain and tls is None:
@@ -277,19 +317,30 @@ def _ray(
 ) -> Iterator[dict[str, Any]]:
     """Connect to a Ray or start one; yield Serve's options for its host, port and certificate."""
     if not ray.is_initialized() and address is None:
-        with own_ray(host, port, tls=tls, num_cpus=num_cpus, ingress=ingress, begins_empty=begins_empty) as listener:
+        with own_ray(
+            host, port, tls=tls, num_cpus=num_cpus, ingress=ingress, begins_empty=begins_empty
+        ) as listener:
             if listener is not None:
                 yield {"host": LOOPBACK, "port": listener.inside}
             elif tls is None:
                 yield {"host": host, "port": port}
             elif tls.client_ca is None:
-                yield {"host": host, "port": port, "ssl_certfile": str(tls.certificate), "ssl_keyfile": str(tls.key)}
+                yield {
+                    "host": host,
+                    "port": port,
+                    "ssl_certfile": str(tls.certificate),
+                    "ssl_keyfile": str(tls.key),
+                }
             else:
-                raise ConfigError("TLS with certificates of clients needs HAProxy: pip install 'vlagents-ray[serve]'")
+                raise ConfigError(
+                    "TLS with certificates of clients needs HAProxy: pip install "
+                    "'vlagents-ray[serve]'"
+                )
         return
     if tls is not None:
         raise ConfigError(
-            "TLS on a cluster that runs already: end it before Serve, in the cluster's load balancer, or name "
+            "TLS on a cluster that runs already: end it before Serve, in the cluster's load "
+            "balancer, or name "
             "ssl_certfile and ssl_keyfile under http_options in the deployment file"
         )
     bare = host in (LOOPBACK, "localhost", EVERYWHERE)
@@ -302,8 +353,12 @@ def _ray(
         yield {"host": host, "port": port}
 
 
-def spread_over_gpus(parts: Mapping[str, Deployment], *, kept: float = 0.0) -> dict[str, Deployment]:
-    """Return deployments that share the GPUs of the connected cluster equally, except for `kept` GPUs."""
+def spread_over_gpus(
+    parts: Mapping[str, Deployment], *, kept: float = 0.0
+) -> dict[str, Deployment]:
+    """Return deployments that share the GPUs of the connected cluster equally, except for `kept`
+    GPUs.
+    """
     share = max(0.0, ray.cluster_resources().get("GPU", 0.0) - kept) / len(parts)
     return {name: with_replicas_on(part, share) for name, part in parts.items()}
 
@@ -318,30 +373,38 @@ def own_ray(
     ingress: bool = True,
     begins_empty: bool = False,
 ) -> Iterator[haproxy.PublicListener | None]:
-    """Run a private Ray for the length of the context, which no other machine and no other user can reach.
+    """Run a private Ray for the length of the context, which no other machine and no other user can
+    reach.
 
-    The arguments are those of `running_server`; the server will listen at `host` and `port`, once it has a replica, or
-    from the start if an application `begins_empty`, as the first request then starts its replica.
+    The arguments are those of `running_server`; the server will listen at `host` and `port`, once
+    it has a replica, or from the start if an application `begins_empty`, as the first request then
+    starts its replica.
 
     Yields:
         HAProxy's listener for clients; None if Serve listens itself.
 
     Raises:
-        ConfigError: The port is in use, or the environment excludes Ray's token or HAProxy's settings.
+        ConfigError: The port is in use, or the environment excludes Ray's token or HAProxy's
+            settings.
     """
     if os.environ.get(session.MODE, "token").lower() != "token":
         raise ConfigError(
-            f"{session.MODE}={os.environ[session.MODE]}: a port of each replica, which runs whatever it is sent, "
+            f"{session.MODE}={os.environ[session.MODE]}: a port of each replica, which runs "
+            "whatever it is sent, "
             f"would be open to other machines without Ray's token; unset it"
         )
     if not is_free(host, port):
-        raise ConfigError(f"cannot listen on {host}:{port}: it is taken; choose another --port or --host")
+        raise ConfigError(
+            f"cannot listen on {host}:{port}: it is taken; choose another --port or --host"
+        )
     keep(port)
     with session.ray_folder() as folder, contextlib.ExitStack() as stack:
-        # By default Ray starts workers with a low priority, so that a policy would wait for all other processes.
-        # Proxies start while policies load: on a slow machine Serve would replace them after three times its 5 s.
+        # By default Ray starts workers with a low priority, so that a policy would wait for all
+        # other processes. Proxies start while policies load: on a slow machine Serve would replace
+        # them after three times its 5 s.
         environment = {"RAY_worker_niceness": "0", "RAY_SERVE_PROXY_READY_CHECK_TIMEOUT_S": "60"}
-        # The address at which replicas listen for WebSockets: loopback if only TLS may cross the network.
+        # The address at which replicas listen for WebSockets: loopback if only TLS may cross the
+        # network.
         ours = {MARK: str(folder), session.ALONE: "0", HOST: host if tls is None else LOOPBACK}
         listener = None
         if not ingress:
@@ -349,20 +412,27 @@ def own_ray(
         elif (binary := haproxy.haproxy_binary()) is not None:
             if tls is not None or host not in (LOOPBACK, "localhost"):
                 bundle = None if tls is None else tls.bundle(folder)
-                client_ca = None if tls is None or tls.client_ca is None else tls.client_ca.absolute()
+                client_ca = (
+                    None if tls is None or tls.client_ca is None else tls.client_ca.absolute()
+                )
                 listener = haproxy.PublicListener(host, port, free_port(), bundle, client_ca)
             settings = haproxy.ingress_environment(folder, binary, listener)
             if begins_empty:
                 haproxy.open_port(folder)
-            # HAProxy's files and admin socket are in the folder, regardless of the user's settings for clusters.
+            # HAProxy's files and admin socket are in the folder, regardless of the user's settings
+            # for clusters.
             ours |= {key: value for key, value in settings.items() if value.startswith(str(folder))}
             environment |= settings
-        # If another server's process started this one, it has inherited that server's files and ports, which are
-        # replaced. Otherwise the user's values are kept, unless they are in `ours`.
+        # If another server's process started this one, it has inherited that server's files and
+        # ports, which are replaced. Otherwise the user's values are kept, unless they are in
+        # `ours`.
         inherited = MARK in os.environ
-        new = {key: value for key, value in environment.items() if inherited or key not in os.environ}
+        new = {
+            key: value for key, value in environment.items() if inherited or key not in os.environ
+        }
         stack.enter_context(session.variables(new | ours | session.token_variables(folder)))
-        stack.callback(private.use_loopback, private.use_loopback(True))  # `ALONE` was read when Ray was imported
+        # `ALONE` was read when Ray was imported.
+        stack.callback(private.use_loopback, private.use_loopback(True))
         if listener is not None:
             listener.require()
         session.start_ray(folder, num_cpus=num_cpus, logging_level="WARNING")
@@ -384,7 +454,8 @@ def wait_until_ready(
         apps: The URL of each application; one without a URL is called through a Serve handle.
         ours: The applications of this package, which report why their policy is not ready yet.
         deadline: End of the waiting, s, of `time.monotonic()`.
-        missing: Describes the resources that the cluster lacks; logged at once, and again every 30 s.
+        missing: Describes the resources that the cluster lacks; logged at once, and again every 30
+            s.
 
     Raises:
         ConfigError: An application failed to deploy, or a policy to load.
@@ -398,14 +469,21 @@ def wait_until_ready(
             if app is not None and app.status in ("DEPLOY_FAILED", "UNHEALTHY"):
                 # The last line of Serve's message is the error below its traceback.
                 texts = [app.message, *(d.message for d in app.deployments.values())]
-                lines = [line.strip() for text in texts for line in (text or "").splitlines() if line.strip()]
+                lines = [
+                    line.strip()
+                    for text in texts
+                    for line in (text or "").splitlines()
+                    if line.strip()
+                ]
                 reason = lines[-1] if lines else "Serve gives no reason"
                 raise ConfigError(f"application {name!r} failed to deploy: {reason}")
         if all(name in status and status[name].status == "RUNNING" for name in apps):
             break
         if time.monotonic() > deadline:
             states = {n: str(status[n].status) for n in apps if n in status}
-            raise PolicyUnavailable("; ".join(filter(None, [f"not running in time: {states}", missing()])))
+            raise PolicyUnavailable(
+                "; ".join(filter(None, [f"not running in time: {states}", missing()]))
+            )
         if time.monotonic() >= remind_at:
             remind_at = time.monotonic() + _REMIND_S
             if (what := missing()) is not None:

@@ -1,1 +1,3 @@
-"""Loaded checkpoints: copies of the agent, the cache of models, and padding to compiled batch sizes."""
+"""Loaded checkpoints: copies of the agent, the cache of models, and padding to compiled batch
+sizes.
+"""

@@ -1,17 +1,17 @@
 """Copies of an initialized agent: the private state of each session.
 
-A policy is initialized once per replica. Every `reset` begins with a pristine copy of that initialized agent, so that
-neither other sessions nor earlier episodes of the session influence an episode. A copy shares objects that are large
-or cannot be copied, and owns everything else:
+A policy is initialized once per replica. Every `reset` begins with a pristine copy of that
+initialized agent, so that neither other sessions nor earlier episodes of the session influence an
+episode. A copy shares objects that are large or cannot be copied, and owns everything else:
 
-- Shared: attributes named in `Agent.shared`, torch parameters, JAX arrays (immutable), functions, classes, modules,
-  and objects that cannot be copied (locks, sockets, native handles).
-- Shared and made read-only: numpy arrays of 64 MiB and more, so that writing into one raises an error instead of
-  changing other sessions.
+- Shared: attributes named in `Agent.shared`, torch parameters, JAX arrays (immutable), functions,
+  classes, modules, and objects that cannot be copied (locks, sockets, native handles).
+- Shared and made read-only: numpy arrays of 64 MiB and more, so that writing into one raises an
+  error instead of changing other sessions.
 - Copied: all other attributes, at any depth.
 
-When a session moves to another replica of the same policy, its copied state is sent there; the shared objects are
-looked up there by their index.
+When a session moves to another replica of the same policy, its copied state is sent there; the
+shared objects are looked up there by their index.
 """
 
 from __future__ import annotations
@@ -32,15 +32,37 @@ logger = logging.getLogger(__name__)
 
 SHARED_ARRAY_BYTES = 64 * 2**20
 
-_BY_REFERENCE = (types.FunctionType, types.BuiltinFunctionType, types.ModuleType, type, logging.Logger)
+_BY_REFERENCE = (
+    types.FunctionType,
+    types.BuiltinFunctionType,
+    types.ModuleType,
+    type,
+    logging.Logger,
+)
 _PLAIN = (
-    *(type(None), bool, int, float, complex, str, bytes, bytearray, list, tuple, dict, set, frozenset),
+    *(
+        type(None),
+        bool,
+        int,
+        float,
+        complex,
+        str,
+        bytes,
+        bytearray,
+        list,
+        tuple,
+        dict,
+        set,
+        frozenset,
+    ),
     pickle.PickleBuffer,  # the data of a numpy array
 )
 
 
 class _Shared:
-    """The objects that the sessions of a replica share, in the order in which the pickler found them."""
+    """The objects that the sessions of a replica share, in the order in which the pickler found
+    them.
+    """
 
     def __init__(self) -> None:
         self.objects: list[Any] = []
@@ -61,7 +83,9 @@ class _Shared:
 
         A large array is made read-only.
         """
-        if isinstance(obj, _BY_REFERENCE) or (self._parameter is not None and isinstance(obj, self._parameter)):
+        if isinstance(obj, _BY_REFERENCE) or (
+            self._parameter is not None and isinstance(obj, self._parameter)
+        ):
             return True
         if isinstance(obj, np.ndarray):
             if obj.nbytes < SHARED_ARRAY_BYTES:
@@ -78,16 +102,25 @@ class _Shared:
         return False
 
     def fingerprint(self) -> str:
-        """Return a digest that is equal in replicas whose shared objects have the same types, names and shapes."""
+        """Return a digest that is equal in replicas whose shared objects have the same types,
+        names and shapes.
+        """
         kinds = [
-            (type(obj).__module__, type(obj).__qualname__, getattr(obj, "__qualname__", ""), str(_shape(obj)))
+            (
+                type(obj).__module__,
+                type(obj).__qualname__,
+                getattr(obj, "__qualname__", ""),
+                str(_shape(obj)),
+            )
             for obj in self.objects
         ]
         return hashlib.sha256(repr(kinds).encode()).hexdigest()
 
 
 class _Pickler(pickle.Pickler):
-    """Pickles an agent in memory without its shared objects; with `find`, objects that must be shared join them."""
+    """Pickles an agent in memory without its shared objects; with `find`, objects that must be
+    shared join them.
+    """
 
     def __init__(self, file: io.BytesIO, shared: _Shared, *, find: bool) -> None:
         super().__init__(file, protocol=pickle.HIGHEST_PROTOCOL)
@@ -96,7 +129,12 @@ class _Pickler(pickle.Pickler):
     def persistent_id(self, obj: Any) -> int | None:
         """Return the index of a shared object, or None for an object that is copied."""
         number = self._shared.numbers.get(id(obj))
-        if number is None and self._find and type(obj) not in _PLAIN and self._shared.must_have(obj):
+        if (
+            number is None
+            and self._find
+            and type(obj) not in _PLAIN
+            and self._shared.must_have(obj)
+        ):
             number = self._shared.add(obj)
         return number
 
@@ -122,7 +160,8 @@ class AgentCopies:
         self.fingerprint = self._shared.fingerprint()
         if self._shared.refused:
             logger.warning(
-                "%s: sessions share objects of %s, which cannot be copied; if one of them holds an episode's "
+                "%s: sessions share objects of %s, which cannot be copied; if one of them holds an "
+                "episode's "
                 "state, create it in reset() instead of initialize()",
                 type(agent).__name__,
                 sorted(self._shared.refused),
@@ -133,7 +172,8 @@ class AgentCopies:
         return self.load(self._pristine)
 
     def dump(self, agent: Agent, *, find: bool = False) -> bytes:
-        """Pickle the private state of a copy, for `load` in another replica; raises any error of pickling.
+        """Pickle the private state of a copy, for `load` in another replica; raises any error of
+        pickling.
 
         With `find`, objects that copies must share are added to the shared ones.
         """
@@ -142,7 +182,9 @@ class AgentCopies:
         return file.getvalue()
 
     def load(self, data: bytes) -> Agent:
-        """Return the copy that `dump` wrote in this replica, or in one with the same fingerprint."""
+        """Return the copy that `dump` wrote in this replica, or in one with the same
+        fingerprint.
+        """
         agent: Agent = _Unpickler(data, self._shared).load()
         return agent
 

@@ -1,10 +1,13 @@
-"""The checkpoints that a deployment offers, and a session's choice among them; this module loads nothing.
+"""The checkpoints that a deployment offers, and a session's choice among them; this module loads
+nothing.
 
-A policy's settings name its checkpoint, and optionally a training step of it (`checkpoint: /runs/a/{step}`,
-`checkpoint_step: 20000`). A session chooses among the checkpoints in the deployment file; it never names a path.
+A policy's settings name its checkpoint, and optionally a training step of it (`checkpoint:
+/runs/a/{step}`, `checkpoint_step: 20000`). A session chooses among the checkpoints in the
+deployment file; it never names a path.
 
-A choice may be a LoRA adapter over the deployment's own checkpoint. All adapters are loaded with that checkpoint, as
-its setting `adapters`, so that sessions with different adapters share a model; the adapter is an option of their reset.
+A choice may be a LoRA adapter over the deployment's own checkpoint. All adapters are loaded with
+that checkpoint, as its setting `adapters`, so that sessions with different adapters share a model;
+the adapter is an option of their reset.
 """
 
 from __future__ import annotations
@@ -23,7 +26,9 @@ _ADAPTERS = "adapters"  # setting of a policy: its adapters by name
 
 
 class Checkpoints:
-    """The deployment's own settings, the choices that may replace some of them, and the factory of agents."""
+    """The deployment's own settings, the choices that may replace some of them, and the factory
+    of agents.
+    """
 
     def __init__(
         self,
@@ -45,25 +50,36 @@ class Checkpoints:
         self.make = make
         self.limit = loaded
         offered = choices or {}
-        self._adapters = {name: settings[ADAPTER] for name, settings in offered.items() if ADAPTER in settings}
-        self._choices = {name: dict(settings) for name, settings in offered.items() if name not in self._adapters}
+        self._adapters = {
+            name: settings[ADAPTER] for name, settings in offered.items() if ADAPTER in settings
+        }
+        self._choices = {
+            name: dict(settings) for name, settings in offered.items() if name not in self._adapters
+        }
         self._steps = steps
         self.config = self.own(config or {})
 
     def own(self, config: Mapping[str, Any]) -> dict[str, Any]:
-        """Return the deployment's own settings `config`, with the offered adapters added to those in `config`.
+        """Return the deployment's own settings `config`, with the offered adapters added to those
+        in `config`.
 
         Raises:
-            ConfigError: Two adapters have the same name, or the adapters in `config` are not a mapping.
+            ConfigError: Two adapters have the same name, or the adapters in `config` are not a
+                mapping.
         """
         if not self._adapters:
             return dict(config)
         named = config.get(_ADAPTERS) or {}
         if not isinstance(named, Mapping):
-            raise ConfigError(f"adapters: got {named!r}, want a folder or hub id by the name of each")
-        if double := sorted(name for name, source in self._adapters.items() if named.get(name, source) != source):
             raise ConfigError(
-                f"adapters: got {double} both in the policy's settings and among the deployment's checkpoints, want "
+                f"adapters: got {named!r}, want a folder or hub id by the name of each"
+            )
+        if double := sorted(
+            name for name, source in self._adapters.items() if named.get(name, source) != source
+        ):
+            raise ConfigError(
+                f"adapters: got {double} both in the policy's settings and among the deployment's "
+                "checkpoints, want "
                 f"each name once; rename one"
             )
         return {**config, _ADAPTERS: {**named, **self._adapters}}
@@ -79,41 +95,65 @@ class Checkpoints:
         if isinstance(choice, str) and choice in self._adapters:
             if step is not None:
                 raise UnknownCheckpoint(
-                    f"{STEP}: got {step!r} with the adapter {choice!r}, which has none; leave it out"
+                    f"{STEP}: got {step!r} with the adapter {choice!r}, which has none; leave it "
+                    "out"
                 )
             adapter = rest.get(ADAPTER)
             if adapter is not None and not (isinstance(adapter, str) and adapter == choice):
-                raise UnknownCheckpoint(f"{ADAPTER}: got {rest[ADAPTER]!r} and {CHOICE} {choice!r}, want one of them")
+                raise UnknownCheckpoint(
+                    f"{ADAPTER}: got {rest[ADAPTER]!r} and {CHOICE} {choice!r}, want one of them"
+                )
             return DEFAULT, {**rest, ADAPTER: choice}
         if choice is not None and (not isinstance(choice, str) or choice not in self._choices):
             raise UnknownCheckpoint(f"{CHOICE}: got {choice!r}, want {self._offered()}")
         if step is not None:
             if not self._steps:
-                raise UnknownCheckpoint(f"{STEP}: got {step!r}; this deployment offers {self._offered()}")
+                raise UnknownCheckpoint(
+                    f"{STEP}: got {step!r}; this deployment offers {self._offered()}"
+                )
             if isinstance(step, bool) or not isinstance(step, int) or step < 0:
-                raise UnknownCheckpoint(f"{STEP}: got {step!r}, want a number of training steps, such as 20000")
+                raise UnknownCheckpoint(
+                    f"{STEP}: got {step!r}, want a number of training steps, such as 20000"
+                )
         return CheckpointChoice(choice, step), rest
 
     def settings(self, choice: CheckpointChoice, config: Mapping[str, Any]) -> dict[str, Any]:
-        """Return the settings of an agent for that choice, based on the deployment's own settings `config`."""
+        """Return the settings of an agent for that choice, based on the deployment's own
+        settings `config`.
+        """
         chosen = {} if choice.name is None else self._choices[choice.name]
-        if self._adapters and choice != DEFAULT:  # the adapters are for the deployment's own checkpoint
+        # The adapters are for the deployment's own checkpoint.
+        if self._adapters and choice != DEFAULT:
             config = {name: value for name, value in config.items() if name != _ADAPTERS}
         return {**config, **chosen, **({} if choice.step is None else {STEP: choice.step})}
 
     def examples(self) -> list[CheckpointChoice]:
-        """Return one example of each choice: the deployment's own, every named one, and a step if steps are offered."""
-        return [DEFAULT, *map(CheckpointChoice, self._choices), *([CheckpointChoice(step=0)] if self._steps else [])]
+        """Return one example of each choice: the deployment's own, every named one, and a step
+        if steps are offered.
+        """
+        return [
+            DEFAULT,
+            *map(CheckpointChoice, self._choices),
+            *([CheckpointChoice(step=0)] if self._steps else []),
+        ]
 
     def describe(self, config: Mapping[str, Any]) -> dict[str, Any]:
         """Return the available choices, for the metadata."""
-        choices = {name: resolved(self.settings(CheckpointChoice(name), config)) for name in self._choices}
+        choices = {
+            name: resolved(self.settings(CheckpointChoice(name), config)) for name in self._choices
+        }
         return {"choices": choices | self._adapters, "steps": self._steps, "limit": self.limit}
 
-    def offers(self, choice: CheckpointChoice, settings: Mapping[str, Any], config: Mapping[str, Any]) -> bool:
+    def offers(
+        self, choice: CheckpointChoice, settings: Mapping[str, Any], config: Mapping[str, Any]
+    ) -> bool:
         """Return whether the deployment offers that choice, and the choice has these settings."""
         known = choice.name is None or choice.name in self._choices
-        return known and (choice.step is None or self._steps) and self.settings(choice, config) == settings
+        return (
+            known
+            and (choice.step is None or self._steps)
+            and self.settings(choice, config) == settings
+        )
 
     def _offered(self) -> str:
         names = sorted({*self._choices, *self._adapters})

@@ -34,7 +34,8 @@ from vlagents_ray.validation import check_observation
 
 logger = logging.getLogger(__name__)
 
-_LIFE = 1000  # acts after which a padding session is replaced, since its agent may store every observation
+# Acts after which a padding session is replaced, since its agent may store every observation.
+_LIFE = 1000
 
 
 @dataclass(slots=True)
@@ -51,9 +52,9 @@ def powers_up_to(most: int) -> list[int]:
 class Padding:
     """Dummy sessions that pad a batch to the next of `sizes`. Use them on the policy's thread only.
 
-    Each is a pristine copy of the agent, reset with the first reset request that the policy accepted, and acts on an
-    observation of a real session in the same batch. Its actions and errors are dropped. If a dummy session cannot be
-    created, the policy gets batches without padding.
+    Each is a pristine copy of the agent, reset with the first reset request that the policy
+    accepted, and acts on an observation of a real session in the same batch. Its actions and errors
+    are dropped. If a dummy session cannot be created, the policy gets batches without padding.
 
     Args:
         sizes: Batch sizes for which the model is compiled.
@@ -73,7 +74,9 @@ class Padding:
             self._first = copy.deepcopy((request.obs, request.instruction, kwargs))
 
     def sessions(self, rows: int) -> list[Agent]:
-        """Return the dummy sessions that pad a batch of `rows` to the next size; none beyond the largest size."""
+        """Return the dummy sessions that pad a batch of `rows` to the next size; none beyond the
+        largest size.
+        """
         missing = next((size for size in self._sizes if size >= rows), rows) - rows
         if self._first is None:  # all sessions so far were moved here from other replicas
             return []
@@ -91,11 +94,17 @@ class Padding:
         return [row.agent for row in self._rows[:missing]]
 
     def check_results(self, results: Sequence[Act | Exception]) -> None:
-        """Check the results of the dummy sessions, and discard those that failed or have made `_LIFE` acts."""
+        """Check the results of the dummy sessions, and discard those that failed or have made
+        `_LIFE` acts.
+        """
         used = self._rows[: len(results)]
         for row in used:
             row.acts += 1
-        kept = [row for row, result in zip(used, results, strict=True) if isinstance(result, Act) and row.acts < _LIFE]
+        kept = [
+            row
+            for row, result in zip(used, results, strict=True)
+            if isinstance(result, Act) and row.acts < _LIFE
+        ]
         self._rows[: len(results)] = kept
 
 
@@ -109,9 +118,11 @@ class LoadedModel:
     contract: Contract | None
     copies: AgentCopies
     padding: Padding
-    weights: dict[str, Any] | None  # digest and revision, see `Agent.weights_id`, and `Agent.statistics`
+    # Digest and revision, see `Agent.weights_id`, and `Agent.statistics`.
+    weights: dict[str, Any] | None
     files: Program  # digests of the files named in its settings
-    version: tuple[str, str]  # equal in replicas that can take over each other's sessions of this model
+    # Equal in replicas that can take over each other's sessions of this model.
+    version: tuple[str, str]
     calls: PolicyCalls  # running calls of the replica, including those of this agent
     parameters: ModelWeights  # versions of the weights
     busy: threading.Lock  # lock held while its agent runs, or is being closed
@@ -120,8 +131,8 @@ class LoadedModel:
     sessions: int = 0  # number of sessions that hold it
     closed: bool = False
     key: str = field(init=False)  # `key_of(settings)`
-    # Held together with `busy` while the agent runs, so that no other model is captured as a CUDA graph. Without an
-    # accelerator it is an unshared lock, which costs less.
+    # Held together with `busy` while the agent runs, so that no other model is captured as a CUDA
+    # graph. Without an accelerator it is an unshared lock, which costs less.
     uncaptured: AbstractContextManager[Any] = field(init=False)
     _calls_by_kind: dict[tuple[str, Hashable], PolicyCall] = field(default_factory=dict)
 
@@ -130,7 +141,9 @@ class LoadedModel:
         self.key = key_of(self.settings)
         torch = sys.modules.get("torch")
         self.uncaptured = (
-            CAPTURES if self.report.accelerated or (torch and torch.cuda.is_initialized()) else threading.RLock()
+            CAPTURES
+            if self.report.accelerated or (torch and torch.cuda.is_initialized())
+            else threading.RLock()
         )
 
     @property
@@ -142,7 +155,11 @@ class LoadedModel:
     def identity(self) -> dict[str, str]:
         """The checkpoint, digest and commit of the loaded weights, for the info of a reset."""
         weights = self.weights or {}
-        known = {"checkpoint": self.checkpoint, "weights": weights.get("digest"), "revision": weights.get("revision")}
+        known = {
+            "checkpoint": self.checkpoint,
+            "weights": weights.get("digest"),
+            "revision": weights.get("revision"),
+        }
         return {name: value for name, value in known.items() if value is not None}
 
     def check(self, request: Request) -> None:
@@ -156,19 +173,26 @@ class LoadedModel:
     def call(self, op: str, kind: Hashable = None) -> PolicyCall:
         """Return a context for a call of the agent, which detects a call that does not return.
 
-        Calls with the same `op` and `kind` take similarly long, and never run on two threads at once.
+        Calls with the same `op` and `kind` take similarly long, and never run on two threads at
+        once.
         """
         if (call := self._calls_by_kind.get((op, kind))) is None:
             call = self._calls_by_kind[op, kind] = PolicyCall(self.calls, op)
         return call
 
     def require_open(self) -> None:
-        """Raise `UnknownSession` if the model and its sessions have been closed; the caller holds `busy`."""
+        """Raise `UnknownSession` if the model and its sessions have been closed; the caller
+        holds `busy`.
+        """
         if self.closed:
-            raise UnknownSession(f"{self.choice} has just been unloaded for another; reset the session")
+            raise UnknownSession(
+                f"{self.choice} has just been unloaded for another; reset the session"
+            )
 
     def pad(self, observations: list[Obs | None], agents: list[Agent | None]) -> int:
-        """Append rows that fill a batch up to the next size; return their number. Runs on the policy's thread only."""
+        """Append rows that fill a batch up to the next size; return their number. Runs on the
+        policy's thread only.
+        """
         with self.call("reset", "padding"):
             padding = self.padding.sessions(len(agents))
         observations += observations[-1:] * len(padding)
@@ -176,9 +200,11 @@ class LoadedModel:
         return len(padding)
 
     def close(self, wait_s: float = -1.0) -> None:
-        """Close the agent after the running batch. Its memory is freed when no reference to it remains.
+        """Close the agent after the running batch. Its memory is freed when no reference to it
+        remains.
 
-        If the batch is still running after `wait_s` (-1: no limit), the agent stays open until this process ends.
+        If the batch is still running after `wait_s` (-1: no limit), the agent stays open until this
+        process ends.
         """
         if not self.busy.acquire(timeout=wait_s):
             logger.error("%s: still busy after %g s; it is left as it is", self.choice, wait_s)
@@ -207,28 +233,39 @@ class Loader:
         self._source, self._version, self._batch_sizes = source, version, batch_sizes
         self._compiled_sizes = batch_sizes or powers_up_to(max_batch_size)
         self._check, self._calls = check, calls
-        self.on_progress: Callable[[str], None] = lambda _: None  # called with each step of a long load
-        self.on_out_of_memory: Callable[[], None] = lambda: None  # called each time that a model runs out of memory
-        self.on_gpu_ms: Callable[[float], None] = lambda _: None  # called with the time of forward passes on a GPU
+        # Called with each step of a long load.
+        self.on_progress: Callable[[str], None] = lambda _: None
+        # Called each time that a model runs out of memory.
+        self.on_out_of_memory: Callable[[], None] = lambda: None
+        # Called with the time of forward passes on a GPU.
+        self.on_gpu_ms: Callable[[float], None] = lambda _: None
 
-    def load(self, choice: CheckpointChoice, settings: dict[str, Any], agent: Agent | None = None) -> LoadedModel:
-        """Load a model into `agent`, by default a new one; the agent is closed if it cannot be served.
+    def load(
+        self, choice: CheckpointChoice, settings: dict[str, Any], agent: Agent | None = None
+    ) -> LoadedModel:
+        """Load a model into `agent`, by default a new one; the agent is closed if it cannot be
+        served.
 
         Args:
             agent: An agent created from the `settings`, but not initialized yet.
 
         Raises:
-            BaseException: Any error of the agent's initialization, or of the deployment's check of its contract.
+            BaseException: Any error of the agent's initialization, or of the deployment's check of
+                its contract.
         """
         with PolicyCall(self._calls, LOAD):
             return self._load(choice, settings, agent)
 
-    def _load(self, choice: CheckpointChoice, settings: dict[str, Any], agent: Agent | None) -> LoadedModel:
+    def _load(
+        self, choice: CheckpointChoice, settings: dict[str, Any], agent: Agent | None
+    ) -> LoadedModel:
         agent = agent or self._source.make(settings)
         try:
             with (
                 used_checkpoints() as found,
-                loading_report(self.on_progress, self._compiled_sizes, self.on_out_of_memory, self.on_gpu_ms) as report,
+                loading_report(
+                    self.on_progress, self._compiled_sizes, self.on_out_of_memory, self.on_gpu_ms
+                ) as report,
             ):
                 agent.initialize()
             weights = agent.weights_id or weights_of(found)
@@ -239,8 +276,14 @@ class Loader:
             files = files_named({**named, CHOICE: resolved(named)}, folders=not weights)
             if weights is None and files:
                 weights = {"digest": digest_of(files), "revision": None}
-            if agent.statistics is not None:  # also of weights that have no digest, for the comparison with a robot
-                weights = {"digest": None, "revision": None, **(weights or {}), "statistics": agent.statistics}
+            # Also of weights that have no digest, for the comparison with a robot.
+            if agent.statistics is not None:
+                weights = {
+                    "digest": None,
+                    "revision": None,
+                    **(weights or {}),
+                    "statistics": agent.statistics,
+                }
             contract = agent.contract
             self._check(contract)
             copies = AgentCopies(agent)
@@ -254,11 +297,25 @@ class Loader:
         if weights is not None and digest:
             logger.info("weights: %s, revision: %s", digest, weights.get("revision"))
         busy = threading.Lock()
-        make = agent.model_weights if isinstance(agent, HoldsWeights) else partial(ModelWeights, agent)
+        make = (
+            agent.model_weights if isinstance(agent, HoldsWeights) else partial(ModelWeights, agent)
+        )
         parameters = make(busy, digest.rpartition(":")[2][:DIGITS], version)
         calls = self._calls
         return LoadedModel(
-            choice, settings, agent, contract, copies, padding, weights, files, version, calls, parameters, busy, report
+            choice,
+            settings,
+            agent,
+            contract,
+            copies,
+            padding,
+            weights,
+            files,
+            version,
+            calls,
+            parameters,
+            busy,
+            report,
         )
 
     def version(self, settings: Mapping[str, Any]) -> str:

@@ -1,13 +1,17 @@
-"""The checkpoints that a replica holds in memory: loaded on demand, and evicted when another needs the memory.
+"""The checkpoints that a replica holds in memory: loaded on demand, and evicted when another needs
+the memory.
 
-The first checkpoint is loaded on the policy's thread. A loading thread then loads and evicts the others, one at a time,
-while sessions of loaded checkpoints act. `ModelCache` decides which one is next.
+The first checkpoint is loaded on the policy's thread. A loading thread then loads and evicts the
+others, one at a time, while sessions of loaded checkpoints act. `ModelCache` decides which one is
+next.
 
-Ray's `serve.multiplexed` counts models alone: at its limit it unloads the one that was requested least recently, also
-while sessions act with it, and it never waits for them. Hence this cache, which tracks the sessions.
+Ray's `serve.multiplexed` counts models alone: at its limit it unloads the one that was requested
+least recently, also while sessions act with it, and it never waits for them. Hence this cache,
+which tracks the sessions.
 
-A deployment's own settings can change (`ModelManager.configure`): the new checkpoint is loaded beside the old one. New
-episodes then use the new checkpoint, and the old one is evicted when its last episode has ended.
+A deployment's own settings can change (`ModelManager.configure`): the new checkpoint is loaded
+beside the old one. New episodes then use the new checkpoint, and the old one is evicted when its
+last episode has ended.
 """
 
 from __future__ import annotations
@@ -20,7 +24,13 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from vlagents_ray.contract import Contract
-from vlagents_ray.errors import CheckpointFailed, DeadlineExceeded, PolicyUnavailable, UnknownSession, VLAgentsError
+from vlagents_ray.errors import (
+    CheckpointFailed,
+    DeadlineExceeded,
+    PolicyUnavailable,
+    UnknownSession,
+    VLAgentsError,
+)
 from vlagents_ray.interface import Agent
 from vlagents_ray.policies.base.accelerator import free_memory, gpu_memory
 from vlagents_ray.policies.base.program import Program
@@ -31,11 +41,13 @@ from vlagents_ray.serve.sessions import Session, SessionTable
 from vlagents_ray.serve.weights import ModelWeights
 from vlagents_ray.weights.trainable import beside_acts
 
-PATIENCE_S = 10.0  # waiting time for a slot after which a checkpoint in use accepts no more episodes
+# Waiting time for a slot after which a checkpoint in use accepts no more episodes.
+PATIENCE_S = 10.0
 
 # Called with None when a session holds its model, otherwise with the error.
 OnLoaded = Callable[[VLAgentsError | None], None]
-DueCallbacks = list[tuple[OnLoaded, VLAgentsError | None]]  # callbacks to call, each with its argument
+# Callbacks to call, each with its argument.
+DueCallbacks = list[tuple[OnLoaded, VLAgentsError | None]]
 logger = logging.getLogger(__name__)
 
 _CHECK_S = 1.0  # interval of the checks whether waiting callers are still there
@@ -75,22 +87,26 @@ class ModelCache:
     It uses no threads; the lock of `ModelManager` guards all calls. If all slots are in use:
 
     - The least recently used checkpoint without a session is evicted.
-    - If all have sessions, the waiting sessions wait for episodes to end. After `PATIENCE_S`, the checkpoint that was
-      loaded first accepts no more episodes, until its sessions have ended and it is evicted. So ten checkpoints can
-      take turns in two slots, each for long enough to be worth loading.
+    - If all have sessions, the waiting sessions wait for episodes to end. After `PATIENCE_S`, the
+      checkpoint that was loaded first accepts no more episodes, until its sessions have ended and
+      it is evicted. So ten checkpoints can take turns in two slots, each for long enough to be
+      worth loading.
     """
 
     def __init__(self, source: Checkpoints, fits: Callable[[int], bool] = lambda _: True) -> None:
         self.config = source.config  # the deployment's own settings in effect
         self.next: dict[str, Any] | None = None  # settings to swap to
         self.failure: str | None = None  # error of the last swap
-        self.loaded: dict[str, LoadedModel] = {}  # models by the keys of their settings, the least recently used first
+        # Models by the keys of their settings, the least recently used first.
+        self.loaded: dict[str, LoadedModel] = {}
         self.waiting: list[Waiter] = []  # waiting sessions in order of arrival
         self.draining = ""  # key of the model that accepts no more episodes before its eviction
         self._source, self._fits = source, fits  # whether one more fits beside so many
 
     def describe(self) -> dict[str, Any]:
-        """Return the available choices, the loaded checkpoints and the state of the last swap, for the metadata."""
+        """Return the available choices, the loaded checkpoints and the state of the last swap,
+        for the metadata.
+        """
         swap = None
         if self.next is not None:
             swap = {"state": "loading", "checkpoint": resolved(self.next)}
@@ -98,21 +114,31 @@ class ModelCache:
             swap = {"state": "failed", "error": self.failure}
         loaded = [model.checkpoint for model in self.loaded.values()]
         weights = [model.weights for model in self.loaded.values()]
-        return {**self._source.describe(self.config), "loaded": loaded, "weights": weights, "swap": swap}
+        return {
+            **self._source.describe(self.config),
+            "loaded": loaded,
+            "weights": weights,
+            "swap": swap,
+        }
 
     def find(self, choice: CheckpointChoice) -> LoadedModel | None:
-        """Return the model that an episode of that choice would use now; None if it is not loaded."""
+        """Return the model that an episode of that choice would use now; None if it is not
+        loaded.
+        """
         return self.loaded.get(key_of(self._settings(choice)))
 
     def free(self, choice: CheckpointChoice) -> LoadedModel | None:
-        """Return the model that an episode of that choice may use now; None if the episode has to wait for it."""
+        """Return the model that an episode of that choice may use now; None if the episode has
+        to wait for it.
+        """
         model = self.find(choice)
         return None if model is None or model.key == self.draining else model
 
     def assign(self, session: Session[LoadedModel], model: LoadedModel) -> LoadedModel:
         """Assign the model to the session, in place of any other, and return the model."""
         self.release_model(session)
-        self.loaded[model.key] = self.loaded.pop(model.key)  # the most recently used model is the last one
+        # The most recently used model is the last one.
+        self.loaded[model.key] = self.loaded.pop(model.key)
         session.model = model
         model.sessions += 1
         return model
@@ -125,19 +151,25 @@ class ModelCache:
         return model is not None
 
     def swap(self) -> LoadedModel | None:
-        """Put the new settings into effect if their model is loaded, and return that model; otherwise None."""
+        """Put the new settings into effect if their model is loaded, and return that model;
+        otherwise None.
+        """
         model = None if self.next is None else self.loaded.get(key_of(self.next))
         if self.next is not None and model is not None:
             self.config, self.next = self.next, None
         return model
 
     def pop_due(self) -> DueCallbacks:
-        """Remove the sessions whose wait has ended; return their callbacks with the errors, if any."""
+        """Remove the sessions whose wait has ended; return their callbacks with the errors, if
+        any.
+        """
         due: DueCallbacks = []
         for waiter in list(self.waiting):
             error: VLAgentsError | None = None
             if waiter.session.over:
-                error = UnknownSession(f"session {waiter.session.id!r}: closed while it waited for {waiter.choice}")
+                error = UnknownSession(
+                    f"session {waiter.session.id!r}: closed while it waited for {waiter.choice}"
+                )
             elif waiter.is_abandoned():
                 error = too_late(waiter.choice)
             elif (model := self.free(waiter.choice)) is None:
@@ -163,7 +195,8 @@ class ModelCache:
             if self._fits(len(self.loaded)):
                 return task
             limit = len(self.loaded)
-        old = None if self.next is None else self.config  # episodes begin with it during a swap: evicted last
+        # Episodes begin with it during a swap: evicted last.
+        old = None if self.next is None else self.config
         if idle:
             self.draining = min(idle, key=lambda model: model.settings == old).key
             return EvictTask(self.draining)
@@ -175,7 +208,8 @@ class ModelCache:
         return None
 
     def failed(self, settings: dict[str, Any], failure: str) -> DueCallbacks:
-        """Remove the sessions that waited for settings that failed to load; return their callbacks with the error.
+        """Remove the sessions that waited for settings that failed to load; return their callbacks
+        with the error.
 
         A later request for these settings loads them again.
         """
@@ -189,7 +223,9 @@ class ModelCache:
         return self._source.settings(choice, self.config)
 
     def _most_wanted(self) -> tuple[LoadTask, float] | None:
-        """Return the next model to load, and the start of the wait for it, s; a swap has priority."""
+        """Return the next model to load, and the start of the wait for it, s; a swap has
+        priority.
+        """
         if self.next is not None:
             return LoadTask(DEFAULT, self.next), float("-inf")
         for waiter in self.waiting:
@@ -204,17 +240,27 @@ def too_late(choice: CheckpointChoice) -> DeadlineExceeded:
 
 
 class ModelManager:
-    """The models of a replica. Thread-safe; it releases its lock before it calls other components."""
+    """The models of a replica. Thread-safe; it releases its lock before it calls other
+    components.
+    """
 
-    def __init__(self, source: Checkpoints, loader: Loader, sessions: SessionTable[LoadedModel]) -> None:
-        """Manage the models of a replica; the `sessions` of a model that is evicted at once are closed."""
-        self.continues_plans = False  # whether chunks of the deployment's own model continue the executed plan
-        self.contract: Contract | None = None  # contract of the deployment's own model that was loaded last
-        self.weights: dict[str, Any] | None = None  # weights of the deployment's own model that was loaded last
+    def __init__(
+        self, source: Checkpoints, loader: Loader, sessions: SessionTable[LoadedModel]
+    ) -> None:
+        """Manage the models of a replica; the `sessions` of a model that is evicted at once are
+        closed.
+        """
+        # Whether chunks of the deployment's own model continue the executed plan.
+        self.continues_plans = False
+        # Contract of the deployment's own model that was loaded last.
+        self.contract: Contract | None = None
+        # Weights of the deployment's own model that was loaded last.
+        self.weights: dict[str, Any] | None = None
         self.devices: list[dict[str, Any]] = []  # devices of that model
         self.files: Program = {}  # digests of the files named in the settings of that model
         self.step = ""  # the step of a long first load, such as "compiling 4 rows (3 of 5)"
-        self.on_step: Callable[[str], None] = lambda _: None  # called with `step`, on the loading thread
+        # Called with `step`, on the loading thread.
+        self.on_step: Callable[[str], None] = lambda _: None
         self._source, self._loader = source, loader
         loader.on_progress = self._set_step
         self._sessions = sessions
@@ -231,7 +277,9 @@ class ModelManager:
         return self._cache.config
 
     def configure(self, config: Mapping[str, Any]) -> None:
-        """Set the deployment's own settings: the first call sets the initial ones, a later one starts a swap."""
+        """Set the deployment's own settings: the first call sets the initial ones, a later one
+        starts a swap.
+        """
         own = self._source.own(config)
         with self._changed:
             if not self._begun:
@@ -242,7 +290,9 @@ class ModelManager:
                 self._wake()
 
     def start(self) -> None:
-        """Load the deployment's own checkpoint on the calling thread; raises an error if it cannot be served."""
+        """Load the deployment's own checkpoint on the calling thread; raises an error if it
+        cannot be served.
+        """
         self._begun = True
         first, self._first = self._first, None
         model = self._loader.load(DEFAULT, self.config, first)
@@ -276,12 +326,16 @@ class ModelManager:
 
     @property
     def version(self) -> tuple[str, str]:
-        """Version that is equal in replicas of the same policy with equal settings of the deployment."""
+        """Version that is equal in replicas of the same policy with equal settings of the
+        deployment.
+        """
         return self._loader.version(self.config), self._fingerprint
 
     @property
     def own_weights(self) -> ModelWeights:
-        """Versions of the weights of the deployment's own model; raises `PolicyUnavailable` before it is loaded."""
+        """Versions of the weights of the deployment's own model; raises `PolicyUnavailable`
+        before it is loaded.
+        """
         with self._changed:
             model = self._cache.find(DEFAULT)
         if model is None:
@@ -290,36 +344,55 @@ class ModelManager:
 
     @property
     def uncompiled(self) -> list[str]:
-        """Return the parts of the loaded models that run without compilation, although their settings request it."""
+        """Return the parts of the loaded models that run without compilation, although their
+        settings request it.
+        """
         with self._changed:
-            return [what for model in self._cache.loaded.values() for what in model.report.uncompiled]
+            return [
+                what for model in self._cache.loaded.values() for what in model.report.uncompiled
+            ]
 
     def gpu_memory(self) -> dict[str, int]:
-        """Return the memory of the GPUs of the deployment's own model, see `accelerator.gpu_memory`."""
+        """Return the memory of the GPUs of the deployment's own model, see
+        `accelerator.gpu_memory`.
+        """
         return gpu_memory(self.devices)
 
     def _fits(self, loaded: int) -> bool:
-        """Return whether the GPU has room for one more checkpoint: as much as each of the loaded ones takes."""
+        """Return whether the GPU has room for one more checkpoint: as much as each of the loaded
+        ones takes.
+        """
         memory, full = self.gpu_memory() if loaded else {}, self._full
         self._full = bool(memory) and memory["free"] * loaded < memory["reserved"]
         if self._full and not full:
             cure = f"set checkpoints: {{loaded: {loaded}}}, or smaller batch.sizes"
             logger.warning(
-                "the next checkpoint waits until one of %d leaves the GPU: %s bytes; %s", loaded, memory, cure
+                "the next checkpoint waits until one of %d leaves the GPU: %s bytes; %s",
+                loaded,
+                memory,
+                cure,
             )
         return not self._full
 
     def loading(self) -> PolicyUnavailable:
-        """Return the error for clients while the first checkpoint is loaded, which names the step of loading."""
-        return PolicyUnavailable(f"the policy is loading{self.step and f' ({self.step})'}; try again")
+        """Return the error for clients while the first checkpoint is loaded, which names the
+        step of loading.
+        """
+        return PolicyUnavailable(
+            f"the policy is loading{self.step and f' ({self.step})'}; try again"
+        )
 
     def describe(self) -> dict[str, Any]:
-        """Return the available choices, the loaded checkpoints and the state of the last swap, for the metadata."""
+        """Return the available choices, the loaded checkpoints and the state of the last swap,
+        for the metadata.
+        """
         with self._changed:
             return self._cache.describe()
 
     def loaded(self, choice: CheckpointChoice) -> LoadedModel | None:
-        """Return the model that an episode of that choice would use now; None if it is not loaded."""
+        """Return the model that an episode of that choice would use now; None if it is not
+        loaded.
+        """
         with self._changed:
             return self._cache.find(choice)
 
@@ -330,12 +403,13 @@ class ModelManager:
         on_loaded: OnLoaded,
         is_abandoned: Callable[[], bool] = lambda: False,
     ) -> LoadedModel | None:
-        """Return the model for a session's next episode, which the session holds until its next call or its end.
+        """Return the model for a session's next episode, which the session holds until its next
+        call or its end.
 
         Args:
             session: The session; it releases the model that it held before.
-            on_loaded: Called if the model has to be loaded or waited for: with None once the session holds it, or with
-                the error.
+            on_loaded: Called if the model has to be loaded or waited for: with None once the
+                session holds it, or with the error.
             is_abandoned: Returns whether the caller no longer waits.
 
         Returns:
@@ -351,11 +425,16 @@ class ModelManager:
             return None
 
     def adopt(
-        self, session: Session[LoadedModel], choice: CheckpointChoice, settings: Mapping[str, Any], timeout_s: float
+        self,
+        session: Session[LoadedModel],
+        choice: CheckpointChoice,
+        settings: Mapping[str, Any],
+        timeout_s: float,
     ) -> LoadedModel:
         """Return the model for a session from another replica.
 
-        If the deployment offers that model, it is loaded, unless that takes longer than `timeout_s`.
+        If the deployment offers that model, it is loaded, unless that takes longer than
+        `timeout_s`.
 
         Raises:
             UnknownSession: The session cannot continue here.
@@ -365,7 +444,9 @@ class ModelManager:
             if (model := self._cache.loaded.get(key_of(settings))) is not None:
                 return self._cache.assign(session, model)
             if timeout_s <= 0 or not self._source.offers(choice, settings, self.config):
-                raise UnknownSession(f"session {session.id!r}: {choice} is not loaded here; reset it")
+                raise UnknownSession(
+                    f"session {session.id!r}: {choice} is not loaded here; reset it"
+                )
         done = threading.Event()
         errors: list[VLAgentsError] = []
 
@@ -376,7 +457,11 @@ class ModelManager:
         if self.hold(session, choice, on_loaded) is None:
             done.wait(timeout_s)
         if session.model is None:
-            raise errors[0] if errors else UnknownSession(f"session {session.id!r}: {choice} takes long; reset it")
+            raise (
+                errors[0]
+                if errors
+                else UnknownSession(f"session {session.id!r}: {choice} takes long; reset it")
+            )
         return session.model
 
     def release_model(self, session: Session[LoadedModel]) -> None:
@@ -396,7 +481,9 @@ class ModelManager:
             raise _stopping()
 
     def _wake(self) -> None:
-        """Wake the loading thread up to check for work; the first call after `start` starts the thread."""
+        """Wake the loading thread up to check for work; the first call after `start` starts the
+        thread.
+        """
         if self._thread.ident is None and self._loaded and not self._closed:
             self._thread.start()
         self._changed.notify_all()
@@ -424,13 +511,16 @@ class ModelManager:
                 logger.exception("the checkpoints' thread goes on")
 
     def _next_task(self) -> LoadTask | EvictTask | DueCallbacks | None:
-        """Wait for the next task, or for callbacks that are due, and return them; None after `close`."""
+        """Wait for the next task, or for callbacks that are due, and return them; None after
+        `close`.
+        """
         with self._changed:
             while not self._closed:
                 if (model := self._cache.swap()) is not None:
                     self._set_own_model(model)
                     logger.info("new episodes begin with %s", model.checkpoint)
-                if due := self._cache.pop_due():  # before `plan`, which might evict a model that was just loaded
+                # Before `plan`, which might evict a model that was just loaded.
+                if due := self._cache.pop_due():
                     return due
                 draining = self._cache.draining
                 if (task := self._cache.plan()) is not None:
@@ -446,11 +536,15 @@ class ModelManager:
                 model = self._loader.load(task.choice, task.settings)
         except BaseException as error:
             logger.exception("%s did not load", task.choice)
-            failure = f"{task.choice} did not load: {type(error).__name__}; the server's log says why"
+            failure = (
+                f"{task.choice} did not load: {type(error).__name__}; the server's log says why"
+            )
             with self._changed:
                 due = self._cache.failed(task.settings, failure)
         else:
-            logger.info("%s: loaded %s in %.1f s", task.choice, model.checkpoint, time.monotonic() - begun)
+            logger.info(
+                "%s: loaded %s in %.1f s", task.choice, model.checkpoint, time.monotonic() - begun
+            )
             with self._changed:
                 if not self._closed:
                     self._cache.loaded[model.key] = model
@@ -467,7 +561,8 @@ class ModelManager:
             logger.info("there is room for one checkpoint: its sessions end, for the next")
             self._sessions.close_those_of(model)
         with self._changed:
-            if task.at_once and model.sessions:  # a session from another replica holds it, but is not in a table yet
+            # A session from another replica holds it, but is not in a table yet.
+            if task.at_once and model.sessions:
                 self._changed.wait(_CHECK_S)
             if model.sessions:  # a session still holds it, or has taken it
                 return

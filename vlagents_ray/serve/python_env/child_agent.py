@@ -49,16 +49,19 @@ _LAST_WORDS = 20  # number of lines at the end of the child's error output that 
 
 
 class Child:
-    """A child process, which ends when this process ends for any reason; the other side is `child_main`.
+    """A child process, which ends when this process ends for any reason; the other side is
+    `child_main`.
 
-    Calls of the replica's engine to the policy are sent through shared memory (`vlagents_ray.client.transports.shm`) to
-    an engine in the child: a batch is one message, and each session has a session in the child.
+    Calls of the replica's engine to the policy are sent through shared memory
+    (`vlagents_ray.client.transports.shm`) to an engine in the child: a batch is one message, and
+    each session has a session in the child.
 
     `call` and the methods below it may be called from any thread.
     """
 
     def __init__(self, python: str, settings: Settings, env_vars: Mapping[str, str]) -> None:
-        self.loaded: dict[str, Any] = {}  # what the process says of the loaded policy: see `child_main`
+        # What the process says of the loaded policy: see `child_main`.
+        self.loaded: dict[str, Any] = {}
         self.sessions: set[str] = set()  # names of the sessions in the child
         self._python, self._settings, self._env_vars = python, settings, env_vars
         self._process: subprocess.Popen[bytes] | None = None
@@ -70,7 +73,8 @@ class Child:
         self._requests = itertools.count(1)
         self._names = itertools.count(1)
         self._free: deque[str] = deque()
-        self._left: queue.SimpleQueue[str | int | None] = queue.SimpleQueue()  # sessions, and versions of weights
+        # sessions, and versions of weights.
+        self._left: queue.SimpleQueue[str | int | None] = queue.SimpleQueue()
         self._closed = False
 
     def start(self) -> None:
@@ -80,12 +84,15 @@ class Child:
             ConfigError: The interpreter cannot be started.
             PolicyFailed: The policy did not load.
         """
-        # The kernel kills the child when the thread that started it ends; this thread ends after the child.
+        # The kernel kills the child when the thread that started it ends; this thread ends after
+        # the child.
         keeper = threading.Thread(target=self._keep, name="policy-process", daemon=True)
         keeper.start()
         spawned = self._spawned.get()
         if isinstance(spawned, OSError):
-            raise ConfigError(f"environment.python: {self._python!r} cannot be started here ({spawned})") from spawned
+            raise ConfigError(
+                f"environment.python: {self._python!r} cannot be started here ({spawned})"
+            ) from spawned
         self._process = spawned
         try:
             self.loaded = self._introduced(spawned, keeper)
@@ -94,10 +101,14 @@ class Child:
         except BaseException:
             self.close()
             raise
-        threading.Thread(target=self._close_sessions, name="policy-process-sessions", daemon=True).start()
+        threading.Thread(
+            target=self._close_sessions, name="policy-process-sessions", daemon=True
+        ).start()
 
     def call(self, requests: Sequence[Request]) -> list[Reply]:
-        """Send requests in one message and return their replies; raise `ConnectionLost` if the process has ended."""
+        """Send requests in one message and return their replies; raise `ConnectionLost` if the
+        process has ended.
+        """
         if self._transport is None:
             raise PolicyUnavailable("the policy's process has not started")
         for request in requests:
@@ -108,11 +119,15 @@ class Child:
             except PolicyUnavailable as error:
                 raise ConnectionLost(f"{self._ended()}; the replica is being replaced") from error
         if len(replies) != len(requests):  # a single reply to the whole message
-            raise replies[0].error or PolicyFailed(f"got {len(replies)} replies to {len(requests)} requests")
+            raise replies[0].error or PolicyFailed(
+                f"got {len(replies)} replies to {len(requests)} requests"
+            )
         return replies
 
     def open_session(self) -> str:
-        """Return a name for a new session; names are reused, since each takes memory until the connection ends."""
+        """Return a name for a new session; names are reused, since each takes memory until the
+        connection ends.
+        """
         try:
             name = self._free.popleft()
         except IndexError:
@@ -121,11 +136,15 @@ class Child:
         return name
 
     def drop(self, name: str | int) -> None:
-        """Close a session, or drop a version of the weights, soon; the garbage collector may call this at any time."""
+        """Close a session, or drop a version of the weights, soon; the garbage collector may
+        call this at any time.
+        """
         self._left.put(name)
 
     def call_for_weights(self, **call: Any) -> dict[str, Any]:
-        """Let the process execute a call (see `child_main`) while it acts, and return the result or raise its error."""
+        """Let the process execute a call (see `child_main`) while it acts, and return the result
+        or raise its error.
+        """
         with self._calling:
             process = self._process
             if process is None or process.stdout is None:
@@ -133,7 +152,9 @@ class Child:
             _write(process, json.dumps(call).encode() + b"\n")
             line = process.stdout.readline()
         if not line:
-            raise PolicyUnavailable(f"weights: {self._ended()}, so that nothing was changed; push again")
+            raise PolicyUnavailable(
+                f"weights: {self._ended()}, so that nothing was changed; push again"
+            )
         answer: dict[str, Any] = json.loads(line)
         if "code" in answer:
             error = read_error(answer)
@@ -165,14 +186,20 @@ class Child:
                 with contextlib.suppress(BrokenPipeError):
                     pipe.close()
 
-    def _introduced(self, process: subprocess.Popen[bytes], keeper: threading.Thread) -> dict[str, Any]:
-        """Return the document that the process sends when its policy is loaded; raise `PolicyFailed` otherwise."""
+    def _introduced(
+        self, process: subprocess.Popen[bytes], keeper: threading.Thread
+    ) -> dict[str, Any]:
+        """Return the document that the process sends when its policy is loaded; raise
+        `PolicyFailed` otherwise.
+        """
         _write(process, json.dumps(asdict(self._settings)).encode() + b"\n")
         while True:
             line = b"" if process.stdout is None else process.stdout.readline()
             if not line:
                 keeper.join(_EXIT_S)
-                raise PolicyFailed(f"{self._ended()}; it said:\n{''.join(self._last_words).strip()}")
+                raise PolicyFailed(
+                    f"{self._ended()}; it said:\n{''.join(self._last_words).strip()}"
+                )
             said: dict[str, Any] = json.loads(line)
             if "step" not in said:
                 break
@@ -186,7 +213,9 @@ class Child:
         return said
 
     def _keep(self) -> None:
-        """Start the process, copy its error output to that of this process, and wait until it ends."""
+        """Start the process, copy its error output to that of this process, and wait until it
+        ends.
+        """
         try:
             process = subprocess.Popen(  # noqa: S603 - the deployment's own interpreter
                 [self._python, "-m", child_main.__name__],
@@ -220,7 +249,9 @@ class Child:
             self._free.append(name)
 
     def _ended(self) -> str:
-        """Return a sentence about the end of the process; its exit status is known shortly after its sockets close."""
+        """Return a sentence about the end of the process; its exit status is known shortly after
+        its sockets close.
+        """
         if self._process is None:
             return "the policy's process has not started"
         try:
@@ -238,13 +269,16 @@ def _write(process: subprocess.Popen[bytes], data: bytes) -> None:
 
 
 def make_agent(args: ServerArgs, config: Mapping[str, Any]) -> Agent:
-    """Build the policy with the settings `config`, or the proxy for a child process, without loading it.
+    """Build the policy with the settings `config`, or the proxy for a child process, without
+    loading it.
 
     `args.environment.process` must be decided, see `probe.with_process`.
     """
     environment = args.environment
     if environment.python is not None and environment.process == "child":
-        settings = Settings(args.policy, dict(config), args.batch.max_size, version_of(args), args.wrappers)
+        settings = Settings(
+            args.policy, dict(config), args.batch.max_size, version_of(args), args.wrappers
+        )
         return ChildAgent(Child(environment.python, settings, environment.env_vars))
     return build_agent(args.policy, config, args.wrappers)
 
@@ -252,13 +286,16 @@ def make_agent(args: ServerArgs, config: Mapping[str, Any]) -> Agent:
 def version_of(args: ServerArgs) -> str:
     """Return a text that is equal in replicas between which sessions can move.
 
-    It covers the policy, wrappers and environment, since pickles of one environment are valid in no other.
+    It covers the policy, wrappers and environment, since pickles of one environment are valid in no
+    other.
     """
     return json.dumps([args.policy, args.wrappers, args.environment.model_dump()], sort_keys=True)
 
 
 class ChildAgent(Agent, HoldsWeights):
-    """Proxy for the policy in a child process; a copy is one of its sessions and moves to another child by pickling."""
+    """Proxy for the policy in a child process; a copy is one of its sessions and moves to
+    another child by pickling.
+    """
 
     shared: ClassVar[tuple[str, ...]] = ("_child",)
 
@@ -276,9 +313,13 @@ class ChildAgent(Agent, HoldsWeights):
         self.weights_id = self._child.loaded["weights"]
 
     def parameters(self) -> dict[str, Any]:
-        raise NotTrainable("the weights are in the policy's own process; a server replaces them there")
+        raise NotTrainable(
+            "the weights are in the policy's own process; a server replaces them there"
+        )
 
-    def model_weights(self, busy: threading.Lock, digest: str, model: tuple[str, str]) -> ModelWeights:
+    def model_weights(
+        self, busy: threading.Lock, digest: str, model: tuple[str, str]
+    ) -> ModelWeights:
         return ChildWeights(self, self._child, busy, digest, model)
 
     def reset(self, obs: Obs, instruction: str | None, **kwargs: Any) -> dict[str, Any]:
@@ -338,7 +379,12 @@ class ChildWeights(ModelWeights):
     """
 
     def __init__(
-        self, agent: ChildAgent, child: Child, busy: threading.Lock, digest: str, model: tuple[str, str]
+        self,
+        agent: ChildAgent,
+        child: Child,
+        busy: threading.Lock,
+        digest: str,
+        model: tuple[str, str],
     ) -> None:
         trained = child.loaded["trained"]
         super().__init__(agent, busy, trained.get("fingerprint", digest), model)
@@ -356,18 +402,25 @@ class ChildWeights(ModelWeights):
         }
 
     def make(
-        self, number: int, newest: WeightsVersion, pushed: Mapping[str, Any] | SharedValues, options: PushOptions
+        self,
+        number: int,
+        newest: WeightsVersion,
+        pushed: Mapping[str, Any] | SharedValues,
+        options: PushOptions,
     ) -> WeightsVersion:
         name, shared = next(self._numbers), None
         if isinstance(pushed, SharedValues):
             shared, pushed = pushed.to_json(), pushed.others
         else:
-            require_fit(newest.values or {}, pushed, partial=options.partial)  # before anything is copied
+            # Before anything is copied.
+            require_fit(newest.values or {}, pushed, partial=options.partial)
         make = {"base": self._names[newest], "number": number, "options": asdict(options)}
         with _memory() as file:
             write_values(file, {key: portable(value) for key, value in pushed.items()})
             call = {"name": name, "values": _path(file), "make": make, "shared": shared}
-            version = WeightsVersion(number, self._child.call_for_weights(**call)["fingerprint"], newest.values)
+            version = WeightsVersion(
+                number, self._child.call_for_weights(**call)["fingerprint"], newest.values
+            )
         self._name(version, name)
         return version
 

@@ -1,12 +1,14 @@
-"""The child process of a replica, which runs a policy with packages, or a Python, that the replica cannot use.
+"""The child process of a replica, which runs a policy with packages, or a Python, that the replica
+cannot use.
 
     python -m vlagents_ray.serve.python_env.child_main
 
-It needs the light install and pydantic, not Ray. The first line of its standard input is `Settings`, as JSON. It writes
-a line of JSON for each step of a long load and, when the policy is loaded, a line with the contract and the address of
-its `ShmServer`, which receives all requests; if the policy does not load, that line contains the error. Each further
-line of input is a call for new weights (see `_executed`), which is answered with a line of output while the policy
-acts; an empty line makes it close the policy and end. The end of its input, or the death of its parent, ends it at
+It needs the light install and pydantic, not Ray. The first line of its standard input is
+`Settings`, as JSON. It writes a line of JSON for each step of a long load and, when the policy is
+loaded, a line with the contract and the address of its `ShmServer`, which receives all requests; if
+the policy does not load, that line contains the error. Each further line of input is a call for new
+weights (see `_executed`), which is answered with a line of output while the policy acts; an empty
+line makes it close the policy and end. The end of its input, or the death of its parent, ends it at
 once.
 """
 
@@ -22,7 +24,13 @@ from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any, BinaryIO
 
-from vlagents_ray.errors import ConfigError, NotTrainable, PolicyFailed, PolicyUnavailable, VLAgentsError
+from vlagents_ray.errors import (
+    ConfigError,
+    NotTrainable,
+    PolicyFailed,
+    PolicyUnavailable,
+    VLAgentsError,
+)
 from vlagents_ray.interface import Agent
 from vlagents_ray.policies.wrapper import build_agent, unloaded_contract
 from vlagents_ray.protocol.json_messages import problem
@@ -37,7 +45,8 @@ from vlagents_ray.weights.safetensors import read_values, write_values
 from vlagents_ray.weights.shared_values import NotShared, SharedValues
 from vlagents_ray.weights.trainable import dtype_name
 
-# The replica checks requests, removes idle sessions and detects calls that take too long, so the child does not.
+# The replica checks requests, removes idle sessions and detects calls that take too long, so the
+# child does not.
 _NO_LIMITS = Limits(**dict.fromkeys([limit.name for limit in fields(Limits)], 2**40))
 _NEVER_S = 1e6
 _CHECK_S = 1.0  # interval of the checks whether the accelerator still computes
@@ -55,7 +64,8 @@ class Settings:
 
 
 def examine(policy: str, config: dict[str, Any], wrappers: Sequence[Any] = ()) -> dict[str, Any]:
-    """Build the policy without loading it, and return its contract, if it states one already, or the error.
+    """Build the policy without loading it, and return its contract, if it states one already, or
+    the error.
 
     Returns:
         `{"contract": ...}`, as JSON values or None, or `{"code": ..., "error": ...}`.
@@ -65,7 +75,10 @@ def examine(policy: str, config: dict[str, Any], wrappers: Sequence[Any] = ()) -
     except VLAgentsError as error:
         return {"code": error.code, "error": str(error)}
     except Exception as error:  # noqa: BLE001 - a policy may raise any error when it is built
-        return {"code": ConfigError.code, "error": f"policy {policy}: {type(error).__name__}: {error}"}
+        return {
+            "code": ConfigError.code,
+            "error": f"policy {policy}: {type(error).__name__}: {error}",
+        }
     contract = unloaded_contract(agent)
     return {"contract": None if contract is None else contract.to_json()}
 
@@ -106,7 +119,8 @@ def run() -> None:
         engine.start()
     except Exception as error:
         logging.getLogger(__name__).exception("the policy did not load")
-        cause = error.__cause__ if isinstance(error, PolicyFailed) else error  # the policy's own error
+        # The policy's own error.
+        cause = error.__cause__ if isinstance(error, PolicyFailed) else error
         answer({"error": f"{type(cause).__name__}: {cause}"})
         sys.exit(1)
     contract = None if engine.contract is None else engine.contract.to_json()
@@ -126,19 +140,30 @@ def run() -> None:
         try:
             engine.calls.require_device()
         except PolicyUnavailable:
-            logging.getLogger(__name__).exception("the process ends, so that the replica is replaced")
+            logging.getLogger(__name__).exception(
+                "the process ends, so that the replica is replaced"
+            )
             os._exit(1)
     engine.close()
     server.close()
 
 
 def _trained(agent: Agent, updates: WeightUpdates) -> dict[str, Any]:
-    """Return types and shapes of the values that a learner trains, by name, or the reason why there are none."""
+    """Return types and shapes of the values that a learner trains, by name, or the reason why
+    there are none.
+    """
     try:
-        values = {name: [dtype_name(value), list(value.shape)] for name, value in agent.parameters().items()}
+        values = {
+            name: [dtype_name(value), list(value.shape)]
+            for name, value in agent.parameters().items()
+        }
     except NotTrainable as error:
         return {"refusal": str(error)}
-    return {"values": values, "fingerprint": updates.given(0).fingerprint, "gpus": updates.newest().gpus}
+    return {
+        "values": values,
+        "fingerprint": updates.given(0).fingerprint,
+        "gpus": updates.newest().gpus,
+    }
 
 
 def _read_calls(
@@ -147,7 +172,9 @@ def _read_calls(
     answer: Callable[[dict[str, Any]], None],
     over: threading.Event,
 ) -> None:
-    """Execute the calls that the replica writes, until it writes an empty line; then only the end of input is left."""
+    """Execute the calls that the replica writes, until it writes an empty line; then only the
+    end of input is left.
+    """
     while (line := calls.readline()) and not over.is_set():
         if not line.strip():
             over.set()
@@ -158,7 +185,13 @@ def _read_calls(
             answer({**problem(error), "not_shared": isinstance(error, NotShared)})
         except Exception as error:
             logging.getLogger(__name__).exception("a call for the weights failed")
-            answer(problem(PolicyFailed(f"weights: the policy raised {type(error).__name__}; see the server's log")))
+            answer(
+                problem(
+                    PolicyFailed(
+                        f"weights: the policy raised {type(error).__name__}; see the server's log"
+                    )
+                )
+            )
     os._exit(1)
 
 

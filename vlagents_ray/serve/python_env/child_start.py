@@ -1,7 +1,7 @@
 """The first steps of a child process that answers its parent in lines.
 
-It needs only the standard library: the scripts of other policy servers (`benchmarks/peers`) load this file with a
-Python without vlagents_ray.
+It needs only the standard library: the scripts of other policy servers (`benchmarks/peers`) load
+this file with a Python without vlagents_ray.
 """
 
 from __future__ import annotations
@@ -22,7 +22,9 @@ def die_with_parent() -> None:
 
 
 def own_stdout() -> TextIO:
-    """Reserve the standard output for the answers, and return it; all other output goes to standard error."""
+    """Reserve the standard output for the answers, and return it; all other output goes to
+    standard error.
+    """
     out = os.fdopen(os.dup(1), "w")
     os.dup2(2, 1)
     return out

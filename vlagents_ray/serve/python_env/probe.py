@@ -1,4 +1,6 @@
-"""Checks of a virtual environment: whether it has an interpreter and its packages, and can build the policy."""
+"""Checks of a virtual environment: whether it has an interpreter and its packages, and can build
+the policy.
+"""
 
 from __future__ import annotations
 
@@ -19,7 +21,8 @@ from vlagents_ray.serve.config.deployment import EnvironmentArgs
 _PACKAGES = ("ray", "numpy", "vlagents-ray")
 _TIMEOUT_S = 120.0  # imports from a network drive without a cache are slow
 OLDEST = (3, 10)
-# The program must run in any interpreter, including an old Python; imports may print before the last line.
+# The program must run in any interpreter, including an old Python; imports may print before the
+# last line.
 _PROBE = """
 import json, sys
 found = {"python": "%d.%d.%d" % sys.version_info[:3]}
@@ -43,17 +46,22 @@ print("VLA" + json.dumps(found))
 class EnvironmentProbe:
     """The answer of an interpreter."""
 
-    versions: dict[str, str]  # versions of "python", "ray", "numpy" and "vlagents-ray", as far as they are installed
+    # Versions of "python", "ray", "numpy" and "vlagents-ray", as far as they are installed.
+    versions: dict[str, str]
     policy: dict[str, Any] | None = None  # result of `child_main.examine`, if it was requested
 
     def hosts_replicas(self) -> str | None:
-        """Return the reason why a replica of this process's cluster cannot run there; None if it can."""
+        """Return the reason why a replica of this process's cluster cannot run there; None if it
+        can.
+        """
         ours, theirs = platform.python_version(), self.versions["python"]
         if _minor(ours) != _minor(theirs):
             return f"it is Python {theirs}, the cluster's is {ours}"
         cluster, there = importlib.metadata.version("ray"), self.versions.get("ray")
         return (
-            None if there == cluster else f"it has {f'Ray {there}' if there else 'no Ray'}, the cluster has {cluster}"
+            None
+            if there == cluster
+            else f"it has {f'Ray {there}' if there else 'no Ray'}, the cluster has {cluster}"
         )
 
 
@@ -72,8 +80,12 @@ def probe(
     """
     if not Path(python).is_file():
         inside = Path(python) / "bin" / "python"
-        cure = f"did you mean {inside}?" if inside.is_file() else f"make one with `{_making(python)}`"
-        raise ConfigError(f"environment.python: no such file, got {python!r}, want an interpreter; {cure}")
+        cure = (
+            f"did you mean {inside}?" if inside.is_file() else f"make one with `{_making(python)}`"
+        )
+        raise ConfigError(
+            f"environment.python: no such file, got {python!r}, want an interpreter; {cure}"
+        )
     version = importlib.metadata.version("vlagents-ray")
     try:
         done = subprocess.run(  # noqa: S603 - the deployment's own interpreter
@@ -87,27 +99,40 @@ def probe(
             env={**os.environ, **(env_vars or {})},
         )
     except (OSError, subprocess.TimeoutExpired) as error:
-        why = error if isinstance(error, OSError) else f"no answer in {_TIMEOUT_S} s; is the machine busy?"
-        raise ConfigError(f"environment.python: {python!r} is no Python interpreter that runs here ({why})") from error
+        why = (
+            error
+            if isinstance(error, OSError)
+            else f"no answer in {_TIMEOUT_S} s; is the machine busy?"
+        )
+        raise ConfigError(
+            f"environment.python: {python!r} is no Python interpreter that runs here ({why})"
+        ) from error
     last = done.stdout.strip().rpartition("\n")[2]
     if not last.startswith("VLA{"):
         words = (done.stderr or done.stdout).strip()[-500:] or "it said nothing"
-        raise ConfigError(f"environment.python: {python!r} is no Python interpreter, or a broken one: {words}")
+        raise ConfigError(
+            f"environment.python: {python!r} is no Python interpreter, or a broken one: {words}"
+        )
     said: dict[str, Any] = json.loads(last[3:])
     examined = said.pop("policy", None)
     if _minor(said["python"]) < OLDEST:
         oldest = ".".join(map(str, OLDEST))
-        raise ConfigError(f"environment.python: {python} is Python {said['python']}, want {oldest} or newer")
+        raise ConfigError(
+            f"environment.python: {python} is Python {said['python']}, want {oldest} or newer"
+        )
     if (theirs := said.get("vlagents-ray")) != version:
         raise ConfigError(
-            f"environment.python: {python} has {f'vlagents-ray {theirs}' if theirs else 'no vlagents-ray'}, want "
+            f"environment.python: {python} has "
+            f"{f'vlagents-ray {theirs}' if theirs else 'no vlagents-ray'}, want "
             f"{version} as here; install it there, or make the environment with `{_making(python)}`"
         )
     return EnvironmentProbe(said, examined)
 
 
 def _making(python: str) -> str:
-    """Return the command that creates an interpreter's environment: .venv-NAME is that of the family's NAME."""
+    """Return the command that creates an interpreter's environment: .venv-NAME is that of the
+    family's NAME.
+    """
     folder = Path(python).parent.parent
     prefix, _, name = folder.name.partition(".venv-")
     if prefix or not name:
@@ -116,10 +141,14 @@ def _making(python: str) -> str:
 
 
 def with_process(environment: EnvironmentArgs) -> EnvironmentArgs:
-    """Return the settings with `process` "auto" decided; raise `ConfigError` if the policy cannot run as stated."""
+    """Return the settings with `process` "auto" decided; raise `ConfigError` if the policy
+    cannot run as stated.
+    """
     if environment.python is None:
         return environment
-    return environment.model_copy(update={"process": _process(environment, probe(environment.python))})
+    return environment.model_copy(
+        update={"process": _process(environment, probe(environment.python))}
+    )
 
 
 def check_policy(
@@ -131,7 +160,8 @@ def check_policy(
         The contract; None if the policy has none before it is loaded.
 
     Raises:
-        ConfigError: The policy cannot be built there, or the environment is unusable or names no interpreter.
+        ConfigError: The policy cannot be built there, or the environment is unusable or names no
+            interpreter.
     """
     if environment.python is None:
         raise ConfigError("environment: names no interpreter to ask")
@@ -151,8 +181,10 @@ def _process(environment: EnvironmentArgs, found: EnvironmentProbe) -> Literal["
     obstacle = found.hosts_replicas()
     if obstacle is not None and environment.process == "replica":
         raise ConfigError(
-            f"environment.process: got 'replica', which cannot run in {environment.python}: {obstacle}; "
-            f"use process 'child' (or 'auto'), or make the environment anew with `vlagents-ray env make`"
+            f"environment.process: got 'replica', which cannot run in {environment.python}: "
+            f"{obstacle}; "
+            "use process 'child' (or 'auto'), or make the environment anew with `vlagents-ray env "
+            "make`"
         )
     return "child" if obstacle else "replica"
 

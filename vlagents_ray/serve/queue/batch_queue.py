@@ -1,12 +1,15 @@
-"""The batch queue: it holds all requests for the policy until the policy's thread takes them in batches.
+"""The batch queue: it holds all requests for the policy until the policy's thread takes them in
+batches.
 
-The queue is work-conserving except for one short wait: as soon as the policy is free, it takes all waiting requests up
-to the batch limit, so that batching never delays a lone request. `vlagents_ray.serve.queue.fair_queue` defines the
-order. Expired and finished requests never reach the policy, but are only dropped when it is next free; a caller that
-needs an earlier notice of its expired deadline sets a timer.
+The queue is work-conserving except for one short wait: as soon as the policy is free, it takes all
+waiting requests up to the batch limit, so that batching never delays a lone request.
+`vlagents_ray.serve.queue.fair_queue` defines the order. Expired and finished requests never reach
+the policy, but are only dropped when it is next free; a caller that needs an earlier notice of its
+expired deadline sets a timer.
 
-The queue waits for the remaining requests of a group of sessions that were answered together and are about to send
-their next requests. `vlagents_ray.serve.queue.batch_window` decides when and for how long. `patience=0` disables this.
+The queue waits for the remaining requests of a group of sessions that were answered together and
+are about to send their next requests. `vlagents_ray.serve.queue.batch_window` decides when and for
+how long. `patience=0` disables this.
 """
 
 from __future__ import annotations
@@ -28,25 +31,29 @@ _DENSE_S = 500e-6  # interval between two requests below which the next one is e
 
 
 class Taken(NamedTuple):
-    """The work that the policy's thread takes at once; both lists are empty after a long time without requests."""
+    """The work that the policy's thread takes at once; both lists are empty after a long time
+    without requests.
+    """
 
     batch: list[PendingRequest]
-    # Requests whose deadlines have passed, or whose connections have ended: not in the batch, and still unanswered.
+    # Requests whose deadlines have passed, or whose connections have ended: not in the batch, and
+    # still unanswered.
     expired: list[PendingRequest]
 
 
 class BatchQueue:
     """The waiting requests, and the watched files that deliver new ones.
 
-    One thread, the policy's, calls `bind`, then in turns `next`, `begin` and `end`, at last `poller.close`. It waits on
-    file descriptors, so that a local client's socket can be one: its request then reaches the policy without a
-    thread switch. While batches take milliseconds and are not all for one session, a second thread polls these files,
-    so that the next batch is already decoded when the current one ends.
+    One thread, the policy's, calls `bind`, then in turns `next`, `begin` and `end`, at last
+    `poller.close`. It waits on file descriptors, so that a local client's socket can be one: its
+    request then reaches the policy without a thread switch. While batches take milliseconds and are
+    not all for one session, a second thread polls these files, so that the next batch is already
+    decoded when the current one ends.
 
     Args:
         idle_s: Time without a request after which `next` returns nothing, s.
-        patience: After a batch that took D s, the thread waits at most `patience` * D s for the sessions of that batch
-            that are about to send their next requests.
+        patience: After a batch that took D s, the thread waits at most `patience` * D s for the
+            sessions of that batch that are about to send their next requests.
         is_open: Returns whether a session still exists.
         poller: Poller for the watched files; by default the queue creates one.
     """
@@ -69,7 +76,8 @@ class BatchQueue:
         self._closed = False
         self._thread = 0  # id of the policy's thread
         self._asleep = False
-        self._driven = False  # whether a caller of `take` drives the queue; each new request then wakes that caller
+        # Whether a caller of `take` drives the queue; each new request then wakes that caller.
+        self._driven = False
         self._dense = False  # whether requests arrive in quick succession
         self.poller = poller or Poller()
         self.window = BatchWindow(patience, max_batch_size, is_open)
@@ -79,13 +87,17 @@ class BatchQueue:
         self._begun = 0.0  # start of the running batch, s
 
     def bind(self, *, driven: bool = False) -> None:
-        """Make the calling thread the policy's; if it is `driven`, the poller's `wake` signals when to call `take`."""
+        """Make the calling thread the policy's; if it is `driven`, the poller's `wake` signals
+        when to call `take`.
+        """
         self._thread = 0 if driven else threading.get_ident()
         self._driven = self._asleep = driven
         self._load_timer.mark_busy()
 
     def put(self, *requests: PendingRequest) -> None:
-        """Queue requests, for the same batch if it has room for all; raise `PolicyUnavailable` after `close`."""
+        """Queue requests, for the same batch if it has room for all; raise `PolicyUnavailable`
+        after `close`.
+        """
         with self._lock:
             if self._closed:
                 raise PolicyUnavailable("the replica is stopping; connect again")
@@ -99,13 +111,17 @@ class BatchQueue:
             self._wake()
 
     def withdraw(self, *requests: PendingRequest) -> None:
-        """End requests without an answer; no batch takes them, except a reset whose checkpoint was loaded."""
+        """End requests without an answer; no batch takes them, except a reset whose checkpoint
+        was loaded.
+        """
         with self._lock:
             for pending in requests:
                 pending.over = True
 
     def cancel(self, pending: PendingRequest) -> bool:
-        """End a request without an answer, unless a batch has taken it; return whether it was ended."""
+        """End a request without an answer, unless a batch has taken it; return whether it was
+        ended.
+        """
         with self._lock:
             if pending.begun:
                 return False
@@ -113,7 +129,9 @@ class BatchQueue:
             return True
 
     def next(self) -> Taken | None:
-        """Wait for requests, and return the next batch; it is empty after `idle_s`, and None after `close`."""
+        """Wait for requests, and return the next batch; it is empty after `idle_s`, and None
+        after `close`.
+        """
         if not self._wait_for_request():
             return Taken([], [])
         if self.window.slow:
@@ -134,7 +152,9 @@ class BatchQueue:
         return Taken(batch, expired)
 
     def begin(self, batch: Sequence[PendingRequest]) -> None:
-        """Record that the policy begins to act on a batch; another thread polls during it, if worthwhile."""
+        """Record that the policy begins to act on a batch; another thread polls during it, if
+        worthwhile.
+        """
         self._begun = self._clock()
         self._running = batch
         if self.window.overlaps:
@@ -149,9 +169,11 @@ class BatchQueue:
         self.poller.reclaim()
 
     def clear(self) -> tuple[Sequence[PendingRequest], list[PendingRequest]]:
-        """Return the running batch, and the waiting requests, which are removed. May be called on any thread.
+        """Return the running batch, and the waiting requests, which are removed. May be called on
+        any thread.
 
-        Another thread reads later requests until the batch ends, so that they can be refused while it hangs.
+        Another thread reads later requests until the batch ends, so that they can be refused while
+        it hangs.
         """
         with self._lock:
             self._load_timer.count(self._waiting.size, self._clock())
@@ -160,7 +182,9 @@ class BatchQueue:
             return self._running, self._waiting.clear()
 
     def full_batch_waits(self) -> bool:
-        """Return whether a full batch waits, so that replies to simulations can be sent while it runs."""
+        """Return whether a full batch waits, so that replies to simulations can be sent while it
+        runs.
+        """
         return self.window.slow and self._waiting.sessions >= self.largest
 
     def depth(self) -> int:
@@ -172,7 +196,8 @@ class BatchQueue:
         return dict(zip(Rank, self._waiting.depth, strict=True))
 
     def load_s(self) -> tuple[float, float]:
-        """Return the total time for which the policy's thread has been idle, and all requests have waited so far, s.
+        """Return the total time for which the policy's thread has been idle, and all requests have
+        waited so far, s.
 
         The growth rate of the latter is the mean queue length.
         """
@@ -180,7 +205,9 @@ class BatchQueue:
             return self._load_timer.idle_time_s(), self._load_timer.waited_s(self._waiting.size)
 
     def close(self) -> list[PendingRequest]:
-        """Refuse further requests, make `next` return None after the running batch, and return the waiting requests."""
+        """Refuse further requests, make `next` return None after the running batch, and return
+        the waiting requests.
+        """
         with self._lock:
             self._closed = True
             self._load_timer.count(self._waiting.size, self._clock())
@@ -189,12 +216,15 @@ class BatchQueue:
             return self._waiting.clear()
 
     def _wake(self) -> None:
-        if self._asleep and threading.get_ident() != self._thread:  # if the policy's thread calls this, it is awake
+        # If the policy's thread calls this, it is awake.
+        if self._asleep and threading.get_ident() != self._thread:
             self._asleep = False
             self.poller.wake()
 
     def _wait_for_request(self) -> bool:
-        """Poll the watched files until a request waits or the queue is closed; False after `idle_s` without events."""
+        """Poll the watched files until a request waits or the queue is closed; False after
+        `idle_s` without events.
+        """
         while True:
             with self._lock:
                 ready = self._closed or self._waiting.size > 0
@@ -207,10 +237,12 @@ class BatchQueue:
                 return False
 
     def _wait_for_event(self) -> bool:
-        """Wait for a watched file or a wake-up call; return False if there was none within `idle_s`.
+        """Wait for a watched file or a wake-up call; return False if there was none within
+        `idle_s`.
 
-        If the last request followed quickly, the thread polls for `_SPIN_S` before it sleeps, since waking up takes as
-        long as a fast policy. While polling it yields the core to other processes.
+        If the last request followed quickly, the thread polls for `_SPIN_S` before it sleeps, since
+        waking up takes as long as a fast policy. While polling it yields the core to other
+        processes.
         """
         begun = self._load_timer.mark_idle()
         while self._dense and time.perf_counter() - begun < _SPIN_S:
@@ -230,7 +262,8 @@ class BatchQueue:
                 return
             self._wait_over.clear()
             self._gathering = True
-        self.poller.hand_to_reader()  # epoll waits for whole milliseconds, the event below for exact times
+        # Epoll waits for whole milliseconds, the event below for exact times.
+        self.poller.hand_to_reader()
         complete = self._wait_over.wait(wait_s)
         self.poller.reclaim()
         if not complete:
@@ -243,7 +276,8 @@ class BatchQueue:
 
 
 class LoadTimer:
-    """Adds up the waiting time of requests and the idle time of the policy's thread, which is idle at first.
+    """Adds up the waiting time of requests and the idle time of the policy's thread, which is idle
+    at first.
 
     Callers of `count` and `waited_s` must hold one lock; `idle_time_s` may be called on any thread.
     """
@@ -252,15 +286,20 @@ class LoadTimer:
         now = time.perf_counter()
         self._waited = 0.0  # total waiting time of all requests, s
         self._counted = now  # time up to which `_waited` is complete
-        self._idle: tuple[float, float | None] = (0.0, now)  # total idle time, s, and start of the current idle period
+        # Total idle time, s, and start of the current idle period.
+        self._idle: tuple[float, float | None] = (0.0, now)
 
     def count(self, waiting: int, now: float) -> None:
-        """Add the time that `waiting` requests have waited until `now`, s, before their number changes."""
+        """Add the time that `waiting` requests have waited until `now`, s, before their number
+        changes.
+        """
         self._waited += waiting * (now - self._counted)
         self._counted = now
 
     def waited_s(self, waiting: int) -> float:
-        """Return the total waiting time of all requests, s, including the `waiting` ones that wait now."""
+        """Return the total waiting time of all requests, s, including the `waiting` ones that
+        wait now.
+        """
         return self._waited + waiting * max(0.0, time.perf_counter() - self._counted)
 
     def mark_idle(self) -> float:
@@ -277,7 +316,9 @@ class LoadTimer:
         return now
 
     def idle_time_s(self) -> float:
-        """Return the total idle time of the policy's thread, s, including the current idle period."""
+        """Return the total idle time of the policy's thread, s, including the current idle
+        period.
+        """
         idle, since = self._idle
         return idle if since is None else idle + max(0.0, time.perf_counter() - since)
 

@@ -1,20 +1,24 @@
-"""Decides whether a batch waits briefly for sessions about to send their next request; uses no threads or clocks.
+"""Decides whether a batch waits briefly for sessions about to send their next request; uses no
+threads or clocks.
 
-The simulations of a group that was answered together send their next requests within about a millisecond. Without a
-wait, the first request would start a batch alone, and the others would wait for it. From then on the group would be
-split into two batches, each of which waits for the other. So the first request waits for the others, under these
-conditions:
+The simulations of a group that was answered together send their next requests within about a
+millisecond. Without a wait, the first request would start a batch alone, and the others would wait
+for it. From then on the group would be split into two batches, each of which waits for the other.
+So the first request waits for the others, under these conditions:
 
-- The queue only waits for sessions of the last batch whose recent return time is about the time that has passed since
-  that batch. It does not wait again for a session that was late before that session has returned in time once.
-- The wait is at most `patience` times the duration of the last batch. It is also at most the time that one batch saves
-  over two: the fixed cost of a batch, estimated from the durations of the last batches.
-- No robot waits for simulations, the wait endangers no deadline, and the waiting requests do not fill the batch.
+- The queue only waits for sessions of the last batch whose recent return time is about the time
+  that has passed since that batch. It does not wait again for a session that was late before that
+  session has returned in time once.
+- The wait is at most `patience` times the duration of the last batch. It is also at most the time
+  that one batch saves over two: the fixed cost of a batch, estimated from the durations of the last
+  batches.
+- No robot waits for simulations, the wait endangers no deadline, and the waiting requests do not
+  fill the batch.
 
-Robots that act as soon as they are answered, such as those behind their rate, are split in the same way, and each of
-their acts then takes two batches. So they wait for one another for as long as one batch saves over two, at most half of
-the last batch. Robots whose usual return time is longer than that have a rate of their own: they neither wait nor are
-waited for. A lone session never waits.
+Robots that act as soon as they are answered, such as those behind their rate, are split in the same
+way, and each of their acts then takes two batches. So they wait for one another for as long as one
+batch saves over two, at most half of the last batch. Robots whose usual return time is longer than
+that have a rate of their own: they neither wait nor are waited for. A lone session never waits.
 """
 
 from __future__ import annotations
@@ -28,14 +32,16 @@ from vlagents_ray.serve.requests import PendingRequest, Rank
 _KEPT = 0.95  # factor by which the weight of a batch decreases with each later batch
 _SPREAD = 0.01  # variance of the batch sizes below which the fixed cost cannot be estimated
 _NEWEST = 0.25  # weight of the last batch in the mean duration of batches
-# Longest wait of robots for one another, as a share of the last batch: usual policies save less, and it bounds the wait
-# while the fixed cost is not known. Eight robots of one process return within 30 ms, more than `patience` allows.
+# Longest wait of robots for one another, as a share of the last batch: usual policies save less,
+# and it bounds the wait while the fixed cost is not known. Eight robots of one process return
+# within 30 ms, more than `patience` allows.
 _ROBOTS = 0.5
 SLOW_S = 0.002  # a shorter batch ends before a wait could pay off, or another thread could wake up
 
 
 class _AnsweredBatch:
-    """The sessions of a batch by class, and the recent return time of each, s; None if it is unknown.
+    """The sessions of a batch by class, and the recent return time of each, s; None if it is
+    unknown.
 
     The return time of a session is the time from an answer to its next request.
     """
@@ -51,7 +57,9 @@ class _AnsweredBatch:
 
 
 class BatchCost:
-    """A weighted linear fit of the durations of batches over their sizes; older batches have less weight."""
+    """A weighted linear fit of the durations of batches over their sizes; older batches have
+    less weight.
+    """
 
     def __init__(self) -> None:
         self._sums = (0.0, 0.0, 0.0, 0.0, 0.0)
@@ -62,7 +70,9 @@ class BatchCost:
         self._sums = tuple(_KEPT * old + one for old, one in zip(self._sums, new, strict=True))  # type: ignore[assignment]
 
     def fixed_s(self) -> float:
-        """Return the fixed cost of a batch, s; `inf` until batches of different sizes were added."""
+        """Return the fixed cost of a batch, s; `inf` until batches of different sizes were
+        added.
+        """
         count, size, duration, squares, products = self._sums
         spread = count * squares - size * size
         if spread <= _SPREAD * count * count:
@@ -71,7 +81,8 @@ class BatchCost:
 
 
 class BatchWindow:
-    """Decides on the wait from the last two batches. Not thread-safe: its callers must hold one lock.
+    """Decides on the wait from the last two batches. Not thread-safe: its callers must hold one
+    lock.
 
     Args:
         patience: Longest wait, as a multiple of the duration of the last batch.
@@ -85,9 +96,11 @@ class BatchWindow:
         self._last = self._previous = self._no_batch
         self._duration = 0.0  # duration of the last batch, s
         self._mean_s = 0.0  # mean duration of recent batches, s
-        self.slow = False  # whether batches take longer than `SLOW_S`; otherwise the window keeps no records
-        # Whether other threads should work on the next requests while a batch runs: batches are slow, and the last two
-        # were not both for one session, nor the last one if there is no other session.
+        # Whether batches take longer than `SLOW_S`; otherwise the window keeps no records.
+        self.slow = False
+        # Whether other threads should work on the next requests while a batch runs: batches are
+        # slow, and the last two were not both for one session, nor the last one if there is no
+        # other session.
         self.overlaps = False
         self._cost = BatchCost()
         self._missing: set[str] = set()
@@ -96,7 +109,10 @@ class BatchWindow:
 
     def record_start(self, batch: Sequence[PendingRequest]) -> None:
         """Record that a batch begins."""
-        self._previous, self._last = self._last, _AnsweredBatch(batch) if self.slow else self._no_batch
+        self._previous, self._last = (
+            self._last,
+            _AnsweredBatch(batch) if self.slow else self._no_batch,
+        )
         last, previous = self._last, self._previous
         one_session = last.lone != "" and (previous is self._no_batch or previous.lone == last.lone)
         self.overlaps = self.slow and not one_session
@@ -112,7 +128,8 @@ class BatchWindow:
     def record_arrival(self, pending: PendingRequest) -> None:
         """Estimate the return time of the session that sent the request.
 
-        The estimate rises to a longer time at once, and falls to a shorter one by half the difference.
+        The estimate rises to a longer time at once, and falls to a shorter one by half the
+        difference.
         """
         for answered in (self._last, self._previous):
             returns = answered.returns[pending.rank]
@@ -123,7 +140,9 @@ class BatchWindow:
                 return
 
     def wait_s(self, now: float, waiting: FairQueue) -> float:
-        """Return how long the free policy may wait for further requests, s; every `put` then calls `ends_wait`."""
+        """Return how long the free policy may wait for further requests, s; every `put` then
+        calls `ends_wait`.
+        """
         self._rank = Rank.ROBOT if waiting.depth[Rank.ROBOT] else Rank.SIMULATION
         robots = self._rank is Rank.ROBOT
         patience = max(_ROBOTS, self._patience) if robots and self._patience else self._patience

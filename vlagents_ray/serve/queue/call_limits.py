@@ -1,8 +1,8 @@
 """Running calls of a policy, and whether one of them exceeds its time limit.
 
-A deadlocked driver, or a policy that waits for an event that never occurs, keeps its thread alive. Only the time since
-the call began distinguishes it from a policy that is computing. A policy that compiles takes long for its first few
-calls, so these calls and loading have longer limits.
+A deadlocked driver, or a policy that waits for an event that never occurs, keeps its thread alive.
+Only the time since the call began distinguishes it from a policy that is computing. A policy that
+compiles takes long for its first few calls, so these calls and loading have longer limits.
 """
 
 from __future__ import annotations
@@ -18,32 +18,39 @@ from dataclasses import dataclass
 from vlagents_ray.errors import PolicyFailed, PolicyUnavailable, VLAgentsError
 from vlagents_ray.policies.base.accelerator import is_device_failure
 
-_WARM_UP_CALLS = 2  # per kind of call: the first one compiles, and the second one compiles for dynamic sizes
+# Per kind of call: the first one compiles, and the second one compiles for dynamic sizes.
+_WARM_UP_CALLS = 2
 _MULTIPLE = 10  # limit of a call, as a multiple of the longest call of its kind so far
 LOAD = "load"
-FAILED_BATCHES = 20  # number of consecutive batches without any action, after which a replica is replaced
+# Number of consecutive batches without any action, after which a replica is replaced.
+FAILED_BATCHES = 20
 
 
 @dataclass(frozen=True, slots=True)
 class CallLimits:
     """Time limits for calls of the policy, s."""
 
-    act_s: float = 60.0  # limit of a call; ten times the longest call of its kind so far if that is more
+    # Limit of a call; ten times the longest call of its kind so far if that is more.
+    act_s: float = 60.0
     warm_up_s: float = 600.0  # limit of each of the first two calls of a kind
     load_s: float = 3600.0  # limit for loading a checkpoint
 
 
 class PolicyCall:
-    """Context manager around the calls of one kind, on one thread at a time; measures their durations."""
+    """Context manager around the calls of one kind, on one thread at a time; measures their
+    durations.
+    """
 
     __slots__ = ("_calls", "_count", "_longest_s", "_process", "_thread", "began", "ended", "op")
 
     def __init__(self, calls: PolicyCalls, op: str) -> None:
         self.op, self._calls = op, calls
-        self.began = self.ended = 0.0  # times of the last call, s of `PolicyCalls.clock`; for the calling thread only
+        # Times of the last call, s of `PolicyCalls.clock`; for the calling thread only.
+        self.began = self.ended = 0.0
         self._thread = self._process = 0
         self._count = 0
-        self._longest_s = 0.0  # duration of the longest call; of the warm-up calls only the shortest counts
+        # Duration of the longest call; of the warm-up calls only the shortest counts.
+        self._longest_s = 0.0
 
     def __enter__(self) -> PolicyCall:
         self._thread, self._process = threading.get_ident(), os.getpid()
@@ -53,8 +60,10 @@ class PolicyCall:
 
     def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
         if os.getpid() != self._process:
-            # The policy forked this process during the call; the process shares the clients' sockets.
-            os.write(2, f"a child that the policy forked in {self.op!r} has returned; it is ended\n".encode())
+            # The policy forked this process during the call; the process shares the clients'
+            # sockets.
+            message = f"a child that the policy forked in {self.op!r} has returned; it is ended\n"
+            os.write(2, message.encode())
             os._exit(1)
         if error is not None:
             self._calls.record_error(error)
@@ -83,9 +92,13 @@ class PolicyCall:
         return self._calls.clock() - self.began
 
     def describe(self) -> str:
-        """Return a sentence with the operation, the time that it has taken so far, and its limit."""
+        """Return a sentence with the operation, the time that it has taken so far, and its
+        limit.
+        """
         return (
-            f"the policy has not returned from {self.op!r} for {self.lasted_s:.3g} s; its limit is {self.limit_s:.3g} s"
+            f"the policy has not returned from {self.op!r} for {self.lasted_s:.3g} s; its "
+            "limit "
+            f"is {self.limit_s:.3g} s"
         )
 
     def stack(self) -> str:
@@ -97,12 +110,15 @@ class PolicyCall:
 class PolicyCalls:
     """The running calls into all policies of a replica, on all threads."""
 
-    def __init__(self, limits: CallLimits | None = None, clock: Callable[[], float] = time.perf_counter) -> None:
+    def __init__(
+        self, limits: CallLimits | None = None, clock: Callable[[], float] = time.perf_counter
+    ) -> None:
         self.limits = limits or CallLimits()
         self.clock = clock
         self.under_way: set[PolicyCall] = set()
         self.failed_batches = 0  # number of consecutive failed batches
-        self.broken: BaseException | None = None  # error of an accelerator, after which every call fails
+        # Error of an accelerator, after which every call fails.
+        self.broken: BaseException | None = None
 
     def record_error(self, error: BaseException) -> None:
         """Record an error of the policy if it reports a failed accelerator."""
@@ -110,21 +126,29 @@ class PolicyCalls:
             self.broken = error
 
     def record_batch(self, results: Sequence[object]) -> None:
-        """Count consecutive batches with errors of the policy only; errors of requests do not count."""
+        """Count consecutive batches with errors of the policy only; errors of requests do not
+        count.
+        """
         errors = [one for one in results if isinstance(one, Exception)]
         for error in errors:
             self.record_error(error)
         if len(errors) < len(results):
             self.failed_batches = 0
-        elif all(isinstance(error, PolicyFailed) or not isinstance(error, VLAgentsError) for error in errors):
+        elif all(
+            isinstance(error, PolicyFailed) or not isinstance(error, VLAgentsError)
+            for error in errors
+        ):
             self.failed_batches += 1
 
     def require_device(self) -> None:
-        """Raise `PolicyUnavailable` if the accelerator failed, so that clients begin again at another replica."""
+        """Raise `PolicyUnavailable` if the accelerator failed, so that clients begin again at
+        another replica.
+        """
         if self.broken is not None:
             error = f"{type(self.broken).__name__}: {str(self.broken).partition(chr(10))[0]}"
             raise PolicyUnavailable(
-                f"the policy's accelerator failed ({error}); this replica is replaced, and the session begins again at "
+                f"the policy's accelerator failed ({error}); this replica is replaced, and the "
+                "session begins again at "
                 f"another one"
             ) from self.broken
 
@@ -132,7 +156,10 @@ class PolicyCalls:
         """Raise if the accelerator failed, or the last batches all did."""
         self.require_device()
         if self.failed_batches >= FAILED_BATCHES:
-            raise PolicyFailed(f"the last {self.failed_batches} batches failed as a whole; the server's log says why")
+            raise PolicyFailed(
+                f"the last {self.failed_batches} batches failed as a whole; the server's log says "
+                "why"
+            )
 
     def overdue(self) -> PolicyCall | None:
         """Return a running call that has exceeded its limit, or None."""

@@ -1,12 +1,15 @@
-"""The order in which waiting requests enter batches; uses no threads and no clock but the requests' arrival times.
+"""The order in which waiting requests enter batches; uses no threads and no clock but the requests'
+arrival times.
 
-Robots go before simulations. Within a class the *sources* take turns (round-robin): a connection that sends 512
-observations at once gets one slot, then the next source gets one, and so on until the batch is full. So a client with
-many requests delays the others of its class by no more than one batch, and a client alone fills the batch. A session
-(one robot, one env) has at most one request in a batch, and its requests keep their order.
+Robots go before simulations. Within a class the *sources* take turns (round-robin): a connection
+that sends 512 observations at once gets one slot, then the next source gets one, and so on until
+the batch is full. So a client with many requests delays the others of its class by no more than one
+batch, and a client alone fills the batch. A session (one robot, one env) has at most one request in
+a batch, and its requests keep their order.
 
-Robots may use the whole throughput of the policy. Simulations then advance slowly: once the request of the next
-simulation has waited for longer than `PATIENCE_S`, it gets a slot in every second batch.
+Robots may use the whole throughput of the policy. Simulations then advance slowly: once the request
+of the next simulation has waited for longer than `PATIENCE_S`, it gets a slot in every second
+batch.
 """
 
 from __future__ import annotations
@@ -15,9 +18,11 @@ from collections import deque
 
 from vlagents_ray.serve.requests import PendingRequest, Rank
 
-PATIENCE_S = 1.0  # time after which a simulation gets a slot although robots' requests keep arriving
+# Time after which a simulation gets a slot although robots' requests keep arriving.
+PATIENCE_S = 1.0
 
-_SessionQueue = deque[PendingRequest]  # requests of one session, in order; never empty while the session waits
+# Requests of one session, in order; never empty while the session waits.
+_SessionQueue = deque[PendingRequest]
 
 
 class _ClassQueue:
@@ -38,7 +43,9 @@ class _ClassQueue:
             queues.append(queue)
 
     def next(self) -> _SessionQueue:
-        """Return the next session of the next source, and move that source to the end of the order."""
+        """Return the next session of the next source, and move that source to the end of the
+        order.
+        """
         source = self.sources.popleft()
         queues = self.queues[source]
         queue = queues.popleft()
@@ -54,12 +61,15 @@ class _ClassQueue:
 
 
 class FairQueue:
-    """The waiting requests. Adding or taking one takes constant time for any number of others. Not thread-safe."""
+    """The waiting requests. Adding or taking one takes constant time for any number of others.
+    Not thread-safe.
+    """
 
     def __init__(self) -> None:
         self._rank_queues = [_ClassQueue() for _ in Rank]
         self._sessions: dict[str, _SessionQueue] = {}
-        self._lone: PendingRequest | None = None  # the only waiting request, which is not in a session's queue
+        # The only waiting request, which is not in a session's queue.
+        self._lone: PendingRequest | None = None
         self._yielded = False  # whether the last batch had a slot for an impatient simulation
         self.depth = [0] * len(Rank)  # waiting requests by rank, including those that are over
         self.size = 0  # waiting requests of all ranks
@@ -105,8 +115,8 @@ class FairQueue:
         """Take the next batch of at most `size` requests.
 
         Returns:
-            The batch, and the requests whose deadlines have passed or whose connections have ended, which are removed.
-            Finished requests are dropped.
+            The batch, and the requests whose deadlines have passed or whose connections have ended,
+            which are removed. Finished requests are dropped.
         """
         lone = self._lone
         if lone is not None and not (lone.over or lone.origin.ended) and now <= lone.deadline:
@@ -149,13 +159,16 @@ class FairQueue:
         expired: list[PendingRequest],
         again: list[_SessionQueue],
     ) -> None:
-        """Move the session's first live request to the batch, and drop finished and expired requests before it."""
+        """Move the session's first live request to the batch, and drop finished and expired
+        requests before it.
+        """
         session_id = queue[0].session_id
         while queue:
             pending = queue.popleft()
             self.depth[pending.rank] -= 1
             self.size -= 1
-            if pending.loaded is None:  # otherwise it must run, to release the checkpoint that its session holds
+            # Otherwise it must run, to release the checkpoint that its session holds.
+            if pending.loaded is None:
                 if pending.over:
                     continue
                 if pending.is_useless(now):

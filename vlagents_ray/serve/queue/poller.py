@@ -1,8 +1,10 @@
-"""The poller of the policy's thread: the files that it watches, and the thread that polls while the policy runs.
+"""The poller of the policy's thread: the files that it watches, and the thread that polls while the
+policy runs.
 
-The policy's thread waits on file descriptors, so that a local client's socket can be one of them: a request then
-reaches the policy without a thread switch. While a batch runs that takes milliseconds, a reader thread polls instead,
-and decodes the next batch. Callbacks run on either thread, never on both at once.
+The policy's thread waits on file descriptors, so that a local client's socket can be one of them: a
+request then reaches the policy without a thread switch. While a batch runs that takes milliseconds,
+a reader thread polls instead, and decodes the next batch. Callbacks run on either thread, never on
+both at once.
 """
 
 from __future__ import annotations
@@ -24,10 +26,13 @@ logger = logging.getLogger(__name__)
 
 
 class Poller:
-    """Watches files and a wake-up pipe. One thread owns the poller, and lends it to a reader thread at times."""
+    """Watches files and a wake-up pipe. One thread owns the poller, and lends it to a reader
+    thread at times.
+    """
 
     def __init__(self) -> None:
-        self._poll = select.epoll()  # not `selectors`, whose event objects cost as much as the transport of a request
+        # Not `selectors`, whose event objects cost as much as the transport of a request.
+        self._poll = select.epoll()
         self._ready: dict[int, Callable[[], None]] = {}  # callbacks by descriptor
         self._wake_read, self._wake_write = os.pipe()
         os.set_blocking(self._wake_read, False)
@@ -40,11 +45,14 @@ class Poller:
         self._waking = threading.Lock()
         self._released = False  # whether the descriptors are closed
         self._scheduled: deque[Callable[[], None]] = deque()
-        self._timers: list[tuple[float, int, Callable[[], None]]] = []  # a heap of times (s), numbers and callbacks
+        # A heap of times (s), numbers and callbacks.
+        self._timers: list[tuple[float, int, Callable[[], None]]] = []
         self._timer_numbers = itertools.count()  # so that no two callbacks are compared
 
     def watch(self, file: socket.socket, ready: Callable[[], None]) -> None:
-        """Call `ready` whenever `file` can be read. Called before the owner's first `poll`, or in a callback."""
+        """Call `ready` whenever `file` can be read. Called before the owner's first `poll`, or
+        in a callback.
+        """
         self._watch(file.fileno(), ready)
 
     def unwatch(self, file: socket.socket) -> None:
@@ -53,7 +61,9 @@ class Poller:
         self._poll.unregister(file)
 
     def call_soon(self, call: Callable[[], None]) -> None:
-        """Schedule `call` to run as a callback; ignored after `close`. May be called on any thread."""
+        """Schedule `call` to run as a callback; ignored after `close`. May be called on any
+        thread.
+        """
         if not self._closed:
             self._scheduled.append(call)
             self.wake()
@@ -67,12 +77,14 @@ class Poller:
 
     def wake(self) -> None:
         """End the current `poll`, or the next one. May be called on any thread."""
-        with self._waking, contextlib.suppress(BlockingIOError):  # the pipe is full: a wake-up is already pending
+        # The pipe is full: a wake-up is already pending.
+        with self._waking, contextlib.suppress(BlockingIOError):
             if not self._released:
                 os.write(self._wake_write, b"x")
 
     def poll(self, timeout_s: float) -> bool:
-        """Wait at most `timeout_s` for watched files, timers or a wake-up call, and run the callbacks that are due.
+        """Wait at most `timeout_s` for watched files, timers or a wake-up call, and run the
+        callbacks that are due.
 
         Returns:
             False if there was no event.
@@ -99,7 +111,9 @@ class Poller:
                 pass
 
     def close(self) -> None:
-        """End the reader thread and close all descriptors. Called when the owner has ended, or by the owner itself."""
+        """End the reader thread and close all descriptors. Called when the owner has ended, or
+        by the owner itself.
+        """
         self._closed = True
         if self._reader is not None:
             self.wake()
@@ -112,8 +126,9 @@ class Poller:
             os.close(self._wake_write)
 
     def _read(self) -> None:
-        # The reader polls the epoll's own descriptor: two threads inside one epoll would take each other's wake-ups.
-        # Events that occur after the owner's `reclaim` are left to the owner: the reader waits until it is lent again.
+        # The reader polls the epoll's own descriptor: two threads inside one epoll would take each
+        # other's wake-ups. Events that occur after the owner's `reclaim` are left to the owner: the
+        # reader waits until it is lent again.
         outside = select.poll()
         outside.register(self._poll, select.POLLIN)
         while True:
@@ -134,7 +149,8 @@ class Poller:
     def _call(self, events: list[tuple[int, int]], lent: bool = False) -> None:
         for descriptor, _ in events:
             if lent and not self._lent.is_set():
-                return  # the epoll is level-triggered: the owner's next poll reports the remaining events
+                # The epoll is level-triggered: the owner's next poll reports the remaining events.
+                return
             if (ready := self._ready.get(descriptor)) is None:
                 continue  # an earlier callback of this loop has stopped watching it
             try:

@@ -1,7 +1,9 @@
-"""Preparation of observations on other threads than the policy's, so that the next batch is ready when one ends.
+"""Preparation of observations on other threads than the policy's, so that the next batch is ready
+when one ends.
 
-A batch does not wait for preparations that have not begun: the policy's thread runs those itself, beginning with the
-last one. So a robot whose request arrives last does not wait for the preparations of earlier simulations.
+A batch does not wait for preparations that have not begun: the policy's thread runs those itself,
+beginning with the last one. So a robot whose request arrives last does not wait for the
+preparations of earlier simulations.
 """
 
 from __future__ import annotations
@@ -40,7 +42,9 @@ class Preparations:
             return None
 
     @staticmethod
-    def finish(preparations: Sequence[tuple[Preparation | None, Agent | None]]) -> dict[int, Exception]:
+    def finish(
+        preparations: Sequence[tuple[Preparation | None, Agent | None]],
+    ) -> dict[int, Exception]:
         """Finish the preparations of a batch; return their errors by their indices in the batch.
 
         Called on the policy's thread.

@@ -1,9 +1,11 @@
-"""Prometheus metrics of a replica, through Ray: at the metrics port of its node, with the prefix `ray_`.
+"""Prometheus metrics of a replica, through Ray: at the metrics port of its node, with the prefix
+`ray_`.
 
-`Exporter` creates the series. All have the tags `application`, `deployment`, `replica` and `policy`. Transport is
-`shm`, `plasma`, `websocket`, `http` or `handle`, class is `robot` or `simulation`, code is "ok", an error's code or
-"disconnected". Latencies are those of successful requests, stages those of successful acts. Counters are exact; a
-histogram takes a random sample of up to 100 values per second for each kind of request and for the batches.
+`Exporter` creates the series. All have the tags `application`, `deployment`, `replica` and
+`policy`. Transport is `shm`, `plasma`, `websocket`, `http` or `handle`, class is `robot` or
+`simulation`, code is "ok", an error's code or "disconnected". Latencies are those of successful
+requests, stages those of successful acts. Counters are exact; a histogram takes a random sample of
+up to 100 values per second for each kind of request and for the batches.
 """
 
 from __future__ import annotations
@@ -29,7 +31,25 @@ logger = logging.getLogger(__name__)
 PERIOD_S = 1.0
 _SLICE_S = 50e-6
 _PAUSE_S = 300e-6
-_MS = [0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0, 200.0, 500.0, 1000.0, 2000.0, 5000.0, 10_000.0]
+_MS = [
+    0.05,
+    0.1,
+    0.2,
+    0.5,
+    1.0,
+    2.0,
+    5.0,
+    10.0,
+    20.0,
+    50.0,
+    100.0,
+    200.0,
+    500.0,
+    1000.0,
+    2000.0,
+    5000.0,
+    10_000.0,
+]
 _SIZES = [1.0, 2.0, 4.0, 8.0, 12.0, 16.0, 24.0, 32.0, 48.0, 64.0, 128.0, 256.0]
 _TRANSPORTS = ("shm", "plasma", "websocket", "http", "handle")
 
@@ -40,33 +60,57 @@ class Exporter:
     """Exports an engine's stats to Ray once a second, on a separate thread, until `close`."""
 
     def __init__(self, engine: Engine, tags: Mapping[str, str], keys: Keys | None = None) -> None:
-        """Create the series of an engine with the `tags` application, deployment, replica and policy.
+        """Create the series of an engine with the `tags` application, deployment, replica and
+        policy.
 
         The state of the file of the `keys` is exported, if there are any.
         """
         make = partial(series, tags)
         self._engine = engine
-        self._requests = make(Counter, "requests", "Requests answered.", "op", "transport", "class", "code")
-        self._latency = make(
-            Histogram, "latency_ms", "Server time of a request.", "op", "transport", "class", boundaries=_MS
+        self._requests = make(
+            Counter, "requests", "Requests answered.", "op", "transport", "class", "code"
         )
-        self._stage = make(Histogram, "stage_ms", "Time of an act by stage.", "stage", "transport", boundaries=_MS)
-        self._batch = make(Histogram, "batch_size", "Observations in one forward pass.", boundaries=_SIZES)
-        self._padding = make(Counter, "padding_rows", "Rows that filled batches up to a fixed size.")
+        self._latency = make(
+            Histogram,
+            "latency_ms",
+            "Server time of a request.",
+            "op",
+            "transport",
+            "class",
+            boundaries=_MS,
+        )
+        self._stage = make(
+            Histogram, "stage_ms", "Time of an act by stage.", "stage", "transport", boundaries=_MS
+        )
+        self._batch = make(
+            Histogram, "batch_size", "Observations in one forward pass.", boundaries=_SIZES
+        )
+        self._padding = make(
+            Counter, "padding_rows", "Rows that filled batches up to a fixed size."
+        )
         self._depth = make(Gauge, "queue_depth", "Requests that wait.", "class")
         self._sessions = make(Gauge, "sessions", "Sessions that are held.", "transport")
         self._utilisation = make(Gauge, "utilisation", "Busy share of the policy's thread.")
-        # Of a GPU in the replica's process, as for the next series; the kinds are allocated, reserved and free.
+        # Of a GPU in the replica's process, as for the next series; the kinds are allocated,
+        # reserved and free.
         self._gpu_memory = make(Gauge, "gpu_memory_bytes", "Memory of the GPU.", "kind")
         self._gpu_ms = make(Histogram, "gpu_ms", "Forward pass on the GPU.", boundaries=_MS)
         self._replays = make(Counter, "graph_replays", "Replays of CUDA graphs.")
         self._version = make(Gauge, "policy_version", "Newest version of the weights.")
-        self._pushes = make(Histogram, "weight_push_ms", "Time until all replicas act with weights.", boundaries=_MS)
+        self._pushes = make(
+            Histogram, "weight_push_ms", "Time until all replicas act with weights.", boundaries=_MS
+        )
         self._hung = make(Counter, "hung_calls", "Calls of the policy over their time limit.", "op")
         # Not those in a child process.
-        self._out_of_memory = make(Counter, "out_of_memory", "Forward passes that did not fit into memory.")
-        self._uncompiled = make(Gauge, "uncompiled", "Batch sizes that run without the compilation that is set.")
-        self._unreadable = make(Gauge, "keys_unreadable_s", "Time in which the key file could not be read.")
+        self._out_of_memory = make(
+            Counter, "out_of_memory", "Forward passes that did not fit into memory."
+        )
+        self._uncompiled = make(
+            Gauge, "uncompiled", "Batch sizes that run without the compilation that is set."
+        )
+        self._unreadable = make(
+            Gauge, "keys_unreadable_s", "Time in which the key file could not be read."
+        )
         self._keys = keys
         self._replayed = 0  # exported part of the replays
         self._meter = LoadMeter(engine.queue)
@@ -128,7 +172,9 @@ class Exporter:
             self._padding.inc(collected.padding)
 
 
-def series(tags: Mapping[str, str], kind: Any, name: str, text: str, *own: str, **options: Any) -> Any:
+def series(
+    tags: Mapping[str, str], kind: Any, name: str, text: str, *own: str, **options: Any
+) -> Any:
     """Create a series of a replica, with the prefix `vlagents_`.
 
     Args:
@@ -144,7 +190,9 @@ def series(tags: Mapping[str, str], kind: Any, name: str, text: str, *own: str, 
 
 
 def _in_slices(values: Iterable[T]) -> Iterator[T]:
-    """Yield each value, pausing at times, so that the policy thread never waits long for the interpreter's lock."""
+    """Yield each value, pausing at times, so that the policy thread never waits long for the
+    interpreter's lock.
+    """
     until = time.perf_counter() + _SLICE_S
     for value in values:
         yield value

@@ -1,18 +1,21 @@
-"""Parts of a replica that plug-ins add: routes, observers of requests, facts in the metadata, calls between replicas.
+"""Parts of a replica that plug-ins add: routes, observers of requests, facts in the metadata, calls
+between replicas.
 
-A plug-in registers a class by the entry-point group `vlagents_ray.replica`, and a deployment file turns it on:
+A plug-in registers a class by the entry-point group `vlagents_ray.replica`, and a deployment file
+turns it on:
 
     args:
       policy: pi0
       parts: {latency_log: {folder: runs/latency}}
 
-A part whose registry entry says `by_default` is on where its plug-in is installed; `parts: {NAME: null}` turns it off.
+A part whose registry entry says `by_default` is on where its plug-in is installed; `parts: {NAME:
+null}` turns it off.
 
-Routes are behind the server's access control: with API keys on, a caller without a key reaches none of them but
-`pages`, which hold no data.
+Routes are behind the server's access control: with API keys on, a caller without a key reaches none
+of them but `pages`, which hold no data.
 
-A deployment may have several replicas, each with a part of its own. A part calls the same part of the others by the
-methods that it lists in `sibling_methods`:
+A deployment may have several replicas, each with a part of its own. A part calls the same part of
+the others by the methods that it lists in `sibling_methods`:
 
     class Counter(ReplicaPart):
         sibling_methods = {"count": 3.0}
@@ -53,7 +56,9 @@ class OtherReplica(Protocol):
     name: str  # unique over time
 
     async def call_part(self, part: str, method: str, *args: Any, limit_s: float | None) -> Any:
-        """Call a method of a part there; raise `PeerEnded`, `PeerUnreachable` or the method's own `VLAgentsError`."""
+        """Call a method of a part there; raise `PeerEnded`, `PeerUnreachable` or the method's
+        own `VLAgentsError`.
+        """
 
 
 async def no_siblings() -> Sequence[OtherReplica]:
@@ -70,9 +75,12 @@ class PartContext:
     node: str  # name of its node
     metadata: Callable[[], Mapping[str, Any]]  # the document of `GET /v1/metadata`
     part: str = ""  # name of the part, its key in the deployment file
-    metric_tags: Mapping[str, str] = field(default_factory=dict)  # of its series, see `replica.metrics.series`
-    siblings: Callable[[], Awaitable[Sequence[OtherReplica]]] = no_siblings  # the application's other replicas
-    open_to_network: bool = False  # whether clients on other machines need no key, `access: {insecure: true}`
+    # Of its series, see `replica.metrics.series`.
+    metric_tags: Mapping[str, str] = field(default_factory=dict)
+    # The application's other replicas.
+    siblings: Callable[[], Awaitable[Sequence[OtherReplica]]] = no_siblings
+    # Whether clients on other machines need no key, `access: {insecure: true}`.
+    open_to_network: bool = False
 
     @property
     def short_name(self) -> str:
@@ -83,8 +91,12 @@ class PartContext:
 class SiblingPart:
     """The same part of another replica."""
 
-    def __init__(self, replica: OtherReplica, part: str, methods: Mapping[str, float | None]) -> None:
-        """Call the part with the name `part` of a replica; `methods` are its `ReplicaPart.sibling_methods`."""
+    def __init__(
+        self, replica: OtherReplica, part: str, methods: Mapping[str, float | None]
+    ) -> None:
+        """Call the part with the name `part` of a replica; `methods` are its
+        `ReplicaPart.sibling_methods`.
+        """
         self.name = replica.name  # of the replica, unique over time
         self._replica = replica
         self._part = part
@@ -98,8 +110,8 @@ class SiblingPart:
 
         Raises:
             PeerEnded: The replica has ended.
-            PeerUnreachable: It does not answer in time, has no such part, or the method raised another error than a
-                `VLAgentsError`; the method may or may not have been executed.
+            PeerUnreachable: It does not answer in time, has no such part, or the method raised
+                another error than a `VLAgentsError`; the method may or may not have been executed.
             VLAgentsError: The method raised it.
         """
         name = method.__name__
@@ -109,19 +121,21 @@ class SiblingPart:
 class ReplicaPart:
     """A part of a replica; a class overrides the methods that it needs.
 
-    `open` is called before the policy is loaded, and `close` after the last answer was sent. If `open` raises an error,
-    the replica does not start, and `serve status` has the reason.
+    `open` is called before the policy is loaded, and `close` after the last answer was sent. If
+    `open` raises an error, the replica does not start, and `serve status` has the reason.
     """
 
     Config: ClassVar[type[PartConfig]] = PartConfig
     sibling_methods: ClassVar[Mapping[str, float | None]] = {}
-    """The methods that the same part of other replicas may call, and the time limit of each for an answer, s; None is
+    """The methods that the same part of other replicas may call, and the time limit of each for an
+    answer, s; None is
     no limit. A coroutine function runs on the replica's event loop, any other one in a thread."""
 
     pages: ClassVar[Mapping[str, str]] = {}
-    """Paths of pages for a browser, by title, such as {"live page": "/live"}; `vlagents-ray serve` prints their
-    addresses. They need no key, which a browser cannot send with them: a page itself must hold no data. Each is a route
-    of the part; the replica does not start otherwise."""
+    """Paths of pages for a browser, by title, such as {"live page": "/live"}; `vlagents-ray serve`
+    prints their
+    addresses. They need no key, which a browser cannot send with them: a page itself must hold no
+    data. Each is a route of the part; the replica does not start otherwise."""
 
     def __init__(self, settings: Any, context: PartContext) -> None:
         """Create a part with the `settings` of the deployment file, an instance of its `Config`."""
@@ -143,13 +157,19 @@ class ReplicaPart:
         return None
 
     def describe(self) -> Mapping[str, Any]:
-        """Return facts for clients, which the replica's metadata has under `parts` and the name of this part."""
+        """Return facts for clients, which the replica's metadata has under `parts` and the name
+        of this part.
+        """
         return {}
 
     async def siblings(self) -> list[SiblingPart]:
-        """Return this part of each other replica of the application; they may change between two calls."""
+        """Return this part of each other replica of the application; they may change between two
+        calls.
+        """
         replicas = await self.context.siblings()
-        return [SiblingPart(replica, self.context.part, self.sibling_methods) for replica in replicas]
+        return [
+            SiblingPart(replica, self.context.part, self.sibling_methods) for replica in replicas
+        ]
 
 
 class ReplicaParts:
@@ -172,15 +192,16 @@ class ReplicaParts:
             server: All routes of the server, in the order in which they are tried.
 
         Raises:
-            ConfigError: A request for a page would be answered by a route that is not the part's own, which would need
-                no key either.
+            ConfigError: A request for a page would be answered by a route that is not the part's
+                own, which would need no key either.
         """
         paths = set()
         for name, part in self._parts.items():
             for path in part.pages.values():
                 if _route_of(path, server) not in self._routes[name]:
                     raise ConfigError(
-                        f"part {name!r}: expected pages that are routes of its own, got {path!r}; correct its `pages`"
+                        f"part {name!r}: expected pages that are routes of its own, got {path!r}; "
+                        "correct its `pages`"
                     )
                 paths.add(path)
         return frozenset(paths)
@@ -209,7 +230,9 @@ class ReplicaParts:
         """
         opened = self._parts.get(part)
         if opened is None or method not in opened.sibling_methods:
-            raise LookupError(f"part {part!r}: this replica has no method {method!r} of it for other replicas")
+            raise LookupError(
+                f"part {part!r}: this replica has no method {method!r} of it for other replicas"
+            )
         call = getattr(opened, method)
         if inspect.iscoroutinefunction(call):
             return await call(*args)
@@ -231,11 +254,15 @@ def _route_of(path: str, routes: Sequence[BaseRoute]) -> BaseRoute | None:
 
 
 def open_parts(args: PartArgs, context: PartContext) -> ReplicaParts:
-    """Create and open the parts that are on in a deployment file; if one fails, close those before it."""
+    """Create and open the parts that are on in a deployment file; if one fails, close those
+    before it.
+    """
     parts: dict[str, ReplicaPart] = {}
     with ExitStack() as opened:
         for name, settings in args.on().items():
-            part: ReplicaPart = registered_class("replica", name)(settings, replace(context, part=name))
+            part: ReplicaPart = registered_class("replica", name)(
+                settings, replace(context, part=name)
+            )
             part.open()
             opened.callback(part.close)
             observer = part.observer()

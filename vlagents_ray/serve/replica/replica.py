@@ -52,19 +52,24 @@ from vlagents_ray.weights.safetensors import ValueSpec
 logger = logging.getLogger(__name__)
 
 _WATCH_S = 0.25
-_LOCKED_S = 1.0  # delay after a call's limit, which `notice_hung` reports unless the interpreter's lock is held
+# Delay after a call's limit, which `notice_hung` reports unless the interpreter's lock is held.
+_LOCKED_S = 1.0
 _STDERR = 2
 _GATEWAY_POLL_S = 10.0
-_LEAVE_S = 5.0  # time in which clients of a draining replica connect to another one before their WebSockets are closed
-_CATCH_UP_S = 10.0  # interval of the checks whether this replica has missed a version of the weights
+# Time in which clients of a draining replica connect to another one before their WebSockets are
+# closed.
+_LEAVE_S = 5.0
+# Interval of the checks whether this replica has missed a version of the weights.
+_CATCH_UP_S = 10.0
 
 
 class PolicyReplica(ClientApi, SiblingApi):
     """One replica of the policy, with all endpoints for clients.
 
-    Ray calls its methods by name: Serve the methods of a deployment, clients inside the cluster those of `ClientApi`,
-    and other replicas those of `SiblingApi`. Until the first replica runs, Serve's proxies reply for the application:
-    see `vlagents_ray.serve.scaling.router` and `vlagents_ray.serve.launch.haproxy`.
+    Ray calls its methods by name: Serve the methods of a deployment, clients inside the cluster
+    those of `ClientApi`, and other replicas those of `SiblingApi`. Until the first replica runs,
+    Serve's proxies reply for the application: see `vlagents_ray.serve.scaling.router` and
+    `vlagents_ray.serve.launch.haproxy`.
     """
 
     _opened = False  # whether `close` has anything to close
@@ -72,7 +77,9 @@ class PolicyReplica(ClientApi, SiblingApi):
     async def __init__(  # type: ignore[misc]  # Serve awaits it
         self, args: dict[str, Any], gateway: Any = None
     ) -> None:
-        """Create the replica with the settings `args`; passing the gateway's handle adds it to the application."""
+        """Create the replica with the settings `args`; passing the gateway's handle adds it to
+        the application.
+        """
         self._args = settings = ServerArgs(**args)
         self._gateway = gateway
         self._gateways: dict[str, Any] = {}
@@ -88,7 +95,9 @@ class PolicyReplica(ClientApi, SiblingApi):
 
         # The engine, and its parts that are shared with other replicas.
         self._peers = SiblingReplicas()
-        self._migrator = SessionMigrator(self._peers.own_name, self._peers.others, asyncio.get_running_loop())
+        self._migrator = SessionMigrator(
+            self._peers.own_name, self._peers.others, asyncio.get_running_loop()
+        )
         self._limits = settings.limits.limits()
         if 0 < settings.resources.num_gpus < 1:
             os.environ.setdefault(GPU_SHARE, str(settings.resources.num_gpus))
@@ -120,25 +129,31 @@ class PolicyReplica(ClientApi, SiblingApi):
 
         # The endpoints.
         has_files = hasattr(os, "memfd_create")
-        admit: Admit | NoKey = NoKey.OPEN if self._keys is None else partial(self._keys.check, app=self._app)
+        admit: Admit | NoKey = (
+            NoKey.OPEN if self._keys is None else partial(self._keys.check, app=self._app)
+        )
         self._local = ShmServer(self._engine, self._limits, admit) if has_files else None
         self._plasma = PlasmaServer(self._engine, self._limits) if has_files else None
-        self._stream = _stream_endpoint(self._engine, settings, admit) if settings.stream.enabled else None
+        self._stream = (
+            _stream_endpoint(self._engine, settings, admit) if settings.stream.enabled else None
+        )
         self._opened = True
         for endpoint in (self._local, self._plasma, self._stream):
             if endpoint is not None:
                 endpoint.open()
 
     async def reconfigure(self, settings: dict[str, Any] | None, rank: Any) -> None:
-        """Apply the file's `user_config`; called by Serve before the replica is ready, and when the settings change.
+        """Apply the file's `user_config`; called by Serve before the replica is ready, and when the
+        settings change.
 
-        The first call loads the policy, so that Serve reports RUNNING only when it can act, and `serve status` has the
-        reason why it cannot. Later calls return at once and raise nothing, as an error would end the replica: the
-        metadata and the log show the result of the swap.
+        The first call loads the policy, so that Serve reports RUNNING only when it can act, and
+        `serve status` has the reason why it cannot. Later calls return at once and raise nothing,
+        as an error would end the replica: the metadata and the log show the result of the swap.
 
         Args:
             settings: The policy's settings that replace those in `args`.
-            rank: Not used, but without this parameter Serve calls no `reconfigure` if there is no `user_config`.
+            rank: Not used, but without this parameter Serve calls no `reconfigure` if there is no
+                `user_config`.
         """
         config = {**self._args.config, **(settings or {})}
         if self._configured:
@@ -153,7 +168,8 @@ class PolicyReplica(ClientApi, SiblingApi):
             if not isinstance(error.__cause__, VLAgentsError):
                 raise
             logger.exception("the policy did not load")
-            # Errors of this package contain the remedy; without this, `serve status` would show both tracebacks first.
+            # Errors of this package contain the remedy; without this, `serve status` would show
+            # both tracebacks first.
             raise PolicyFailed(str(error)) from None
         await self._catch_up()  # gets the other replicas' versions before this replica is ready
         works = [self._watch_shutdown(), self._keep_catching_up(), self._rebalancer.run()]
@@ -162,10 +178,11 @@ class PolicyReplica(ClientApi, SiblingApi):
         self._tasks = [asyncio.ensure_future(work) for work in works]
 
     async def close(self) -> None:
-        """Close everything: first the sources of requests, then the engine, the endpoints, and last the parts.
+        """Close everything: first the sources of requests, then the engine, the endpoints, and last
+        the parts.
 
-        In this order the engine can answer waiting requests over open endpoints, no client waits for the parts, and
-        their observers receive all answers.
+        In this order the engine can answer waiting requests over open endpoints, no client waits
+        for the parts, and their observers receive all answers.
         """
         for task in self._tasks:
             task.cancel()
@@ -184,11 +201,15 @@ class PolicyReplica(ClientApi, SiblingApi):
             await self.close()
 
     async def check_health(self) -> None:
-        """Raise an error if the policy died or hangs; Serve calls this after loading, and then replaces the replica."""
+        """Raise an error if the policy died or hangs; Serve calls this after loading, and then
+        replaces the replica.
+        """
         await asyncio.to_thread(self._engine.check_health)
 
     async def refusal(self) -> str | None:
-        """Return the full reason why the policy cannot act, for the process that starts the server; None if it can."""
+        """Return the full reason why the policy cannot act, for the process that starts the
+        server; None if it can.
+        """
         try:
             self._engine.check_health()
         except Exception as error:  # noqa: BLE001 - a policy's own check may raise any error
@@ -208,11 +229,15 @@ class PolicyReplica(ClientApi, SiblingApi):
         slow_s, idle_s = self._args.limits.slow_s, self._args.sessions.idle_s
         insecure, hosts = self._args.access.insecure, self._args.access.hosts
         more = [
-            *dialect_routes(self._args.dialects, ReplicaContext(self._engine, self.metadata, self._limits)),
+            *dialect_routes(
+                self._args.dialects, ReplicaContext(self._engine, self.metadata, self._limits)
+            ),
             *weights_routes(self, slow_s, open_to_network=insecure),
             *self._parts.routes(),
         ]
-        inside = build_http_app(self._engine, self.metadata, self._limits, self._metadata_for_machine, more)
+        inside = build_http_app(
+            self._engine, self.metadata, self._limits, self._metadata_for_machine, more
+        )
         return AccessMiddleware(
             inside,
             self._keys,
@@ -237,14 +262,18 @@ class PolicyReplica(ClientApi, SiblingApi):
 
     # Clients inside the cluster: `ClientApi`.
 
-    async def attach(self, node: str = "", boot_id: str = "", must_be_near: bool = False) -> tuple[dict[str, Any], Any]:
-        """Return the metadata and the actor of the least loaded replica, near the client if possible.
+    async def attach(
+        self, node: str = "", boot_id: str = "", must_be_near: bool = False
+    ) -> tuple[dict[str, Any], Any]:
+        """Return the metadata and the actor of the least loaded replica, near the client if
+        possible.
 
-        A session must stay on one replica, which a Serve handle does not guarantee; therefore the client calls the
-        actor's own entry point for every further request.
+        A session must stay on one replica, which a Serve handle does not guarantee; therefore the
+        client calls the actor's own entry point for every further request.
 
         Args:
-            node: The id of the client's node, which is in the cluster; replicas on this node are preferred.
+            node: The id of the client's node, which is in the cluster; replicas on this node are
+                preferred.
             boot_id: The boot id of the client's machine.
             must_be_near: Whether the client's transport reaches no other machine.
         """
@@ -252,17 +281,25 @@ class PolicyReplica(ClientApi, SiblingApi):
         return await self._rebalancer.place(place) or self._connection_info()
 
     async def call(self, session_id: str, frame: Any) -> bytes:
-        """Execute a frame of requests from inside the cluster, a buffer that is read in place from plasma."""
+        """Execute a frame of requests from inside the cluster, a buffer that is read in place
+        from plasma.
+        """
         return await answer_frame(self._engine, self._limits, session_id, frame)
 
     async def lease(self, length: int) -> tuple[bytes, int]:
-        """Lease a plasma channel for frames of `length` bytes to a client that got the address from `attach`."""
+        """Lease a plasma channel for frames of `length` bytes to a client that got the address
+        from `attach`.
+        """
         if self._plasma is None:
-            raise PolicyUnavailable("plasma: this replica has no plasma endpoint; use transport 'handle'")
+            raise PolicyUnavailable(
+                "plasma: this replica has no plasma endpoint; use transport 'handle'"
+            )
         return await asyncio.to_thread(self._plasma.pool.lease, length)
 
     async def nodes(self) -> dict[str, int]:
-        """Return the number of replicas that accept sessions by node, so that clients can be placed near them."""
+        """Return the number of replicas that accept sessions by node, so that clients can be
+        placed near them.
+        """
         loads = [self._rebalancer.load(), *await self._peers.loads()]
         return dict(Counter(load.node for load in loads if load.accepts))
 
@@ -271,7 +308,9 @@ class PolicyReplica(ClientApi, SiblingApi):
         return self.metadata() | {"plasma": plasma}, ray.get_runtime_context().current_actor
 
     async def _metadata_for_machine(self, caller: str) -> dict[str, Any]:
-        """Return the metadata of the least loaded replica on the machine with boot id `caller`, or of this replica."""
+        """Return the metadata of the least loaded replica on the machine with boot id `caller`,
+        or of this replica.
+        """
         machines = [boot_id()] if caller == SERVERS_MACHINE else [caller, boot_id()]
         places = [ClientLocation(boot_id=machine, must_be_near=True) for machine in machines]
         metadata, _ = await self._rebalancer.place(*places) or (self.metadata(), None)
@@ -282,7 +321,9 @@ class PolicyReplica(ClientApi, SiblingApi):
     def _load_of(self, sessions: int) -> ReplicaLoad:
         accepts = self._engine.ready and not (self._engine.draining or replica_is_ending())
         node = ray.get_runtime_context().get_node_id()
-        return ReplicaLoad(self._peers.own_name, sessions, accepts, node, boot_id(), self._engine.models.version)
+        return ReplicaLoad(
+            self._peers.own_name, sessions, accepts, node, boot_id(), self._engine.models.version
+        )
 
     async def expect_client(self) -> tuple[dict[str, Any], Any]:
         """Return metadata and actor for a client that another replica redirects to this one."""
@@ -299,7 +340,9 @@ class PolicyReplica(ClientApi, SiblingApi):
         return await self._weights.weights(call, *args)
 
     async def call_part(self, part: str, method: str, *args: Any) -> Any:
-        """Call a method of a part for the same part of another replica, or for a process of the cluster."""
+        """Call a method of a part for the same part of another replica, or for a process of the
+        cluster.
+        """
         return await self._parts.call(part, method, *args)
 
     # New weights: from learners, and from the replica that coordinates a push.
@@ -316,7 +359,8 @@ class PolicyReplica(ClientApi, SiblingApi):
         """Make all replicas act with new weights, which this one has received over the network."""
         if not await self._peers.others():
             return await self._pusher.push(named, options)
-        reference = await asyncio.to_thread(ray.put, named)  # a copy, which does not delay robots on this event loop
+        # A copy, which does not delay robots on this event loop.
+        reference = await asyncio.to_thread(ray.put, named)
         return await self._pusher.push([reference], options)
 
     def read_header(self, header: bytes, options: PushOptions) -> dict[str, ValueSpec]:
@@ -334,14 +378,18 @@ class PolicyReplica(ClientApi, SiblingApi):
     # The replica's periodic tasks.
 
     async def _watch_shutdown(self) -> None:
-        """Drain the engine as soon as Serve stops this replica, if other replicas can take its clients.
+        """Drain the engine as soon as Serve stops this replica, if other replicas can take its
+        clients.
 
-        The WebSockets end, since Serve waits for them before it calls `close`, and kills the replica after a while.
-        Before that, detect a policy that hangs. A policy that holds the interpreter's lock also blocks this task; in
-        that case a thread that needs no lock writes the stack traces into the log.
+        The WebSockets end, since Serve waits for them before it calls `close`, and kills the
+        replica after a while. Before that, detect a policy that hangs. A policy that holds the
+        interpreter's lock also blocks this task; in that case a thread that needs no lock writes
+        the stack traces into the log.
         """
         while not replica_is_ending():
-            faulthandler.dump_traceback_later(self._engine.calls.limits.act_s + _LOCKED_S, file=_STDERR)
+            faulthandler.dump_traceback_later(
+                self._engine.calls.limits.act_s + _LOCKED_S, file=_STDERR
+            )
             await asyncio.sleep(_WATCH_S)
             self._engine.notice_hung()
         faulthandler.cancel_dump_traceback_later()
@@ -359,13 +407,18 @@ class PolicyReplica(ClientApi, SiblingApi):
         try:
             await self._pusher.catch_up()
         except Exception:
-            logger.exception("the newest weights were not taken from the other replicas; tried again later")
+            logger.exception(
+                "the newest weights were not taken from the other replicas; tried again later"
+            )
 
     async def _poll_gateways(self) -> None:
-        """Query the gateway periodically for its addresses, which may change without a restart of this replica."""
+        """Query the gateway periodically for its addresses, which may change without a restart
+        of this replica.
+        """
         while True:
             try:
-                self._gateways = await self._gateway.description.remote()  # waits until the gateway runs
+                # Waits until the gateway runs.
+                self._gateways = await self._gateway.description.remote()
             except (ray.exceptions.RayError, RayServeException) as error:
                 self._gateways = {}
                 logger.info("the gateway does not say where it listens: %s", error)
@@ -375,20 +428,23 @@ class PolicyReplica(ClientApi, SiblingApi):
 def _stream_endpoint(engine: Engine, args: ServerArgs, admit: Admit | NoKey) -> WebSocketServer:
     slow_s, idle_s, hosts = args.limits.slow_s, args.sessions.idle_s, args.access.hosts
     host, ports, limits = _plain_host(), args.stream.ports, args.limits.limits()
-    return WebSocketServer(engine, limits, host, ports, admit, slow_s=slow_s, idle_s=idle_s, hosts=hosts)
+    return WebSocketServer(
+        engine, limits, host, ports, admit, slow_s=slow_s, idle_s=idle_s, hosts=hosts
+    )
 
 
 def hide_gpus(given: Sequence[str]) -> None:
     """Hide the node's GPUs from this process and its children, unless Ray has assigned it some.
 
-    Ray itself does not hide them from a replica with `num_gpus: 0`, which would use unreserved memory of the first one.
-    Call this before anything uses CUDA.
+    Ray itself does not hide them from a replica with `num_gpus: 0`, which would use unreserved
+    memory of the first one. Call this before anything uses CUDA.
     """
     if given:
         return
     if found := gpus_here():
         logger.warning(
-            "this node has %g GPUs, which are hidden from the policy, as its resources say num_gpus: 0; with "
+            "this node has %g GPUs, which are hidden from the policy, as its resources say "
+            "num_gpus: 0; with "
             "resources: {num_gpus: 1} it gets one",
             found,
         )

@@ -1,1 +1,3 @@
-"""Several replicas: autoscaling, the choice of a replica for each session, and moves of sessions between them."""
+"""Several replicas: autoscaling, the choice of a replica for each session, and moves of sessions
+between them.
+"""

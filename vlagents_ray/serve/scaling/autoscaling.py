@@ -1,16 +1,19 @@
 """An autoscaling policy for Ray Serve, which derives the number of replicas from the measured load.
 
-Serve's own policy counts requests. But a WebSocket counts as one request for as long as it is open, and a session over
-shared memory or a Serve handle's actor does not count at all. So each replica reports (`record_autoscaling_stats`):
+Serve's own policy counts requests. But a WebSocket counts as one request for as long as it is open,
+and a session over shared memory or a Serve handle's actor does not count at all. So each replica
+reports (`record_autoscaling_stats`):
 
 - `utilisation`: the share of the time in which its policy's thread was busy, in [0, 1].
 - `waiting`: the mean number of requests in its batch queue, in batches of the largest size.
 - `sessions`: the robots and envs that it holds, over all transports.
 
-Serve averages these values over `look_back_s`. Its controller calls the policy ten times a second, limits the result
-to the minimum and maximum number of replicas, and applies it after `upscale_delay_s` or `downscale_delay_s`.
+Serve averages these values over `look_back_s`. Its controller calls the policy ten times a second,
+limits the result to the minimum and maximum number of replicas, and applies it after
+`upscale_delay_s` or `downscale_delay_s`.
 
-The controller gets this module pickled by value, so the module imports no other module of this package.
+The controller gets this module pickled by value, so the module imports no other module of this
+package.
 """
 
 from __future__ import annotations
@@ -23,8 +26,11 @@ UTILISATION = "utilisation"
 WAITING = "waiting"
 SESSIONS = "sessions"
 
-_MARGIN = 0.8  # share of each target below which fewer replicas must stay, so that their number does not oscillate
-_NOTHING = 1e-3  # load below which a replica is idle, as a share of a replica: idle ones measure some millionths
+# Share of each target below which fewer replicas must stay, so that their number does not
+# oscillate.
+_MARGIN = 0.8
+# Load below which a replica is idle, as a share of a replica: idle ones measure some millionths.
+_NOTHING = 1e-3
 
 
 class MeasuredLoad:
@@ -37,27 +43,37 @@ class MeasuredLoad:
     """
 
     def __init__(
-        self, *, target_utilisation: float = 0.7, target_waiting: float = 1.0, target_sessions: float | None = None
+        self,
+        *,
+        target_utilisation: float = 0.7,
+        target_waiting: float = 1.0,
+        target_sessions: float | None = None,
     ) -> None:
         self._targets = {UTILISATION: target_utilisation, WAITING: target_waiting}
         if target_sessions is not None:
             self._targets[SESSIONS] = target_sessions
 
     def __call__(self, ctx: Any) -> tuple[int, dict[str, Any]]:
-        """Return the desired number of replicas for a `ray.serve.config.AutoscalingContext`, and an empty state."""
+        """Return the desired number of replicas for a `ray.serve.config.AutoscalingContext`, and
+        an empty state.
+        """
         metrics: Mapping[str, Mapping[Any, float]] = ctx.aggregated_metrics or {}
         target: int = ctx.target_num_replicas
         reported = metrics.get(UTILISATION, {})
         if not reported:  # no replica runs, or none has reported yet
             return target, {}
-        totals = {name: sum(metrics.get(name, {}).values()) for name in (UTILISATION, WAITING, SESSIONS)}
+        totals = {
+            name: sum(metrics.get(name, {}).values()) for name in (UTILISATION, WAITING, SESSIONS)
+        }
         most = self._needed(totals, 1.0)
         least = self._needed(totals, _MARGIN)
         if totals[SESSIONS] or ctx.total_num_requests:
-            most, least = max(1, most), max(1, least)  # only an unused application may have no replica
+            # Only an unused application may have no replica.
+            most, least = max(1, most), max(1, least)
         if most > target:
             return most, {}
-        if least < target and len(reported) >= ctx.current_num_replicas:  # a replica without a report may be busy
+        # A replica without a report may be busy.
+        if least < target and len(reported) >= ctx.current_num_replicas:
             return least, {}
         return target, {}
 

@@ -1,10 +1,12 @@
-"""Balances sessions over the replicas: new sessions go to the least loaded one, and surplus sessions are moved.
+"""Balances sessions over the replicas: new sessions go to the least loaded one, and surplus
+sessions are moved.
 
-A connection over shared memory, plasma, a WebSocket or a Serve handle stays at its replica for as long as it lasts, so
-that a new replica would not relieve the others. Therefore each replica compares its number of sessions with the others'
-every few seconds. If it holds clearly more than its share, it requests some connections to reconnect. Their sessions
-then move as they do when a replica stops (`vlagents_ray.serve.scaling.session_migration`). The load balancer's hash
-decides on the replica of HTTP sessions.
+A connection over shared memory, plasma, a WebSocket or a Serve handle stays at its replica for as
+long as it lasts, so that a new replica would not relieve the others. Therefore each replica
+compares its number of sessions with the others' every few seconds. If it holds clearly more than
+its share, it requests some connections to reconnect. Their sessions then move as they do when a
+replica stops (`vlagents_ray.serve.scaling.session_migration`). The load balancer's hash decides on
+the replica of HTTP sessions.
 """
 
 from __future__ import annotations
@@ -21,14 +23,18 @@ from typing import Any, Protocol
 
 from vlagents_ray.serve.engine.engine import Engine
 
-_SLACK = 0.25  # tolerated excess over the mean, as a share of the mean; at least one session is tolerated
+# Tolerated excess over the mean, as a share of the mean; at least one session is tolerated.
+_SLACK = 0.25
 logger = logging.getLogger(__name__)
 PERIOD_S = 3.0  # interval of the comparisons
-MOVABLE = ("shm", "plasma", "websocket", "handle")  # transports whose connections can be requested to reconnect
+# Transports whose connections can be requested to reconnect.
+MOVABLE = ("shm", "plasma", "websocket", "handle")
 _EXPECTED_S = 3.0  # time after which a client that was sent here is no longer expected
 _SETTLE_S = 6.0  # time for which a connection counts as leaving after a request to reconnect
 _RECONNECT_S = 20.0  # shortest time between two requests to reconnect on one connection
-_ACTIVE_S = 30.0  # time since its last request for which a session is active; only replies can request a reconnection
+# Time since its last request for which a session is active; only replies can request a
+# reconnection.
+_ACTIVE_S = 30.0
 _AT_ONCE = 32  # largest number of sessions to send away after one comparison
 
 
@@ -41,7 +47,8 @@ class ReplicaLoad:
     accepts: bool  # whether its policy is loaded, and it is not stopping
     node: str  # Ray's id of its node
     boot_id: str  # boot id of its machine
-    version: tuple[str, str]  # version of the policy and its shared objects; sessions only move between equal ones
+    # Version of the policy and its shared objects; sessions only move between equal ones.
+    version: tuple[str, str]
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,19 +61,30 @@ class ClientLocation:
 
     def is_near(self, load: ReplicaLoad) -> bool:
         """Return whether that replica runs on the client's node, or on its machine."""
-        return (self.node != "" and self.node == load.node) or (self.boot_id != "" and self.boot_id == load.boot_id)
+        return (self.node != "" and self.node == load.node) or (
+            self.boot_id != "" and self.boot_id == load.boot_id
+        )
 
 
 def choose_replica(loads: Sequence[ReplicaLoad], place: ClientLocation) -> ReplicaLoad | None:
-    """Return the least loaded replica near to the client, or the least loaded one if that has clearly fewer sessions.
+    """Return the least loaded replica near to the client, or the least loaded one if that has
+    clearly fewer sessions.
 
-    Among equally loaded replicas, the first is chosen. The result is None if no replica accepts sessions, or if the
-    client needs a near one and there is none.
+    Among equally loaded replicas, the first is chosen. The result is None if no replica accepts
+    sessions, or if the client needs a near one and there is none.
     """
     accepting = [load for load in loads if load.accepts]
-    near = min((load for load in accepting if place.is_near(load)), key=attrgetter("sessions"), default=None)
+    near = min(
+        (load for load in accepting if place.is_near(load)),
+        key=attrgetter("sessions"),
+        default=None,
+    )
     least = min(accepting, key=attrgetter("sessions"), default=None)
-    if place.must_be_near or least is None or (near and near.sessions <= _tolerated(least.sessions)):
+    if (
+        place.must_be_near
+        or least is None
+        or (near and near.sessions <= _tolerated(least.sessions))
+    ):
         return near
     return least
 
@@ -74,7 +92,8 @@ def choose_replica(loads: Sequence[ReplicaLoad], place: ClientLocation) -> Repli
 def excess_sessions(mine: int, others: Iterable[int], leaving: int = 0) -> int:
     """Return the number of sessions that a replica should send away, without the `leaving` ones.
 
-    It is the excess over the mean, rounded down; 0 if that is at most 25 % of the mean or one session.
+    It is the excess over the mean, rounded down; 0 if that is at most 25 % of the mean or one
+    session.
     """
     loads = [mine, *others]
     mean = sum(loads) / len(loads)
@@ -86,8 +105,8 @@ def excess_sessions(mine: int, others: Iterable[int], leaving: int = 0) -> int:
 def choose_connections(connections: Counter[str], count: int) -> set[str]:
     """Choose the connections to send away, given the number of sessions of each.
 
-    At most `count` sessions leave. All sessions of a connection move together, so a connection with more sessions
-    stays.
+    At most `count` sessions leave. All sessions of a connection move together, so a connection with
+    more sessions stays.
     """
     chosen = set()
     for connection, sessions in connections.most_common():
@@ -102,22 +121,33 @@ def _tolerated(sessions: float) -> float:
 
 
 class Siblings(Protocol):
-    """The other replicas of the application: `vlagents_ray.serve.scaling.sibling_replicas.SiblingReplicas`."""
+    """The other replicas of the application:
+    `vlagents_ray.serve.scaling.sibling_replicas.SiblingReplicas`.
+    """
 
     async def loads(self) -> list[ReplicaLoad]:
         """Return the loads of the replicas that answer at once."""
 
     async def announce_client(self, replica: str) -> Any:
-        """Announce a client to that replica; return its answer for the client, None if it does not answer at once."""
+        """Announce a client to that replica; return its answer for the client, None if it does
+        not answer at once.
+        """
 
 
 class Rebalancer:
-    """Compares the sessions of one replica with those of the others, and places new clients; on one event loop."""
+    """Compares the sessions of one replica with those of the others, and places new clients; on
+    one event loop.
+    """
 
-    def __init__(self, engine: Engine, siblings: Siblings, own_load: Callable[[int], ReplicaLoad]) -> None:
-        """Balance the sessions of `engine` and `siblings`; `own_load` returns the load of this replica for a count."""
+    def __init__(
+        self, engine: Engine, siblings: Siblings, own_load: Callable[[int], ReplicaLoad]
+    ) -> None:
+        """Balance the sessions of `engine` and `siblings`; `own_load` returns the load of this
+        replica for a count.
+        """
         self._engine, self._siblings, self._own_load = engine, siblings, own_load
-        self._expected: deque[float] = deque()  # times at which clients were sent here that have no session yet
+        # Times at which clients were sent here that have no session yet.
+        self._expected: deque[float] = deque()
         self._opened = 0
         self._others: list[ReplicaLoad] = []
         self._asked_at = float("-inf")  # time of the last request for the others' loads
@@ -152,17 +182,20 @@ class Rebalancer:
         """Choose the replica for a new client, and announce the client there.
 
         Args:
-            *places: Locations of the client in order of preference; the first one that suits any replica is used.
+            *places: Locations of the client in order of preference; the first one that suits any
+                replica is used.
 
         Returns:
             The result of `Siblings.announce_client`; None if the client stays here.
         """
         arrived = time.monotonic()
         async with self._placing:
-            if arrived > self._asked_at:  # clients that arrived during the requests use those answers
+            # Clients that arrived during the requests use those answers.
+            if arrived > self._asked_at:
                 try:
                     self._others = await self._siblings.loads()
-                except Exception:  # errors of the other replicas must not keep a client from connecting
+                except Exception:
+                    # errors of the other replicas must not keep a client from connecting
                     logger.exception("the other replicas could not be asked")
                     self._others = []
                 self._asked_at = time.monotonic()
@@ -184,7 +217,9 @@ class Rebalancer:
         return chosen.replica
 
     async def compare(self) -> None:
-        """Compare the loads, and mark connections to drain if there were too many sessions here twice in a row."""
+        """Compare the loads, and mark connections to drain if there were too many sessions here
+        twice in a row.
+        """
         drain_list, sessions = self._engine.drain_list, self._engine.sessions
         drain_list.forget_older(_RECONNECT_S)
         sessions.drop_idle()
@@ -201,7 +236,11 @@ class Rebalancer:
             drain_list.mark(set())
         else:
             lately = drain_list.asked_within(_RECONNECT_S)
-            movable = Counter({group: count for group, count in active.items() if group not in lately})
+            movable = Counter(
+                {group: count for group, count in active.items() if group not in lately}
+            )
             drain_list.mark(choose_connections(movable, min(too_many, _AT_ONCE)))
-            logger.info("%d sessions, %d more than a fair share: sending some away", mine.sessions, too_many)
+            logger.info(
+                "%d sessions, %d more than a fair share: sending some away", mine.sessions, too_many
+            )
         self._uneven = too_many > 0

@@ -1,7 +1,8 @@
 """The request router for Serve's Python proxy, which is used where HAProxy is not the ingress.
 
-Serve sends this module by value to its proxies, so it imports no other module of this package. It uses private names
-of Serve (read in Ray 2.60): `RequestRouter._choose_replica_for_request` and `_handle_source`.
+Serve sends this module by value to its proxies, so it imports no other module of this package. It
+uses private names of Serve (read in Ray 2.60): `RequestRouter._choose_replica_for_request` and
+`_handle_source`.
 """
 
 from __future__ import annotations
@@ -13,8 +14,8 @@ from ray.serve._private.common import DeploymentHandleSource
 from ray.serve.exceptions import BackPressureError
 from ray.serve.experimental.consistent_hash_router import ConsistentHashRouter
 
-# Longest wait for a replica. `/healthz` must be answered within 2 s, and a waiting request makes Serve start a replica
-# of an idle application.
+# Longest wait for a replica. `/healthz` must be answered within 2 s, and a waiting request makes
+# Serve start a replica of an idle application.
 _WAIT_S = 1.5
 _RETRY_AFTER_S = 1
 
@@ -24,13 +25,20 @@ class _NoReplica(BackPressureError):  # type: ignore[misc]
 
     def __init__(self, app: str) -> None:
         super().__init__(0, 0, retry_after_s=_RETRY_AFTER_S)
-        self._message = f"no replica of application {app!r} runs: its policy loads, or waits for resources; try again"
+        self._message = (
+            f"no replica of application {app!r} runs: its policy loads, or waits for "
+            "resources; try again"
+        )
 
 
 class SessionRouter(ConsistentHashRouter):  # type: ignore[misc]
-    """Routes a session's requests to one replica, by the session header; without replicas, the proxy answers 503."""
+    """Routes a session's requests to one replica, by the session header; without replicas, the
+    proxy answers 503.
+    """
 
-    async def _choose_replica_for_request(self, pending_request: Any, *, is_retry: bool = False) -> Any:
+    async def _choose_replica_for_request(
+        self, pending_request: Any, *, is_retry: bool = False
+    ) -> Any:
         chosen = super()._choose_replica_for_request(pending_request, is_retry=is_retry)
         if self._replicas or self._handle_source != DeploymentHandleSource.PROXY:
             return await chosen

@@ -1,18 +1,20 @@
-"""Migration of sessions, when a replica stops or the load balancer sends a session's request to another replica.
+"""Migration of sessions, when a replica stops or the load balancer sends a session's request to
+another replica.
 
-A replica that gets a request for an unknown session searches the other replicas for it, and continues the session in
-exactly the same state, including instruction, history and random generator. A replica that stops lets the others fetch
-its remaining sessions.
+A replica that gets a request for an unknown session searches the other replicas for it, and
+continues the session in exactly the same state, including instruction, history and random
+generator. A replica that stops lets the others fetch its remaining sessions.
 
-A move never duplicates or loses a session. It has three steps, of which only the second one changes a session:
+A move never duplicates or loses a session. It has three steps, of which only the second one changes
+a session:
 
 1. The new replica creates a copy that cannot act yet.
 2. The old replica releases the session, if that is still in the state of the copy.
 3. The copy becomes the session.
 
-A late or repeated message finds the session in another state (`Version`), and has no effect. The copy waits without a
-time limit until the old replica has answered the second step or has ended; all other calls may time out. If a fault
-leaves several copies, the newest one is the session.
+A late or repeated message finds the session in another state (`Version`), and has no effect. The
+copy waits without a time limit until the old replica has answered the second step or has ended; all
+other calls may time out. If a fault leaves several copies, the newest one is the session.
 """
 
 from __future__ import annotations
@@ -43,7 +45,8 @@ logger = logging.getLogger(__name__)
 
 EXPORT_S = 10.0  # time limit for the export of a session, which waits for the session's queued acts
 ARRIVAL_S = 3.0  # time limit for a released session to arrive at its new replica
-ON_ITS_WAY_S = 0.1  # interval between queries to the other replicas, since a session may be moving between two of them
+# Interval between queries to the other replicas, since a session may be moving between two of them.
+ON_ITS_WAY_S = 0.1
 _REMEMBERED = 1000  # number of remembered releases, for replicas that repeat a request
 
 P = ParamSpec("P")
@@ -52,10 +55,14 @@ InThread = Callable[..., Awaitable[Any]]
 Spawn = Callable[[Coroutine[Any, Any, Any]], "asyncio.Task[Any]"]
 FetchFrom = Callable[[str, str], Awaitable[bool]]  # fetches a session from the replica of that name
 UserOf = Callable[[dict[str, Any], float], Origin | None]
-_Callback = tuple[Callable[[], None], UserOf]  # called when a search is over, and its request's `user` of `fetch`
-_PENDING = 4096  # largest number of concurrent searches of a caller; further requests get `UnknownSession` at once
-_ANSWER_S = 3.0  # time limit for another replica's answer; a replica that still loads does not answer
-_OTHERS_S = 0.3  # time limit for the remaining answers, once a replica has answered that it holds the session
+# Called when a search is over, and its request's `user` of `fetch`.
+_Callback = tuple[Callable[[], None], UserOf]
+# Largest number of concurrent searches of a caller; further requests get `UnknownSession` at once.
+_PENDING = 4096
+# Time limit for another replica's answer; a replica that still loads does not answer.
+_ANSWER_S = 3.0
+# Time limit for the remaining answers, once a replica has answered that it holds the session.
+_OTHERS_S = 0.3
 _SILENT_S = 3.0  # time without further requests to a silent replica
 _ATTEMPTS = 5  # number of attempts after which a search is given up, if `ARRIVAL_S` has also passed
 _LOAD_S = 60.0  # time limit for loading the checkpoint of a fetched session
@@ -69,26 +76,38 @@ class PeerEnded(Exception):
 
 
 class PeerUnreachable(Exception):
-    """Raised if the other replica cannot be reached, so that it may or may not have executed the request."""
+    """Raised if the other replica cannot be reached, so that it may or may not have executed the
+    request.
+    """
 
 
 class HeldSessions:
     """Exports, releases and adopts the sessions of one engine, on the replica's event loop."""
 
     def __init__(
-        self, engine: Engine, loop: asyncio.AbstractEventLoop, name: str, fetch_from: FetchFrom, spawn: Spawn
+        self,
+        engine: Engine,
+        loop: asyncio.AbstractEventLoop,
+        name: str,
+        fetch_from: FetchFrom,
+        spawn: Spawn,
     ) -> None:
-        """Move the sessions of an engine, of the replica called `name`; `fetch_from` fetches one from a replica."""
+        """Move the sessions of an engine, of the replica called `name`; `fetch_from` fetches one
+        from a replica.
+        """
         self._engine, self._loop, self._name = engine, loop, name
         self._fetch_from, self._spawn = fetch_from, spawn
-        self._claims: OrderedDict[str, asyncio.Task[bool]] = OrderedDict()  # releases that other replicas requested
+        # Releases that other replicas requested.
+        self._claims: OrderedDict[str, asyncio.Task[bool]] = OrderedDict()
         self._released: OrderedDict[str, float] = OrderedDict()  # time of release by session, s
-        self._leaving: dict[str, asyncio.Future[None]] = {}  # sessions being given away, until another replica has them
+        # Sessions being given away, until another replica has them.
+        self._leaving: dict[str, asyncio.Future[None]] = {}
 
     # Operations for other replicas.
 
     async def held(self, session_ids: Collection[str]) -> dict[str, Version]:
-        """Return the versions of those sessions that are here, or are moving from here to another replica.
+        """Return the versions of those sessions that are here, or are moving from here to another
+        replica.
 
         Returns at once. The version of a session that is moving is (0, 0).
         """
@@ -96,10 +115,12 @@ class HeldSessions:
         return leaving | self._engine.sessions.held(session_ids)
 
     async def copy(self, session_id: str, offered: bool = False) -> dict[str, Any] | None:
-        """Return the session's state after its queued acts; None if it is not here, or cannot be pickled.
+        """Return the session's state after its queued acts; None if it is not here, or cannot be
+        pickled.
 
-        Its `age_s` is the time from its episode's reset to this call, s. `offered` is for the replica that
-        `send_to_peer` called: there is no time limit, since the session ends with this replica otherwise.
+        Its `age_s` is the time from its episode's reset to this call, s. `offered` is for the
+        replica that `send_to_peer` called: there is no time limit, since the session ends with this
+        replica otherwise.
         """
         asked = self._engine.clock()
         if session_id in self._leaving and not offered:
@@ -142,15 +163,20 @@ class HeldSessions:
         return True
 
     def is_leaving(self, session_id: str) -> bool:
-        """Return whether the session has just been released here, so that no replica may hold it at the moment."""
+        """Return whether the session has just been released here, so that no replica may hold it
+        at the moment.
+        """
         left = self._loop.time() - self._released.get(session_id, float("-inf"))
-        return session_id in self._leaving or (left < ARRIVAL_S and session_id not in self._engine.sessions)
+        return session_id in self._leaving or (
+            left < ARRIVAL_S and session_id not in self._engine.sessions
+        )
 
     async def take_over(self, session_id: str, holder: str) -> bool:
         """Fetch a session from the replica called `holder`, which stops.
 
         Returns:
-            Whether the session is here; also True if a newer state of the session has replaced that one.
+            Whether the session is here; also True if a newer state of the session has replaced that
+            one.
         """
         if self._engine.draining:
             return False
@@ -169,7 +195,9 @@ class HeldSessions:
     # Operations for this replica.
 
     async def send_to_peer(self, session_id: str, peers: Sequence[Peer]) -> None:
-        """Let the first of `peers` that can do so fetch the session, which stays here until that replica has a copy."""
+        """Let the first of `peers` that can do so fetch the session, which stays here until that
+        replica has a copy.
+        """
         self._leaving[session_id] = self._loop.create_future()
         try:
             for peer in peers:
@@ -181,7 +209,11 @@ class HeldSessions:
                 except PeerEnded:
                     continue
                 except PeerUnreachable as error:
-                    logger.warning("session %s: offered to a replica that does not answer: %s", session_id, error)
+                    logger.warning(
+                        "session %s: offered to a replica that does not answer: %s",
+                        session_id,
+                        error,
+                    )
         finally:
             self._leaving.pop(session_id).set_result(None)
 
@@ -190,7 +222,9 @@ class HeldSessions:
         if session_id in self._leaving:
             await asyncio.wait([self._leaving[session_id]])
 
-    async def _ask(self, session_id: str, op: Op, timeout_s: float | None, **kwargs: Any) -> dict[str, Any] | None:
+    async def _ask(
+        self, session_id: str, op: Op, timeout_s: float | None, **kwargs: Any
+    ) -> dict[str, Any] | None:
         """Return the engine's answer to a request, or None for an error.
 
         If the request has not begun after `timeout_s`, it is cancelled, and has no effect.
@@ -213,35 +247,45 @@ class HeldSessions:
 class Peer(ABC):
     """A remote proxy for the `HeldSessions` of another replica of the application.
 
-    Each method waits for the other replica without a time limit, and raises `PeerEnded` or `PeerUnreachable`.
+    Each method waits for the other replica without a time limit, and raises `PeerEnded` or
+    `PeerUnreachable`.
     """
 
     name: str  # unique name of the replica
 
     @abstractmethod
     async def ask(
-        self, method: Callable[Concatenate[HeldSessions, P], Awaitable[T]], *args: P.args, **kwargs: P.kwargs
+        self,
+        method: Callable[Concatenate[HeldSessions, P], Awaitable[T]],
+        *args: P.args,
+        **kwargs: P.kwargs,
     ) -> T:
         """Call `method`, at the other replica, and return its result."""
 
 
 Peers = Callable[[], Awaitable[Sequence[Peer]]]
-_Answers = dict[Peer, "asyncio.Task[dict[str, Version] | None]"]  # each replica's answer with the sessions it holds
+# Each replica's answer with the sessions it holds.
+_Answers = dict[Peer, "asyncio.Task[dict[str, Version] | None]"]
 
 
 class SessionMigrator:
     """Finds sessions at other replicas, takes them over, and gives away those of this replica.
 
-    `held` answers the calls of the other replicas. All work runs on the replica's event loop; `fetch` and `announce`
-    may be called on any thread.
+    `held` answers the calls of the other replicas. All work runs on the replica's event loop;
+    `fetch` and `announce` may be called on any thread.
     """
 
     def __init__(
-        self, name: str, peers: Peers, loop: asyncio.AbstractEventLoop, in_thread: InThread | None = None
+        self,
+        name: str,
+        peers: Peers,
+        loop: asyncio.AbstractEventLoop,
+        in_thread: InThread | None = None,
     ) -> None:
         """Create the migrator of the replica that its peers call `name`.
 
-        `in_thread` runs a slow call (unpickling, loading a checkpoint) on another thread, by default a dedicated one.
+        `in_thread` runs a slow call (unpickling, loading a checkpoint) on another thread, by
+        default a dedicated one.
         """
         self._name, self._peers = name, peers
         self._threads = ThreadPoolExecutor(_AT_ONCE, thread_name_prefix="session-migration")
@@ -252,12 +296,16 @@ class SessionMigrator:
         self._callbacks: dict[str, list[_Callback]] = {}  # by session, until its search is over
         self._next_query: dict[str, asyncio.Future[_Answers]] = {}  # sessions of the next query
         self._callers: Counter[str] = Counter()  # number of running searches by caller
-        self._unannounced: dict[str, int] = {}  # steps of begun episodes that are not announced yet, by session
+        # Steps of begun episodes that are not announced yet, by session.
+        self._unannounced: dict[str, int] = {}
         self._announced: list[Callable[[], None]] = []  # called once those are announced
-        self._offered = 0  # number of sessions that are being fetched since other replicas offered them
-        self._silent: dict[str, float] = {}  # time until which a silent replica gets no request, by its name
+        # Number of sessions that are being fetched since other replicas offered them.
+        self._offered = 0
+        # Time until which a silent replica gets no request, by its name.
+        self._silent: dict[str, float] = {}
         self._tasks: set[asyncio.Task[Any]] = set()
-        self._fetching_weights = asyncio.Lock()  # held while a version of the weights, which may be large, is fetched
+        # Held while a version of the weights, which may be large, is fetched.
+        self._fetching_weights = asyncio.Lock()
 
     def start(self, engine: Engine) -> None:
         """Set the engine whose sessions move; this migrator is its `finder`."""
@@ -265,18 +313,24 @@ class SessionMigrator:
         self.held = HeldSessions(engine, self._loop, self._name, self._fetch_from, self._spawn)
 
     def fetch(
-        self, session_id: str, then: Callable[[], None], caller: str = "", user: UserOf = lambda *_: NOWHERE
+        self,
+        session_id: str,
+        then: Callable[[], None],
+        caller: str = "",
+        user: UserOf = lambda *_: NOWHERE,
     ) -> bool:
         """Fetch a session from another replica.
 
         Args:
             then: Called once the session is here or was not found.
             caller: Owner of the search; the number of concurrent searches per caller is limited.
-            user: Returns the origin of a request that can act on a session with that exported state, whose episode
-                began at that time. A session for which all return None is not moved.
+            user: Returns the origin of a request that can act on a session with that exported
+                state, whose episode began at that time. A session for which all return None is not
+                moved.
 
         Returns:
-            False if `then` will not be called, since `caller` has too many searches or the migrator is closed.
+            False if `then` will not be called, since `caller` has too many searches or the migrator
+            is closed.
         """
         with self._lock:
             if self._closed or self._callers[caller] >= _PENDING:
@@ -298,7 +352,8 @@ class SessionMigrator:
         return True
 
     def announce(self, session_id: str, step: int, then: Callable[[], None]) -> None:
-        """Announce to the other replicas that the session began an episode here at `step`; their states are older.
+        """Announce to the other replicas that the session began an episode here at `step`; their
+        states are older.
 
         `then` is called once they have dropped those states, or `_OTHERS_S` have passed.
         """
@@ -324,20 +379,28 @@ class SessionMigrator:
                 break
             tried.update(here)
             peers = await self._responsive_first() if here else []
-            orders = [peers[i:] + peers[:i] for i in range(max(1, len(peers)))]  # round-robin over the replicas
-            transfers = [transfer(session_id, orders[i % len(orders)]) for i, (session_id, _) in enumerate(here)]
+            # round-robin over the replicas.
+            orders = [peers[i:] + peers[:i] for i in range(max(1, len(peers)))]
+            transfers = [
+                transfer(session_id, orders[i % len(orders)])
+                for i, (session_id, _) in enumerate(here)
+            ]
             await asyncio.gather(*transfers)
-            if not here:  # sessions are still being fetched, for earlier requests or since they were offered
+            # Sessions are still being fetched, for earlier requests or since they were offered.
+            if not here:
                 await asyncio.sleep(ON_ITS_WAY_S)
         self._closed = True
-        self._engine.stop(0.0)  # later requests are refused, so that clients send them to the new replica
+        # Later requests are refused, so that clients send them to the new replica.
+        self._engine.stop(0.0)
 
     async def _responsive_first(self) -> list[Peer]:
         """Return the other replicas; those that do not answer at once are last."""
         answers = {peer: self._spawn(self._query_peer(peer, [])) for peer in await self._peers()}
         if answers:
             await asyncio.wait(answers.values(), timeout=_OTHERS_S)
-        return sorted(answers, key=lambda peer: not answers[peer].done() or answers[peer].result() is None)
+        return sorted(
+            answers, key=lambda peer: not answers[peer].done() or answers[peer].result() is None
+        )
 
     async def close(self) -> None:
         """Cancel all running tasks, and accept no further searches."""
@@ -348,7 +411,9 @@ class SessionMigrator:
         self._threads.shutdown(wait=False, cancel_futures=True)
 
     async def _search(self, session_id: str) -> None:
-        """Search for the session, and if it is not found, once more for the requests that joined the search late."""
+        """Search for the session, and if it is not found, once more for the requests that joined
+        the search late.
+        """
         searching = True
         while searching:
             with self._lock:
@@ -363,19 +428,27 @@ class SessionMigrator:
                 searching = self._finish(session_id, waiting)
 
     async def _find(self, session_id: str) -> None:
-        """Take the session over from the replica that has it, unless there is none, or no waiting request fits it."""
-        misses = 0  # consecutive attempts that found no holder; after two, the session is not moving either
+        """Take the session over from the replica that has it, unless there is none, or no
+        waiting request fits it.
+        """
+        # Consecutive attempts that found no holder; after two, the session is not moving either.
+        misses = 0
         begun = self._loop.time()
         for attempt in itertools.count():
             if attempt:
                 await asyncio.sleep(ON_ITS_WAY_S)
-                if self._engine.sessions.held([session_id]):  # another replica has given it to this one
+                # Another replica has given it to this one.
+                if self._engine.sessions.held([session_id]):
                     return
             await self.held.wait_until_left(session_id)
             holders = await self._holders(session_id, await self._answers(session_id))
             for version, peer in holders[1:]:
                 if version < holders[0][0]:
-                    self._spawn(self._answer(peer.ask(HeldSessions.drop_older, {session_id: holders[0][0][0]})))
+                    self._spawn(
+                        self._answer(
+                            peer.ask(HeldSessions.drop_older, {session_id: holders[0][0][0]})
+                        )
+                    )
             if holders and await self._move(session_id, holders[0][1]):
                 return
             misses = 0 if holders or self.held.is_leaving(session_id) else misses + 1
@@ -383,7 +456,9 @@ class SessionMigrator:
                 return
 
     async def _fetch_from(self, session_id: str, holder: str) -> bool:
-        """Fetch a session from the replica called `holder`, which offers it; return whether it is here."""
+        """Fetch a session from the replica called `holder`, which offers it; return whether it
+        is here.
+        """
         self._offered += 1
         try:
             for peer in await self._peers():
@@ -394,16 +469,19 @@ class SessionMigrator:
             self._offered -= 1
 
     async def _move(self, session_id: str, peer: Peer, *, offered: bool = False) -> bool:
-        """Move the session from that replica to this one; return False if its state there has changed.
+        """Move the session from that replica to this one; return False if its state there has
+        changed.
 
-        A session that the replica has not `offered` is moved only if one of the waiting requests can act on it.
+        A session that the replica has not `offered` is moved only if one of the waiting requests
+        can act on it.
         """
         asked = self._engine.clock()
         copying = peer.ask(HeldSessions.copy, session_id, offered)
         state = await self._answer(copying, None if offered else EXPORT_S)
         if state is None:
             return False
-        # The other replica received the call later than `asked`, so that this is no later than the episode's true
+        # The other replica received the call later than `asked`, so that this is no later than the
+        # episode's true
         # begin: an act that arrived after the reset is never taken for one of an older episode.
         began = asked - state["age_s"]
         origin = NOWHERE if offered else self._user_of(session_id, state, began)
@@ -411,23 +489,30 @@ class SessionMigrator:
             return True
         arriving = await self._prepare(peer, session_id, state, began, origin)
         version = state["steps"], state["moves"]
-        release = self._spawn(self._answer(peer.ask(HeldSessions.release, session_id, version, uuid.uuid4().hex)))
+        release = self._spawn(
+            self._answer(peer.ask(HeldSessions.release, session_id, version, uuid.uuid4().hex))
+        )
         while not (await asyncio.wait([release], timeout=_ANSWER_S))[0]:
-            if await self._query_peer(peer, []) is None:  # the replica hangs: only the copy waits for it
+            # The replica hangs: only the copy waits for it.
+            if await self._query_peer(peer, []) is None:
                 self._finish(session_id)
         if not release.result():
             self._engine.abandon(arriving)
             return False
         self._engine.enter(arriving)
         logger.info(
-            "session %s: fetched from another replica, after %d acts", session_id, state["steps"] - state["first"]
+            "session %s: fetched from another replica, after %d acts",
+            session_id,
+            state["steps"] - state["first"],
         )
         return True
 
     async def _prepare(
         self, peer: Peer, session_id: str, state: dict[str, Any], began: float, origin: Origin
     ) -> Session[LoadedModel]:
-        """Create the copy of a session; if its version of the weights is not held here, get that from the `peer`."""
+        """Create the copy of a session; if its version of the weights is not held here, get that
+        from the `peer`.
+        """
 
         async def prepare(weights: dict[str, Any] | None = None) -> Session[LoadedModel]:
             create = self._engine.prepare_adoption
@@ -448,14 +533,18 @@ class SessionMigrator:
             return await prepare(weights)
 
     def _user_of(self, session_id: str, state: dict[str, Any], began: float) -> Origin | None:
-        """Return the origin of a waiting request that can act on the session; None if there is no such request."""
+        """Return the origin of a waiting request that can act on the session; None if there is
+        no such request.
+        """
         with self._lock:
             callbacks = list(self._callbacks.get(session_id, ()))
         origins = (user(state, began) for _, user in callbacks)
         return next((origin for origin in origins if origin is not None), None)
 
     def _answers(self, session_id: str) -> asyncio.Future[_Answers]:
-        """Return a future of the other replicas' answers to one query about all sessions that are being searched."""
+        """Return a future of the other replicas' answers to one query about all sessions that
+        are being searched.
+        """
         answers: asyncio.Future[_Answers] = self._loop.create_future()
         if not self._next_query:
             self._loop.call_later(_BATCH_S, lambda: self._spawn(self._ask_all()))
@@ -474,7 +563,9 @@ class SessionMigrator:
             for each in query.values():
                 each.set_result(answers)
 
-    async def _query_peer(self, peer: Peer, session_ids: Sequence[str]) -> dict[str, Version] | None:
+    async def _query_peer(
+        self, peer: Peer, session_ids: Sequence[str]
+    ) -> dict[str, Version] | None:
         """Return that replica's answer; None if it does not answer in time."""
         try:
             return await asyncio.wait_for(peer.ask(HeldSessions.held, session_ids), _ANSWER_S)
@@ -484,14 +575,18 @@ class SessionMigrator:
             return None
 
     async def _holders(self, session_id: str, answers: _Answers) -> list[tuple[Version, Peer]]:
-        """Return the replicas that have the session, with its version there, the newest version first."""
+        """Return the replicas that have the session, with its version there, the newest version
+        first.
+        """
         of = {task: peer for peer, task in answers.items()}
         found: list[tuple[Version, Peer]] = []
         waiting = set(of)
         until = self._loop.time() + _ANSWER_S
         while waiting:
             left_s = max(0.0, until - self._loop.time())
-            completed, waiting = await asyncio.wait(waiting, timeout=left_s, return_when=asyncio.FIRST_COMPLETED)
+            completed, waiting = await asyncio.wait(
+                waiting, timeout=left_s, return_when=asyncio.FIRST_COMPLETED
+            )
             if not completed:
                 break
             for task in completed:
@@ -518,24 +613,31 @@ class SessionMigrator:
                 await asyncio.sleep(_GATHER_S)
             begun, announced = self._take_unannounced()
             if peers:
-                answers = [self._spawn(self._answer(peer.ask(HeldSessions.drop_older, begun))) for peer in peers]
+                answers = [
+                    self._spawn(self._answer(peer.ask(HeldSessions.drop_older, begun)))
+                    for peer in peers
+                ]
                 await asyncio.wait(answers, timeout=_OTHERS_S)
         finally:  # also if the task is cancelled, as the replica stops
             for then in announced or self._take_unannounced()[1]:
                 then()
 
     def _take_unannounced(self) -> tuple[dict[str, int], list[Callable[[], None]]]:
-        """Return the steps of the begun episodes, by session, and what to call once those are announced."""
+        """Return the steps of the begun episodes, by session, and what to call once those are
+        announced.
+        """
         with self._lock:
             begun, self._unannounced = self._unannounced, {}
             announced, self._announced = self._announced, []
         return begun, announced
 
     def _finish(self, session_id: str, waiting: Collection[_Callback] | None = None) -> bool:
-        """Call the callbacks of a session whose search is over; if it was not found, only those of `waiting`.
+        """Call the callbacks of a session whose search is over; if it was not found, only those of
+        `waiting`.
 
         Returns:
-            Whether requests have joined the search since those of `waiting`. The other replicas' answers may be older.
+            Whether requests have joined the search since those of `waiting`. The other replicas'
+            answers may be older.
         """
         later: list[_Callback] = []
         found = self._engine.sessions.held([session_id])
@@ -551,7 +653,8 @@ class SessionMigrator:
                 then()
             except Exception:
                 logger.exception("session %s: its request could not go on", session_id)
-        return bool(callbacks and later)  # without any of `waiting`, the later ones have a search of their own already
+        # Without any of `waiting`, the later ones have a search of their own already.
+        return bool(callbacks and later)
 
     def _spawn(self, work: Coroutine[Any, Any, Any]) -> asyncio.Task[Any]:
         task = self._loop.create_task(work)

@@ -16,7 +16,12 @@ from vlagents_ray.errors import VLAgentsError
 from vlagents_ray.ray_tools import private
 from vlagents_ray.serve.config.deployment import POLICY
 from vlagents_ray.serve.scaling.rebalancer import Rebalancer, ReplicaLoad
-from vlagents_ray.serve.scaling.session_migration import HeldSessions, Peer, PeerEnded, PeerUnreachable
+from vlagents_ray.serve.scaling.session_migration import (
+    HeldSessions,
+    Peer,
+    PeerEnded,
+    PeerUnreachable,
+)
 from vlagents_ray.serve.weights import WeightUpdates
 
 P = ParamSpec("P")
@@ -35,13 +40,17 @@ class SiblingApi(Protocol):
     """The actor methods that the replicas of an application call on each other."""
 
     async def expect_client(self) -> tuple[dict[str, Any], Any]:
-        """Expect a client that another replica sends here; return the metadata for the client, and the actor."""
+        """Expect a client that another replica sends here; return the metadata for the client,
+        and the actor.
+        """
 
     async def peer(self, method: str, *args: Any) -> Any:
         """Call the method of that name in `PEER_METHODS`, and return its result."""
 
     async def call_part(self, part: str, method: str, *args: Any) -> Any:
-        """Call a method of a part that its `ReplicaPart.sibling_methods` name, and return its result."""
+        """Call a method of a part that its `ReplicaPart.sibling_methods` name, and return its
+        result.
+        """
 
 
 class PeerMethod(NamedTuple):
@@ -70,18 +79,27 @@ PEER_METHODS = {
         PeerMethod(Rebalancer, Rebalancer.load, _QUICK_S),
     )
 }
-"""What replicas call at each other, beside `SiblingApi`: moves of sessions, pushes of weights, loads."""
+"""What replicas call at each other, beside `SiblingApi`: moves of sessions, pushes of weights,
+loads.
+"""
 
 
 class SiblingReplica(Peer):
-    """Another replica: for moving sessions, for pushes of weights (`WeightsReplica`), and for parts of replicas."""
+    """Another replica: for moving sessions, for pushes of weights (`WeightsReplica`), and for
+    parts of replicas.
+    """
 
     def __init__(self, name: str, actor: Any, initialized: set[str]) -> None:
-        """`initialized` are the names of the replicas that are known to be; one that answers so is added."""
+        """`initialized` are the names of the replicas that are known to be; one that answers so
+        is added.
+        """
         self.name, self._actor, self._initialized = name, actor, initialized
 
     async def ask(
-        self, method: Callable[Concatenate[HeldSessions, P], Awaitable[T]], *args: P.args, **kwargs: P.kwargs
+        self,
+        method: Callable[Concatenate[HeldSessions, P], Awaitable[T]],
+        *args: P.args,
+        **kwargs: P.kwargs,
     ) -> T:
         try:
             found: T = await self.call(method, *args)
@@ -90,7 +108,9 @@ class SiblingReplica(Peer):
         return found
 
     async def call(self, method: Callable[..., Any], *args: Any) -> Any:
-        """Call one of `PEER_METHODS`; raise `PeerEnded`, `PeerUnreachable` or the method's own errors."""
+        """Call one of `PEER_METHODS`; raise `PeerEnded`, `PeerUnreachable` or the method's own
+        errors.
+        """
         name = method.__qualname__
         return await self._ask_actor(PEER_METHODS[name].limit_s, SiblingApi.peer, name, *args)
 
@@ -98,11 +118,16 @@ class SiblingReplica(Peer):
         """Call a method of a part there, within a time limit; raises what `call` raises."""
         return await self._ask_actor(limit_s, SiblingApi.call_part, part, method, *args)
 
-    async def _ask_actor(self, limit_s: float | None, method: Callable[..., Any], *args: Any) -> Any:
+    async def _ask_actor(
+        self, limit_s: float | None, method: Callable[..., Any], *args: Any
+    ) -> Any:
         try:
             if self.name not in self._initialized:
-                # Serve answers a request to a replica that is not initialized with a traceback in its log.
-                if not await asyncio.wait_for(private.replica_is_initialized(self._actor), _ANSWER_S):
+                # Serve answers a request to a replica that is not initialized with a traceback in
+                # its log.
+                if not await asyncio.wait_for(
+                    private.replica_is_initialized(self._actor), _ANSWER_S
+                ):
                     raise PeerUnreachable("it is not initialized yet")
                 self._initialized.add(self.name)
             answer = call_replica(self._actor, method, *args)
@@ -110,8 +135,13 @@ class SiblingReplica(Peer):
         except ray.exceptions.ActorDiedError as error:
             raise PeerEnded(str(error)) from error
         except ray.exceptions.RayTaskError as error:  # the replica itself raised it
-            raise error.cause if isinstance(error.cause, VLAgentsError) else PeerUnreachable(str(error)) from error
-        except (ray.exceptions.RayError, TimeoutError, asyncio.TimeoutError) as error:  # or the network is partitioned
+            raise (
+                error.cause
+                if isinstance(error.cause, VLAgentsError)
+                else PeerUnreachable(str(error))
+            ) from error
+        except (ray.exceptions.RayError, TimeoutError, asyncio.TimeoutError) as error:
+            # or the network is partitioned
             raise PeerUnreachable(str(error) or f"no answer within {limit_s} s") from error
 
     weights = call
@@ -150,14 +180,17 @@ class SiblingReplicas(ReplicasInCluster):
         context = serve.get_replica_context()
         self.own_name = context.replica_id.to_full_id_str()
         super().__init__([context.app_name], but=self.own_name)
-        self._silent: dict[str, float] = {}  # time until which a silent replica gets no request, by its name
+        # Time until which a silent replica gets no request, by its name.
+        self._silent: dict[str, float] = {}
 
     async def loads(self) -> list[ReplicaLoad]:
         """Return the loads of the replicas that answer within 0.3 s."""
         now = time.monotonic()
         self._silent = {name: until for name, until in self._silent.items() if until > now}
         asked = [one for one in await self.others() if one.name not in self._silent]
-        answers = await asyncio.gather(*(one.call(Rebalancer.load) for one in asked), return_exceptions=True)
+        answers = await asyncio.gather(
+            *(one.call(Rebalancer.load) for one in asked), return_exceptions=True
+        )
         for one, answer in zip(asked, answers, strict=True):
             if not isinstance(answer, ReplicaLoad):
                 logger.info("another replica does not answer: %s", answer)
@@ -165,7 +198,9 @@ class SiblingReplicas(ReplicasInCluster):
         return [answer for answer in answers if isinstance(answer, ReplicaLoad)]
 
     async def announce_client(self, replica: str) -> Any:
-        """Announce a client to another replica; return its answer for the client, or None after 0.3 s without one."""
+        """Announce a client to another replica; return its answer for the client, or None after
+        0.3 s without one.
+        """
         try:
             actor = await asyncio.to_thread(ray.get_actor, replica, namespace=_NAMESPACE)
             return await asyncio.wait_for(call_replica(actor, SiblingApi.expect_client), _QUICK_S)

@@ -1,9 +1,11 @@
-"""New weights for all replicas of an application: every replica holds a version before any replica acts with it.
+"""New weights for all replicas of an application: every replica holds a version before any replica
+acts with it.
 
-The replica that receives a push coordinates it. It stages the version at all replicas, and commits it only if all of
-them hold it; otherwise it drops it, and nothing has changed. A replica that starts later, or has missed a commit, gets
-the versions of the others (`WeightPusher.catch_up`). If the coordinator dies before the commits, the replicas drop the
-staged version by themselves; if it dies between two commits, the replicas without a commit catch up.
+The replica that receives a push coordinates it. It stages the version at all replicas, and commits
+it only if all of them hold it; otherwise it drops it, and nothing has changed. A replica that
+starts later, or has missed a commit, gets the versions of the others (`WeightPusher.catch_up`). If
+the coordinator dies before the commits, the replicas drop the staged version by themselves; if it
+dies between two commits, the replicas without a commit catch up.
 """
 
 from __future__ import annotations
@@ -16,18 +18,27 @@ from typing import Any, Protocol, TypeVar
 
 from vlagents_ray.errors import InvalidInput, InvalidWeights, PolicyUnavailable, VLAgentsError
 from vlagents_ray.serve.scaling.session_migration import PeerEnded, PeerUnreachable
-from vlagents_ray.serve.weights import NewestVersion, PushMode, PushOptions, PushResult, Rest, WeightUpdates
+from vlagents_ray.serve.weights import (
+    NewestVersion,
+    PushMode,
+    PushOptions,
+    PushResult,
+    Rest,
+    WeightUpdates,
+)
 from vlagents_ray.weights.shared_values import NotShared, SharedValues
 
 T = TypeVar("T")
 
 Values = Mapping[str, Any] | list[Awaitable[Mapping[str, Any]]] | SharedValues
-"""Values by name; a list of one reference to them in Ray's object store, which each replica reads in place; or handles
+"""Values by name; a list of one reference to them in Ray's object store, which each replica reads
+in place; or handles
 of a learner's memory on the GPU of all replicas."""
 
 logger = logging.getLogger(__name__)
 
-_MOST_AHEAD = 10**9  # maximum step from one version to the next if a learner numbers them, such as by its training step
+# Maximum step from one version to the next if a learner numbers them, such as by its training step.
+_MOST_AHEAD = 10**9
 _ATTEMPTS = 3  # attempts to commit at a replica that cannot be reached
 
 
@@ -37,7 +48,9 @@ class WeightsReplica(Protocol):
     name: str  # for messages
 
     async def weights(self, method: Callable[..., T], *args: Any) -> T:
-        """Call a method of the replica's `WeightUpdates`; also raise `PeerEnded` and `PeerUnreachable`."""
+        """Call a method of the replica's `WeightUpdates`; also raise `PeerEnded` and
+        `PeerUnreachable`.
+        """
 
 
 class ThisReplica(WeightsReplica):
@@ -55,7 +68,9 @@ class ThisReplica(WeightsReplica):
 class WeightPusher:
     """Pushes new weights to all replicas, on the event loop of one of them."""
 
-    def __init__(self, own: WeightsReplica, others: Callable[[], Awaitable[Sequence[WeightsReplica]]]) -> None:
+    def __init__(
+        self, own: WeightsReplica, others: Callable[[], Awaitable[Sequence[WeightsReplica]]]
+    ) -> None:
         """Push to the `own` replica and to the `others`, which are looked up for each push."""
         self._own, self._others = own, others
         self._pushing = asyncio.Lock()
@@ -70,14 +85,19 @@ class WeightPusher:
                 **await self._loaded(await self._others()),
             }
             if len({one.model for one in newest.values()}) > 1:
-                raise PolicyUnavailable("weights: the replicas are changing their checkpoint; push again in a while")
+                raise PolicyUnavailable(
+                    "weights: the replicas are changing their checkpoint; push again in a while"
+                )
             last = max(one.number for one in newest.values())
             number = last + 1 if options.version is None else options.version
             if number <= last:
-                raise InvalidInput(f"version: got {number}, want one above {last}, the newest that acts")
+                raise InvalidInput(
+                    f"version: got {number}, want one above {last}, the newest that acts"
+                )
             if number > last + _MOST_AHEAD:
                 raise InvalidInput(
-                    f"version: got {number}, want at most {_MOST_AHEAD} above {last}, the newest that acts: versions "
+                    f"version: got {number}, want at most {_MOST_AHEAD} above {last}, the newest "
+                    "that acts: versions "
                     f"never go back, so that a number beyond would end all numbered pushes"
                 )
             if isinstance(values, SharedValues):
@@ -85,7 +105,9 @@ class WeightPusher:
             staged: dict[WeightsReplica, str] = {}
 
             async def stage(replica: WeightsReplica) -> None:
-                staged[replica] = await replica.weights(WeightUpdates.stage, number, values, options)
+                staged[replica] = await replica.weights(
+                    WeightUpdates.stage, number, values, options
+                )
 
             try:
                 results = await asyncio.gather(*map(stage, newest), return_exceptions=True)
@@ -96,17 +118,23 @@ class WeightPusher:
                         raise result
                 if len(found := set(staged.values())) > 1:
                     raise InvalidWeights(
-                        f"weights: the replicas hold different values, {sorted(found)}; push them again"
+                        f"weights: the replicas hold different values, {sorted(found)}; push them "
+                        "again"
                     )
             except BaseException:
                 # Where staging failed, another push may have staged a version of the same number.
                 await asyncio.gather(
-                    *(one.weights(WeightUpdates.drop, number) for one in staged), return_exceptions=True
+                    *(one.weights(WeightUpdates.drop, number) for one in staged),
+                    return_exceptions=True,
                 )
                 raise
-            done = await asyncio.gather(*(self._commit(replica, number, options) for replica in staged))
+            done = await asyncio.gather(
+                *(self._commit(replica, number, options) for replica in staged)
+            )
             await self._own.weights(WeightUpdates.pushed, 1e3 * (time.perf_counter() - begun))
-            acting = sorted(replica.name for replica, acts in zip(staged, done, strict=True) if acts)
+            acting = sorted(
+                replica.name for replica, acts in zip(staged, done, strict=True) if acts
+            )
             return PushResult(number, staged[self._own], tuple(acting))
 
     async def rest(self, rest: Rest) -> None:
@@ -114,11 +142,14 @@ class WeightPusher:
         async with self._pushing:
             replicas = [self._own, *await self._loaded(await self._others())]
             results = await asyncio.gather(
-                *(replica.weights(WeightUpdates.rest, rest) for replica in replicas), return_exceptions=True
+                *(replica.weights(WeightUpdates.rest, rest) for replica in replicas),
+                return_exceptions=True,
             )
             answers = dict(zip(replicas, results, strict=True))
             failed = {
-                one: error for one, error in answers.items() if error is not None and type(error) is not PeerEnded
+                one: error
+                for one, error in answers.items()
+                if error is not None and type(error) is not PeerEnded
             }
             if not failed:
                 return
@@ -142,7 +173,8 @@ class WeightPusher:
             for replica in await self._others():
                 try:
                     newest = await replica.weights(WeightUpdates.newest)
-                except (PeerEnded, PeerUnreachable, VLAgentsError):  # the replica has no newer version
+                except (PeerEnded, PeerUnreachable, VLAgentsError):
+                    # the replica has no newer version
                     continue
                 if newest.number > best.number and newest.model == own.model:
                     best, source = newest, replica
@@ -151,34 +183,50 @@ class WeightPusher:
             last = own.number
             for version in await source.weights(WeightUpdates.held):
                 if version.number > own.number:
-                    mode: PushMode = "keep" if last < version.kept <= version.number else "next_episode"
+                    mode: PushMode = (
+                        "keep" if last < version.kept <= version.number else "next_episode"
+                    )
                     last = version.number
                     options = PushOptions(mode=mode, allow_same=True, pin=version.pinned)
-                    await self._own.weights(WeightUpdates.stage, version.number, version.values, options)
+                    await self._own.weights(
+                        WeightUpdates.stage, version.number, version.values, options
+                    )
                     await self._own.weights(WeightUpdates.commit, version.number, options)
             logger.info("took version %d of the weights from %s", best.number, source.name)
 
     async def _commit(self, replica: WeightsReplica, number: int, options: PushOptions) -> bool:
-        """Commit at one replica, and return whether it acts with the version; otherwise it will catch up."""
+        """Commit at one replica, and return whether it acts with the version; otherwise it will
+        catch up.
+        """
         for _ in range(_ATTEMPTS):
             try:
                 await replica.weights(WeightUpdates.commit, number, options)
             except PeerEnded:
                 return False
             except PeerUnreachable as error:
-                logger.warning("version %d of the weights: %s has not committed: %s", number, replica.name, error)
+                logger.warning(
+                    "version %d of the weights: %s has not committed: %s",
+                    number,
+                    replica.name,
+                    error,
+                )
             else:
                 return True
         return False
 
-    async def _loaded(self, replicas: Sequence[WeightsReplica]) -> dict[WeightsReplica, NewestVersion]:
-        """Return the newest versions of the replicas that have loaded their policy; the others will catch up.
+    async def _loaded(
+        self, replicas: Sequence[WeightsReplica]
+    ) -> dict[WeightsReplica, NewestVersion]:
+        """Return the newest versions of the replicas that have loaded their policy; the others will
+        catch up.
 
-        A replica that does not answer may be loading. One that has answered before has loaded, so it counts as
-        unreachable.
+        A replica that does not answer may be loading. One that has answered before has loaded, so
+        it counts as unreachable.
         """
         found: dict[WeightsReplica, NewestVersion] = {}
-        answers = await asyncio.gather(*(one.weights(WeightUpdates.newest) for one in replicas), return_exceptions=True)
+        answers = await asyncio.gather(
+            *(one.weights(WeightUpdates.newest) for one in replicas), return_exceptions=True
+        )
         for replica, answer in zip(replicas, answers, strict=True):
             if isinstance(answer, NewestVersion):
                 found[replica] = answer
@@ -193,11 +241,16 @@ class WeightPusher:
 def _require_gpu(gpu: str, replicas: Mapping[WeightsReplica, NewestVersion]) -> None:
     for replica, newest in replicas.items():
         if gpu not in newest.gpus:
-            reads = f"only memory of GPU {', '.join(newest.gpus)}" if newest.gpus else "no GPU's memory"
-            raise NotShared(f"replica {replica.name} can copy {reads}, and the learner's is on GPU {gpu}")
+            reads = (
+                f"only memory of GPU {', '.join(newest.gpus)}" if newest.gpus else "no GPU's memory"
+            )
+            raise NotShared(
+                f"replica {replica.name} can copy {reads}, and the learner's is on GPU {gpu}"
+            )
 
 
 def _unreachable(replica: WeightsReplica) -> PolicyUnavailable:
     return PolicyUnavailable(
-        f"weights: replica {replica.name} cannot be reached, so that nothing was changed; push again"
+        f"weights: replica {replica.name} cannot be reached, so that nothing was changed; push "
+        "again"
     )

@@ -1,6 +1,7 @@
 """Small random checkpoints of SAM 2 and Grounding DINO, made by transformers itself.
 
-python plugins/vlagents_ray_arro/tests/support/tiny_arro.py FOLDER: writes FOLDER/sam2 and FOLDER/grounding_dino.
+python plugins/vlagents_ray_arro/tests/support/tiny_arro.py FOLDER: writes FOLDER/sam2 and
+FOLDER/grounding_dino.
 """
 
 from __future__ import annotations
@@ -85,7 +86,8 @@ def make_sam2(folder: Path) -> Path:
         num_maskmem=3,
     )
     model = Sam2VideoModel(config)
-    with torch.no_grad():  # zeros as a network begins with would say little about what it does with them
+    # Zeros as a network begins with would say little about what it does with them.
+    with torch.no_grad():
         for parameter in model.parameters():
             parameter.add_(0.05 * torch.randn_like(parameter))
     model.save_pretrained(folder)
@@ -123,7 +125,11 @@ def make_grounding_dino(folder: Path) -> Path:
             out_indices=[2, 3, 4],
         ),
         text_config=BertConfig(
-            vocab_size=len(WORDS), hidden_size=32, num_hidden_layers=1, num_attention_heads=2, intermediate_size=64
+            vocab_size=len(WORDS),
+            hidden_size=32,
+            num_hidden_layers=1,
+            num_attention_heads=2,
+            intermediate_size=64,
         ),
         num_queries=20,
         d_model=32,
@@ -142,7 +148,9 @@ def make_grounding_dino(folder: Path) -> Path:
     model.save_pretrained(folder)
     tokenizer = BertTokenizer(vocab=str(vocabulary))
     size = {"shortest_edge": SIDE, "longest_edge": 2 * SIDE}
-    GroundingDinoProcessor(GroundingDinoImageProcessor(size=size), tokenizer).save_pretrained(folder)
+    GroundingDinoProcessor(GroundingDinoImageProcessor(size=size), tokenizer).save_pretrained(
+        folder
+    )
     return folder
 
 

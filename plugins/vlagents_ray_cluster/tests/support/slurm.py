@@ -1,4 +1,6 @@
-"""A Slurm of a test's own: its controller on one host, slurmd on others, with their own key and files."""
+"""A Slurm of a test's own: its controller on one host, slurmd on others, with their own key and
+files.
+"""
 
 from __future__ import annotations
 
@@ -65,7 +67,9 @@ class Slurm:
 
     def vlagents_ray(self, *words: str) -> str:
         """What `vlagents-ray` prints where jobs are submitted."""
-        return self.login.run([sys.executable, "-c", "from vlagents_ray.cli import main; main()", *words])
+        return self.login.run(
+            [sys.executable, "-c", "from vlagents_ray.cli import main; main()", *words]
+        )
 
     def do(self, *command: str) -> str:
         """What one of Slurm's own commands prints there."""
@@ -73,7 +77,9 @@ class Slurm:
 
     def state(self, job: str) -> str:
         """PENDING, RUNNING, COMPLETED, …"""
-        return self.do("squeue", "--noheader", "--format=%T", "--states=all", f"--jobs={job}").strip()
+        return self.do(
+            "squeue", "--noheader", "--format=%T", "--states=all", f"--jobs={job}"
+        ).strip()
 
     def wait_for_end(self, job: str, timeout_s: float = 240.0) -> str:
         """Until the job is over; its last state."""
@@ -93,18 +99,24 @@ class Slurm:
 
 @contextlib.contextmanager
 def running_slurm(nodes: int, cpus: int) -> Iterator[Slurm]:
-    """A cluster of so many nodes with so many CPUs each, which are bookkeeping; all of it ends with the context."""
+    """A cluster of so many nodes with so many CPUs each, which are bookkeeping; all of it ends
+    with the context.
+    """
     folder = Path(tempfile.mkdtemp(prefix="slurm-"))
     try:
         with hosts(nodes + 1) as [login, *others]:
             (folder / "munge.key").write_bytes(secrets.token_bytes(128))
             (folder / "munge.key").chmod(0o600)
             lines = [
-                f"NodeName={one.name} NodeAddr={one.address} CPUs={cpus} Gres=gpu:1 State=UNKNOWN" for one in others
+                f"NodeName={one.name} NodeAddr={one.address} CPUs={cpus} Gres=gpu:1 State=UNKNOWN"
+                for one in others
             ]
             configuration = folder / "slurm.conf"
-            configuration.write_text(_CONFIGURATION.format(head=login, folder=folder, nodes="\n".join(lines)))
-            (folder / "gres.conf").write_text("Name=gpu File=/dev/null\n")  # a GPU as far as bookkeeping goes
+            configuration.write_text(
+                _CONFIGURATION.format(head=login, folder=folder, nodes="\n".join(lines))
+            )
+            # A GPU as far as bookkeeping goes.
+            (folder / "gres.conf").write_text("Name=gpu File=/dev/null\n")
             for one in (login, *others):
                 one.environment |= {
                     "SLURM_CONF": str(configuration),
@@ -126,7 +138,11 @@ def _daemons(slurm: Slurm, folder: Path) -> Iterator[None]:
     with contextlib.ExitStack() as stack:
 
         def start(host: Host, command: Sequence[str]) -> None:
-            quiet = {"stdin": subprocess.DEVNULL, "stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
+            quiet = {
+                "stdin": subprocess.DEVNULL,
+                "stdout": subprocess.DEVNULL,
+                "stderr": subprocess.DEVNULL,
+            }
             process = host.start(command, **quiet)
             stack.callback(process.wait, 20)
             stack.callback(process.kill)  # what it started in the host ends with that

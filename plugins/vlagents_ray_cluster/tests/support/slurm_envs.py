@@ -15,13 +15,17 @@ NOTED = "slurm_envs:Noted"
 
 
 class Noted(Line):
-    """A file HOST-SEED in `folder` for each episode; those with a seed in `held` wait in it for the file `open`."""
+    """A file HOST-SEED in `folder` for each episode; those with a seed in `held` wait in it for
+    the file `open`.
+    """
 
     def __init__(self, folder: str, held: Sequence[int] = ()) -> None:
         super().__init__()
         self._notes, self._held = Path(folder), held
 
-    def reset(self, *, seed: int, options: Mapping[str, Any] | None = None) -> tuple[Obs, dict[str, Any]]:
+    def reset(
+        self, *, seed: int, options: Mapping[str, Any] | None = None
+    ) -> tuple[Obs, dict[str, Any]]:
         (self._notes / f"{socket.gethostname()}-{seed}").touch()
         return super().reset(seed=seed, options=options)
 

@@ -30,12 +30,17 @@ class TunableConfig(BaseModel, extra="forbid"):
 
 
 class Tunable(Agent):
-    """Acts on state, image and seed. Compiled, a batch costs nothing; in float16, its process ends while it loads."""
+    """Acts on state, image and seed. Compiled, a batch costs nothing; in float16, its process
+    ends while it loads.
+    """
 
     Config: ClassVar[type] = TunableConfig
     shared: ClassVar[tuple[str, ...]] = ("config",)
     contract = Contract(
-        cameras={"front": CameraSpec(16, 16)}, state={"joints": StateSpec(2)}, action=ActionSpec(dim=2), chunk=3
+        cameras={"front": CameraSpec(16, 16)},
+        state={"joints": StateSpec(2)},
+        action=ActionSpec(dim=2),
+        chunk=3,
     )
 
     def __init__(self, config: TunableConfig) -> None:
@@ -54,10 +59,20 @@ class Tunable(Agent):
     def act_batch(self, obs: Sequence[Obs], sessions: Sequence[Agent]) -> list[Act | Exception]:
         if self.config.most_rows is not None and len(obs) > self.config.most_rows:
             raise MemoryError(f"{len(obs)} rows")
-        time.sleep(0 if self.config.compile else (self.config.eager_ms + self.config.row_ms * len(obs)) / 1000)
-        off = self.config.off if self.config.dtype == "bfloat16" or self.config.quantization else 0.0
+        time.sleep(
+            0
+            if self.config.compile
+            else (self.config.eager_ms + self.config.row_ms * len(obs)) / 1000
+        )
+        off = (
+            self.config.off if self.config.dtype == "bfloat16" or self.config.quantization else 0.0
+        )
         return [
-            Act(np.tile(one.state["joints"] + session.seed + one.cameras["front"].mean() + off, (3, 1)))  # type: ignore[attr-defined]
+            Act(
+                np.tile(
+                    one.state["joints"] + session.seed + one.cameras["front"].mean() + off, (3, 1)
+                )
+            )  # type: ignore[attr-defined]
             for one, session in zip(obs, sessions, strict=True)
         ]
 

@@ -22,24 +22,38 @@ if TYPE_CHECKING:
 
 slurm = typer.Typer(
     no_args_is_help=True,
-    help="Evaluations and servers as Slurm jobs. Options that are not this command's are sbatch's: --nodes, --time, …",
+    help="Evaluations and servers as Slurm jobs. Options that are not this command's are sbatch's: "
+    "--nodes, --time, …",
 )
 _BOTH = {"allow_extra_args": True, "ignore_unknown_options": True}
 _FOUND_OUT = "it finds that out for itself"
 _TASK = "%a"  # the number of a task of --array, as in sbatch's file names
-DryRun = Annotated[bool, typer.Option("--dry-run", help="Print the script; write and submit nothing.")]
-Parsable = Annotated[bool, typer.Option("--parsable", help="Print the job's number and nothing else.")]
-Setup = Annotated[Path | None, typer.Option(help="File of shell lines that the job begins with: module load, export.")]
+DryRun = Annotated[
+    bool, typer.Option("--dry-run", help="Print the script; write and submit nothing.")
+]
+Parsable = Annotated[
+    bool, typer.Option("--parsable", help="Print the job's number and nothing else.")
+]
+Setup = Annotated[
+    Path | None,
+    typer.Option(help="File of shell lines that the job begins with: module load, export."),
+]
 
 
 @slurm.command("eval", context_settings=_BOTH, options_metavar="{FILE | ENV...} [OPTIONS]")
 def eval_(
     context: typer.Context,
     resubmit: Annotated[
-        int, typer.Option(min=0, max=MOST_RETRIES, help="Times that the job, out of time, queues itself again.")
+        int,
+        typer.Option(
+            min=0, max=MOST_RETRIES, help="Times that the job, out of time, queues itself again."
+        ),
     ] = 0,
     closing_s: Annotated[
-        float, typer.Option(min=0, max=MOST_S, callback=finite, help="End so long before the job's time does.")
+        float,
+        typer.Option(
+            min=0, max=MOST_S, callback=finite, help="End so long before the job's time does."
+        ),
     ] = 60.0,
     setup: Setup = None,
     dry_run: DryRun = False,
@@ -47,25 +61,35 @@ def eval_(
 ) -> None:
     """Evaluate in a job, with the options of `vlagents-ray eval` (see its --help) and sbatch's.
 
-    Existing results are continued, so the same command after `scancel` or a failure finishes the rest. Without
-    --workers there is one for each CPU but one, and a policy has a replica on each GPU.
+    Existing results are continued, so the same command after `scancel` or a failure finishes the
+    rest. Without --workers there is one for each CPU but one, and a policy has a replica on each
+    GPU.
     """
     from vlagents_ray.evaluate import most_cpus, most_gpus
 
     with errors():
         words, options = split(context.args, _options(evaluate_command))
         index = first_index(options.get("array") or "0")
-        config, other = (_evaluation([word.replace(_TASK, one) for word in words]) for one in (index, f"{index}0"))
+        config, other = (
+            _evaluation([word.replace(_TASK, one) for word in words])
+            for one in (index, f"{index}0")
+        )
         if "array" in options and config.out == other.out:
-            raise ConfigError(f"--array: its tasks write to one folder; want {_TASK} in it, as in --out runs/x/{_TASK}")
+            raise ConfigError(
+                f"--array: its tasks write to one folder; want {_TASK} in it, as in --out "
+                f"runs/x/{_TASK}"
+            )
         fill = []
-        if "workers" not in config.model_fields_set:  # they fill the job; how many GPUs policies need is not known
+        # They fill the job; how many GPUs policies need is not known.
+        if "workers" not in config.model_fields_set:
             if most_gpus(config):
                 raise ConfigError(
-                    "workers have GPUs, but their number is not said; want --workers: policies get the GPUs left over"
+                    "workers have GPUs, but their number is not said; want --workers: policies get "
+                    "the GPUs left over"
                 )
             fill = [f"--fill={max(1.0, most_cpus(config)):g}"]
-        folder = Path(os.path.commonpath([config.out, other.out])) / "slurm"  # of an array: above its tasks
+        # Of an array: above its tasks.
+        folder = Path(os.path.commonpath([config.out, other.out])) / "slurm"
         arguments = ["eval", *fill, f"--closing-s={closing_s:g}", "--", *words]
         _submit(Script("eval", folder, arguments, options, resubmit, setup), dry_run, parsable)
 
@@ -74,13 +98,17 @@ def eval_(
 def serve(
     context: typer.Context,
     out_dir: Annotated[
-        Path | None, typer.Option("--out", help="Folder of script, logs, and server.json; default: runs/serve/POLICY.")
+        Path | None,
+        typer.Option(
+            "--out", help="Folder of script, logs, and server.json; default: runs/serve/POLICY."
+        ),
     ] = None,
     setup: Setup = None,
     dry_run: DryRun = False,
     parsable: Parsable = False,
 ) -> None:
-    """Serve a policy in a job, with the options of `vlagents-ray serve` (see its --help) and sbatch's.
+    """Serve a policy in a job, with the options of `vlagents-ray serve` (see its --help) and
+    sbatch's.
 
     Once it answers, OUT/JOB/server.json and the job's log have URL, key and the line for ssh.
     """
@@ -90,7 +118,13 @@ def serve(
         words, options = split(context.args, _options(serve_command))
         given = _parsed("serve", serve_command, words)
         _refuse(given, _FOUND_OUT, "address", "host")
-        _refuse(given, "its server speaks no TLS, the ssh line encrypts", "tls_cert", "tls_key", "tls_client_ca")
+        _refuse(
+            given,
+            "its server speaks no TLS, the ssh line encrypts",
+            "tls_cert",
+            "tls_key",
+            "tls_client_ca",
+        )
         if "array" in options:
             raise ConfigError("--array: a server is one job; submit several")
         source = given["source"]
@@ -99,12 +133,18 @@ def serve(
         arguments = ["serve", *(f"--app={name}={route}" for name, route in apps.items())]
         arguments += [] if given["port"] is None else [f"--port={given['port']}"]
         arguments += ["--key"] if given["keys"] is None and not given["insecure"] else []
-        _submit(Script("serve", folder, [*arguments, "--", *words], options, setup=setup), dry_run, parsable)
+        _submit(
+            Script("serve", folder, [*arguments, "--", *words], options, setup=setup),
+            dry_run,
+            parsable,
+        )
 
 
 def _submit(script: Script, dry_run: bool, parsable: bool) -> None:
     if script.setup is not None and not script.setup.is_file():
-        raise ConfigError(f"--setup: expected a file of shell lines, got {str(script.setup)!r}, which is none")
+        raise ConfigError(
+            f"--setup: expected a file of shell lines, got {str(script.setup)!r}, which is none"
+        )
     if dry_run:
         typer.echo(script.text(), nl=False)
         return
@@ -118,7 +158,11 @@ def _submit(script: Script, dry_run: bool, parsable: bool) -> None:
         f"job {job} is queued; its script: {script.file}",
         f"  state   squeue --jobs={job}",
         f"  log     {log}, and Ray's of each node in {script.folder}/{number}/",
-        *([f"  way in  {script.folder}/{number}/server.json, once it answers"] if script.name == "serve" else []),
+        *(
+            [f"  way in  {script.folder}/{number}/server.json, once it answers"]
+            if script.name == "serve"
+            else []
+        ),
         f"  end it  scancel {job}",
     ]
     out.print("\n".join(lines))
@@ -127,12 +171,19 @@ def _submit(script: Script, dry_run: bool, parsable: bool) -> None:
 def _options(command: Callable[..., None]) -> dict[str, bool]:
     """Return the options of a command, and whether each takes a value."""
     found = _click(command)
-    return {name: not param.is_flag for param in found.params if hasattr(param, "is_flag") for name in param.opts}
+    return {
+        name: not param.is_flag
+        for param in found.params
+        if hasattr(param, "is_flag")
+        for name in param.opts
+    }
 
 
 def _parsed(name: str, command: Callable[..., None], words: list[str]) -> dict[str, Any]:
     """Parse the arguments of a command, with the command's own errors."""
-    params: dict[str, Any] = _click(command).make_context(f"vlagents-ray slurm {name}", list(words)).params
+    params: dict[str, Any] = (
+        _click(command).make_context(f"vlagents-ray slurm {name}", list(words)).params
+    )
     return params
 
 
@@ -148,13 +199,19 @@ def _refuse(given: dict[str, Any], why: str, *names: str) -> None:
 
 
 def _evaluation(words: list[str]) -> EvalConfig:
-    """Build the configuration as `eval` does, and raise errors that would end the job at its start."""
+    """Build the configuration as `eval` does, and raise errors that would end the job at its
+    start.
+    """
     from vlagents_ray.cli.policies import resolve_policies
     from vlagents_ray.evaluate.plan.cases import cells
 
     given = _parsed("eval", evaluate_command, words)
     _refuse(given, _FOUND_OUT, "address", "end_at")
-    _refuse(given, "it would wait for a training; have that submit each checkpoint (`submit_evaluation`)", "watch")
+    _refuse(
+        given,
+        "it would wait for a training; have that submit each checkpoint (`submit_evaluation`)",
+        "watch",
+    )
     config = config_from_options(EvalOptions(**given))
     cells(resolve_policies(config, ask=False)[0])
     return config

@@ -1,13 +1,14 @@
 """The programs of a job, which `job.sh` starts.
 
-    python -m vlagents_ray_cluster.slurm.job address      print the address of this node, where Ray's head runs
-    python -m vlagents_ray_cluster.slurm.job node         run Ray on this node until the step ends
-    python -m vlagents_ray_cluster.slurm.job eval [--fill CPUS] -- WORDS
+    python -m vlagents_ray_cluster.slurm.job address      print the address of this node, where
+    Ray's head runs python -m vlagents_ray_cluster.slurm.job node         run Ray on this node until
+    the step ends python -m vlagents_ray_cluster.slurm.job eval [--fill CPUS] -- WORDS
     python -m vlagents_ray_cluster.slurm.job serve [--key] --app NAME=ROUTE... -- WORDS
     python -m vlagents_ray_cluster.slurm.job announce FOLDER PORT NAME=ROUTE...
 
-`eval` and `serve` run on the first node: they wait for Ray on all nodes, and are replaced by `vlagents-ray eval` or
-`vlagents-ray serve` with the arguments WORDS. `announce` prints how to reach the server when it is ready.
+`eval` and `serve` run on the first node: they wait for Ray on all nodes, and are replaced by
+`vlagents-ray eval` or `vlagents-ray serve` with the arguments WORDS. `announce` prints how to reach
+the server when it is ready.
 """
 
 from __future__ import annotations
@@ -35,12 +36,16 @@ from typing import Any
 from vlagents_ray.client.credentials import KEY_VARIABLE
 from vlagents_ray.ray_tools.session import FILES
 
-HEAD = "VLAGENTS_RAY_HEAD"  # variable with the address of the first node, exported by the job's script
-_FIRST_PORT, _PORTS, _JOBS = 10_000, 5, 2_000  # below the ports that the package and the system assign
+# Variable with the address of the first node, exported by the job's script.
+HEAD = "VLAGENTS_RAY_HEAD"
+# Below the ports that the package and the system assign.
+_FIRST_PORT, _PORTS, _JOBS = 10_000, 5, 2_000
 _REST = ("--block", "--disable-usage-stats", "--log-color=false")
-_OBJECTS = 0.25  # share of the memory for Ray's object store, in /dev/shm; Ray's default is 0.3 of the machine's
+# Share of the memory for Ray's object store, in /dev/shm; Ray's default is 0.3 of the machine's.
+_OBJECTS = 0.25
 _SHORT = "/tmp"  # noqa: S108 - the names of Ray's sockets are limited to 107 bytes
-_AT_ONCE = {"RAY_GRACEFUL_SHUTDOWN_DRAIN_TIMEOUT_S": "0"}  # Ray would drain for 30 s, which is useless here
+# Ray would drain for 30 s, which is useless here.
+_AT_ONCE = {"RAY_GRACEFUL_SHUTDOWN_DRAIN_TIMEOUT_S": "0"}
 _HEAD_S = 120.0  # time limit for the head to listen
 _NODES_S = 300.0  # time limit for all nodes to join
 _COMMAND = "from vlagents_ray.cli import main; main()"  # runs with this Python, independent of PATH
@@ -64,7 +69,9 @@ from elsewhere, first:      {ssh}
 
 @dataclass(frozen=True, slots=True)
 class Ports:
-    """The ports of a job, derived from its number so that jobs on the same node have different ones."""
+    """The ports of a job, derived from its number so that jobs on the same node have different
+    ones.
+    """
 
     gcs: int  # Ray's head
     client: int  # Ray Client, which cannot be disabled
@@ -95,7 +102,10 @@ class Allocation:
         cpus = int(environ["SLURM_CPUS_ON_NODE"])
         gpus = len([one for one in environ.get("SLURM_STEP_GPUS", "").split(",") if one])
         # Slurm counts MiB, and 0 means all of the node's.
-        mebibytes = int(environ.get("SLURM_MEM_PER_NODE", "0")) or int(environ.get("SLURM_MEM_PER_CPU", "0")) * cpus
+        mebibytes = (
+            int(environ.get("SLURM_MEM_PER_NODE", "0"))
+            or int(environ.get("SLURM_MEM_PER_CPU", "0")) * cpus
+        )
         return cls(
             job=int(environ["SLURM_JOB_ID"]),
             nodes=int(environ["SLURM_JOB_NUM_NODES"]),
@@ -114,7 +124,12 @@ class Allocation:
         """Return the command that starts Ray on this node with the allocated resources."""
         ports = self.ports
         if self.node == 0:
-            where = ["--head", f"--node-ip-address={head}", f"--port={ports.gcs}", "--include-dashboard=false"]
+            where = [
+                "--head",
+                f"--node-ip-address={head}",
+                f"--port={ports.gcs}",
+                "--include-dashboard=false",
+            ]
             where += [f"--ray-client-server-port={ports.client}"]
         else:
             where = [f"--address={head}:{ports.gcs}"]
@@ -122,21 +137,26 @@ class Allocation:
         if self.memory is not None:
             objects = int(self.memory * _OBJECTS)
             given += [f"--object-store-memory={objects}", f"--memory={self.memory - objects}"]
-        # The other listeners use free ports, since Ray's defaults are the same numbers for every cluster.
+        # The other listeners use free ports, since Ray's defaults are the same numbers for every
+        # cluster.
         given.append(f"--metrics-export-port={ports.export}")
         free = ["--min-worker-port=0", "--max-worker-port=0", "--dashboard-agent-listen-port=0"]
         return ["ray", "start", *where, *given, *free, f"--temp-dir={folder}/{FILES}", *_REST]
 
 
 def run_node() -> int:
-    """Run Ray, then remove its files; return the exit status of the step, which is that of Ray on the head."""
+    """Run Ray, then remove its files; return the exit status of the step, which is that of Ray
+    on the head.
+    """
     allocation = Allocation.here()
     head = os.environ[HEAD]
     if allocation.node:
         wait_for_head(head, allocation.ports.gcs)
     environment = os.environ | {"AUTOSCALER_METRIC_PORT": str(allocation.ports.metrics), **_AT_ONCE}
     asked = threading.Event()
-    with tempfile.TemporaryDirectory(prefix=f"vlr-{allocation.job}-", dir=_SHORT, ignore_cleanup_errors=True) as folder:
+    with tempfile.TemporaryDirectory(
+        prefix=f"vlr-{allocation.job}-", dir=_SHORT, ignore_cleanup_errors=True
+    ) as folder:
         ray = subprocess.Popen(allocation.ray_start(head, folder), env=environment)  # noqa: S603 - our own command
 
         def end(_number: int, _frame: FrameType | None) -> None:
@@ -159,7 +179,10 @@ def wait_for_head(host: str, port: int) -> None:
             socket.create_connection((host, port), timeout=5).close()
         except OSError as error:
             if time.monotonic() > deadline:
-                sys.exit(f"Ray's head at {host}:{port} does not listen after {_HEAD_S:g} s ({error}); see its log")
+                sys.exit(
+                    f"Ray's head at {host}:{port} does not listen after {_HEAD_S:g} s ({error}); "
+                    "see its log"
+                )
             time.sleep(_POLL_S)
         else:
             return
@@ -169,10 +192,16 @@ def run_command(arguments: Sequence[str]) -> None:
     """Wait for Ray, and replace this process by the command."""
     parser = argparse.ArgumentParser()
     parser.add_argument("what", choices=["eval", "serve"])
-    parser.add_argument("--fill", type=float, metavar="CPUS", help="workers of so many CPUs each, on all but one")
-    parser.add_argument("--closing-s", type=float, default=0.0, help="s before the job's end, to end in order")
+    parser.add_argument(
+        "--fill", type=float, metavar="CPUS", help="workers of so many CPUs each, on all but one"
+    )
+    parser.add_argument(
+        "--closing-s", type=float, default=0.0, help="s before the job's end, to end in order"
+    )
     parser.add_argument("--key", action="store_true", help="create an API key")
-    parser.add_argument("--port", type=int, help="port of the server; by default derived from the job's number")
+    parser.add_argument(
+        "--port", type=int, help="port of the server; by default derived from the job's number"
+    )
     parser.add_argument("--app", action="append", default=[], help="an application and its route")
     end_of_own = arguments.index("--")
     given = parser.parse_args(arguments[:end_of_own])
@@ -185,12 +214,16 @@ def run_command(arguments: Sequence[str]) -> None:
         end = end_of_job(allocation.job)
         words += ["--resume", "--replica-per-gpu"]
         if given.fill is not None:
-            words += [f"--workers={max(1, int((cpus - 1) / given.fill))}", f"--worker-cpus={given.fill:g}"]
+            words += [
+                f"--workers={max(1, int((cpus - 1) / given.fill))}",
+                f"--worker-cpus={given.fill:g}",
+            ]
         words += [] if end is None else [f"--end-at={end - given.closing_s:.0f}"]
     else:
         from vlagents_ray.serve.access.key_store import new_key
 
-        folder = Path(os.environ["RAY_AUTH_TOKEN_PATH"]).parent  # the job's folder, which only its user can read
+        # The job's folder, which only its user can read.
+        folder = Path(os.environ["RAY_AUTH_TOKEN_PATH"]).parent
         port, key = given.port or allocation.ports.serve, ""
         words += ["--host=0.0.0.0", f"--port={port}"]
         if given.key:
@@ -225,7 +258,10 @@ def wait_for_nodes(address: str, number: int) -> int:
     try:
         while len(alive := [node for node in ray.nodes() if node["Alive"]]) < number:
             if time.monotonic() > deadline:
-                sys.exit(f"{len(alive)} of {number} nodes joined Ray in {_NODES_S:g} s: {_names(alive)}; see the logs")
+                sys.exit(
+                    f"{len(alive)} of {number} nodes joined Ray in {_NODES_S:g} s: "
+                    f"{_names(alive)}; see the logs"
+                )
             time.sleep(_POLL_S)
         sys.stdout.write(f"Ray runs on {_names(alive)}\n")
         sys.stdout.flush()
@@ -235,17 +271,27 @@ def wait_for_nodes(address: str, number: int) -> int:
 
 
 def _names(nodes: list[dict[str, Any]]) -> str:
-    found = sorted(((one["NodeManagerHostname"], one["Resources"]) for one in nodes), key=lambda one: one[0])
-    return ", ".join(f"{name} ({has.get('CPU', 0):g} CPUs, {has.get('GPU', 0):g} GPUs)" for name, has in found)
+    found = sorted(
+        ((one["NodeManagerHostname"], one["Resources"]) for one in nodes), key=lambda one: one[0]
+    )
+    return ", ".join(
+        f"{name} ({has.get('CPU', 0):g} CPUs, {has.get('GPU', 0):g} GPUs)" for name, has in found
+    )
 
 
 def end_of_job(job: int) -> float | None:
-    """Return the time at which Slurm ends the job, s since 1970; None if never. Newer versions set a variable."""
+    """Return the time at which Slurm ends the job, s since 1970; None if never. Newer versions
+    set a variable.
+    """
     if (variable := os.environ.get("SLURM_JOB_END_TIME")) is not None:
         return float(variable)
     command = ["squeue", "--noheader", f"--jobs={job}", "--format=%e"]
     end = subprocess.run(command, check=True, capture_output=True, text=True).stdout.strip()  # noqa: S603
-    return None if end in ("NONE", "Unknown", "N/A") else datetime.datetime.fromisoformat(end).timestamp()
+    return (
+        None
+        if end in ("NONE", "Unknown", "N/A")
+        else datetime.datetime.fromisoformat(end).timestamp()
+    )
 
 
 def announce(words: Sequence[str]) -> None:
@@ -253,8 +299,11 @@ def announce(words: Sequence[str]) -> None:
     folder, port, apps = Path(words[0]), int(words[1]), dict(one.split("=", 1) for one in words[2:])
     deadline = time.monotonic() + _MOST_S
     server = os.getppid()
-    while not all(_answers(f"http://127.0.0.1:{port}{route.rstrip('/')}/healthz") for route in apps.values()):
-        if time.monotonic() > deadline or os.getppid() != server:  # the server has ended, and its log has the reason
+    while not all(
+        _answers(f"http://127.0.0.1:{port}{route.rstrip('/')}/healthz") for route in apps.values()
+    ):
+        # The server has ended, and its log has the reason.
+        if time.monotonic() > deadline or os.getppid() != server:
             return
         time.sleep(_POLL_S)
     found = connection_info(apps, port, os.environ)
@@ -263,8 +312,12 @@ def announce(words: Sequence[str]) -> None:
     sys.stdout.flush()
 
 
-def connection_info(apps: Mapping[str, str], port: int, environ: Mapping[str, str]) -> dict[str, Any]:
-    """Return the content of the file: the URL of each application, the key, and a command for a tunnel."""
+def connection_info(
+    apps: Mapping[str, str], port: int, environ: Mapping[str, str]
+) -> dict[str, Any]:
+    """Return the content of the file: the URL of each application, the key, and a command for a
+    tunnel.
+    """
     host = socket.gethostname()
     url = f"http://{host}:{port}"
     login = environ.get("SLURM_SUBMIT_HOST", host)

@@ -1,4 +1,6 @@
-"""The submission of jobs: sbatch's options on the command line, the script, and the call of sbatch."""
+"""The submission of jobs: sbatch's options on the command line, the script, and the call of
+sbatch.
+"""
 
 from __future__ import annotations
 
@@ -16,33 +18,83 @@ from vlagents_ray.errors import ConfigError, VLAgentsError
 
 # Options of sbatch (22.05 to 24.11) without a value, or with a value after "=" only.
 _ALONE = {
-    "contiguous", "exclusive", "get-user-env", "hold", "ignore-pbs", "nice", "no-kill", "no-requeue", "overcommit",
-    "oversubscribe", "propagate", "quiet", "reboot", "requeue", "spread-job", "stepmgr", "test-only", "use-min-nodes",
+    "contiguous",
+    "exclusive",
+    "get-user-env",
+    "hold",
+    "ignore-pbs",
+    "nice",
+    "no-kill",
+    "no-requeue",
+    "overcommit",
+    "oversubscribe",
+    "propagate",
+    "quiet",
+    "reboot",
+    "requeue",
+    "spread-job",
+    "stepmgr",
+    "test-only",
+    "use-min-nodes",
     "verbose",
-}  # fmt: skip
+}
 _SHORT = {
-    "A": "account", "B": "extra-node-info", "C": "constraint", "D": "chdir", "F": "nodefile", "G": "gpus",
-    "H": "hold", "J": "job-name", "L": "licenses", "M": "clusters", "N": "nodes", "O": "overcommit", "S": "core-spec",
-    "a": "array", "b": "begin", "c": "cpus-per-task", "d": "dependency", "e": "error", "k": "no-kill",
-    "m": "distribution", "o": "output", "p": "partition", "q": "qos", "s": "oversubscribe", "t": "time",
-    "w": "nodelist", "x": "exclude",
-}  # fmt: skip
+    "A": "account",
+    "B": "extra-node-info",
+    "C": "constraint",
+    "D": "chdir",
+    "F": "nodefile",
+    "G": "gpus",
+    "H": "hold",
+    "J": "job-name",
+    "L": "licenses",
+    "M": "clusters",
+    "N": "nodes",
+    "O": "overcommit",
+    "S": "core-spec",
+    "a": "array",
+    "b": "begin",
+    "c": "cpus-per-task",
+    "d": "dependency",
+    "e": "error",
+    "k": "no-kill",
+    "m": "distribution",
+    "o": "output",
+    "p": "partition",
+    "q": "qos",
+    "s": "oversubscribe",
+    "t": "time",
+    "w": "nodelist",
+    "x": "exclude",
+}
 # The script starts one process of Ray on each node, so these options are refused.
 _OURS = {
-    "ntasks": "--nodes and --cpus-per-task", "ntasks-per-node": "--nodes and --cpus-per-task", "n": "--nodes",
-    "ntasks-per-gpu": "--gpus-per-node", "ntasks-per-core": "--cpus-per-task", "ntasks-per-socket": "--cpus-per-task",
-    "gpus-per-task": "--gpus-per-node", "wrap": "no `--wrap`, as the script is written for you",
-    "wait": "`squeue`, and --dependency in the jobs that wait", "W": "`squeue`, and --dependency in the jobs that wait",
-    "input": "a deployment or a file of runs", "i": "a file of runs",
-}  # fmt: skip
+    "ntasks": "--nodes and --cpus-per-task",
+    "ntasks-per-node": "--nodes and --cpus-per-task",
+    "n": "--nodes",
+    "ntasks-per-gpu": "--gpus-per-node",
+    "ntasks-per-core": "--cpus-per-task",
+    "ntasks-per-socket": "--cpus-per-task",
+    "gpus-per-task": "--gpus-per-node",
+    "wrap": "no `--wrap`, as the script is written for you",
+    "wait": "`squeue`, and --dependency in the jobs that wait",
+    "W": ("`squeue`, and --dependency in the jobs that wait"),
+    "input": "a deployment or a file of runs",
+    "i": "a file of runs",
+}
 BODY = Path(__file__).with_name("job.sh")
 _LINE_ENDS = "\x7f\x85\u2028\u2029"
-_KEPT = {"SLURM_CONF", "SLURM_CLUSTERS"}  # the location of Slurm; other variables belong to this process's own job
+# The location of Slurm; other variables belong to this process's own job.
+_KEPT = {"SLURM_CONF", "SLURM_CLUSTERS"}
 _SBATCH_S = 120.0
 
 
-def split(words: Sequence[str], known: Mapping[str, bool]) -> tuple[list[str], dict[str, str | None]]:
-    """Return a command's own arguments, and sbatch's options by their long names, None for those without a value."""
+def split(
+    words: Sequence[str], known: Mapping[str, bool]
+) -> tuple[list[str], dict[str, str | None]]:
+    """Return a command's own arguments, and sbatch's options by their long names, None for those
+    without a value.
+    """
     own: list[str] = []
     sbatch: dict[str, str | None] = {}
     waiting = iter(words)
@@ -60,10 +112,14 @@ def split(words: Sequence[str], known: Mapping[str, bool]) -> tuple[list[str], d
                 option, attached = _SHORT.get(word[1], word[1]), word[2:] or None
             if option in _OURS:
                 raise ConfigError(
-                    f"{word}: got an option that does not fit one Ray process on each node; want {_OURS[option]}"
+                    f"{word}: got an option that does not fit one Ray process on each node; want "
+                    f"{_OURS[option]}"
                 )
             if is_short and len(option) == 1:
-                raise ConfigError(f"{word}: got an option that is neither this command's nor a short one of sbatch")
+                raise ConfigError(
+                    f"{word}: got an option that is neither this command's nor a short one of "
+                    "sbatch"
+                )
             if not re.fullmatch(r"[a-z][a-z0-9-]*", option):
                 raise ConfigError(f"{word}: got an invalid option name, want --NAME=VALUE")
             if option not in _ALONE and attached is None:
@@ -104,8 +160,9 @@ class Script:
         """Return the content of the script.
 
         Raises:
-            ConfigError: A name, path or option has a control character, such as a line feed, after which the rest of a
-                comment would be a command; or quotes in a value with spaces, which sbatch cannot read.
+            ConfigError: A name, path or option has a control character, such as a line feed, after
+                which the rest of a comment would be a command; or quotes in a value with spaces,
+                which sbatch cannot read.
         """
         defaults = {
             "job-name": f"vlagents-ray-{self.name}",
@@ -120,12 +177,17 @@ class Script:
         for option, value in (defaults | dict(self.options)).items():
             spaced = value is not None and any(sign.isspace() for sign in value)
             if value is not None and spaced and '"' in value:
-                raise ConfigError(f"slurm: got the option {value[:200]!r}, want no quotes in a value with spaces")
+                raise ConfigError(
+                    f"slurm: got the option {value[:200]!r}, want no quotes in a value with spaces"
+                )
             given = f'="{value}"' if spaced else f"={value}"
             words.append(f"--{option}{'' if value is None else given}")
         for word in (self.name, str(self.folder), *words):
             if any(ord(sign) < ord(" ") or sign in _LINE_ENDS for sign in word):
-                raise ConfigError(f"slurm: got {word[:200]!r}, want no control characters, such as line feeds, in it")
+                raise ConfigError(
+                    f"slurm: got {word[:200]!r}, want no control characters, such as line feeds, "
+                    "in it"
+                )
         settings = {
             "python": sys.executable,
             "folder": str(self.folder.absolute()),
@@ -135,7 +197,10 @@ class Script:
         }
         lines = [
             "#!/bin/bash",
-            f"# Written by `vlagents-ray slurm {self.name}`; again: sbatch {shlex.quote(str(self.file))}",
+            (
+                f"# Written by `vlagents-ray slurm {self.name}`; again: sbatch "
+                f"{shlex.quote(str(self.file))}"
+            ),
             *(f"#SBATCH {word}" for word in words),
             "",
             *(f"{name}={shlex.quote(value)}" for name, value in settings.items()),
@@ -158,14 +223,21 @@ def submit(script: Script) -> str:
     try:
         done = subprocess.run(  # noqa: S603 - the user's own arguments
             ["sbatch", "--parsable", str(file)],  # noqa: S607 - found by PATH
-            capture_output=True, text=True, check=False, timeout=_SBATCH_S, env=outside_of_jobs(os.environ),
-        )  # fmt: skip
+            capture_output=True,
+            text=True,
+            check=False,
+            timeout=_SBATCH_S,
+            env=outside_of_jobs(os.environ),
+        )
     except FileNotFoundError as error:
         raise ConfigError(
-            f"sbatch is not installed here: run it where jobs are submitted, or copy {file} there (--dry-run shows it)"
+            f"sbatch is not installed here: run it where jobs are submitted, or copy {file} there "
+            "(--dry-run shows it)"
         ) from error
     except subprocess.TimeoutExpired as error:
-        raise SubmissionFailed(f"sbatch {file}: no answer in {_SBATCH_S:g} s; look with `squeue --me`") from error
+        raise SubmissionFailed(
+            f"sbatch {file}: no answer in {_SBATCH_S:g} s; look with `squeue --me`"
+        ) from error
     if done.returncode:
         raise SubmissionFailed(f"sbatch {file}: {done.stderr.strip() or done.stdout.strip()}")
     return done.stdout.strip().partition(";")[0]
@@ -174,6 +246,11 @@ def submit(script: Script) -> str:
 def outside_of_jobs(environ: Mapping[str, str]) -> dict[str, str]:
     """Return the environment without the variables of this process's own job, such as a training.
 
-    sbatch passes its environment on, and steps of the new job would read these variables as their options.
+    sbatch passes its environment on, and steps of the new job would read these variables as their
+    options.
     """
-    return {name: value for name, value in environ.items() if not name.startswith("SLURM_") or name in _KEPT}
+    return {
+        name: value
+        for name, value in environ.items()
+        if not name.startswith("SLURM_") or name in _KEPT
+    }

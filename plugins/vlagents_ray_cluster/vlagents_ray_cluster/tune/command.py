@@ -28,27 +28,47 @@ class Wanted(str, Enum):
 def tune_command(
     file: Annotated[Path, typer.Argument(help="A deployment file.")],
     wanted: Annotated[
-        Wanted, typer.Option("--for", help="The most actions a second, or the most robots within --p99-ms.")
+        Wanted,
+        typer.Option(
+            "--for", help="The most actions a second, or the most robots within --p99-ms."
+        ),
     ] = Wanted.throughput,
     p99_ms: Annotated[
         float | None,
-        typer.Option("--p99-ms", min=0, max=1e6, callback=finite, help="Of robots: the longest p99, ms."),
+        typer.Option(
+            "--p99-ms", min=0, max=1e6, callback=finite, help="Of robots: the longest p99, ms."
+        ),
     ] = None,
     minutes: Annotated[
         float, typer.Option(min=0.1, max=10_000, callback=finite, help="That all of it may take.")
     ] = 5.0,
-    max_batch: Annotated[int, typer.Option(min=1, max=10_000, help="The largest batch to try.")] = 32,
-    seconds: Annotated[float, typer.Option(min=0.1, max=3600, callback=finite, help="Of each measurement.")] = 2.0,
-    dtypes: Annotated[str | None, typer.Option(help="To try, as bfloat16,int8; default: the accelerator's.")] = None,
+    max_batch: Annotated[
+        int, typer.Option(min=1, max=10_000, help="The largest batch to try.")
+    ] = 32,
+    seconds: Annotated[
+        float, typer.Option(min=0.1, max=3600, callback=finite, help="Of each measurement.")
+    ] = 2.0,
+    dtypes: Annotated[
+        str | None, typer.Option(help="To try, as bfloat16,int8; default: the accelerator's.")
+    ] = None,
     tolerance: Annotated[
-        float, typer.Option(min=0, max=1, callback=finite, help="Largest error of actions, share of their range.")
+        float,
+        typer.Option(
+            min=0, max=1, callback=finite, help="Largest error of actions, share of their range."
+        ),
     ] = 0.01,
-    frames: Annotated[Path | None, typer.Option(help="Recorded trajectories; default: random observations.")] = None,
+    frames: Annotated[
+        Path | None, typer.Option(help="Recorded trajectories; default: random observations.")
+    ] = None,
     app: Annotated[str | None, typer.Option(help="Of the file, if it holds several.")] = None,
-    image: Annotated[int, typer.Option(min=1, max=8192, help="Pixels a side, where the policy takes any image.")] = 224,
+    image: Annotated[
+        int, typer.Option(min=1, max=8192, help="Pixels a side, where the policy takes any image.")
+    ] = 224,
     state: StateDims = [],  # noqa: B006
 ) -> None:
-    """Find the best batch size, compilation and precision by measuring, and print the settings to change."""
+    """Find the best batch size, compilation and precision by measuring, and print the settings
+    to change.
+    """
     began = time.monotonic()
     from vlagents_ray.serve.config.deployment import ServerArgs
     from vlagents_ray.serve.launch.deployment_file import policy_application
@@ -69,9 +89,17 @@ def tune_command(
         application = policy_application(str(file), app)
         args = ServerArgs(**application.args)
         plan = TunePlan(
-            args, goal, max_batch, minutes, seconds, tolerance, None if dtypes is None else parse_list(dtypes), frames,
-            image, parse_dims(state, "--state-dim"),
-        )  # fmt: skip
+            args,
+            goal,
+            max_batch,
+            minutes,
+            seconds,
+            tolerance,
+            None if dtypes is None else parse_list(dtypes),
+            frames,
+            image,
+            parse_dims(state, "--state-dim"),
+        )
         tuner = Tuner(plan, progress, began)
         points = tuner.measure()
         title = f"{args.policy} on {tuner.device}"

@@ -23,7 +23,9 @@ _KEPT = 2000  # characters of a failed process's standard error that are shown
 
 
 class ProcessFailed(VLAgentsError):
-    """A process of a benchmark, ours or a peer's, ended or did not answer; the message has the end of its errors."""
+    """A process of a benchmark, ours or a peer's, ended or did not answer; the message has the
+    end of its errors.
+    """
 
 
 class LineProcess:
@@ -49,24 +51,39 @@ class LineProcess:
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=self._errors,
-            env={name: value for name, value in {**os.environ, **(environment or {})}.items() if value is not None},
+            env={
+                name: value
+                for name, value in {**os.environ, **(environment or {})}.items()
+                if value is not None
+            },
             start_new_session=True,  # Ctrl-C goes to the bench, which ends its children in order
         )
-        self._input, self._output = cast(IO[bytes], self._process.stdin), cast(IO[bytes], self._process.stdout)
+        self._input, self._output = (
+            cast(IO[bytes], self._process.stdin),
+            cast(IO[bytes], self._process.stdout),
+        )
         self.pid = self._process.pid
 
     def read(self, timeout_s: float) -> Any:
-        """Read the next line that the process writes, decoded; raises `ProcessFailed` on its end or a time-out."""
+        """Read the next line that the process writes, decoded; raises `ProcessFailed` on its end
+        or a time-out.
+        """
         deadline = time.monotonic() + timeout_s
         while b"\n" not in self._received:
-            ready, _, _ = select.select([self._output], [], [], max(0.0, deadline - time.monotonic()))
+            ready, _, _ = select.select(
+                [self._output], [], [], max(0.0, deadline - time.monotonic())
+            )
             if not ready:
-                raise ProcessFailed(f"{self.name}: no answer within {timeout_s:g} s\n{self._last_errors()}".rstrip())
+                raise ProcessFailed(
+                    f"{self.name}: no answer within {timeout_s:g} s\n{self._last_errors()}".rstrip()
+                )
             if not (more := os.read(self._output.fileno(), 2**16)):
                 with contextlib.suppress(subprocess.TimeoutExpired):
                     self._process.wait(_END_S)
                 status = self._process.returncode
-                raise ProcessFailed(f"{self.name}: ended with exit status {status}\n{self._last_errors()}".rstrip())
+                raise ProcessFailed(
+                    f"{self.name}: ended with exit status {status}\n{self._last_errors()}".rstrip()
+                )
             self._received += more
         line, _, self._received = self._received.partition(b"\n")
         try:
@@ -109,7 +126,9 @@ class LineProcess:
 
 
 def our_environment() -> dict[str, str]:
-    """Return the environment variables with which a child process finds this package and the core, installed or not."""
+    """Return the environment variables with which a child process finds this package and the
+    core, installed or not.
+    """
     core = str(Path(vlagents_ray.__file__).parents[1])
     plugin = str(Path(__file__).parents[2])
     inherited = [folder for folder in os.environ.get("PYTHONPATH", "").split(os.pathsep) if folder]

@@ -1,9 +1,10 @@
 """A policy in this process, behind a replica's batch queue, with timed calls; without Ray.
 
-`python -m vlagents_ray_cluster.tune.measured_policy` loads and measures one variant of a policy for `tuner`. It runs in
-the policy's own Python environment, and so needs the light install and pydantic. The first line of its input is
-`ProcessSettings`, as JSON. Each further line is a request, {"measure": SESSIONS, "seconds": S, "rank": RANK} or {"act":
-BATCH}, and is answered with a line of JSON. {"step": …} is a step of a long load, {"failed": …} an error.
+`python -m vlagents_ray_cluster.tune.measured_policy` loads and measures one variant of a policy for
+`tuner`. It runs in the policy's own Python environment, and so needs the light install and
+pydantic. The first line of its input is `ProcessSettings`, as JSON. Each further line is a request,
+{"measure": SESSIONS, "seconds": S, "rank": RANK} or {"act": BATCH}, and is answered with a line of
+JSON. {"step": …} is a step of a long load, {"failed": …} an error.
 """
 
 from __future__ import annotations
@@ -64,7 +65,9 @@ class MeasuredPolicy:
         on_step: Callable[[str], None] = lambda _: None,
     ) -> None:
         self.agent = agent
-        self.engine = Engine(agent, max_batch_size=max_size, patience=patience, batch_sizes=batch_sizes)
+        self.engine = Engine(
+            agent, max_batch_size=max_size, patience=patience, batch_sizes=batch_sizes
+        )
         self.engine.models.on_step = on_step
         self.load_s = 0.0
         self._view = view
@@ -85,14 +88,17 @@ class MeasuredPolicy:
         self.engine.close()
 
     def actions(self, size: int, count: int) -> list[np.ndarray]:
-        """Return the first actions of episodes 0, 1, … with their own observations and seeds, in batches of `size`.
+        """Return the first actions of episodes 0, 1, … with their own observations and seeds, in
+        batches of `size`.
 
         Args:
             size: The batch size.
-            count: The number of episodes; if `size` does not divide it, the last batch continues with episode 0.
+            count: The number of episodes; if `size` does not divide it, the last batch continues
+                with episode 0.
 
         Returns:
-            At least `count` actions, (D,) or (H, D) float32; the one at i belongs to episode i modulo `count`.
+            At least `count` actions, (D,) or (H, D) float32; the one at i belongs to episode i
+            modulo `count`.
         """
         found: list[np.ndarray] = []
         while len(found) < count:
@@ -118,7 +124,9 @@ class MeasuredPolicy:
         return act
 
     def queued(self, size: int, seconds: float, rank: RankName) -> QueuedTurn:
-        """Measure `size` sessions, each of which sends its next request as soon as the last one is answered."""
+        """Measure `size` sessions, each of which sends its next request as soon as the last one
+        is answered.
+        """
         views = [self._view(self.engine.contract, i) for i in range(size)]
         answers: queue.SimpleQueue[tuple[int, Reply]] = queue.SimpleQueue()
         asked = [0.0] * size
@@ -154,7 +162,8 @@ class MeasuredPolicy:
             ask(i, "close")
             answer()
         calls = calls[first:]
-        # Each call counts its batch once for each of the batch's members: the harmonic mean is the batches' own.
+        # Each call counts its batch once for each of the batch's members: the harmonic mean is the
+        # batches' own.
         mean_batch = len(calls) / sum(1 / call[2] for call in calls)
         return QueuedTurn(rate_of([calls]), mean_batch, [call[1] * 1e3 for call in calls])
 
@@ -162,8 +171,8 @@ class MeasuredPolicy:
 def rate_of(calls: Sequence[Sequence[tuple[float, ...]]]) -> float:
     """Return actions per second: the slope of the line through all ends of calls.
 
-    Actions come in batches, so counting them within a time would be wrong by up to a batch. 0 for fewer than two
-    calls.
+    Actions come in batches, so counting them within a time would be wrong by up to a batch. 0 for
+    fewer than two calls.
 
     Args:
         calls: The calls of each client; the first number of a call is its end, s.
@@ -177,7 +186,11 @@ def rate_of(calls: Sequence[Sequence[tuple[float, ...]]]) -> float:
 def cuda() -> Any:
     """Return `torch.cuda` if this process uses it, else None."""
     torch = sys.modules.get("torch")
-    return torch.cuda if torch is not None and torch.cuda.is_available() and torch.cuda.is_initialized() else None
+    return (
+        torch.cuda
+        if torch is not None and torch.cuda.is_available() and torch.cuda.is_initialized()
+        else None
+    )
 
 
 def jax_device() -> Any:
@@ -194,7 +207,9 @@ def forget_peak() -> None:
 
 
 def peak_mib() -> float:
-    """Return the peak memory, MiB, of the accelerator, with torch since `forget_peak`; else of this process."""
+    """Return the peak memory, MiB, of the accelerator, with torch since `forget_peak`; else of
+    this process.
+    """
     if (used := cuda()) is not None:
         return float(used.max_memory_allocated()) / 2**20
     if (device := jax_device()) is not None:
@@ -275,8 +290,13 @@ def _serve(settings: ProcessSettings, answer: Callable[[Mapping[str, Any]], None
         agent = agent.agent
     with measured:
         uncompiled, config = measured.engine.models.uncompiled, getattr(agent, "config", None)
-        has = {name: getattr(config, name) for name in _TUNED if name in getattr(type(config), "model_fields", {})}
-        dtypes = [] if jax_device() is None else ["bfloat16"]  # that the accelerator computes without emulation
+        has = {
+            name: getattr(config, name)
+            for name in _TUNED
+            if name in getattr(type(config), "model_fields", {})
+        }
+        # That the accelerator computes without emulation.
+        dtypes = [] if jax_device() is None else ["bfloat16"]
         if (used := cuda()) is not None:
             dtypes = ["bfloat16" if used.get_device_capability() >= (8, 0) else "float16"]
         answer({
@@ -289,20 +309,30 @@ def _serve(settings: ProcessSettings, answer: Callable[[Mapping[str, Any]], None
                 asked = json.loads(line)
                 if "act" in asked:
                     said: dict[str, Any] = {
-                        "actions": [action.tolist() for action in measured.actions(asked["act"], FRAMES)]
+                        "actions": [
+                            action.tolist() for action in measured.actions(asked["act"], FRAMES)
+                        ]
                     }
                 else:
                     forget_peak()
                     turn = measured.queued(asked["measure"], asked["seconds"], asked["rank"])
                     trips_ms = [round(trip, 4) for trip in turn.trips_ms]
-                    said = {"actions_per_s": turn.actions_per_s, "trips_ms": trips_ms, "peak_mib": peak_mib()}
+                    said = {
+                        "actions_per_s": turn.actions_per_s,
+                        "trips_ms": trips_ms,
+                        "peak_mib": peak_mib(),
+                    }
             except Exception as error:  # noqa: BLE001 - as above; smaller batches may still work
                 said = {"failed": _sentence(error)}
             answer(said)
 
 
 def _sentence(error: BaseException) -> str:
-    cause = error.__cause__ if isinstance(error, PolicyFailed) and error.__cause__ is not None else error
+    cause = (
+        error.__cause__
+        if isinstance(error, PolicyFailed) and error.__cause__ is not None
+        else error
+    )
     return f"{type(cause).__name__}: {' '.join(str(cause).split())}"
 
 

@@ -1,4 +1,6 @@
-"""Measures variants of a deployment file's settings, each in its own process, within a given time, and chooses one."""
+"""Measures variants of a deployment file's settings, each in its own process, within a given
+time, and chooses one.
+"""
 
 from __future__ import annotations
 
@@ -24,7 +26,8 @@ from vlagents_ray.serve.config.deployment import BatchArgs, ServerArgs
 from vlagents_ray_cluster.tune.line_process import LineProcess, ProcessFailed, our_environment
 from vlagents_ray_cluster.tune.measured_policy import FRAMES, ProcessSettings, save_observations
 
-_BETTER = 1.05  # factor by which a variant must be better than the file's own settings to replace them
+# Factor by which a variant must be better than the file's own settings to replace them.
+_BETTER = 1.05
 
 
 class GoalMissed(VLAgentsError):
@@ -33,14 +36,19 @@ class GoalMissed(VLAgentsError):
 
 @dataclass(frozen=True, slots=True)
 class TuningGoal:
-    """The goal of `tune`: the most actions per second, or the most robots whose round trips are short enough."""
+    """The goal of `tune`: the most actions per second, or the most robots whose round trips are
+    short enough.
+    """
 
     kind: Literal["throughput", "robots"]
     p99_ms: float | None = None  # for robots: upper bound of the 99th percentile of round trips
 
     def __post_init__(self) -> None:
         if self.kind == "robots" and self.p99_ms is None:
-            raise ConfigError("--for robots: got no --p99-ms, want the longest round trip that your robots bear, ms")
+            raise ConfigError(
+                "--for robots: got no --p99-ms, want the longest round trip that your robots bear, "
+                "ms"
+            )
         if self.kind == "throughput" and self.p99_ms is not None:
             raise ConfigError("--p99-ms: is for --for robots; leave it out")
 
@@ -53,19 +61,27 @@ class Variant:
 
     @property
     def name(self) -> str:
-        """The changes in words, without the batch sizes, which have their own column in the table."""
+        """The changes in words, without the batch sizes, which have their own column in the
+        table.
+        """
         shown = {key: value for key, value in self.changes.items() if key != "batch_sizes"}
-        words = [f"{key}: {str(value).lower() if isinstance(value, bool) else value}" for key, value in shown.items()]
+        words = [
+            f"{key}: {str(value).lower() if isinstance(value, bool) else value}"
+            for key, value in shown.items()
+        ]
         return ", ".join(words) or "own settings"
 
 
 @dataclass(slots=True)
 class MeasuredPoint:
-    """A variant with one number of sessions, which equals its batch size, measured in alternation with others."""
+    """A variant with one number of sessions, which equals its batch size, measured in
+    alternation with others.
+    """
 
     variant: Variant
     sessions: int
-    difference: float  # largest difference from the actions of the file's own settings, as a share of their range
+    # Largest difference from the actions of the file's own settings, as a share of their range.
+    difference: float
     rates: list[float] = field(default_factory=list)  # actions per second, for each turn
     trips_ms: list[float] = field(default_factory=list)  # of all turns
     peak_mib: float = 0.0
@@ -112,34 +128,56 @@ def choose(points: Sequence[MeasuredPoint], goal: TuningGoal) -> MeasuredPoint:
     if not reaching:
         found = min(points, key=lambda point: point.p99_ms)
         raise GoalMissed(
-            f"--p99-ms: got {goal.p99_ms}; the shortest p99 of a round trip was {found.p99_ms:.1f} ms, with "
-            f"{sessions(found.sessions)} and {found.variant.name}; raise --p99-ms, or use a faster machine or model"
+            f"--p99-ms: got {goal.p99_ms}; the shortest p99 of a round trip was {found.p99_ms:.1f} "
+            "ms, with "
+            f"{sessions(found.sessions)} and {found.variant.name}; raise --p99-ms, or use a faster "
+            "machine or model"
         )
-    variants = sorted({point.variant.name: point.variant for point in reaching}.values(), key=lambda v: len(v.changes))
+    variants = sorted(
+        {point.variant.name: point.variant for point in reaching}.values(),
+        key=lambda v: len(v.changes),
+    )
     reached = lambda point: point.actions_per_s if goal.kind == "throughput" else point.sessions  # noqa: E731
-    best, *others = (max((one for one in reaching if one.variant is variant), key=reached) for variant in variants)
+    best, *others = (
+        max((one for one in reaching if one.variant is variant), key=reached)
+        for variant in variants
+    )
     for other in others:
         is_better = other.actions_per_s > _BETTER * best.actions_per_s
         if goal.kind == "robots":
-            is_better = (other.sessions, 0.0) > (best.sessions, other.p99_ms * _BETTER - best.p99_ms)
+            is_better = (other.sessions, 0.0) > (
+                best.sessions,
+                other.p99_ms * _BETTER - best.p99_ms,
+            )
         best = other if is_better else best
     return best
 
 
-def default_point(points: Sequence[MeasuredPoint], goal: TuningGoal, max_size: int) -> MeasuredPoint | None:
-    """Return the figures of the unchanged file; None if they were not measured, or miss the goal."""
+def default_point(
+    points: Sequence[MeasuredPoint], goal: TuningGoal, max_size: int
+) -> MeasuredPoint | None:
+    """Return the figures of the unchanged file; None if they were not measured, or miss the
+    goal.
+    """
     own = [point for point in points if not point.variant.changes and point.sessions <= max_size]
     if goal.kind == "throughput":
         own = [point for point in own if point.sessions == max_size]
-    return max((one for one in own if one.reaches(goal)), key=lambda point: point.sessions, default=None)
+    return max(
+        (one for one in own if one.reaches(goal)), key=lambda point: point.sessions, default=None
+    )
 
 
-def chosen_settings(chosen: MeasuredPoint, batch: BatchArgs, fixed: Sequence[int] | None) -> dict[str, dict[str, Any]]:
+def chosen_settings(
+    chosen: MeasuredPoint, batch: BatchArgs, fixed: Sequence[int] | None
+) -> dict[str, dict[str, Any]]:
     """Return the settings of a deployment file to change, by section and key below `args`."""
     config, queue = dict(chosen.variant.changes), dict[str, Any]()
     sizes = chosen.variant.changes.get("batch_sizes", fixed)
     if sizes and sizes[-1] > chosen.sessions:
-        config["batch_sizes"] = [*(size for size in sizes if size < chosen.sessions), chosen.sessions]
+        config["batch_sizes"] = [
+            *(size for size in sizes if size < chosen.sessions),
+            chosen.sessions,
+        ]
     if chosen.sessions != batch.max_size and batch.sizes is not None:
         queue["sizes"] = [size for size in batch.sizes if size <= chosen.sessions]
     elif chosen.sessions != batch.max_size:
@@ -149,17 +187,34 @@ def chosen_settings(chosen: MeasuredPoint, batch: BatchArgs, fixed: Sequence[int
 
 def figures(points: Sequence[MeasuredPoint]) -> list[list[str]]:
     """Return a table of the measurements, with its header as the first row."""
-    rows = [["settings", "sessions", "actions/s", "round trip ms", "p99 ms", "peak MiB", "actions off by"]]
+    rows = [
+        [
+            "settings",
+            "sessions",
+            "actions/s",
+            "round trip ms",
+            "p99 ms",
+            "peak MiB",
+            "actions off by",
+        ]
+    ]
     for one in points:
-        numbers = [f"{one.actions_per_s:.1f}", f"{one.round_trip_ms:.1f}", f"{one.p99_ms:.1f}", f"{one.peak_mib:.0f}"]
+        numbers = [
+            f"{one.actions_per_s:.1f}",
+            f"{one.round_trip_ms:.1f}",
+            f"{one.p99_ms:.1f}",
+            f"{one.peak_mib:.0f}",
+        ]
         rows.append([one.variant.name, str(one.sessions), *numbers, f"{one.difference:.3%}"])
     return rows
 
 
-_RISING = 1.05  # factor by which two larger batches must raise the rate before a still larger one is measured
+# Factor by which two larger batches must raise the rate before a still larger one is measured.
+_RISING = 1.05
 _TURNS = 3
 _END_S = 2.0  # time for a process to end before it is killed
-_SMALLEST_RANGE = 0.1  # of a number of the action, as a share of its largest magnitude: it may hardly move
+# Of a number of the action, as a share of its largest magnitude: it may hardly move.
+_SMALLEST_RANGE = 0.1
 
 
 class VariantFailed(VLAgentsError):
@@ -179,18 +234,23 @@ class TunePlan:
     dtypes: Sequence[str] | None = None  # to try; None: those that the device computes natively
     frames: Path | None = None  # folder of recorded trajectories; None: random observations
     side: int = 224  # px, of random images if the policy accepts any size
-    dims: Mapping[str, int] = field(default_factory=dict)  # sizes of parts of the state that the contract leaves open
+    # Sizes of parts of the state that the contract leaves open.
+    dims: Mapping[str, int] = field(default_factory=dict)
 
 
 class Tuner:
     """Measures the plan; `left_out` has a sentence for each skipped variant."""
 
     def __init__(
-        self, plan: TunePlan, progress: Callable[[str], None] = lambda _: None, began: float | None = None
+        self,
+        plan: TunePlan,
+        progress: Callable[[str], None] = lambda _: None,
+        began: float | None = None,
     ) -> None:
         self.left_out: list[str] = []
         self.device = ""
-        self.fixed: Sequence[int] | None = None  # `batch_sizes` of the file's own settings, explicit or by default
+        # `batch_sizes` of the file's own settings, explicit or by default.
+        self.fixed: Sequence[int] | None = None
         self._plan, self._progress = plan, progress
         self._end = (time.monotonic() if began is None else began) + plan.minutes * 60
         self._wanted: list[np.ndarray] = []  # actions of the file's own settings
@@ -206,20 +266,32 @@ class Tuner:
                 save_observations(recorded_observations(self._plan.frames, FRAMES), frames)
             ready = self._measure_own(frames)
             rates = {point.sessions: point.actions_per_s for point in self._points}
-            most = max(rates, key=rates.__getitem__) if self._plan.goal.kind == "throughput" else max(rates)
+            most = (
+                max(rates, key=rates.__getitem__)
+                if self._plan.goal.kind == "throughput"
+                else max(rates)
+            )
             variants = self._variants(ready, sorted(size for size in rates if size <= most))
             for number, variant in enumerate(variants):
-                if any(failed.changes.items() <= variant.changes.items() for failed in self._failed):
+                if any(
+                    failed.changes.items() <= variant.changes.items() for failed in self._failed
+                ):
                     continue
                 if time.monotonic() >= self._end:
                     self.left_out.append(f"{variant.name}: no time was left")
                     continue
-                sizes = self._plan.args.batch.sizes or variant.changes.get("batch_sizes") or self._candidates()
+                sizes = (
+                    self._plan.args.batch.sizes
+                    or variant.changes.get("batch_sizes")
+                    or self._candidates()
+                )
                 try:
                     with self._loaded(variant, frames) as (process, ready):
                         for what in ready["uncompiled"]:
                             self.left_out.append(f"{variant.name}: not compiled: {what}")
-                        if variant.changes.get("compile") and len(ready["uncompiled"]) == len(sizes):
+                        if variant.changes.get("compile") and len(ready["uncompiled"]) == len(
+                            sizes
+                        ):
                             raise VariantFailed("no size could be compiled")
                         self._sweep(process, variant, sizes, parts=len(variants) - number)
                 except VariantFailed as error:
@@ -234,7 +306,9 @@ class Tuner:
             with self._loaded(own, frames) as (process, ready):
                 self.device, self.fixed = ready["device"], ready["settings"].get("batch_sizes")
                 if self._plan.dtypes and "dtype" not in ready["settings"]:
-                    raise ConfigError(f"--dtypes: {self._plan.args.policy!r} has no setting `dtype`; leave it out")
+                    raise ConfigError(
+                        f"--dtypes: {self._plan.args.policy!r} has no setting `dtype`; leave it out"
+                    )
                 sizes = self._candidates()
                 self._wanted = self._actions(process, sizes[0])[:FRAMES]
                 self._sweep(process, own, sizes, parts=len(self._variants(ready, ())) + 1)
@@ -249,31 +323,53 @@ class Tuner:
         fixed = self._plan.args.batch.sizes or self.fixed
         sizes = fixed or [2**power for power in range(self._plan.max_batch.bit_length())]
         if not (found := [size for size in sizes if size <= self._plan.max_batch]):
-            raise ConfigError(f"--max-batch: got {self._plan.max_batch}, the file's smallest fixed size is {sizes[0]}")
+            raise ConfigError(
+                f"--max-batch: got {self._plan.max_batch}, the file's smallest fixed size is "
+                f"{sizes[0]}"
+            )
         return found
 
     def _variants(self, ready: Mapping[str, Any], sizes: Sequence[int]) -> list[Variant]:
-        """Return the variants other than the file's own settings; compiled ones use `sizes` unless the file sets it."""
+        """Return the variants other than the file's own settings; compiled ones use `sizes`
+        unless the file sets it.
+        """
         has = ready["settings"]
         wanted = ready["dtypes"] if self._plan.dtypes is None else self._plan.dtypes
-        named = [{"quantization" if one in get_args(Quantization) else "dtype": one} for one in wanted]
-        dtypes = [change for change in named if change.keys() <= has.keys() and not change.items() <= has.items()]
+        named = [
+            {"quantization" if one in get_args(Quantization) else "dtype": one} for one in wanted
+        ]
+        dtypes = [
+            change
+            for change in named
+            if change.keys() <= has.keys() and not change.items() <= has.items()
+        ]
         own = has.get("compile", True)  # what "auto" means here
-        modes = [] if own is True or own == "require" else [mode for mode in ready["modes"] if mode != own]
+        modes = (
+            []
+            if own is True or own == "require"
+            else [mode for mode in ready["modes"] if mode != own]
+        )
         free = "batch_sizes" in has and self._plan.args.config.get("batch_sizes") is None
-        compiled = [{"compile": mode} | ({"batch_sizes": list(sizes)} if mode and free else {}) for mode in modes]
+        compiled = [
+            {"compile": mode} | ({"batch_sizes": list(sizes)} if mode and free else {})
+            for mode in modes
+        ]
         both = [one | other for other in compiled for one in dtypes]
         return [Variant(changes) for changes in [*dtypes, *compiled, *both]]
 
     @contextmanager
-    def _loaded(self, variant: Variant, frames: Path | None) -> Iterator[tuple[LineProcess, Mapping[str, Any]]]:
+    def _loaded(
+        self, variant: Variant, frames: Path | None
+    ) -> Iterator[tuple[LineProcess, Mapping[str, Any]]]:
         """Yield the process of a loaded variant, and its report."""
         args, environment = self._plan.args, self._plan.args.environment
         settings = ProcessSettings(
             policy=args.policy,
             config=args.config | dict(variant.changes),
             wrappers=args.wrappers,
-            max_size=args.batch.sizes[-1] if args.batch.sizes else max(self._plan.max_batch, args.batch.max_size),
+            max_size=args.batch.sizes[-1]
+            if args.batch.sizes
+            else max(self._plan.max_batch, args.batch.max_size),
             patience=args.batch.patience,
             batch_sizes=args.batch.sizes or (),
             frames=None if frames is None else str(frames),
@@ -281,7 +377,11 @@ class Tuner:
             dims=self._plan.dims,
         )
         found = our_environment() if environment.python is None else {}
-        command = [environment.python or sys.executable, "-m", "vlagents_ray_cluster.tune.measured_policy"]
+        command = [
+            environment.python or sys.executable,
+            "-m",
+            "vlagents_ray_cluster.tune.measured_policy",
+        ]
         with LineProcess("tune", command, found | environment.env_vars, end_s=_END_S) as process:
             process.send(json.dumps(asdict(settings)))
             said = self._answer(process)
@@ -291,8 +391,12 @@ class Tuner:
             self._progress(f"{variant.name}: loaded in {said['load_s']:.1f} s on {said['device']}")
             yield process, said
 
-    def _sweep(self, process: LineProcess, variant: Variant, sizes: Sequence[int], parts: int) -> None:
-        """Measure a loaded variant with growing batches while the rate rises, then again in turns as time permits."""
+    def _sweep(
+        self, process: LineProcess, variant: Variant, sizes: Sequence[int], parts: int
+    ) -> None:
+        """Measure a loaded variant with growing batches while the rate rises, then again in
+        turns as time permits.
+        """
         now = time.monotonic()
         until = now + (self._end - now) / parts
         found: list[MeasuredPoint] = []
@@ -300,7 +404,11 @@ class Tuner:
             if not self._worth_more(found) or not self._add(process, variant, size, found, until):
                 break
         default = self._plan.args.batch.max_size
-        if self._plan.goal.kind == "throughput" and not variant.changes and default not in [s.sessions for s in found]:
+        if (
+            self._plan.goal.kind == "throughput"
+            and not variant.changes
+            and default not in [s.sessions for s in found]
+        ):
             self._add(process, variant, default, found, (time.monotonic() + self._end) / 2)
         turn_s = sum(measured.took_s for measured in found)
         for _ in range(_TURNS - 1):
@@ -310,14 +418,26 @@ class Tuner:
                 measured.add(self._turn(process, measured.sessions))
 
     def _worth_more(self, found: Sequence[MeasuredPoint]) -> bool:
-        """Return whether a larger batch may serve the goal better than the measured ones, ascending."""
+        """Return whether a larger batch may serve the goal better than the measured ones,
+        ascending.
+        """
         if found and self._plan.goal.p99_ms is not None:
             return found[-1].round_trip_ms <= self._plan.goal.p99_ms
         rates = [measured.rates[0] for measured in found]
-        return len(rates) < 3 or max(rates[-2:]) >= _RISING * max(rates[:-2])  # one measurement may have been disturbed
+        # One measurement may have been disturbed.
+        return len(rates) < 3 or max(rates[-2:]) >= _RISING * max(rates[:-2])
 
-    def _add(self, process: LineProcess, variant: Variant, size: int, found: list[MeasuredPoint], until: float) -> bool:
-        """Compare the actions of a batch size, and measure it once; return False, with a report, if it is skipped."""
+    def _add(
+        self,
+        process: LineProcess,
+        variant: Variant,
+        size: int,
+        found: list[MeasuredPoint],
+        until: float,
+    ) -> bool:
+        """Compare the actions of a batch size, and measure it once; return False, with a report,
+        if it is skipped.
+        """
         began = time.monotonic()
         if found and began + found[-1].took_s * size / found[-1].sessions > until:
             self.left_out.append(f"{variant.name}, {sessions(size)}: no time was left")
@@ -325,11 +445,15 @@ class Tuner:
         try:
             difference = largest_difference(self._actions(process, size), self._wanted)
             if difference > self._plan.tolerance:
-                off = f"actions differ by {difference:.2%} of their range, want at most {self._plan.tolerance:.2%}"
+                off = (
+                    f"actions differ by {difference:.2%} of their range, want at most "
+                    f"{self._plan.tolerance:.2%}"
+                )
                 if variant.changes or found:
                     raise VariantFailed(f"refused, as {off}")
                 raise VariantFailed(
-                    f"{off}, for the same observations and seeds, so that nothing can be compared with them; let the "
+                    f"{off}, for the same observations and seeds, so that nothing can be compared "
+                    "with them; let the "
                     f"seed of `reset` determine what is random in the policy, or raise --tolerance"
                 )
             measured = MeasuredPoint(variant, size, difference)
@@ -355,12 +479,16 @@ class Tuner:
         return self._answer(process)
 
     def _answer(self, process: LineProcess) -> dict[str, Any]:
-        """Return the next line of a process; raises `VariantFailed` for its error, its end, or a time-out."""
+        """Return the next line of a process; raises `VariantFailed` for its error, its end, or a
+        time-out.
+        """
         try:
             said: dict[str, Any] = process.read(max(0.0, self._end - time.monotonic()))
         except ProcessFailed as error:
             if time.monotonic() >= self._end:
-                raise VariantFailed(f"not done within {self._plan.minutes:g} minutes; raise --minutes") from error
+                raise VariantFailed(
+                    f"not done within {self._plan.minutes:g} minutes; raise --minutes"
+                ) from error
             first, *more = str(error).partition(": ")[2].splitlines()
             raise VariantFailed(". ".join([first, *more[-1:]])) from error
         if "failed" in said:
@@ -373,8 +501,8 @@ def largest_difference(actions: Sequence[np.ndarray], wanted: Sequence[np.ndarra
 
     An action is (D,) or (H, D); the one at i is compared with `wanted[i % len(wanted)]`.
 
-    Each number of an action has its own range: the largest minus the smallest value among all actions and rows, or
-    a tenth of its largest magnitude if that is more.
+    Each number of an action has its own range: the largest minus the smallest value among all
+    actions and rows, or a tenth of its largest magnitude if that is more.
 
     Returns:
         The difference; infinity if shapes differ, or if a value is not finite.
@@ -393,15 +521,23 @@ def largest_difference(actions: Sequence[np.ndarray], wanted: Sequence[np.ndarra
 
 
 def recorded_observations(folder: Path, count: int) -> list[Obs]:
-    """Read observations, spread evenly over the trajectories below a folder and over their steps."""
+    """Read observations, spread evenly over the trajectories below a folder and over their
+    steps.
+    """
     if not (files := sorted(folder.rglob("*.npz"))):
-        raise ConfigError(f"--frames {folder}: holds no trajectory (.npz), want a folder of them, as evaluations save")
+        raise ConfigError(
+            f"--frames {folder}: holds no trajectory (.npz), want a folder of them, as evaluations "
+            "save"
+        )
     used = files[:: max(1, len(files) // count)][:count]
     found: list[Obs] = []
     for number, file in enumerate(used):
         share, trajectory = len(range(number, count, len(used))), Trajectory.load(file)
         steps = np.linspace(0, len(trajectory.actions), share, dtype=int).tolist()
-        images = {camera: _images(video, steps) for camera, video in videos_of(file, trajectory.cameras).items()}
+        images = {
+            camera: _images(video, steps)
+            for camera, video in videos_of(file, trajectory.cameras).items()
+        }
         found += [
             Obs(
                 cameras={camera: images[camera][step] for camera in trajectory.cameras},

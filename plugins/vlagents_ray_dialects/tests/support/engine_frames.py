@@ -1,9 +1,11 @@
-"""Recordings of the message code of SGLang, vLLM-Omni and FlashRT, for `upstream/test_engines.py` of the dialects.
+"""Recordings of the message code of SGLang, vLLM-Omni and FlashRT, for `upstream/test_engines.py`
+of the dialects.
 
-`python tests/support/engine_frames.py SGLANG_WHEEL VLLM_OMNI_WHEEL FLASHRT_SERVER` runs the modules of two wheels that
-read and write messages, and FlashRT's `examples/server.py`, on a CPU and without a network. The model is replaced by a
-sum of all that it is given, and the other modules that they import by placeholders. SGLang's and vLLM-Omni's requests
-are packed by their packers. It needs `msgspec`, `fastapi` and `httpx`.
+`python tests/support/engine_frames.py SGLANG_WHEEL VLLM_OMNI_WHEEL FLASHRT_SERVER` runs the modules
+of two wheels that read and write messages, and FlashRT's `examples/server.py`, on a CPU and without
+a network. The model is replaced by a sum of all that it is given, and the other modules that they
+import by placeholders. SGLang's and vLLM-Omni's requests are packed by their packers. It needs
+`msgspec`, `fastapi` and `httpx`.
 """
 
 from __future__ import annotations
@@ -46,7 +48,9 @@ def observed() -> tuple[dict[str, np.ndarray], np.ndarray, str]:
 
 def answered(images: dict[str, Any], state: Any, prompt: str) -> np.ndarray:
     """The actions for an observation, (ROWS, COLUMNS) float32, which depend on each part of it."""
-    total = sum((place + 1) * float(np.sum(images[name])) for place, name in enumerate(CAMERAS)) + len(prompt)
+    total = sum(
+        (place + 1) * float(np.sum(images[name])) for place, name in enumerate(CAMERAS)
+    ) + len(prompt)
     return (np.asarray(state) + np.arange(ROWS)[:, None] + total).astype(np.float32)
 
 
@@ -82,7 +86,9 @@ class _Wheels(importlib.abc.MetaPathFinder, importlib.abc.Loader):
 
     def exec_module(self, module: ModuleType) -> None:
         if module.__name__ in OWN:
-            code = compile(self._files[module.__name__.replace(".", "/") + ".py"], module.__name__, "exec")
+            code = compile(
+                self._files[module.__name__.replace(".", "/") + ".py"], module.__name__, "exec"
+            )
             exec(code, vars(module))  # noqa: S102 - the wheel that the user named
         else:
             vars(module)["__getattr__"] = lambda name: getattr(_Placeholder, name)
@@ -123,13 +129,17 @@ def sglang() -> dict[str, dict[str, Any]]:
     from sglang.multimodal_gen.configs.sample.pi05 import Pi05SamplingParams
 
     entrypoints = "sglang.multimodal_gen.runtime.entrypoints.action"
-    api, openpi, protocol = (importlib.import_module(f"{entrypoints}.{name}") for name in ("api", "openpi", "protocol"))
+    api, openpi, protocol = (
+        importlib.import_module(f"{entrypoints}.{name}") for name in ("api", "openpi", "protocol")
+    )
 
     async def forward(request: Any) -> Any:
         if request.prompt == "fail":
             return SimpleNamespace(error="a secret of the upstream", output=None)
         actions = answered(request.images, request.state, request.prompt)
-        return SimpleNamespace(error=None, output=[{"actions": actions, "timings": {"prefix_ms": 1.5}}])
+        return SimpleNamespace(
+            error=None, output=[{"actions": actions, "timings": {"prefix_ms": 1.5}}]
+        )
 
     protocol.prepare_request = lambda _args, params: params
     protocol.async_scheduler_client = SimpleNamespace(forward=forward)
@@ -158,9 +168,15 @@ def sglang() -> dict[str, dict[str, Any]]:
         prefix_cuda_graph_available=lambda: False,
         action_cuda_graph_available=lambda: False,
     )
-    parallel = dict.fromkeys(("num_gpus", "tp_size", "sp_degree", "ulysses_degree", "ring_degree"), 1)
+    parallel = dict.fromkeys(
+        ("num_gpus", "tp_size", "sp_degree", "ulysses_degree", "ring_degree"), 1
+    )
     args = SimpleNamespace(
-        pipeline_config=config, served_model_name="pi05", model_path="pi05", kv_gather_degree=1, **parallel
+        pipeline_config=config,
+        served_model_name="pi05",
+        model_path="pi05",
+        kv_gather_degree=1,
+        **parallel,
     )
     images, state, prompt = observed()
     dotted = {f"observation.images.{name}": image for name, image in images.items()}
@@ -228,7 +244,9 @@ def vllm_omni() -> dict[str, dict[str, Any]]:
             actions = answered(images, seen["state"], seen["prompt"])
             yield SimpleNamespace(multimodal_output={"actions": actions})
 
-    sys.modules["vllm_omni.entrypoints.openpi.serving"].OmegaConf = SimpleNamespace(is_config=lambda _value: False)
+    sys.modules["vllm_omni.entrypoints.openpi.serving"].OmegaConf = SimpleNamespace(
+        is_config=lambda _value: False
+    )
     serving = ServingRealtimeRobotOpenPI.__new__(ServingRealtimeRobotOpenPI)
     serving.engine_client = Engine()
     serving.policy_server_config = PolicyServerConfig.from_model_config(Engine.model_config)
@@ -241,7 +259,8 @@ def vllm_omni() -> dict[str, dict[str, Any]]:
     asyncio.run(RobotRealtimeConnection(socket, serving).handle_connection())
     if len(socket.sent) != 1 + len(requests):
         raise RuntimeError(
-            f"vllm-omni answered {len(socket.sent)} times, want the metadata and {len(requests)} answers"
+            f"vllm-omni answered {len(socket.sent)} times, want the metadata and {len(requests)} "
+            "answers"
         )
     return {"vllm_omni_websocket": {"requests": requests, "replies": socket.sent}}
 
@@ -255,7 +274,9 @@ def flashrt(server: Path) -> dict[str, dict[str, Any]]:
         return answered(dict(zip(CAMERAS, images, strict=True)), np.zeros(COLUMNS), prompt)
 
     model = SimpleNamespace(framework="torch", prompt=None, predict=predict)
-    sys.modules["flash_rt"] = SimpleNamespace(__version__="0.1.0", load_model=lambda **_settings: model)
+    sys.modules["flash_rt"] = SimpleNamespace(
+        __version__="0.1.0", load_model=lambda **_settings: model
+    )
     sys.argv = [str(server), "--checkpoint", "none"]
     module = ModuleType("flashrt_server")
     sys.modules[module.__name__], module.__file__ = module, str(server)
@@ -265,28 +286,39 @@ def flashrt(server: Path) -> dict[str, dict[str, Any]]:
     images, _, prompt = observed()
     texts = [base64.b64encode(image.tobytes()).decode() for image in images.values()]
     requests = [
-        json.dumps({"images": texts, "prompt": text, "image_shape": [2, 2, 3]}).encode() for text in (prompt, "fail")
+        json.dumps({"images": texts, "prompt": text, "image_shape": [2, 2, 3]}).encode()
+        for text in (prompt, "fail")
     ]
     kind = {"Content-Type": "application/json"}
     replies = [client.post("/predict", content=one, headers=kind).content for one in requests]
-    return {"flashrt_http": {"requests": requests, "replies": [client.get("/health").content, *replies]}}
+    return {
+        "flashrt_http": {"requests": requests, "replies": [client.get("/health").content, *replies]}
+    }
 
 
 def main(sglang_wheel: str, vllm_omni_wheel: str, flashrt_server: str) -> None:
     files = {}
     for wheel in (sglang_wheel, vllm_omni_wheel):
         with zipfile.ZipFile(wheel) as archive:
-            files |= {name: archive.read(name) for name in archive.namelist() if name[:-3].replace("/", ".") in OWN}
+            files |= {
+                name: archive.read(name)
+                for name in archive.namelist()
+                if name[:-3].replace("/", ".") in OWN
+            }
     sys.meta_path.insert(0, _Wheels(files))
     sources = {
         name: "code of " + "-".join(Path(wheel).name.split("-")[:2])
         for name, wheel in (("sglang", sglang_wheel), ("vllm", vllm_omni_wheel))
     }
     sources["flashrt"] = (
-        f"code of flashrt, examples/server.py, sha256 {hashlib.sha256(Path(flashrt_server).read_bytes()).hexdigest()}"
+        "code of flashrt, examples/server.py, sha256 "
+        f"{hashlib.sha256(Path(flashrt_server).read_bytes()).hexdigest()}"
     )
     for name, frames in (sglang() | vllm_omni() | flashrt(Path(flashrt_server))).items():
-        texts = {key: [base64.b64encode(one).decode() for one in values] for key, values in frames.items()}
+        texts = {
+            key: [base64.b64encode(one).decode() for one in values]
+            for key, values in frames.items()
+        }
         document = {"source": sources[name.partition("_")[0]], **texts}
         (FOLDER / f"{name}.json").write_text(json.dumps(document, indent=1) + "\n")
 

@@ -1,7 +1,8 @@
-"""Inference engines behind `upstream`, replayed from what their own message code reads and writes (engines/*.json).
+"""Inference engines behind `upstream`, replayed from what their own message code reads and writes
+(engines/*.json).
 
-Each recording is made by `tests/support/engine_frames.py`. A server here answers a request only if it is, to the byte,
-one that the engine's code has answered.
+Each recording is made by `tests/support/engine_frames.py`. A server here answers a request only if
+it is, to the byte, one that the engine's code has answered.
 """
 
 from __future__ import annotations
@@ -20,7 +21,12 @@ import numpy as np
 import pytest
 from websockets.sync.server import serve
 
-from vlagents_ray.errors import ContractMismatch, InvalidObservation, PolicyFailed, PolicyUnavailable
+from vlagents_ray.errors import (
+    ContractMismatch,
+    InvalidObservation,
+    PolicyFailed,
+    PolicyUnavailable,
+)
 from vlagents_ray.interface import Act, Obs
 from vlagents_ray_dialects.upstream import Upstream
 
@@ -32,7 +38,11 @@ SETTINGS: dict[str, dict[str, Any]] = {
     "sglang_websocket": {
         "protocol": "openpi",
         "urls": ["/openpi/policy"],
-        "mapping": {"cameras": DOTTED, "state": {"joints": "observation.state"}, "instruction": "prompt"},
+        "mapping": {
+            "cameras": DOTTED,
+            "state": {"joints": "observation.state"},
+            "instruction": "prompt",
+        },
     },
     "sglang_http": {
         "protocol": "sglang",
@@ -55,14 +65,17 @@ PATHS = {
     "flashrt_http": ("/health", "/predict"),
 }
 STATES = {"flashrt_http": np.zeros_like(STATE)}  # FlashRT's server reads none
-FAILING = [name for name in SETTINGS if name != "sglang_http"]  # the 500 of SGLang's HTTP is not made by its own code
+# The 500 of SGLang's HTTP is not made by its own code.
+FAILING = [name for name in SETTINGS if name != "sglang_http"]
 SEEN = Obs(dict(zip(("front", "wrist"), IMAGES.values(), strict=True)), state={"joints": STATE})
 
 
 def recorded(name: str) -> tuple[bytes, dict[bytes, bytes]]:
     """The metadata of an engine, and its answers by request."""
     document = json.loads((engine_frames.FOLDER / f"{name}.json").read_text())
-    requests, replies = ([base64.b64decode(one) for one in document[key]] for key in ("requests", "replies"))
+    requests, replies = (
+        [base64.b64decode(one) for one in document[key]] for key in ("requests", "replies")
+    )
     return replies[0], dict(zip(requests, replies[1:], strict=True))
 
 
@@ -113,7 +126,9 @@ def replayed() -> Iterator[Callable[[str], Upstream]]:
             stack.callback(server.shutdown)
             path = prefix + PATHS[name][1] if prefix else SETTINGS[name]["urls"][0]
             url = f"{'http' if is_http else 'ws'}://127.0.0.1:{port}{path}"
-            config = SETTINGS[name] | {"urls": [url], "connect_timeout_s": 5, "retry_s": 30} | changes
+            config = (
+                SETTINGS[name] | {"urls": [url], "connect_timeout_s": 5, "retry_s": 30} | changes
+            )
             return stack.enter_context(Upstream.from_config(config))
 
         yield make
@@ -152,7 +167,9 @@ def test_an_engines_error_is_in_the_log_and_not_in_the_answer(
 
 
 @pytest.mark.parametrize("name", [name for name in SETTINGS if not name.startswith("flashrt")])
-def test_the_rows_of_an_engines_metadata_are_the_contracts(replayed: Callable[..., Upstream], name: str) -> None:
+def test_the_rows_of_an_engines_metadata_are_the_contracts(
+    replayed: Callable[..., Upstream], name: str
+) -> None:
     agent = replayed(name)
     agent.initialize()
     assert agent.contract.chunk == engine_frames.ROWS
@@ -160,7 +177,9 @@ def test_the_rows_of_an_engines_metadata_are_the_contracts(replayed: Callable[..
         replayed(name, contract={"chunk": 50}).initialize()
 
 
-def test_vllm_omni_needs_its_external_and_its_wrist_camera(replayed: Callable[..., Upstream]) -> None:
+def test_vllm_omni_needs_its_external_and_its_wrist_camera(
+    replayed: Callable[..., Upstream],
+) -> None:
     mapping = SETTINGS["vllm_omni_websocket"]["mapping"] | {"cameras": {"wrist": DOTTED["wrist"]}}
     with pytest.raises(ContractMismatch, match="needs 1 external ones, the mapping has 0"):
         replayed("vllm_omni_websocket", mapping=mapping).initialize()
@@ -174,7 +193,10 @@ CAMERAS = SETTINGS["flashrt_http"]["mapping"]["cameras"]
     [
         ({"instruction": "prompt"}, r"cameras: got \[\], want images/NAME for each"),
         ({"cameras": {"front": "images"}, "instruction": "prompt"}, r"cameras: got \['front'\]"),
-        ({"cameras": CAMERAS | {"front": {"key": "images/f", "optional": True}}}, r"cameras: got \['front'\]"),
+        (
+            {"cameras": CAMERAS | {"front": {"key": "images/f", "optional": True}}},
+            r"cameras: got \['front'\]",
+        ),
         ({"cameras": CAMERAS, "instruction": "task"}, "instruction: got 'task', want 'prompt'"),
     ],
 )
@@ -186,7 +208,8 @@ def test_flashrt_does_not_start_with_a_mapping_that_it_would_complete_itself(
 
 
 @pytest.mark.parametrize(
-    ("obs", "instruction"), [(SEEN, None), (Obs(SEEN.cameras | {"front": np.zeros((4, 4, 3), np.uint8)}), PROMPT)]
+    ("obs", "instruction"),
+    [(SEEN, None), (Obs(SEEN.cameras | {"front": np.zeros((4, 4, 3), np.uint8)}), PROMPT)],
 )
 def test_flashrt_never_gets_an_observation_that_it_would_complete_itself(
     replayed: Callable[..., Upstream], obs: Obs, instruction: str | None
@@ -198,24 +221,37 @@ def test_flashrt_never_gets_an_observation_that_it_would_complete_itself(
 
 
 @pytest.mark.parametrize("name", ["sglang_websocket", "sglang_http"])
-def test_a_camera_that_sglang_would_ignore_does_not_start(replayed: Callable[..., Upstream], name: str) -> None:
+def test_a_camera_that_sglang_would_ignore_does_not_start(
+    replayed: Callable[..., Upstream], name: str
+) -> None:
     mapping = SETTINGS[name]["mapping"]
     only_front = mapping | {"cameras": {"front": mapping["cameras"]["front"]}}
     replayed(name, mapping=only_front).initialize()  # a robot without a camera at its wrist
     misspelt = mapping | {"cameras": {"front": mapping["cameras"]["front"].replace("rgb", "bgr")}}
-    with pytest.raises(ContractMismatch, match=r"reads \['base_0_rgb', 'left_wrist_0_rgb'\], the mapping gives"):
+    with pytest.raises(
+        ContractMismatch, match=r"reads \['base_0_rgb', 'left_wrist_0_rgb'\], the mapping gives"
+    ):
         replayed(name, mapping=misspelt).initialize()
 
 
-def test_an_upstream_that_closes_each_connection_or_has_a_prefix_is_used(replayed: Callable[..., Upstream]) -> None:
-    for agent in (replayed("sglang_http", closing=True), replayed("sglang_http", prefix="/robot/1")):
+def test_an_upstream_that_closes_each_connection_or_has_a_prefix_is_used(
+    replayed: Callable[..., Upstream],
+) -> None:
+    for agent in (
+        replayed("sglang_http", closing=True),
+        replayed("sglang_http", prefix="/robot/1"),
+    ):
         agent.initialize()
         assert isinstance(act(agent, PROMPT), Act)
 
 
-def test_an_error_over_http_states_the_status_and_the_place_of_the_text(replayed: Callable[..., Upstream]) -> None:
+def test_an_error_over_http_states_the_status_and_the_place_of_the_text(
+    replayed: Callable[..., Upstream],
+) -> None:
     agent = replayed("flashrt_http")
     agent.initialize()
     assert "it answered with HTTP 422, whose text the server's log has" in str(act(agent, "fail"))
-    with pytest.raises(PolicyUnavailable, match=r"HTTP 404, .*; want its metadata at /v1/actions/metadata"):
+    with pytest.raises(
+        PolicyUnavailable, match=r"HTTP 404, .*; want its metadata at /v1/actions/metadata"
+    ):
         replayed("flashrt_http", protocol="sglang", connect_timeout_s=0.2).initialize()

@@ -39,7 +39,9 @@ def seen(number: int) -> Obs:
 
 
 def expected(number: int, text: str = "task") -> np.ndarray:
-    return answer({"observation/state": seen(number).state["position"], "prompt": text}).astype(np.float32)
+    return answer({"observation/state": seen(number).state["position"], "prompt": text}).astype(
+        np.float32
+    )
 
 
 Open = Callable[..., Upstream]
@@ -78,7 +80,9 @@ def require_right(agent: Upstream, of: list[Any]) -> None:
 
 
 @pytest.mark.parametrize("protocol", ["openpi", "openpi-batch"])
-def test_the_rows_of_a_lost_lane_are_asked_over_the_others(opened: Open, start: Any, protocol: str) -> None:
+def test_the_rows_of_a_lost_lane_are_asked_over_the_others(
+    opened: Open, start: Any, protocol: str
+) -> None:
     ports = [free_port(), free_port()]
     servers = [start(port, protocol) for port in ports]
     agent = opened(*ports, protocol=protocol)
@@ -105,7 +109,9 @@ PIXELS = {
 
 
 @pytest.mark.parametrize("protocol", sorted(PIXELS))
-def test_connections_that_ended_while_nobody_acted_cost_a_row_nothing(opened: Open, start: Any, protocol: str) -> None:
+def test_connections_that_ended_while_nobody_acted_cost_a_row_nothing(
+    opened: Open, start: Any, protocol: str
+) -> None:
     port = free_port()
     server = start(port, protocol)
     agent = opened(port, protocol=protocol, mapping=PIXELS[protocol], connections=5, retry_s=60)
@@ -132,7 +138,8 @@ def test_a_connection_that_ends_in_its_handshake_is_tried_again(
     def connect(*args: Any, **options: Any) -> Any:
         if len(refused) < 2:
             refused.append(port)
-            raise ConnectionClosedError(None, None)  # as when the upstream is killed in the meantime
+            # As when the upstream is killed in the meantime.
+            raise ConnectionClosedError(None, None)
         return real(*args, **options)
 
     monkeypatch.setattr(websocket, "connect", connect)
@@ -141,7 +148,9 @@ def test_a_connection_that_ends_in_its_handshake_is_tried_again(
     require_right(agent, sessions(agent, 1))
 
 
-def test_without_any_upstream_a_request_is_answered_as_for_a_lost_replica(opened: Open, start: Any) -> None:
+def test_without_any_upstream_a_request_is_answered_as_for_a_lost_replica(
+    opened: Open, start: Any
+) -> None:
     port = free_port()
     server = start(port)
     agent = opened(port, retry_s=0.1)
@@ -154,7 +163,9 @@ def test_without_any_upstream_a_request_is_answered_as_for_a_lost_replica(opened
     agent.check_health()  # another replica would not help
 
 
-@pytest.mark.parametrize(("text", "why"), [(SLOW, "no answer within 0.5 s"), (CLOSED, "received 1000")])
+@pytest.mark.parametrize(
+    ("text", "why"), [(SLOW, "no answer within 0.5 s"), (CLOSED, "received 1000")]
+)
 def test_a_row_on_which_the_upstream_is_lost_fails_alone_and_in_time(
     opened: Open, start: Any, text: str, why: str
 ) -> None:
@@ -194,7 +205,9 @@ def test_the_connection_of_an_ended_session_is_closed(opened: Open, start: Any) 
 
 
 @pytest.mark.parametrize("protocol", ["openpi", "vla_eval"])
-def test_an_upstream_that_is_killed_and_restarted_fails_no_episode(protocol: str, start: Any, tmp_path: Path) -> None:
+def test_an_upstream_that_is_killed_and_restarted_fails_no_episode(
+    protocol: str, start: Any, tmp_path: Path
+) -> None:
     port = free_port()
     servers = [start(port, protocol)]
     mapping = {"mapping": {"cameras": CAMERA, **PLAIN}} if protocol == "openpi" else {}
@@ -205,7 +218,9 @@ def test_an_upstream_that_is_killed_and_restarted_fails_no_episode(protocol: str
         """Twice, each when the last server has answered some more."""
         while len(servers) < 3 and not over.is_set():
             enough = len(replicas.frames) + 10
-            wait_for(lambda enough=enough: over.is_set() or len(replicas.frames) > enough, every_s=0.002)
+            wait_for(
+                lambda enough=enough: over.is_set() or len(replicas.frames) > enough, every_s=0.002
+            )
             servers[-1].kill()
             servers[-1].wait()
             servers.append(start(port, protocol))
@@ -216,7 +231,13 @@ def test_an_upstream_that_is_killed_and_restarted_fails_no_episode(protocol: str
         config = EvalConfig.model_validate(
             {
                 "policies": [{"name": "upstream", "source": "upstream"}],
-                "suites": [{"envs": ["eval_fakes:SevenLine"], "env_options": {"camera": [8, 8]}, "episodes": 20}],
+                "suites": [
+                    {
+                        "envs": ["eval_fakes:SevenLine"],
+                        "env_options": {"camera": [8, 8]},
+                        "episodes": 20,
+                    }
+                ],
                 "out": tmp_path,
             }
         )

@@ -40,7 +40,9 @@ WAYS = {
 def port() -> Iterator[int]:
     engine = Engine(Mirror(chunk=2))
     engine.start()
-    routes = dialect_routes(DialectArgs(**DIALECTS), ReplicaContext(engine, lambda: METADATA, DEFAULT_LIMITS))
+    routes = dialect_routes(
+        DialectArgs(**DIALECTS), ReplicaContext(engine, lambda: METADATA, DEFAULT_LIMITS)
+    )
     app = build_http_app(engine, lambda: METADATA, DEFAULT_LIMITS, more=routes)
     with served(AccessMiddleware(app, None, "app")) as found:
         yield found
@@ -50,7 +52,11 @@ def port() -> Iterator[int]:
 @pytest.mark.parametrize("way", sorted(WAYS))
 def test_a_server_of_ours_answers_to_upstream_as_to_a_client(port: int, way: str) -> None:
     protocol, scheme, path, mapping = WAYS[way]
-    config = {"protocol": protocol, "urls": [f"{scheme}://127.0.0.1:{port}{path}"], "mapping": mapping}
+    config = {
+        "protocol": protocol,
+        "urls": [f"{scheme}://127.0.0.1:{port}{path}"],
+        "mapping": mapping,
+    }
     with Upstream.from_config(config) as agent:
         agent.initialize()
         copies = AgentCopies(agent)

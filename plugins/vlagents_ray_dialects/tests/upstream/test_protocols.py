@@ -42,7 +42,9 @@ def libero(obs: Obs, text: str) -> dict[str, Any]:
     return {
         "observation/image": obs.cameras["front"],
         "observation/wrist_image": obs.cameras["wrist"],
-        "observation/state": np.concatenate([obs.state["xyz_axis_angle"], obs.state["gripper_qpos"]]),
+        "observation/state": np.concatenate(
+            [obs.state["xyz_axis_angle"], obs.state["gripper_qpos"]]
+        ),
         "prompt": text,
     }
 
@@ -59,7 +61,10 @@ def droid(obs: Obs, text: str) -> dict[str, Any]:
 
 def so100(obs: Obs, text: str) -> np.ndarray:
     batch = {
-        "video": {"ego": obs.cameras["front"][None, None], "wrist": obs.cameras["wrist"][None, None]},
+        "video": {
+            "ego": obs.cameras["front"][None, None],
+            "wrist": obs.cameras["wrist"][None, None],
+        },
         "state": {"arm": obs.state["joints"][None, None]},
         "language": {"annotation.human.task_description": [[text]]},
     }
@@ -74,7 +79,9 @@ DIRECT: dict[str, Callable[[Obs, str, int], np.ndarray]] = {
     "gr00t": lambda obs, text, _step: so100(obs, text),
     "gr00t packed": lambda obs, text, _step: so100(obs, text),
     "gr00t sim": lambda obs, text, _step: so100(obs, text),
-    "openvla": lambda obs, text, _step: answer({"image": obs.cameras["front"], "instruction": text})[0],
+    "openvla": lambda obs, text, _step: answer(
+        {"image": obs.cameras["front"], "instruction": text}
+    )[0],
     "vla_eval": lambda obs, text, step: answer(
         {
             "images": {"front": obs.cameras["front"], "wrist": obs.cameras["wrist"]},
@@ -110,7 +117,11 @@ def served(request: pytest.FixtureRequest, ports: dict[int, str]) -> tuple[str, 
     """A kind of server, and the settings that name two of it."""
     kind = request.param
     protocol = kind.partition(" ")[0]
-    urls = [f"{SCHEMES.get(protocol, 'ws')}://127.0.0.1:{port}" for port, one in ports.items() if one == kind]
+    urls = [
+        f"{SCHEMES.get(protocol, 'ws')}://127.0.0.1:{port}"
+        for port, one in ports.items()
+        if one == kind
+    ]
     settings = {"protocol": protocol, "urls": urls, "connect_timeout_s": 30}
     return kind, settings | ({"mapping": MAPPINGS[kind]} if kind in MAPPINGS else {})
 
@@ -135,7 +146,9 @@ def test_each_of_16_sessions_gets_what_the_upstream_answers_to_its_own_client(
         for i, act in enumerate(acts):
             assert not isinstance(act, Exception), act
             assert act.action.dtype == np.float32
-            np.testing.assert_array_equal(act.action, direct(views[i], f"task {i}", step).astype(np.float32))
+            np.testing.assert_array_equal(
+                act.action, direct(views[i], f"task {i}", step).astype(np.float32)
+            )
 
 
 def test_an_error_of_the_upstream_is_that_of_its_session_and_says_none_of_its_details(

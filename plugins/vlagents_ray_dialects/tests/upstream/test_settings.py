@@ -13,7 +13,13 @@ from eval_fakes import wait_for
 from upstream_servers import pack_openpi, unpack_openpi, upstream
 from websockets.sync.server import serve
 
-from vlagents_ray.errors import ConfigError, ContractMismatch, PolicyUnavailable, Unauthorized, VLAgentsError
+from vlagents_ray.errors import (
+    ConfigError,
+    ContractMismatch,
+    PolicyUnavailable,
+    Unauthorized,
+    VLAgentsError,
+)
 from vlagents_ray.interface import Obs
 from vlagents_ray.serve.models.agent_copies import AgentCopies
 from vlagents_ray.serve.ports import free_port
@@ -34,7 +40,10 @@ OPENPI: dict[str, Any] = {"protocol": "openpi", "urls": ["ws://127.0.0.1:9"], "m
         ({"mapping": "openpi-libera"}, "openpi-libero"),
         ({"mapping": {"camera": {}}}, "unknown keys"),
         ({"contract": {"chunks": 3}}, "unknown keys"),
-        ({"protocol": "vlagents", "urls": ["rpyc://box:1"], "key_env": "KEY"}, "no place for a key"),
+        (
+            {"protocol": "vlagents", "urls": ["rpyc://box:1"], "key_env": "KEY"},
+            "no place for a key",
+        ),
         ({"speed": 3}, "speed"),
     ],
 )
@@ -81,8 +90,16 @@ GR00T: dict[str, Any] = {
 def test_a_mapping_that_is_not_what_the_upstream_needs_does_not_start(
     gr00t: str, mapping: dict[str, Any], contract: dict[str, Any], said: str
 ) -> None:
-    config = {"protocol": "gr00t", "urls": [gr00t], "mapping": GR00T | mapping, "contract": contract}
-    with pytest.raises(ContractMismatch, match=said), closing(Upstream.from_config(config)) as agent:
+    config = {
+        "protocol": "gr00t",
+        "urls": [gr00t],
+        "mapping": GR00T | mapping,
+        "contract": contract,
+    }
+    with (
+        pytest.raises(ContractMismatch, match=said),
+        closing(Upstream.from_config(config)) as agent,
+    ):
         agent.initialize()
 
 
@@ -114,7 +131,9 @@ def serving() -> Iterator[Serving]:
     with ExitStack() as stack:
 
         def serve_with(handler: Callable[[Any], None], **options: Any) -> str:
-            server = stack.enter_context(serve(handler, "127.0.0.1", 0, compression=None, max_size=None, **options))
+            server = stack.enter_context(
+                serve(handler, "127.0.0.1", 0, compression=None, max_size=None, **options)
+            )
             thread = threading.Thread(target=server.serve_forever)
             thread.start()
             stack.callback(thread.join)
@@ -124,7 +143,9 @@ def serving() -> Iterator[Serving]:
         yield serve_with
 
 
-def test_the_key_is_sent_and_a_refused_one_is_an_error(serving: Serving, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_key_is_sent_and_a_refused_one_is_an_error(
+    serving: Serving, monkeypatch: pytest.MonkeyPatch
+) -> None:
     def check(connection: Any, request: Any) -> Any:
         right = request.headers.get("Authorization") == "Api-Key right"
         return None if right else connection.respond(401, "no\n")
@@ -146,8 +167,12 @@ ANSWERS: dict[str, bytes] = {
     "no actions": pack_openpi({"action": 1}),
     "text": pack_openpi({"actions": "left"}),
     "four dimensions": pack_openpi({"actions": np.ones((1, 2, 3, 4))}),
-    "objects": pack_openpi({"actions": {b"__ndarray__": True, b"data": b"12345678", b"dtype": "|O", b"shape": (1,)}}),
-    "too short": pack_openpi({"actions": {b"__ndarray__": True, b"data": b"1234", b"dtype": "<f8", b"shape": (9,)}}),
+    "objects": pack_openpi(
+        {"actions": {b"__ndarray__": True, b"data": b"12345678", b"dtype": "|O", b"shape": (1,)}}
+    ),
+    "too short": pack_openpi(
+        {"actions": {b"__ndarray__": True, b"data": b"1234", b"dtype": "<f8", b"shape": (9,)}}
+    ),
     "deep": b"\x91" * 5000 + b"\x90",
 }
 
@@ -173,7 +198,8 @@ def test_an_answer_that_is_none_is_an_error_of_ours(serving: Serving, kind: str)
 
 
 def test_connections_share_a_batch(serving: Serving) -> None:
-    together = threading.Barrier(3, timeout=60)  # each waits for the two others: asked in turn, they never pass
+    # Each waits for the two others: asked in turn, they never pass.
+    together = threading.Barrier(3, timeout=60)
 
     def answer(connection: Any) -> None:
         connection.send(pack_openpi({}))

@@ -1,9 +1,11 @@
-"""The messages of GR00T's `PolicyClient` and `PolicyServer` over ZMQ, each of which is one msgpack map.
+"""The messages of GR00T's `PolicyClient` and `PolicyServer` over ZMQ, each of which is one msgpack
+map.
 
-Sources: Isaac-GR00T's `gr00t/eval/service.py` (N1.5) and `gr00t/policy/server_client.py` (N1.6 and newer). A
-request is `{"endpoint", "data"?, "api_token"?}`. An array is `{"__ndarray_class__": True, "as_npy": <.npy file>}` or,
-in newer clients, has the format of `msgpack_numpy`: `{b"nd": True, b"type", b"kind", b"shape", b"data"}`; the reply has
-the format of the request.
+Sources: Isaac-GR00T's `gr00t/eval/service.py` (N1.5) and `gr00t/policy/server_client.py` (N1.6 and
+    newer). A
+request is `{"endpoint", "data"?, "api_token"?}`. An array is `{"__ndarray_class__": True, "as_npy":
+<.npy file>}` or, in newer clients, has the format of `msgpack_numpy`: `{b"nd": True, b"type",
+b"kind", b"shape", b"data"}`; the reply has the format of the request.
 """
 
 from __future__ import annotations
@@ -44,10 +46,12 @@ class GR00TRequest:
 class Observations:
     """The observations of one `get_action`, one for each session."""
 
-    each: tuple[dict[str, Any], ...]  # {"video": {name: (T, H, W, 3)}, "state": {name: (T, D)}, "language": {...}}
+    # {"video": {name: (T, H, W, 3)}, "state": {name: (T, D)}, "language": {...}}.
+    each: tuple[dict[str, Any], ...]
     batched: bool  # whether the arrays had a batch dimension
     flat: bool  # whether keys are like "video.front" instead of {"video": {"front": ...}}
-    paired: bool  # whether the reply is [action, info], as in N1.6 and newer, or only the action, as in N1.5
+    # Whether the reply is [action, info], as in N1.6 and newer, or only the action, as in N1.5.
+    paired: bool
 
 
 _TOKEN_BYTES = 4096  # maximum size of an API key, and of the names of the fields before it
@@ -56,10 +60,15 @@ _TOKEN_BYTES = 4096  # maximum size of an API key, and of the names of the field
 def read_token(payload: bytes | memoryview, limits: Limits) -> str | None:
     """Return the API key in a message without decoding the other fields; None if it has none."""
     if len(payload) > limits.body_bytes:
-        raise MessageTooLarge(f"gr00t: a message of {len(payload)} bytes, the limit is {limits.body_bytes}")
+        raise MessageTooLarge(
+            f"gr00t: a message of {len(payload)} bytes, the limit is {limits.body_bytes}"
+        )
     package = require("msgpack")
     reader = package.Unpacker(
-        max_buffer_size=limits.body_bytes, max_array_len=0, max_map_len=limits.items, max_str_len=_TOKEN_BYTES
+        max_buffer_size=limits.body_bytes,
+        max_array_len=0,
+        max_map_len=limits.items,
+        max_str_len=_TOKEN_BYTES,
     )
     try:
         reader.feed(payload)
@@ -74,12 +83,16 @@ def read_token(payload: bytes | memoryview, limits: Limits) -> str | None:
     except (package.exceptions.UnpackException, ValueError, TypeError) as error:
         if isinstance(error, MalformedMessage):
             raise
-        raise MalformedMessage(f"gr00t: no msgpack map ({type(error).__name__}: {str(error)[:100]})") from error
+        raise MalformedMessage(
+            f"gr00t: no msgpack map ({type(error).__name__}: {str(error)[:100]})"
+        ) from error
     return None
 
 
 def read_request(payload: bytes | memoryview, limits: Limits) -> GR00TRequest:
-    """Return the request in a message; raise `MalformedMessage` or `MessageTooLarge` if it is invalid."""
+    """Return the request in a message; raise `MalformedMessage` or `MessageTooLarge` if it is
+    invalid.
+    """
     packed = False
 
     def array(node: dict[Any, Any]) -> Any:
@@ -90,9 +103,15 @@ def read_request(payload: bytes | memoryview, limits: Limits) -> GR00TRequest:
     document = msgpack.unpack(payload, limits, array, text=limits.text)
     if not isinstance(document, dict):
         raise MalformedMessage(f"gr00t: got {type(document).__name__}, want a map")
-    endpoint, data, token = document.get("endpoint", "get_action"), document.get("data"), document.get("api_token")
+    endpoint, data, token = (
+        document.get("endpoint", "get_action"),
+        document.get("data"),
+        document.get("api_token"),
+    )
     if not isinstance(endpoint, str) or endpoint not in ENDPOINTS:
-        raise MalformedMessage(f"gr00t: unknown endpoint {shown(endpoint)}, want one of {list(ENDPOINTS)}")
+        raise MalformedMessage(
+            f"gr00t: unknown endpoint {shown(endpoint)}, want one of {list(ENDPOINTS)}"
+        )
     if data is not None and not isinstance(data, dict):
         raise MalformedMessage(f"gr00t: data: got {type(data).__name__}, want a map")
     if token is not None and not isinstance(token, str):
@@ -101,23 +120,39 @@ def read_request(payload: bytes | memoryview, limits: Limits) -> GR00TRequest:
 
 
 def read_observations(data: Mapping[str, Any]) -> Observations:
-    """Return the observations in the data of a `get_action`; raise `InvalidObservation` for wrong shapes."""
+    """Return the observations in the data of a `get_action`; raise `InvalidObservation` for
+    wrong shapes.
+    """
     paired = isinstance(data.get("observation"), dict)
     observation = data["observation"] if paired else data
     flat = is_flat(observation)
     named = nested(observation) if flat else observation
     groups = {kind: _arrays(named.get(kind), kind) for kind in _ARRAYS}
-    axes = {array.ndim - usual for kind, usual in (("video", 4), ("state", 2)) for array in groups[kind].values()}
+    axes = {
+        array.ndim - usual
+        for kind, usual in (("video", 4), ("state", 2))
+        for array in groups[kind].values()
+    }
     if axes not in ({0}, {1}):
-        shapes = {name: array.shape for name, array in list((groups["video"] | groups["state"]).items())[:8]}
-        raise InvalidObservation(f"observation: got {shapes}, want videos (B, T, H, W, 3) and states (B, T, D)")
+        shapes = {
+            name: array.shape
+            for name, array in list((groups["video"] | groups["state"]).items())[:8]
+        }
+        raise InvalidObservation(
+            f"observation: got {shapes}, want videos (B, T, H, W, 3) and states (B, T, D)"
+        )
     batched = axes == {1}
     if not batched:
-        groups = {kind: {name: array[None] for name, array in group.items()} for kind, group in groups.items()}
+        groups = {
+            kind: {name: array[None] for name, array in group.items()}
+            for kind, group in groups.items()
+        }
     arrays = [array for group in groups.values() for array in group.values()]
     sizes = {array.shape[0] for array in arrays}
     if len(sizes) != 1 or not 0 < min(sizes) <= _BATCH:
-        raise InvalidObservation(f"observation: got batches of {sorted(sizes)}, want the same, 1 to {_BATCH}, in all")
+        raise InvalidObservation(
+            f"observation: got batches of {sorted(sizes)}, want the same, 1 to {_BATCH}, in all"
+        )
     number = sizes.pop()
     texts = _texts(named.get("language"), number)
     if any(array.shape[1] == 0 for array in arrays):
@@ -136,7 +171,9 @@ def is_flat(observation: Mapping[str, Any]) -> bool:
 
 
 def nested(flat: Mapping[str, Any]) -> dict[str, Any]:
-    """Return {"video": {"front": …}} for {"video.front": …}; keys other than video and state become language."""
+    """Return {"video": {"front": …}} for {"video.front": …}; keys other than video and state
+    become language.
+    """
     found: dict[str, Any] = {kind: {} for kind in _MODALITIES}
     for key, value in flat.items():
         kind, _, name = key.partition(".") if isinstance(key, str) else ("", "", "")
@@ -148,20 +185,32 @@ def nested(flat: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def newest(observation: Mapping[str, Any]) -> dict[str, Any]:
-    """Return an observation's last time step: {"video": {name: (H, W, 3)}, "state": {name: (D,)}, "language": ...}."""
-    arrays = {kind: {name: array[-1] for name, array in observation[kind].items()} for kind in _ARRAYS}
+    """Return an observation's last time step: {"video": {name: (H, W, 3)}, "state": {name:
+    (D,)}, "language": ...}.
+    """
+    arrays = {
+        kind: {name: array[-1] for name, array in observation[kind].items()} for kind in _ARRAYS
+    }
     return arrays | {"language": observation["language"]}
 
 
-def write_actions(actions: Sequence[Mapping[str, np.ndarray]], asked: Observations, info: Mapping[str, Any]) -> Any:
-    """Return the reply to `get_action` with the actions of B sessions by name, each (H, D), as (B, H, D) by name.
+def write_actions(
+    actions: Sequence[Mapping[str, np.ndarray]], asked: Observations, info: Mapping[str, Any]
+) -> Any:
+    """Return the reply to `get_action` with the actions of B sessions by name, each (H, D), as (B,
+    H, D) by name.
 
-    If the request `asked` has no batch dimension, the reply has none. `info` is only sent to N1.6 and newer.
+    If the request `asked` has no batch dimension, the reply has none. `info` is only sent to N1.6
+    and newer.
     """
     shapes = {name: {one[name].shape for one in actions} for name in actions[0]}
     if any(len(found) > 1 for found in shapes.values()):
-        raise InvalidObservation(f"the batch's actions differ in length ({shapes}); send its observations one by one")
-    joined = {name: np.stack([one[name] for one in actions]).astype(np.float32) for name in actions[0]}
+        raise InvalidObservation(
+            f"the batch's actions differ in length ({shapes}); send its observations one by one"
+        )
+    joined = {
+        name: np.stack([one[name] for one in actions]).astype(np.float32) for name in actions[0]
+    }
     if not asked.batched:
         joined = {name: array[0] for name, array in joined.items()}
     if asked.flat:
@@ -172,23 +221,33 @@ def write_actions(actions: Sequence[Mapping[str, np.ndarray]], asked: Observatio
 def modality_config(
     modalities: Mapping[str, tuple[Sequence[str], Sequence[int]]], *, flat: bool = False
 ) -> dict[str, Any]:
-    """Return the reply to `get_modality_config`: keys and time steps by modality, except for modalities without keys.
+    """Return the reply to `get_modality_config`: keys and time steps by modality, except for
+    modalities without keys.
 
-    `flat` is the format of N1.5, in which keys contain their modality and a config is a JSON text. The clients of N1.6
-    and newer read a map, and the newest refuses a modality without keys.
+    `flat` is the format of N1.5, in which keys contain their modality and a config is a JSON text.
+    The clients of N1.6 and newer read a map, and the newest refuses a modality without keys.
     """
     answer: dict[str, Any] = {}
     for name, (keys, steps) in modalities.items():
         if not keys:
             continue
-        named = [_FLAT_TEXT_KEY if name == "language" else _flat(name, key) for key in keys] if flat else list(keys)
+        named = (
+            [_FLAT_TEXT_KEY if name == "language" else _flat(name, key) for key in keys]
+            if flat
+            else list(keys)
+        )
         config = {"delta_indices": list(steps), "modality_keys": named}
-        answer[name] = {"__ModalityConfig_class__": True, "as_json": json.dumps(config) if flat else config}
+        answer[name] = {
+            "__ModalityConfig_class__": True,
+            "as_json": json.dumps(config) if flat else config,
+        }
     return answer
 
 
 def _flat(modality: str, key: str) -> str:
-    """Return N1.5's name of a key, "modality.key"; the key of an action without named parts is just "action"."""
+    """Return N1.5's name of a key, "modality.key"; the key of an action without named parts is
+    just "action".
+    """
     return key if key == modality else f"{modality}.{key}"
 
 
@@ -204,12 +263,16 @@ def _arrays(group: Any, kind: str) -> dict[str, np.ndarray]:
         raise InvalidObservation(f"{kind}: got {type(group).__name__}, want a map of arrays")
     for name, array in group.items():
         if not isinstance(name, str) or not isinstance(array, np.ndarray):
-            raise InvalidObservation(f"{kind}.{shown(name)}: got {type(array).__name__}, want an array")
+            raise InvalidObservation(
+                f"{kind}.{shown(name)}: got {type(array).__name__}, want an array"
+            )
     return group
 
 
 def _texts(language: Any, number: int) -> list[str | None]:
-    """Return the instruction of each of `number` observations; `language` has one key, with text or lists of it."""
+    """Return the instruction of each of `number` observations; `language` has one key, with text
+    or lists of it.
+    """
     if not isinstance(language, dict) or not language:
         return [None] * number
     if len(language) > 1:
@@ -219,7 +282,9 @@ def _texts(language: Any, number: int) -> list[str | None]:
     if isinstance(texts, list) and len(texts) == 1:
         texts = texts * number
     if not isinstance(texts, list) or len(texts) != number:
-        raise InvalidObservation(f"{shown(key)}: want {number} instructions, one for each observation")
+        raise InvalidObservation(
+            f"{shown(key)}: want {number} instructions, one for each observation"
+        )
     return [_text(key, one) for one in texts]
 
 
@@ -233,12 +298,13 @@ def _text(key: Any, value: Any) -> str:
 
 # Arrays in the format of most of GR00T's clients: .npy files.
 #
-# A file's header is matched, not evaluated, and must agree with the size of the content, so that no memory is allocated
-# for a false shape. Arrays of text become lists; arrays of objects and structures are refused.
+# A file's header is matched, not evaluated, and must agree with the size of the content, so that no
+# memory is allocated for a false shape. Arrays of text become lists; arrays of objects and
+# structures are refused.
 
 _NPY = b"\x93NUMPY"
-# The header that numpy writes for every plain array; any other (structures, objects) is refused. Each text has only one
-# match, so that matching is fast.
+# The header that numpy writes for every plain array; any other (structures, objects) is refused.
+# Each text has only one match, so that matching is fast.
 _HEADER = re.compile(
     rb"\{'descr': '([<|]?[a-zA-Z]\d{1,5})', 'fortran_order': (True|False), "
     rb"'shape': \(((?:\d{1,15}, ?)*(?:\d{1,15})?)\), \}\s*"
@@ -247,7 +313,9 @@ _TEXT_DTYPE = re.compile(r"<U\d{1,5}")
 
 
 def read_npy(data: Any, limits: Limits) -> Any:
-    """Return the array in the bytes of an .npy file as a read-only view; an array of text as a list."""
+    """Return the array in the bytes of an .npy file as a read-only view; an array of text as a
+    list.
+    """
     if not isinstance(data, bytes) or not data.startswith(_NPY) or len(data) < 12:
         raise MalformedMessage("gr00t: as_npy: not an .npy file")
     start = 12 if data[6] > 1 else 10
@@ -266,7 +334,11 @@ def read_npy(data: Any, limits: Limits) -> Any:
             return np.frombuffer(content, dtype).reshape(shape).tolist()
         except (ValueError, SystemError) as error:
             raise MalformedMessage("gr00t: an array of text that is none") from error
-    return read_array(content, dtype, shape[::-1]).T if by_columns else read_array(content, dtype, shape)
+    return (
+        read_array(content, dtype, shape[::-1]).T
+        if by_columns
+        else read_array(content, dtype, shape)
+    )
 
 
 def _array(node: dict[Any, Any], limits: Limits) -> Any:
@@ -285,22 +357,28 @@ def write_npy(value: Any) -> dict[str, Any]:
     raise TypeError(f"gr00t: cannot send {type(value).__name__}")
 
 
-# Mappings of GR00T's clients; the names of an action's columns depend on the robot, so a deployment adds `action`.
+# Mappings of GR00T's clients; the names of an action's columns depend on the robot, so a deployment
+# adds `action`.
 
 PRESETS: dict[str, dict[str, Any]] = {
-    # N1.6 and newer: {"video": {k: (1, T, H, W, 3)}, "state": {k: (1, T, D)}, "language": {"task": [[text]]}}
+    # N1.6 and newer: {"video": {k: (1, T, H, W, 3)}, "state": {k: (1, T, D)}, "language": {"task":
+    # [[text]]}}
     "gr00t": {"cameras": {"*": "video/*"}, "state": {"*": "state/*"}, "instruction": "language/*"},
     # N1.5 has the same content with flat keys
-    "gr00t-n1.5": {"cameras": {"*": "video.*"}, "state": {"*": "state.*"}, "instruction": "annotation.human.*"},
+    "gr00t-n1.5": {
+        "cameras": {"*": "video.*"},
+        "state": {"*": "state.*"},
+        "instruction": "annotation.human.*",
+    },
 }
 
 
 # The client's side of GR00T's protocol: writing requests, and reading replies within limits.
 #
-# N1.5's clients send flat keys and receive only the action; those of N1.6 and newer send `{"observation": {...},
-# "options": None}` and receive `[action, info]`. The observation is nested, or flat for servers that run with
-# `--use-sim-policy-wrapper`. A server that marks its modalities with `__ModalityConfig__` reads arrays of
-# `msgpack_numpy`.
+# N1.5's clients send flat keys and receive only the action; those of N1.6 and newer send
+# `{"observation": {...}, "options": None}` and receive `[action, info]`. The observation is nested,
+# or flat for servers that run with `--use-sim-policy-wrapper`. A server that marks its modalities
+# with `__ModalityConfig__` reads arrays of `msgpack_numpy`.
 
 _KEYS_AT_MOST = 64
 _PACKED = "__ModalityConfig__"  # older servers write `__ModalityConfig_class__`
@@ -310,18 +388,22 @@ def batch(observations: Sequence[Mapping[str, Any]], text_key: str) -> dict[str,
     """Stack observations of one moment each into a batch.
 
     Args:
-        observations: For each, {"video": {name: (H, W, 3)}, "state": {name: (D,)}, "language": {"task": text}}.
+        observations: For each, {"video": {name: (H, W, 3)}, "state": {name: (D,)}, "language":
+            {"task": text}}.
         text_key: The server's name of the instruction.
 
     Returns:
-        {"video": {name: (B, 1, H, W, 3)}, "state": {name: (B, 1, D)}, "language": {text_key: B lists of one text}}.
+        {"video": {name: (B, 1, H, W, 3)}, "state": {name: (B, 1, D)}, "language": {text_key: B
+        lists of one text}}.
 
     Raises:
         ValueError: The observations have different keys or shapes, and cannot be one batch.
     """
     first = observations[0]
     kinds = {kind: list(first.get(kind, {})) for kind in _ARRAYS}
-    if any(list(one.get(kind, {})) != names for one in observations for kind, names in kinds.items()):
+    if any(
+        list(one.get(kind, {})) != names for one in observations for kind, names in kinds.items()
+    ):
         raise ValueError("the observations have different keys")
     joined: dict[str, Any] = {
         kind: {name: np.stack([one[kind][name] for one in observations])[:, None] for name in names}
@@ -332,31 +414,43 @@ def batch(observations: Sequence[Mapping[str, Any]], text_key: str) -> dict[str,
 
 
 def flat(batched: Mapping[str, Any]) -> dict[str, Any]:
-    """Convert a batch to flat keys: `video.NAME`, `state.NAME`, and the instruction's own key with B texts."""
+    """Convert a batch to flat keys: `video.NAME`, `state.NAME`, and the instruction's own key
+    with B texts.
+    """
     named = {f"{kind}.{name}": array for kind in _ARRAYS for name, array in batched[kind].items()}
     return named | {key: [text for [text] in texts] for key, texts in batched["language"].items()}
 
 
 def write(endpoint: str, data: Any, api_token: str | None, *, packed: bool = False) -> bytes:
-    """Return the message of a request; `data` is omitted if it is None; `packed` is the result of `reads_packed`."""
+    """Return the message of a request; `data` is omitted if it is None; `packed` is the result
+    of `reads_packed`.
+    """
     message = {"endpoint": endpoint} | ({} if data is None else {"data": data})
     return pack(message | ({"api_token": api_token} if api_token else {}), packed=packed)
 
 
 def read(payload: bytes, limits: Limits = DEFAULT_LIMITS) -> Any:
-    """Return the value of a reply; raise `MalformedMessage` or `MessageTooLarge` if it is invalid."""
+    """Return the value of a reply; raise `MalformedMessage` or `MessageTooLarge` if it is
+    invalid.
+    """
     return msgpack.unpack(payload, limits, partial(_array, limits=limits))
 
 
 def read_actions(reply: Any, number: int) -> list[dict[str, np.ndarray]]:
-    """Return the actions of each of `number` observations by name, (H, D), in a reply to `get_action`."""
+    """Return the actions of each of `number` observations by name, (H, D), in a reply to
+    `get_action`.
+    """
     actions = reply[0] if isinstance(reply, list) and len(reply) == 2 else reply
     if not isinstance(actions, dict) or not actions:
-        raise MalformedMessage(f"gr00t: got {type(actions).__name__} for an action, want a map of arrays")
+        raise MalformedMessage(
+            f"gr00t: got {type(actions).__name__} for an action, want a map of arrays"
+        )
     for name, array in actions.items():
         is_array = isinstance(name, str) and isinstance(array, np.ndarray)
         if not is_array or array.ndim not in (2, 3) or len(array) != number:
-            raise MalformedMessage(f"gr00t: action {shown(name)}: got {described(array)}, want ({number}, H, D)")
+            raise MalformedMessage(
+                f"gr00t: action {shown(name)}: got {described(array)}, want ({number}, H, D)"
+            )
     return [
         {
             name.removeprefix("action."): array[i] if array.ndim == 3 else array[i][:, np.newaxis]
@@ -367,15 +461,24 @@ def read_actions(reply: Any, number: int) -> list[dict[str, np.ndarray]]:
 
 
 def reads_packed(reply: Any) -> bool:
-    """Return whether the reply to `get_modality_config` is from a server that reads arrays of `msgpack_numpy`."""
-    return isinstance(reply, dict) and any(isinstance(one, dict) and _PACKED in one for one in reply.values())
+    """Return whether the reply to `get_modality_config` is from a server that reads arrays of
+    `msgpack_numpy`.
+    """
+    return isinstance(reply, dict) and any(
+        isinstance(one, dict) and _PACKED in one for one in reply.values()
+    )
 
 
 def read_modalities(reply: Any) -> dict[str, dict[str, list[Any]]]:
-    """Return "keys" and "steps" by modality in the reply to `get_modality_config`; keys lack the prefix `video.`."""
+    """Return "keys" and "steps" by modality in the reply to `get_modality_config`; keys lack the
+    prefix `video.`.
+    """
     if not isinstance(reply, dict):
         raise MalformedMessage(f"gr00t: got {type(reply).__name__} for modalities, want a map")
-    return {str(name): _modality(str(name), value) for name, value in list(reply.items())[:_KEYS_AT_MOST]}
+    return {
+        str(name): _modality(str(name), value)
+        for name, value in list(reply.items())[:_KEYS_AT_MOST]
+    }
 
 
 def _modality(name: str, value: Any) -> dict[str, list[Any]]:
@@ -388,9 +491,15 @@ def _modality(name: str, value: Any) -> dict[str, list[Any]]:
     keys = config.get("modality_keys") if isinstance(config, dict) else None
     steps = config.get("delta_indices") if isinstance(config, dict) else None
     if not isinstance(keys, list) or not isinstance(steps, list):
-        raise MalformedMessage(f"gr00t: modality {name[:40]!r}: want lists modality_keys and delta_indices")
-    if not all(isinstance(key, str) for key in keys) or not all(type(step) is int for step in steps):
-        raise MalformedMessage(f"gr00t: modality {name[:40]!r}: want texts and whole numbers in its lists")
+        raise MalformedMessage(
+            f"gr00t: modality {name[:40]!r}: want lists modality_keys and delta_indices"
+        )
+    if not all(isinstance(key, str) for key in keys) or not all(
+        type(step) is int for step in steps
+    ):
+        raise MalformedMessage(
+            f"gr00t: modality {name[:40]!r}: want texts and whole numbers in its lists"
+        )
     if name != "language":
         keys = [key.removeprefix(f"{name}.") for key in keys]
     return {"keys": keys[:_KEYS_AT_MOST], "steps": steps}

@@ -1,24 +1,29 @@
-"""The part of HTTP/2 that bounds what a client's frames cost gRPC's library: its preface, and the heads of frames."""
+"""The part of HTTP/2 that bounds what a client's frames cost gRPC's library: its preface, and
+the heads of frames.
+"""
 
 from __future__ import annotations
 
 PREFACE = b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n"
 _HEAD_BYTES = 9
 _SIZE_BYTES = 3  # of the payload, at the begin of a head
-# The cost of a frame with a larger payload is that of its bytes. Clients send messages in frames of 16 KiB.
+# The cost of a frame with a larger payload is that of its bytes. Clients send messages in frames of
+# 16 KiB.
 _SMALL_BYTES = 4096
 
 
 class FrameCounter:
     """Counts the small frames in the bytes that a client sends after its preface.
 
-    Control frames (PING, SETTINGS, WINDOW_UPDATE), begun and cancelled requests, and messages in tiny parts are all
-    small frames: they cost their sender a few bytes each, and gRPC's library up to a new connection.
+    Control frames (PING, SETTINGS, WINDOW_UPDATE), begun and cancelled requests, and messages in
+    tiny parts are all small frames: they cost their sender a few bytes each, and gRPC's library up
+    to a new connection.
     """
 
     def __init__(self) -> None:
         self._head = b""  # the part of a frame's head that has arrived
-        self._payload_left = 0  # number of bytes of the current frame's payload that have not arrived
+        # Number of bytes of the current frame's payload that have not arrived.
+        self._payload_left = 0
 
     def count(self, data: bytes) -> int:
         """Return the number of small frames whose heads end in the next bytes of a client."""

@@ -1,4 +1,6 @@
-"""Parts of mappings that clients of several systems share: the layouts of LIBERO's and ALOHA's vectors."""
+"""Parts of mappings that clients of several systems share: the layouts of LIBERO's and ALOHA's
+vectors.
+"""
 
 from __future__ import annotations
 
@@ -17,10 +19,13 @@ ALOHA_ACTION = [{"index": 6}, {"index": 13}]
 def libero_state(key: str) -> dict[str, Any]:
     """Return the mapping of LIBERO's state, which a client sends under `key`.
 
-    The state contains the end effector's pose in the robot's base frame (position in m, axis-angle in rad) and two
-    finger joints, 0.04 m when open.
+    The state contains the end effector's pose in the robot's base frame (position in m, axis-angle
+    in rad) and two finger joints, 0.04 m when open.
     """
     return {
-        "state": {"xyz_axis_angle": {"key": key, "stop": 6}, "gripper_qpos": {"key": key, "start": 6, "stop": 8}},
+        "state": {
+            "xyz_axis_angle": {"key": key, "stop": 6},
+            "gripper_qpos": {"key": key, "start": 6, "stop": 8},
+        },
         "gripper": {"key": key, "index": 6, "open": 0.04, "closed": 0.0},
     }

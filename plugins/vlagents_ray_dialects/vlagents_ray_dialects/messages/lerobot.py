@@ -1,8 +1,10 @@
-"""The pickled messages of LeRobot's asynchronous inference: policy instructions, observations and chunks of actions.
+"""The pickled messages of LeRobot's asynchronous inference: policy instructions, observations and
+chunks of actions.
 
-Sources: `async_inference/helpers.py` and `robot_client.py` of LeRobot 0.4.4, which are equivalent in 0.6.1. A
-client pickles its data classes. They are read as data, see `pickles`, and the chunk is written as a pickle that refers
-to the client's own `TimedAction` and `torch.tensor`.
+Sources: `async_inference/helpers.py` and `robot_client.py` of LeRobot 0.4.4, which are equivalent
+    in 0.6.1. A
+client pickles its data classes. They are read as data, see `pickles`, and the chunk is written as a
+pickle that refers to the client's own `TimedAction` and `torch.tensor`.
 """
 
 from __future__ import annotations
@@ -16,7 +18,13 @@ from typing import Any
 
 import numpy as np
 
-from vlagents_ray.errors import InvalidObservation, MalformedMessage, MessageTooLarge, MissingCamera, MissingState
+from vlagents_ray.errors import (
+    InvalidObservation,
+    MalformedMessage,
+    MessageTooLarge,
+    MissingCamera,
+    MissingState,
+)
 from vlagents_ray.protocol.frame_layout import Buffer
 from vlagents_ray.protocol.messages import Budget, Limits
 from vlagents_ray.protocol.values import is_number
@@ -26,10 +34,15 @@ HELPERS = "lerobot.async_inference.helpers"
 SETUP, OBSERVATION = Name(HELPERS, "RemotePolicyConfig"), Name(HELPERS, "TimedObservation")
 _REQUESTS: Mapping[Name, Sequence[str]] = {
     SETUP: (
-        "policy_type", "pretrained_name_or_path", "lerobot_features", "actions_per_chunk", "device", "rename_map",
+        "policy_type",
+        "pretrained_name_or_path",
+        "lerobot_features",
+        "actions_per_chunk",
+        "device",
+        "rename_map",
     ),
     OBSERVATION: ("timestamp", "timestep", "observation", "must_go"),
-}  # fmt: skip
+}
 _STEPS = 2**31  # time steps fit into a pickle's plain integers
 _SHOWN = 40  # largest number of a client's keys in an error, and of characters of each
 
@@ -54,39 +67,57 @@ class RobotObservation:
 
 
 def read_instructions(data: Buffer, limits: Limits) -> PolicyInstructions:
-    """Return the policy instructions in a pickle; raises `InvalidObservation` for features that are not served."""
+    """Return the policy instructions in a pickle; raises `InvalidObservation` for features that
+    are not served.
+    """
     stated = _pickled_fields(data, limits, SETUP)
-    policy_type, checkpoint = (_text(stated, name) for name in ("policy_type", "pretrained_name_or_path"))
-    rows, features, renames = (stated[name] for name in ("actions_per_chunk", "lerobot_features", "rename_map"))
+    policy_type, checkpoint = (
+        _text(stated, name) for name in ("policy_type", "pretrained_name_or_path")
+    )
+    rows, features, renames = (
+        stated[name] for name in ("actions_per_chunk", "lerobot_features", "rename_map")
+    )
     if type(rows) is not int or rows < 1:
-        raise MalformedMessage(f"actions_per_chunk: got {_shown(rows)}, want an integer of 1 or more")
+        raise MalformedMessage(
+            f"actions_per_chunk: got {_shown(rows)}, want an integer of 1 or more"
+        )
     if not (isinstance(features, dict) and isinstance(renames, dict)):
-        raise MalformedMessage(f"lerobot_features, rename_map: got {_shown(features)}, {_shown(renames)}, want dicts")
+        raise MalformedMessage(
+            f"lerobot_features, rename_map: got {_shown(features)}, {_shown(renames)}, want dicts"
+        )
     if renames:
-        raise InvalidObservation("rename_map: got names, want none; rename them in dialects.lerobot.mapping")
+        raise InvalidObservation(
+            "rename_map: got names, want none; rename them in dialects.lerobot.mapping"
+        )
     state: tuple[str, ...] = ()
     for name, feature in features.items():
         if not isinstance(feature, dict):
-            raise MalformedMessage(f"lerobot_features: {name[:_SHOWN]!r}: got {_shown(feature)}, want a dict")
+            raise MalformedMessage(
+                f"lerobot_features: {name[:_SHOWN]!r}: got {_shown(feature)}, want a dict"
+            )
         kind = _text(feature, "dtype")
         if name == STATE and kind == "float32":
             state = _names(feature)
         elif not (name.startswith(IMAGES) and kind in ("image", "video")):
             raise InvalidObservation(
-                f"lerobot_features: got {name[:_SHOWN]!r} of {kind[:_SHOWN]!r}, want {STATE!r} of float32, and "
+                f"lerobot_features: got {name[:_SHOWN]!r} of {kind[:_SHOWN]!r}, want {STATE!r} of "
+                "float32, and "
                 f"images {IMAGES + 'NAME'!r}"
             )
     cameras = tuple(name.removeprefix(IMAGES) for name in features if name != STATE)
     if len(cameras) > limits.cameras or len(state) > limits.state_values:
         raise MessageTooLarge(
-            f"lerobot_features: got {len(cameras)} cameras and {len(state)} numbers of state, the limits are "
+            f"lerobot_features: got {len(cameras)} cameras and {len(state)} numbers of state, the "
+            "limits are "
             f"{limits.cameras} and {limits.state_values}"
         )
     return PolicyInstructions(policy_type, checkpoint, state, cameras, rows)
 
 
 def read_observation(data: Buffer, budget: Budget) -> RobotObservation:
-    """Return the observation in a pickle; its arrays are views of the pickle, and count in `budget`."""
+    """Return the observation in a pickle; its arrays are views of the pickle, and count in
+    `budget`.
+    """
     stated = _pickled_fields(data, budget.limits, OBSERVATION)
     timestamp, timestep, values, must_go = (stated[name] for name in _REQUESTS[OBSERVATION])
     if not is_number(timestamp) or not math.isfinite(timestamp):
@@ -102,19 +133,23 @@ def read_observation(data: Buffer, budget: Budget) -> RobotObservation:
             budget.count(value.nbytes)
         elif not (isinstance(value, (str, bool)) or is_number(value)):
             raise MalformedMessage(
-                f"observation: {name[:_SHOWN]!r}: got {_shown(value)}, want a number, text or numpy array"
+                f"observation: {name[:_SHOWN]!r}: got {_shown(value)}, want a number, text or "
+                "numpy array"
             )
     return RobotObservation(float(timestamp), timestep, values, must_go)
 
 
 def frame(observation: RobotObservation, robot: PolicyInstructions) -> dict[str, Any]:
-    """Convert an observation to LeRobot's names, as LeRobot's own server does before it calls a policy.
+    """Convert an observation to LeRobot's names, as LeRobot's own server does before it calls a
+    policy.
 
     Returns:
-        `observation.state`, (D,) float32, in the order of the robot's features, `observation.images.NAME`, and `task`.
+        `observation.state`, (D,) float32, in the order of the robot's features,
+        `observation.images.NAME`, and `task`.
 
     Raises:
-        MissingState, MissingCamera: The observation lacks a feature that the policy instructions state.
+        MissingState, MissingCamera: The observation lacks a feature that the policy instructions
+        state.
         InvalidObservation: A value of the state is not a number.
     """
     values = observation.values
@@ -145,8 +180,9 @@ def frame(observation: RobotObservation, robot: PolicyInstructions) -> dict[str,
 def write_chunk(rows: np.ndarray, timestamp: float, timestep: int, period_s: float) -> bytes:
     """Return the pickle of a chunk: a list of `TimedAction`, which the client unpickles.
 
-    The pickle has the form that LeRobot's server writes, except that each tensor is a call of `torch.tensor` with its
-    float32 numbers, which needs neither torch here nor an archive within the pickle.
+    The pickle has the form that LeRobot's server writes, except that each tensor is a call of
+    `torch.tensor` with its float32 numbers, which needs neither torch here nor an archive within
+    the pickle.
 
     Args:
         rows: The chunk, (H, D) float32.
@@ -155,7 +191,9 @@ def write_chunk(rows: np.ndarray, timestamp: float, timestep: int, period_s: flo
         period_s: Time between two actions, s.
     """
     if timestep + len(rows) > _STEPS:
-        raise InvalidObservation(f"timestep: got {timestep}, which leaves no numbers for {len(rows)} actions")
+        raise InvalidObservation(
+            f"timestep: got {timestep}, which leaves no numbers for {len(rows)} actions"
+        )
     parts = [b"\x80\x02", _global(0, HELPERS, "TimedAction"), _global(1, "torch", "tensor"), b"]("]
     for number, row in enumerate(rows):
         values = b"".join(b"G" + struct.pack(">d", value) for value in row.tolist())
@@ -191,7 +229,9 @@ def _text(stated: Mapping[str, Any], name: str) -> str:
 
 
 def _shown(value: object) -> str:
-    """Return a client's value for an error message: a number, or the type of anything else, whatever its size."""
+    """Return a client's value for an error message: a number, or the type of anything else,
+    whatever its size.
+    """
     return repr(value) if is_number(value) else type(value).__name__
 
 
@@ -204,8 +244,9 @@ def _names(feature: Mapping[str, Any]) -> tuple[str, ...]:
 
 # The protobuf messages of LeRobot's `AsyncInference` service, read and written by hand.
 #
-# Source: `transport/services.proto` of LeRobot 0.4.4 and 0.6.1. `Observation` has the field 1, `transfer_state`, and
-# the field 2, `data`; `PolicySetup` and `Actions` have the field 1, `data`; `Empty` has none.
+# Source: `transport/services.proto` of LeRobot 0.4.4 and 0.6.1. `Observation` has the field 1,
+# `transfer_state`, and the field 2, `data`; `PolicySetup` and `Actions` have the field 1, `data`;
+# `Empty` has none.
 
 SERVICE = "transport.AsyncInference"
 _VARINT, _FIXED64, _BYTES, _FIXED32 = 0, 1, 2, 5  # types of fields
@@ -221,7 +262,9 @@ class TransferState(enum.IntEnum):
 
 
 def read_observation_part(message: bytes) -> tuple[TransferState, memoryview]:
-    """Return the content of an `Observation`, a part of a pickle; raise `MalformedMessage` for anything else."""
+    """Return the content of an `Observation`, a part of a pickle; raise `MalformedMessage` for
+    anything else.
+    """
     number, data = 0, memoryview(b"")
     for field, value in _protobuf_fields(message):
         if field == 1 and isinstance(value, int):
@@ -231,13 +274,17 @@ def read_observation_part(message: bytes) -> tuple[TransferState, memoryview]:
     try:
         return TransferState(number), data
     except ValueError as error:
-        raise MalformedMessage(f"observation: got transfer state {number}, want 1, 2 or 3") from error
+        raise MalformedMessage(
+            f"observation: got transfer state {number}, want 1, 2 or 3"
+        ) from error
 
 
 def read_data(message: bytes) -> memoryview | None:
     """Return the pickle in a `PolicySetup` or an `Actions`; None if it has none."""
     fields = _protobuf_fields(message)
-    return next((value for field, value in fields if field == 1 and isinstance(value, memoryview)), None)
+    return next(
+        (value for field, value in fields if field == 1 and isinstance(value, memoryview)), None
+    )
 
 
 def write_data(data: bytes) -> bytes:
@@ -253,7 +300,9 @@ EMPTY = b""  # an `Empty`, and an `Actions` without a pickle
 
 
 def _protobuf_fields(message: bytes) -> Iterator[tuple[int, int | memoryview]]:
-    """Yield the number and the value of each field that is a number or bytes; other fields are skipped."""
+    """Yield the number and the value of each field that is a number or bytes; other fields are
+    skipped.
+    """
     view, at = memoryview(message), 0
     while at < len(view):
         key, at = _varint(view, at)
@@ -282,7 +331,8 @@ def _varint(view: memoryview, at: int) -> tuple[int, int]:
     raise MalformedMessage("protobuf: a number that ends too early")
 
 
-# The mapping of LeRobot's robots: the names of its datasets, to which its own server converts a robot's names.
+# The mapping of LeRobot's robots: the names of its datasets, to which its own server converts a
+# robot's names.
 
 STATE, IMAGES, TASK = "observation.state", "observation.images.", "task"
 

@@ -1,7 +1,7 @@
 """A reader of msgpack with limits, for the messages of other systems; our own messages are frames.
 
-A short message can need much memory (each byte may be an empty list). Values are therefore counted while they are
-read, and reading stops at the limit.
+A short message can need much memory (each byte may be an empty list). Values are therefore counted
+while they are read, and reading stops at the limit.
 """
 
 from __future__ import annotations
@@ -25,8 +25,9 @@ def unpack(data: bytes | memoryview, limits: Limits, hook: Hook, text: int | Non
 
     Args:
         limits: The limits of its size, its number of values and their nesting.
-        hook: Receives each map, innermost first, and returns the value that replaces it. Values of a list that it
-            returns, such as an array of text, also count; the hook itself limits them to `limits.items`.
+        hook: Receives each map, innermost first, and returns the value that replaces it. Values of
+            a list that it returns, such as an array of text, also count; the hook itself limits
+            them to `limits.items`.
         text: Largest size of one text, bytes; None if the limit of the message is enough.
 
     Raises:
@@ -43,7 +44,9 @@ def unpack(data: bytes | memoryview, limits: Limits, hook: Hook, text: int | Non
         nonlocal count
         count += len(values) + 1
         if count > limits.items:
-            raise MessageTooLarge(f"message: more than {limits.items} values; send arrays instead of lists")
+            raise MessageTooLarge(
+                f"message: more than {limits.items} values; send arrays instead of lists"
+            )
         return values
 
     def hooked(values: dict[Any, Any]) -> Any:
@@ -70,13 +73,17 @@ def unpack(data: bytes | memoryview, limits: Limits, hook: Hook, text: int | Non
     except (msgpack.exceptions.UnpackException, ValueError, TypeError, OverflowError) as error:
         if "exceeds max_" in str(error):  # msgpack has no error class for this
             raise MessageTooLarge(f"message: {error}; send arrays instead of lists") from error
-        raise MalformedMessage(f"message: no msgpack ({type(error).__name__}: {str(error)[:100]})") from error
+        raise MalformedMessage(
+            f"message: no msgpack ({type(error).__name__}: {str(error)[:100]})"
+        ) from error
     require_plain(value, limits.depth)
     return value
 
 
 def pack(value: Any, default: Callable[[Any], Any]) -> bytes:
-    """Return `value` as msgpack; `default` converts types that msgpack does not support, such as arrays, to maps."""
+    """Return `value` as msgpack; `default` converts types that msgpack does not support, such as
+    arrays, to maps.
+    """
     packed: bytes = require("msgpack").packb(value, default=default)
     return packed
 
@@ -94,7 +101,10 @@ def is_packed(node: Mapping[Any, Any]) -> bool:
 
 def read_packed(node: Mapping[Any, Any]) -> np.ndarray:
     """Return the array in a map of `msgpack_numpy` as a read-only view."""
-    found = {(key.decode(errors="replace") if isinstance(key, bytes) else key): item for key, item in node.items()}
+    found = {
+        (key.decode(errors="replace") if isinstance(key, bytes) else key): item
+        for key, item in node.items()
+    }
     dtype, shape, data = found.get("type"), found.get("shape"), found.get("data")
     if not isinstance(data, bytes) or found.get("kind") not in (None, "", b""):
         raise MalformedMessage("array: nd: want bytes of a plain array")

@@ -18,7 +18,9 @@ from vlagents_ray_dialects.messages.msgpack import pack, unpack
 
 
 def decode(data: bytes, limits: Limits = DEFAULT_LIMITS) -> dict[str, Any]:
-    """Return the map in a message; arrays are read-only views, and an array of text becomes a list."""
+    """Return the map in a message; arrays are read-only views, and an array of text becomes a
+    list.
+    """
     value = decode_any(data, limits)
     if not isinstance(value, dict):
         raise MalformedMessage(f"message: got {type(value).__name__}, want a map")
@@ -56,7 +58,9 @@ def _array(node: dict[Any, Any], most: int) -> Any:
 
 
 def _texts(data: bytes, dtype: str, most: int) -> list[str]:
-    """Return an array of at most `most` texts as a flat list; some clients send a prompt in this form."""
+    """Return an array of at most `most` texts as a flat list; some clients send a prompt in this
+    form.
+    """
     length = dtype.removeprefix("<U")
     size = 4 * int(length) if length.isascii() and length.isdigit() and len(length) < 9 else 0
     if not size or len(data) % size:
@@ -64,14 +68,22 @@ def _texts(data: bytes, dtype: str, most: int) -> list[str]:
     if len(data) // size > most:
         raise MessageTooLarge(f"array: got {len(data) // size} texts, want {most} more at most")
     try:
-        return [data[at : at + size].decode("utf-32-le").rstrip("\0") for at in range(0, len(data), size)]
+        return [
+            data[at : at + size].decode("utf-32-le").rstrip("\0")
+            for at in range(0, len(data), size)
+        ]
     except UnicodeDecodeError as error:
         raise MalformedMessage(f"array: no text ({error.reason})") from error
 
 
 def _node(value: Any) -> Any:
     if isinstance(value, np.ndarray) and value.dtype.kind in "biuf":
-        return {b"__ndarray__": True, b"data": value.tobytes(), b"dtype": value.dtype.str, b"shape": value.shape}
+        return {
+            b"__ndarray__": True,
+            b"data": value.tobytes(),
+            b"dtype": value.dtype.str,
+            b"shape": value.shape,
+        }
     if isinstance(value, np.generic) and value.dtype.kind in "biuf":
         return value.item()
     if isinstance(value, Mapping):
@@ -81,8 +93,9 @@ def _node(value: Any) -> Any:
 
 # Mappings of openpi's example clients, and of RoboArena's.
 #
-# openpi's servers accept images as (H, W, 3) or (3, H, W), in uint8 or floats in [0, 1]: see `_parse_image` in its
-# src/openpi/policies/libero_policy.py and droid_policy.py, and `convert_image` in aloha_policy.py.
+# openpi's servers accept images as (H, W, 3) or (3, H, W), in uint8 or floats in [0, 1]: see
+# `_parse_image` in its src/openpi/policies/libero_policy.py and droid_policy.py, and
+# `convert_image` in aloha_policy.py.
 
 PRESETS: dict[str, dict[str, Any]] = {
     # openpi, examples/libero/main.py
@@ -125,7 +138,11 @@ ROBOARENA: dict[str, dict[str, Any]] = {
     | {
         "cameras": {
             "front": {"key": "observation/exterior_image_0_left", "layout": "any"},
-            "front_2": {"key": "observation/exterior_image_1_left", "layout": "any", "optional": True},
+            "front_2": {
+                "key": "observation/exterior_image_1_left",
+                "layout": "any",
+                "optional": True,
+            },
             "wrist": {"key": "observation/wrist_image_left", "layout": "any", "optional": True},
         },
         "info": {"session_id": "session_id"},

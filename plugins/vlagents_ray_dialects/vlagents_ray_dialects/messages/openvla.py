@@ -1,7 +1,8 @@
 """OpenVLA's REST bodies: JSON with arrays in the format of `json-numpy`, encoded once or twice.
 
-`{"__numpy__": base64, "dtype": "|u1", "shape": [H, W, 3]}` is an array. Clients that do not patch their json module
-encode twice: a request is `{"encoded": "<the JSON>"}` and its reply a JSON string that contains the JSON.
+`{"__numpy__": base64, "dtype": "|u1", "shape": [H, W, 3]}` is an array. Clients that do not patch
+their json module encode twice: a request is `{"encoded": "<the JSON>"}` and its reply a JSON string
+that contains the JSON.
 """
 
 from __future__ import annotations
@@ -30,7 +31,9 @@ def decode(body: bytes, limits: Limits = DEFAULT_LIMITS) -> tuple[dict[str, Any]
     return payload, twice
 
 
-def encode(value: np.ndarray | Sequence[np.ndarray] | Mapping[str, Any], twice: bool = False) -> bytes:
+def encode(
+    value: np.ndarray | Sequence[np.ndarray] | Mapping[str, Any], twice: bool = False
+) -> bytes:
     """Return the body with an action or an observation."""
     text = json_numpy.dumps(value)
     return (json.dumps(text) if twice else text).encode()
@@ -44,7 +47,9 @@ def _load(text: bytes, limits: Limits) -> dict[str, Any]:
 
 
 def decode_action(body: bytes, limits: Limits = DEFAULT_LIMITS) -> np.ndarray | None:
-    """Return the action in a reply, (D,) or (H, D); None if the reply is "error", the error of OpenVLA's own server."""
+    """Return the action in a reply, (D,) or (H, D); None if the reply is "error", the error of
+    OpenVLA's own server.
+    """
     value = json_numpy.loads(body, limits)
     if isinstance(value, str) and value != "error":  # encoded twice
         value = json_numpy.loads(value, limits)
@@ -53,7 +58,9 @@ def decode_action(body: bytes, limits: Limits = DEFAULT_LIMITS) -> np.ndarray | 
     if isinstance(value, list):
         value = json_numpy.rows(value)
     if not isinstance(value, np.ndarray):
-        raise MalformedMessage(f"action: got {type(value).__name__}, want an array, or a list of rows")
+        raise MalformedMessage(
+            f"action: got {type(value).__name__}, want an array, or a list of rows"
+        )
     return value
 
 
@@ -67,8 +74,9 @@ PRESETS: dict[str, dict[str, Any]] = {
         "info": {"unnorm_key": "unnorm_key"},
         "action_gripper": {"index": 6, "open": 1.0, "closed": 0.0},
     },
-    # openvla-oft: observations as in experiments/robot/libero; vla-scripts/deploy.py replies with the model's output, 1
-    # = open, which its clients convert to LIBERO's -1 themselves (normalize_gripper_action, invert_gripper_action)
+    # openvla-oft: observations as in experiments/robot/libero; vla-scripts/deploy.py replies with
+    # the model's output, 1 = open, which its clients convert to LIBERO's -1 themselves
+    # (normalize_gripper_action, invert_gripper_action)
     "openvla-oft": {
         "cameras": {"front": "full_image", "wrist": {"key": "wrist_image", "optional": True}},
         **libero_state("state"),

@@ -1,12 +1,15 @@
-"""Pickles of a few known shapes, whose opcodes are read as data: nothing is unpickled, looked up or imported.
+"""Pickles of a few known shapes, whose opcodes are read as data: nothing is unpickled, looked up or
+imported.
 
-A pickle is a program for a stack machine, and its dangerous opcodes import and call any name in it. This reader has
-no such opcode: a pair of module and name is compared, as text, with the closed lists of its caller, whose entries
-represent the caller's own functions. An opcode, a name or a shape that is not listed is refused.
+A pickle is a program for a stack machine, and its dangerous opcodes import and call any name in it.
+This reader has no such opcode: a pair of module and name is compared, as text, with the closed
+lists of its caller, whose entries represent the caller's own functions. An opcode, a name or a
+shape that is not listed is refused.
 
-The opcodes are those that Python's own pickler writes in protocol 4 and 5 for dicts, lists, tuples, texts, numbers,
-numpy's arrays and data classes. `Limits` bound the number of opcodes (`items`), the nesting (`depth`) and the texts.
-Bytes are not copied, so that arrays take no memory beyond that of the message.
+The opcodes are those that Python's own pickler writes in protocol 4 and 5 for dicts, lists, tuples,
+texts, numbers, numpy's arrays and data classes. `Limits` bound the number of opcodes (`items`), the
+nesting (`depth`) and the texts. Bytes are not copied, so that arrays take no memory beyond that of
+the message.
 """
 
 from __future__ import annotations
@@ -51,7 +54,9 @@ class Reduced:
 
 
 Call = Callable[[tuple[Any, ...]], "Reduced | int | float"]
-"""Returns the value of a call in a pickle, given its arguments; raises `MalformedMessage` for invalid ones."""
+"""Returns the value of a call in a pickle, given its arguments; raises `MalformedMessage` for
+invalid ones.
+"""
 
 
 class _StackValue(NamedTuple):
@@ -61,25 +66,33 @@ class _StackValue(NamedTuple):
 
 
 def read_pickle(
-    data: Buffer, limits: Limits, records: Mapping[Name, Sequence[str]], calls: Mapping[Name, Call | None]
+    data: Buffer,
+    limits: Limits,
+    records: Mapping[Name, Sequence[str]],
+    calls: Mapping[Name, Call | None],
 ) -> Any:
     """Return the object in a pickle; an object of a data class may lack some of its fields.
 
     Args:
         data: The pickle. Arrays of the result are views of its memory.
-        limits: Limits of the number of opcodes (`items`), of nesting (`depth`) and of texts (`text`).
+        limits: Limits of the number of opcodes (`items`), of nesting (`depth`) and of texts
+            (`text`).
         records: The data classes that may occur, with the names of their fields.
-        calls: The functions that may occur, with our replacements; None for a class that is only an argument.
+        calls: The functions that may occur, with our replacements; None for a class that is only an
+            argument.
 
     Raises:
-        MalformedMessage: The bytes are not a pickle, or contain an opcode, name or shape that is not listed.
+        MalformedMessage: The bytes are not a pickle, or contain an opcode, name or shape that is
+            not listed.
         MessageTooLarge: The pickle exceeds a limit.
     """
     return _StackMachine(data, limits, records, calls).whole()
 
 
 def fields_of(value: Any, wanted: Name) -> dict[str, Any]:
-    """Return the fields of an object of a data class; raise `MalformedMessage` for anything else."""
+    """Return the fields of an object of a data class; raise `MalformedMessage` for anything
+    else.
+    """
     if not isinstance(value, Record) or value.name != wanted or value.fields is None:
         raise MalformedMessage(f"pickle: got {_kind(value)}, want a {wanted.name} with its fields")
     return value.fields
@@ -89,7 +102,11 @@ class _StackMachine:
     """A stack machine without calls."""
 
     def __init__(
-        self, data: Buffer, limits: Limits, records: Mapping[Name, Sequence[str]], calls: Mapping[Name, Call | None]
+        self,
+        data: Buffer,
+        limits: Limits,
+        records: Mapping[Name, Sequence[str]],
+        calls: Mapping[Name, Call | None],
     ) -> None:
         self._data = memoryview(data)
         self._at = 0
@@ -101,7 +118,9 @@ class _StackMachine:
 
     def whole(self) -> Any:
         if self.take(1)[0] != _PROTO or self.take(1)[0] not in _PROTOCOLS:
-            raise MalformedMessage(f"pickle: want one of protocol {_PROTOCOLS[0]} or {_PROTOCOLS[1]}")
+            raise MalformedMessage(
+                f"pickle: want one of protocol {_PROTOCOLS[0]} or {_PROTOCOLS[1]}"
+            )
         while (opcode := self.take(1)[0]) != _STOP:
             self._count(1)
             if (read := _OPCODES.get(opcode)) is None:
@@ -130,7 +149,9 @@ class _StackMachine:
 
     def text(self, length: int) -> None:
         if length > self._limits.text:
-            raise MessageTooLarge(f"pickle: a text of {length} bytes, the limit is {self._limits.text}")
+            raise MessageTooLarge(
+                f"pickle: a text of {length} bytes, the limit is {self._limits.text}"
+            )
         try:
             self.push(str(self.take(length), "utf-8"))
         except UnicodeDecodeError as error:
@@ -149,12 +170,16 @@ class _StackMachine:
         self._memo.append(self._top())
 
     def recall(self, index: int) -> None:
-        """Push a value of the memo; one that can still change is refused, so that no value contains itself."""
+        """Push a value of the memo; one that can still change is refused, so that no value
+        contains itself.
+        """
         if index >= len(self._memo):
             raise MalformedMessage("pickle: a reference to nothing")
         entry = self._memo[index]
         value = entry.value
-        if isinstance(value, (list, dict, Record)) or (isinstance(value, Reduced) and value.value is None):
+        if isinstance(value, (list, dict, Record)) or (
+            isinstance(value, Reduced) and value.value is None
+        ):
             raise MalformedMessage(f"pickle: a second reference to {_kind(value)}; send a copy")
         self._count(entry.items)
         self._stack.append(entry)
@@ -192,7 +217,8 @@ class _StackMachine:
         found = Name(module, name)
         if found not in self._calls and found not in self._records:
             raise MalformedMessage(
-                f"pickle: names {module[:_SHOWN]!r} {name[:_SHOWN]!r}, which is not read here; send numbers, texts and "
+                f"pickle: names {module[:_SHOWN]!r} {name[:_SHOWN]!r}, which is not read here; "
+                "send numbers, texts and "
                 "numpy arrays of numbers"
             )
         self.push(found)
@@ -201,13 +227,17 @@ class _StackMachine:
         arguments, name = self.pop(), self.pop()
         read = self._calls.get(name) if isinstance(name, Name) else None
         if read is None or type(arguments) is not tuple:
-            raise MalformedMessage(f"pickle: got a call of {_kind(name)}, want a numpy array of numbers")
+            raise MalformedMessage(
+                f"pickle: got a call of {_kind(name)}, want a numpy array of numbers"
+            )
         self.push(read(arguments))
 
     def new(self) -> None:
         arguments, name = self.pop(), self.pop()
         if arguments != () or not isinstance(name, Name) or name not in self._records:
-            raise MalformedMessage(f"pickle: got an object of {_kind(name)}, want one of LeRobot's messages")
+            raise MalformedMessage(
+                f"pickle: got an object of {_kind(name)}, want one of LeRobot's messages"
+            )
         self.push(Record(name))
 
     def build(self) -> None:
@@ -217,7 +247,9 @@ class _StackMachine:
             fields = self._records[target.name]
             if state.value.keys() != set(fields):
                 got = shown(list(state.value))
-                raise MalformedMessage(f"pickle: {target.name.name}: got the fields {got}, want {list(fields)}")
+                raise MalformedMessage(
+                    f"pickle: {target.name.name}: got the fields {got}, want {list(fields)}"
+                )
             target.fields = state.value
             self._stack[-1] = _StackValue(target, state.depth + 1)
         elif isinstance(target, Reduced) and target.value is None and target.read_state is not None:
@@ -276,7 +308,9 @@ _U1, _U2, _U4, _U8 = (struct.Struct(f"<{kind}") for kind in "BHIQ")
 _I4, _F8 = struct.Struct("<i"), struct.Struct(">d")
 
 
-def _number(form: struct.Struct, then: Callable[[_StackMachine, Any], None]) -> Callable[[_StackMachine], None]:
+def _number(
+    form: struct.Struct, then: Callable[[_StackMachine, Any], None]
+) -> Callable[[_StackMachine], None]:
     return lambda reader: then(reader, form.unpack(reader.take(form.size))[0])
 
 
@@ -327,8 +361,8 @@ _OPCODES: dict[int, Callable[[_StackMachine], Any]] = {
 
 # numpy's arrays, types and numbers in a pickle: the calls in numpy's own pickles.
 #
-# Based on the pickles of numpy 1.26 and 2.4 in protocol 4 and 5. Arrays of objects, text, times or structures, and
-# big-endian ones, are refused.
+# Based on the pickles of numpy 1.26 and 2.4 in protocol 4 and 5. Arrays of objects, text, times or
+# structures, and big-endian ones, are refused.
 
 
 class _Dtype(str):
@@ -349,11 +383,15 @@ def _ordered_dtype(kind: str, state: Any) -> _Dtype:
     match state:
         case (int(3), str("<") | str("|") as order, None, None, None, int(-1), int(-1), int(0)):
             return _Dtype(order + kind)
-    raise MalformedMessage("pickle: numpy.dtype: want the type of plain numbers in little-endian order")
+    raise MalformedMessage(
+        "pickle: numpy.dtype: want the type of plain numbers in little-endian order"
+    )
 
 
 def _array(arguments: tuple[Any, ...]) -> Reduced:
-    """Read `_reconstruct`: (numpy.ndarray, (0,), b"b"), then (1, shape, dtype, whether by columns, data)."""
+    """Read `_reconstruct`: (numpy.ndarray, (0,), b"b"), then (1, shape, dtype, whether by
+    columns, data).
+    """
     match arguments:
         case (Name("numpy", "ndarray"), (int(0),), memoryview() as kind) if bytes(kind[:2]) == b"b":
             return Reduced(_content)
@@ -364,7 +402,9 @@ def _content(state: Any) -> np.ndarray:
     match state:
         case (int(1), tuple(shape), _Dtype() as dtype, bool(by_columns), memoryview() as data):
             return _ordered(data, dtype, shape, by_columns)
-    raise MalformedMessage("pickle: numpy: want the shape, the type of numbers and the data of an array")
+    raise MalformedMessage(
+        "pickle: numpy: want the shape, the type of numbers and the data of an array"
+    )
 
 
 def _frombuffer(arguments: tuple[Any, ...]) -> Reduced:
@@ -372,7 +412,9 @@ def _frombuffer(arguments: tuple[Any, ...]) -> Reduced:
     match arguments:
         case (memoryview() as data, _Dtype() as dtype, tuple(shape), str("C") | str("F") as order):
             return Reduced(value=_ordered(data, dtype, shape, order == "F"))
-    raise MalformedMessage("pickle: numpy: want an array by rows; send numpy.ascontiguousarray of it")
+    raise MalformedMessage(
+        "pickle: numpy: want an array by rows; send numpy.ascontiguousarray of it"
+    )
 
 
 def _scalar(arguments: tuple[Any, ...]) -> int | float:
@@ -385,11 +427,18 @@ def _scalar(arguments: tuple[Any, ...]) -> int | float:
 
 
 def _ordered(data: memoryview, dtype: str, shape: tuple[Any, ...], by_columns: bool) -> np.ndarray:
-    return read_array(data, str(dtype), shape[::-1]).T if by_columns else read_array(data, str(dtype), shape)
+    return (
+        read_array(data, str(dtype), shape[::-1]).T
+        if by_columns
+        else read_array(data, str(dtype), shape)
+    )
 
 
 # numpy renamed its modules in 2.0.
-NUMPY_CALLS: dict[Name, Call | None] = {Name("numpy", "dtype"): _dtype, Name("numpy", "ndarray"): None} | {
+NUMPY_CALLS: dict[Name, Call | None] = {
+    Name("numpy", "dtype"): _dtype,
+    Name("numpy", "ndarray"): None,
+} | {
     Name(f"numpy.{core}.{module}", name): read
     for core in ("core", "_core")
     for module, name, read in (

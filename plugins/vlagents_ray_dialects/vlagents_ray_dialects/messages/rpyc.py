@@ -1,11 +1,12 @@
 """The part of RPyC's protocol for a service with text arguments and results; based on rpyc 6.0.
 
-RPyC allows a peer to access attributes of the server's objects, to call them, and to pass objects that the server calls
-back. This reader supports none of that: it knows the root and its methods by number, and accepts only values without
-references. A peer can therefore only call the methods that the server offers.
+RPyC allows a peer to access attributes of the server's objects, to call them, and to pass objects
+that the server calls back. This reader supports none of that: it knows the root and its methods by
+number, and accepts only values without references. A peer can therefore only call the methods that
+the server offers.
 
-A frame is a header (length, compressed?), a message and a newline. A message is its kind and one value, written
-in "brine": `(sequence number, content)`.
+A frame is a header (length, compressed?), a message and a newline. A message is its kind and one
+value, written in "brine": `(sequence number, content)`.
 """
 
 from __future__ import annotations
@@ -21,12 +22,14 @@ from vlagents_ray.errors import MalformedMessage, MessageTooLarge
 HEADER = struct.Struct("!LB")  # size of the message in bytes, and whether it is compressed
 END = b"\n"
 ROOT = 0  # the number of the root; those of its methods follow
-_ROOT_NAME = ("vlagents_ray.Policy", 1, 1)  # a peer's reference to the root: its class, numbers of class and object
+# A peer's reference to the root: its class, numbers of class and object.
+_ROOT_NAME = ("vlagents_ray.Policy", 1, 1)
 _METHOD_CLASS = "builtins.method"  # peers know this class and do not inspect it
 _METHODS_AT_MOST = 64
 _COMPRESS_OVER = 3000  # bytes, RPyC's own threshold
 _REQUEST, _REPLY, _EXCEPTION = 1, 2, 3
-VALUE, TUPLE, LOCAL, REMOTE = 1, 2, 3, 4  # labels of boxed values; a local one is the receiver's own object
+# Labels of boxed values; a local one is the receiver's own object.
+VALUE, TUPLE, LOCAL, REMOTE = 1, 2, 3, 4
 
 
 class Handler(IntEnum):
@@ -57,7 +60,9 @@ class RpycCall:
 
 
 def read_header(header: bytes | bytearray, limit: int) -> tuple[int, bool]:
-    """Return the number of bytes that follow, including the newline, and whether the message is compressed."""
+    """Return the number of bytes that follow, including the newline, and whether the message is
+    compressed.
+    """
     length, compressed = HEADER.unpack(header)
     if length > limit:
         raise MessageTooLarge(f"rpyc: a message of {length} bytes, the limit is {limit}")
@@ -67,7 +72,9 @@ def read_header(header: bytes | bytearray, limit: int) -> tuple[int, bool]:
 
 
 def read_call(body: bytes | bytearray, compressed: bool, limit: int) -> RpycCall | None:
-    """Return the request in a frame's body, which follows the header; None if the message needs no reply."""
+    """Return the request in a frame's body, which follows the header; None if the message needs
+    no reply.
+    """
     message = _message(body, compressed, limit)
     kind = message[0]
     if kind in (_REPLY, _EXCEPTION):  # the server sends no requests, so it expects no replies
@@ -102,7 +109,9 @@ class Refused(MalformedMessage):
 
 
 def reply(sequence: int, value: Any) -> bytes:
-    """Return the frame of a reply with a value: None, bool, int, float, text, bytes or tuples of these."""
+    """Return the frame of a reply with a value: None, bool, int, float, text, bytes or tuples of
+    these.
+    """
     return _frame(_REPLY, (sequence, (VALUE, value)))
 
 
@@ -113,19 +122,28 @@ def reference_reply(sequence: int, number: int) -> bytes:
 
 
 def exception(sequence: int, kind: str, text: str) -> bytes:
-    """Return the frame that raises the built-in exception `kind` at the peer, without a traceback."""
+    """Return the frame that raises the built-in exception `kind` at the peer, without a
+    traceback.
+    """
     return _frame(_EXCEPTION, (sequence, (("builtins", kind), (text,), (), "")))
 
 
 def request(sequence: int, handler: Handler, boxed_args: tuple[int, Any]) -> bytes:
-    """Return the frame of a request to a server, with its arguments in boxes: a label, and a value or boxes."""
+    """Return the frame of a request to a server, with its arguments in boxes: a label, and a
+    value or boxes.
+    """
     return _frame(_REQUEST, (sequence, (int(handler), boxed_args)))
 
 
-def read_reply(body: bytes | bytearray, compressed: bool, limit: int) -> tuple[int, bool, Any] | None:
-    """Return a reply's sequence number, whether it is a result or an exception, and its content; None for a request."""
+def read_reply(
+    body: bytes | bytearray, compressed: bool, limit: int
+) -> tuple[int, bool, Any] | None:
+    """Return a reply's sequence number, whether it is a result or an exception, and its content;
+    None for a request.
+    """
     message = _message(body, compressed, limit)
-    if message[0] not in (_REPLY, _EXCEPTION):  # nothing is offered to a server, so its requests get no answer
+    # Nothing is offered to a server, so its requests get no answer.
+    if message[0] not in (_REPLY, _EXCEPTION):
         return None
     content = read_brine(message[1:])
     if not (isinstance(content, tuple) and len(content) == 2 and _is_int(content[0])):
@@ -170,7 +188,11 @@ def _unbox(boxed: Any) -> Any:
     if label == LOCAL and isinstance(value, tuple) and len(value) == 3:
         if value == _ROOT_NAME:
             return Reference(ROOT)
-        if value[:2] == (_METHOD_CLASS, 2) and _is_int(value[2]) and 0 < value[2] < _METHODS_AT_MOST:
+        if (
+            value[:2] == (_METHOD_CLASS, 2)
+            and _is_int(value[2])
+            and 0 < value[2] < _METHODS_AT_MOST
+        ):
             return Reference(value[2])
     raise MalformedMessage("rpyc: objects are not taken here; send values")
 
@@ -179,7 +201,8 @@ def _is_int(value: object) -> bool:
     return isinstance(value, int) and not isinstance(value, bool)
 
 
-# Brine, RPyC's encoding of values: None, bool, int, float, text, bytes, and tuples of these; based on rpyc 6.0.
+# Brine, RPyC's encoding of values: None, bool, int, float, text, bytes, and tuples of these; based
+# on rpyc 6.0.
 #
 # Its other types (slices, sets, complex numbers, …) are refused, since no client needs them here.
 
@@ -190,17 +213,25 @@ _F8, _U4 = struct.Struct("!d"), struct.Struct("!L")
 
 
 def read_brine(data: memoryview) -> Any:
-    """Return the only value in `data`; raise `MalformedMessage` or `MessageTooLarge` if it is invalid."""
+    """Return the only value in `data`; raise `MalformedMessage` or `MessageTooLarge` if it is
+    invalid.
+    """
     return _BrineReader(data).all()
 
 
 def write_brine(value: Any) -> bytes:
-    """Return a value in brine, the inverse of `read_brine`; raise `TypeError` for an unsupported type."""
+    """Return a value in brine, the inverse of `read_brine`; raise `TypeError` for an unsupported
+    type.
+    """
     if value is None or isinstance(value, bool):
         return {None: b"\x00", True: b"\x03", False: b"\x04"}[value]
     if isinstance(value, int):
         digits = str(value).encode()
-        return bytes([value + 0x50]) if -0x30 <= value < 0xA0 else b"\x16" + bytes([len(digits)]) + digits
+        return (
+            bytes([value + 0x50])
+            if -0x30 <= value < 0xA0
+            else b"\x16" + bytes([len(digits)]) + digits
+        )
     if isinstance(value, float):
         return b"\x18" + _F8.pack(value)
     if isinstance(value, str):
@@ -208,7 +239,11 @@ def write_brine(value: Any) -> bytes:
     if isinstance(value, bytes):
         return b"\x0f" + _U4.pack(len(value)) + value if value else b"\x01"
     if isinstance(value, tuple):
-        return b"".join([b"\x15" + _U4.pack(len(value)), *map(write_brine, value)]) if value else b"\x02"
+        return (
+            b"".join([b"\x15" + _U4.pack(len(value)), *map(write_brine, value)])
+            if value
+            else b"\x02"
+        )
     raise TypeError(f"brine: cannot send {type(value).__name__}")
 
 
@@ -235,7 +270,9 @@ class _BrineReader:
     def _value(self, depth: int) -> Any:
         self._items += 1
         if self._items > _ITEMS or depth > _DEPTH:
-            raise MessageTooLarge(f"brine: more than {_ITEMS} values or {_DEPTH} levels in a message")
+            raise MessageTooLarge(
+                f"brine: more than {_ITEMS} values or {_DEPTH} levels in a message"
+            )
         tag = self._take(1)[0]
         if 0x20 <= tag < 0xF0:
             return tag - 0x50
@@ -251,7 +288,9 @@ class _BrineReader:
             return self._tuple(self._length(_TUPLES[tag]), depth)
         if tag in _INTS:
             return self._integer(self._length(_INTS[tag]))
-        raise MalformedMessage(f"brine: got a value of kind {tag:#04x}, want text, numbers or tuples")
+        raise MalformedMessage(
+            f"brine: got a value of kind {tag:#04x}, want text, numbers or tuples"
+        )
 
     def _text(self, depth: int) -> str:
         data = self._value(depth + 1)

@@ -1,7 +1,7 @@
 """vla-eval's messages: msgpack maps of type, payload, seq and timestamp, protocol version 1.
 
-Arrays are maps with the key "__ndarray__"; images are maps with the key "__image__", raw, PNG or JPEG. The format
-is that of `vla_eval.protocol`, 0.8.0.
+Arrays are maps with the key "__ndarray__"; images are maps with the key "__image__", raw, PNG or
+JPEG. The format is that of `vla_eval.protocol`, 0.8.0.
 """
 
 from __future__ import annotations
@@ -36,7 +36,9 @@ class _File(bytes):
 
 
 def decode(data: bytes, limits: Limits = DEFAULT_LIMITS) -> Message:
-    """Return the message in `data`, with its JPEG and PNG images still encoded, see `decode_images`."""
+    """Return the message in `data`, with its JPEG and PNG images still encoded, see
+    `decode_images`.
+    """
     taken = 0
 
     def array(node: dict[Any, Any]) -> Any:
@@ -64,7 +66,9 @@ def decode(data: bytes, limits: Limits = DEFAULT_LIMITS) -> Message:
 
 
 def decode_images(payload: dict[str, Any], budget: Budget) -> dict[str, Any]:
-    """Return an observation with its images decoded; raise the errors of `budget` and of invalid images."""
+    """Return an observation with its images decoded; raise the errors of `budget` and of invalid
+    images.
+    """
     files: dict[int, _File] = {}
     names: dict[int, str] = {}
 
@@ -77,7 +81,9 @@ def decode_images(payload: dict[str, Any], budget: Budget) -> dict[str, Any]:
                 find(item, f"{path}/{key}" if path else str(key))
 
     find(payload, "")
-    images = dict(zip(files, decode_files(list(files.values()), budget, list(names.values())), strict=True))
+    images = dict(
+        zip(files, decode_files(list(files.values()), budget, list(names.values())), strict=True)
+    )
 
     def filled(node: Any) -> Any:
         if isinstance(node, _File):
@@ -90,7 +96,12 @@ def decode_images(payload: dict[str, Any], budget: Budget) -> dict[str, Any]:
 
 
 def encode(message: Message) -> bytes:
-    fields = {"type": message.kind, "payload": message.payload, "seq": message.seq, "timestamp": time.time()}
+    fields = {
+        "type": message.kind,
+        "payload": message.payload,
+        "seq": message.seq,
+        "timestamp": time.time(),
+    }
     return pack(fields, _node)
 
 
@@ -99,13 +110,20 @@ def _image(node: dict[Any, Any]) -> np.ndarray | _File:
     if form == "raw":
         return read_array(data, node.get("dtype"), node.get("shape"))  # type: ignore[arg-type]  # it checks
     if form not in ("png", "jpeg") or not isinstance(data, bytes):
-        raise MalformedMessage(f"image: got format {shown(form, 20)}, want raw, png or jpeg, and bytes")
+        raise MalformedMessage(
+            f"image: got format {shown(form, 20)}, want raw, png or jpeg, and bytes"
+        )
     return _File(data)
 
 
 def _node(value: Any) -> Any:
     if isinstance(value, np.ndarray) and value.dtype.kind in "biuf":
-        return {"__ndarray__": True, "data": value.tobytes(), "dtype": value.dtype.str, "shape": list(value.shape)}
+        return {
+            "__ndarray__": True,
+            "data": value.tobytes(),
+            "dtype": value.dtype.str,
+            "shape": list(value.shape),
+        }
     if isinstance(value, np.generic) and value.dtype.kind in "biuf":
         return value.item()
     raise TypeError(f"cannot send {type(value).__name__}; want plain values and arrays of numbers")
@@ -114,8 +132,9 @@ def _node(value: Any) -> Any:
 # The mapping of vla-eval's benchmarks.
 
 PRESETS: dict[str, dict[str, Any]] = {
-    # The benchmark chooses the names of cameras. Most benchmarks call the state `states`, some `state`, as recommended
-    # in vla-eval's types.py; its own servers prefer the former. RoboTwin's is `joint_state`.
+    # The benchmark chooses the names of cameras. Most benchmarks call the state `states`, some
+    # `state`, as recommended in vla-eval's types.py; its own servers prefer the former. RoboTwin's
+    # is `joint_state`.
     "vla-eval": {
         "cameras": {"*": "images/*"},
         "state": {"state": {"key": "states|state|joint_state", "optional": True}},

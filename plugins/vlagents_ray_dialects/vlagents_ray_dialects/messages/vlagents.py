@@ -1,7 +1,9 @@
-"""Observations and actions in the format of the package `vlagents`, versions 0.2 and 0.3: JSON with arrays.
+"""Observations and actions in the format of the package `vlagents`, versions 0.2 and 0.3: JSON with
+arrays.
 
-In 0.3 an observation contains named robots and the instruction; 0.2 has one unnamed robot, and the instruction in
-its `reset`. A camera is an array, a JPEG file in base64, or the name of a shared-memory segment of the client.
+In 0.3 an observation contains named robots and the instruction; 0.2 has one unnamed robot, and the
+instruction in its `reset`. A camera is an array, a JPEG file in base64, or the name of a
+shared-memory segment of the client.
 """
 
 from __future__ import annotations
@@ -13,7 +15,13 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from vlagents_ray.errors import InvalidAction, InvalidObservation, MalformedMessage, MessageTooLarge, shown
+from vlagents_ray.errors import (
+    InvalidAction,
+    InvalidObservation,
+    MalformedMessage,
+    MessageTooLarge,
+    shown,
+)
 from vlagents_ray.images.codecs import decode_files
 from vlagents_ray.interface import GOAL_IMAGE, Act, Obs
 from vlagents_ray.protocol.frame_layout import read_array
@@ -35,28 +43,40 @@ class Segments(Protocol):
     """Reads a client's shared memory."""
 
     def read(self, name: str, size: int) -> bytearray:
-        """Return a copy of the first `size` bytes of a segment; raise `InvalidObservation` if that is impossible."""
+        """Return a copy of the first `size` bytes of a segment; raise `InvalidObservation` if
+        that is impossible.
+        """
 
 
 @dataclass(frozen=True, slots=True)
 class Part:
-    """The columns of one robot in a row of actions, with indices as in Python: -1 is the last column."""
+    """The columns of one robot in a row of actions, with indices as in Python: -1 is the last
+    column.
+    """
 
     start: int | None = None
     stop: int | None = None
-    gripper: int | None = None  # the column that becomes `SingleAct.gripper` instead of a part of `action`
+    # The column that becomes `SingleAct.gripper` instead of a part of `action`.
+    gripper: int | None = None
     gripper_open: float = 1.0  # the column's value for an open gripper, which vlagents writes as 1
-    gripper_closed: float = 0.0  # the column's value for a closed gripper, which vlagents writes as 0
+    # The column's value for a closed gripper, which vlagents writes as 0.
+    gripper_closed: float = 0.0
 
     def split(self, row: np.ndarray) -> tuple[np.ndarray, float | None]:
-        """Return the action, (d,), and the gripper, None or in [0, 1] with 1 = open, of a row, (D,) float32."""
+        """Return the action, (d,), and the gripper, None or in [0, 1] with 1 = open, of a row,
+        (D,) float32.
+        """
         columns = np.arange(len(row))[self.start : self.stop]
         if not len(columns):
-            raise InvalidAction(f"vlagents: columns {self.start}:{self.stop} of a row of {len(row)} are none")
+            raise InvalidAction(
+                f"vlagents: columns {self.start}:{self.stop} of a row of {len(row)} are none"
+            )
         if self.gripper is None:
             return row[columns], None
         if not -len(row) <= self.gripper < len(row):
-            raise InvalidAction(f"vlagents: no column {self.gripper} for the gripper in a row of {len(row)}")
+            raise InvalidAction(
+                f"vlagents: no column {self.gripper} for the gripper in a row of {len(row)}"
+            )
         span = self.gripper_open - self.gripper_closed
         opened = (float(row[self.gripper]) - self.gripper_closed) / span
         return row[columns[columns != self.gripper % len(row)]], min(1.0, max(0.0, opened))
@@ -75,8 +95,12 @@ def read_act(text: str | bytes, budget: Budget, segments: Segments) -> Observati
     return _read(json_numpy.loads(text, budget.limits, _LEVELS), budget, segments)
 
 
-def read_reset(text: str | bytes, budget: Budget, segments: Segments) -> tuple[ObservationRequest, dict[str, Any]]:
-    """Return the observation and the options of a `reset` of vlagents 0.2, and count it as a request."""
+def read_reset(
+    text: str | bytes, budget: Budget, segments: Segments
+) -> tuple[ObservationRequest, dict[str, Any]]:
+    """Return the observation and the options of a `reset` of vlagents 0.2, and count it as a
+    request.
+    """
     budget.begin("reset")
     document = json_numpy.loads(text, budget.limits, _LEVELS)
     if not (isinstance(document, list) and len(document) == 3):
@@ -85,11 +109,15 @@ def read_reset(text: str | bytes, budget: Budget, segments: Segments) -> tuple[O
     kwargs = _mapping(document[2], "reset: options")
     if taken := kwargs.keys() & _TAKEN:
         raise MalformedMessage(f"reset: got the options {sorted(taken)}, which are no options")
-    return ObservationRequest(seen.obs, _instruction(document[1], budget.limits), seen.robots), kwargs
+    return ObservationRequest(
+        seen.obs, _instruction(document[1], budget.limits), seen.robots
+    ), kwargs
 
 
 def write_act(act: Act, robots: Sequence[str], parts: Mapping[str, Part] | None = None) -> str:
-    """Return the reply to an `act` of those robots; without `parts`, each robot's action is a whole row."""
+    """Return the reply to an `act` of those robots; without `parts`, each robot's action is a
+    whole row.
+    """
     if not robots:
         return json_numpy.dumps({"action": act.action, "done": act.done, "info": act.info})
     rows = act.rows()
@@ -118,7 +146,9 @@ def _read(document: Any, budget: Budget, segments: Segments) -> ObservationReque
     if not (robots := _mapping(top["obs"], "observation.obs")):
         raise InvalidObservation("observation.obs: got no robot, want one or more")
     if len(robots) > limits.cameras:
-        raise MessageTooLarge(f"observation.obs: got {len(robots)} robots, the limit is {limits.cameras}")
+        raise MessageTooLarge(
+            f"observation.obs: got {len(robots)} robots, the limit is {limits.cameras}"
+        )
     views = [part.get("cameras") for part in robots.values() if isinstance(part, dict)]
     cameras = sum(len(view) for view in views if isinstance(view, dict))
     if cameras > limits.cameras:  # counts the cameras of all robots before decoding any
@@ -135,19 +165,29 @@ def _read(document: Any, budget: Budget, segments: Segments) -> ObservationReque
     if (goal := top.get("goal_image")) is not None:
         kind = top.get("goal_image_data_type", RAW)
         whole.info[GOAL_IMAGE] = _image(goal, kind, GOAL_IMAGE, budget, segments)
-    return ObservationRequest(whole, _instruction(top.get("language_instruction"), limits), tuple(robots))
+    return ObservationRequest(
+        whole, _instruction(top.get("language_instruction"), limits), tuple(robots)
+    )
 
 
 def _robot(robot: Mapping[str, Any], prefix: str, budget: Budget, segments: Segments) -> Obs:
-    """Return one robot's observation; a `prefix` is added to all names, and moves the gripper into the state, (1,)."""
+    """Return one robot's observation; a `prefix` is added to all names, and moves the gripper
+    into the state, (1,).
+    """
     limits = budget.limits
     cameras = _mapping(robot.get("cameras") or {}, "cameras")
     if len(cameras) > limits.cameras:
         raise MessageTooLarge(f"cameras: got {len(cameras)}, the limit is {limits.cameras}")
     kind = robot.get("camera_data_type", RAW)
     obs = Obs(
-        {prefix + name: _image(image, kind, name, budget, segments) for name, image in cameras.items()},
-        info={prefix + name: value for name, value in _mapping(robot.get("info") or {}, "info").items()},
+        {
+            prefix + name: _image(image, kind, name, budget, segments)
+            for name, image in cameras.items()
+        },
+        info={
+            prefix + name: value
+            for name, value in _mapping(robot.get("info") or {}, "info").items()
+        },
     )
     for name in _PARTS:
         if (part := robot.get(name)) is not None:
@@ -156,7 +196,9 @@ def _robot(robot: Mapping[str, Any], prefix: str, budget: Budget, segments: Segm
         if isinstance(gripper, np.ndarray) and gripper.size == 1:
             gripper = gripper.item()
         if not is_number(gripper):
-            raise InvalidObservation(f"gripper: got {shown(gripper)}, want a number in [0, 1] where 1 = open")
+            raise InvalidObservation(
+                f"gripper: got {shown(gripper)}, want a number in [0, 1] where 1 = open"
+            )
         if prefix:
             obs.state[f"{prefix}gripper"] = np.array([gripper], np.float32)
         else:
@@ -178,21 +220,31 @@ def _image(image: Any, kind: Any, name: str, budget: Budget, segments: Segments)
     """Return a camera's image, (H, W, 3) uint8; of several frames, (N, H, W, 3), the last one."""
     limits = budget.limits
     if kind == JPEG:
-        [found] = decode_files([json_numpy.decode_base64(image, f"camera {name[:40]!r}")], budget, [name])
+        [found] = decode_files(
+            [json_numpy.decode_base64(image, f"camera {name[:40]!r}")], budget, [name]
+        )
     elif kind == SHARED:
         found = _shared(_mapping(image, f"camera {name[:40]!r}"), budget, segments)
     elif kind == RAW:
         if not isinstance(image, np.ndarray):
-            raise InvalidObservation(f"camera {name[:40]!r}: got {type(image).__name__}, want an array")
+            raise InvalidObservation(
+                f"camera {name[:40]!r}: got {type(image).__name__}, want an array"
+            )
         found = image
     else:
-        raise MalformedMessage(f"camera_data_type: got {shown(kind)}, want {RAW!r}, {JPEG!r} or {SHARED!r}")
+        raise MalformedMessage(
+            f"camera_data_type: got {shown(kind)}, want {RAW!r}, {JPEG!r} or {SHARED!r}"
+        )
     if found.ndim == 4 and len(found):
         found = found[-1]
     if found.ndim != 3 or found.shape[2] != 3 or found.dtype != np.uint8:
-        raise InvalidObservation(f"camera {name[:40]!r}: got {found.shape} {found.dtype}, want (H, W, 3) uint8 RGB")
+        raise InvalidObservation(
+            f"camera {name[:40]!r}: got {found.shape} {found.dtype}, want (H, W, 3) uint8 RGB"
+        )
     if found.shape[0] * found.shape[1] > limits.pixels:
-        raise MessageTooLarge(f"camera {name[:40]!r}: got {found.shape[:2]} pixels, the limit is {limits.pixels}")
+        raise MessageTooLarge(
+            f"camera {name[:40]!r}: got {found.shape[:2]} pixels, the limit is {limits.pixels}"
+        )
     return found
 
 
@@ -201,10 +253,16 @@ def _shared(payload: Mapping[str, Any], budget: Budget, segments: Segments) -> n
     name, shape = payload.get("shm_name"), payload.get("shape")
     if not isinstance(name, str) or payload.get("dtype", "uint8") != "uint8":
         raise MalformedMessage("shared memory: want a name, and pixels of uint8")
-    if not (isinstance(shape, list) and 0 < len(shape) <= 4 and all(type(n) is int and n > 0 for n in shape)):
+    if not (
+        isinstance(shape, list)
+        and 0 < len(shape) <= 4
+        and all(type(n) is int and n > 0 for n in shape)
+    ):
         raise MalformedMessage(f"shared memory: got the shape {shown(shape)}, want (H, W, 3)")
     if (size := math.prod(shape)) > budget.limits.body_bytes:
-        raise MessageTooLarge(f"shared memory: got {size} bytes, the limit is {budget.limits.body_bytes}")
+        raise MessageTooLarge(
+            f"shared memory: got {size} bytes, the limit is {budget.limits.body_bytes}"
+        )
     budget.hold(size)
     return read_array(memoryview(segments.read(name, size)), "|u1", shape)
 
@@ -213,7 +271,9 @@ def _instruction(value: Any, limits: Limits) -> str | None:
     if value is not None and not isinstance(value, str):
         raise MalformedMessage(f"instruction: got {type(value).__name__}, want text")
     if value is not None and len(value) > limits.text:
-        raise MessageTooLarge(f"instruction: got {len(value)} characters, the limit is {limits.text}")
+        raise MessageTooLarge(
+            f"instruction: got {len(value)} characters, the limit is {limits.text}"
+        )
     return value
 
 
@@ -225,13 +285,17 @@ def _mapping(value: Any, what: str) -> dict[str, Any]:
 
 def _require_known(value: Mapping[str, Any], known: set[str], what: str) -> None:
     if unknown := value.keys() - known:
-        raise MalformedMessage(f"{what}: unknown keys {shown(sorted(unknown))}, want some of {sorted(known)}")
+        raise MalformedMessage(
+            f"{what}: unknown keys {shown(sorted(unknown))}, want some of {sorted(known)}"
+        )
 
 
-# The client's side of the package `vlagents`, 0.3: calls of a server's methods over RPyC, and their results.
+# The client's side of the package `vlagents`, 0.3: calls of a server's methods over RPyC, and their
+# results.
 #
-# The server sends a reference to its root once; calls consist of that reference and the name of a method. No object of
-# this process is offered to the server, which returns text, a truth value, or an error.
+# The server sends a reference to its root once; calls consist of that reference and the name of a
+# method. No object of this process is offered to the server, which returns text, a truth value, or
+# an error.
 
 _ACTION_LEVELS = 4  # levels of nesting above an action: reply, acts, step, robot
 _ERROR = 2000  # characters of an error that are kept
@@ -255,19 +319,25 @@ def call(sequence: int, root: tuple[Any, ...], method: str, *args: str) -> bytes
 
 
 def read_result(body: bytes | bytearray, compressed: bool, limit: int) -> tuple[int, Any] | None:
-    """Return a reply's sequence number, and its value or `RemoteError`; None if the message is not a reply."""
+    """Return a reply's sequence number, and its value or `RemoteError`; None if the message is
+    not a reply.
+    """
     if (message := rpyc.read_reply(body, compressed, limit)) is None:
         return None
     sequence, ok, content = message
     if not ok:
-        return sequence, RemoteError(content[:_ERROR] if isinstance(content, str) else shown(content, _ERROR))
+        return sequence, RemoteError(
+            content[:_ERROR] if isinstance(content, str) else shown(content, _ERROR)
+        )
     if not (isinstance(content, tuple) and len(content) == 2):
         raise MalformedMessage("rpyc: want (label, value)")
     return sequence, content[1]
 
 
 def write_observation(observation: Mapping[str, Any]) -> str:
-    """Return the argument of `act`: the instruction, and each robot's cameras, state and gripper, (1,)."""
+    """Return the argument of `act`: the instruction, and each robot's cameras, state and
+    gripper, (1,).
+    """
     robots = {}
     for name, one in observation.items():
         if isinstance(one, Mapping):
@@ -290,11 +360,19 @@ def write_observation(observation: Mapping[str, Any]) -> str:
 
 
 def read_actions(text: str, limits: Limits = DEFAULT_LIMITS) -> dict[str, np.ndarray]:
-    """Return the actions in the reply to `act` by robot, each (H, D); a gripper is the last column, 1 = open."""
+    """Return the actions in the reply to `act` by robot, each (H, D); a gripper is the last
+    column, 1 = open.
+    """
     document = json_numpy.loads(text, limits, _ACTION_LEVELS)
     steps = document.get("acts") if isinstance(document, dict) else None
-    if not isinstance(steps, list) or not steps or not all(isinstance(step, dict) and step for step in steps):
-        raise MalformedMessage("vlagents: want `acts`, a list of one step or more, with the robots of each")
+    if (
+        not isinstance(steps, list)
+        or not steps
+        or not all(isinstance(step, dict) and step for step in steps)
+    ):
+        raise MalformedMessage(
+            "vlagents: want `acts`, a list of one step or more, with the robots of each"
+        )
     if any(step.keys() != steps[0].keys() for step in steps):
         raise MalformedMessage("vlagents: want the same robots in each step of `acts`")
     try:
@@ -316,5 +394,7 @@ def _row(robot: str, act: Any) -> np.ndarray:
     if isinstance(gripper, np.ndarray) and gripper.size == 1:
         gripper = gripper.item()
     if not is_number(gripper):
-        raise MalformedMessage(f"vlagents: gripper of {robot[:40]!r}: got {type(gripper).__name__}, want a number")
+        raise MalformedMessage(
+            f"vlagents: gripper of {robot[:40]!r}: got {type(gripper).__name__}, want a number"
+        )
     return np.append(action, gripper)

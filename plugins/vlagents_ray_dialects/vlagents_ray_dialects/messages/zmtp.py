@@ -1,8 +1,10 @@
-"""The part of ZMTP 3, the protocol of ZeroMQ over TCP, that a ROUTER needs for REQ and DEALER sockets.
+"""The part of ZMTP 3, the protocol of ZeroMQ over TCP, that a ROUTER needs for REQ and DEALER
+sockets.
 
-A peer sends a greeting of 64 bytes, the command READY, and then messages: frames of a head and a body, all but the last
-of which announce another one. ZeroMQ's own library buffers a message until it is complete, however many frames it has,
-and an empty frame costs its sender 2 bytes and its reader 64; here the reader sees each head before the body arrives.
+A peer sends a greeting of 64 bytes, the command READY, and then messages: frames of a head and a
+body, all but the last of which announce another one. ZeroMQ's own library buffers a message until
+it is complete, however many frames it has, and an empty frame costs its sender 2 bytes and its
+reader 64; here the reader sees each head before the body arrives.
 """
 
 from __future__ import annotations
@@ -50,13 +52,19 @@ def check_greeting(greeting: bytes | bytearray) -> None:
     signature, version, mechanism = greeting[:10], greeting[10:11], greeting[12:32]
     is_zmtp = signature[:1] == _SIGNATURE[:1] and signature[9:10] in (b"", _SIGNATURE[9:])
     if not is_zmtp or (version and version[0] < _MAJOR_VERSION):
-        raise MalformedMessage("zmtp: expected a greeting of ZMTP 3, got another one; use libzmq 4 or newer")
+        raise MalformedMessage(
+            "zmtp: expected a greeting of ZMTP 3, got another one; use libzmq 4 or newer"
+        )
     if len(mechanism) == len(_MECHANISM) and mechanism != _MECHANISM:
-        raise MalformedMessage("zmtp: expected the mechanism NULL, got another one; use a socket without encryption")
+        raise MalformedMessage(
+            "zmtp: expected the mechanism NULL, got another one; use a socket without encryption"
+        )
 
 
 def read_flags(first: int) -> FrameFlags:
-    """Return the flags in the first byte of a frame; raise `MalformedMessage` if they are invalid."""
+    """Return the flags in the first byte of a frame; raise `MalformedMessage` if they are
+    invalid.
+    """
     flags = FrameFlags(bool(first & _MORE), bool(first & _LONG), bool(first & _COMMAND))
     if first > (_MORE | _LONG | _COMMAND) or (flags.is_command and flags.has_more):
         raise MalformedMessage(f"zmtp: expected the flags of a frame, got {first}")
@@ -70,7 +78,9 @@ def read_size(data: bytes | memoryview) -> int:
 
 
 def read_command(body: bytes | memoryview) -> tuple[bytes, bytes]:
-    """Return the name of a command and what follows it; raise `MalformedMessage` if it is invalid."""
+    """Return the name of a command and what follows it; raise `MalformedMessage` if it is
+    invalid.
+    """
     length = body[0] if body else 0
     name = bytes(body[1 : 1 + length])
     if not 0 < length == len(name):
@@ -79,7 +89,9 @@ def read_command(body: bytes | memoryview) -> tuple[bytes, bytes]:
 
 
 def check_ready(properties: bytes) -> None:
-    """Raise `MalformedMessage` unless the READY of a peer contains the type of a socket that may connect."""
+    """Raise `MalformedMessage` unless the READY of a peer contains the type of a socket that may
+    connect.
+    """
     values: dict[bytes, bytes] = {}
     rest = properties
     while rest:
@@ -89,11 +101,15 @@ def check_ready(properties: bytes) -> None:
             raise MalformedMessage("zmtp: expected a property of READY, got a part of one")
         (size,) = _VALUE_SIZE.unpack(rest[name_end:value_start])
         if len(rest) < value_start + size:
-            raise MalformedMessage("zmtp: expected the value of a property of READY, got a part of it")
+            raise MalformedMessage(
+                "zmtp: expected the value of a property of READY, got a part of it"
+            )
         values[rest[1:name_end].lower()] = rest[value_start : value_start + size]
         rest = rest[value_start + size :]
     if (socket_type := values.get(b"socket-type")) not in _SOCKET_TYPES:
-        raise MalformedMessage(f"zmtp: expected a REQ or DEALER socket, got {socket_type!r}; use one of these")
+        raise MalformedMessage(
+            f"zmtp: expected a REQ or DEALER socket, got {socket_type!r}; use one of these"
+        )
 
 
 def write_ready() -> bytes:

@@ -10,14 +10,21 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from vlagents_ray.errors import ConnectionLost, MalformedMessage, PolicyFailed, PolicyUnavailable, shown
+from vlagents_ray.errors import (
+    ConnectionLost,
+    MalformedMessage,
+    PolicyFailed,
+    PolicyUnavailable,
+    shown,
+)
 from vlagents_ray.protocol.messages import DEFAULT_LIMITS, Limits
 from vlagents_ray.wire.mapping import matches
 from vlagents_ray_dialects.messages.outgoing import Outgoing
 
 logger = logging.getLogger(__name__)
 
-Answer = np.ndarray | Mapping[str, np.ndarray]  # (D,) or (H, D), or several of them by the upstream's names
+# (D,) or (H, D), or several of them by the upstream's names.
+Answer = np.ndarray | Mapping[str, np.ndarray]
 _LOGGED = 8000  # characters of an upstream's error that are logged
 
 
@@ -35,7 +42,8 @@ class UpstreamClient(abc.ABC):
     """One connection to an upstream, used by one thread at a time."""
 
     batches: ClassVar[bool] = False  # whether `ask` sends all observations in one message
-    keeps_sessions: ClassVar[bool] = False  # whether the upstream keeps a session for each connection, by default
+    # Whether the upstream keeps a session for each connection, by default.
+    keeps_sessions: ClassVar[bool] = False
     mapping: ClassVar[str | None] = None
     """The preset that is used if the deployment states no mapping."""
     schemes: ClassVar[tuple[str, ...]] = ()  # the schemes that a URL may have, the usual one first
@@ -47,12 +55,16 @@ class UpstreamClient(abc.ABC):
 
     @staticmethod
     def is_nested(key: str) -> bool:
-        """Return whether a key `a/b` of the mapping means the key `b` within `a`; if not, it is a single key."""
+        """Return whether a key `a/b` of the mapping means the key `b` within `a`; if not, it is
+        a single key.
+        """
         return "/" in key
 
     @abc.abstractmethod
     def connect(self, timeout_s: float) -> dict[str, Any]:
-        """Connect, and return the upstream's metadata; raises `PolicyUnavailable` if it does not answer."""
+        """Connect, and return the upstream's metadata; raises `PolicyUnavailable` if it does not
+        answer.
+        """
 
     @property
     @abc.abstractmethod
@@ -64,42 +76,57 @@ class UpstreamClient(abc.ABC):
         """Return the actions for one observation, or for several if `batches`.
 
         Raises:
-            ConnectionLost: The connection broke, or there was no answer in time; `close` was called.
+            ConnectionLost: The connection broke, or there was no answer in time; `close` was
+                called.
             PolicyFailed: The upstream answered with an error.
             MalformedMessage, MessageTooLarge: Its answer is invalid.
         """
 
     def begin(self) -> None:  # noqa: B027 - not abstract: a protocol may have no such message
-        """Announce the start of an episode, if the protocol can; raises the same errors as `ask`."""
+        """Announce the start of an episode, if the protocol can; raises the same errors as
+        `ask`.
+        """
 
     @abc.abstractmethod
     def close(self) -> None:
         """Close the connection; repeated calls are allowed."""
 
     def differences(self, metadata: Mapping[str, Any], outgoing: Outgoing) -> list[str]:
-        """Return the differences between the upstream's metadata and the mapping, each with its cure.
+        """Return the differences between the upstream's metadata and the mapping, each with its
+        cure.
 
-        SGLang ignores a camera that is not in its `image_keys`, and acts as if the robot had none. One of them that the
-        mapping lacks may be missing on purpose.
+        SGLang ignores a camera that is not in its `image_keys`, and acts as if the robot had none.
+        One of them that the mapping lacks may be missing on purpose.
         """
         stated = metadata.get("input")
         keys = stated.get("image_keys") if isinstance(stated, Mapping) else None
         if not isinstance(keys, list):
             return []
-        known = {f"{prefix}{key}" for key in keys for prefix in ("", "images/", "observation.images.")}
+        known = {
+            f"{prefix}{key}" for key in keys for prefix in ("", "images/", "observation.images.")
+        }
         given = [camera.key.partition("|")[0] for camera in outgoing.mapping.cameras.values()]
         if wrong := [key for key in given if not any(matches(one, key) for one in known)]:
-            return [f"cameras: the upstream reads {keys}, the mapping gives {wrong}; change mapping.cameras"]
+            return [
+                (
+                    f"cameras: the upstream reads {keys}, the mapping gives {wrong}; change "
+                    "mapping.cameras"
+                )
+            ]
         return []
 
     def chunk(self, metadata: Mapping[str, Any]) -> int | None:
-        """Return the number of rows of the upstream's actions, if its metadata states it, in SGLang's `output`."""
+        """Return the number of rows of the upstream's actions, if its metadata states it, in
+        SGLang's `output`.
+        """
         output = metadata.get("output")
         rows = (output if isinstance(output, Mapping) else metadata).get("action_horizon")
         return rows if type(rows) is int and rows > 0 else None
 
     def actions(self, reply: Any) -> np.ndarray:
-        """Return the actions of a reply that is a map; raises `MalformedMessage` if there is no such array."""
+        """Return the actions of a reply that is a map; raises `MalformedMessage` if there is no
+        such array.
+        """
         actions = reply.get("actions") if isinstance(reply, dict) else None
         if not isinstance(actions, np.ndarray):
             got = sorted(map(str, reply))[:8] if isinstance(reply, dict) else type(reply).__name__
@@ -108,8 +135,12 @@ class UpstreamClient(abc.ABC):
 
     def failed(self, text: object, got: str = "an error") -> PolicyFailed:
         """Log an error that the upstream sent, and return ours, without the upstream's details."""
-        logger.error("upstream %s answered with %s: %s", self.options.url, got, shown(text, _LOGGED))
-        return PolicyFailed(f"upstream {self.options.url}: it answered with {got}, whose text the server's log has")
+        logger.error(
+            "upstream %s answered with %s: %s", self.options.url, got, shown(text, _LOGGED)
+        )
+        return PolicyFailed(
+            f"upstream {self.options.url}: it answered with {got}, whose text the server's log has"
+        )
 
     def closed(self) -> ConnectionLost:
         """Return the error of a request over a closed connection."""
@@ -117,7 +148,9 @@ class UpstreamClient(abc.ABC):
 
     def unreachable(self, error: Exception) -> PolicyUnavailable:
         """Return the error of an upstream that does not answer."""
-        return PolicyUnavailable(f"upstream {self.options.url}: cannot connect ({error}); is it running?")
+        return PolicyUnavailable(
+            f"upstream {self.options.url}: cannot connect ({error}); is it running?"
+        )
 
     def lost(self, reason: object) -> ConnectionLost:
         """Close the connection, and return the error of its loss."""
@@ -129,5 +162,6 @@ class UpstreamClient(abc.ABC):
     def unreadable(self, got: object, want: str) -> MalformedMessage:
         """Return the error for an answer that violates the protocol."""
         return MalformedMessage(
-            f"upstream {self.options.url}: got {got}, want {want}; does it speak the protocol of the deployment?"
+            f"upstream {self.options.url}: got {got}, want {want}; does it speak the protocol of "
+            "the deployment?"
         )

@@ -1,4 +1,6 @@
-"""Connections to upstreams: shared by all sessions, or one for each session if the upstream keeps sessions."""
+"""Connections to upstreams: shared by all sessions, or one for each session if the upstream
+keeps sessions.
+"""
 
 from __future__ import annotations
 
@@ -25,7 +27,8 @@ logger = logging.getLogger(__name__)
 
 _CONNECT_S = 5.0  # s for one attempt to connect
 _FIRST_PAUSE_S, _LONGEST_PAUSE_S = 0.02, 1.0
-_ATTEMPTS = 3  # connections that one row may lose, so that a row that crashes an upstream does not end them all
+# Connections that one row may lose, so that a row that crashes an upstream does not end them all.
+_ATTEMPTS = 3
 
 Check = Callable[[UpstreamClient, Mapping[str, Any]], None]
 
@@ -51,7 +54,8 @@ class Lanes:
         self._clients, self._check, self._retry_s = clients, check, retry_s
         self._ready: list[UpstreamClient] = []
         self._changed = threading.Condition()
-        self._reason: VLAgentsError = NoReplica("upstream: not connected yet")  # why the last attempt failed
+        # Why the last attempt failed.
+        self._reason: VLAgentsError = NoReplica("upstream: not connected yet")
         self._connecting: list[threading.Thread] = []
         self._closed = False
         self._pool = ThreadPoolExecutor(max(1, len(clients) - 1), "upstream")
@@ -62,7 +66,9 @@ class Lanes:
             self._connect_in_background(client)
         with self._changed:
             # Waiting may help if the upstream is unavailable, but not if it is the wrong one.
-            self._changed.wait_for(lambda: self._ready or self._reason.status != NoReplica.status, timeout_s)
+            self._changed.wait_for(
+                lambda: self._ready or self._reason.status != NoReplica.status, timeout_s
+            )
             failed = None if self._ready else self._reason
         if failed is not None:
             self.close()
@@ -71,24 +77,30 @@ class Lanes:
     def ask(self, observations: Sequence[Mapping[str, Any]]) -> list[Answer | Exception]:
         """Return the answer to each observation, or the error in its place.
 
-        If a connection is lost, its rows are sent again over another one, or over the same one once it is reopened: an
-        upstream without sessions keeps no state of them.
+        If a connection is lost, its rows are sent again over another one, or over the same one once
+        it is reopened: an upstream without sessions keeps no state of them.
         """
         results: list[Answer | Exception] = [NoReplica("upstream: not asked")] * len(observations)
         deadline = time.monotonic() + self._retry_s
         work: deque[_Share] = deque()
         while not work or time.monotonic() < deadline:
             with self._changed:
-                self._changed.wait_for(lambda: self._ready or self._closed, max(0.0, deadline - time.monotonic()))
+                self._changed.wait_for(
+                    lambda: self._ready or self._closed, max(0.0, deadline - time.monotonic())
+                )
                 ready = list(self._ready)
-            if not work:  # single rows, or as many parts as there are connections if the protocol has batches
+            # Single rows, or as many parts as there are connections if the protocol has batches.
+            if not work:
                 rows = len(observations)
                 parts = min(rows, max(1, len(ready))) if self._clients[0].batches else rows
-                work.extend(_Share(range(rows * i // parts, rows * (i + 1) // parts)) for i in range(parts))
+                work.extend(
+                    _Share(range(rows * i // parts, rows * (i + 1) // parts)) for i in range(parts)
+                )
             if not ready:
                 break
             others = [
-                self._pool.submit(self._work, client, work, observations, results) for client in ready[1 : len(work)]
+                self._pool.submit(self._work, client, work, observations, results)
+                for client in ready[1 : len(work)]
             ]
             self._work(ready[0], work, observations, results)
             for other in others:
@@ -97,7 +109,9 @@ class Lanes:
                 return results
         for share in work:
             for row in share.rows:
-                results[row] = NoReplica(f"{self._reason}; no other upstream answers either: send the request again")
+                results[row] = NoReplica(
+                    f"{self._reason}; no other upstream answers either: send the request again"
+                )
         return results
 
     def close(self) -> None:
@@ -118,7 +132,9 @@ class Lanes:
         observations: Sequence[Mapping[str, Any]],
         results: list[Answer | Exception],
     ) -> None:
-        """Send shares over one connection until none is left or it is lost; an ended connection consumes no share."""
+        """Send shares over one connection until none is left or it is lost; an ended connection
+        consumes no share.
+        """
         while True:
             if not client.is_open:
                 self._lose(client, None)
@@ -128,7 +144,9 @@ class Lanes:
             except IndexError:
                 return
             try:
-                answers: Sequence[Answer | Exception] = client.ask([observations[row] for row in share.rows])
+                answers: Sequence[Answer | Exception] = client.ask(
+                    [observations[row] for row in share.rows]
+                )
             except ConnectionLost as error:
                 share.attempts += 1
                 if share.attempts < _ATTEMPTS:
@@ -139,7 +157,8 @@ class Lanes:
                 return
             except Exception as error:  # noqa: BLE001 - the result of these rows alone
                 answers = [error] * len(share.rows)
-                if len(share.rows) > 1:  # one of the rows may be the cause, and must not fail the others
+                # One of the rows may be the cause, and must not fail the others.
+                if len(share.rows) > 1:
                     work.extend(_Share(range(row, row + 1), share.attempts) for row in share.rows)
             for row, answer in zip(share.rows, answers, strict=True):
                 results[row] = answer
@@ -157,7 +176,9 @@ class Lanes:
         self._connect_in_background(client)
 
     def _connect_in_background(self, client: UpstreamClient) -> None:
-        thread = threading.Thread(target=self._connect, args=(client,), name="upstream-connect", daemon=True)
+        thread = threading.Thread(
+            target=self._connect, args=(client,), name="upstream-connect", daemon=True
+        )
         self._connecting = [one for one in self._connecting if one.is_alive()] + [thread]
         thread.start()
 
@@ -172,7 +193,8 @@ class Lanes:
                 else:
                     logger.exception("upstream %s: connecting failed", client.options.url)
                     reason = PolicyFailed(
-                        f"upstream {client.options.url}: connecting failed, the server's log says how"
+                        f"upstream {client.options.url}: connecting failed, the server's log says "
+                        "how"
                     )
                 client.close()
             else:
@@ -209,7 +231,11 @@ class SessionConnections:
     """
 
     def __init__(
-        self, urls: Sequence[str], make: Callable[[str], UpstreamClient], check: Check, retry_s: float
+        self,
+        urls: Sequence[str],
+        make: Callable[[str], UpstreamClient],
+        check: Check,
+        retry_s: float,
     ) -> None:
         self._urls, self._make, self._check, self._retry_s = urls, make, check, retry_s
         self._clients: dict[str, UpstreamClient] = {}
@@ -217,11 +243,15 @@ class SessionConnections:
         self._pool = ThreadPoolExecutor(_AT_ONCE, "upstream")
 
     def start(self, timeout_s: float) -> None:
-        """Return when one upstream answers and its metadata fits the mapping; raises the errors of `Lanes.start`."""
+        """Return when one upstream answers and its metadata fits the mapping; raises the errors
+        of `Lanes.start`.
+        """
         self._connected(timeout_s).close()
 
     def begin(self, session: str) -> None:
-        """Connect for an episode of a session; raises `NoReplica` if no upstream answers within `retry_s`."""
+        """Connect for an episode of a session; raises `NoReplica` if no upstream answers within
+        `retry_s`.
+        """
         client = self._connected(self._retry_s)
         try:
             client.begin()
@@ -231,7 +261,9 @@ class SessionConnections:
         with self._lock:
             self._clients[session] = client
 
-    def ask(self, sessions: Sequence[str], observations: Sequence[Mapping[str, Any]]) -> list[Answer | Exception]:
+    def ask(
+        self, sessions: Sequence[str], observations: Sequence[Mapping[str, Any]]
+    ) -> list[Answer | Exception]:
         """Return the answer to the observation of each session, or the error in its place."""
         others = [
             self._pool.submit(self._ask, session, observation)
@@ -244,7 +276,8 @@ class SessionConnections:
         with self._lock:
             client = self._clients.pop(session, None)
         if client is not None:
-            threading.Thread(target=client.close, name="upstream-close", daemon=True).start()  # it may wait for a reply
+            # It may wait for a reply.
+            threading.Thread(target=client.close, name="upstream-close", daemon=True).start()
 
     def close(self) -> None:
         self._pool.shutdown()
@@ -271,7 +304,9 @@ class SessionConnections:
         return answer
 
     def _connected(self, timeout_s: float) -> UpstreamClient:
-        """Return a client connected to the upstream with the fewest sessions among those that answer."""
+        """Return a client connected to the upstream with the fewest sessions among those that
+        answer.
+        """
         deadline, pause_s = time.monotonic() + timeout_s, _FIRST_PAUSE_S
         while True:
             with self._lock:

@@ -16,7 +16,8 @@ from vlagents_ray_dialects.upstream.client import Answer, ClientOptions, Upstrea
 
 
 class GR00TClient(UpstreamClient):
-    """A client of servers from N1.6 on, or of N1.5, recognised by modality keys such as `video.front`.
+    """A client of servers from N1.6 on, or of N1.5, recognised by modality keys such as
+    `video.front`.
 
     If the mapping has such keys, the observation has them also, as `Gr00tSimPolicyWrapper` expects.
     """
@@ -44,7 +45,8 @@ class GR00TClient(UpstreamClient):
         self._context = zmq.Context(io_threads=1)
         self._socket = self._context.socket(zmq.REQ)
         self._socket.setsockopt(zmq.LINGER, 0)
-        self._socket.setsockopt(zmq.IMMEDIATE, 1)  # do not queue messages for an upstream that is not connected
+        # Do not queue messages for an upstream that is not connected.
+        self._socket.setsockopt(zmq.IMMEDIATE, 1)
         self._socket.setsockopt(zmq.MAXMSGSIZE, self.options.limits.body_bytes)
         self._monitor = self._socket.get_monitor_socket(zmq.EVENT_DISCONNECTED)
         try:
@@ -62,9 +64,13 @@ class GR00TClient(UpstreamClient):
     def ask(self, observations: Sequence[Mapping[str, Any]]) -> list[Answer]:
         flat = is_flat(observations[0])
         try:
-            batched = wire.batch([nested(one) for one in observations] if flat else observations, self._text_key)
+            batched = wire.batch(
+                [nested(one) for one in observations] if flat else observations, self._text_key
+            )
         except ValueError as error:
-            raise InvalidObservation(f"gr00t: {error}; all sessions of a deployment must send the same") from error
+            raise InvalidObservation(
+                f"gr00t: {error}; all sessions of a deployment must send the same"
+            ) from error
         named = wire.flat(batched) if self._flat or flat else batched
         data = named if self._flat else {"observation": named, "options": None}
         reply = self._call("get_action", data, self.options.timeout_s)
@@ -91,21 +97,34 @@ class GR00TClient(UpstreamClient):
             ("state", "state", [part.key for parts in mapping.state.values() for part in parts]),
         ):
             stated = metadata.get(kind, {"keys": [], "steps": []})
-            given = [one.removeprefix(f"{kind}/").removeprefix(f"{kind}.") for key in keys for one in key.split("|")]
-            if lacks := [key for key in stated["keys"] if not any(matches(key, one) for one in given)]:
+            given = [
+                one.removeprefix(f"{kind}/").removeprefix(f"{kind}.")
+                for key in keys
+                for one in key.split("|")
+            ]
+            if lacks := [
+                key for key in stated["keys"] if not any(matches(key, one) for one in given)
+            ]:
                 found.append(
-                    f"{kind}: the upstream needs {lacks}, the mapping gives {given}; add them to mapping.{field}"
+                    f"{kind}: the upstream needs {lacks}, the mapping gives {given}; add them to "
+                    f"mapping.{field}"
                 )
             if len(stated["steps"]) > 1:
                 found.append(
-                    f"{kind}: the upstream needs the moments {stated['steps']}, and only the newest is sent; "
+                    f"{kind}: the upstream needs the moments {stated['steps']}, and only the "
+                    "newest is sent; "
                     f"serve a model that needs one"
                 )
         names = metadata.get("action", {"keys": []})["keys"]
         if names and (wrong := [name for name in mapping.action if name not in names]):
-            found.append(f"action: the upstream gives {names}, mapping.action reads {wrong}; change it")
+            found.append(
+                f"action: the upstream gives {names}, mapping.action reads {wrong}; change it"
+            )
         if len(names) > 1 and not mapping.action:
-            found.append(f"action: the upstream gives {names}; say in mapping.action which columns of ours each is")
+            found.append(
+                f"action: the upstream gives {names}; say in mapping.action which columns of ours "
+                "each is"
+            )
         return found
 
     def chunk(self, metadata: Mapping[str, Any]) -> int | None:
@@ -117,7 +136,9 @@ class GR00TClient(UpstreamClient):
         deadline = time.monotonic() + timeout_s
         try:
             self._wait(self._zmq.POLLOUT, deadline, "it takes no connection")
-            self._socket.send(wire.write(endpoint, data, self.options.key, packed=self._packed), self._zmq.NOBLOCK)
+            self._socket.send(
+                wire.write(endpoint, data, self.options.key, packed=self._packed), self._zmq.NOBLOCK
+            )
             self._wait(self._zmq.POLLIN, deadline, "no answer")
             payload = self._socket.recv(self._zmq.NOBLOCK)
         except self._zmq.ZMQError as error:
@@ -128,7 +149,9 @@ class GR00TClient(UpstreamClient):
         return reply
 
     def _wait(self, event: int, deadline: float, what: str) -> None:
-        """Wait until the socket can be written or read; raise `ConnectionLost` if its connection ends first."""
+        """Wait until the socket can be written or read; raise `ConnectionLost` if its connection
+        ends first.
+        """
         begun = time.monotonic()
         poller = self._zmq.Poller()
         poller.register(self._socket, event)
@@ -137,7 +160,9 @@ class GR00TClient(UpstreamClient):
         if self._socket in ready:
             return
         ended = self._monitor in ready
-        raise self.lost("the connection ended" if ended else f"{what} within {deadline - begun:.3g} s")
+        raise self.lost(
+            "the connection ended" if ended else f"{what} within {deadline - begun:.3g} s"
+        )
 
 
 def _is_flat(reply: Any) -> bool:
@@ -145,5 +170,6 @@ def _is_flat(reply: Any) -> bool:
     video = reply.get("video") if isinstance(reply, dict) else None
     config = video.get("as_json", video) if isinstance(video, dict) else None
     return isinstance(config, str) or (
-        isinstance(config, dict) and any(str(key).startswith("video.") for key in config.get("modality_keys", []))
+        isinstance(config, dict)
+        and any(str(key).startswith("video.") for key in config.get("modality_keys", []))
     )

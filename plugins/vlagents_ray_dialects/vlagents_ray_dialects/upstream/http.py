@@ -1,4 +1,6 @@
-"""Clients of the protocols over HTTP: OpenVLA's `vla-scripts/deploy.py`, SGLang's actions and FlashRT's server."""
+"""Clients of the protocols over HTTP: OpenVLA's `vla-scripts/deploy.py`, SGLang's actions and
+FlashRT's server.
+"""
 
 from __future__ import annotations
 
@@ -16,7 +18,13 @@ from urllib.parse import urlsplit
 import numpy as np
 
 from vlagents_ray.client.http_deadline import DeadlineSocket
-from vlagents_ray.errors import ConnectionLost, InvalidObservation, MessageTooLarge, PolicyUnavailable, VLAgentsError
+from vlagents_ray.errors import (
+    ConnectionLost,
+    InvalidObservation,
+    MessageTooLarge,
+    PolicyUnavailable,
+    VLAgentsError,
+)
 from vlagents_ray.wire import json_numpy
 from vlagents_ray_dialects.messages import openpi, openvla
 from vlagents_ray_dialects.messages.outgoing import Outgoing
@@ -108,11 +116,15 @@ class HttpClient(UpstreamClient):
             raise self.lost(error) from error
         if len(body) > most:
             self.close()
-            raise MessageTooLarge(f"upstream {self.options.url}: an answer of more than {most} bytes")
+            raise MessageTooLarge(
+                f"upstream {self.options.url}: an answer of more than {most} bytes"
+            )
         if response.will_close:
             self.close()
         if response.status in _BUSY:
-            raise ConnectionLost(f"upstream {self.options.url}: it answered with HTTP {response.status}")
+            raise ConnectionLost(
+                f"upstream {self.options.url}: it answered with HTTP {response.status}"
+            )
         if response.status != http.HTTPStatus.OK:
             raise self.failed(body[:2000], f"HTTP {response.status}")
         return body
@@ -144,24 +156,30 @@ class OpenVLAClient(HttpClient):
 
 
 class SGLangClient(HttpClient):
-    """A client of SGLang's `/v1/actions`, in msgpack, which its WebSocket at `/openpi/policy` also uses."""
+    """A client of SGLang's `/v1/actions`, in msgpack, which its WebSocket at `/openpi/policy`
+    also uses.
+    """
 
     path: ClassVar[str] = "/v1/actions/generations"
     about: ClassVar[str | None] = "/v1/actions/metadata"
     media_type: ClassVar[str] = "application/msgpack"
 
     def encode(self, observation: Mapping[str, Any]) -> bytes:
-        return openpi.encode({"input": {"observation": observation}, "runtime": {"response_format": "raw"}})
+        return openpi.encode(
+            {"input": {"observation": observation}, "runtime": {"response_format": "raw"}}
+        )
 
     def decode(self, body: bytes) -> np.ndarray:
         return self.actions(openpi.decode(body, self.options.limits))
 
 
 class FlashRTClient(HttpClient):
-    """A client of FlashRT's `/predict`: images without names in base64, in the order of the mapping.
+    """A client of FlashRT's `/predict`: images without names in base64, in the order of the
+    mapping.
 
-    Without images the server draws random ones, without a prompt it uses the last one of any client, and if an image is
-    missing, the next one takes its place. So a mapping of which one may be missing is refused.
+    Without images the server draws random ones, without a prompt it uses the last one of any
+    client, and if an image is missing, the next one takes its place. So a mapping of which one may
+    be missing is refused.
     """
 
     path: ClassVar[str] = "/predict"
@@ -170,9 +188,16 @@ class FlashRTClient(HttpClient):
 
     def differences(self, metadata: Mapping[str, Any], outgoing: Outgoing) -> list[str]:
         cameras, found = outgoing.mapping.cameras, []
-        unfit = [name for name, one in cameras.items() if one.optional or not re.fullmatch(r"images/[^/|*]+", one.key)]
+        unfit = [
+            name
+            for name, one in cameras.items()
+            if one.optional or not re.fullmatch(r"images/[^/|*]+", one.key)
+        ]
         if unfit or not cameras:
-            found.append(f"cameras: got {unfit}, want images/NAME for each, none optional; change mapping.cameras")
+            found.append(
+                f"cameras: got {unfit}, want images/NAME for each, none optional; change "
+                "mapping.cameras"
+            )
         if (text := outgoing.mapping.instruction) != "prompt":
             found.append(f"instruction: got {text!r}, want 'prompt'; change mapping.instruction")
         return found
@@ -182,10 +207,14 @@ class FlashRTClient(HttpClient):
         shapes = sorted({image.shape for image in images})
         if len(shapes) != 1 or not observation.get("prompt"):
             raise InvalidObservation(
-                f"flashrt: got images of {shapes} and the keys {sorted(observation)}, want images of one shape and a "
+                f"flashrt: got images of {shapes} and the keys {sorted(observation)}, want images "
+                "of one shape and a "
                 f"prompt; resize them, and reset with an instruction"
             )
-        body = {name: value.tolist() if isinstance(value, np.ndarray) else value for name, value in observation.items()}
+        body = {
+            name: value.tolist() if isinstance(value, np.ndarray) else value
+            for name, value in observation.items()
+        }
         body["images"] = [base64.b64encode(image.tobytes()).decode() for image in images]
         return json.dumps(body | {"image_shape": shapes[0]}).encode()
 

@@ -26,7 +26,12 @@ from vlagents_ray_dialects.upstream.connections import Lanes, SessionConnections
 from vlagents_ray_dialects.upstream.gr00t import GR00TClient
 from vlagents_ray_dialects.upstream.http import FlashRTClient, OpenVLAClient, SGLangClient
 from vlagents_ray_dialects.upstream.vlagents import VlagentsClient
-from vlagents_ray_dialects.upstream.websocket import OpenPiBatchClient, OpenPiClient, RoboArenaClient, VlaEvalClient
+from vlagents_ray_dialects.upstream.websocket import (
+    OpenPiBatchClient,
+    OpenPiClient,
+    RoboArenaClient,
+    VlaEvalClient,
+)
 
 PROTOCOLS: dict[str, type[UpstreamClient]] = {
     "openpi": OpenPiClient,
@@ -45,34 +50,54 @@ class UpstreamConfig(BaseModel, extra="forbid"):
     """The address, protocol and time limits of the other policy server."""
 
     protocol: Literal[
-        "openpi", "openpi-batch", "roboarena", "gr00t", "openvla", "vla_eval", "vlagents", "sglang", "flashrt"
+        "openpi",
+        "openpi-batch",
+        "roboarena",
+        "gr00t",
+        "openvla",
+        "vla_eval",
+        "vlagents",
+        "sglang",
+        "flashrt",
     ]
     urls: list[str] = Field(
         min_length=1,
         max_length=64,
-        description="of servers with the same model, e.g. ws://gpu-box:8000, tcp://gpu-box:5555 (gr00t), "
+        description="of servers with the same model, e.g. ws://gpu-box:8000, tcp://gpu-box:5555 "
+        "(gr00t), "
         "http://gpu-box:8000 (openvla, sglang, flashrt); a batch is spread over them",
     )
     mapping: str | dict[str, Any] | None = Field(
         default=None,
-        description="our names of the upstream's keys: a preset's name, or an object, as for dialects; default: the "
+        description="our names of the upstream's keys: a preset's name, or an object, as for "
+        "dialects; default: the "
         "protocol's own, except for openpi, whose robots have different keys",
     )
     contract: dict[str, Any] = Field(
         default_factory=dict,
-        description="what is known about the model beyond the mapping, e.g. action: {dim: 7}, chunk",
+        description="what is known about the model beyond the mapping, e.g. action: {dim: 7}, "
+        "chunk",
     )
     sessions: Literal["none", "connection"] | None = Field(
         default=None,
-        description="none: the model keeps nothing between two observations, and connections are shared; connection: a "
-        "session has a connection of its own, and is reset; default: connection for roboarena and vla_eval",
+        description="none: the model keeps nothing between two observations, and connections are "
+        "shared; connection: a "
+        "session has a connection of its own, and is reset; default: connection for roboarena and "
+        "vla_eval",
     )
     connections: int = Field(
-        default=1, ge=1, le=64, description="to each URL, over which a batch is spread too; for `sessions: none`"
+        default=1,
+        ge=1,
+        le=64,
+        description="to each URL, over which a batch is spread too; for `sessions: none`",
     )
-    timeout_s: float = Field(default=30.0, gt=0, description="for an answer; then the connection counts as lost, s")
+    timeout_s: float = Field(
+        default=30.0, gt=0, description="for an answer; then the connection counts as lost, s"
+    )
     retry_s: float = Field(
-        default=2.0, ge=0, description="for a lost upstream to return, before a request is answered with 503, s"
+        default=2.0,
+        ge=0,
+        description="for a lost upstream to return, before a request is answered with 503, s",
     )
     connect_timeout_s: float = Field(
         default=600.0, gt=0, description="for the first upstream to answer at the start, s"
@@ -99,13 +124,15 @@ class UpstreamConfig(BaseModel, extra="forbid"):
                 raise ValueError(f"urls: got {url!r}, want {want} for {self.protocol}")
             if parts.username is not None or parts.password is not None:
                 raise ValueError(
-                    "urls: got a name or a password in one; put the key into a variable, and name it in key_env"
+                    "urls: got a name or a password in one; put the key into a variable, and name "
+                    "it in key_env"
                 )
         if self.key_env is not None and not self.client.takes_key:
             raise ValueError(f"key_env: {self.protocol} has no place for a key; remove it")
         if self.mapping is None and self.client.mapping is None:
             raise ValueError(
-                f"mapping: {self.protocol} has none of its own; give an object, or a preset, such as openpi-libero for "
+                f"mapping: {self.protocol} has none of its own; give an object, or a preset, such "
+                "as openpi-libero for "
                 f"openpi"
             )
         self.keys()  # raises an error for an invalid mapping
@@ -118,7 +145,9 @@ class UpstreamConfig(BaseModel, extra="forbid"):
     @property
     def keeps_sessions(self) -> bool:
         """Whether each session has its own connection."""
-        return self.client.keeps_sessions if self.sessions is None else self.sessions == "connection"
+        return (
+            self.client.keeps_sessions if self.sessions is None else self.sessions == "connection"
+        )
 
     def keys(self) -> KeyMapping:
         return read_mapping(self.mapping if self.mapping is not None else str(self.client.mapping))
@@ -130,8 +159,8 @@ UPSTREAM_MS = "upstream_ms"  # in `Act.info`: the time that the upstreams needed
 class Upstream(Agent):
     """Requests the actions of each batch from the servers of another system.
 
-    The mapping converts the observation to the upstream's own keys. The upstream's actions are returned unchanged; the
-    contract states the range of their gripper commands.
+    The mapping converts the observation to the upstream's own keys. The upstream's actions are
+    returned unchanged; the contract states the range of their gripper commands.
     """
 
     Config: ClassVar[type] = UpstreamConfig
@@ -149,14 +178,21 @@ class Upstream(Agent):
 
     @property
     def contract(self) -> Contract:
-        """The contract from the mapping and the settings, with the length of a chunk if the upstream states it."""
+        """The contract from the mapping and the settings, with the length of a chunk if the
+        upstream states it.
+        """
         return self._state["contract"]
 
     def initialize(self) -> None:
-        """Connect to the upstreams; raises `ContractMismatch` if their metadata contradicts the mapping."""
+        """Connect to the upstreams; raises `ContractMismatch` if their metadata contradicts the
+        mapping.
+        """
         config, key = self.config, None
         if (name := config.key_env) is not None and not (key := os.environ.get(name)):
-            raise ConfigError(f"key_env: the environment variable {name!r} is not set; set it where the replica runs")
+            raise ConfigError(
+                f"key_env: the environment variable {name!r} is not set; set it where the replica "
+                "runs"
+            )
 
         def make(url: str) -> UpstreamClient:
             return config.client(ClientOptions(url, config.timeout_s, key))
@@ -175,12 +211,15 @@ class Upstream(Agent):
         if self._sessions is not None:
             self._session = uuid.uuid4().hex
             self._sessions.begin(self._session)
-            ended = weakref.finalize(self, self._sessions.drop, self._session)  # the copy ends with its session
+            # The copy ends with its session.
+            ended = weakref.finalize(self, self._sessions.drop, self._session)
             ended.atexit = False
         return {}
 
     def act_batch(self, obs: Sequence[Obs], sessions: Sequence[Agent]) -> list[Act | Exception]:
-        """Request the actions of all sessions from the upstreams at once; an error only fails its own session."""
+        """Request the actions of all sessions from the upstreams at once; an error only fails
+        its own session.
+        """
 
         def converted(one: Obs, session: Any) -> tuple[Any, dict[str, Any]]:
             return session, self._outgoing.observation(one, session._instruction)
@@ -191,7 +230,11 @@ class Upstream(Agent):
             info = {UPSTREAM_MS: (time.perf_counter() - begun) * 1e3}
 
             def act(answer: Any) -> Any:
-                return answer if isinstance(answer, Exception) else Act(self._outgoing.rows(answer), info=info)
+                return (
+                    answer
+                    if isinstance(answer, Exception)
+                    else Act(self._outgoing.rows(answer), info=info)
+                )
 
             return [attempt(act, answer) for answer in answers]
 
@@ -204,7 +247,9 @@ class Upstream(Agent):
 
     def _ask(self, sessions: Sequence[Any], observations: Sequence[Mapping[str, Any]]) -> list[Any]:
         if self._sessions is not None:
-            return list(self._sessions.ask([session._session or "" for session in sessions], observations))
+            return list(
+                self._sessions.ask([session._session or "" for session in sessions], observations)
+            )
         if self._lanes is None:
             raise NotReset("upstream: act before initialize; there is no connection")
         return list(self._lanes.ask(observations))
@@ -213,10 +258,14 @@ class Upstream(Agent):
         found = client.differences(metadata, self._outgoing)
         stated, chunk = self.config.contract.get("chunk"), client.chunk(metadata)
         if stated is not None and chunk is not None and stated != chunk:
-            found.append(f"chunk: the upstream gives {chunk} rows, contract.chunk says {stated}; change it")
+            found.append(
+                f"chunk: the upstream gives {chunk} rows, contract.chunk says {stated}; change it"
+            )
         if found:
             lines = "\n".join(f"- {line}" for line in found)
-            raise ContractMismatch(f"upstream {client.options.url} and the deployment's mapping do not fit:\n{lines}")
+            raise ContractMismatch(
+                f"upstream {client.options.url} and the deployment's mapping do not fit:\n{lines}"
+            )
         if chunk is not None:
             self._state["contract"] = replace(self.contract, chunk=chunk)
 

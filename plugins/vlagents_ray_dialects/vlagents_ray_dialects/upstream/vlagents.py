@@ -17,7 +17,9 @@ _PAUSE_S = 0.2  # s, between two checks whether the upstream's model is loaded
 
 
 class VlagentsClient(UpstreamClient):
-    """A client of one agent, shared by all connections; each observation contains the instruction."""
+    """A client of one agent, shared by all connections; each observation contains the
+    instruction.
+    """
 
     schemes: ClassVar[tuple[str, ...]] = ("rpyc",)
     takes_key: ClassVar[bool] = False
@@ -35,7 +37,9 @@ class VlagentsClient(UpstreamClient):
     def connect(self, timeout_s: float) -> dict[str, Any]:
         url, deadline = urlsplit(self.options.url), time.monotonic() + timeout_s
         try:
-            self._socket = socket.create_connection((url.hostname or "", url.port or 8080), timeout_s)
+            self._socket = socket.create_connection(
+                (url.hostname or "", url.port or 8080), timeout_s
+            )
             self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
             root = self._call(wire.get_root(self._next()), deadline)
             if not isinstance(root, tuple):
@@ -83,7 +87,8 @@ class VlagentsClient(UpstreamClient):
             connection.sendall(frame)
             while True:
                 length, compressed = rpyc.read_header(
-                    self._receive(connection, rpyc.HEADER.size, deadline), self.options.limits.body_bytes
+                    self._receive(connection, rpyc.HEADER.size, deadline),
+                    self.options.limits.body_bytes,
                 )
                 body = self._receive(connection, length, deadline)
                 found = wire.read_result(body, compressed, self.options.limits.body_bytes)

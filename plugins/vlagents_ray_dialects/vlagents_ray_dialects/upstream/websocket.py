@@ -1,4 +1,6 @@
-"""Clients of the protocols over WebSockets: openpi's, for one observation or a batch, RoboArena's and vla-eval's."""
+"""Clients of the protocols over WebSockets: openpi's, for one observation or a batch,
+RoboArena's and vla-eval's.
+"""
 
 from __future__ import annotations
 
@@ -25,22 +27,29 @@ _LOG = logging.getLogger("vlagents_ray.upstream.websocket")
 _LOG.setLevel(logging.CRITICAL)  # it logs each lost connection as an error, which is also raised
 _CLOSE_S = 1
 _REFUSED = (401, 403)
-# An upstream that computes on its event loop answers no pings meanwhile. Older versions of `websockets` send none.
-_NO_PINGS: dict[str, Any] = {"ping_interval": None} if "ping_interval" in inspect.signature(connect).parameters else {}
+# An upstream that computes on its event loop answers no pings meanwhile. Older versions of
+# `websockets` send none.
+_NO_PINGS: dict[str, Any] = (
+    {"ping_interval": None} if "ping_interval" in inspect.signature(connect).parameters else {}
+)
 
 
 class WebSocketClient(UpstreamClient):
     """A client over a WebSocket, with limits on the size of messages and on the waiting time.
 
-    A separate thread answers the upstream's pings, so that a connection stays open while no session acts.
+    A separate thread answers the upstream's pings, so that a connection stays open while no session
+    acts.
     """
 
     schemes: ClassVar[tuple[str, ...]] = ("ws", "wss")
-    key_scheme: ClassVar[str] = "Bearer"  # the word before the API key in the header `Authorization`
+    # The word before the API key in the header `Authorization`.
+    key_scheme: ClassVar[str] = "Bearer"
 
     def __init__(self, options: ClientOptions) -> None:
         super().__init__(options)
-        self._headers = {} if options.key is None else {"Authorization": f"{self.key_scheme} {options.key}"}
+        self._headers = (
+            {} if options.key is None else {"Authorization": f"{self.key_scheme} {options.key}"}
+        )
         self._connection: ClientConnection | None = None
         self._open = contextlib.ExitStack()
 
@@ -49,7 +58,9 @@ class WebSocketClient(UpstreamClient):
         return self._connection is not None and self._connection.protocol.state is State.OPEN
 
     def open(self, timeout_s: float) -> None:
-        """Connect; raises `PolicyUnavailable` if the upstream is unreachable, `Unauthorized` if it rejects the key."""
+        """Connect; raises `PolicyUnavailable` if the upstream is unreachable, `Unauthorized` if
+        it rejects the key.
+        """
         url = self.options.url
         try:
             opening = connect(
@@ -66,10 +77,13 @@ class WebSocketClient(UpstreamClient):
         except InvalidStatus as error:
             if error.response.status_code in _REFUSED:
                 raise Unauthorized(
-                    f"upstream {url}: it refuses the API key (HTTP {error.response.status_code}); name the environment "
+                    f"upstream {url}: it refuses the API key (HTTP {error.response.status_code}); "
+                    "name the environment "
                     f"variable with the right one in key_env"
                 ) from error
-            raise PolicyUnavailable(f"upstream {url}: refused with HTTP {error.response.status_code}") from error
+            raise PolicyUnavailable(
+                f"upstream {url}: refused with HTTP {error.response.status_code}"
+            ) from error
         except (OSError, InvalidHandshake, ConnectionClosed, TimeoutError) as error:
             raise self.unreachable(error) from error
 
@@ -106,7 +120,9 @@ class OpenPiClient(WebSocketClient):
 
     @staticmethod
     def is_nested(key: str) -> bool:
-        """Return whether a key is a path: `images/cam_high` is one, openpi's keys under `observation/` are not."""
+        """Return whether a key is a path: `images/cam_high` is one, openpi's keys under
+        `observation/` are not.
+        """
         return not key.startswith("observation/")
 
     def connect(self, timeout_s: float) -> dict[str, Any]:
@@ -129,12 +145,18 @@ class OpenPiClient(WebSocketClient):
         return self._map(data)
 
     def _map(self, data: bytes | str) -> dict[str, Any]:
-        """Return the map in a message; an error that is a text, or has the key `error`, ends the connection."""
-        reply: dict[str, Any] = self._good(data if isinstance(data, str) else openpi.decode(data, self.options.limits))
+        """Return the map in a message; an error that is a text, or has the key `error`, ends the
+        connection.
+        """
+        reply: dict[str, Any] = self._good(
+            data if isinstance(data, str) else openpi.decode(data, self.options.limits)
+        )
         return reply
 
     def _good(self, reply: Any) -> Any:
-        """Return a reply that is no error: openpi's is a text, SGLang's and vLLM-Omni's are maps."""
+        """Return a reply that is no error: openpi's is a text, SGLang's and vLLM-Omni's are
+        maps.
+        """
         if isinstance(reply, str):
             self.close()
             raise self.failed(reply)
@@ -147,14 +169,18 @@ class OpenPiClient(WebSocketClient):
 
 
 class OpenPiBatchClient(OpenPiClient):
-    """A client that sends `{"batch": [...]}`, as in openpi's pull request 941 and in our own dialect."""
+    """A client that sends `{"batch": [...]}`, as in openpi's pull request 941 and in our own
+    dialect.
+    """
 
     batches: ClassVar[bool] = True
 
     def ask(self, observations: Sequence[Mapping[str, Any]]) -> list[Answer]:
         actions = self.actions(self._call({"batch": list(observations)}))
         if actions.ndim != 3 or len(actions) != len(observations):
-            raise self.unreadable(f"actions {actions.shape}", f"({len(observations)}, H, D), one chunk an observation")
+            raise self.unreadable(
+                f"actions {actions.shape}", f"({len(observations)}, H, D), one chunk an observation"
+            )
         return list(actions)
 
 
@@ -162,7 +188,9 @@ _RESET = "reset successful"  # the answer of RoboArena's servers to `reset`
 
 
 class RoboArenaClient(OpenPiClient):
-    """A client of RoboArena's servers, which keep a session for each `session_id` and have a reset."""
+    """A client of RoboArena's servers, which keep a session for each `session_id` and have a
+    reset.
+    """
 
     keeps_sessions: ClassVar[bool] = True
     mapping: ClassVar[str | None] = "roboarena"
@@ -180,30 +208,43 @@ class RoboArenaClient(OpenPiClient):
         self._session = uuid.uuid4().hex
         self.send(openpi.encode({"endpoint": "reset"}))
         if (answer := self.recv()) != _RESET:
-            self._read(answer)  # vLLM-Omni answers with a map; any text other than `_RESET` is an error
+            # vLLM-Omni answers with a map; any text other than `_RESET` is an error.
+            self._read(answer)
 
     def differences(self, metadata: Mapping[str, Any], outgoing: Outgoing) -> list[str]:
         cameras = [camera.key.partition("|")[0] for camera in outgoing.mapping.cameras.values()]
         found = []
         external = metadata.get("n_external_cameras")
-        have = sum("wrist" not in key for key in cameras)  # vLLM-Omni's π0 has no key with "exterior"
+        # vLLM-Omni's π0 has no key with "exterior".
+        have = sum("wrist" not in key for key in cameras)
         if isinstance(external, int) and external > have:
             found.append(
                 f"cameras: the upstream needs {external} external ones, the mapping has {have}; "
                 f"add them to mapping.cameras"
             )
-        if metadata.get("needs_wrist_camera") is True and not any("wrist" in key for key in cameras):
+        if metadata.get("needs_wrist_camera") is True and not any(
+            "wrist" in key for key in cameras
+        ):
             found.append(
-                "cameras: the upstream needs one at the wrist, the mapping has none; add it to mapping.cameras"
+                "cameras: the upstream needs one at the wrist, the mapping has none; add it to "
+                "mapping.cameras"
             )
         return found
 
     def _read(self, data: bytes | str) -> Any:
         """Return a map, or the array that older servers and vLLM-Omni send."""
-        return self._good(data if isinstance(data, str) else openpi.decode_any(data, self.options.limits))
+        return self._good(
+            data if isinstance(data, str) else openpi.decode_any(data, self.options.limits)
+        )
 
 
-_STATED = ("model_server", "harness_version", "protocol_version", "observation_params", "action_spec")
+_STATED = (
+    "model_server",
+    "harness_version",
+    "protocol_version",
+    "observation_params",
+    "action_spec",
+)
 
 
 class VlaEvalClient(WebSocketClient):
@@ -222,7 +263,11 @@ class VlaEvalClient(WebSocketClient):
         version = importlib.metadata.version("vlagents-ray")
         try:
             self._send(
-                "hello", {"harness_version": f"vlagents-ray {version}", "protocol_version": vla_eval.PROTOCOL_VERSION}
+                "hello",
+                {
+                    "harness_version": f"vlagents-ray {version}",
+                    "protocol_version": vla_eval.PROTOCOL_VERSION,
+                },
             )
             hello = self._answer("hello", timeout_s)
         except VLAgentsError as error:
@@ -246,16 +291,27 @@ class VlaEvalClient(WebSocketClient):
         payload = self._answer("action", self.options.timeout_s)
         actions = payload.get("actions", payload.get("action"))
         if isinstance(actions, list):
-            actions = np.asarray(actions, np.float32) if all(isinstance(one, int | float) for one in actions) else None
+            actions = (
+                np.asarray(actions, np.float32)
+                if all(isinstance(one, int | float) for one in actions)
+                else None
+            )
         if not isinstance(actions, np.ndarray):
-            raise self.unreadable(sorted(map(str, payload))[:8], "a payload with an array `actions`")
+            raise self.unreadable(
+                sorted(map(str, payload))[:8], "a payload with an array `actions`"
+            )
         return [actions]
 
     def differences(self, metadata: Mapping[str, Any], outgoing: Outgoing) -> list[str]:
         params = metadata.get("observation_params")
         wants_state = isinstance(params, dict) and params.get("send_state") is True
         if wants_state and not outgoing.mapping.state:
-            return ["state: the upstream needs it (send_state), the mapping has none; add it to mapping.state"]
+            return [
+                (
+                    "state: the upstream needs it (send_state), the mapping has none; add it to "
+                    "mapping.state"
+                )
+            ]
         return []
 
     def _send(self, kind: vla_eval.Kind, payload: dict[str, Any]) -> None:

@@ -38,25 +38,35 @@ def served(shared_ray: None, version: Path) -> Iterator[Server]:
 def expected(version: Path) -> Any:
     """The transitions of 8 episodes of the policy in this process, one after the other."""
     write(version, 3)
-    with Rollouts(RolloutPlan(LINE, partial(Stochastic, str(version)), **GROUPS | {"workers": 0})) as found:
+    with Rollouts(
+        RolloutPlan(LINE, partial(Stochastic, str(version)), **GROUPS | {"workers": 0})
+    ) as found:
         return without_key(found.collect(8))
 
 
 def write(version: Path, number: int) -> None:
-    """Name the version, at once: a policy that acts meanwhile reads the old number or the new one."""
+    """Name the version, at once: a policy that acts meanwhile reads the old number or the new
+    one.
+    """
     part = version.with_suffix(".part")
     part.write_text(str(number))
     part.rename(version)
 
 
 def without_key(table: Any) -> Any:
-    """The transitions without their keys, which depend on settings such as the number of environments."""
+    """The transitions without their keys, which depend on settings such as the number of
+    environments.
+    """
     return table.drop_columns(["key"]).combine_chunks()
 
 
 @pytest.mark.parametrize("url", ["serve://Stochastic", "http"])
-def test_transitions_are_those_of_the_policy_itself(served: Server, expected: Any, url: str) -> None:
-    with Rollouts(RolloutPlan(LINE, served.url if url == "http" else url, workers=2, num_envs=3, **GROUPS)) as found:
+def test_transitions_are_those_of_the_policy_itself(
+    served: Server, expected: Any, url: str
+) -> None:
+    with Rollouts(
+        RolloutPlan(LINE, served.url if url == "http" else url, workers=2, num_envs=3, **GROUPS)
+    ) as found:
         got = without_key(found.collect(8))
     assert got.equals(expected)
     columns = arrays(got)
@@ -79,7 +89,9 @@ def test_a_worker_killed_with_several_episodes_costs_no_transition_and_doubles_n
 
     killer = threading.Thread(target=kill)
     gate = {"folder": str(tmp_path), "trouble": {"gate": [11]}}
-    with Rollouts(RolloutPlan(LINE, "serve://Stochastic", workers=2, num_envs=3, env_options=gate, **GROUPS)) as found:
+    with Rollouts(
+        RolloutPlan(LINE, "serve://Stochastic", workers=2, num_envs=3, env_options=gate, **GROUPS)
+    ) as found:
         killer.start()
         got = without_key(found.collect(8))
         killer.join()
@@ -88,7 +100,9 @@ def test_a_worker_killed_with_several_episodes_costs_no_transition_and_doubles_n
     assert found.stats.lost == 0
 
 
-def test_what_the_policy_does_not_offer_ends_the_rollouts_at_once(served: Server, version: Path) -> None:
+def test_what_the_policy_does_not_offer_ends_the_rollouts_at_once(
+    served: Server, version: Path
+) -> None:
     write(version, 1)
     with (
         Rollouts(RolloutPlan(LINE, served.url, want=["logprob", "entropy"])) as found,

@@ -30,13 +30,19 @@ def gain(value: float) -> dict[str, np.ndarray]:
 
 
 def plan(out: Path, **changes: Any) -> EvalConfig:
-    return flat_config(**{"envs": [LINE], "episodes": 6, "workers": 2, "video": "none", "out": out} | changes)
+    return flat_config(
+        **{"envs": [LINE], "episodes": 6, "workers": 2, "video": "none", "out": out} | changes
+    )
 
 
 def played(summary: Summary) -> dict[str, Any]:
     """What was executed in each episode, and by which weights."""
     return {
-        str(one.result.key): (one.result.actions_sha256, one.result.policy_version, one.result.policy_fingerprint)
+        str(one.result.key): (
+            one.result.actions_sha256,
+            one.result.policy_version,
+            one.result.policy_fingerprint,
+        )
         for cell in summary.results.cells
         for one in cell.episodes
     }
@@ -59,5 +65,7 @@ def test_each_version_is_evaluated_as_it_was_pushed(
         assert played(summary) == played(here.play(versions[-1]))
     assert summary.results.contenders == [f"policy@{version}" for version in versions]
     assert len(played(summary)) == 12
-    with pytest.raises(ConfigError, match=rf"got 99, but the newest that {url} acts with is {versions[-1]}"):
+    with pytest.raises(
+        ConfigError, match=rf"got 99, but the newest that {url} acts with is {versions[-1]}"
+    ):
         served.play(99)

@@ -18,7 +18,9 @@ from vlagents_ray.weights.trainable import portable
 
 
 def model(device: str) -> Any:
-    """Values of many kinds: tied, transposed, of one element, of two precisions, whole numbers, on the CPU."""
+    """Values of many kinds: tied, transposed, of one element, of two precisions, whole numbers,
+    on the CPU.
+    """
     import torch
 
     torch.manual_seed(0)
@@ -71,7 +73,9 @@ class _Replica:
         return {name: portable(value) for name, value in self.agent.parameters().items()}
 
     def memory(self) -> tuple[int, set[str]]:
-        """Bytes of GPU memory in use, and the files of shared memory that were open at any answer."""
+        """Bytes of GPU memory in use, and the files of shared memory that were open at any
+        answer.
+        """
         import torch
 
         return torch.cuda.memory_allocated() if torch.cuda.is_available() else 0, self.left_open
@@ -111,11 +115,18 @@ class ReplicaProcess:
         return answer
 
     async def weights(self, method: Callable[..., Any], *args: Any) -> Any:
-        return self.ask(method.__name__, *[await one[0] if isinstance(one, list) else one for one in args])
+        return self.ask(
+            method.__name__, *[await one[0] if isinstance(one, list) else one for one in args]
+        )
 
     def __enter__(self) -> ReplicaProcess:
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        at: TracebackType | None,
+    ) -> None:
         self._pipe.send(None)
         self._process.join(60)

@@ -16,13 +16,22 @@ from vlagents_ray.evaluate.results.summary import pushed_of
 
 
 def start_run(folder: Path, out: Path, *options: str, before: str = "") -> subprocess.Popen[str]:
-    """Start the example with the plan of `folder`, where its Ray is, in a process that runs `before` first."""
+    """Start the example with the plan of `folder`, where its Ray is, in a process that runs
+    `before` first.
+    """
     script = str(EXAMPLES / "learn" / "train.py")
-    code = f"import sys; sys.argv[0] = {script!r}; sys.path.insert(0, {str(EXAMPLES / 'learn')!r})\nimport train\n"
+    code = (
+        f"import sys; sys.argv[0] = {script!r}; sys.path.insert(0, "
+        f"{str(EXAMPLES / 'learn')!r})\nimport train\n"
+    )
     command = [sys.executable, "-c", f"{code}{before}\ntrain.typer.run(train.main)"]
     command += [str(folder / "plan.yaml"), "--out", str(out), *options]
     return subprocess.Popen(
-        command, env=os.environ | {"RAY_TMPDIR": str(folder)}, stdout=PIPE, stderr=subprocess.STDOUT, text=True
+        command,
+        env=os.environ | {"RAY_TMPDIR": str(folder)},
+        stdout=PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
     )
 
 

@@ -15,24 +15,37 @@ from vlagents_ray.errors import ConfigError
 
 
 def open_loop_command(
-    folder: Annotated[Path, typer.Argument(metavar="DATASET", help="A LeRobotDataset, or a folder of them.")],
+    folder: Annotated[
+        Path, typer.Argument(metavar="DATASET", help="A LeRobotDataset, or a folder of them.")
+    ],
     policy: Annotated[str, typer.Option(help="Name, deployment file, or URL.")],
-    out_dir: Annotated[Path | None, typer.Option("--out", help="Folder of the errors; default: a new one.")] = None,
+    out_dir: Annotated[
+        Path | None, typer.Option("--out", help="Folder of the errors; default: a new one.")
+    ] = None,
     only: Annotated[str | None, typer.Option(help="Episodes, as 0-9,12. Default: all.")] = None,
     horizon: Annotated[
-        int | None, typer.Option(min=1, max=MOST_ROWS, help="Rows of a chunk that are compared. Default: all.")
+        int | None,
+        typer.Option(min=1, max=MOST_ROWS, help="Rows of a chunk that are compared. Default: all."),
     ] = None,
     every: Annotated[
-        int, typer.Option(min=1, max=MOST_EPISODES, help="Without recorded answers: each so many-th frame.")
+        int,
+        typer.Option(
+            min=1, max=MOST_EPISODES, help="Without recorded answers: each so many-th frame."
+        ),
     ] = 1,
-    at_once: Annotated[int, typer.Option(min=1, max=MOST_ROWS, help="Sessions that share a batch.")] = 8,
-    camera_map: Annotated[str | None, typer.Option(help="POLICY=DATASET, as base=top,wrist=left.")] = None,
+    at_once: Annotated[
+        int, typer.Option(min=1, max=MOST_ROWS, help="Sessions that share a batch.")
+    ] = 8,
+    camera_map: Annotated[
+        str | None, typer.Option(help="POLICY=DATASET, as base=top,wrist=left.")
+    ] = None,
     state: Annotated[str | None, typer.Option(help="Parts of observation.state in order.")] = None,
 ) -> None:
-    """Send the observations of a dataset to a policy, and compare its actions with the recorded ones.
+    """Send the observations of a dataset to a policy, and compare its actions with the recorded
+    ones.
 
-    A dataset is a server's recording, or any LeRobotDataset. The errors by joint and by step of the horizon are
-    printed, and written as JSON.
+    A dataset is a server's recording, or any LeRobotDataset. The errors by joint and by step of the
+    horizon are printed, and written as JSON.
     """
     with errors():
         from vlagents_ray_learn.open_loop.comparison import (
@@ -44,7 +57,9 @@ def open_loop_command(
         )
         from vlagents_ray_learn.open_loop.recorded_dataset import Names
 
-        names = Names(parse_camera_map(camera_map or ""), None if state is None else parse_list(state))
+        names = Names(
+            parse_camera_map(camera_map or ""), None if state is None else parse_list(state)
+        )
         episodes = None if only is None else parse_episodes(only)
         plan = OpenLoopPlan(episodes, horizon, every, at_once, names)
         datasets = open_datasets(folder)
@@ -54,21 +69,29 @@ def open_loop_command(
 
         table = result.to_json()
         out.print(
-            f"{table['frames']} frames of {table['sessions']} sessions, against the recorded {result.against}: "
-            f"mean absolute error {table['mae']:.4g}, root mean square {table['rmse']:.4g}, largest {table['max']:.4g}"
+            f"{table['frames']} frames of {table['sessions']} sessions, against the recorded "
+            f"{result.against}: "
+            f"mean absolute error {table['mae']:.4g}, root mean square {table['rmse']:.4g}, "
+            f"largest {table['max']:.4g}"
         )
         for joint in table["by_joint"]:
-            out.print(f"  {joint['joint']}: {joint['mae']:.4g}, {joint['rmse']:.4g}, {joint['max']:.4g}")
+            out.print(
+                f"  {joint['joint']}: {joint['mae']:.4g}, {joint['rmse']:.4g}, {joint['max']:.4g}"
+            )
         out.print(f"wrote {write_result(result, policy, into)}")
 
 
 def parse_camera_map(text: str) -> dict[str, str]:
-    """Return the camera of the dataset for each of the policy's, from "base=top,wrist=left"; raises `ConfigError`."""
+    """Return the camera of the dataset for each of the policy's, from "base=top,wrist=left";
+    raises `ConfigError`.
+    """
     cameras = {}
     for pair in parse_list(text):
         name, equals, camera = pair.partition("=")
         if not equals:
-            raise ConfigError(f"--camera-map: expected POLICY=DATASET, such as base=top,wrist=left, got {pair!r}")
+            raise ConfigError(
+                f"--camera-map: expected POLICY=DATASET, such as base=top,wrist=left, got {pair!r}"
+            )
         cameras[name] = camera
     return cameras
 
@@ -79,9 +102,14 @@ def parse_episodes(text: str) -> Sequence[int]:
     for interval in parse_list(text):
         first, dash, last = interval.partition("-")
         if not first.isdecimal() or (dash and not last.isdecimal()):
-            raise ConfigError(f"--only: expected numbers and ranges, such as 0-9,12, got {interval!r}")
+            raise ConfigError(
+                f"--only: expected numbers and ranges, such as 0-9,12, got {interval!r}"
+            )
         numbers = range(int(first), int(last or first) + 1)
         if not numbers or len(episodes) + len(numbers) > MOST_EPISODES:
-            raise ConfigError(f"--only: expected up to {MOST_EPISODES} numbers, from low to high, got {interval!r}")
+            raise ConfigError(
+                f"--only: expected up to {MOST_EPISODES} numbers, from low to high, got "
+                f"{interval!r}"
+            )
         episodes += numbers
     return episodes

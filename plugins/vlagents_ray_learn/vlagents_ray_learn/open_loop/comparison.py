@@ -1,4 +1,6 @@
-"""A policy's answers to the observations of datasets, with several sessions at once, which it answers in batches."""
+"""A policy's answers to the observations of datasets, with several sessions at once, which it
+answers in batches.
+"""
 
 from __future__ import annotations
 
@@ -36,7 +38,8 @@ OpenSession = Callable[[], Agent]  # the caller closes the session
 
 FILE = "open_loop.json"
 _WORST_FRAMES = 10  # number of frames that the result lists
-_CHOICES_OF_WEIGHTS = (CHOICE, STEP, OPTION)  # options of a reset, which another policy does not have
+# Options of a reset, which another policy does not have.
+_CHOICES_OF_WEIGHTS = (CHOICE, STEP, OPTION)
 
 
 @contextmanager
@@ -53,14 +56,18 @@ def candidate(source: str) -> Iterator[OpenSession]:
         yield partial(RemoteAgent, source, rank="simulation", codec="exact")
         return
     application = policy_application(source)
-    with LocalPolicy(ServerArgs(**application.args), own_settings(application), threaded=True) as policy:
+    with LocalPolicy(
+        ServerArgs(**application.args), own_settings(application), threaded=True
+    ) as policy:
         policy.initialize()
         yield lambda: policy.sessions(1)[0]
 
 
 @dataclass
 class ErrorTable:
-    """Sums over the frames so far, for each step of the horizon (H) and each number of an action (D)."""
+    """Sums over the frames so far, for each step of the horizon (H) and each number of an action
+    (D).
+    """
 
     joints: list[str]  # the names of these numbers
     absolute: np.ndarray = field(init=False)  # (H, D), of the absolute errors
@@ -96,7 +103,9 @@ class ErrorTable:
         self.frames = np.pad(self.frames, (0, missing))
 
     def to_json(self) -> dict[str, Any]:
-        """Return the errors overall, by joint, by step, and by both, in the units of the actions."""
+        """Return the errors overall, by joint, by step, and by both, in the units of the
+        actions.
+        """
         total = max(1, int(self.frames.sum()))
         mae = self.absolute.sum(0) / total
         rmse = np.sqrt(self.square.sum(0) / total)
@@ -109,7 +118,12 @@ class ErrorTable:
         means = self.absolute / frames
         step_rmse = np.sqrt((self.square / frames).mean(1))
         by_step = [
-            {"step": step, "frames": int(count), "mae": float(means[step].mean()), "rmse": float(step_rmse[step])}
+            {
+                "step": step,
+                "frames": int(count),
+                "mae": float(means[step].mean()),
+                "rmse": float(step_rmse[step]),
+            }
             for step, count in enumerate(self.frames)
         ]
         return {
@@ -127,7 +141,8 @@ class OpenLoopPlan:
     """The settings of a comparison."""
 
     episodes: Sequence[int] | None = None  # of each dataset; None: all
-    horizon: int | None = None  # largest number of compared rows of a chunk; None: all rows that both have
+    # Largest number of compared rows of a chunk; None: all rows that both have.
+    horizon: int | None = None
     every: int = 1  # stride of the queried frames in a dataset without recorded answers
     at_once: int = 8  # number of concurrent sessions
     names: Names = field(default_factory=Names)
@@ -141,15 +156,22 @@ class OpenLoopResult:
     against: str  # "answers" recorded by a server, or "actions" of the dataset
     table: ErrorTable
     sessions: int = 0
-    missing: int = 0  # calls that the recording lacks, so that a policy with a history received less
-    frames: list[dict[str, Any]] = field(default_factory=list)  # dataset, episode, frame, and its chunk's "mae"
+    # Calls that the recording lacks, so that a policy with a history received less.
+    missing: int = 0
+    # dataset, episode, frame, and its chunk's "mae".
+    frames: list[dict[str, Any]] = field(default_factory=list)
 
     def to_json(self) -> dict[str, Any]:
         errors_of: dict[tuple[str, int], list[float]] = {}
         for frame in self.frames:
             errors_of.setdefault((frame["dataset"], frame["episode"]), []).append(frame["mae"])
         by_episode = [
-            {"dataset": dataset, "episode": episode, "frames": len(errors), "mae": float(np.mean(errors))}
+            {
+                "dataset": dataset,
+                "episode": episode,
+                "frames": len(errors),
+                "mae": float(np.mean(errors)),
+            }
             for (dataset, episode), errors in sorted(errors_of.items())
         ]
         worst = sorted(self.frames, key=lambda frame: -frame["mae"])[:_WORST_FRAMES]
@@ -175,20 +197,26 @@ def open_datasets(folder: Path) -> list[RecordedDataset]:
     files_below = sorted(folder.glob("*/meta/info.json"))
     files = [*own_file, *files_below]
     if not files:
-        raise ConfigError(f"{folder}: expected a LeRobotDataset, or a folder of them, got no meta/info.json")
+        raise ConfigError(
+            f"{folder}: expected a LeRobotDataset, or a folder of them, got no meta/info.json"
+        )
     datasets = [RecordedDataset(path.parents[1]) for path in files]
     first = datasets[0]
     for other in datasets[1:]:
         if len(other.joints) != len(first.joints) or other.traced != first.traced:
-            raise ConfigError(f"{other.root}: has other actions than {first.root}; compare them one by one")
+            raise ConfigError(
+                f"{other.root}: has other actions than {first.root}; compare them one by one"
+            )
     return datasets
 
 
-def compare(datasets: Sequence[RecordedDataset], open_session: OpenSession, plan: OpenLoopPlan) -> OpenLoopResult:
+def compare(
+    datasets: Sequence[RecordedDataset], open_session: OpenSession, plan: OpenLoopPlan
+) -> OpenLoopResult:
     """Query a policy at each frame, and compare its actions with those of the dataset.
 
-    A session is reset with its first recorded observation, its instruction and its options, and then receives each of
-    its observations in order, whatever its answers are.
+    A session is reset with its first recorded observation, its instruction and its options, and
+    then receives each of its observations in order, whatever its answers are.
 
     Args:
         datasets: The result of `open_datasets`.
@@ -202,7 +230,9 @@ def compare(datasets: Sequence[RecordedDataset], open_session: OpenSession, plan
     first = datasets[0]
     sessions = [session for dataset in datasets for session in dataset.sessions(plan.episodes)]
     against = "answers" if first.traced else "actions"
-    result = OpenLoopResult([str(dataset.root) for dataset in datasets], against, ErrorTable(first.joints))
+    result = OpenLoopResult(
+        [str(dataset.root) for dataset in datasets], against, ErrorTable(first.joints)
+    )
     for session in sessions:
         result.missing += sum(episode.dataset.gaps(episode) for episode in session.episodes)
     lock = threading.Lock()
@@ -213,7 +243,11 @@ def compare(datasets: Sequence[RecordedDataset], open_session: OpenSession, plan
             for episode, step, actions in _answers(session, agent, plan):
                 expected = _fitting(step.expected, actions, episode)
                 rows = min(len(expected), len(actions), plan.horizon or len(actions))
-                frame = {"dataset": episode.dataset.root.name, "episode": episode.index, "frame": step.frame}
+                frame = {
+                    "dataset": episode.dataset.root.name,
+                    "episode": episode.index,
+                    "frame": step.frame,
+                }
                 with lock:
                     mae = result.table.add(expected[:rows], actions[:rows])
                     result.frames.append({**frame, "mae": mae})
@@ -234,10 +268,13 @@ def compare(datasets: Sequence[RecordedDataset], open_session: OpenSession, plan
 
 
 def _fitting(expected: np.ndarray, actions: np.ndarray, episode: RecordedEpisode) -> np.ndarray:
-    """Return the recorded actions; raises `ConfigError` if the policy's have another number of values."""
+    """Return the recorded actions; raises `ConfigError` if the policy's have another number of
+    values.
+    """
     if actions.shape[1] != expected.shape[1]:
         raise ConfigError(
-            f"{episode.dataset.root}: its actions have {expected.shape[1]} numbers, those of the policy "
+            f"{episode.dataset.root}: its actions have {expected.shape[1]} numbers, those of the "
+            "policy "
             f"{actions.shape[1]}; use a policy of the same robot and control mode"
         )
     return expected
@@ -247,7 +284,9 @@ def _answers(
     session: RecordedSession, agent: Agent, plan: OpenLoopPlan
 ) -> Iterator[tuple[RecordedEpisode, RecordedStep, np.ndarray]]:
     """Yield the frames of a session, each with the policy's action, (H, D)."""
-    options = {name: value for name, value in session.options.items() if name not in _CHOICES_OF_WEIGHTS}
+    options = {
+        name: value for name, value in session.options.items() if name not in _CHOICES_OF_WEIGHTS
+    }
     is_reset = False
     for episode in session.episodes:
         every = 1 if episode.dataset.traced else plan.every
@@ -269,5 +308,8 @@ def write_result(result: OpenLoopResult, policy: str, folder: Path) -> Path:
     with storing(folder):
         folder.mkdir(parents=True, exist_ok=True)
         with whole(folder / FILE) as path:
-            path.write_text(json.dumps({"policy": policy, **result.to_json()}, indent=2, ensure_ascii=False), "utf-8")
+            path.write_text(
+                json.dumps({"policy": policy, **result.to_json()}, indent=2, ensure_ascii=False),
+                "utf-8",
+            )
     return folder / FILE

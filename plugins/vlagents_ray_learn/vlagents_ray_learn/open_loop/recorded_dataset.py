@@ -21,7 +21,14 @@ from vlagents_ray.dataset_contract import (
     divided_state,
     state_parts,
 )
-from vlagents_ray.datasets.episode import ACTION, ENVIRONMENT, IMAGES, INTERVENTION_COLUMN, SAFE_COLUMN, STATE
+from vlagents_ray.datasets.episode import (
+    ACTION,
+    ENVIRONMENT,
+    IMAGES,
+    INTERVENTION_COLUMN,
+    SAFE_COLUMN,
+    STATE,
+)
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.images import jpeg_png
 from vlagents_ray.images.mp4 import rgb_converter
@@ -38,8 +45,10 @@ _IMAGE_DTYPES = ("video", "image")
 class Names:
     """The policy's names for the cameras and state of a dataset without a contract of ours."""
 
-    cameras: Mapping[str, str] = field(default_factory=dict)  # policy's camera -> camera or feature of the dataset
-    state: Sequence[str] | None = None  # concatenated parts of `observation.state`; "gripper" is `Obs.gripper`
+    # policy's camera -> camera or feature of the dataset.
+    cameras: Mapping[str, str] = field(default_factory=dict)
+    # Concatenated parts of `observation.state`; "gripper" is `Obs.gripper`.
+    state: Sequence[str] | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,7 +57,8 @@ class RecordedStep:
 
     frame: int
     obs: Obs
-    expected: np.ndarray  # (H, D): the recorded answer, or the actions from here to the end of the episode
+    # (H, D): the recorded answer, or the actions from here to the end of the episode.
+    expected: np.ndarray
     intervention: bool = False  # whether the recorded action is an operator's
 
 
@@ -82,10 +92,15 @@ class RecordedDataset:
         self.info = _read_info(root / "meta/info.json")
         self.version = str(self.info.get("codebase_version"))
         if not self.version.startswith(("v3.", "v2.")):
-            raise ConfigError(f"{root}: expected a LeRobotDataset v3.0, v2.1 or v2.0, got {self.version}; convert it")
+            raise ConfigError(
+                f"{root}: expected a LeRobotDataset v3.0, v2.1 or v2.0, got {self.version}; "
+                "convert it"
+            )
         self.features: dict[str, Any] = self.info.get("features") or {}
         if ACTION not in self.features:
-            raise ConfigError(f"{root}: expected {ACTION!r} among its features, got {sorted(self.features)}")
+            raise ConfigError(
+                f"{root}: expected {ACTION!r} among its features, got {sorted(self.features)}"
+            )
         contract = self.info.get(INFO)
         self.contract = None if contract is None else DatasetContract.from_json(contract)
         self.traced = TRACE in self.info and CHUNK in self.features
@@ -114,7 +129,9 @@ class RecordedDataset:
         if chosen is not None:
             missing = sorted(set(chosen) - {episode.index for episode in episodes})
             if missing:
-                raise ConfigError(f"{self.root}: expected some of its {len(episodes)} episodes, got {missing}")
+                raise ConfigError(
+                    f"{self.root}: expected some of its {len(episodes)} episodes, got {missing}"
+                )
             episodes = [episode for episode in episodes if episode.index in set(chosen)]
         if not self.traced:
             return [RecordedSession((episode,), {}) for episode in episodes]
@@ -127,7 +144,8 @@ class RecordedDataset:
             by_session.setdefault(session, []).append(episode)
             options.setdefault(session, columns["reset"][0])
         return [
-            RecordedSession(tuple(in_order), _read_values(options[session])) for session, in_order in by_session.items()
+            RecordedSession(tuple(in_order), _read_values(options[session]))
+            for session, in_order in by_session.items()
         ]
 
     def gaps(self, episode: RecordedEpisode) -> int:
@@ -137,18 +155,23 @@ class RecordedDataset:
         ticks = np.array(self._columns(episode, ["tick"])["tick"])
         return int((np.diff(ticks) - 1).clip(0).sum())
 
-    def steps(self, episode: RecordedEpisode, names: Names, policy: Contract | None) -> Iterator[RecordedStep]:
+    def steps(
+        self, episode: RecordedEpisode, names: Names, policy: Contract | None
+    ) -> Iterator[RecordedStep]:
         """Yield the frames of an episode, with the input names of a policy.
 
         Args:
             episode: One of this dataset.
             names: The policy's names, where the dataset has no contract.
-            policy: The contract of the policy, which divides a state without names; None if it has none.
+            policy: The contract of the policy, which divides a state without names; None if it has
+                none.
 
         Raises:
             ConfigError: A name is unknown, or a file is incomplete.
         """
-        image_features = [name for name, feature in self.features.items() if feature["dtype"] in _IMAGE_DTYPES]
+        image_features = [
+            name for name, feature in self.features.items() if feature["dtype"] in _IMAGE_DTYPES
+        ]
         embedded = [name for name in image_features if self.features[name]["dtype"] == "image"]
         numbers = (ACTION, STATE, ENVIRONMENT, INTERVENTION_COLUMN, SAFE_COLUMN)
         wanted = [name for name in numbers if name in self.features] + embedded
@@ -163,9 +186,16 @@ class RecordedDataset:
         for i in range(episode.length):
             images = {}
             for feature, camera in cameras.items():
-                image = next(videos[feature]) if feature in videos else _embedded_image(columns[feature][i])
+                image = (
+                    next(videos[feature])
+                    if feature in videos
+                    else _embedded_image(columns[feature][i])
+                )
                 images[camera] = self._original_size(image, camera)
-            values = {name: np.atleast_1d(np.array(columns[name][i], np.float32)) for name in state_features}
+            values = {
+                name: np.atleast_1d(np.array(columns[name][i], np.float32))
+                for name in state_features
+            }
             state, gripper = divided_state(values, state_features)
 
             info: dict[str, Any] = {}
@@ -177,7 +207,9 @@ class RecordedDataset:
             intervention = INTERVENTION_COLUMN in columns and bool(columns[INTERVENTION_COLUMN][i])
             # Datasets of earlier releases also mark an operator's action that the guard refused.
             refused = SAFE_COLUMN in columns and bool(columns[SAFE_COLUMN][i])
-            yield RecordedStep(i, Obs(images, gripper, state, info), expected, intervention and not refused)
+            yield RecordedStep(
+                i, Obs(images, gripper, state, info), expected, intervention and not refused
+            )
 
     def _episodes(self) -> list[RecordedEpisode]:
         """Read the episodes from the metadata, in the order of their indices."""
@@ -188,13 +220,17 @@ class RecordedDataset:
         else:
             for path in sorted(self.root.glob("meta/episodes/*/*.parquet")):
                 with self._pq.ParquetFile(path) as file:
-                    names = [name for name in file.schema_arrow.names if not name.startswith("stats/")]
+                    names = [
+                        name for name in file.schema_arrow.names if not name.startswith("stats/")
+                    ]
                     rows += file.read(names).to_pylist()
         rows.sort(key=lambda row: row["episode_index"])
         episodes = []
         for row in rows:
             instruction = str(next(iter(row.get("tasks") or ()), ""))
-            episodes.append(RecordedEpisode(self, row["episode_index"], row["length"], instruction, row))
+            episodes.append(
+                RecordedEpisode(self, row["episode_index"], row["length"], instruction, row)
+            )
         return episodes
 
     def _columns(self, episode: RecordedEpisode, names: Sequence[str]) -> dict[str, list[Any]]:
@@ -205,7 +241,8 @@ class RecordedDataset:
         columns: dict[str, list[Any]] = table.to_pydict()
         if any(len(values) != episode.length for values in columns.values()):
             raise ConfigError(
-                f"{file}: expected {episode.length} frames of episode {episode.index}, got another number; "
+                f"{file}: expected {episode.length} frames of episode {episode.index}, got another "
+                "number; "
                 f"is the file complete?"
             )
         return columns
@@ -230,10 +267,14 @@ class RecordedDataset:
             for frame in container.decode(stream):
                 if frame.time >= start_s - 0.5 / self.info["fps"]:
                     yield convert(frame)
-        raise ConfigError(f"{file}: has fewer than the {episode.length} frames of episode {episode.index}")
+        raise ConfigError(
+            f"{file}: has fewer than the {episode.length} frames of episode {episode.index}"
+        )
 
     def _original_size(self, image: np.ndarray, camera: str) -> np.ndarray:
-        """Return an image without the row and the column that were added to make the size of its video even."""
+        """Return an image without the row and the column that were added to make the size of its
+        video even.
+        """
         cameras = {} if self.contract is None else self.contract.contract.cameras or {}
         spec = cameras.get(camera)
         if spec is None or spec.height is None or spec.width is None:
@@ -243,7 +284,9 @@ class RecordedDataset:
     def _cameras(self, image_features: Sequence[str], names: Names) -> dict[str, str]:
         """Return the policy's name of each feature that contains images."""
         known = {} if self.contract is None else self.contract.cameras
-        by_feature = {feature: known.get(feature, feature.removeprefix(IMAGES)) for feature in image_features}
+        by_feature = {
+            feature: known.get(feature, feature.removeprefix(IMAGES)) for feature in image_features
+        }
         if not names.cameras:
             return by_feature
         features = {camera: feature for feature, camera in by_feature.items()}
@@ -251,26 +294,38 @@ class RecordedDataset:
         unknown = [name for name in names.cameras.values() if name not in features]
         if unknown:
             raise ConfigError(
-                f"--camera-map: expected some of {sorted(by_feature.values())} of {self.root}, got {unknown[0]!r}"
+                f"--camera-map: expected some of {sorted(by_feature.values())} of {self.root}, got "
+                f"{unknown[0]!r}"
                 f"{did_you_mean(unknown[0], features)}"
             )
         return {features[name]: camera for camera, name in names.cameras.items()}
 
-    def _state_features(self, names: Names, policy: Contract | None) -> dict[str, list[tuple[str, int]]]:
+    def _state_features(
+        self, names: Names, policy: Contract | None
+    ) -> dict[str, list[tuple[str, int]]]:
         """Return the parts, and their widths, of each state feature."""
-        widths = {name: int(self.features[name]["shape"][0]) for name in (STATE, ENVIRONMENT) if name in self.features}
+        widths = {
+            name: int(self.features[name]["shape"][0])
+            for name in (STATE, ENVIRONMENT)
+            if name in self.features
+        }
         if self.contract is not None and names.state is None:
             specs = self.contract.contract.state or {}
             order = {STATE: self.contract.state, ENVIRONMENT: self.contract.environment}
             return {
-                name: [(part, int(specs[part].dim or 0) if part in specs else 1) for part in order[name]]
+                name: [
+                    (part, int(specs[part].dim or 0) if part in specs else 1)
+                    for part in order[name]
+                ]
                 for name in widths
             }
         features: dict[str, list[tuple[str, int]]] = {}
         if ENVIRONMENT in widths:
             features[ENVIRONMENT] = [(ENVIRONMENT.rpartition(".")[2], widths[ENVIRONMENT])]
         if STATE in widths:
-            features[STATE] = state_parts(widths[STATE], policy, names.state, option="--state joints,gripper")
+            features[STATE] = state_parts(
+                widths[STATE], policy, names.state, option="--state joints,gripper"
+            )
         return features
 
 
@@ -279,7 +334,9 @@ def _read_info(file: Path) -> dict[str, Any]:
     try:
         info = json.loads(file.read_text())
     except ValueError as error:
-        raise ConfigError(f"{file}: expected JSON, got an error, {error}; is the file complete?") from error
+        raise ConfigError(
+            f"{file}: expected JSON, got an error, {error}; is the file complete?"
+        ) from error
     if not isinstance(info, dict):
         raise ConfigError(f"{file}: expected a JSON object, got {type(info).__name__}")
     return info
@@ -290,7 +347,8 @@ def _embedded_image(value: Mapping[str, Any]) -> np.ndarray:
     data = value.get("bytes")
     if not data:
         raise ConfigError(
-            f"expected the bytes of an image in the table, got a path, {value.get('path')!r}; LeRobot embeds images"
+            f"expected the bytes of an image in the table, got a path, {value.get('path')!r}; "
+            "LeRobot embeds images"
         )
     return jpeg_png.decode(data, DEFAULT_LIMITS.pixels)
 

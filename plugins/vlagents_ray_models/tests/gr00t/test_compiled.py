@@ -18,7 +18,9 @@ DIM, SPARE = 4, 3
 
 
 class Transformer(torch.nn.Module):
-    """Attends to the tokens of each mask in turn, like NVIDIA's `AlternateVLDiT`, or to all, like its `DiT`."""
+    """Attends to the tokens of each mask in turn, like NVIDIA's `AlternateVLDiT`, or to all,
+    like its `DiT`.
+    """
 
     def forward(
         self,
@@ -30,7 +32,11 @@ class Transformer(torch.nn.Module):
         kv_cache: Any = None,
     ) -> Any:
         attention = torch.nn.functional.scaled_dot_product_attention
-        masks = [None] if image_mask is None else [image_mask & backbone_attention_mask, backbone_attention_mask]
+        masks = (
+            [None]
+            if image_mask is None
+            else [image_mask & backbone_attention_mask, backbone_attention_mask]
+        )
         seen = hidden_states + timestep[:, None, None]
         for mask in masks:
             allowed = None if mask is None else mask[:, None].expand(-1, seen.shape[1], -1)
@@ -52,7 +58,10 @@ def inputs(rows: int, tokens: int, *, masked: bool) -> dict[str, Any]:
     }
     if masked:
         there = torch.arange(tokens).expand(rows, -1) < tokens - 1
-        found |= {"image_mask": torch.arange(tokens).expand(rows, -1) < 2, "backbone_attention_mask": there}
+        found |= {
+            "image_mask": torch.arange(tokens).expand(rows, -1) < 2,
+            "backbone_attention_mask": there,
+        }
     return found
 
 
@@ -78,7 +87,9 @@ def test_without_compilation_it_is_called_as_ever() -> None:
     wanted = transformer(**given)
     seen: list[Any] = []
     forward = transformer.forward
-    transformer.forward = lambda *args, **named: seen.append(named["kv_cache"]) or forward(*args, **named)
+    transformer.forward = lambda *args, **named: (
+        seen.append(named["kv_cache"]) or forward(*args, **named)
+    )
     compile_with(transformer, SPARE, compilation)
     compilation.mode = False
     torch.testing.assert_close(transformer(**given, kv_cache=kept), wanted)

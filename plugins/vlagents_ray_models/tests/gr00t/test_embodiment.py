@@ -13,15 +13,22 @@ from vlagents_ray_models.gr00t import CONFIG, STATISTICS, Embodiment
 
 
 @pytest.mark.parametrize("ends", [("min", "max"), ("q01", "q99")])
-def test_ranges_are_those_of_the_normalisation_in_the_order_of_the_model(tmp_path: Path, ends: tuple[str, str]) -> None:
+def test_ranges_are_those_of_the_normalisation_in_the_order_of_the_model(
+    tmp_path: Path, ends: tuple[str, str]
+) -> None:
     groups = {"gripper": [[0.0], [1.0]], "arm": [[-1.0, -2.0], [1.0, 2.0]]}
-    named = {group: dict(zip(ends, bounds, strict=True)) | {"mean": bounds[0]} for group, bounds in groups.items()}
+    named = {
+        group: dict(zip(ends, bounds, strict=True)) | {"mean": bounds[0]}
+        for group, bounds in groups.items()
+    }
     config = {"delta_indices": [0], "modality_keys": ["arm", "gripper"]}
     configs = dict.fromkeys(("video", "state", "action"), config)
     settings = {"modality_configs": {"mine": configs}, "use_percentiles": ends[0] == "q01"}
     (tmp_path / CONFIG).write_text(json.dumps({"processor_kwargs": settings}))
     (tmp_path / STATISTICS).write_text(json.dumps({"mine": {"state": named, "action": named}}))
-    trained = Trained.from_statistics({"parts": ["arm", "gripper"], **Embodiment.of(tmp_path, None).ranges})
+    trained = Trained.from_statistics(
+        {"parts": ["arm", "gripper"], **Embodiment.of(tmp_path, None).ranges}
+    )
     for span in (trained.state, trained.action):
         assert span is not None
         assert [end.tolist() for end in span] == [[-1, -2, 0], [1, 2, 1]]

@@ -25,9 +25,14 @@ class Processor:
         return self.seen
 
 
-def test_each_observation_is_read_by_itself_on_several_threads(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_each_observation_is_read_by_itself_on_several_threads(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     types: Any = ModuleType("gr00t.data.types")
-    types.VLAStepData, types.MessageType = SimpleNamespace, SimpleNamespace(EPISODE_STEP=SimpleNamespace(value="step"))
+    types.VLAStepData, types.MessageType = (
+        SimpleNamespace,
+        SimpleNamespace(EPISODE_STEP=SimpleNamespace(value="step")),
+    )
     for name, module in {
         "gr00t": ModuleType("gr00t"),
         "gr00t.data": ModuleType("gr00t.data"),
@@ -38,7 +43,9 @@ def test_each_observation_is_read_by_itself_on_several_threads(monkeypatch: pyte
     network = Gr00tNetwork(None, Processor(), robot)
 
     def read(text: str) -> Any:
-        return network.inputs([{"front": np.zeros((2, 2, 3), np.uint8)}], [{"arm": np.zeros(2)}], text)["processed"]
+        return network.inputs(
+            [{"front": np.zeros((2, 2, 3), np.uint8)}], [{"arm": np.zeros(2)}], text
+        )["processed"]
 
     texts = [f"task {number}" for number in range(40)]
     with ThreadPoolExecutor(4) as threads:

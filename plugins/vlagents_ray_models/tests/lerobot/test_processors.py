@@ -10,11 +10,15 @@ from vlagents_ray_models.lerobot.processors import cached_tokenizer
 
 
 @pytest.mark.torch
-def test_rows_of_tensors_are_those_of_the_tokenizer_and_changes_of_a_batch_do_not_reach_the_cache() -> None:
+def test_rows_of_tensors_are_those_of_the_tokenizer_and_changes_of_a_batch_do_not_reach_the_cache() -> (
+    None
+):
     torch = pytest.importorskip("torch")
     asked: list[list[str]] = []
 
-    def tokenizer(texts: list[str], *, padding: str, return_tensors: str, max_length: int) -> dict[str, Any]:
+    def tokenizer(
+        texts: list[str], *, padding: str, return_tensors: str, max_length: int
+    ) -> dict[str, Any]:
         assert (padding, return_tensors) == ("max_length", "pt")
         asked.append(texts)
         ids = torch.tensor([[*map(ord, text), *[0] * (max_length - len(text))] for text in texts])

@@ -1,4 +1,6 @@
-"""Policies from ONNX files: where each input comes from, what an act returns, and whose memory it is."""
+"""Policies from ONNX files: where each input comes from, what an act returns, and whose memory
+it is.
+"""
 
 from __future__ import annotations
 
@@ -38,14 +40,17 @@ RECURRENT = """g (float[N, 4] x, float[2, N, 8] h) => (float[N, 3] action, float
     action = MatMul(new, v)
 }"""
 WEIGHTS = {
-    name: RNG.normal(size=shape).astype(np.float32) / 2 for name, shape in (("w", (4, 8)), ("u", (8, 8)), ("v", (8, 3)))
+    name: RNG.normal(size=shape).astype(np.float32) / 2
+    for name, shape in (("w", (4, 8)), ("u", (8, 8)), ("v", (8, 3)))
 }
 
 
 def exported(folder: Path, graph: str, /, **weights: np.ndarray) -> Path:
     """Write a model from ONNX's text, and return its file."""
     model = parse_model(f'<ir_version: 8, opset_import: ["": 17, "ai.onnx.ml": 3]> {graph}')
-    model.graph.initializer.extend(numpy_helper.from_array(value, name) for name, value in weights.items())
+    model.graph.initializer.extend(
+        numpy_helper.from_array(value, name) for name, value in weights.items()
+    )
     file = folder / "policy.onnx"
     onnx.save(model, file)
     return file
@@ -57,7 +62,9 @@ def loaded(file: Path, **settings: Any) -> Onnx:
     return policy
 
 
-def acts(policy: Onnx, seen: list[Obs], instruction: str | None = None, **options: Any) -> list[Act]:
+def acts(
+    policy: Onnx, seen: list[Obs], instruction: str | None = None, **options: Any
+) -> list[Act]:
     """The acts of a session of its own."""
     session = AgentCopies(policy).make()
     session.reset(seen[0], instruction, **options)
@@ -70,7 +77,9 @@ def action(policy: Onnx, obs: Obs, instruction: str | None = None) -> np.ndarray
 
 
 def of(**parts: Any) -> Obs:
-    return Obs(state={name: np.atleast_1d(np.asarray(part, np.float32)) for name, part in parts.items()})
+    return Obs(
+        state={name: np.atleast_1d(np.asarray(part, np.float32)) for name, part in parts.items()}
+    )
 
 
 def vectors(count: int, length: int = 4, seed: int = 1) -> list[Obs]:
@@ -94,7 +103,9 @@ def test_a_session_acts_to_the_bit_as_onnx_runtime_called_directly(recurrent: Pa
         np.testing.assert_array_equal(act.action, wanted)
 
 
-def test_sessions_of_a_batch_keep_their_own_memory_also_where_some_begin_again(recurrent: Path) -> None:
+def test_sessions_of_a_batch_keep_their_own_memory_also_where_some_begin_again(
+    recurrent: Path,
+) -> None:
     policy, steps = loaded(recurrent, **MEMORY), 12
     assert policy.model.batched
     begins = [{0} | ({5 + i % 3} if i % 4 == 0 else set()) for i in range(SESSIONS)]
@@ -114,7 +125,9 @@ def test_sessions_of_a_batch_keep_their_own_memory_also_where_some_begin_again(r
             np.testing.assert_allclose(act.action, alone.action, atol=1e-6)
 
 
-def test_a_session_that_moves_takes_its_memory_along_and_a_lost_one_computes_it_anew(recurrent: Path) -> None:
+def test_a_session_that_moves_takes_its_memory_along_and_a_lost_one_computes_it_anew(
+    recurrent: Path,
+) -> None:
     seen = vectors(10)
     wanted = [act.action for act in acts(loaded(recurrent, **MEMORY), seen)]
     settings = {"checkpoint": str(recurrent), **MEMORY, "burn_in": 9}
@@ -168,30 +181,42 @@ PIXELS = {
             "NCHW",
             {"mean": [0.5, 0.25, 0.125], "std": [0.5, 1, 2], "clip": [-0.25, 0.5]},
             lambda image: (
-                ((image / np.float32(255) - np.float32([0.5, 0.25, 0.125])) / np.float32([0.5, 1, 2]))
+                (
+                    (image / np.float32(255) - np.float32([0.5, 0.25, 0.125]))
+                    / np.float32([0.5, 1, 2])
+                )
                 .clip(-0.25, 0.5)
                 .transpose(2, 0, 1)
             ),
         ),
     ],
 )
-def test_an_image_gets_the_models_layout_and_range(tmp_path: Path, kind: str, option: Any, convert: Any) -> None:
-    policy = loaded(exported(tmp_path, PIXELS[kind]), cameras={"image": "front"}, inputs={"image": option})
+def test_an_image_gets_the_models_layout_and_range(
+    tmp_path: Path, kind: str, option: Any, convert: Any
+) -> None:
+    policy = loaded(
+        exported(tmp_path, PIXELS[kind]), cameras={"image": "front"}, inputs={"image": option}
+    )
     image = RNG.integers(0, 256, (4, 6, 3), np.uint8)
     assert policy.contract.cameras == {"front": CameraSpec(4, 6)}
     found = action(policy, Obs({"front": image}))
-    np.testing.assert_array_equal(found, convert(image.astype(np.float32)).astype(np.float32).ravel())
+    np.testing.assert_array_equal(
+        found, convert(image.astype(np.float32)).astype(np.float32).ravel()
+    )
 
 
 def test_an_image_of_another_size_is_refused_or_padded_as_set(tmp_path: Path) -> None:
     file, image = exported(tmp_path, PIXELS["uint8"]), RNG.integers(0, 256, (12, 12, 3), np.uint8)
     with pytest.raises(
-        InvalidObservation, match=r"'front': got 12x12, want 4x6; .* `resize: true` for the input 'image'"
+        InvalidObservation,
+        match=r"'front': got 12x12, want 4x6; .* `resize: true` for the input 'image'",
     ):
         action(loaded(file, cameras={"image": "front"}), Obs({"front": image}))
     policy = loaded(file, cameras={"image": "front"}, inputs={"image": {"resize": True}})
     assert policy.contract.cameras == {"front": CameraSpec()}
-    np.testing.assert_array_equal(action(policy, Obs({"front": image})), resize_with_pad(image, 4, 6).ravel())
+    np.testing.assert_array_equal(
+        action(policy, Obs({"front": image})), resize_with_pad(image, 4, 6).ravel()
+    )
 
 
 SAME = "g (float[N, {0}] x) => (float[N, {0}] action) {{ action = Identity(x) }}"
@@ -208,11 +233,16 @@ SAME = "g (float[N, {0}] x) => (float[N, {0}] action) {{ action = Identity(x) }}
         ({"std": {"joints": 0.5}, "clip": [-1, 2.5]}, [2, 2.5, 2.5, 0.5]),
     ],
 )
-def test_the_state_is_put_together_in_order_and_scaled(tmp_path: Path, option: Any, wanted: list[float]) -> None:
+def test_the_state_is_put_together_in_order_and_scaled(
+    tmp_path: Path, option: Any, wanted: list[float]
+) -> None:
     parts = ["joints", "speed", "gripper"]
     policy = loaded(exported(tmp_path, SAME.format(4)), state=parts, inputs={"x": option})
     obs = Obs(state=of(joints=[1, 2], speed=3).state, gripper=0.5)
-    assert (set(policy.contract.state or {}), policy.contract.gripper) == ({"joints", "speed"}, True)
+    assert (set(policy.contract.state or {}), policy.contract.gripper) == (
+        {"joints", "speed"},
+        True,
+    )
     np.testing.assert_array_equal(action(policy, obs), np.float32(wanted))
 
 
@@ -226,10 +256,14 @@ def test_the_previous_output_is_that_before_offset_and_scale(tmp_path: Path) -> 
     )
     previous, speed = np.zeros(2, np.float32), np.float32([3.0])
     for obs, act in zip(
-        seen := [of(speed=speed, joints=RNG.normal(size=2)) for _ in range(6)], acts(policy, seen), strict=True
+        seen := [of(speed=speed, joints=RNG.normal(size=2)) for _ in range(6)],
+        acts(policy, seen),
+        strict=True,
     ):
         previous = (np.concatenate([speed, previous, obs.state["joints"]])[None] @ w).clip(-1, 1)[0]
-        np.testing.assert_allclose(act.action[0], np.float32([0.5, -0.5]) + np.float32(0.25) * previous, rtol=1e-6)
+        np.testing.assert_allclose(
+            act.action[0], np.float32([0.5, -0.5]) + np.float32(0.25) * previous, rtol=1e-6
+        )
 
 
 def test_constants_and_a_counter_of_steps_are_inputs(tmp_path: Path) -> None:
@@ -256,7 +290,12 @@ def test_a_history_begins_with_the_first_observation_again(tmp_path: Path) -> No
     policy = loaded(exported(tmp_path, graph), state=["joints"], inputs={"x": {"history": 3}})
     assert (policy.contract.history, policy.contract.state) == (3, {"joints": StateSpec(2)})
     found = acts(policy, [of(joints=[i, i]) for i in range(4)])
-    assert [act.action[0, ::2].tolist() for act in found] == [[0, 0, 0], [0, 0, 1], [0, 1, 2], [1, 2, 3]]
+    assert [act.action[0, ::2].tolist() for act in found] == [
+        [0, 0, 0],
+        [0, 0, 1],
+        [0, 1, 2],
+        [1, 2, 3],
+    ]
 
 
 def test_a_history_has_the_previous_output_of_each_observation(tmp_path: Path) -> None:
@@ -265,9 +304,16 @@ def test_a_history_has_the_previous_output_of_each_observation(tmp_path: Path) -
         axes = Constant <value_ints = [1]> ()
         action = ReduceSum(flat, axes)
     }"""
-    policy = loaded(exported(tmp_path, graph), state=["speed", "previous_output"], inputs={"x": {"history": 2}})
+    policy = loaded(
+        exported(tmp_path, graph), state=["speed", "previous_output"], inputs={"x": {"history": 2}}
+    )
     found = acts(policy, [of(speed=1)] * 4)
-    assert [float(act.action[0, 0]) for act in found] == [2, 1 + 0 + 1 + 2, 1 + 2 + 1 + 4, 1 + 4 + 1 + 8]
+    assert [float(act.action[0, 0]) for act in found] == [
+        2,
+        1 + 0 + 1 + 2,
+        1 + 2 + 1 + 4,
+        1 + 4 + 1 + 8,
+    ]
 
 
 def test_a_chunk_of_actions_is_one_act(tmp_path: Path) -> None:
@@ -278,10 +324,19 @@ def test_a_chunk_of_actions_is_one_act(tmp_path: Path) -> None:
     policy = loaded(
         exported(tmp_path, graph),
         state=["joints"],
-        contract={"control_hz": 20, "state": {"joints": {"dim": 6, "unit": "rad"}}, "action": {"space": "joint"}},
+        contract={
+            "control_hz": 20,
+            "state": {"joints": {"dim": 6, "unit": "rad"}},
+            "action": {"space": "joint"},
+        },
     )
     contract = policy.contract
-    assert (contract.chunk, contract.action.dim, contract.action.space, contract.control_hz) == (3, 2, "joint", 20)
+    assert (contract.chunk, contract.action.dim, contract.action.space, contract.control_hz) == (
+        3,
+        2,
+        "joint",
+        20,
+    )
     assert contract.state == {"joints": StateSpec(6, "rad")}
     assert action(policy, of(joints=range(6))).tolist() == [0, 1]
     assert acts(policy, [of(joints=range(6))])[0].action.tolist() == [[0, 1], [2, 3], [4, 5]]
@@ -315,7 +370,9 @@ def test_the_instruction_is_a_string_or_its_tokens(tmp_path: Path) -> None:
 
 
 def test_noise_is_the_sessions_own_and_samples_differ(tmp_path: Path) -> None:
-    graph = "g (float[N, 2] x, float[N, 2] noise) => (float[N, 2] action) { action = Add(x, noise) }"
+    graph = (
+        "g (float[N, 2] x, float[N, 2] noise) => (float[N, 2] action) { action = Add(x, noise) }"
+    )
     policy = loaded(exported(tmp_path, graph), state=["joints"], inputs={"noise": {"noise": True}})
     [obs] = vectors(1, 2)
     first, again, other = (acts(policy, [obs], seed=seed)[0].action for seed in (1, 1, 2))
@@ -333,7 +390,9 @@ def test_rows_of_a_sequence_are_not_taken_for_a_batch(tmp_path: Path) -> None:
     }"""
     policy = loaded(exported(tmp_path, graph), state=["joints"])
     assert not policy.model.batched
-    check_agent(Onnx.from_config({"checkpoint": str(tmp_path / "policy.onnx"), "state": ["joints"]}))
+    check_agent(
+        Onnx.from_config({"checkpoint": str(tmp_path / "policy.onnx"), "state": ["joints"]})
+    )
 
 
 TWO = """g (float[N, 2] x, float[N, 2] y, float[N, 5] h) => (float[N, 2] action, float[N, 2] h_out) {
@@ -353,7 +412,11 @@ OPEN = "g (float[N, T] x) => (float[N, T] action) { action = Identity(x) }"
         (TWO, {"state": ["joints"]}, r"inputs without a source: \['x', 'y', 'h'\]"),
         (TWO, {"cameras": {"rgb": "front"}}, r"unknown: \['rgb'\]"),
         (TWO, {"recurrent": {"h": "c"}}, r"unknown: \['c'\]"),
-        (TWO, {"state": ["joints"], "cameras": {"x": "front"}, "recurrent": {"x": "h_out"}}, r"named twice: \['x'\]"),
+        (
+            TWO,
+            {"state": ["joints"], "cameras": {"x": "front"}, "recurrent": {"x": "h_out"}},
+            r"named twice: \['x'\]",
+        ),
         (
             SAME.format(4),
             {"cameras": {"x": "front"}},
@@ -366,7 +429,11 @@ OPEN = "g (float[N, T] x) => (float[N, T] action) { action = Identity(x) }"
         ),
         (
             TWO,
-            {"state": ["a"], "inputs": {"y": {"constant": 1}, "h": {"constant": [1, 2]}}, "info": ["h_out"]},
+            {
+                "state": ["a"],
+                "inputs": {"y": {"constant": 1}, "h": {"constant": [1, 2]}},
+                "info": ["h_out"],
+            },
             r"inputs: h: constant: got \[1, 2\], want numbers of \(1, 5\)",
         ),
         (
@@ -384,14 +451,42 @@ OPEN = "g (float[N, T] x) => (float[N, T] action) { action = Identity(x) }"
             {"state": ["a"], "action": {"std": [1, 2]}},
             "action: got lists of statistics .* want 4 numbers",
         ),
-        (SAME.format(4), {"state": ["previous_output", "previous_output"]}, "previous_output has 4 numbers"),
-        (SAME.format(4), {"state": ["a"], "info": ["action"]}, r"one of them the action: \['none of the outputs'\]"),
-        (SAME.format(4), {"state": ["a"], "contract": {"hz": 3}}, r"contract: .*unknown keys \['hz'\]"),
-        (SAME.format(4), {"state": ["a"], "inputs": {"x": {"std": {"b": 2}}}}, r"inputs: x: has no use of \['b'\]"),
-        (SAME.format(4), {"state": ["a"], "inputs": {"x": {"range": [0, 1]}}}, r"inputs: x: has no use of \['range'\]"),
-        (SAME.format(4), {"state": ["a"], "action": {"std": {"a": 2}}}, r"action: has no use of \['a'\]"),
+        (
+            SAME.format(4),
+            {"state": ["previous_output", "previous_output"]},
+            "previous_output has 4 numbers",
+        ),
+        (
+            SAME.format(4),
+            {"state": ["a"], "info": ["action"]},
+            r"one of them the action: \['none of the outputs'\]",
+        ),
+        (
+            SAME.format(4),
+            {"state": ["a"], "contract": {"hz": 3}},
+            r"contract: .*unknown keys \['hz'\]",
+        ),
+        (
+            SAME.format(4),
+            {"state": ["a"], "inputs": {"x": {"std": {"b": 2}}}},
+            r"inputs: x: has no use of \['b'\]",
+        ),
+        (
+            SAME.format(4),
+            {"state": ["a"], "inputs": {"x": {"range": [0, 1]}}},
+            r"inputs: x: has no use of \['range'\]",
+        ),
+        (
+            SAME.format(4),
+            {"state": ["a"], "action": {"std": {"a": 2}}},
+            r"action: has no use of \['a'\]",
+        ),
         (NOISY, {"state": ["joints"]}, "draws noise, or keeps a state"),
-        (OPEN, {"state": ["joints"]}, r"inputs: x: shape: got None, the file states \[-1, -1\], want all lengths"),
+        (
+            OPEN,
+            {"state": ["joints"]},
+            r"inputs: x: shape: got None, the file states \[-1, -1\], want all lengths",
+        ),
         (
             SAME.format(4),
             {"state": ["a"], "inputs": {"x": {"shape": [-1, 5]}}},
@@ -399,7 +494,9 @@ OPEN = "g (float[N, T] x) => (float[N, T] action) { action = Identity(x) }"
         ),
     ],
 )
-def test_a_wrong_mapping_says_what_the_file_has(tmp_path: Path, graph: str, settings: Any, said: str) -> None:
+def test_a_wrong_mapping_says_what_the_file_has(
+    tmp_path: Path, graph: str, settings: Any, said: str
+) -> None:
     with pytest.raises(ConfigError, match=said):
         loaded(exported(tmp_path, graph), **settings)
 
@@ -447,7 +544,9 @@ def test_a_device_that_the_runtime_lacks_is_an_error_with_its_cure(
 
 @pytest.fixture
 def cuda(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
-    """A runtime that claims to have CUDA; `providers` are those it was started with, and `started` what runs then."""
+    """A runtime that claims to have CUDA; `providers` are those it was started with, and
+    `started` what runs then.
+    """
     real, found = onnxruntime.InferenceSession, {"started": ["CUDAExecutionProvider"]}
 
     def session(path: str, options: Any, providers: Any) -> Any:
@@ -462,7 +561,9 @@ def cuda(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
     return found
 
 
-def test_a_gpu_is_used_where_there_is_one_with_the_precision_that_is_set(recurrent: Path, cuda: dict[str, Any]) -> None:
+def test_a_gpu_is_used_where_there_is_one_with_the_precision_that_is_set(
+    recurrent: Path, cuda: dict[str, Any]
+) -> None:
     policy = loaded(recurrent, **MEMORY, max_rows=4)
     assert cuda["providers"] == [("CUDAExecutionProvider", {"device_id": "0", "use_tf32": "1"})]
     assert (policy.report.accelerated, set(policy.report.pass_s)) == (True, {1, 4})
@@ -471,16 +572,22 @@ def test_a_gpu_is_used_where_there_is_one_with_the_precision_that_is_set(recurre
     assert cuda["providers"] == [("CUDAExecutionProvider", {"device_id": "1", "use_tf32": "0"})]
 
 
-def test_a_gpu_that_does_not_start_is_not_replaced_by_the_cpu(recurrent: Path, cuda: dict[str, Any]) -> None:
+def test_a_gpu_that_does_not_start_is_not_replaced_by_the_cpu(
+    recurrent: Path, cuda: dict[str, Any]
+) -> None:
     cuda["started"] = ["CPUExecutionProvider"]
-    with pytest.raises(ConfigError, match=r"CUDAExecutionProvider did not start, .* set device: cpu"):
+    with pytest.raises(
+        ConfigError, match=r"CUDAExecutionProvider did not start, .* set device: cpu"
+    ):
         loaded(recurrent, **MEMORY)
 
 
 def large(folder: Path, location: str) -> Path:
     """A model whose weights are in a file beside it."""
     file = exported(
-        folder, "g (float[N, 64] x) => (float[N, 64] action) { action = MatMul(x, w) }", w=np.eye(64, dtype=np.float32)
+        folder,
+        "g (float[N, 64] x) => (float[N, 64] action) { action = MatMul(x, w) }",
+        w=np.eye(64, dtype=np.float32),
     )
     onnx.save(onnx.load(file), file, save_as_external_data=True, location=location)
     return file

@@ -1,4 +1,6 @@
-"""Models that others published, behind a replica's queue, against ONNX Runtime called as their authors call it."""
+"""Models that others published, behind a replica's queue, against ONNX Runtime called as their
+authors call it.
+"""
 
 from __future__ import annotations
 
@@ -20,7 +22,8 @@ from vlagents_ray_models.onnx import Onnx
 pytestmark = pytest.mark.integration  # downloads 20 MB
 PACKAGES = ("holosoma-inference==0.1.3", "silero-vad==6.2.3")
 STEPS, SESSIONS = 50, 32
-WALK = {  # an observation of holosoma's loco_g1_29dof, with the factors of its observation config as 1 / std
+# An observation of holosoma's loco_g1_29dof, with the factors of its observation config as 1 / std.
+WALK = {
     "actions": 29,
     "base_ang_vel": 3,
     "command_ang_vel": 1,
@@ -84,18 +87,31 @@ class Dance:
         self._session, self._step = session, 0
 
     def act(self, obs: Obs) -> np.ndarray:
-        feed = {"obs": obs.state["actor_obs"][None], "time_step": np.array([[self._step]], np.float32)}
+        feed = {
+            "obs": obs.state["actor_obs"][None],
+            "time_step": np.array([[self._step]], np.float32),
+        }
         self._step += 1
         return self._session.run(["actions"], feed)[0]
 
 
 class Speech:
-    """Silero's voice activity detector, no robot's, but recurrent: its state has the batch in its second dimension."""
+    """Silero's voice activity detector, no robot's, but recurrent: its state has the batch in
+    its second dimension.
+    """
 
     def __init__(self, file: str, *, one_row: bool = False) -> None:
-        self.file, self.lengths, self._rate = f"silero_vad/data/{file}.onnx", {"audio": 576}, not one_row
+        self.file, self.lengths, self._rate = (
+            f"silero_vad/data/{file}.onnx",
+            {"audio": 576},
+            not one_row,
+        )
         inputs = {"input": {"shape": [-1, 576]}, "sr": {"constant": 16000}}
-        self.settings = {"state": ["audio"], "recurrent": {"state": "stateN"}, "inputs": {} if one_row else inputs}
+        self.settings = {
+            "state": ["audio"],
+            "recurrent": {"state": "stateN"},
+            "inputs": {} if one_row else inputs,
+        }
 
     def begin(self, session: onnxruntime.InferenceSession) -> None:
         self._session, self._state = session, np.zeros((2, 1, 128), np.float32)
@@ -115,7 +131,9 @@ MODELS = [
     pytest.param(lambda: Dance("ppo_g1_29dof_dancing"), False, id="dance-ppo"),
     pytest.param(lambda: Dance("fastsac_g1_29dof_dancing"), False, id="dance-fastsac"),
     pytest.param(lambda: Speech("silero_vad"), True, id="speech"),
-    pytest.param(lambda: Speech("silero_vad_openvino_16k", one_row=True), False, id="speech-one-row"),
+    pytest.param(
+        lambda: Speech("silero_vad_openvino_16k", one_row=True), False, id="speech-one-row"
+    ),
 ]
 
 
@@ -125,7 +143,9 @@ def test_the_table_states_as_many_as_there_are() -> None:
 
 def seen(model: Any, seed: int) -> list[Obs]:
     rng = np.random.default_rng(seed)
-    state = lambda: {name: rng.normal(size=n).astype(np.float32) / 4 for name, n in model.lengths.items()}  # noqa: E731
+    state = lambda: {  # noqa: E731
+        name: rng.normal(size=n).astype(np.float32) / 4 for name, n in model.lengths.items()
+    }
     return [Obs(state=state()) for _ in range(STEPS)]
 
 

@@ -27,7 +27,9 @@ SETTINGS = {
 
 @pytest.fixture(scope="module")
 def archives(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A GRU whose state is an input and an output, and one that keeps it in a buffer, as rsl_rl exports it."""
+    """A GRU whose state is an input and an output, and one that keeps it in a buffer, as rsl_rl
+    exports it.
+    """
     import torch
 
     class Explicit(torch.nn.Module):
@@ -89,14 +91,36 @@ def test_a_suite_of_the_interface_accepts_it(archives: Path) -> None:
 @pytest.mark.parametrize(
     ("file", "settings", "said"),
     [
-        ("explicit.pt", {"trust_checkpoint": False}, r"is a program, .* set trust_checkpoint: true"),
-        ("explicit.pt", {"inputs": {"x": {"shape": [-1, 4]}}}, r"inputs: h: shape: got None, the file states none"),
-        ("explicit.pt", {"outputs": ["action"], "recurrent": {}}, r"inputs without a source: \['x', 'h'\]"),
-        ("explicit.pt", {"outputs": ["action", "h_out", "c"], "info": ["c"]}, "want names for the 2 results"),
-        ("hidden.pt", {"outputs": ["action"], "recurrent": {}, "inputs": {"x": {"shape": [1, 4]}}}, "keeps a state"),
+        (
+            "explicit.pt",
+            {"trust_checkpoint": False},
+            r"is a program, .* set trust_checkpoint: true",
+        ),
+        (
+            "explicit.pt",
+            {"inputs": {"x": {"shape": [-1, 4]}}},
+            r"inputs: h: shape: got None, the file states none",
+        ),
+        (
+            "explicit.pt",
+            {"outputs": ["action"], "recurrent": {}},
+            r"inputs without a source: \['x', 'h'\]",
+        ),
+        (
+            "explicit.pt",
+            {"outputs": ["action", "h_out", "c"], "info": ["c"]},
+            "want names for the 2 results",
+        ),
+        (
+            "hidden.pt",
+            {"outputs": ["action"], "recurrent": {}, "inputs": {"x": {"shape": [1, 4]}}},
+            "keeps a state",
+        ),
     ],
 )
-def test_what_cannot_be_served_is_refused_at_the_start(archives: Path, file: str, settings: Any, said: str) -> None:
+def test_what_cannot_be_served_is_refused_at_the_start(
+    archives: Path, file: str, settings: Any, said: str
+) -> None:
     with pytest.raises(ConfigError, match=said):
         policy(archives / file, **settings)
 

@@ -1,4 +1,6 @@
-"""The parts that fine-tuning added to OpenVLA-OFT, as a learner pushes them, on a stand-in for the network."""
+"""The parts that fine-tuning added to OpenVLA-OFT, as a learner pushes them, on a stand-in for
+the network.
+"""
 
 from __future__ import annotations
 
@@ -21,20 +23,34 @@ def named(prefix: str, shapes: dict[str, tuple[int, ...]]) -> dict[str, Any]:
     """Return the weights and biases of layers, as a file of upstream's has them."""
     generator = torch.Generator().manual_seed(0)
     layers = {f"{prefix}{layer}": shape for layer, shape in shapes.items()}
-    weights = {f"{layer}.weight": torch.randn(shape, generator=generator) for layer, shape in layers.items()}
-    return weights | {f"{layer}.bias": torch.randn(shape[:1], generator=generator) for layer, shape in layers.items()}
+    weights = {
+        f"{layer}.weight": torch.randn(shape, generator=generator)
+        for layer, shape in layers.items()
+    }
+    return weights | {
+        f"{layer}.bias": torch.randn(shape[:1], generator=generator)
+        for layer, shape in layers.items()
+    }
 
 
 @pytest.fixture(params=["model", "noise_predictor.mlp_resnet"])
 def policy(request: pytest.FixtureRequest) -> OpenVLAOFT:
     """A policy whose network is one layer."""
-    norms = {f"mlp_resnet_blocks.{i}.ffn.0": (4,) for i in (0, 1)} | {"layer_norm1": (WIDTH,), "layer_norm2": (4,)}
-    linear = {f"mlp_resnet_blocks.{i}.ffn.1": (4, 4) for i in (0, 1)} | {"fc1": (4, WIDTH), "fc2": (DIM, 4)}
+    norms = {f"mlp_resnet_blocks.{i}.ffn.0": (4,) for i in (0, 1)} | {
+        "layer_norm1": (WIDTH,),
+        "layer_norm2": (4,),
+    }
+    linear = {f"mlp_resnet_blocks.{i}.ffn.1": (4, 4) for i in (0, 1)} | {
+        "fc1": (4, WIDTH),
+        "fc2": (DIM, 4),
+    }
     base: Any = SimpleNamespace(network=torch.nn.Linear(WIDTH, WIDTH))
     head = Mlp(named(f"{request.param}.", norms | linear), request.param)
     proprio = Projector(named("", {"fc1": (WIDTH, 3), "fc2": (WIDTH, WIDTH)}), "proprio_projector")
     made = OpenVLAOFT(OpenVLAOFTConfig(checkpoint="none"))
-    made.model = Parallel(base, horizon=1, dim=DIM, head=head, proprio=proprio, noisy=None, film=None, steps=(1, 1))
+    made.model = Parallel(
+        base, horizon=1, dim=DIM, head=head, proprio=proprio, noisy=None, film=None, steps=(1, 1)
+    )
     return made
 
 

@@ -27,17 +27,47 @@ def scene(height: int, width: int) -> np.ndarray:
     [
         (
             (256, 256),
-            [[111, 49, 8], [190, 231, 136], [56, 20, 31], [199, 233, 230], [74, 19, 87], [120, 52, 225]],
-            [[167, 82, 13], [137, 231, 136], [36, 18, 37], [173, 231, 222], [65, 19, 86], [143, 82, 223]],
+            [
+                [111, 49, 8],
+                [190, 231, 136],
+                [56, 20, 31],
+                [199, 233, 230],
+                [74, 19, 87],
+                [120, 52, 225],
+            ],
+            [
+                [167, 82, 13],
+                [137, 231, 136],
+                [36, 18, 37],
+                [173, 231, 222],
+                [65, 19, 86],
+                [143, 82, 223],
+            ],
         ),
         (
             (120, 160),
-            [[94, 26, 0], [31, 227, 133], [163, 20, 31], [142, 231, 225], [35, 16, 81], [163, 218, 255]],
-            [[158, 89, 12], [48, 229, 135], [144, 18, 40], [106, 230, 218], [46, 17, 84], [188, 160, 241]],
+            [
+                [94, 26, 0],
+                [31, 227, 133],
+                [163, 20, 31],
+                [142, 231, 225],
+                [35, 16, 81],
+                [163, 218, 255],
+            ],
+            [
+                [158, 89, 12],
+                [48, 229, 135],
+                [144, 18, 40],
+                [106, 230, 218],
+                [46, 17, 84],
+                [188, 160, 241],
+            ],
         ),
     ],
 )
-def test_pixels_are_tensorflows(size: tuple[int, int], small: list[list[int]], cropped: list[list[int]]) -> None:
+def test_pixels_are_tensorflows(
+    size: tuple[int, int], small: list[list[int]], cropped: list[list[int]]
+) -> None:
     picture = resized(scene(*size))
     assert picture.shape == (224, 224, 3)
     assert np.abs(picture[AT].astype(int) - small).max() <= 1
@@ -49,18 +79,32 @@ def test_a_picture_of_the_right_size_is_not_compressed_again() -> None:
     assert np.array_equal(resized(picture), picture)
 
 
-ACTION = {"q01": [-1.0, 0.0], "q99": [3.0, 1.0], "min": [-2.0, 0.0], "max": [4.0, 1.0], "mask": [True, False]}
-ONE = {"libero_goal_no_noops": {"action": ACTION, "proprio": {"q01": [0.0, 5.0], "q99": [2.0, 5.0]}}}
+ACTION = {
+    "q01": [-1.0, 0.0],
+    "q99": [3.0, 1.0],
+    "min": [-2.0, 0.0],
+    "max": [4.0, 1.0],
+    "mask": [True, False],
+}
+ONE = {
+    "libero_goal_no_noops": {"action": ACTION, "proprio": {"q01": [0.0, 5.0], "q99": [2.0, 5.0]}}
+}
 
 
 def test_masked_numbers_stay_as_they_are() -> None:
     scale = Statistics(ONE).scale("libero_goal_no_noops")
-    assert scale.restore(np.array([[-1.0, 0.25], [0.0, 1.0], [1.0, 0.0]])).tolist() == [[-1, 0.25], [1, 1], [3, 0]]
+    assert scale.restore(np.array([[-1.0, 0.25], [0.0, 1.0], [1.0, 0.0]])).tolist() == [
+        [-1, 0.25],
+        [1, 1],
+        [3, 0],
+    ]
     assert scale.restore_spread(np.array([0.5, 0.5])).tolist() == [1.0, 0.5]
 
 
 def test_bounds_may_be_the_smallest_and_largest() -> None:
-    assert Statistics(ONE, "min_max").scale("libero_goal_no_noops").restore(np.ones(2)).tolist() == [4.0, 1.0]
+    assert Statistics(ONE, "min_max").scale("libero_goal_no_noops").restore(
+        np.ones(2)
+    ).tolist() == [4.0, 1.0]
 
 
 def test_states_beyond_their_range_are_at_its_end_and_those_that_never_moved_do_no_harm() -> None:
@@ -87,7 +131,9 @@ def test_fine_tunings_statistics_go_before_the_base_models(tmp_path: Path) -> No
     assert Statistics.of(tmp_path).key(None) == "libero_goal_no_noops"
 
 
-@pytest.mark.parametrize(("content", "says"), [("{", "is no JSON .*; copy it again"), ("[3]", "got no normalisation")])
+@pytest.mark.parametrize(
+    ("content", "says"), [("{", "is no JSON .*; copy it again"), ("[3]", "got no normalisation")]
+)
 def test_damaged_statistics_are_refused(tmp_path: Path, content: str, says: str) -> None:
     (tmp_path / "dataset_statistics.json").write_text(content)
     with pytest.raises(ConfigError, match=says):

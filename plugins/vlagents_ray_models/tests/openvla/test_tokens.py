@@ -1,4 +1,6 @@
-"""The distribution over action tokens: what is drawn from it, and its log-probability and entropy."""
+"""The distribution over action tokens: what is drawn from it, and its log-probability and
+entropy.
+"""
 
 from __future__ import annotations
 
@@ -20,7 +22,10 @@ LAST = VOCABULARY - 4 - 1
 @pytest.fixture
 def bins() -> ActionBins:
     sizes = SimpleNamespace(vocab_size=VOCABULARY)
-    return ActionBins(SimpleNamespace(n_action_bins=BINS, text_config=sizes, pad_to_multiple_of=4), torch.device("cpu"))
+    return ActionBins(
+        SimpleNamespace(n_action_bins=BINS, text_config=sizes, pad_to_multiple_of=4),
+        torch.device("cpu"),
+    )
 
 
 def logits(*shape: int, seed: int = 0) -> Any:
@@ -30,7 +35,9 @@ def logits(*shape: int, seed: int = 0) -> Any:
 def test_the_log_probability_is_that_of_the_bins_alone(bins: ActionBins) -> None:
     scores = logits(3, 2)
     tokens = torch.tensor([[LAST, LAST - 1], [LAST - 7, LAST], [LAST - 3, LAST - 4]])
-    categorical = torch.distributions.Categorical(logits=scores[..., range(LAST - BINS + 1, LAST + 1)].double())
+    categorical = torch.distributions.Categorical(
+        logits=scores[..., range(LAST - BINS + 1, LAST + 1)].double()
+    )
     _, over = bins.read(scores)
     *_, logprob, entropy, stated = bins.stated(tokens, over)
     np.testing.assert_allclose(logprob, categorical.log_prob(tokens - (LAST - BINS + 1)), rtol=1e-9)

@@ -10,7 +10,9 @@ import torch
 class Head(torch.nn.Module):
     def draw(self, batch: int) -> tuple[Any, Any]:
         noise = torch.randn(size=(batch, 3), dtype=torch.bfloat16, device=torch.device("cpu"))
-        return torch.cat([noise.float(), torch.randn((batch, 2))], 1), torch.multinomial(torch.ones(batch, 50), 1)
+        return torch.cat([noise.float(), torch.randn((batch, 2))], 1), torch.multinomial(
+            torch.ones(batch, 50), 1
+        )
 
     def draw_otherwise(self) -> Any:
         return torch.rand(2)

@@ -25,7 +25,9 @@ def config(**settings: Any) -> VJepa2AcConfig:
 
 def noise(settings: VJepa2AcConfig, *seeds: int) -> torch.Tensor:
     shape = (settings.iterations, settings.rollout, settings.samples, DRAWN)
-    return torch.stack([torch.randn(shape, generator=torch.Generator().manual_seed(seed)) for seed in seeds])
+    return torch.stack(
+        [torch.randn(shape, generator=torch.Generator().manual_seed(seed)) for seed in seeds]
+    )
 
 
 def world(features: torch.Tensor, actions: torch.Tensor, poses: torch.Tensor) -> torch.Tensor:
@@ -72,7 +74,9 @@ def test_a_session_gets_the_same_plan_in_any_company_and_in_passes_of_any_size()
     small = config(samples=50, pass_size=7)
     for i in range(3):
         one = slice(i, i + 1)
-        alone = plan(world, seen(start[one]), start[one], seen(goal[one]), noise(settings, i), small)
+        alone = plan(
+            world, seen(start[one]), start[one], seen(goal[one]), noise(settings, i), small
+        )
         assert torch.allclose(alone.actions[0], together.actions[i], atol=1e-6)
         assert torch.allclose(alone.energy[0], together.energy[i], atol=1e-6)
 
@@ -126,8 +130,16 @@ def test_the_features_of_a_goal_move_without_its_device_and_are_not_computed_aga
     policy = VJepa2Ac(config(samples=20, iterations=2))
     policy.model = network = PoseWorld()
     start = np.array([0.3, 0.0, 0.4, 3.1, 0.0, 0.0, 0.5], np.float32)
-    row = Row((Frame(start, start),), "", np.random.default_rng(0), memory={"goal": Goal(start + np.float32(0.04))})
-    samples = [Row(row.frames, "", np.random.default_rng(i), memory=copy.deepcopy(row.memory)) for i in (1, 2)]
+    row = Row(
+        (Frame(start, start),),
+        "",
+        np.random.default_rng(0),
+        memory={"goal": Goal(start + np.float32(0.04))},
+    )
+    samples = [
+        Row(row.frames, "", np.random.default_rng(i), memory=copy.deepcopy(row.memory))
+        for i in (1, 2)
+    ]
     policy._plans([row, *samples])
     assert network.encoded == 3 + 1  # the images of three rows, and one goal
     pickled = pickle.dumps(row.memory)
@@ -141,5 +153,7 @@ def test_the_features_of_a_goal_move_without_its_device_and_are_not_computed_aga
 
     np.testing.assert_array_equal(planned(there), planned(row.memory))
     assert network.encoded == 4 + 2
-    assert isinstance(there["goal"].features, torch.Tensor), "once it is on the device, it stays there"
+    assert isinstance(there["goal"].features, torch.Tensor), (
+        "once it is on the device, it stays there"
+    )
     assert b"torch" not in pickle.dumps(there)

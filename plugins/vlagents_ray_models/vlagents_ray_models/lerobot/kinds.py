@@ -1,7 +1,7 @@
 """The types of LeRobot's policies, and how each computes the chunks of many sessions.
 
-LeRobot's `select_action` stores observations, actions and plans in the policy object, for one robot. The classes here
-call its stateless functions, and pass them the state of each session.
+LeRobot's `select_action` stores observations, actions and plans in the policy object, for one
+robot. The classes here call its stateless functions, and pass them the state of each session.
 """
 
 from __future__ import annotations
@@ -27,19 +27,25 @@ from vlagents_ray.registry import require
 from vlagents_ray_models.key_value_cache import cache_of, layers_of, stack_of
 from vlagents_ray_models.pi0_passes import Pi0Passes
 
-LONGEST_PREFIX = "rtc_training_max_delay"  # the config's field, of LeRobot after 0.6.1, for π0.5; 0: without prefixes
-_MEMORIES = ("use_visual_memory", "use_proprioceptive_memory")  # fields of π0.5's config in the same versions
+# The config's field, of LeRobot after 0.6.1, for π0.5; 0: without prefixes.
+LONGEST_PREFIX = "rtc_training_max_delay"
+# Fields of π0.5's config in the same versions.
+_MEMORIES = ("use_visual_memory", "use_proprioceptive_memory")
 STATE, ACTION, IMAGES = "observation.state", "action", "observation.images"
 FRAMES = (STATE, "observation.environment_state", IMAGES)  # inputs of each step of a history
 
 
 class Kind:
-    """The default for any type: one row at a time with a seed from its session, which is slow but exact."""
+    """The default for any type: one row at a time with a seed from its session, which is slow
+    but exact.
+    """
 
     batched = False
-    lengths: ClassVar[tuple[str, ...]] = ("chunk_size", "n_action_steps")  # the config's rows of a chunk, by preference
+    # The config's rows of a chunk, by preference.
+    lengths: ClassVar[tuple[str, ...]] = ("chunk_size", "n_action_steps")
     random: RandomSteps | None = None  # of the last sampled chunks
-    given: Mapping[int, int] = {}  # number of rows that the last sampled chunks were given, by the row of the batch
+    # Number of rows that the last sampled chunks were given, by the row of the batch.
+    given: Mapping[int, int] = {}
 
     def __init__(self, policy: Any, compilation: Compilation) -> None:
         """Use a loaded policy, and mark its core functions for compilation if its type has any."""
@@ -47,7 +53,8 @@ class Kind:
         self.staging = Staging(policy.config.device)
         if type(self) is Kind and self.steps > 1:
             raise ConfigError(
-                f"checkpoint: {policy.name!r} keeps {self.steps} observations by itself, so that sessions would mix; "
+                f"checkpoint: {policy.name!r} keeps {self.steps} observations by itself, so that "
+                "sessions would mix; "
                 f"want another type, or a policy with n_obs_steps 1"
             )
 
@@ -59,7 +66,9 @@ class Kind:
     @property
     def horizon(self) -> int:
         """The number of rows of a chunk, counted from the current tick."""
-        return int(getattr(self.config, self.lengths[0], 0) or getattr(self.config, self.lengths[-1]))
+        return int(
+            getattr(self.config, self.lengths[0], 0) or getattr(self.config, self.lengths[-1])
+        )
 
     @property
     def dim(self) -> int:
@@ -68,11 +77,15 @@ class Kind:
 
     @property
     def usual(self) -> int:
-        """The number of rows that the policy executes before the next inference, from its config."""
+        """The number of rows that the policy executes before the next inference, from its
+        config.
+        """
         return min(int(getattr(self.config, "n_action_steps", self.horizon)), self.horizon)
 
     def observations(self, rows: Sequence[Row]) -> list[int]:
-        """Return the indices of the rows whose observations `draw` needs: all, unless samples share one."""
+        """Return the indices of the rows whose observations `draw` needs: all, unless samples
+        share one.
+        """
         return list(range(len(rows)))
 
     def draw(self, batch: dict[str, Any], rows: Sequence[Row], leftovers: Sequence[Any]) -> Any:
@@ -111,7 +124,9 @@ def vectors(config: Any) -> list[str]:
 
 
 def stacked(batch: dict[str, Any], config: Any, rows: int) -> dict[str, Any]:
-    """Reshape (rows * steps, …) to (rows, steps, …), with the cameras in one tensor (rows, steps, cameras, 3, H, W)."""
+    """Reshape (rows * steps, …) to (rows, steps, …), with the cameras in one tensor (rows,
+    steps, cameras, 3, H, W).
+    """
     if config.image_features:
         images = [batch[key] for key in config.image_features]
         batch = {**batch, IMAGES: require("torch").stack(images, dim=1)}
@@ -122,7 +137,9 @@ _TOKENS = ("observation.language.tokens", "observation.language.attention_mask")
 
 
 class Diffusion(Kind):
-    """Diffusion policies, with noise for the first sample and, with DDPM, for every denoising step."""
+    """Diffusion policies, with noise for the first sample and, with DDPM, for every denoising
+    step.
+    """
 
     batched = True
 
@@ -141,7 +158,9 @@ class Diffusion(Kind):
         from vlagents_ray_models.sampling_rng import generator_of
 
         model = self.policy.diffusion
-        noise = np.stack([row.noise(self.config.horizon, self.config.action_feature.shape[0]) for row in rows])
+        noise = np.stack(
+            [row.noise(self.config.horizon, self.config.action_feature.shape[0]) for row in rows]
+        )
         actions = model.conditional_sample(
             len(rows),
             global_cond=self._encode(*stacked(batch, self.config, len(rows)).values()),
@@ -152,11 +171,15 @@ class Diffusion(Kind):
 
     def _condition(self, *inputs: Any) -> Any:
         names = [*vectors(self.config), *([IMAGES] if self.config.image_features else [])]
-        return self.policy.diffusion._prepare_global_conditioning(dict(zip(names, inputs, strict=True)))
+        return self.policy.diffusion._prepare_global_conditioning(
+            dict(zip(names, inputs, strict=True))
+        )
 
 
 class MultiTaskDit(Kind):
-    """The multi-task diffusion transformer of LeRobot 0.6, by diffusion or flow matching, with an instruction."""
+    """The multi-task diffusion transformer of LeRobot 0.6, by diffusion or flow matching, with
+    an instruction.
+    """
 
     batched = True
 
@@ -167,18 +190,23 @@ class MultiTaskDit(Kind):
     def draw(self, batch: dict[str, Any], rows: Sequence[Row], leftovers: Sequence[Any]) -> Any:
         seen = stacked(batch, self.config, len(rows))
         for name in _TOKENS:
-            seen[name] = batch[name].unflatten(0, (len(rows), -1))[:, -1]  # the same in each step of a history
+            # The same in each step of a history.
+            seen[name] = batch[name].unflatten(0, (len(rows), -1))[:, -1]
         condition = self.policy.observation_encoder.encode(seen)
-        own = self.policy.objective, require("diffusers.utils.torch_utils")  # DDPM's steps draw in the latter
+        # DDPM's steps draw in the latter.
+        own = self.policy.objective, require("diffusers.utils.torch_utils")
         with row_draws(rows, *own):
-            actions = self.policy.objective.conditional_sample(self.policy.noise_predictor, len(rows), condition)
+            actions = self.policy.objective.conditional_sample(
+                self.policy.noise_predictor, len(rows), condition
+            )
         return actions[:, self.steps - 1 :]
 
 
 class Flow(Kind):
     """SmolVLA, π0 and π0.5: flow matching from noise of the sessions, guided by their leftovers.
 
-    A checkpoint that was trained with prefixes is given the first rows of a leftover instead, and no guidance.
+    A checkpoint that was trained with prefixes is given the first rows of a leftover instead, and
+    no guidance.
     """
 
     batched = True
@@ -191,10 +219,13 @@ class Flow(Kind):
             self.passes: FlowPasses = SmolVLAPasses(model, compilation)
         else:
             self.passes = Pi0Passes(model, compilation, stated=policy.name == "pi0")
-        self.flow_steps = int(config.num_steps if policy.name == "smolvla" else config.num_inference_steps)
+        self.flow_steps = int(
+            config.num_steps if policy.name == "smolvla" else config.num_inference_steps
+        )
         if memories := [name for name in _MEMORIES if getattr(config, name, False)]:
             raise ConfigError(
-                f"checkpoint: has {memories}, want none: the policy object keeps them, so that sessions would mix"
+                f"checkpoint: has {memories}, want none: the policy object keeps them, so that "
+                "sessions would mix"
             )
         # The policy calls it after preparing the inputs and before converting the actions.
         model.sample_actions = self.passes.sample
@@ -215,9 +246,15 @@ class Flow(Kind):
         given, self.given = None, {}
         if any(left is not None for left in leftovers):
             plans = [None if left is None else self._encoded(left) for left in leftovers]
-            prefixes = Guide.of(list(map(self._prefixed, rows, plans)), *shape) if self.longest else None
+            prefixes = (
+                Guide.of(list(map(self._prefixed, rows, plans)), *shape) if self.longest else None
+            )
             if prefixes is not None:
-                self.given = {i: int(prefixes.frozen[i].sum()) for i, plan in enumerate(plans) if plan is not None}
+                self.given = {
+                    i: int(prefixes.frozen[i].sum())
+                    for i, plan in enumerate(plans)
+                    if plan is not None
+                }
                 prefixes = prefixes.to(convert)
                 noise, given = prefixes.given(noise), prefixes.frozen
                 changes.append(prefixes.keep)
@@ -237,14 +274,20 @@ class Flow(Kind):
         )
 
     def _shared(self, rows: Sequence[Row]) -> tuple[list[int], list[int]]:
-        """Return the rows whose observations are read, and for each row the index of its observations among them."""
-        if getattr(self.config, "use_relative_actions", False):  # each row's state is added to its actions
+        """Return the rows whose observations are read, and for each row the index of its
+        observations among them.
+        """
+        # Each row's state is added to its actions.
+        if getattr(self.config, "use_relative_actions", False):
             return list(range(len(rows))), list(range(len(rows)))
         return shared_frames(rows)
 
     def _prefixed(self, row: Row, plan: Any) -> Row:
-        """Return the row with its plan in the policy's units, and the number of its rows that are given."""
-        delay = min(row.delay or self.longest, self.longest)  # before the first answer its delay is unknown
+        """Return the row with its plan in the policy's units, and the number of its rows that
+        are given.
+        """
+        # Before the first answer its delay is unknown.
+        delay = min(row.delay or self.longest, self.longest)
         return replace(row, leftover=None if plan is None else fetch(plan), delay=delay)
 
     def _encoded(self, left: Any) -> Any:
@@ -254,8 +297,15 @@ class Flow(Kind):
         return self.policy._pi_aloha_encode_actions_inv(left[None].clone())[0]
 
 
-def guided(processor: Any, plans: Sequence[Any], delays: Sequence[int], shape: tuple[int, int], convert: Any) -> Change:
-    """Return the change of velocities that leads chunks to the leftovers of their sessions, as LeRobot does.
+def guided(
+    processor: Any,
+    plans: Sequence[Any],
+    delays: Sequence[int],
+    shape: tuple[int, int],
+    convert: Any,
+) -> Change:
+    """Return the change of velocities that leads chunks to the leftovers of their sessions, as
+    LeRobot does.
 
     Args:
         processor: The policy's `RTCProcessor`, for its settings and its schedule.
@@ -287,27 +337,41 @@ class SmolVLAPasses(FlowPasses):
     """The passes of SmolVLA, whose images are encoded from their patches."""
 
     def __init__(self, model: Any, compilation: Compilation) -> None:
-        """Use the passes of a `VLAFlowMatching`, which then also accepts patches in place of images."""
+        """Use the passes of a `VLAFlowMatching`, which then also accepts patches in place of
+        images.
+        """
         super().__init__(model, compilation)
         self._vlm = model.vlm_with_expert.get_vlm_model()
-        # LeRobot 0.4 stores keys and values by name, (B, L, heads, D); later versions in a cache of transformers.
-        self._by_name = "fill_kv_cache" in inspect.signature(model.vlm_with_expert.forward).parameters
-        self._positions: dict[tuple[int, int], Any] = {}  # of an image's patches, (L,), by its height and width
+        # LeRobot 0.4 stores keys and values by name, (B, L, heads, D); later versions in a cache of
+        # transformers.
+        self._by_name = (
+            "fill_kv_cache" in inspect.signature(model.vlm_with_expert.forward).parameters
+        )
+        # Of an image's patches, (L,), by its height and width.
+        self._positions: dict[tuple[int, int], Any] = {}
         self._embed_image = model.vlm_with_expert.embed_image
         model.vlm_with_expert.embed_image = self._embed
 
     def encode_images(self, images: Sequence[Any]) -> list[Any]:
-        """Return the patches of images (P, 3, H, W) in the format of the vision model, (P, L, E)."""
+        """Return the patches of images (P, 3, H, W) in the format of the vision model, (P, L,
+        E).
+        """
         vision = self._vlm.vision_model
         places = vision.embeddings.position_embedding
         found = []
         for image in images:
-            patches = vision.embeddings.patch_embedding(image.to(vision.dtype)).flatten(2).transpose(1, 2)
+            patches = (
+                vision.embeddings.patch_embedding(image.to(vision.dtype)).flatten(2).transpose(1, 2)
+            )
             found.append(patches + places(self._positions_of(image)))
         return found
 
-    def encode(self, tokens: Any, mask: Any, cameras: Any, state: Any, *patches: Any) -> tuple[Any, Any]:
-        embedded, seen, causal = self.model.embed_prefix(patches, cameras.unbind(1), tokens, mask, state=state)
+    def encode(
+        self, tokens: Any, mask: Any, cameras: Any, state: Any, *patches: Any
+    ) -> tuple[Any, Any]:
+        embedded, seen, causal = self.model.embed_prefix(
+            patches, cameras.unbind(1), tokens, mask, state=state
+        )
         _, cache = self.model.vlm_with_expert.forward(
             attention_mask=self.module.make_att_2d_masks(seen, causal),
             position_ids=seen.cumsum(1) - 1,
@@ -324,10 +388,15 @@ class SmolVLAPasses(FlowPasses):
     def velocity(self, encoded: Any, seen: Any, state: Any, actions: Any, times: Any) -> Any:
         layers = encoded.unbind(1)
         if self._by_name:
-            cache = {i: {"key_states": layer[:, 0], "value_states": layer[:, 1]} for i, layer in enumerate(layers)}
+            cache = {
+                i: {"key_states": layer[:, 0], "value_states": layer[:, 1]}
+                for i, layer in enumerate(layers)
+            }
         else:
             cache = cache_of(layers)
-        return self.model.denoise_step(prefix_pad_masks=seen.bool(), past_key_values=cache, x_t=actions, timestep=times)
+        return self.model.denoise_step(
+            prefix_pad_masks=seen.bool(), past_key_values=cache, x_t=actions, timestep=times
+        )
 
     def _embed(self, patches: Any) -> Any:
         if patches.ndim == 4:  # an image, in LeRobot's own training pass
@@ -337,16 +406,21 @@ class SmolVLAPasses(FlowPasses):
         return self._vlm.connector(vision.post_layernorm(hidden))
 
     def _positions_of(self, image: Any) -> Any:
-        """Return the positions that the vision model gives to the patches of an image of this size."""
+        """Return the positions that the vision model gives to the patches of an image of this
+        size.
+        """
         size = (image.shape[-2], image.shape[-1])
         if size not in self._positions:
             torch, vision = require("torch"), self._vlm.vision_model
             found: list[Any] = []
-            hook = vision.embeddings.position_embedding.register_forward_pre_hook(lambda _, given: found.extend(given))
+            hook = vision.embeddings.position_embedding.register_forward_pre_hook(
+                lambda _, given: found.extend(given)
+            )
             with hook, self.adapters.rows(()):  # the image belongs to no row
                 patches = [length // vision.patch_size for length in size]
                 vision.embeddings(
-                    image[:1].to(vision.dtype), torch.ones(1, *patches, dtype=torch.bool, device=image.device)
+                    image[:1].to(vision.dtype),
+                    torch.ones(1, *patches, dtype=torch.bool, device=image.device),
                 )
             self._positions[size] = found[0][0].clone()
         return self._positions[size]
@@ -358,8 +432,8 @@ _BOUNDS = ("min", "max")  # statistics that scale states and actions
 class Groot(Kind):
     """GR00T N1.7: flow matching from noise drawn for each session.
 
-    The layers above its language model do not mask padding, so only observations whose prompts have the same number of
-    tokens share a pass.
+    The layers above its language model do not mask padding, so only observations whose prompts have
+    the same number of tokens share a pass.
     """
 
     batched = True
@@ -386,14 +460,21 @@ class Groot(Kind):
         return require("torch").stack(chunks).float()
 
 
-def _part(batch: Mapping[str, Any], places: Sequence[int], length: int, rows: int) -> dict[str, Any]:
-    """Return the inputs of some rows, whose prompts have `length` tokens, without the padding before them."""
+def _part(
+    batch: Mapping[str, Any], places: Sequence[int], length: int, rows: int
+) -> dict[str, Any]:
+    """Return the inputs of some rows, whose prompts have `length` tokens, without the padding
+    before them.
+    """
     grid = batch["image_grid_thw"]
     patches = batch["pixel_values"].split(grid.prod(1).tolist())  # one for each image
     views = len(grid) // rows
     images = [place * views + view for place in places for view in range(views)]
     padded = batch["input_ids"].shape
-    found = {"pixel_values": require("torch").cat([patches[i] for i in images]), "image_grid_thw": grid[images]}
+    found = {
+        "pixel_values": require("torch").cat([patches[i] for i in images]),
+        "image_grid_thw": grid[images],
+    }
     for name, value in batch.items():
         if name not in found and hasattr(value, "shape") and value.shape[:1] == (rows,):
             of_tokens = value.shape[:2] == padded
@@ -402,36 +483,54 @@ def _part(batch: Mapping[str, Any], places: Sequence[int], length: int, rows: in
 
 
 def require_groot_statistics(before: Sequence[Any], after: Sequence[Any], settings: Any) -> None:
-    """Raise `ConfigError` unless GR00T's processors have usable bounds; LeRobot replaces missing ones by 0 and 1."""
+    """Raise `ConfigError` unless GR00T's processors have usable bounds; LeRobot replaces missing
+    ones by 0 and 1.
+    """
     torch = require("torch")
     pack, decode = _step(before, "embodiment_tag"), _step(after, "env_action_dim")
     if pack is None or decode is None:
-        raise ConfigError("checkpoint: misses the steps of GR00T N1.7's processors; save it with LeRobot 0.6 again")
+        raise ConfigError(
+            "checkpoint: misses the steps of GR00T N1.7's processors; save it with LeRobot 0.6 "
+            "again"
+        )
     if pack.embodiment_tag not in pack.embodiment_mapping:
         raise ConfigError(
-            f"checkpoint: got the embodiment {pack.embodiment_tag!r}, want one of {sorted(pack.embodiment_mapping)}: "
+            f"checkpoint: got the embodiment {pack.embodiment_tag!r}, want one of "
+            f"{sorted(pack.embodiment_mapping)}: "
             f"LeRobot would act as the first of them"
         )
-    sources = [("policy_preprocessor.json", STATE, pack.stats), ("policy_preprocessor.json", ACTION, pack.stats)]
+    sources = [
+        ("policy_preprocessor.json", STATE, pack.stats),
+        ("policy_preprocessor.json", ACTION, pack.stats),
+    ]
     if hasattr(decode, "stats"):
         sources.append(("policy_postprocessor.json", ACTION, decode.stats))
     features = {**settings.input_features, **settings.output_features}
     for file, key, stats in sources:
-        have = {name: torch.as_tensor(value).float() for name, value in ((stats or {}).get(key) or {}).items()}
+        have = {
+            name: torch.as_tensor(value).float()
+            for name, value in ((stats or {}).get(key) or {}).items()
+        }
         width = features[key].shape[0]
         missing = [name for name in _BOUNDS if name not in have or not have[name].isfinite().all()]
         short = [name for name in _BOUNDS if name in have and have[name].numel() < width]
         if missing or short:
             raise ConfigError(
-                f"checkpoint: {file} has no usable {missing or short} of {key!r}, has {sorted(have)}, want {width} "
-                f"numbers each; without them its inputs and actions are wrong: save it with its dataset's statistics"
+                f"checkpoint: {file} has no usable {missing or short} of {key!r}, has "
+                f"{sorted(have)}, want {width} "
+                "numbers each; without them its inputs and actions are wrong: save it with its "
+                "dataset's statistics"
             )
 
 
 def groot_dataset(before: Sequence[Any]) -> DatasetContract | None:
-    """Return the parts of the state that NVIDIA's checkpoint names; None if no name has a meaning."""
+    """Return the parts of the state that NVIDIA's checkpoint names; None if no name has a
+    meaning.
+    """
     pack = _step(before, "embodiment_tag")
-    names = ((getattr(pack, "modality_config", None) or {}).get("state") or {}).get("modality_keys") or ()
+    names = ((getattr(pack, "modality_config", None) or {}).get("state") or {}).get(
+        "modality_keys"
+    ) or ()
     stats = (getattr(pack, "raw_stats", None) or {}).get("state") or {}
     widths = {name: len(stats.get(name, {}).get("min", ())) for name in names}
     if not widths or not all(widths.values()) or widths.get(GRIPPER, 1) != 1:
@@ -454,7 +553,9 @@ class ActPolicy(Kind):
         self._act = compilation.core("act", self._actions)
 
     def draw(self, batch: dict[str, Any], rows: Sequence[Row], leftovers: Sequence[Any]) -> Any:
-        return self._act(*(batch[key] for key in (*vectors(self.config), *self.config.image_features)))
+        return self._act(
+            *(batch[key] for key in (*vectors(self.config), *self.config.image_features))
+        )
 
     def _actions(self, *inputs: Any) -> Any:
         names = vectors(self.config)
@@ -479,7 +580,9 @@ class Evo1(Kind):
 
 
 class XVla(Kind):
-    """X-VLA, which draws its noise itself and does not mask padding, so a batch needs instructions of one length."""
+    """X-VLA, which draws its noise itself and does not mask padding, so a batch needs
+    instructions of one length.
+    """
 
     @property
     def batched(self) -> bool:  # type: ignore[override]
@@ -494,7 +597,10 @@ class XVla(Kind):
 
         def look(*inputs: Any) -> dict[str, Any]:
             """Run the vision-language encoder once for each observation."""
-            return {name: one[owners] for name, one in self._look(*(each[firsts] for each in inputs)).items()}
+            return {
+                name: one[owners]
+                for name, one in self._look(*(each[firsts] for each in inputs)).items()
+            }
 
         self.policy.model.forward_vlm = look
         with row_draws(rows, self.policy.model):
@@ -502,14 +608,19 @@ class XVla(Kind):
 
 
 class VqBet(Kind):
-    """VQ-BeT, which samples the codes of its residual VQ; checkpoints of its first training phase have no codes."""
+    """VQ-BeT, which samples the codes of its residual VQ; checkpoints of its first training
+    phase have no codes.
+    """
 
     batched, lengths = True, ("action_chunk_size",)
 
     def __init__(self, policy: Any, compilation: Compilation) -> None:
         super().__init__(policy, compilation)
         if not policy.vqbet.action_head.vqvae_model.discretized.item():
-            raise ConfigError("checkpoint: VQ-BeT's residual VQ is not trained in it; train on, or name a later step")
+            raise ConfigError(
+                "checkpoint: VQ-BeT's residual VQ is not trained in it; train on, or name a later "
+                "step"
+            )
 
     def draw(self, batch: dict[str, Any], rows: Sequence[Row], leftovers: Sequence[Any]) -> Any:
         with row_draws(rows, self.policy.vqbet):
@@ -517,7 +628,8 @@ class VqBet(Kind):
 
 
 class Tdmpc(Kind):
-    """TD-MPC, which runs one row at a time, since the rows of a batch would share random trajectories and Q functions.
+    """TD-MPC, which runs one row at a time, since the rows of a batch would share random
+    trajectories and Q functions.
 
     The plan of a session's last tick, from which the next one starts, is in `row.memory`.
     """
@@ -537,7 +649,8 @@ class Tdmpc(Kind):
         if (mean := row.memory.get("mean")) is not None:
             policy._prev_mean = torch.from_numpy(mean).to(self.config.device)
         latent = policy.model.encode(batch)
-        actions = policy.plan(latent) if self.config.use_mpc else policy.model.pi(latent)[None]  # (horizon, 1, D)
+        # (horizon, 1, D)
+        actions = policy.plan(latent) if self.config.use_mpc else policy.model.pi(latent)[None]
         actions = actions.clamp(-1, 1)
         if policy._prev_mean is not None:
             row.memory["mean"] = fetch(policy._prev_mean)
@@ -546,7 +659,9 @@ class Tdmpc(Kind):
 
 
 class Single(Kind):
-    """SAC, which LeRobot 0.6 calls `gaussian_actor`, with single actions and no state between them."""
+    """SAC, which LeRobot 0.6 calls `gaussian_actor`, with single actions and no state between
+    them.
+    """
 
     @property
     def horizon(self) -> int:
@@ -554,14 +669,17 @@ class Single(Kind):
 
     @property
     def dim(self) -> int:
-        return super().dim + (self.config.num_discrete_actions is not None)  # the gripper's choice, which comes last
+        # The gripper's choice, which comes last.
+        return super().dim + (self.config.num_discrete_actions is not None)
 
     def _alone(self, batch: dict[str, Any], row: Row) -> Any:
-        inputs = {key: batch[key] for key in self.config.input_features}  # the gripper's network takes no others
+        # The gripper's network takes no others.
+        inputs = {key: batch[key] for key in self.config.input_features}
         return self.policy.select_action(inputs)[:, None]
 
 
-RESIZING = {"groot", "smolvla", "pi0", "pi05", "pi0_fast", "wall_x"}  # types that resize images themselves
+# Types that resize images themselves.
+RESIZING = {"groot", "smolvla", "pi0", "pi05", "pi0_fast", "wall_x"}
 MASKING = {"smolvla", "pi0", "pi05", "pi0_fast", "xvla"}
 
 KINDS: Mapping[str, type[Kind]] = {

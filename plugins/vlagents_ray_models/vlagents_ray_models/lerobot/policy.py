@@ -47,7 +47,8 @@ class LoadedLeRobot:
     contract: Contract
     trained: DatasetContract  # of the dataset; empty if the dataset states none
     renames: dict[str, str]  # from the dataset's cameras to the policy's observation keys
-    own: dict[str, Processors] = field(default_factory=dict)  # of adapters that were trained with other statistics
+    # Of adapters that were trained with other statistics.
+    own: dict[str, Processors] = field(default_factory=dict)
 
 
 class LeRobot(ModelPolicy):
@@ -88,45 +89,69 @@ class LeRobot(ModelPolicy):
         kind = kinds.KINDS.get(settings.type, kinds.Kind)(policy, self.compilation)
         if self.config.compile not in (False, "auto") and not self.compilation.cores:
             raise ConfigError(
-                f"compile: not for LeRobot's {settings.type!r}; leave it out, or have LeRobot compile it, where its "
+                f"compile: not for LeRobot's {settings.type!r}; leave it out, or have LeRobot "
+                "compile it, where its "
                 f"config has that: overrides: {{compile_model: true}}"
             )
         if isinstance(kind, kinds.Flow):
             kind.noise_level, kind.passes.adapters = self.config.noise_level, self.adapters
         elif self.config.adapters:
             raise ConfigError(
-                f"adapters: got them for LeRobot's {settings.type!r}, want one of {_FLOWS}; merge each into its base"
+                f"adapters: got them for LeRobot's {settings.type!r}, want one of {_FLOWS}; merge "
+                "each into its base"
             )
         elif self.config.noise_level:
             raise ConfigError(
-                f"noise_level: got {self.config.noise_level} for LeRobot's {settings.type!r}, want 0, as its actions "
+                f"noise_level: got {self.config.noise_level} for LeRobot's {settings.type!r}, want "
+                "0, as its actions "
                 f"come out of no flow; those of {_FLOWS} do"
             )
         self.config = _with_defaults(self.config, kind)
         processors = Processors(folder, settings, self.config, kind.staging)
-        loaded = self._described(kind, processors, _trained(settings, processors), processors.rename_map)
+        loaded = self._described(
+            kind, processors, _trained(settings, processors), processors.rename_map
+        )
         self.statistics = _ranges(loaded)
         return loaded
 
     def _described(
-        self, kind: kinds.Kind, processors: Processors, trained: DatasetContract, renames: dict[str, str]
+        self,
+        kind: kinds.Kind,
+        processors: Processors,
+        trained: DatasetContract,
+        renames: dict[str, str],
     ) -> LoadedLeRobot:
         """Return the loaded checkpoint with the contract that follows from its training."""
         settings = kind.config
         cameras = _cameras(settings, self.config, renames, trained.cameras)
-        parts = list(self.config.state or trained.state or [JOINTS]) if settings.robot_state_feature else []
-        inputs = [*cameras, *(key for key in (STATE, ENVIRONMENT) if key in settings.input_features)]
+        parts = (
+            list(self.config.state or trained.state or [JOINTS])
+            if settings.robot_state_feature
+            else []
+        )
+        inputs = [
+            *cameras,
+            *(key for key in (STATE, ENVIRONMENT) if key in settings.input_features),
+        ]
         processors.require_statistics(settings, inputs)
-        environment = list(trained.environment or [ENVIRONMENT_STATE]) if settings.env_state_feature else []
+        environment = (
+            list(trained.environment or [ENVIRONMENT_STATE]) if settings.env_state_feature else []
+        )
         width = processors.width(kind.dim)
         action, known = trained.contract.action, trained.contract.state or {}
         action = action if action.dim == width else ActionSpec(dim=width)
         if len(names := getattr(settings, "action_feature_names", None) or ()) == width:
             action = replace(action, names=tuple(names))
-        state = model_inputs.state_specs(parts, settings.robot_state_feature.shape[0]) if parts else {}
+        state = (
+            model_inputs.state_specs(parts, settings.robot_state_feature.shape[0]) if parts else {}
+        )
         if tuple(parts) == trained.state:
             state |= known
-        around = model_inputs.state_specs(environment, settings.env_state_feature.shape[0]) if environment else {}
+        around = (
+            model_inputs.state_specs(environment, settings.env_state_feature.shape[0])
+            if environment
+            else {}
+        )
         contract = Contract(
             cameras={ours: _camera(settings, key) for key, ours in cameras.items()},
             state=state | {part: known.get(part, spec) for part, spec in around.items()},
@@ -138,13 +163,16 @@ class LeRobot(ModelPolicy):
             history=kind.steps,
             behaviour=self.offered(OFFERED if self.config.noise_level else ()),
         )
-        return LoadedLeRobot(kind, processors, cameras, parts, environment, contract, trained, renames)
+        return LoadedLeRobot(
+            kind, processors, cameras, parts, environment, contract, trained, renames
+        )
 
     def adapt(self, adapter: str, folder: Path) -> None:
-        """Keep the processors saved with an adapter, if any, for the state and the actions of its rows.
+        """Keep the processors saved with an adapter, if any, for the state and the actions of its
+        rows.
 
-        A base that does not describe its dataset, such as one of many robots, gets the contract of the adapter's
-        dataset.
+        A base that does not describe its dataset, such as one of many robots, gets the contract of
+        the adapter's dataset.
         """
         model: LoadedLeRobot = self.model
         own = own_processors(folder, model.kind.config, self.config, model.processors)
@@ -155,18 +183,26 @@ class LeRobot(ModelPolicy):
         unsaid = model.trained.contract == Contract() and model.trained.state in ((), trained.state)
         if own.rename_map not in ({}, renames) or not (unsaid or stated in (None, model.trained)):
             raise ConfigError(
-                f"{folder}: its dataset has another contract, or its cameras other names, than that of the base or of "
+                f"{folder}: its dataset has another contract, or its cameras other names, than "
+                "that of the base or of "
                 f"an adapter before, want the same; serve it in a deployment of its own"
             )
         if trained != model.trained:
-            self.model = model = replace(self._described(model.kind, model.processors, trained, renames), own=model.own)
+            self.model = model = replace(
+                self._described(model.kind, model.processors, trained, renames), own=model.own
+            )
         model.own[adapter] = own
 
     def perceive(self, obs: Obs) -> StagedRow:
         model: LoadedLeRobot = self.model
-        frame = {key: image.copy() for key, image in model_inputs.camera_images(obs, model.cameras).items()}
+        frame = {
+            key: image.copy()
+            for key, image in model_inputs.camera_images(obs, model.cameras).items()
+        }
         if model.state:
-            frame[STATE] = model.trained.wrapped(model_inputs.state_vector(obs, model.state, self.state_dim))
+            frame[STATE] = model.trained.wrapped(
+                model_inputs.state_vector(obs, model.state, self.state_dim)
+            )
         if model.environment:
             width = int(model.kind.config.env_state_feature.shape[0])
             frame[ENVIRONMENT] = model_inputs.state_vector(obs, model.environment, width)
@@ -187,7 +223,8 @@ class LeRobot(ModelPolicy):
         torch, model = require("torch"), self.model
         kind, settings = model.kind, model.kind.config
         leftovers = [model.own.get(row.adapter, model.processors).leftover(row) for row in rows]
-        mixed = settings.use_amp and torch.device(settings.device).type == "cuda"  # as in LeRobot's own loop
+        # As in LeRobot's own loop.
+        mixed = settings.use_amp and torch.device(settings.device).type == "cuda"
         with torch.inference_mode(), torch.autocast("cuda", enabled=mixed):
             seen = [rows[i] for i in kind.observations(rows)]
             inputs = model.processors.observe(seen, kind.steps)
@@ -202,7 +239,10 @@ class LeRobot(ModelPolicy):
             dim = settings.action_feature.shape[0]
             stated = {} if kind.random is None else kind.random.stated(self.config.execute, dim)
         given = [{GIVEN: kind.given[i]} if i in kind.given else {} for i in range(len(rows))]
-        return [Prediction(chunk, behaviour=stated.get(i, {}), info=given[i]) for i, chunk in enumerate(chunks)]
+        return [
+            Prediction(chunk, behaviour=stated.get(i, {}), info=given[i])
+            for i, chunk in enumerate(chunks)
+        ]
 
 
 def _of(adapter: str, rows: Sequence[Row]) -> list[int]:
@@ -219,16 +259,22 @@ def _with_defaults(config: LeRobotConfig, kind: kinds.Kind) -> LeRobotConfig:
         defaults = {"actions": "ensemble", "ensemble_m": coefficient, "execute": None}
     if (config.execute or 0) > kind.horizon:
         raise ConfigError(
-            f"execute: got {config.execute}, the checkpoint's chunks have {kind.horizon} rows from the observation on; "
+            f"execute: got {config.execute}, the checkpoint's chunks have {kind.horizon} rows from "
+            "the observation on; "
             f"want at most these"
         )
-    return config.model_copy(update={k: v for k, v in defaults.items() if k not in config.model_fields_set})
+    return config.model_copy(
+        update={k: v for k, v in defaults.items() if k not in config.model_fields_set}
+    )
 
 
 def _ranges(loaded: LoadedLeRobot) -> dict[str, Any] | None:
     """Return `Agent.statistics`: without turned angles of the state, and relative actions."""
     found: dict[str, Any] = {}
-    for key, comparable in ((STATE, not loaded.trained.angles), (ACTION, not loaded.processors.whole)):
+    for key, comparable in (
+        (STATE, not loaded.trained.angles),
+        (ACTION, not loaded.processors.whole),
+    ):
         known = loaded.processors.statistics(key) if comparable else {}
         for names in (("min", "max"), ("q01", "q99")):
             if all(known.get(name) and np.isfinite(known[name]).all() for name in names):
@@ -237,14 +283,21 @@ def _ranges(loaded: LoadedLeRobot) -> dict[str, Any] | None:
 
 
 def _trained(settings: Any, processors: Processors) -> DatasetContract:
-    """Return the contract of the checkpoint's dataset, or one inferred from the features of a dataset without one."""
+    """Return the contract of the checkpoint's dataset, or one inferred from the features of a
+    dataset without one.
+    """
     state, dataset = settings.robot_state_feature, processors.dataset()
     if dataset is None:
-        return DatasetContract(Contract()) if state is None else _of_features(settings.input_features, processors)
+        return (
+            DatasetContract(Contract())
+            if state is None
+            else _of_features(settings.input_features, processors)
+        )
     if state is None or dataset.width == state.shape[0]:
         return dataset
     log.warning(
-        "the contract of the checkpoint's dataset has %d numbers of state, the policy takes %d: it is not used; "
+        "the contract of the checkpoint's dataset has %d numbers of state, the policy takes %d: it "
+        "is not used; "
         "set `state` to the parts that the policy was trained with",
         dataset.width,
         state.shape[0],
@@ -255,9 +308,9 @@ def _trained(settings: Any, processors: Processors) -> DatasetContract:
 def _of_features(features: Iterable[str], processors: Processors) -> DatasetContract:
     """Infer the parts of the state, and its angles, from features and their statistics.
 
-    Copies that LeRobot's tools make without some episodes have no contract. The parts are the features
-    other than `observation.state`; their order follows from comparing their statistics with those of
-    `observation.state`.
+    Copies that LeRobot's tools make without some episodes have no contract. The parts are the
+    features other than `observation.state`; their order follows from comparing their statistics
+    with those of `observation.state`.
     """
     keys = {key.removeprefix(f"{STATE}."): key for key in features if key.startswith(f"{STATE}.")}
     if f"observation.{model_inputs.GRIPPER}" in features:
@@ -267,7 +320,10 @@ def _of_features(features: Iterable[str], processors: Processors) -> DatasetCont
     listed = [part for key in features for part, own in keys.items() if own == key]
 
     def alike(name: str) -> bool:
-        values, wanted = np.concatenate([parts[part].get(name, []) for part in order]), whole.get(name, [])
+        values, wanted = (
+            np.concatenate([parts[part].get(name, []) for part in order]),
+            whole.get(name, []),
+        )
         return len(values) == len(wanted) and np.allclose(values, wanted, rtol=1e-5, atol=1e-6)
 
     for order in (listed, sorted(keys, key=lambda part: (part == model_inputs.GRIPPER, part))):
@@ -294,7 +350,8 @@ def _cameras(
         raise ConfigError(f"masked_cameras: got {unknown}, want some of {sorted(names.values())}")
     if config.masked_cameras and settings.type not in kinds.MASKING:
         raise ConfigError(
-            f"masked_cameras: LeRobot's {settings.type!r} needs all its cameras, {sorted(names.values())}; "
+            f"masked_cameras: LeRobot's {settings.type!r} needs all its cameras, "
+            f"{sorted(names.values())}; "
             f"{sorted(kinds.MASKING)} can do without"
         )
     seen = {key: name for key, name in names.items() if name not in config.masked_cameras}
@@ -311,7 +368,10 @@ def _short(key: str) -> str:
 
 def _camera(settings: Any, key: str) -> CameraSpec:
     """Specify a camera: any size if the policy resizes, else that of its training."""
-    if settings.type in kinds.RESIZING or getattr(settings, "resize_imgs_with_padding", None) is not None:
+    if (
+        settings.type in kinds.RESIZING
+        or getattr(settings, "resize_imgs_with_padding", None) is not None
+    ):
         return CameraSpec()
     _, height, width = settings.input_features[key].shape
     return CameraSpec(height, width)

@@ -1,4 +1,6 @@
-"""OpenVLA-OFT: computes a chunk of actions from images, proprioception and an instruction in one forward pass."""
+"""OpenVLA-OFT: computes a chunk of actions from images, proprioception and an instruction in one
+forward pass.
+"""
 
 from __future__ import annotations
 
@@ -17,38 +19,59 @@ from vlagents_ray.errors import ConfigError, InvalidObservation
 from vlagents_ray.interface import Obs
 from vlagents_ray.policies.base import Prediction, Row
 from vlagents_ray.policies.base.accelerator import fetch
-from vlagents_ray.policies.base.model_inputs import camera_images, choose_cameras, needs_gripper, state_vector
+from vlagents_ray.policies.base.model_inputs import (
+    camera_images,
+    choose_cameras,
+    needs_gripper,
+    state_vector,
+)
 from vlagents_ray.policies.base.staging import StagedRow
 from vlagents_ray.policies.compilation import Compilation
 from vlagents_ray.registry import require
 from vlagents_ray_models.openvla import prismatic
 
 _PRIMARY = "full_image"
-_CAMERAS = (_PRIMARY, "wrist_image", "left_wrist_image", "right_wrist_image")  # in the order of training
+# In the order of training.
+_CAMERAS = (_PRIMARY, "wrist_image", "left_wrist_image", "right_wrist_image")
 _USUAL = {_PRIMARY: "front", "wrist_image": "wrist"}  # of LIBERO
 _STATE = ("xyz_axis_angle", "gripper_qpos")  # of LIBERO, 6 and 2 numbers
 
 
 class OpenVLAOFTConfig(prismatic.PrismaticConfig):
-    """Settings of OpenVLA-OFT; they must state how a checkpoint was trained, since its files do not."""
+    """Settings of OpenVLA-OFT; they must state how a checkpoint was trained, since its files do
+    not.
+    """
 
-    attention: Literal["sdpa", "eager"] = Field(default="sdpa", description="of the language model; has no causal mask")
-    center_crop: bool = Field(default=True, description="trained with random crops (upstream's `image_aug`)")
+    attention: Literal["sdpa", "eager"] = Field(
+        default="sdpa", description="of the language model; has no causal mask"
+    )
+    center_crop: bool = Field(
+        default=True, description="trained with random crops (upstream's `image_aug`)"
+    )
     head: Literal["l1", "diffusion", "tokens"] = Field(
-        default="l1", description="how actions come out: by regression, by diffusion, or as tokens of bins"
+        default="l1",
+        description="how actions come out: by regression, by diffusion, or as tokens of bins",
     )
     film: bool = Field(default=False, description="trained with FiLM (OFT+)")
-    horizon: int = Field(default=8, ge=1, description="rows of a chunk, as in training: LIBERO 8, ALOHA 25, Bridge 5")
+    horizon: int = Field(
+        default=8, ge=1, description="rows of a chunk, as in training: LIBERO 8, ALOHA 25, Bridge 5"
+    )
     bounds: prismatic.Bounds = Field(
-        default="q99", description="of actions and states in training: 'q99', or 'min_max' for ALOHA's absolute joints"
+        default="q99",
+        description="of actions and states in training: 'q99', or 'min_max' for ALOHA's absolute "
+        "joints",
     )
     diffusion_steps: int = Field(default=50, ge=1, description="of training")
-    inference_steps: int = Field(default=50, ge=1, description="of diffusion, at most as many as in training")
+    inference_steps: int = Field(
+        default=50, ge=1, description="of diffusion, at most as many as in training"
+    )
 
     @model_validator(mode="after")
     def _steps_fit(self) -> Self:
         if self.inference_steps > self.diffusion_steps:
-            raise ValueError(f"inference_steps: got {self.inference_steps}, want at most {self.diffusion_steps}")
+            raise ValueError(
+                f"inference_steps: got {self.inference_steps}, want at most {self.diffusion_steps}"
+            )
         return self
 
 
@@ -79,7 +102,9 @@ class OpenVLAOFT(prismatic.PrismaticPolicy):
         return None if self.model is None or self.model.proprio is None else self.model.proprio.dim
 
     def load(self) -> Parallel:
-        """Read the checkpoint and its components; raises `ConfigError` if one is missing or unused."""
+        """Read the checkpoint and its components; raises `ConfigError` if one is missing or
+        unused.
+        """
         config = self.config
         base = prismatic.load_prismatic(config, config.bounds)
         place = {"device": base.device, "dtype": base.dtype}
@@ -104,14 +129,18 @@ class OpenVLAOFT(prismatic.PrismaticPolicy):
             head=head,
             proprio=projectors["proprio_projector"],
             noisy=projectors["noisy_action_projector"],
-            film=Film(saved["vision_backbone"], base.network.vision_backbone).to(**place) if config.film else None,
+            film=Film(saved["vision_backbone"], base.network.vision_backbone).to(**place)
+            if config.film
+            else None,
             steps=(config.diffusion_steps, config.inference_steps),
         )
         parallel.compile_with(self.compilation)
         return parallel
 
     def perceive(self, obs: Obs) -> tuple[StagedRow, np.ndarray | None]:
-        """Return the images, in the order of training, as inputs of the backbones, and the state vector (P,)."""
+        """Return the images, in the order of training, as inputs of the backbones, and the state
+        vector (P,).
+        """
         seen = [prismatic.resized(image) for image in camera_images(obs, self._cameras).values()]
         if self.config.center_crop:
             seen = [prismatic.middle(image) for image in seen]
@@ -124,36 +153,52 @@ class OpenVLAOFT(prismatic.PrismaticPolicy):
         base = self.model.base
         if (dim := base.statistics.scale(key).dim) != self.model.dim:
             raise InvalidObservation(
-                f"unnorm_key: got {key!r} of {dim} numbers, want one of {self.model.dim}, the head's"
+                f"unnorm_key: got {key!r} of {dim} numbers, want one of {self.model.dim}, the "
+                "head's"
             )
         proprio = None if state is None else base.statistics.scale(key, "proprio").normalise(state)
         return ModelInput(seen, base.tokens(row.instruction), proprio)
 
     def _compute(self, prepared: Sequence[prismatic.PreparedRow]) -> list[Prediction]:
-        """Run one forward pass, or one per diffusion step. Regression gives a session's samples the same answer."""
+        """Run one forward pass, or one per diffusion step. Regression gives a session's samples
+        the same answer.
+        """
         firsts, owners = self.observations_of([entry.row for entry in prepared])
         inputs = [prepared[i].model_input for i in firsts]
         shape = (self.model.horizon, self.model.dim)
         if self.config.head == "tokens":
             draws = np.stack(
-                [entry.row.rng.random(shape) if entry.row.sample else np.full(shape, np.nan) for entry in prepared]
+                [
+                    entry.row.rng.random(shape) if entry.row.sample else np.full(shape, np.nan)
+                    for entry in prepared
+                ]
             )
-            return self._decoded(self.model.base.bins, prepared, *self.model.choose(inputs, owners, draws))
+            return self._decoded(
+                self.model.base.bins, prepared, *self.model.choose(inputs, owners, draws)
+            )
         if self.config.head == "l1":
             chunks = self.model.regress(inputs)[owners]
         else:
-            chunks = self.model.denoise(inputs, owners, np.stack([entry.row.noise(*shape) for entry in prepared]))
-        return [Prediction(entry.scale.restore(chunk)) for entry, chunk in zip(prepared, chunks, strict=True)]
+            chunks = self.model.denoise(
+                inputs, owners, np.stack([entry.row.noise(*shape) for entry in prepared])
+            )
+        return [
+            Prediction(entry.scale.restore(chunk))
+            for entry, chunk in zip(prepared, chunks, strict=True)
+        ]
 
 
 def _action_dim(statistics: prismatic.Statistics, unnorm_key: str | None, head: Mlp | None) -> int:
-    """Return the length of an action, which must be the same for the head and all datasets that episodes may select."""
+    """Return the length of an action, which must be the same for the head and all datasets that
+    episodes may select.
+    """
     dims = statistics.action_dims(unnorm_key)
     if head is not None:
         dims.add(head.dim)
     if len(dims) != 1:
         raise ConfigError(
-            f"actions: the checkpoint's head and statistics have {sorted(dims)} numbers a row, want one length; set "
+            f"actions: the checkpoint's head and statistics have {sorted(dims)} numbers a row, "
+            "want one length; set "
             f"unnorm_key to the dataset that the head was trained on"
         )
     return dims.pop()
@@ -172,7 +217,9 @@ class ModelInput:
 
 
 class Sequences(NamedTuple):
-    """The parts of sequences of embeddings that are known before the actions, and how they make up a sequence."""
+    """The parts of sequences of embeddings that are known before the actions, and how they make
+    up a sequence.
+    """
 
     seen: Any  # (B, P, D), of images and state
     words: Any  # (B, L, D)
@@ -182,9 +229,11 @@ class Sequences(NamedTuple):
 
 @dataclass
 class Parallel:
-    """A checkpoint of OFT: OpenVLA's, and its components; a component is None if training did not use it.
+    """A checkpoint of OFT: OpenVLA's, and its components; a component is None if training did not
+    use it.
 
-    `encode_images` and `hidden_states` are functions of tensors, which `compile_with` replaces by their compiled forms.
+    `encode_images` and `hidden_states` are functions of tensors, which `compile_with` replaces by
+    their compiled forms.
     """
 
     base: prismatic.Prismatic
@@ -198,14 +247,19 @@ class Parallel:
 
     @property
     def trained(self) -> dict[str, Any]:
-        """The parts that upstream's training saves: modules, and tensors by their names in its files."""
+        """The parts that upstream's training saves: modules, and tensors by their names in its
+        files.
+        """
         added = {
             "action_head": self.head,
             "proprio_projector": self.proprio,
             "noisy_action_projector": self.noisy,
             "film": self.film,
         }
-        return {"vla": self.base.network, **{name: part.weights for name, part in added.items() if part is not None}}
+        return {
+            "vla": self.base.network,
+            **{name: part.weights for name, part in added.items() if part is not None},
+        }
 
     def compile_with(self, compilation: Compilation) -> None:
         self.encode_images = compilation.core("vision encoder", self.encode_images)  # type: ignore[method-assign]
@@ -215,24 +269,37 @@ class Parallel:
         with require("torch").inference_mode():
             return fetch(self._heads(self._hidden(self._sequences(inputs))).float())
 
-    def denoise(self, inputs: Sequence[ModelInput], owners: Sequence[int], noise: np.ndarray) -> np.ndarray:
-        """Denoise chunks (B, H, D) in [-1, 1] from standard normal noise, for the inputs `owners` (B,)."""
+    def denoise(
+        self, inputs: Sequence[ModelInput], owners: Sequence[int], noise: np.ndarray
+    ) -> np.ndarray:
+        """Denoise chunks (B, H, D) in [-1, 1] from standard normal noise, for the inputs
+        `owners` (B,).
+        """
         with require("torch").inference_mode():
             sequences = self._sequences(inputs)
             index = self.base.moved(owners)
             sequences = Sequences(*(part[index] for part in sequences))
             start = self.base.moved(noise).to(self.base.dtype)
-            return fetch(denoise(start, lambda time, noisy: self._noise(sequences, time, noisy), *self.steps).float())
+            return fetch(
+                denoise(
+                    start, lambda time, noisy: self._noise(sequences, time, noisy), *self.steps
+                ).float()
+            )
 
-    def choose(self, inputs: Sequence[ModelInput], owners: Sequence[int], draws: np.ndarray) -> tuple[Any, Any]:
-        """Choose tokens (B, H, D) for the inputs `owners` (B,), by draws (B, H, D) as in `ActionBins.choose`.
+    def choose(
+        self, inputs: Sequence[ModelInput], owners: Sequence[int], draws: np.ndarray
+    ) -> tuple[Any, Any]:
+        """Choose tokens (B, H, D) for the inputs `owners` (B,), by draws (B, H, D) as in
+        `ActionBins.choose`.
 
         Returns the tokens, and the logits of the bins (B, H, D, bins) there.
         """
         with require("torch").inference_mode():
             hidden = self._hidden(self._sequences(inputs)).unflatten(1, (self.horizon, self.dim))
             index, bins = self.base.moved(owners), self.base.bins
-            likeliest, over = (one[index] for one in bins.read(self.base.network.language_model.lm_head(hidden)))
+            likeliest, over = (
+                one[index] for one in bins.read(self.base.network.language_model.lm_head(hidden))
+            )
             return bins.choose(likeliest, over, self.base.moved(draws)), over
 
     def _heads(self, hidden: Any) -> Any:
@@ -240,15 +307,29 @@ class Parallel:
 
     def _noise(self, sequences: Sequences, time: int, actions: Any) -> Any:
         seen = sequences.seen
-        now = time_embedding(time, seen.shape[-1], actions.device).to(actions.dtype).expand(len(seen), 1, -1)
+        now = (
+            time_embedding(time, seen.shape[-1], actions.device)
+            .to(actions.dtype)
+            .expand(len(seen), 1, -1)
+        )
         noisy = self.noisy(actions.flatten(1)[..., None])  # type: ignore[misc]
-        return self._heads(self._hidden(sequences._replace(seen=require("torch").cat([seen, now], 1)), noisy))
+        return self._heads(
+            self._hidden(sequences._replace(seen=require("torch").cat([seen, now], 1)), noisy)
+        )
 
     def _sequences(self, inputs: Sequence[ModelInput]) -> Sequences:
-        """Return the sequences of inputs; for a diffusion head, with a place for the time after images and state."""
+        """Return the sequences of inputs; for a diffusion head, with a place for the time after
+        images and state.
+        """
         torch, base = require("torch"), self.base
-        prompts, timed = [[*model_input.tokens, _STOP] for model_input in inputs], self.noisy is not None
-        words, counts = base.embed(base.padded(prompts)), base.moved([len(tokens) for tokens in prompts])
+        prompts, timed = (
+            [[*model_input.tokens, _STOP] for model_input in inputs],
+            self.noisy is not None,
+        )
+        words, counts = (
+            base.embed(base.padded(prompts)),
+            base.moved([len(tokens) for tokens in prompts]),
+        )
         padding = torch.arange(words.shape[1], device=base.device) >= counts[:, None]
         language = words.float().masked_fill(padding[..., None], 0).sum(1) / counts[:, None]
         pixels = base.pixels([model_input.seen for model_input in inputs])
@@ -256,15 +337,21 @@ class Parallel:
         if self.proprio is not None:
             states = base.moved([model_input.proprio for model_input in inputs]).to(base.dtype)
             seen = torch.cat([seen, self.proprio(states)[:, None]], 1)
-        first, count = 1 + seen.shape[1] + timed, self.horizon * self.dim  # `first`: place of a row's first token
-        actions = [(first + words.shape[1] + i) * timed for i in range(count)]  # zeros without a diffusion head
+        # `first`: place of a row's first token.
+        first, count = 1 + seen.shape[1] + timed, self.horizon * self.dim
+        # Zeros without a diffusion head.
+        actions = [(first + words.shape[1] + i) * timed for i in range(count)]
         lasts = [first + len(tokens) - 1 for tokens in prompts]
-        places = [[first, *range(1, first), *range(first + 1, last), *actions, last] for last in lasts]
+        places = [
+            [first, *range(1, first), *range(first + 1, last), *actions, last] for last in lasts
+        ]
         length = first - 1 + count + max(words.shape[1], base.padded_tokens)
         return Sequences(seen, words, base.padded(places, length), counts + (first - 1 + count))
 
     def encode_images(self, pixels: Any, language: Any) -> Any:
-        """Return the embeddings (P, N, D) of images (P, views, C, S, S); `language` (P, D) is the mean of the words."""
+        """Return the embeddings (P, N, D) of images (P, views, C, S, S); `language` (P, D) is
+        the mean of the words.
+        """
         views = pixels.shape[1]
         images = pixels.flatten(0, 1)
         if self.film is None:
@@ -274,24 +361,36 @@ class Parallel:
         return self.base.network.projector(patches).unflatten(0, (len(pixels), views)).flatten(1, 2)
 
     def hidden_states(self, embeddings: Any, lengths: Any) -> Any:
-        """Return hidden states (B, L, D) of sequences (B, L, D); each token attends to the whole length of its row."""
+        """Return hidden states (B, L, D) of sequences (B, L, D); each token attends to the whole
+        length of its row.
+        """
         import torch  # the compiler follows an import statement, but not `require`
 
         model, length = self.base.network.language_model.model, embeddings.shape[1]
         places = lengths.new_ones(1, length).cumsum(1) - 1
         hidden = (places >= lengths[:, None])[:, None, None].expand(-1, 1, length, -1)
-        mask = embeddings.new_zeros(1).expand(hidden.shape).masked_fill(hidden, torch.finfo(embeddings.dtype).min)
+        mask = (
+            embeddings.new_zeros(1)
+            .expand(hidden.shape)
+            .masked_fill(hidden, torch.finfo(embeddings.dtype).min)
+        )
         for layer in model.layers:
             [embeddings] = layer(embeddings, attention_mask=mask, position_ids=places)
         return model.norm(embeddings)
 
     def _hidden(self, sequences: Sequences, *actions: Any) -> Any:
-        """Return hidden states (B, H * D, …) of the action tokens: `actions` for a diffusion head, else zeros."""
+        """Return hidden states (B, H * D, …) of the action tokens: `actions` for a diffusion
+        head, else zeros.
+        """
         lengths, count = sequences.lengths, self.horizon * self.dim
-        embeddings = self.base.assembled([sequences.seen, sequences.words, *actions], sequences.places)
+        embeddings = self.base.assembled(
+            [sequences.seen, sequences.words, *actions], sequences.places
+        )
         hidden = self.hidden_states(embeddings, lengths)
         # the preceding token predicts an action, as in training
-        places = lengths[:, None] - count - 2 + require("torch").arange(count, device=self.base.device)
+        places = (
+            lengths[:, None] - count - 2 + require("torch").arange(count, device=self.base.device)
+        )
         return hidden.take_along_dim(places[..., None], 1)
 
 
@@ -337,18 +436,27 @@ def _kept(trained: int) -> list[float]:
 
 Weights = dict[str, Any]  # tensors by name
 
-_MLP = ("layer_norm1", "fc1", *(f"mlp_resnet_blocks.{i}.ffn.{j}" for i in (0, 1) for j in (0, 1)), "layer_norm2", "fc2")
+_MLP = (
+    "layer_norm1",
+    "fc1",
+    *(f"mlp_resnet_blocks.{i}.ffn.{j}" for i in (0, 1) for j in (0, 1)),
+    "layer_norm2",
+    "fc2",
+)
 _WRAPPED = "module."  # prefix of all names after distributed training
 _LORA_ALPHA = 16  # upstream's scale is min(rank, 16) / rank
 
 
 def read_component(folder: Path, name: str) -> dict[str, Any]:
-    """Return the tensors of the only file `name--*_checkpoint.pt`; raises `ConfigError` if there is none or several."""
+    """Return the tensors of the only file `name--*_checkpoint.pt`; raises `ConfigError` if there
+    is none or several.
+    """
     files = sorted(path.name for path in folder.glob(f"{name}--*checkpoint.pt"))
     if len(files) != 1:
         have = sorted(path.name for path in folder.glob("*.pt"))
         raise ConfigError(
-            f"checkpoint {folder}: got {files or have} for {name!r}, want one file {name}--STEP_checkpoint.pt; copy it "
+            f"checkpoint {folder}: got {files or have} for {name!r}, want one file "
+            f"{name}--STEP_checkpoint.pt; copy it "
             f"there, or check `head`, `film` and `state` against how the checkpoint was trained"
         )
     saved = require("torch").load(folder / files[0], map_location="cpu", weights_only=True)
@@ -360,7 +468,8 @@ def require_unused(folder: Path, names: Iterable[str]) -> None:
     for name in names:
         if any(folder.glob(f"{name}--*")):
             raise ConfigError(
-                f"checkpoint {folder}: has {name}--…, which these settings do not use; set `head`, `film` and `state` "
+                f"checkpoint {folder}: has {name}--…, which these settings do not use; set `head`, "
+                "`film` and `state` "
                 f"to how the checkpoint was trained, or move the file away"
             )
 
@@ -369,7 +478,8 @@ def _exactly(found: Weights, layers: Iterable[str], what: str) -> Weights:
     want = {f"{layer}.{part}" for layer in layers for part in ("weight", "bias")}
     if set(found) != want:
         raise ConfigError(
-            f"{what}: misses {sorted(want - set(found))}, has {sorted(set(found) - want)} too; is it of another kind?"
+            f"{what}: misses {sorted(want - set(found))}, has {sorted(set(found) - want)} too; is "
+            "it of another kind?"
         )
     return found
 
@@ -390,7 +500,9 @@ class Component:
         return torch.nn.functional.linear(x, *self._of(layer))
 
     def _of(self, layer: str) -> tuple[Any, Any]:
-        return self.weights[f"{self._prefix}{layer}.weight"], self.weights[f"{self._prefix}{layer}.bias"]
+        return self.weights[f"{self._prefix}{layer}.weight"], self.weights[
+            f"{self._prefix}{layer}.bias"
+        ]
 
 
 class Mlp(Component):
@@ -432,7 +544,9 @@ class Projector(Component):
 
 
 class Film(Component):
-    """Vision backbones whose blocks are scaled and shifted by the instruction (arXiv 1709.07871)."""
+    """Vision backbones whose blocks are scaled and shifted by the instruction (arXiv
+    1709.07871).
+    """
 
     def __init__(self, saved: Weights, backbone: Any) -> None:
         """Take FiLM's tensors from `saved`, and load the other tensors into the backbone."""
@@ -447,18 +561,30 @@ class Film(Component):
             backbone.load_state_dict(plain)
         except RuntimeError as error:
             raise ConfigError(f"vision_backbone: not the checkpoint's ({error})") from error
-        vits = {n: getattr(backbone, n) for n in ("featurizer", "fused_featurizer") if hasattr(backbone, n)}
+        vits = {
+            n: getattr(backbone, n)
+            for n in ("featurizer", "fused_featurizer")
+            if hasattr(backbone, n)
+        }
         layers = [
-            f"{n}.blocks.{i}.{way}" for n, v in vits.items() for i in range(len(v.blocks)) for way in ("scale", "shift")
+            f"{n}.blocks.{i}.{way}"
+            for n, v in vits.items()
+            for i in range(len(v.blocks))
+            for way in ("scale", "shift")
         ]
         self.weights, self._vits = _exactly(film, layers, "vision_backbone"), vits
 
     def __call__(self, pixels: Any, language: Any) -> Any:
-        """Return patches (B, P, V) of pixels (B, C, S, S) for instructions (B, D), each the mean of its embeddings."""
+        """Return patches (B, P, V) of pixels (B, C, S, S) for instructions (B, D), each the mean
+        of its embeddings.
+        """
         import torch  # the compiler follows an import statement, but not `require`
 
         parts = pixels.split(3, dim=1)
-        return torch.cat([self._see(name, part, language) for name, part in zip(self._vits, parts, strict=True)], dim=2)
+        return torch.cat(
+            [self._see(name, part, language) for name, part in zip(self._vits, parts, strict=True)],
+            dim=2,
+        )
 
     def _see(self, name: str, pixels: Any, language: Any) -> Any:
         """Return the output of the second to last block, which OpenVLA uses."""
@@ -466,7 +592,9 @@ class Film(Component):
         x = vit.norm_pre(vit.patch_drop(vit._pos_embed(vit.patch_embed(pixels))))
         for i, block in enumerate(vit.blocks[:-1]):
             layer = f"{name}.blocks.{i}"
-            scale, shift = (self._linear(f"{layer}.{way}", language)[:, None] for way in ("scale", "shift"))
+            scale, shift = (
+                self._linear(f"{layer}.{way}", language)[:, None] for way in ("scale", "shift")
+            )
             x = x + block.ls1(block.attn(block.norm1(x)))
             x = x * (1 + scale) + shift
             x = x + block.ls2(block.mlp(block.norm2(x)))
@@ -474,13 +602,23 @@ class Film(Component):
 
 
 def _merged(saved: Weights) -> dict[str, Any]:
-    """Add the low-rank adapters to their layers, including convolutions; OFT+ saves adapters separately."""
-    merged = {key.replace(".base_layer.", "."): tensor for key, tensor in saved.items() if ".lora_" not in key}
+    """Add the low-rank adapters to their layers, including convolutions; OFT+ saves adapters
+    separately.
+    """
+    merged = {
+        key.replace(".base_layer.", "."): tensor
+        for key, tensor in saved.items()
+        if ".lora_" not in key
+    }
     for key, down in saved.items():
         if ".lora_A." in key:
             up = saved[key.replace(".lora_A.", ".lora_B.")]
             rank = len(down)
             name = key.partition(".lora_A.")[0] + ".weight"
-            added = up.flatten(1).float() @ down.flatten(1).float() * (min(rank, _LORA_ALPHA) / rank)
-            merged[name] = (merged[name].float() + added.view_as(merged[name])).to(merged[name].dtype)
+            added = (
+                up.flatten(1).float() @ down.flatten(1).float() * (min(rank, _LORA_ALPHA) / rank)
+            )
+            merged[name] = (merged[name].float() + added.view_as(merged[name])).to(
+                merged[name].dtype
+            )
     return merged

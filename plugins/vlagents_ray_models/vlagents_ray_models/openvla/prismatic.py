@@ -1,4 +1,6 @@
-"""The common parts of OpenVLA and OpenVLA-OFT: the model, the checkpoint, its statistics, images and prompts."""
+"""The common parts of OpenVLA and OpenVLA-OFT: the model, the checkpoint, its statistics, images
+and prompts.
+"""
 
 from __future__ import annotations
 
@@ -27,15 +29,22 @@ from vlagents_ray.contract import ActionSpec
 from vlagents_ray.errors import ConfigError, InvalidObservation
 from vlagents_ray.interface import Obs
 from vlagents_ray.policies.base import ModelConfig, ModelPolicy, Prediction, Row
-from vlagents_ray.policies.base.accelerator import ensure_torchvision, fetch, torch_device, torch_dtype
+from vlagents_ray.policies.base.accelerator import (
+    ensure_torchvision,
+    fetch,
+    torch_device,
+    torch_dtype,
+)
 from vlagents_ray.policies.base.checkpoint import SavedTensors, find_checkpoint, require_loaded
 from vlagents_ray.policies.base.model_inputs import keeping_tokens
 from vlagents_ray.policies.base.staging import StagedRow, Staging
 from vlagents_ray.policies.outcomes import attempt, of_good
 from vlagents_ray.registry import require
 
-Bounds = Literal["q99", "min_max"]  # of each dimension: 1st and 99th percentile, or minimum and maximum
-FILE = "dataset_statistics.json"  # written by fine-tuning; it overrides the statistics in config.json
+# Of each dimension: 1st and 99th percentile, or minimum and maximum.
+Bounds = Literal["q99", "min_max"]
+# Written by fine-tuning; it overrides the statistics in config.json.
+FILE = "dataset_statistics.json"
 _KEYS = {"q99": ("q01", "q99"), "min_max": ("min", "max")}
 _EPSILON = 1e-8  # upstream's value, for dimensions that never moved
 
@@ -59,16 +68,22 @@ class Scale:
 
     def restore_spread(self, normalised: np.ndarray) -> np.ndarray:
         """Convert standard deviations (…, D) to physical units, float32."""
-        return np.where(self.mask, 0.5 * normalised * (self.high - self.low), normalised).astype(np.float32)
+        return np.where(self.mask, 0.5 * normalised * (self.high - self.low), normalised).astype(
+            np.float32
+        )
 
     def normalise(self, values: np.ndarray) -> np.ndarray:
-        """Convert (…, D) in physical units to [-1, 1], float32, clipped at the ends of the range."""
+        """Convert (…, D) in physical units to [-1, 1], float32, clipped at the ends of the
+        range.
+        """
         scaled = 2 * (values - self.low) / (self.high - self.low + _EPSILON) - 1
         return np.clip(np.where(self.mask, scaled, values), -1, 1).astype(np.float32)
 
 
 class Statistics:
-    """The statistics of all datasets on which a checkpoint was trained, by `unnorm_key`, the name of the dataset."""
+    """The statistics of all datasets on which a checkpoint was trained, by `unnorm_key`, the
+    name of the dataset.
+    """
 
     def __init__(self, datasets: Mapping[str, Any], bounds: Bounds = "q99") -> None:
         self._datasets, self.bounds = datasets, bounds
@@ -86,7 +101,8 @@ class Statistics:
             found = found.get("norm_stats")
         if not found or not isinstance(found, dict):
             raise ConfigError(
-                f"checkpoint {checkpoint}: got no normalisation statistics, want {FILE}, or norm_stats in config.json; "
+                f"checkpoint {checkpoint}: got no normalisation statistics, want {FILE}, or "
+                "norm_stats in config.json; "
                 f"copy it from where the training run saved it"
             )
         return cls(found, bounds)
@@ -96,19 +112,24 @@ class Statistics:
         return list(self._datasets)
 
     def key(self, wanted: str | None) -> str:
-        """Return the key of the dataset `wanted`, with or without `_no_noops`; None selects the only dataset."""
+        """Return the key of the dataset `wanted`, with or without `_no_noops`; None selects the
+        only dataset.
+        """
         if wanted is None and len(self._datasets) == 1:
             return next(iter(self._datasets))
         for name in (wanted, f"{wanted}_no_noops"):
             if name in self._datasets:
                 return str(name)
         raise InvalidObservation(
-            f"unnorm_key: got {wanted!r}, want one of the checkpoint's datasets {sorted(self._datasets)}; set it in "
+            f"unnorm_key: got {wanted!r}, want one of the checkpoint's datasets "
+            f"{sorted(self._datasets)}; set it in "
             f"the policy's config, in reset(..., unnorm_key=...) or in an observation's info"
         )
 
     def scale(self, key: str, part: Literal["action", "proprio"] = "action") -> Scale:
-        """Return the ranges of a dataset's actions or proprioception; raises `ConfigError` if it lacks them."""
+        """Return the ranges of a dataset's actions or proprioception; raises `ConfigError` if it
+        lacks them.
+        """
         found = self._datasets[key].get(part, {})
         low, high = _KEYS[self.bounds]
         if low not in found or high not in found:
@@ -117,11 +138,16 @@ class Statistics:
                 f"were they saved by another version, or with other normalisation bounds?"
             )
         mask = found.get("mask", [True] * len(found[low]))
-        return Scale(np.array(found[low], float), np.array(found[high], float), np.array(mask, bool))
+        return Scale(
+            np.array(found[low], float), np.array(found[high], float), np.array(mask, bool)
+        )
 
     def action_dims(self, wanted: str | None = None) -> set[int]:
         """Return the lengths of the actions of the dataset `wanted`, or of all datasets."""
-        return {self.scale(key).dim for key in (self._datasets if wanted is None else [self.key(wanted)])}
+        return {
+            self.scale(key).dim
+            for key in (self._datasets if wanted is None else [self.key(wanted)])
+        }
 
     def require(self, wanted: str | None) -> None:
         """Raise `ConfigError` unless the dataset `wanted` by a deployment exists."""
@@ -136,9 +162,12 @@ _NEEDS = ("config.json", "preprocessor_config.json", "tokenizer_config.json", "*
 _SPACE = 29871  # Llama's token of an empty word, between "Out:" and the action in training
 _PIXELS = "pixels"
 _PROMPT = "In: What action should the robot take to {}?\nOut:"
-_PROMPT_V01 = (  # OpenVLA v0.1 was fine-tuned from Vicuna; upstream also detects it by the checkpoint's name
-    "A chat between a curious user and an artificial intelligence assistant. The assistant gives helpful, detailed, "
-    "and polite answers to the user's questions. USER: What action should the robot take to {}? ASSISTANT:"
+# OpenVLA v0.1 was fine-tuned from Vicuna; upstream also detects it by the checkpoint's name.
+_PROMPT_V01 = (
+    "A chat between a curious user and an artificial intelligence assistant. The assistant gives "
+    "helpful, detailed, "
+    "and polite answers to the user's questions. USER: What action should the robot take to {}? "
+    "ASSISTANT:"
 )
 
 
@@ -147,7 +176,8 @@ class Prismatic:
     """A loaded checkpoint."""
 
     path: Path
-    network: Any  # OpenVLAForActionPrediction; uses its vision_backbone, projector and language_model
+    # OpenVLAForActionPrediction; uses its vision_backbone, projector and language_model.
+    network: Any
     tokenizer: Any
     processor: Any  # PrismaticImageProcessor
     bins: ActionBins
@@ -156,25 +186,35 @@ class Prismatic:
     device: Any
     dtype: Any
     staging: Staging
-    padded_tokens: int  # the length to which shorter prompts are padded; 0: that of the longest prompt
-    own: dict[str, Statistics] = field(default_factory=dict)  # of adapters that were trained on other datasets
+    # The length to which shorter prompts are padded; 0: that of the longest prompt.
+    padded_tokens: int
+    # Of adapters that were trained on other datasets.
+    own: dict[str, Statistics] = field(default_factory=dict)
 
     def stage(self, images: Sequence[np.ndarray]) -> StagedRow:
-        """Begin to copy V images, (H, W, 3) uint8, as inputs of the checkpoint's backbones, to the model's device."""
+        """Begin to copy V images, (H, W, 3) uint8, as inputs of the checkpoint's backbones, to
+        the model's device.
+        """
         convert = require("PIL.Image").fromarray
         pixels = [self.processor.apply_transform(convert(image)).numpy() for image in images]
         return self.staging.stage({_PIXELS: np.stack(pixels)})
 
     def pixels(self, rows: Sequence[StagedRow]) -> Any:
-        """Return the images (B, V, C, S, S) of rows of `stage`, on the device and in the model's dtype."""
+        """Return the images (B, V, C, S, S) of rows of `stage`, on the device and in the model's
+        dtype.
+        """
         return self.staging.stack(rows)[_PIXELS].to(self.dtype)
 
     def tokens(self, instruction: str) -> list[int]:
-        """Return the prompt's tokens, read-only; raises `InvalidObservation` if the instruction is too long."""
+        """Return the prompt's tokens, read-only; raises `InvalidObservation` if the instruction
+        is too long.
+        """
         ids = self._tokenized(instruction)
         most = self.network.config.llm_max_length
         if len(ids) > most:
-            raise InvalidObservation(f"instruction: got {len(ids)} tokens with the prompt, want {most} at most")
+            raise InvalidObservation(
+                f"instruction: got {len(ids)} tokens with the prompt, want {most} at most"
+            )
         return ids
 
     @cached_property
@@ -193,7 +233,9 @@ class Prismatic:
         return self.staging.upload(np.asarray(numbers))
 
     def padded(self, rows: Sequence[Sequence[int]], length: int = 0, *, left: bool = False) -> Any:
-        """Return rows of int64 on the device with zeros after them, or before them, up to the longest or `length`."""
+        """Return rows of int64 on the device with zeros after them, or before them, up to the
+        longest or `length`.
+        """
         found = np.zeros((len(rows), max(length, *map(len, rows))), np.int64)
         for row, numbers in zip(found, rows, strict=True):
             row[slice(-len(numbers), None) if left else slice(len(numbers))] = numbers
@@ -205,7 +247,9 @@ class Prismatic:
 
     @staticmethod
     def assembled(parts: Sequence[Any], places: Any) -> Any:
-        """Return sequences (B, L, D) of the parts (B, N, D) at places (B, L), which count from 1; at 0 are zeros."""
+        """Return sequences (B, L, D) of the parts (B, N, D) at places (B, L), which count from
+        1; at 0 are zeros.
+        """
         zeros = parts[0].new_zeros(len(places), 1, parts[0].shape[-1])
         return require("torch").cat([zeros, *parts], 1).take_along_dim(places[..., None], 1)
 
@@ -244,36 +288,47 @@ class PrismaticConfig(ModelConfig):
     compiled_tokens: int = Field(
         default=64,
         ge=1,
-        description="compiled: tokens to which prompts are padded; longer ones run without compilation",
+        description="compiled: tokens to which prompts are padded; longer ones run without "
+        "compilation",
     )
     unnorm_key: str | None = Field(
         default=None,
-        description="dataset whose statistics turn answers into physical units, with or without `_no_noops`; unset: "
+        description="dataset whose statistics turn answers into physical units, with or without "
+        "`_no_noops`; unset: "
         "the checkpoint's only one, or the one that `reset` or an observation names",
     )
     source_dir: str | None = Field(
         default=None,
-        description="a clone of openvla or openvla-oft, for the model's classes; unset: $OPENVLA_SRC, "
+        description="a clone of openvla or openvla-oft, for the model's classes; unset: "
+        "$OPENVLA_SRC, "
         "$OPENVLA_OFT_SRC, or an installed `prismatic`",
     )
     trust_remote_code: bool = Field(
         default=False,
-        description="run the Python code in the checkpoint's folder instead: write access to it, or to the hub's "
+        description="run the Python code in the checkpoint's folder instead: write access to it, "
+        "or to the hub's "
         "repository, then gives all rights of this process",
     )
     attention: Literal["sdpa", "eager", "flash_attention_2"] = Field(
-        default="sdpa", description="of the language model; flash_attention_2 needs the package flash-attn and a GPU"
+        default="sdpa",
+        description="of the language model; flash_attention_2 needs the package flash-attn and a "
+        "GPU",
     )
 
     @model_validator(mode="after")
     def _one_source(self) -> Self:
         if self.trust_remote_code and self.source_dir:
-            raise ValueError("source_dir and trust_remote_code: got both, want the model's classes from one of them")
+            raise ValueError(
+                "source_dir and trust_remote_code: got both, want the model's classes from one of "
+                "them"
+            )
         return self
 
 
 class ActionBins:
-    """The bins of [-1, 1], which are the last tokens of the vocabulary; the very last token is the lowest bin."""
+    """The bins of [-1, 1], which are the last tokens of the vocabulary; the very last token is
+    the lowest bin.
+    """
 
     def __init__(self, config: Any, device: Any) -> None:
         torch = require("torch")
@@ -285,14 +340,17 @@ class ActionBins:
         self._tokens = self._first - torch.arange(config.n_action_bins, device=device)
 
     def read(self, logits: Any) -> tuple[Any, Any]:
-        """Return the likeliest of all tokens (…), and the logits of bins (…, bins), float64, of logits (…, V)."""
+        """Return the likeliest of all tokens (…), and the logits of bins (…, bins), float64, of
+        logits (…, V).
+        """
         return logits.argmax(-1), logits[..., self._tokens].double()
 
     def choose(self, likeliest: Any, over: Any, draws: Any) -> Any:
-        """Choose tokens (…) from the results of `read`: bins at given quantiles, or the likeliest tokens.
+        """Choose tokens (…) from the results of `read`: bins at given quantiles, or the likeliest
+        tokens.
 
-        An element of `draws` (…), in [0, 1), is a quantile of the distribution over bins; NaN selects the likeliest of
-        all tokens, as upstream does.
+        An element of `draws` (…), in [0, 1), is a quantile of the distribution over bins; NaN
+        selects the likeliest of all tokens, as upstream does.
         """
         torch = require("torch")
         upto = over.softmax(-1).cumsum(-1)
@@ -300,16 +358,20 @@ class ActionBins:
         return torch.where(draws.isnan(), likeliest, self._tokens[drawn])
 
     def logprob(self, tokens: Any, logits: Any) -> Any:
-        """Return the log-probabilities (…) of tokens (…) among the bins, nats, differentiable in logits (…, V)."""
+        """Return the log-probabilities (…) of tokens (…) among the bins, nats, differentiable in
+        logits (…, V).
+        """
         over = logits[..., self._tokens].double().log_softmax(-1)
         return over.gather(-1, (self._first - tokens)[..., None])[..., 0]
 
     def stated(self, tokens: Any, over: Any) -> np.ndarray:
-        """Return what is known of tokens (…) by the logits of bins, (…, bins) float64, with one copy from the device.
+        """Return what is known of tokens (…) by the logits of bins, (…, bins) float64, with one
+        copy from the device.
 
         Returns:
-            (6, …) float64: values in [-1, 1], of the nearest bin for other tokens, as upstream; mean and standard
-            deviation over the bins; log-probability and entropy, nats; and the tokens.
+            (6, …) float64: values in [-1, 1], of the nearest bin for other tokens, as upstream;
+            mean and standard deviation over the bins; log-probability and entropy, nats; and the
+            tokens.
         """
         torch = require("torch")
         share, bins = over.softmax(-1), (self._first - tokens).clamp(0, len(self._middles) - 1)
@@ -317,20 +379,31 @@ class ActionBins:
         spread = (share * (self._middles - mean[..., None]) ** 2).sum(-1).sqrt()
         logprob = over.log_softmax(-1).gather(-1, bins[..., None])[..., 0]
         entropy = torch.special.entr(share).sum(-1)
-        return fetch(torch.stack([self._middles[bins], mean, spread, logprob, entropy, tokens.double()]))
+        return fetch(
+            torch.stack([self._middles[bins], mean, spread, logprob, entropy, tokens.double()])
+        )
 
 
 MODEL, PROCESSOR = "OpenVLAForActionPrediction", "PrismaticImageProcessor"
-VARIABLES = ("OPENVLA_SRC", "OPENVLA_OFT_SRC")  # either serves both policies, which use code common to both
-_PACKAGES = ("prismatic", "prismatic.extern", "prismatic.extern.hf", "prismatic.training", "prismatic.vla")
+# Either serves both policies, which use code common to both.
+VARIABLES = ("OPENVLA_SRC", "OPENVLA_OFT_SRC")
+_PACKAGES = (
+    "prismatic",
+    "prismatic.extern",
+    "prismatic.extern.hf",
+    "prismatic.training",
+    "prismatic.vla",
+)
 
 
-def model_classes(checkpoint: Path, source_dir: str | None, trust_remote_code: bool) -> tuple[Any, Any]:
+def model_classes(
+    checkpoint: Path, source_dir: str | None, trust_remote_code: bool
+) -> tuple[Any, Any]:
     """Return the classes of the model and of its image processor.
 
-    With `trust_remote_code`, they are the classes that the checkpoint's files name: Python code that runs with all
-    rights of this process. Otherwise they come from the source tree: `source_dir`, $OPENVLA_SRC, $OPENVLA_OFT_SRC, or
-    an installed `prismatic`.
+    With `trust_remote_code`, they are the classes that the checkpoint's files name: Python code
+    that runs with all rights of this process. Otherwise they come from the source tree:
+    `source_dir`, $OPENVLA_SRC, $OPENVLA_OFT_SRC, or an installed `prismatic`.
 
     Raises:
         ConfigError: The classes are not found.
@@ -344,28 +417,42 @@ def model_classes(checkpoint: Path, source_dir: str | None, trust_remote_code: b
 
 
 def _remote(checkpoint: Path, file: str, auto: str) -> Any:
-    named = json.loads((checkpoint / file).read_text(encoding="utf-8")).get("auto_map", {}).get(auto)
+    named = (
+        json.loads((checkpoint / file).read_text(encoding="utf-8")).get("auto_map", {}).get(auto)
+    )
     if named is None:
         raise ConfigError(
             f"trust_remote_code: {checkpoint / file} names no code (auto_map has no {auto!r}); "
             f"take the classes from a source tree instead: set source_dir"
         )
-    return require("transformers.dynamic_module_utils").get_class_from_dynamic_module(named, str(checkpoint))
+    return require("transformers.dynamic_module_utils").get_class_from_dynamic_module(
+        named, str(checkpoint)
+    )
 
 
 def find_source(source_dir: str | None) -> Path:
     """Return the folder that holds the package `prismatic`."""
-    asked = [source_dir] if source_dir else [os.environ[name] for name in VARIABLES if os.environ.get(name)]
+    asked = (
+        [source_dir]
+        if source_dir
+        else [os.environ[name] for name in VARIABLES if os.environ.get(name)]
+    )
     if not asked:
         spec = importlib.util.find_spec("prismatic")  # finds without importing
-        asked = [str(Path(found).parent) for found in (spec.submodule_search_locations or ())] if spec else []
+        asked = (
+            [str(Path(found).parent) for found in (spec.submodule_search_locations or ())]
+            if spec
+            else []
+        )
     for folder in asked:
         root = Path(folder).expanduser().resolve()
         if (root / "prismatic/extern/hf/modeling_prismatic.py").is_file():
             return root
     raise ConfigError(
-        f"OpenVLA's model classes: got {asked or 'no source tree'}, want a folder with prismatic/extern/hf in it; set "
-        f"source_dir or ${VARIABLES[0]} to a clone of openvla or openvla-oft, or, if you trust the Python code that "
+        f"OpenVLA's model classes: got {asked or 'no source tree'}, want a folder with "
+        "prismatic/extern/hf in it; set "
+        f"source_dir or ${VARIABLES[0]} to a clone of openvla or openvla-oft, or, if you trust the "
+        "Python code that "
         f"lies beside the weights, trust_remote_code: true"
     )
 
@@ -381,7 +468,9 @@ def _from_source(root: Path) -> tuple[Any, Any]:
 
 @contextlib.contextmanager
 def _bare_packages(root: Path) -> Iterator[None]:
-    """Import from `root` without the packages' own `__init__`, which would import TensorFlow and more."""
+    """Import from `root` without the packages' own `__init__`, which would import TensorFlow and
+    more.
+    """
     before = _take_out()
     for name in _PACKAGES:
         package = types.ModuleType(name)
@@ -403,7 +492,8 @@ def _take_out() -> dict[str, types.ModuleType]:
     return {name: sys.modules.pop(name) for name in names}
 
 
-UNNORM_KEY = "unnorm_key"  # key of reset's options and of an observation's info, as sent by OpenVLA's clients
+# Key of reset's options and of an observation's info, as sent by OpenVLA's clients.
+UNNORM_KEY = "unnorm_key"
 OFFERED = ("logprob", "entropy", "replay")  # of action tokens
 _SINGLE_ARM = 7  # six numbers for motion, one for the gripper
 
@@ -440,7 +530,9 @@ class PrismaticPolicy(ModelPolicy):
     def predict(self, rows: Sequence[Row]) -> list[Prediction | Exception]:
         def prepare(row: Row) -> PreparedRow:
             key = self._key(row)
-            return PreparedRow(row, self._statistics(row.adapter).scale(key), self._model_input(row, key))
+            return PreparedRow(
+                row, self._statistics(row.adapter).scale(key), self._model_input(row, key)
+            )
 
         return of_good([attempt(prepare, row) for row in rows], self._compute)
 
@@ -458,13 +550,18 @@ class PrismaticPolicy(ModelPolicy):
         dims = own.action_dims(), base.action_dims(self.config.unnorm_key)
         if not dims[0] <= dims[1]:
             raise ConfigError(
-                f"{folder / FILE}: got actions of {sorted(dims[0])} numbers, want {sorted(dims[1])}, as the base's; "
+                f"{folder / FILE}: got actions of {sorted(dims[0])} numbers, want "
+                f"{sorted(dims[1])}, as the base's; "
                 f"merge the adapter into its base, and serve that as a checkpoint of its own"
             )
         self.model.base.own[adapter] = own
 
-    def _decoded(self, bins: ActionBins, prepared: Sequence[PreparedRow], tokens: Any, over: Any) -> list[Prediction]:
-        """Return the chunks of action tokens (B, H, D) that were chosen by the logits of bins (B, H, D, bins)."""
+    def _decoded(
+        self, bins: ActionBins, prepared: Sequence[PreparedRow], tokens: Any, over: Any
+    ) -> list[Prediction]:
+        """Return the chunks of action tokens (B, H, D) that were chosen by the logits of bins
+        (B, H, D, bins).
+        """
         chunks, parts = [], bins.stated(tokens, over)
         for i, entry in enumerate(prepared):
             scale = entry.scale
@@ -484,7 +581,9 @@ class PrismaticPolicy(ModelPolicy):
 
     def _default(self, adapter: str) -> str | None:
         """Return the dataset of the settings; None for an adapter with its own datasets."""
-        return None if self._statistics(adapter) is not self._statistics() else self.config.unnorm_key
+        return (
+            None if self._statistics(adapter) is not self._statistics() else self.config.unnorm_key
+        )
 
     def _named(self, options: Mapping[str, Any], adapter: str) -> str | None:
         if (key := options.get(UNNORM_KEY)) is None:
@@ -494,16 +593,28 @@ class PrismaticPolicy(ModelPolicy):
         return self._statistics(adapter).key(key)
 
     def _key(self, row: Row) -> str:
-        """Return the dataset of a row: that of the observation, the episode or the settings, or the only one."""
-        named = self._named(row.info, row.adapter) or row.memory.get(UNNORM_KEY) or self._default(row.adapter)
+        """Return the dataset of a row: that of the observation, the episode or the settings, or
+        the only one.
+        """
+        named = (
+            self._named(row.info, row.adapter)
+            or row.memory.get(UNNORM_KEY)
+            or self._default(row.adapter)
+        )
         return self._statistics(row.adapter).key(named)
 
     def _action(self) -> ActionSpec:
-        """Describe an action: its meaning depends on the dataset, except for the gripper of a single arm."""
-        dims = set() if self.model is None else self._statistics().action_dims(self.config.unnorm_key)
+        """Describe an action: its meaning depends on the dataset, except for the gripper of a
+        single arm.
+        """
+        dims = (
+            set() if self.model is None else self._statistics().action_dims(self.config.unnorm_key)
+        )
         dim = dims.pop() if len(dims) == 1 else None
         single = dim == _SINGLE_ARM
-        return ActionSpec(dim=dim, gripper_open=1.0 if single else None, gripper_closed=0.0 if single else None)
+        return ActionSpec(
+            dim=dim, gripper_open=1.0 if single else None, gripper_closed=0.0 if single else None
+        )
 
 
 SIDE = 224  # px; the size of all images in OpenVLA's training data
@@ -512,7 +623,9 @@ _LOBES = 3  # of the Lanczos kernel
 
 
 def resized(image: np.ndarray) -> np.ndarray:
-    """Resize an (H, W, 3) uint8 image to (224, 224, 3) by JPEG of quality 95 and Lanczos, unless it has that size."""
+    """Resize an (H, W, 3) uint8 image to (224, 224, 3) by JPEG of quality 95 and Lanczos, unless
+    it has that size.
+    """
     height, width = image.shape[:2]
     if (height, width) == (SIDE, SIDE):
         return image
@@ -521,7 +634,9 @@ def resized(image: np.ndarray) -> np.ndarray:
 
 
 def middle(image: np.ndarray) -> np.ndarray:
-    """Crop the central nine tenths of the area of an (H, W, 3) uint8 image, and scale them to (224, 224, 3)."""
+    """Crop the central nine tenths of the area of an (H, W, 3) uint8 image, and scale them to
+    (224, 224, 3).
+    """
     height, width = image.shape[:2]
     pixels = _apply(_crop(height), _crop(width), image.astype(np.float32) / 255)
     return _uint8(pixels * 255.5, 255.5)  # as TensorFlow converts: add a half, then truncate
@@ -534,11 +649,14 @@ def _uint8(pixels: np.ndarray, most: float) -> np.ndarray:
 def _through_jpeg(image: np.ndarray) -> np.ndarray:
     """Compress and decompress the image with the algorithms that TensorFlow uses.
 
-    Its encoder is Pillow's exact one, its decoder the fast one; simplejpeg's encoder differs by up to 18.
+    Its encoder is Pillow's exact one, its decoder the fast one; simplejpeg's encoder differs by up
+    to 18.
     """
     file = io.BytesIO()
     require("PIL.Image").fromarray(image).save(file, "JPEG", quality=95, subsampling="4:2:0")
-    decoded: np.ndarray = simplejpeg.decode_jpeg(file.getvalue(), "RGB", fastdct=True, fastupsample=False)
+    decoded: np.ndarray = simplejpeg.decode_jpeg(
+        file.getvalue(), "RGB", fastdct=True, fastupsample=False
+    )
     return decoded
 
 
@@ -550,7 +668,9 @@ def _apply(rows: np.ndarray, columns: np.ndarray, image: np.ndarray) -> np.ndarr
 
 @lru_cache(maxsize=16)
 def _lanczos(size: int) -> np.ndarray:
-    """Return weights (224, size); kernels are wider where the image shrinks, so that it does not alias."""
+    """Return weights (224, size); kernels are wider where the image shrinks, so that it does not
+    alias.
+    """
     scale = size / SIDE
     centres = (np.arange(SIDE) + 0.5) * scale
     x = ((np.arange(size) + 0.5) - centres[:, None]) / max(scale, 1.0)
@@ -560,7 +680,9 @@ def _lanczos(size: int) -> np.ndarray:
 
 @lru_cache(maxsize=16)
 def _crop(size: int) -> np.ndarray:
-    """Return weights (224, size) that scale the centre up, by linear interpolation between the two nearest pixels."""
+    """Return weights (224, size) that scale the centre up, by linear interpolation between the
+    two nearest pixels.
+    """
     side = CROP_AREA**0.5
     at = (1 - side) / 2 * (size - 1) + np.arange(SIDE) * (side * (size - 1) / (SIDE - 1))
     return np.asarray(np.maximum(0.0, 1.0 - np.abs(np.arange(size) - at[:, None])), np.float32)

@@ -1,4 +1,6 @@
-"""Messages of ROS 2 as arrays and words, whatever their layout; garbage is refused with its cure."""
+"""Messages of ROS 2 as arrays and words, whatever their layout; garbage is refused with its
+cure.
+"""
 
 from __future__ import annotations
 
@@ -14,18 +16,32 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from many import many
 
-from vlagents_ray.errors import InvalidObservation, MalformedMessage, MessageTooLarge, MissingState, VLAgentsError
+from vlagents_ray.errors import (
+    InvalidObservation,
+    MalformedMessage,
+    MessageTooLarge,
+    MissingState,
+    VLAgentsError,
+)
 from vlagents_ray.images.jpeg_png import encode_jpeg, encode_png
 from vlagents_ray_robot.ros import messages
 
 RGB = np.arange(2 * 3 * 3, dtype=np.uint8).reshape(2, 3, 3) * 7
 
 
-def image_message(pixels: np.ndarray, encoding: str, padding: int = 0, **more: Any) -> dict[str, Any]:
+def image_message(
+    pixels: np.ndarray, encoding: str, padding: int = 0, **more: Any
+) -> dict[str, Any]:
     """An Image of pixels, (H, W, bytes of a pixel), with unused bytes at the end of each row."""
     height, width, _ = pixels.shape
     rows = np.pad(pixels.reshape(height, -1), ((0, 0), (0, padding)), constant_values=255)
-    said = {"height": height, "width": width, "encoding": encoding, "is_bigendian": 0, "step": rows.shape[1]}
+    said = {
+        "height": height,
+        "width": width,
+        "encoding": encoding,
+        "is_bigendian": 0,
+        "step": rows.shape[1],
+    }
     return {**said, "data": rows.tobytes(), **more}
 
 
@@ -35,9 +51,16 @@ def alpha(pixels: np.ndarray) -> np.ndarray:
 
 @pytest.mark.parametrize(
     ("encoding", "pixels"),
-    [("rgb8", RGB), ("bgr8", RGB[..., ::-1]), ("rgba8", alpha(RGB)), ("bgra8", alpha(RGB[..., ::-1]))],
+    [
+        ("rgb8", RGB),
+        ("bgr8", RGB[..., ::-1]),
+        ("rgba8", alpha(RGB)),
+        ("bgra8", alpha(RGB[..., ::-1])),
+    ],
 )
-def test_an_image_is_rgb_whatever_the_order_of_its_channels(encoding: str, pixels: np.ndarray) -> None:
+def test_an_image_is_rgb_whatever_the_order_of_its_channels(
+    encoding: str, pixels: np.ndarray
+) -> None:
     found = messages.image(image_message(pixels, encoding))
     assert found.dtype == np.uint8
     assert found.flags.c_contiguous
@@ -49,8 +72,12 @@ def test_greys_are_three_equal_channels_and_16_bits_are_read_in_their_byte_order
     wanted = np.repeat(grey, 3, axis=2)
     np.testing.assert_array_equal(messages.image(image_message(grey, "mono8", 1)), wanted)
     for big in (0, 1):
-        sixteen = (grey.astype(np.uint16) << 8 | 0x34).astype(">u2" if big else "<u2").view(np.uint8)
-        np.testing.assert_array_equal(messages.image(image_message(sixteen, "mono16", 3, is_bigendian=big)), wanted)
+        sixteen = (
+            (grey.astype(np.uint16) << 8 | 0x34).astype(">u2" if big else "<u2").view(np.uint8)
+        )
+        np.testing.assert_array_equal(
+            messages.image(image_message(sixteen, "mono16", 3, is_bigendian=big)), wanted
+        )
 
 
 @pytest.mark.parametrize(
@@ -90,7 +117,9 @@ def test_an_encoding_that_is_no_colour_is_refused_with_the_cure(encoding: Any) -
         ({"data": None}, "want an array of uint8"),
     ],
 )
-def test_an_image_that_is_not_as_large_as_it_says_is_refused(wrong: dict[str, Any], said: str) -> None:
+def test_an_image_that_is_not_as_large_as_it_says_is_refused(
+    wrong: dict[str, Any], said: str
+) -> None:
     with pytest.raises(MalformedMessage, match=said):
         messages.image(image_message(RGB, "rgb8", **wrong))
 
@@ -108,7 +137,9 @@ def test_an_image_too_large_is_refused_before_memory_is_taken() -> None:
     encoding=st.sampled_from(["rgb8", "bgr8", "bgra8", "mono8"]),
 )
 @settings(max_examples=many(200))
-def test_any_stride_gives_the_same_pixels(height: int, width: int, padding: int, rest: int, encoding: str) -> None:
+def test_any_stride_gives_the_same_pixels(
+    height: int, width: int, padding: int, rest: int, encoding: str
+) -> None:
     channels = {"mono8": 1, "bgra8": 4}.get(encoding, 3)
     pixels = np.random.default_rng(height).integers(0, 256, (height, width, channels), np.uint8)
     message = image_message(pixels, encoding, padding)
@@ -119,11 +150,30 @@ def test_any_stride_gives_the_same_pixels(height: int, width: int, padding: int,
 
 
 ANYTHING = st.recursive(
-    st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=9) | st.binary(max_size=40),
-    lambda inside: st.lists(inside, max_size=3) | st.dictionaries(st.text(max_size=4), inside, max_size=3),
+    st.none()
+    | st.booleans()
+    | st.integers()
+    | st.floats()
+    | st.text(max_size=9)
+    | st.binary(max_size=40),
+    lambda inside: (
+        st.lists(inside, max_size=3) | st.dictionaries(st.text(max_size=4), inside, max_size=3)
+    ),
     max_leaves=8,
 )
-FIELDS = ["data", "encoding", "height", "width", "step", "is_bigendian", "name", "position", "pose", "header", "format"]
+FIELDS = [
+    "data",
+    "encoding",
+    "height",
+    "width",
+    "step",
+    "is_bigendian",
+    "name",
+    "position",
+    "pose",
+    "header",
+    "format",
+]
 
 
 @given(message=st.dictionaries(st.sampled_from(FIELDS), ANYTHING) | ANYTHING)
@@ -151,13 +201,19 @@ def test_a_compressed_image_is_decoded() -> None:
         messages.compressed_image({"format": "32FC1; compressedDepth", "data": bytes(40)})
 
 
-JOINTS = {"name": ["b", "c", "a"], "position": [2.0, 3.0, 1.0], "velocity": array.array("d", [0.2, 0.3, 0.1])}
+JOINTS = {
+    "name": ["b", "c", "a"],
+    "position": [2.0, 3.0, 1.0],
+    "velocity": array.array("d", [0.2, 0.3, 0.1]),
+}
 
 
 def test_joints_come_in_the_order_that_is_asked_for() -> None:
     np.testing.assert_array_equal(messages.joints(JOINTS, ("a", "b")), np.array([1, 2], np.float32))
     np.testing.assert_array_equal(messages.joints(JOINTS), np.array([2, 3, 1], np.float32))
-    np.testing.assert_allclose(messages.joints(JOINTS, ("a", "c"), "velocity"), [0.1, 0.3], rtol=1e-6)
+    np.testing.assert_allclose(
+        messages.joints(JOINTS, ("a", "c"), "velocity"), [0.1, 0.3], rtol=1e-6
+    )
     assert messages.joints(JOINTS, ("a",)).dtype == np.float32
 
 
@@ -168,7 +224,12 @@ def test_a_missing_joint_is_an_error_that_names_those_there() -> None:
 
 @pytest.mark.parametrize(
     "wrong",
-    [{"position": [1.0, 2.0]}, {"position": [1.0, 2.0, None]}, {"position": [1.0, 2.0, np.inf]}, {"velocity": []}],
+    [
+        {"position": [1.0, 2.0]},
+        {"position": [1.0, 2.0, None]},
+        {"position": [1.0, 2.0, np.inf]},
+        {"velocity": []},
+    ],
 )
 def test_joints_without_their_numbers_are_refused(wrong: dict[str, Any]) -> None:
     with pytest.raises(MalformedMessage):
@@ -186,8 +247,12 @@ def test_a_pose_has_its_rotation_in_the_form_asked_for() -> None:
     quarter = pose_message([0.0, 0.0, 2**-0.5, 2**-0.5])  # about z
     np.testing.assert_allclose(messages.pose(quarter), [1, 2, 3, 0, 0, 2**-0.5, 2**-0.5], rtol=1e-6)
     stamped = {"header": {}, "pose": quarter}
-    np.testing.assert_allclose(messages.pose(stamped, "quat_wxyz"), [1, 2, 3, 2**-0.5, 0, 0, 2**-0.5], rtol=1e-6)
-    np.testing.assert_allclose(messages.pose(stamped, "euler_xyz"), [1, 2, 3, 0, 0, np.pi / 2], rtol=1e-6, atol=1e-7)
+    np.testing.assert_allclose(
+        messages.pose(stamped, "quat_wxyz"), [1, 2, 3, 2**-0.5, 0, 0, 2**-0.5], rtol=1e-6
+    )
+    np.testing.assert_allclose(
+        messages.pose(stamped, "euler_xyz"), [1, 2, 3, 0, 0, np.pi / 2], rtol=1e-6, atol=1e-7
+    )
     np.testing.assert_array_equal(messages.pose(quarter, "none"), np.array([1, 2, 3], np.float32))
 
 
@@ -224,4 +289,6 @@ def test_actions_become_messages_of_their_type() -> None:
     }
     trajectory = messages.joint_trajectory(row, ("a", "b"), 1.25)
     assert trajectory["joint_names"] == ["a", "b"]
-    assert trajectory["points"] == [{"positions": [0.5, -1.0], "time_from_start": {"sec": 1, "nanosec": 250_000_000}}]
+    assert trajectory["points"] == [
+        {"positions": [0.5, -1.0], "time_from_start": {"sec": 1, "nanosec": 250_000_000}}
+    ]

@@ -21,7 +21,17 @@ from ros_arm import BEAT, CAMERA, COMMANDS, JOINTS, NAMES, SIDE, RosArm, Wire, h
 from rosbridge_double import RosbridgeDouble, rosbridge_double
 
 import vlagents_ray.cli.robot as command
-from vlagents_ray import Act, ActionSpec, Agent, CameraSpec, ChunkPlayer, Contract, Obs, PlayerSettings, StateSpec
+from vlagents_ray import (
+    Act,
+    ActionSpec,
+    Agent,
+    CameraSpec,
+    ChunkPlayer,
+    Contract,
+    Obs,
+    PlayerSettings,
+    StateSpec,
+)
 from vlagents_ray.contract import require_match
 from vlagents_ray.errors import ConfigError, ContractMismatch, InvalidAction
 from vlagents_ray.robot import Guard, Watchdog, run_loop
@@ -37,7 +47,9 @@ FAR = 7.0  # rad; beyond the bounds
 
 
 class Ahead(Agent):
-    """Chunks of two rows that lead from the measured pose by STEP a row; FAR in each third chunk, if it is wild."""
+    """Chunks of two rows that lead from the measured pose by STEP a row; FAR in each third
+    chunk, if it is wild.
+    """
 
     shared = ("instructions", "seen")
 
@@ -112,12 +124,16 @@ def driving(agent: Agent, **more: Any) -> Iterator[Drive]:
         watchdog = robot.watchdog = Watchdog(lambda _: robot.stop(), robot.silent_s)
         guard = SeeingGuard(agent.contract, max_step=MAX_STEP, measure=measured_state("joints"))
         player = stack.enter_context(
-            ChunkPlayer(agent, PlayerSettings(mode="open_loop", deadline_s=1.0, safe="hold"), check=guard)
+            ChunkPlayer(
+                agent, PlayerSettings(mode="open_loop", deadline_s=1.0, safe="hold"), check=guard
+            )
         )
         drive = Drive(double, arm, robot, watchdog)
 
         def run() -> None:
-            drive.reports.append(run_loop(robot, player, hz=50, watchdog=watchdog, until=lambda: drive.over))
+            drive.reports.append(
+                run_loop(robot, player, hz=50, watchdog=watchdog, until=lambda: drive.over)
+            )
 
         thread = threading.Thread(target=run)
         thread.start()
@@ -141,7 +157,14 @@ def test_the_command_drives_an_arm_from_its_topics_and_stops_it_where_it_is(
         (tmp_path / "arm.yaml").write_text(yaml.safe_dump(ros_arm.settings(double.url)))
         with RosArm(double.publish, lambda: double.on(COMMANDS)) as arm:
             options = f"--robot ros:{tmp_path / 'arm.yaml'} --hz 30 --mode open_loop --restart auto".split()
-            said = ["--instruction", "stack the cups", "--measure", "joints", "--max-step", str(MAX_STEP)]
+            said = [
+                "--instruction",
+                "stack the cups",
+                "--measure",
+                "joints",
+                "--max-step",
+                str(MAX_STEP),
+            ]
             status = command.main([f"http://127.0.0.1:{port}", *options, *said])
     assert status != 2, capsys.readouterr().out  # a busy machine may be late at a tick
     assert list(agent.instructions) == ["stack the cups"]
@@ -153,7 +176,10 @@ def test_the_command_drives_an_arm_from_its_topics_and_stops_it_where_it_is(
     assert np.abs(np.diff([[0.0, 0.0], *commands], axis=0)).max() <= MAX_STEP
     assert commands[-1][0] > 0.05
     assert commands[-1] in arm.poses  # it ends with a stop, at the measured pose
-    assert double.advertised == {COMMANDS: "std_msgs/msg/Float64MultiArray", BEAT: "std_msgs/msg/Bool"}
+    assert double.advertised == {
+        COMMANDS: "std_msgs/msg/Float64MultiArray",
+        BEAT: "std_msgs/msg/Bool",
+    }
     beats = [message["data"] for message in double.on(BEAT)]
     assert beats.count(True) > 10
     assert not beats[-1]
@@ -178,7 +204,8 @@ def test_a_hanging_camera_holds_the_arm_still_until_it_goes_on() -> None:
         assert drive.robot.holds == f"no new message of {CAMERA} for more than 0.3 s"
         wait_for(lambda: not drive.alive)
         beats = len(drive.double.on(BEAT))
-        wait_for(lambda: len(drive.double.on(BEAT)) > beats + 2)  # messages of two topics may arrive in any order
+        # Messages of two topics may arrive in any order.
+        wait_for(lambda: len(drive.double.on(BEAT)) > beats + 2)
         still = len(drive.commands)
         assert drive.commands[-1] in drive.arm.poses  # where it was measured
         wait_for(lambda: len(drive.double.on(BEAT)) > beats + 7)  # the loop goes on
@@ -248,7 +275,9 @@ def test_a_stop_into_a_dead_connection_is_sent_again_at_the_pose_after_the_loss(
 @pytest.mark.parametrize("change", ["sent again", "unreadable", "of a clock that was set back"])
 def test_an_image_that_is_no_news_holds_the_arm(change: str) -> None:
     wire = Wire()
-    with RosRobot(settings_from(ros_arm.settings("ws://arm", max_age_s=0.3), "arm.yaml"), wire) as robot:
+    with RosRobot(
+        settings_from(ros_arm.settings("ws://arm", max_age_s=0.3), "arm.yaml"), wire
+    ) as robot:
         arm = RosArm(wire.publish, list)
         image = arm._image()
         wire.deliver(0.0, 0.0)
@@ -275,9 +304,12 @@ def test_a_killed_server_stops_the_arm(tmp_path: Path, capsys: pytest.CaptureFix
     with server, rosbridge_double() as double:
         (tmp_path / "arm.yaml").write_text(yaml.safe_dump(ros_arm.settings(double.url)))
         with RosArm(double.publish, lambda: double.on(COMMANDS)) as arm:
-            options = f"--robot ros:{tmp_path / 'arm.yaml'} --hz 30 --seconds 4 --silent-s 1".split()
+            options = (
+                f"--robot ros:{tmp_path / 'arm.yaml'} --hz 30 --seconds 4 --silent-s 1".split()
+            )
             status: list[int] = []
-            options += ["--timeout-s", "1", "--restart", "auto"]  # a busy machine may stop it before
+            # A busy machine may stop it before.
+            options += ["--timeout-s", "1", "--restart", "auto"]
             run = [url, *options, "--measure", "joints", "--max-step", str(MAX_STEP)]
             thread = threading.Thread(target=lambda: status.append(command.main(run)))
             thread.start()
@@ -298,11 +330,16 @@ def test_a_killed_server_stops_the_arm(tmp_path: Path, capsys: pytest.CaptureFix
             {"cameras": {"front": {"topic": "/elsewhere"}}},
             r"no message of \['/elsewhere'\] within 0.3 s.*ros2 topic list",
         ),
-        ({"state": {"joints": {"topic": JOINTS, "names": [*NAMES, "wrist"]}}}, "/joint_states: .*'wrist' is missing"),
+        (
+            {"state": {"joints": {"topic": JOINTS, "names": [*NAMES, "wrist"]}}},
+            "/joint_states: .*'wrist' is missing",
+        ),
         ({"state": {"joints": {"topic": JOINTS}}}, "stop: got 'joints' with 3 numbers, want 2"),
     ],
 )
-def test_topics_that_do_not_fit_are_an_error_before_anything_moves(change: dict[str, Any], said: str) -> None:
+def test_topics_that_do_not_fit_are_an_error_before_anything_moves(
+    change: dict[str, Any], said: str
+) -> None:
     with rosbridge_double() as double, RosArm(double.publish, lambda: double.on(COMMANDS)):
         settings = settings_from(ros_arm.settings(double.url, ready_s=0.3, **change), "arm.yaml")
         with pytest.raises(ConfigError, match=said), RosRobot(settings):
@@ -310,7 +347,9 @@ def test_topics_that_do_not_fit_are_an_error_before_anything_moves(change: dict[
         assert double.on(COMMANDS) == []
 
 
-@pytest.mark.parametrize(("ago_s", "said"), [(3600, "3.6e[+]03 s ago"), (-3600, "3.6e[+]03 s ahead")])
+@pytest.mark.parametrize(
+    ("ago_s", "said"), [(3600, "3.6e[+]03 s ago"), (-3600, "3.6e[+]03 s ahead")]
+)
 def test_clocks_that_differ_are_an_error_with_the_cure(ago_s: int, said: str) -> None:
     with rosbridge_double() as double, RosArm(double.publish, lambda: double.on(COMMANDS)) as arm:
         real = arm._image
@@ -322,19 +361,31 @@ def test_clocks_that_differ_are_an_error_with_the_cure(ago_s: int, said: str) ->
 
         arm._image = image  # type: ignore[method-assign]
         plain = ros_arm.settings(double.url)
-        with pytest.raises(ConfigError, match=f"{said}.*clock: arrival"), RosRobot(settings_from(plain, "arm.yaml")):
+        with (
+            pytest.raises(ConfigError, match=f"{said}.*clock: arrival"),
+            RosRobot(settings_from(plain, "arm.yaml")),
+        ):
             pass
         with RosRobot(settings_from({**plain, "clock": "arrival"}, "arm.yaml")) as robot:
             robot.observe()
             assert robot.holds is None
 
 
-def test_a_policy_for_another_robot_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_policy_for_another_robot_is_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     with ahead_server(Ahead()) as port, rosbridge_double() as double:
         with RosArm(double.publish, lambda: double.on(COMMANDS)):
             cameras = {"cameras": {"top": {"topic": CAMERA}}}
-            (tmp_path / "arm.yaml").write_text(yaml.safe_dump(ros_arm.settings(double.url, **cameras)))
-            assert command.main([f"http://127.0.0.1:{port}", "--robot", f"ros:{tmp_path / 'arm.yaml'}"]) == 2
+            (tmp_path / "arm.yaml").write_text(
+                yaml.safe_dump(ros_arm.settings(double.url, **cameras))
+            )
+            assert (
+                command.main(
+                    [f"http://127.0.0.1:{port}", "--robot", f"ros:{tmp_path / 'arm.yaml'}"]
+                )
+                == 2
+            )
         assert double.on(COMMANDS) == []
     assert "camera 'front': the policy needs it, the env gives ['top']" in capsys.readouterr().err
 
@@ -342,9 +393,16 @@ def test_a_policy_for_another_robot_is_refused(tmp_path: Path, capsys: pytest.Ca
 @pytest.mark.parametrize("stop", ["joints", "nothing"])
 @pytest.mark.parametrize("declared", [False, True])
 def test_the_check_of_a_robot_behind_topics_moves_nothing(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, stop: str, *, declared: bool
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+    stop: str,
+    *,
+    declared: bool,
 ) -> None:
-    """Numbers that the measured pose stops are targets; of others only the contract of a policy states it."""
+    """Numbers that the measured pose stops are targets; of others only the contract of a policy
+    states it.
+    """
     monkeypatch.setattr("builtins.input", lambda _: "")  # the person cannot tell
     with ahead_server(Ahead()) as port, rosbridge_double() as double:
         settings = ros_arm.settings(double.url)
@@ -355,7 +413,9 @@ def test_the_check_of_a_robot_behind_topics_moves_nothing(
             status = command.main(["check", f"ros:{tmp_path / 'arm.yaml'}", "--hz", "20", *policy])
         states_meaning = declared or stop == "joints"
         assert status == (0 if states_meaning else 3)
-        assert len({tuple(one["data"]) for one in double.on(COMMANDS)}) <= 1, "stops, with the measured pose"
+        assert len({tuple(one["data"]) for one in double.on(COMMANDS)}) <= 1, (
+            "stops, with the measured pose"
+        )
     printed = capsys.readouterr().out
     assert "ok observation" in printed
     assert "not checked cameras" in printed

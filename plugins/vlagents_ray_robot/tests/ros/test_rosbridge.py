@@ -1,7 +1,8 @@
-"""The rosbridge protocol: what a real server sent is read as it was meant, and by the double's rules as well.
+"""The rosbridge protocol: what a real server sent is read as it was meant, and by the double's
+rules as well.
 
-`recorded_rosbridge.jsonl` holds frames of rosbridge_suite (commit c1bfc2f, of the branch ros2) beside ROS 2 Kilted, to
-a client that subscribed without compression.
+`recorded_rosbridge.jsonl` holds frames of rosbridge_suite (commit c1bfc2f, of the branch ros2)
+beside ROS 2 Kilted, to a client that subscribed without compression.
 """
 
 from __future__ import annotations
@@ -21,24 +22,37 @@ from vlagents_ray.errors import ConnectionLost, MalformedMessage
 from vlagents_ray_robot.ros import messages
 from vlagents_ray_robot.ros.links import Rosbridge, decoded
 
-RECORDED = [json.loads(line) for line in (Path(__file__).parent / "recorded_rosbridge.jsonl").read_text().splitlines()]
+RECORDED = [
+    json.loads(line)
+    for line in (Path(__file__).parent / "recorded_rosbridge.jsonl").read_text().splitlines()
+]
 STAMP = 1_700_000_000.25
 
 
 def test_what_a_real_server_sent_is_read_as_it_was_published() -> None:
-    came = {message["topic"]: message["msg"] for message in (decoded(line["text"]) for line in RECORDED)}
+    came = {
+        message["topic"]: message["msg"] for message in (decoded(line["text"]) for line in RECORDED)
+    }
     assert len(came) == 6
     padded = np.arange(24, dtype=np.uint8).reshape(2, 12)
-    np.testing.assert_array_equal(messages.image(came["/cam"]), padded[:, :9].reshape(2, 3, 3)[..., ::-1])
+    np.testing.assert_array_equal(
+        messages.image(came["/cam"]), padded[:, :9].reshape(2, 3, 3)[..., ::-1]
+    )
     assert messages.stamp(came["/cam"]) == STAMP
     assert abs(messages.compressed_image(came["/cam/compressed"]).astype(int) - 90).max() <= 2
-    np.testing.assert_array_equal(messages.joints(came["/joint_states"], ("a", "b")), np.array([-1, 2.5], np.float32))
+    np.testing.assert_array_equal(
+        messages.joints(came["/joint_states"], ("a", "b")), np.array([-1, 2.5], np.float32)
+    )
     assert messages.joints(came["/joint_states"], ("b",), "velocity") == 0
     with pytest.raises(MalformedMessage, match="finite"):  # JSON has null for NaN and infinity
         messages.joints(came["/joint_states"], ("a", "finger"), "velocity")
-    np.testing.assert_array_equal(messages.pose(came["/pose"]), np.array([0.5, 0, 0, 0, 0, 0, 1], np.float32))
+    np.testing.assert_array_equal(
+        messages.pose(came["/pose"]), np.array([0.5, 0, 0, 0, 0, 0, 1], np.float32)
+    )
     assert came["/instruction"]["data"] == "fold the cloth, größer"
-    np.testing.assert_array_equal(messages.numbers(came["/numbers"]), np.array([1.5, -2], np.float32))
+    np.testing.assert_array_equal(
+        messages.numbers(came["/numbers"]), np.array([1.5, -2], np.float32)
+    )
 
 
 @pytest.mark.parametrize("frame", ["{", "[1]", '{"topic": "/a"}', "[" * 100_000])
@@ -48,7 +62,9 @@ def test_a_frame_that_is_no_message_is_refused(frame: str) -> None:
 
 
 @contextlib.contextmanager
-def linked(double: RosbridgeDouble, take: Callable[[Any], None], *topics: str) -> Iterator[Rosbridge]:
+def linked(
+    double: RosbridgeDouble, take: Callable[[Any], None], *topics: str
+) -> Iterator[Rosbridge]:
     """An open link that is subscribed to these topics, and publishes to /arm."""
     link = Rosbridge(double.url)
     for topic in topics:
@@ -99,8 +115,12 @@ def test_a_link_that_is_lost_publishes_nothing_and_comes_back_with_its_topics() 
 
 
 @pytest.mark.parametrize("busy", [True, False])
-def test_a_silent_sensor_is_subscribed_to_again(busy: bool, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A real server that subscribed before it knew the publisher may have chosen a quality that does not match it."""
+def test_a_silent_sensor_is_subscribed_to_again(
+    busy: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A real server that subscribed before it knew the publisher may have chosen a quality that
+    does not match it.
+    """
     monkeypatch.setattr("vlagents_ray_robot.ros.links._SILENT_S", 0.2)
     with rosbridge_double() as double, linked(double, lambda _: None, "/silent", "/busy"):
 

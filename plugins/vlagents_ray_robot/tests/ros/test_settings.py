@@ -21,7 +21,12 @@ ARM: dict[str, Any] = {
     "cameras": {"front": {"topic": "/camera/image_raw"}},
     "state": {"joints": {"topic": "/joint_states", "names": ["a", "b"]}},
     "actions": [
-        {"topic": "/arm/commands", "type": "std_msgs/msg/Float64MultiArray", "numbers": 2, "stop": "joints"},
+        {
+            "topic": "/arm/commands",
+            "type": "std_msgs/msg/Float64MultiArray",
+            "numbers": 2,
+            "stop": "joints",
+        },
     ],
 }
 
@@ -34,13 +39,22 @@ def test_the_examples_are_read(file: Path) -> None:
 def test_the_files_and_commands_of_the_documentation_are_read() -> None:
     page = (EXAMPLES.parents[1] / "docs/ros.md").read_text()
     files = re.findall(r"```yaml\n(.*?)```", page, re.DOTALL)
-    lines = [*page.replace("\\\n", " ").splitlines(), *(EXAMPLES / "arm.yaml").read_text().splitlines()]
-    commands = [line.split("vlagents-ray robot ")[1] for line in lines if "vlagents-ray robot " in line]
+    lines = [
+        *page.replace("\\\n", " ").splitlines(),
+        *(EXAMPLES / "arm.yaml").read_text().splitlines(),
+    ]
+    commands = [
+        line.split("vlagents-ray robot ")[1] for line in lines if "vlagents-ray robot " in line
+    ]
     assert [settings_from(yaml.safe_load(file), "docs/ros.md").dim for file in files] == [4]
-    assert [robot_command.parse(shlex.split(words)).policy for words in commands] == 2 * ["http://gpu-box:8000"]
+    assert [robot_command.parse(shlex.split(words)).policy for words in commands] == 2 * [
+        "http://gpu-box:8000"
+    ]
 
 
-def test_types_and_limits_have_defaults_and_an_action_the_numbers_of_all_its_topics(tmp_path: Path) -> None:
+def test_types_and_limits_have_defaults_and_an_action_the_numbers_of_all_its_topics(
+    tmp_path: Path,
+) -> None:
     (tmp_path / "arm.yaml").write_text(yaml.safe_dump(ARM))
     settings = read_settings(tmp_path / "arm.yaml")
     front, joints = settings.cameras["front"], settings.state["joints"]
@@ -51,8 +65,18 @@ def test_types_and_limits_have_defaults_and_an_action_the_numbers_of_all_its_top
     )
     assert (front.max_age_s, front.silent_s, settings.dim) == (0.3, 1.0, 2)
     actions = [
-        {"topic": "/t", "type": "trajectory_msgs/msg/JointTrajectory", "names": ["a", "b"], "stop": "joints"},
-        {"topic": "/g", "type": "sensor_msgs/msg/JointState", "names": ["finger"], "stop": "nothing"},
+        {
+            "topic": "/t",
+            "type": "trajectory_msgs/msg/JointTrajectory",
+            "names": ["a", "b"],
+            "stop": "joints",
+        },
+        {
+            "topic": "/g",
+            "type": "sensor_msgs/msg/JointState",
+            "names": ["finger"],
+            "stop": "nothing",
+        },
         {"topic": "/v", "type": "geometry_msgs/msg/Twist", "fields": ["linear.x", "angular.z"]},
     ]
     assert settings_from({**ARM, "actions": actions}, "f").dim == 5
@@ -63,25 +87,65 @@ def test_types_and_limits_have_defaults_and_an_action_the_numbers_of_all_its_top
     [
         ({"link": "tcp://x"}, "link: got 'tcp://x', want 'ros2', or a rosbridge"),
         ({"lnik": "ros2"}, "did you mean 'link'"),
-        ({"cameras": {"front": {"topic": "/c", "tpye": "x"}}}, "cameras.front: .*did you mean 'type'"),
-        ({"cameras": {"front": {"topic": "/c", "type": "sensor_msgs/msg/PointCloud2"}}}, "front: type: got .*want one"),
+        (
+            {"cameras": {"front": {"topic": "/c", "tpye": "x"}}},
+            "cameras.front: .*did you mean 'type'",
+        ),
+        (
+            {"cameras": {"front": {"topic": "/c", "type": "sensor_msgs/msg/PointCloud2"}}},
+            "front: type: got .*want one",
+        ),
         ({"cameras": {"front": "/camera"}}, "cameras.front: got str, want keys"),
         ({"cameras": {"front": {"topic": 3}}}, "topic: got 3, want str"),
         ({"state": {"joints": {"topic": "/j", "names": "a"}}}, "names: got 'a', want a list"),
-        ({"state": {"joints": {"topic": "/j", "names": [1]}}}, r"names: got \[1\], want a list of names"),
-        ({"state": {"joints": {"topic": "/j", "values": "torque"}}}, "values: got 'torque', want one of"),
-        ({"state": {"joints": {"topic": "/camera/image_raw"}}}, "and elsewhere as sensor_msgs/msg/Image"),
+        (
+            {"state": {"joints": {"topic": "/j", "names": [1]}}},
+            r"names: got \[1\], want a list of names",
+        ),
+        (
+            {"state": {"joints": {"topic": "/j", "values": "torque"}}},
+            "values: got 'torque', want one of",
+        ),
+        (
+            {"state": {"joints": {"topic": "/camera/image_raw"}}},
+            "and elsewhere as sensor_msgs/msg/Image",
+        ),
         ({"cameras": {}, "state": {}}, "got no camera, state or gripper"),
         ({"actions": []}, "actions: got none"),
         ({"actions": {"topic": "/a"}}, "want a list of topics"),
-        ({"actions": [{**ARM["actions"][0], "stop": ""}]}, "want what stops /arm/commands: 'zeros' where"),
-        ({"actions": [{**ARM["actions"][0], "stop": "joint"}]}, "stop: got 'joint', want one of .*'joints'"),
+        (
+            {"actions": [{**ARM["actions"][0], "stop": ""}]},
+            "want what stops /arm/commands: 'zeros' where",
+        ),
+        (
+            {"actions": [{**ARM["actions"][0], "stop": "joint"}]},
+            "stop: got 'joint', want one of .*'joints'",
+        ),
         ({"actions": [{**ARM["actions"][0], "numbers": 0}]}, "without numbers, want numbers"),
-        ({"actions": [{**ARM["actions"][0], "type": "std_msgs/msg/String"}]}, "type: got 'std_msgs/msg/String'"),
-        ({"actions": [{"topic": "/v", "type": "geometry_msgs/msg/Twist", "fields": ["linear.w"]}]}, "fields: got"),
-        ({"actions": [{**ARM["actions"][0], "grippers": [2]}]}, r"grippers: got 2, want one of \[0, 1\]"),
-        ({"actions": [{**ARM["actions"][0], "grippers": "b"}]}, "grippers: got 'b', want a list of numbers"),
-        ({"actions": [{**ARM["actions"][0], "grippers": [1], "stop": "zeros"}]}, "and no `gripper`; add the topic"),
+        (
+            {"actions": [{**ARM["actions"][0], "type": "std_msgs/msg/String"}]},
+            "type: got 'std_msgs/msg/String'",
+        ),
+        (
+            {
+                "actions": [
+                    {"topic": "/v", "type": "geometry_msgs/msg/Twist", "fields": ["linear.w"]}
+                ]
+            },
+            "fields: got",
+        ),
+        (
+            {"actions": [{**ARM["actions"][0], "grippers": [2]}]},
+            r"grippers: got 2, want one of \[0, 1\]",
+        ),
+        (
+            {"actions": [{**ARM["actions"][0], "grippers": "b"}]},
+            "grippers: got 'b', want a list of numbers",
+        ),
+        (
+            {"actions": [{**ARM["actions"][0], "grippers": [1], "stop": "zeros"}]},
+            "and no `gripper`; add the topic",
+        ),
         ({"gripper": {"topic": "/joint_states"}}, "want `open` and `closed`"),
         ({"max_age_s": 0}, "max_age_s: got 0, want above 0"),
         ({"max_age_s": float("nan")}, "max_age_s: got nan, want above 0"),
@@ -89,7 +153,9 @@ def test_types_and_limits_have_defaults_and_an_action_the_numbers_of_all_its_top
         ({"clock": "sim"}, "clock: got 'sim', want one of"),
     ],
 )
-def test_a_wrong_setting_is_an_error_that_names_it_and_the_cure(change: dict[str, Any], said: str) -> None:
+def test_a_wrong_setting_is_an_error_that_names_it_and_the_cure(
+    change: dict[str, Any], said: str
+) -> None:
     with pytest.raises(ConfigError, match=said) as error:
         settings_from({**ARM, **change}, "arm.yaml")
     assert str(error.value).startswith("arm.yaml")

@@ -26,5 +26,9 @@ def model_file(arm: str) -> Path:
 
 
 def simulated_arm(arm: str, **options: Any) -> MujocoArm:
-    """Make an arm in simulated time, with cameras that are slow enough for rendering in software."""
-    return MujocoArm(model_file(arm), like=arm, **{"clock": SimulatedClock(), "fps": 5.0, **options})
+    """Make an arm in simulated time, with cameras that are slow enough for rendering in
+    software.
+    """
+    return MujocoArm(
+        model_file(arm), like=arm, **{"clock": SimulatedClock(), "fps": 5.0, **options}
+    )

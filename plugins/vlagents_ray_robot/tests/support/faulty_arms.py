@@ -18,7 +18,11 @@ class FaultyArm:
 
     def __init__(self, arm: MujocoArm) -> None:
         self.arm, self.clock = arm, arm.clock
-        self.contract, self.joint_names, self.joint_limits = arm.contract, arm.joint_names, arm.joint_limits
+        self.contract, self.joint_names, self.joint_limits = (
+            arm.contract,
+            arm.joint_names,
+            arm.joint_limits,
+        )
 
     def observe(self) -> Obs:
         return self.arm.observe()
@@ -73,7 +77,11 @@ class Degrees(FaultyArm):
         return self._state(lambda joints: np.rad2deg(joints).astype(np.float32))
 
     def apply(self, action: np.ndarray) -> None:
-        self.arm.apply(np.array([*np.deg2rad(action[: len(self.joint_names)]), *action[len(self.joint_names) :]]))
+        self.arm.apply(
+            np.array(
+                [*np.deg2rad(action[: len(self.joint_names)]), *action[len(self.joint_names) :]]
+            )
+        )
 
 
 class SwappedCameras(FaultyArm):
@@ -122,7 +130,9 @@ class LateState(FaultyArm):
 
 
 class GripperInverted(FaultyArm):
-    """Both the command and the measured opening are inverted, so that each agrees with the other."""
+    """Both the command and the measured opening are inverted, so that each agrees with the
+    other.
+    """
 
     def observe(self) -> Obs:
         obs = self.arm.observe()
@@ -138,7 +148,8 @@ class OffByOne(FaultyArm):
     def apply(self, action: np.ndarray) -> None:
         count = len(self.joint_names)
         held = self.arm.joints()
-        held[1:] += action[: count - 1] - held[: count - 1]  # the change of each, so that nothing jumps at first
+        # The change of each, so that nothing jumps at first.
+        held[1:] += action[: count - 1] - held[: count - 1]
         self.arm.apply(np.array([*held, *action[count:]]))
 
 
@@ -196,7 +207,9 @@ class BaseTurned(FaultyArm):
     """The pose is in a frame that is turned by 90° about the vertical."""
 
     def observe(self) -> Obs:
-        return self._state(lambda pose: np.array([-pose[1], pose[0], *pose[2:]], np.float32), "tquat")
+        return self._state(
+            lambda pose: np.array([-pose[1], pose[0], *pose[2:]], np.float32), "tquat"
+        )
 
 
 class NoStop(FaultyArm):
@@ -218,7 +231,9 @@ class ClockStep(FaultyArm):
     def observe(self) -> Obs:
         self.seen += 1
         obs = self.arm.observe()
-        return replace(obs, info={**obs.info, CAPTURED: obs.info[CAPTURED] - (2.0 if self.seen > 10 else 0.0)})
+        return replace(
+            obs, info={**obs.info, CAPTURED: obs.info[CAPTURED] - (2.0 if self.seen > 10 else 0.0)}
+        )
 
 
 class Dropped(FaultyArm):

@@ -1,4 +1,6 @@
-"""An arm with a camera behind topics, as a thread that plays its driver: at 30 Hz it publishes, and obeys commands."""
+"""An arm with a camera behind topics, as a thread that plays its driver: at 30 Hz it publishes,
+and obeys commands.
+"""
 
 from __future__ import annotations
 
@@ -22,7 +24,12 @@ def settings(link: str, **more: Any) -> dict[str, Any]:
         "cameras": {"front": {"topic": CAMERA}},
         "state": {"joints": {"topic": JOINTS, "names": NAMES}},
         "actions": [
-            {"topic": COMMANDS, "type": "std_msgs/msg/Float64MultiArray", "numbers": 2, "stop": "joints"},
+            {
+                "topic": COMMANDS,
+                "type": "std_msgs/msg/Float64MultiArray",
+                "numbers": 2,
+                "stop": "joints",
+            },
         ],
         "heartbeat": {"topic": BEAT, "hz": 50.0},
         "max_age_s": 1.0,
@@ -40,7 +47,9 @@ class RosArm(threading.Thread):
     """
 
     def __init__(
-        self, publish: Callable[[str, dict[str, Any]], None], commands: Callable[[], list[dict[str, Any]]]
+        self,
+        publish: Callable[[str, dict[str, Any]], None],
+        commands: Callable[[], list[dict[str, Any]]],
     ) -> None:
         super().__init__(name="arm")
         self.joints = [0.0, 0.0]
@@ -76,7 +85,13 @@ class RosArm(threading.Thread):
     def _image(self) -> dict[str, Any]:
         self.images += self.varies
         pixels = np.full((SIDE, SIDE, 3), self.images % 256, np.uint8)
-        said = {"height": SIDE, "width": SIDE, "encoding": "bgr8", "is_bigendian": 0, "step": 3 * SIDE}
+        said = {
+            "height": SIDE,
+            "width": SIDE,
+            "encoding": "bgr8",
+            "is_bigendian": 0,
+            "step": 3 * SIDE,
+        }
         return {"header": header(), **said, "data": pixels.tobytes()}
 
 

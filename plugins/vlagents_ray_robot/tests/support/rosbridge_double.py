@@ -1,7 +1,8 @@
 """A rosbridge server without ROS, written from the protocol's specification, version 2.
 
-It is compared with the real one in tests/robot/ros: with a recording of what that sends, and by the same tests against
-both. Topics exist in this process alone: a test publishes with `publish`, and reads what clients published.
+It is compared with the real one in tests/robot/ros: with a recording of what that sends, and by the
+same tests against both. Topics exist in this process alone: a test publishes with `publish`, and
+reads what clients published.
 """
 
 from __future__ import annotations
@@ -37,8 +38,10 @@ class RosbridgeDouble:
     published: list[Published] = field(default_factory=list)
     advertised: dict[str, str] = field(default_factory=dict)
     subscribed: dict[str, str] = field(default_factory=dict)
-    subscriptions: list[str] = field(default_factory=list)  # in their order, with those that were made again
-    noticed: Callable[[dict[str, Any]], None] = lambda _: None  # gets each message that a client publishes
+    # In their order, with those that were made again.
+    subscriptions: list[str] = field(default_factory=list)
+    # Gets each message that a client publishes.
+    noticed: Callable[[dict[str, Any]], None] = lambda _: None
     _asked: dict[ServerConnection, set[str]] = field(default_factory=lambda: defaultdict(set))
     _server: Server | None = None
     _thread: threading.Thread | None = None
@@ -56,11 +59,15 @@ class RosbridgeDouble:
         for socket, asked in list(self._asked.items()):
             if topic in asked:
                 with contextlib.suppress(ConnectionClosed, OSError):
-                    socket.send(json.dumps(_plain({"op": "publish", "topic": topic, "msg": message})))
+                    socket.send(
+                        json.dumps(_plain({"op": "publish", "topic": topic, "msg": message}))
+                    )
 
     def open(self) -> None:
         """Listen, at the same port as before if it was open before."""
-        self._server = serve(self._handle, "127.0.0.1", self.port, compression=None, close_timeout=0.5)
+        self._server = serve(
+            self._handle, "127.0.0.1", self.port, compression=None, close_timeout=0.5
+        )
         self.port = self._server.socket.getsockname()[1]
         self._thread = threading.Thread(target=self._server.serve_forever)
         self._thread.start()

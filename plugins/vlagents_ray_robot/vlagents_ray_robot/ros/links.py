@@ -1,7 +1,7 @@
 """Links to topics of ROS 2: rclpy, if ROS 2 is installed, or a rosbridge.
 
-A rosbridge uses version 2 of its protocol over a WebSocket, as specified in ROSBRIDGE_PROTOCOL.md of
-https://github.com/RobotWebTools/rosbridge_suite.
+A rosbridge uses version 2 of its protocol over a WebSocket, as specified in ROSBRIDGE_PROTOCOL.md
+of https://github.com/RobotWebTools/rosbridge_suite.
 """
 
 from __future__ import annotations
@@ -20,22 +20,33 @@ from typing import Any
 from websockets.exceptions import ConnectionClosed, WebSocketException
 from websockets.sync.client import ClientConnection, connect
 
-from vlagents_ray.errors import ConfigError, ConnectionLost, MalformedMessage, MissingDependency, VLAgentsError, shown
+from vlagents_ray.errors import (
+    ConfigError,
+    ConnectionLost,
+    MalformedMessage,
+    MissingDependency,
+    VLAgentsError,
+    shown,
+)
 from vlagents_ray.registry import require
 
 logger = logging.getLogger(__name__)
 _SILENT_S = 2.0
 _GET_ROS = (
-    "source the setup file of ROS 2 (`. /opt/ros/jazzy/setup.bash`) and start its Python, or reach ROS through a "
+    "source the setup file of ROS 2 (`. /opt/ros/jazzy/setup.bash`) and start its Python, or reach "
+    "ROS through a "
     "rosbridge, `link: ws://arm-pc:9090`"
 )
-# The kernel's time limit for a send, which websockets lacks: a dead link would block the control loop for minutes.
+# The kernel's time limit for a send, which websockets lacks: a dead link would block the control
+# loop for minutes.
 _SEND_LIMIT = struct.pack("@ll", 0, 200_000)
 _LARGEST = 64 << 20  # bytes of a frame; a 4K image in base64 has 34 million
 
 
 class Ros2:
-    """A node of ROS 2, which a thread spins; raises `MissingDependency` without rclpy, or if ROS was not sourced."""
+    """A node of ROS 2, which a thread spins; raises `MissingDependency` without rclpy, or if ROS
+    was not sourced.
+    """
 
     name = "ros2"
     up = True  # it has no connection; a lost peer is silent
@@ -56,7 +67,8 @@ class Ros2:
     def subscribe(self, topic: str, kind: str, take: Callable[[Any], None]) -> None:
         """Pass messages of a topic to `take` on the link's thread; call it before `open`.
 
-        Only the newest message is kept, and a lost one is not sent again; this also matches reliable publishers.
+        Only the newest message is kept, and a lost one is not sent again; this also matches
+        reliable publishers.
         """
         qos = require("rclpy.qos")
         newest = qos.QoSProfile(depth=1, reliability=qos.ReliabilityPolicy.BEST_EFFORT)
@@ -92,13 +104,16 @@ class Ros2:
 
 
 def message_class(kind: str) -> type[Any]:
-    """Return the class of a message type such as "sensor_msgs/msg/Image"; raises `ConfigError` if it is missing."""
+    """Return the class of a message type such as "sensor_msgs/msg/Image"; raises `ConfigError`
+    if it is missing.
+    """
     package, _, name = kind.split("/")
     try:
         found: type[Any] = getattr(import_module(f"{package}.msg"), name)
     except (ImportError, AttributeError) as error:
         raise ConfigError(
-            f"{kind}: ROS has no such message here ({error}); install the package {package} of this ROS"
+            f"{kind}: ROS has no such message here ({error}); install the package {package} of "
+            "this ROS"
         ) from error
     return found
 
@@ -146,8 +161,8 @@ class Rosbridge:
     def subscribe(self, topic: str, kind: str, take: Callable[[Any], None]) -> None:
         """Pass messages of a topic to `take` on the link's thread; call it before `open`.
 
-        While the topic is silent, it is subscribed to again: the server sets the quality of service by the present
-        publishers, and would miss a later one with best effort.
+        While the topic is silent, it is subscribed to again: the server sets the quality of service
+        by the present publishers, and would miss a later one with best effort.
         """
         self._take[topic], self._types[topic] = take, kind
         self._heard[topic] = 0.0
@@ -159,7 +174,9 @@ class Rosbridge:
     def open(self) -> None:
         """Connect; raises `ConnectionLost` if the server cannot be reached."""
         self._connect()
-        self._thread = threading.Thread(target=self._run, name="vlagents-ray-rosbridge", daemon=True)
+        self._thread = threading.Thread(
+            target=self._run, name="vlagents-ray-rosbridge", daemon=True
+        )
         self._thread.start()
 
     @property
@@ -173,7 +190,9 @@ class Rosbridge:
         if socket is None:
             return False
         try:
-            socket.send(json.dumps({"op": "publish", "topic": topic, "msg": message}, allow_nan=False))
+            socket.send(
+                json.dumps({"op": "publish", "topic": topic, "msg": message}, allow_nan=False)
+            )
         except (WebSocketException, OSError):
             self._lose(socket)
             return False
@@ -191,7 +210,9 @@ class Rosbridge:
     def _connect(self) -> None:
         self._open.close()  # the previous connection
         try:
-            opening = connect(self._url, compression=None, max_size=_LARGEST, open_timeout=5, close_timeout=1)
+            opening = connect(
+                self._url, compression=None, max_size=_LARGEST, open_timeout=5, close_timeout=1
+            )
             socket = self._open.enter_context(opening)
             socket.socket.setsockopt(SOL_SOCKET, SO_SNDTIMEO, _SEND_LIMIT)
             for topic, kind in self._outlets.items():
@@ -216,7 +237,8 @@ class Rosbridge:
                 try:
                     self._receive(socket.recv(_SILENT_S))
                 except TimeoutError:
-                    if not socket.ping().wait(_SILENT_S):  # its other end is gone, as after a power failure
+                    # Its other end is gone, as after a power failure.
+                    if not socket.ping().wait(_SILENT_S):
                         self._lose(socket)
                         continue
                 for topic, at in self._heard.items():

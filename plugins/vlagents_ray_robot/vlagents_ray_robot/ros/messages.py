@@ -1,8 +1,8 @@
 """ROS 2 messages to numbers and images, and actions to messages; nothing here needs ROS.
 
-A received message is a mapping, as from rosbridge, or an object with the same fields, as from rclpy. A message to send
-is a mapping of its fields. The fields and their units are those of ROS 2's packages `sensor_msgs`, `geometry_msgs`,
-`std_msgs` and `trajectory_msgs`.
+A received message is a mapping, as from rosbridge, or an object with the same fields, as from
+rclpy. A message to send is a mapping of its fields. The fields and their units are those of ROS 2's
+packages `sensor_msgs`, `geometry_msgs`, `std_msgs` and `trajectory_msgs`.
 """
 
 from __future__ import annotations
@@ -16,7 +16,13 @@ from typing import Any, Literal
 
 import numpy as np
 
-from vlagents_ray.errors import InvalidObservation, MalformedMessage, MessageTooLarge, MissingState, shown
+from vlagents_ray.errors import (
+    InvalidObservation,
+    MalformedMessage,
+    MessageTooLarge,
+    MissingState,
+    shown,
+)
 from vlagents_ray.images.jpeg_png import MAX_PIXELS, decode
 
 Values = Literal["position", "velocity", "effort"]
@@ -27,24 +33,31 @@ TWIST = ("linear.x", "linear.y", "linear.z", "angular.x", "angular.y", "angular.
 
 
 def field(message: Any, path: str) -> Any:
-    """Return a field of a message, such as "header.stamp.sec"; raises `MalformedMessage` if it is missing."""
+    """Return a field of a message, such as "header.stamp.sec"; raises `MalformedMessage` if it
+    is missing.
+    """
     for name in path.split("."):
         try:
             message = message[name] if isinstance(message, Mapping) else getattr(message, name)
         except (KeyError, AttributeError) as error:
             raise MalformedMessage(
-                f"message: got one without {path!r}, want a field of this name; is the topic's type right?"
+                f"message: got one without {path!r}, want a field of this name; is the topic's "
+                "type right?"
             ) from error
     return message
 
 
 def stamp(message: Any) -> float | None:
-    """Return the time in a message's header, s since 1970; None without a header, or with an empty one."""
+    """Return the time in a message's header, s since 1970; None without a header, or with an
+    empty one.
+    """
     try:
         sec, nanosec = field(message, "header.stamp.sec"), field(message, "header.stamp.nanosec")
     except MalformedMessage:
         return None
-    return (_whole("header.stamp.sec", sec) + _whole("header.stamp.nanosec", nanosec) * 1e-9) or None
+    return (
+        _whole("header.stamp.sec", sec) + _whole("header.stamp.nanosec", nanosec) * 1e-9
+    ) or None
 
 
 def image(message: Any) -> np.ndarray:
@@ -63,16 +76,21 @@ def image(message: Any) -> np.ndarray:
             f"image: got the encoding {shown(encoding)}, want one of {list(_PIXEL)}; "
             f"have the camera's driver publish rgb8, and take no topic of depth for a camera"
         )
-    height, width, step = (_whole(name, field(message, name)) for name in ("height", "width", "step"))
+    height, width, step = (
+        _whole(name, field(message, name)) for name in ("height", "width", "step")
+    )
     data = _bytes("image", field(message, "data"))
     if not (height > 0 and width > 0):
-        raise MalformedMessage(f"image: got {height} rows of {width} pixels, want some; is the camera on?")
+        raise MalformedMessage(
+            f"image: got {height} rows of {width} pixels, want some; is the camera on?"
+        )
     if height * width > MAX_PIXELS:
         raise MessageTooLarge(f"image: got {height} x {width} pixels, want at most {MAX_PIXELS}")
     used = width * _PIXEL[encoding]
     if step < used or len(data) < step * height:
         raise MalformedMessage(
-            f"image: got {len(data)} bytes in rows of {step}, want {height} rows of {used} or more for {width} pixels "
+            f"image: got {len(data)} bytes in rows of {step}, want {height} rows of {used} or more "
+            f"for {width} pixels "
             f"of {encoding}"
         )
     rows = np.frombuffer(data, np.uint8, step * height).reshape(height, step)[:, :used]
@@ -85,12 +103,15 @@ def image(message: Any) -> np.ndarray:
 
 
 def compressed_image(message: Any) -> np.ndarray:
-    """Return the pixels of a `sensor_msgs/msg/CompressedImage` that holds a JPEG or PNG file, as `decode` does."""
+    """Return the pixels of a `sensor_msgs/msg/CompressedImage` that holds a JPEG or PNG file, as
+    `decode` does.
+    """
     return decode(_bytes("image", field(message, "data")))
 
 
 def joints(message: Any, names: Sequence[str] = (), values: Values = "position") -> np.ndarray:
-    """Return numbers of a `sensor_msgs/msg/JointState` by the names of joints, (len(names),) float32.
+    """Return numbers of a `sensor_msgs/msg/JointState` by the names of joints, (len(names),)
+    float32.
 
     Args:
         message: The message, whose order does not matter.
@@ -103,11 +124,14 @@ def joints(message: Any, names: Sequence[str] = (), values: Values = "position")
     """
     came = field(message, "name")
     if not isinstance(came, Sequence) or not all(isinstance(name, str) for name in came):
-        raise MalformedMessage(f"name: got {shown(came)}, want a list of names; is the topic's type right?")
+        raise MalformedMessage(
+            f"name: got {shown(came)}, want a list of names; is the topic's type right?"
+        )
     numbers = _numbers(values, field(message, values))
     if len(numbers) != len(came):
         raise MalformedMessage(
-            f"joint state: got {len(numbers)} numbers in {values!r} for {len(came)} names, want as many"
+            f"joint state: got {len(numbers)} numbers in {values!r} for {len(came)} names, want as "
+            "many"
         )
     place = {name: i for i, name in enumerate(came)}
     for name in names:
@@ -117,11 +141,12 @@ def joints(message: Any, names: Sequence[str] = (), values: Values = "position")
 
 
 def pose(message: Any, rotation: PoseRotation = "quat_xyzw") -> np.ndarray:
-    """Return position (m) and rotation of a `geometry_msgs/msg/Pose` or `PoseStamped`, (7,), (6,) or (3,) float32.
+    """Return position (m) and rotation of a `geometry_msgs/msg/Pose` or `PoseStamped`, (7,), (6,)
+    or (3,) float32.
 
-    `rotation` is its form after the position: "quat_xyzw" or "quat_wxyz" (of unit length), "euler_xyz" (roll, pitch and
-    yaw about fixed axes, rad), or "none". Raises `MalformedMessage` if a number is not finite, or the quaternion is
-    zero.
+    `rotation` is its form after the position: "quat_xyzw" or "quat_wxyz" (of unit length),
+    "euler_xyz" (roll, pitch and yaw about fixed axes, rad), or "none". Raises `MalformedMessage` if
+    a number is not finite, or the quaternion is zero.
     """
     stamped = "pose" in message if isinstance(message, Mapping) else hasattr(message, "pose")
     at = field(message, "pose") if stamped else message
@@ -132,7 +157,8 @@ def pose(message: Any, rotation: PoseRotation = "quat_xyzw") -> np.ndarray:
     length = float(np.linalg.norm(quaternion))
     if not length > 1e-6:
         raise MalformedMessage(
-            f"pose: got the quaternion {quaternion.tolist()}, want one of unit length; is the field unset?"
+            f"pose: got the quaternion {quaternion.tolist()}, want one of unit length; is the "
+            "field unset?"
         )
     quaternion = quaternion / length
     if rotation == "quat_wxyz":
@@ -147,7 +173,9 @@ def pose(message: Any, rotation: PoseRotation = "quat_xyzw") -> np.ndarray:
 
 
 def numbers(message: Any) -> np.ndarray:
-    """Return the numbers of a `Float64MultiArray`, `Float32MultiArray`, `Float64` or `Float32`, flat, (D,) float32."""
+    """Return the numbers of a `Float64MultiArray`, `Float32MultiArray`, `Float64` or `Float32`,
+    flat, (D,) float32.
+    """
     data = field(message, "data")
     return _finite("data", _numbers("data", [data] if isinstance(data, (int, float)) else data))
 
@@ -157,7 +185,9 @@ def float64_multi_array(row: np.ndarray) -> dict[str, Any]:
     return {"layout": {"dim": [], "data_offset": 0}, "data": row.astype(np.float64).tolist()}
 
 
-def joint_state(row: np.ndarray, names: Sequence[str], values: Values = "position") -> dict[str, Any]:
+def joint_state(
+    row: np.ndarray, names: Sequence[str], values: Values = "position"
+) -> dict[str, Any]:
     """Return a `sensor_msgs/msg/JointState` that commands joints, (D,) in the order of `names`."""
     now = time.time_ns()
     header = {"stamp": {"sec": now // 10**9, "nanosec": now % 10**9}, "frame_id": ""}
@@ -165,7 +195,9 @@ def joint_state(row: np.ndarray, names: Sequence[str], values: Values = "positio
 
 
 def twist(row: np.ndarray, fields: Sequence[str] = TWIST) -> dict[str, Any]:
-    """Return a `geometry_msgs/msg/Twist` with numbers at these of its fields, m/s and rad/s; the others are 0."""
+    """Return a `geometry_msgs/msg/Twist` with numbers at these of its fields, m/s and rad/s; the
+    others are 0.
+    """
     message: dict[str, Any] = {part: dict.fromkeys("xyz", 0.0) for part in ("linear", "angular")}
     for path, number in zip(fields, row.astype(np.float64).tolist(), strict=True):
         part, axis = path.split(".")
@@ -174,7 +206,8 @@ def twist(row: np.ndarray, fields: Sequence[str] = TWIST) -> dict[str, Any]:
 
 
 def joint_trajectory(row: np.ndarray, names: Sequence[str], reach_s: float) -> dict[str, Any]:
-    """Return a `trajectory_msgs/msg/JointTrajectory` of one point: positions, (D,) in the order of `names`.
+    """Return a `trajectory_msgs/msg/JointTrajectory` of one point: positions, (D,) in the order of
+    `names`.
 
     The arm should reach it `reach_s` seconds after the controller receives the message.
     """
@@ -183,24 +216,31 @@ def joint_trajectory(row: np.ndarray, names: Sequence[str], reach_s: float) -> d
         "positions": row.astype(np.float64).tolist(),
         "time_from_start": {"sec": nanoseconds // 10**9, "nanosec": nanoseconds % 10**9},
     }
-    now = {"stamp": {"sec": 0, "nanosec": 0}, "frame_id": ""}  # controllers read a stamp of zero as now
+    # Controllers read a stamp of zero as now.
+    now = {"stamp": {"sec": 0, "nanosec": 0}, "frame_id": ""}
     return {"header": now, "joint_names": list(names), "points": [point]}
 
 
 def _whole(name: str, value: Any) -> int:
     if isinstance(value, bool) or not isinstance(value, int):
-        raise MalformedMessage(f"{name}: got {value!r}, want a whole number; is the topic's type right?")
+        raise MalformedMessage(
+            f"{name}: got {value!r}, want a whole number; is the topic's type right?"
+        )
     return value
 
 
 def _bytes(name: str, value: Any) -> bytes | memoryview:
-    """Return the bytes of a uint8 array: an array from rclpy; base64, or from some servers a list, from rosbridge."""
+    """Return the bytes of a uint8 array: an array from rclpy; base64, or from some servers a
+    list, from rosbridge.
+    """
     try:
         if isinstance(value, str):
             return base64.b64decode(value, validate=True)
         return bytes(value) if isinstance(value, (list, tuple)) else memoryview(value).cast("B")
     except (binascii.Error, TypeError, ValueError) as error:
-        raise MalformedMessage(f"{name}: got data that are no bytes ({error}), want an array of uint8") from error
+        raise MalformedMessage(
+            f"{name}: got data that are no bytes ({error}), want an array of uint8"
+        ) from error
 
 
 def _numbers(name: str, values: Any) -> np.ndarray:
@@ -214,9 +254,13 @@ def _numbers(name: str, values: Any) -> np.ndarray:
 
 
 def _finite(name: str, values: np.ndarray) -> np.ndarray:
-    """Return finite numbers as float32; rosbridge writes others as null, which numpy reads as NaN."""
+    """Return finite numbers as float32; rosbridge writes others as null, which numpy reads as
+    NaN.
+    """
     with np.errstate(over="ignore"):
         found = values.astype(np.float32)
     if not np.isfinite(found).all():
-        raise MalformedMessage(f"{name}: got {values.tolist()}, want finite numbers; is the sensor broken?")
+        raise MalformedMessage(
+            f"{name}: got {values.tolist()}, want finite numbers; is the sensor broken?"
+        )
     return found

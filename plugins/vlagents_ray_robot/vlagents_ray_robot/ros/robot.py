@@ -1,4 +1,6 @@
-"""A robot behind topics of ROS 2, the parts of its observation and its action, and the file that names the topics."""
+"""A robot behind topics of ROS 2, the parts of its observation and its action, and the file that
+names the topics.
+"""
 
 from __future__ import annotations
 
@@ -31,8 +33,15 @@ ROS2 = "ros2"
 IMAGE, COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
 JOINT_STATE, BOOL = "sensor_msgs/msg/JointState", "std_msgs/msg/Bool"
 POSES = ("geometry_msgs/msg/Pose", "geometry_msgs/msg/PoseStamped")
-NUMBERS = tuple(f"std_msgs/msg/{name}" for name in ("Float64MultiArray", "Float32MultiArray", "Float64", "Float32"))
-ARRAY, TWIST_TYPE, TRAJECTORY = NUMBERS[0], "geometry_msgs/msg/Twist", "trajectory_msgs/msg/JointTrajectory"
+NUMBERS = tuple(
+    f"std_msgs/msg/{name}"
+    for name in ("Float64MultiArray", "Float32MultiArray", "Float64", "Float32")
+)
+ARRAY, TWIST_TYPE, TRAJECTORY = (
+    NUMBERS[0],
+    "geometry_msgs/msg/Twist",
+    "trajectory_msgs/msg/JointTrajectory",
+)
 ZEROS, NOTHING = "zeros", "nothing"
 _AGES = ("max_age_s", "silent_s")
 
@@ -64,7 +73,8 @@ class ActionTopic:
     values: Values = "position"  # field of a JointState
     fields: tuple[str, ...] = TWIST  # of a Twist
     reach_s: float = 0.1  # time in which the arm should reach the point of a JointTrajectory
-    grippers: tuple[int, ...] | None = None  # which of its numbers; None: the joints of the gripper's topic
+    # Which of its numbers; None: the joints of the gripper's topic.
+    grippers: tuple[int, ...] | None = None
 
     @property
     def dim(self) -> int:
@@ -76,7 +86,9 @@ class ActionTopic:
 
 @dataclass(frozen=True)
 class HeartbeatTopic:
-    """A `std_msgs/msg/Bool`, published while the control loop runs: whether it may move the robot."""
+    """A `std_msgs/msg/Bool`, published while the control loop runs: whether it may move the
+    robot.
+    """
 
     topic: str
     hz: float = 10.0
@@ -92,13 +104,18 @@ class RosSettings:
     state: Mapping[str, InputTopic] = field(default_factory=dict)
     gripper: InputTopic | None = None
     heartbeat: HeartbeatTopic | None = None
-    clock: str = "stamp"  # whether a message's age counts from its header's time stamp, or from its arrival ("arrival")
+    # Whether a message's age counts from its header's time stamp, or from its arrival ("arrival")
+    clock: str = "stamp"
     ready_s: float = 10.0  # time limit for the first message of each topic
 
     @property
     def sensors(self) -> list[InputTopic]:
         """The topics whose readings must be recent."""
-        return [*self.cameras.values(), *self.state.values(), *([self.gripper] if self.gripper else [])]
+        return [
+            *self.cameras.values(),
+            *self.state.values(),
+            *([self.gripper] if self.gripper else []),
+        ]
 
     @property
     def dim(self) -> int:
@@ -107,15 +124,19 @@ class RosSettings:
 
     @property
     def delta(self) -> bool | None:
-        """Whether actions are relative: False if the measured pose stops the robot, as their numbers are targets then.
+        """Whether actions are relative: False if the measured pose stops the robot, as their
+        numbers are targets then.
 
-        Else it is None: zeros stop velocities as well as deltas, and a topic without a stop states nothing.
+        Else it is None: zeros stop velocities as well as deltas, and a topic without a stop states
+        nothing.
         """
         stops = {command.stop for command in self.actions} - {NOTHING}
         return False if stops and stops <= self.state.keys() else None
 
     def gripper_columns(self, command: ActionTopic) -> list[int]:
-        """Return which numbers of a topic are grippers; joints are compared by name with those of `gripper`."""
+        """Return which numbers of a topic are grippers; joints are compared by name with those
+        of `gripper`.
+        """
         if command.grippers is not None:
             return list(command.grippers)
         measured = self.state.get(command.stop)
@@ -132,19 +153,26 @@ def read_settings(file: Path | str) -> RosSettings:
         MissingDependency: PyYAML is not installed.
     """
     try:
-        stated = load_yaml(Path(file).read_text(encoding="utf-8"), extra="ros", distribution=DISTRIBUTION)
+        stated = load_yaml(
+            Path(file).read_text(encoding="utf-8"), extra="ros", distribution=DISTRIBUTION
+        )
     except (OSError, ValueError) as error:
         raise ConfigError(f"{file}: cannot be read as a file of ROS topics ({error})") from error
     return settings_from(stated, str(file))
 
 
 def settings_from(stated: Any, where: str) -> RosSettings:
-    """Check the decoded document of a file with the name `where`, and return it; raises `ConfigError`."""
+    """Check the decoded document of a file with the name `where`, and return it; raises
+    `ConfigError`.
+    """
     top = dict(_mapping(stated, where))
     usual = {key: top.pop(key) for key in _AGES if key in top}  # of all readings
     for part, kind in (("cameras", IMAGE), ("state", JOINT_STATE)):
         named = _mapping(top.get(part) or {}, f"{where}: {part}")
-        top[part] = {str(name): _reading(one, f"{where}: {part}.{name}", kind, usual) for name, one in named.items()}
+        top[part] = {
+            str(name): _reading(one, f"{where}: {part}.{name}", kind, usual)
+            for name, one in named.items()
+        }
     if top.get("gripper") is not None:
         top["gripper"] = _reading(top["gripper"], f"{where}: gripper", JOINT_STATE, usual)
     if top.get("heartbeat") is not None:
@@ -152,7 +180,9 @@ def settings_from(stated: Any, where: str) -> RosSettings:
     actions = top.get("actions") or []
     if not isinstance(actions, list):
         raise ConfigError(f"{where}: actions: got {type(actions).__name__}, want a list of topics")
-    top["actions"] = tuple(_made(ActionTopic, one, f"{where}: actions[{i}]") for i, one in enumerate(actions))
+    top["actions"] = tuple(
+        _made(ActionTopic, one, f"{where}: actions[{i}]") for i, one in enumerate(actions)
+    )
     settings: RosSettings = _made(RosSettings, top, where)
     _check(settings, where)
     return settings
@@ -161,8 +191,15 @@ def settings_from(stated: Any, where: str) -> RosSettings:
 def _check(settings: RosSettings, where: str) -> None:
     readings = [
         *((f"cameras.{name}", one, (IMAGE, COMPRESSED)) for name, one in settings.cameras.items()),
-        *((f"state.{name}", one, (JOINT_STATE, *POSES, *NUMBERS)) for name, one in settings.state.items()),
-        *([("gripper", gripper, (JOINT_STATE, *NUMBERS))] if (gripper := settings.gripper) is not None else []),
+        *(
+            (f"state.{name}", one, (JOINT_STATE, *POSES, *NUMBERS))
+            for name, one in settings.state.items()
+        ),
+        *(
+            [("gripper", gripper, (JOINT_STATE, *NUMBERS))]
+            if (gripper := settings.gripper) is not None
+            else []
+        ),
     ]
     for name, reading, types in readings:
         _one_of(f"{where}: {name}: type", reading.type, types)
@@ -172,24 +209,38 @@ def _check(settings: RosSettings, where: str) -> None:
     for name, reading, _ in readings:
         if types_of.setdefault(reading.topic, reading.type) != reading.type:
             raise ConfigError(
-                f"{where}: {name}: got {reading.topic} as {reading.type}, and elsewhere as {types_of[reading.topic]}"
+                f"{where}: {name}: got {reading.topic} as {reading.type}, and elsewhere as "
+                f"{types_of[reading.topic]}"
             )
     if not settings.sensors:
-        raise ConfigError(f"{where}: got no camera, state or gripper, want one, by whose age the robot is stopped")
+        raise ConfigError(
+            f"{where}: got no camera, state or gripper, want one, by whose age the robot is stopped"
+        )
     if not settings.actions:
         raise ConfigError(f"{where}: actions: got none, want the topics that command the robot")
-    if gripper is not None and (gripper.open is None or gripper.closed is None or gripper.open == gripper.closed):
-        raise ConfigError(f"{where}: gripper: got no two numbers, want `open` and `closed` as the topic gives them")
+    if gripper is not None and (
+        gripper.open is None or gripper.closed is None or gripper.open == gripper.closed
+    ):
+        raise ConfigError(
+            f"{where}: gripper: got no two numbers, want `open` and `closed` as the topic gives "
+            "them"
+        )
     for i, command in enumerate(settings.actions):
         _check_command(command, settings, f"{where}: actions[{i}]")
-    limits = [("ready_s", settings.ready_s), *([("heartbeat: hz", beat.hz)] if (beat := settings.heartbeat) else [])]
+    limits = [
+        ("ready_s", settings.ready_s),
+        *([("heartbeat: hz", beat.hz)] if (beat := settings.heartbeat) else []),
+    ]
     limits += [(f"{name}: {key}", getattr(one, key)) for name, one, _ in readings for key in _AGES]
     for name, limit in limits:
         if not limit > 0:
             raise ConfigError(f"{where}: {name}: got {limit}, want above 0")
     _one_of(f"{where}: clock", settings.clock, ("stamp", "arrival"))
     if settings.link != ROS2 and not settings.link.startswith(("ws://", "wss://")):
-        raise ConfigError(f"{where}: link: got {settings.link!r}, want 'ros2', or a rosbridge as 'ws://arm-pc:9090'")
+        raise ConfigError(
+            f"{where}: link: got {settings.link!r}, want 'ros2', or a rosbridge as "
+            "'ws://arm-pc:9090'"
+        )
 
 
 def _check_command(command: ActionTopic, settings: RosSettings, where: str) -> None:
@@ -198,14 +249,18 @@ def _check_command(command: ActionTopic, settings: RosSettings, where: str) -> N
     for name in command.fields:
         _one_of(f"{where}: fields", name, TWIST)
     if command.dim < 1:
-        wants = "numbers, how many it takes" if command.type == ARRAY else "names, those of the joints"
+        wants = (
+            "numbers, how many it takes" if command.type == ARRAY else "names, those of the joints"
+        )
         raise ConfigError(f"{where}: got a {command.type} without numbers, want {wants}")
     if command.type == TRAJECTORY and not command.reach_s > 0:
         raise ConfigError(f"{where}: reach_s: got {command.reach_s}, want above 0")
     if not command.stop and command.type != TWIST_TYPE:
         raise ConfigError(
-            f"{where}: stop: got none, want what stops {command.topic}: {ZEROS!r} where numbers are velocities or "
-            f"deltas, a part of the state with the measured pose where they are targets, or {NOTHING!r} where the "
+            f"{where}: stop: got none, want what stops {command.topic}: {ZEROS!r} where numbers "
+            "are velocities or "
+            "deltas, a part of the state with the measured pose where they are targets, or "
+            f"{NOTHING!r} where the "
             f"controller stays at its last target and that is right"
         )
     if command.stop and command.stop not in (ZEROS, NOTHING):
@@ -214,13 +269,16 @@ def _check_command(command: ActionTopic, settings: RosSettings, where: str) -> N
         _one_of(f"{where}: grippers", number, tuple(range(command.dim)))
     if command.grippers and command.stop == ZEROS and settings.gripper is None:
         raise ConfigError(
-            f"{where}: grippers: got {list(command.grippers)} in a topic that zeros stop, and no `gripper`; add the "
+            f"{where}: grippers: got {list(command.grippers)} in a topic that zeros stop, and no "
+            "`gripper`; add the "
             f"topic of its opening, as a stop publishes that in place of a zero"
         )
 
 
 def _reading(stated: Any, where: str, kind: str, usual: Mapping[str, Any]) -> InputTopic:
-    reading: InputTopic = _made(InputTopic, {"type": kind, **usual, **_mapping(stated, where)}, where)
+    reading: InputTopic = _made(
+        InputTopic, {"type": kind, **usual, **_mapping(stated, where)}, where
+    )
     return reading
 
 
@@ -233,7 +291,9 @@ def _made(kind: type[Any], stated: Any, where: str) -> Any:
         given[name] = tuple(value)
     if (grippers := given.get("grippers")) is not None:
         if not isinstance(grippers, list) or not all(type(number) is int for number in grippers):
-            raise ConfigError(f"{where}: grippers: got {grippers!r}, want a list of numbers from 0, such as [2]")
+            raise ConfigError(
+                f"{where}: grippers: got {grippers!r}, want a list of numbers from 0, such as [2]"
+            )
         given["grippers"] = tuple(grippers)
     require_arguments(where, kind, given)
     return kind(**given)
@@ -241,7 +301,9 @@ def _made(kind: type[Any], stated: Any, where: str) -> Any:
 
 def _mapping(stated: Any, where: str) -> Mapping[str, Any]:
     if not isinstance(stated, Mapping):
-        raise ConfigError(f"{where}: got {type(stated).__name__}, want keys with values; see docs/ros.md")
+        raise ConfigError(
+            f"{where}: got {type(stated).__name__}, want keys with values; see docs/ros.md"
+        )
     return stated
 
 
@@ -262,7 +324,8 @@ class TopicReader:
         self._by_stamp = by_stamp
         self._clock = CaptureClock()
         self._seen_at = -math.inf  # s of `time.monotonic`
-        self._lock = threading.Lock()  # a stop by the watchdog reads the pose beside the control loop
+        # A stop by the watchdog reads the pose beside the control loop.
+        self._lock = threading.Lock()
         self._came: tuple[Any, float] | None = None
         self._looked_at: tuple[Any, float] | None = None
 
@@ -271,7 +334,9 @@ class TopicReader:
         self._came = message, time.time()
 
     def refresh(self) -> None:
-        """Decode the newest message, if any. An unreadable one is ignored, so that the reading ages."""
+        """Decode the newest message, if any. An unreadable one is ignored, so that the reading
+        ages.
+        """
         with self._lock:
             came = self._came
             if came is None or came is self._looked_at:
@@ -285,13 +350,17 @@ class TopicReader:
                 if self.value is None:
                     raise ConfigError(f"{self.topic}: {error}") from error
                 if self.unreadable == 1:
-                    logger.warning("%s: a message is left out, as are others like it: %s", self.topic, error)
+                    logger.warning(
+                        "%s: a message is left out, as are others like it: %s", self.topic, error
+                    )
                 return
             self.value, self.captured_at = value, at
             self._seen_at = self._clock(Obs(info={CAPTURED: at}))
 
     def _read(self, message: Any) -> Any:
-        """Return the image, the part of the state or, by its first number, the gripper's opening in a message."""
+        """Return the image, the part of the state or, by its first number, the gripper's opening
+        in a message.
+        """
         reading = self._reading
         if reading.type == IMAGE:
             return messages.image(message)
@@ -300,10 +369,16 @@ class TopicReader:
         if reading.type == JOINT_STATE:
             part = messages.joints(message, reading.names, reading.values)
         else:
-            part = messages.pose(message, reading.rotation) if reading.type in POSES else messages.numbers(message)
+            part = (
+                messages.pose(message, reading.rotation)
+                if reading.type in POSES
+                else messages.numbers(message)
+            )
         if reading.open is None or reading.closed is None:
             return part
-        return min(1.0, max(0.0, (float(part[0]) - reading.closed) / (reading.open - reading.closed)))
+        return min(
+            1.0, max(0.0, (float(part[0]) - reading.closed) / (reading.open - reading.closed))
+        )
 
     @property
     def age_s(self) -> float:
@@ -314,10 +389,11 @@ class TopicReader:
 class RosRobot:
     """A `Robot` whose cameras, state and actions are topics.
 
-    An observation has the newest message of each topic, and the time of the oldest of them as `captured_at`. While a
-    message is older than its `max_age_s`, or the link is lost, `holds` is the reason: the control loop stops the robot,
-    and continues by itself later. After `silent_s` without a new message the watchdog stops it. Use it as a context
-    manager, which connects and waits for the first message of each topic.
+    An observation has the newest message of each topic, and the time of the oldest of them as
+    `captured_at`. While a message is older than its `max_age_s`, or the link is lost, `holds` is
+    the reason: the control loop stops the robot, and continues by itself later. After `silent_s`
+    without a new message the watchdog stops it. Use it as a context manager, which connects and
+    waits for the first message of each topic.
 
     Args:
         settings: The topics, or the path of their YAML file.
@@ -325,7 +401,9 @@ class RosRobot:
     """
 
     dates_pictures = True
-    """Whether `captured_at` is from the messages, so that a camera that hangs is found by the age of its picture."""
+    """Whether `captured_at` is from the messages, so that a camera that hangs is found by the
+    age of its picture.
+    """
 
     def __init__(self, settings: RosSettings | Path | str, link: Link | None = None) -> None:
         if not isinstance(settings, RosSettings):
@@ -335,12 +413,15 @@ class RosRobot:
         self.watchdog: Watchdog | None = None
         """The watchdog of the control loop, with `silent_s` among its sources."""
         self._link: Link = link or (Ros2() if settings.link == ROS2 else Rosbridge(settings.link))
-        self._readers = {id(one): TopicReader(one, settings.clock == "stamp") for one in settings.sensors}
+        self._readers = {
+            id(one): TopicReader(one, settings.clock == "stamp") for one in settings.sensors
+        }
         self._beat_at = -math.inf
         self._connections = 0
         self._lost_at = -math.inf  # s of `time.monotonic`
         self._stop_unsent = False
-        self._commanded: dict[int, np.ndarray] = {}  # the last numbers of each topic of the actions, by its place
+        # The last numbers of each topic of the actions, by its place.
+        self._commanded: dict[int, np.ndarray] = {}
         for topic, kind in {reading.topic: reading.type for reading in settings.sensors}.items():
             self._link.subscribe(topic, kind, partial(self._take, topic))
         for command in settings.actions:
@@ -364,7 +445,9 @@ class RosRobot:
 
     @property
     def silent_s(self) -> dict[str, float]:
-        """The sources for a `Watchdog`: each topic, and its longest time without a new message, s."""
+        """The sources for a `Watchdog`: each topic, and its longest time without a new message,
+        s.
+        """
         limits: dict[str, float] = {}
         for reading in self.settings.sensors:
             limits[reading.topic] = min(reading.silent_s, limits.get(reading.topic, math.inf))
@@ -408,7 +491,9 @@ class RosRobot:
             InvalidAction: The number of values differs from that of the topics.
         """
         if action.shape != (self.settings.dim,):
-            raise InvalidAction(f"action: got {action.shape}, want ({self.settings.dim},), as the topics take")
+            raise InvalidAction(
+                f"action: got {action.shape}, want ({self.settings.dim},), as the topics take"
+            )
         first = 0
         for place, command in enumerate(self.settings.actions):
             row = self._commanded[place] = action[first : first + command.dim].copy()
@@ -434,7 +519,11 @@ class RosRobot:
                 reader.refresh()
                 if reader.age_s > reading.max_age_s or self._from_before_loss(reader):
                     self._stop_unsent = True  # until a pose is known
-                    logger.warning("%s: no stop was published, as the pose of %s is old", command.topic, reading.topic)
+                    logger.warning(
+                        "%s: no stop was published, as the pose of %s is old",
+                        command.topic,
+                        reading.topic,
+                    )
                     continue
                 row = reader.value.copy()
             if place in self._commanded:
@@ -466,13 +555,17 @@ class RosRobot:
         up, connections = self._link.up, self._link.connections
         if not up or connections != self._connections:  # or the link was lost between two ticks
             self._connections, self._lost_at = connections, time.monotonic()
-            self._stop_unsent = True  # the last stop may have been sent before the loss was detected
+            # The last stop may have been sent before the loss was detected.
+            self._stop_unsent = True
         lost = any(self._from_before_loss(reader) for reader in self._readers.values())
         self.holds = f"the connection to the {self._link.name} was lost" if lost else None
         for reading in self.settings.sensors:
             reader = self._readers[id(reading)]
             if reader.age_s > reading.max_age_s:
-                self.holds = self.holds or f"no new message of {reading.topic} for more than {reading.max_age_s:g} s"
+                self.holds = (
+                    self.holds
+                    or f"no new message of {reading.topic} for more than {reading.max_age_s:g} s"
+                )
             if self.watchdog is not None and reader.age_s < math.inf:
                 self.watchdog.heard(reading.topic, max(0.0, reader.age_s))
         if self._stop_unsent and self.holds is None:
@@ -504,7 +597,8 @@ class RosRobot:
                 break
             if time.monotonic() > deadline:
                 raise ConfigError(
-                    f"{self.settings.link}: got no message of {missing} within {self.settings.ready_s:g} s, want one "
+                    f"{self.settings.link}: got no message of {missing} within "
+                    f"{self.settings.ready_s:g} s, want one "
                     f"of each; compare names and types with `ros2 topic list --show-types`"
                 )
             time.sleep(0.01)
@@ -513,13 +607,17 @@ class RosRobot:
             if not -SKEW_S <= ago_s <= reading.silent_s:
                 when = f"{abs(ago_s):.3g} s {'ahead' if ago_s < 0 else 'ago'}"
                 raise ConfigError(
-                    f"{reading.topic}: got a message with the time stamp of {when}, want one of now; "
-                    f"synchronize the clocks of both machines, or count from the arrival: `clock: arrival`"
+                    f"{reading.topic}: got a message with the time stamp of {when}, want one of "
+                    "now; "
+                    "synchronize the clocks of both machines, or count from the arrival: `clock: "
+                    "arrival`"
                 )
         for command in self.settings.actions:
             pose = self.settings.state.get(command.stop)
             if pose is not None and self._value(pose).shape != (command.dim,):
                 raise ConfigError(
-                    f"{command.topic}: stop: got {command.stop!r} with {len(self._value(pose))} numbers, want "
-                    f"{command.dim}, as the topic takes; name a part of the state with these, in this order"
+                    f"{command.topic}: stop: got {command.stop!r} with {len(self._value(pose))} "
+                    "numbers, want "
+                    f"{command.dim}, as the topic takes; name a part of the state with these, in "
+                    "this order"
                 )

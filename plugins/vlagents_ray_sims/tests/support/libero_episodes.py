@@ -22,12 +22,19 @@ def play(env: Libero, state: int = 0, between: Callable[[], object] = lambda: No
     seen = [begin(env, state)]
     for i in range(3):
         between()
-        seen.append(env.step(Act(np.array([0.5, -0.5, 0.2 * i, 0, 0, 0.3, (-1) ** i], np.float32)))[0])
+        seen.append(
+            env.step(Act(np.array([0.5, -0.5, 0.2 * i, 0, 0, 0.3, (-1) ** i], np.float32)))[0]
+        )
     return seen
 
 
 def fingerprint(seen: list[Obs]) -> str:
-    parts = [array.tobytes() for obs in seen for group in (obs.cameras, obs.state) for array in group.values()]
+    parts = [
+        array.tobytes()
+        for obs in seen
+        for group in (obs.cameras, obs.state)
+        for array in group.values()
+    ]
     return hashlib.sha256(b"".join(parts)).hexdigest()
 
 

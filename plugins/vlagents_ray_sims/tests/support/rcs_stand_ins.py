@@ -1,7 +1,8 @@
-"""Simple bodies in place of assets that tests do not have: of RCS's two-arm scene, and all of DuoBench's.
+"""Simple bodies in place of assets that tests do not have: of RCS's two-arm scene, and all of
+DuoBench's.
 
-They have the names and the sizes, in metres, that DuoBench's `transfer_cube` goes by, and no more: what
-is proved with them is how its code is driven, not how its objects behave.
+They have the names and the sizes, in metres, that DuoBench's `transfer_cube` goes by, and no more:
+what is proved with them is how its code is driven, not how its objects behave.
 """
 
 from __future__ import annotations
@@ -11,9 +12,13 @@ import re
 import shutil
 from pathlib import Path
 
-_CAMERA = '<mujoco><worldbody><body name="case"><camera name="lens" fovy="60"/></body></worldbody></mujoco>'
+_CAMERA = (
+    '<mujoco><worldbody><body name="case"><camera name="lens" '
+    'fovy="60"/></body></worldbody></mujoco>'
+)
 
-# Two bars that swing towards each other; RCS reads 0.005 rad as open and 1 rad as closed, and sends 0 and 255.
+# Two bars that swing towards each other; RCS reads 0.005 rad as open and 1 rad as closed, and sends
+# 0 and 255.
 _FINGER = """
 <body name="{side}_pad" pos="0 {y} 0.05">
   <joint name="{side}_driver_joint" type="hinge" axis="{axis} 0 0" range="0 1" damping="0.1"/>
@@ -72,7 +77,9 @@ _DUOBENCH = {
     "objects/transfer_gate/white_long_box.xml": _OBJECT.format(
         name="white_long_box", shape='box" size="0.015 0.015 0.02'
     ),
-    "objects/bin_sort/white_bowl.xml": _OBJECT.format(name="white_bowl", shape='cylinder" size="0.06 0.004'),
+    "objects/bin_sort/white_bowl.xml": _OBJECT.format(
+        name="white_bowl", shape='cylinder" size="0.06 0.004'
+    ),
 }
 
 

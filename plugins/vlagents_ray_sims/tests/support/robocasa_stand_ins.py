@@ -1,9 +1,9 @@
 """A plain kitchen in place of RoboCasa's assets, about 10 GB that tests do not have.
 
-RoboCasa's package has its scenes, its counters, cabinets and drawers; textures, appliances and objects are a download.
-Here textures are of one colour, the appliances are boxes without doors or knobs, every object is a box, and all
-kitchens are one. What is proved with it is how RoboCasa's code is driven, seeded and read, not how its kitchens look or
-its objects behave.
+RoboCasa's package has its scenes, its counters, cabinets and drawers; textures, appliances and
+objects are a download. Here textures are of one colour, the appliances are boxes without doors or
+knobs, every object is a box, and all kitchens are one. What is proved with it is how RoboCasa's
+code is driven, seeded and read, not how its kitchens look or its objects behave.
 """
 
 from __future__ import annotations
@@ -67,12 +67,16 @@ fridge_bottom_freezer: default
 
 
 def write_package(folder: Path) -> Path:
-    """Write a copy of the installed robocasa with these assets into `folder`, for the beginning of `sys.path`."""
+    """Write a copy of the installed robocasa with these assets into `folder`, for the beginning
+    of `sys.path`.
+    """
     spec = importlib.util.find_spec("robocasa")
     assert spec is not None
     assert spec.origin is not None
     installed, assets = Path(spec.origin).parent, folder / "kitchen"
-    shutil.copytree(installed, folder / "robocasa", ignore=shutil.ignore_patterns("assets", "__pycache__"))
+    shutil.copytree(
+        installed, folder / "robocasa", ignore=shutil.ignore_patterns("assets", "__pycache__")
+    )
     shutil.copytree(installed / "models" / "assets", assets)
     (folder / "robocasa" / "models" / "assets").symlink_to(assets)
     for kind, text in (("layout", _KITCHEN), ("style", _STYLE)):
@@ -82,7 +86,9 @@ def write_package(folder: Path) -> Path:
         _write_box(assets / "fixtures" / name, "0.4 0.4 0.9", "main", rgba)
     for name in _folders(installed / "models" / "objects" / "kitchen_objects.py"):
         for number, rgba in enumerate(("0.2 0.7 0.2", "0.7 0.7 0.2")):  # two: one for each split
-            _write_box(assets / "objects" / name / f"plain_{number}", "0.03 0.03 0.02", "bbox", rgba)
+            _write_box(
+                assets / "objects" / name / f"plain_{number}", "0.03 0.03 0.02", "bbox", rgba
+            )
     for file in [*assets.rglob("*.xml"), *assets.rglob("fixture_registry/*.yaml")]:
         for texture in re.findall(r"textures/[\w/]+\.png", file.read_text()):
             _write_texture(assets / texture)
@@ -90,23 +96,31 @@ def write_package(folder: Path) -> Path:
 
 
 def _folders(categories: Path) -> set[str]:
-    """The folders of all categories of objects, e.g. "objaverse/apple", which their table names where they differ."""
+    """The folders of all categories of objects, e.g. "objaverse/apple", which their table names
+    where they differ.
+    """
     found = set()
     for category in ast.walk(ast.parse(categories.read_text())):
         for registry in getattr(getattr(category, "value", None), "keywords", []):
             if registry.arg in ("objaverse", "lightwheel"):
                 own = [one.value for one in registry.value.keywords if one.arg == "model_folders"]
-                found |= set(ast.literal_eval(own[0]) if own else [f"{registry.arg}/{category.arg}"])
+                found |= set(
+                    ast.literal_eval(own[0]) if own else [f"{registry.arg}/{category.arg}"]
+                )
     return found
 
 
 def _write_box(folder: Path, half: str, region: str, rgba: str) -> None:
     folder.mkdir(parents=True)
     height = half.split()[2]
-    (folder / "model.xml").write_text(_BOX.format(half=half, region=region, rgba=rgba, height=height))
+    (folder / "model.xml").write_text(
+        _BOX.format(half=half, region=region, rgba=rgba, height=height)
+    )
 
 
 def _write_texture(path: Path) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
-    colour = 100 + np.frombuffer(zlib.crc32(path.name.encode()).to_bytes(4, "big"), np.uint8)[:3] // 2
+    colour = (
+        100 + np.frombuffer(zlib.crc32(path.name.encode()).to_bytes(4, "big"), np.uint8)[:3] // 2
+    )
     cv2.imwrite(str(path), np.full((8, 8, 3), colour, np.uint8))

@@ -55,12 +55,18 @@ def squares(count: int) -> list[np.ndarray]:
     return masks
 
 
-def test_boxes_lie_on_the_image_and_go_by_the_phrases_that_were_asked_for(grounding_dino: Path) -> None:
+def test_boxes_lie_on_the_image_and_go_by_the_phrases_that_were_asked_for(
+    grounding_dino: Path,
+) -> None:
     detector = part("detector", "grounding_dino", grounding_dino, threshold=0.0)
-    for found, asked, (height, width) in zip(detector.detect(images(), PHRASES), PHRASES, SIZES, strict=True):
+    for found, asked, (height, width) in zip(
+        detector.detect(images(), PHRASES), PHRASES, SIZES, strict=True
+    ):
         assert found
         assert {thing.phrase for thing in found} <= set(asked)
-        assert [thing.score for thing in found] == sorted((thing.score for thing in found), reverse=True)
+        assert [thing.score for thing in found] == sorted(
+            (thing.score for thing in found), reverse=True
+        )
         for thing in found:
             left, top, right, bottom = thing.box
             assert 0 <= left <= right <= width
@@ -71,7 +77,9 @@ def test_boxes_lie_on_the_image_and_go_by_the_phrases_that_were_asked_for(ground
 def test_boxes_are_those_that_transformers_finds_itself(grounding_dino: Path) -> None:
     import torch
 
-    detector = part("detector", "grounding_dino", grounding_dino, threshold=0.3, overlap=1.0, most=100)
+    detector = part(
+        "detector", "grounding_dino", grounding_dino, threshold=0.3, overlap=1.0, most=100
+    )
     [image], [asked] = images()[:1], PHRASES[:1]
     inputs = detector._processor(images=image.copy(), text=[asked], return_tensors="pt")
     with torch.no_grad():
@@ -97,8 +105,13 @@ def test_what_is_found_does_not_depend_on_other_images_and_texts(grounding_dino:
     for one, asked, found in zip(images(), PHRASES, together, strict=True):
         [alone] = detector.detect([one], [asked])
         assert [thing.phrase for thing in alone] == [thing.phrase for thing in found]
-        assert np.allclose([thing.box for thing in alone], [thing.box for thing in found], atol=1e-3)  # px
-        assert np.allclose([thing.score for thing in alone], [thing.score for thing in found], atol=1e-5)
+        # px.
+        assert np.allclose(
+            [thing.box for thing in alone], [thing.box for thing in found], atol=1e-3
+        )
+        assert np.allclose(
+            [thing.score for thing in alone], [thing.score for thing in found], atol=1e-5
+        )
 
 
 @pytest.mark.verifies("batches")
@@ -118,7 +131,10 @@ def test_regions_are_proposed_without_repetitions(sam2: Path) -> None:
         assert 1 < len(regions) < 4 * 4 * 3
         assert regions.shape[1:] == size
     certain = part("segmenter", "sam2", sam2, points=4, confidence=1.0)
-    assert all(regions.shape == (0, *size) for regions, size in zip(certain.propose(images()), SIZES, strict=True))
+    assert all(
+        regions.shape == (0, *size)
+        for regions, size in zip(certain.propose(images()), SIZES, strict=True)
+    )
 
 
 @pytest.mark.verifies("parity")
@@ -131,21 +147,29 @@ def test_segments_are_followed_as_transformers_does_with_all_frames_kept(sam2: P
     model, processor = tracker._model, tracker._processor
     whole = [processor.init_video_session() for _ in SIZES]
     for i, session in enumerate(whole):
-        processor.add_inputs_to_inference_session(session, 0, [0, 1], input_masks=list(squares(2)[i]))
+        processor.add_inputs_to_inference_session(
+            session, 0, [0, 1], input_masks=list(squares(2)[i])
+        )
         model(
             session,
             frame_idx=0,
-            frame=processor.image_processor(images()[i].copy(), return_tensors="pt").pixel_values[0],
+            frame=processor.image_processor(images()[i].copy(), return_tensors="pt").pixel_values[
+                0
+            ],
         )
     for frame in range(1, 10):
         views = images(frame)
         for i, (masks, seen) in enumerate(tracker.follow(views, memories)):
             pixels = processor.image_processor(views[i].copy(), return_tensors="pt").pixel_values[0]
             theirs = model(whole[i], frame_idx=frame, frame=pixels)
-            logits = torch.nn.functional.interpolate(theirs.pred_masks[:, 0][None], size=SIZES[i], mode="bilinear")[0]
+            logits = torch.nn.functional.interpolate(
+                theirs.pred_masks[:, 0][None], size=SIZES[i], mode="bilinear"
+            )[0]
             unsure = logits.abs().numpy() < 1e-3  # on the very edge of a mask
             assert np.array_equal(masks | unsure, (logits.numpy() > 0) | unsure)
-            assert np.array_equal(seen, (theirs.object_score_logits.flatten() > 0).numpy() & masks.any((1, 2)))
+            assert np.array_equal(
+                seen, (theirs.object_score_logits.flatten() > 0).numpy() & masks.any((1, 2))
+            )
 
 
 def test_a_memory_stops_growing_and_can_be_moved(sam2: Path) -> None:
@@ -178,7 +202,9 @@ def test_sessions_with_all_learned_parts_are_apart(sam2: Path, grounding_dino: P
     policy = Arro.around(
         Watcher(),
         {
-            "detector": {"grounding_dino": {"checkpoint": str(grounding_dino), "threshold": 0.1, "most": 2}},
+            "detector": {
+                "grounding_dino": {"checkpoint": str(grounding_dino), "threshold": 0.1, "most": 2}
+            },
             "segmenter": {"sam2": {"checkpoint": str(sam2)}},
             "tracker": {"sam2": {"checkpoint": str(sam2)}},
             "selector": None,
@@ -234,7 +260,9 @@ def test_weights_that_are_missing_are_never_random(sam2: Path, tmp_path: Path) -
     del tensors["memory_encoder.projection.weight"]
     save_file(tensors, tmp_path / "model.safetensors", metadata={"format": "pt"})
     part("segmenter", "sam2", tmp_path)  # which has no memory
-    with pytest.raises(ConfigError, match=r"does not fill Sam2VideoModel.*memory_encoder\.projection\.weight"):
+    with pytest.raises(
+        ConfigError, match=r"does not fill Sam2VideoModel.*memory_encoder\.projection\.weight"
+    ):
         part("tracker", "sam2", tmp_path)
 
 

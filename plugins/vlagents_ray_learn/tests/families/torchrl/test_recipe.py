@@ -21,5 +21,7 @@ def test_the_recipe_trains_with_one_more_line(tmp_path: Path) -> None:
     assert LINE in PAGE.read_text()
     program = prepare(Path(os.environ["TORCHRL_SRC"]), tmp_path / "recipe", LINE)
     words = ["collector.groups_per_iter=2", "collector.total_iters=3", "loss.mini_batch_size=8"]
-    found = play(program, Path(sys.executable), 0, [*words, "logger.eval_iter=2", "logger.eval_episodes=4"])
+    found = play(
+        program, Path(sys.executable), 0, [*words, "logger.eval_iter=2", "logger.eval_episodes=4"]
+    )
     assert 0 <= found["success"] <= 1

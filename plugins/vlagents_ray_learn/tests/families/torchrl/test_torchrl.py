@@ -32,7 +32,12 @@ TOKENS, LOG_PROBS = ("vla_action", "tokens"), ("vla_action", "log_probs")
 
 
 def tiny(**options: Any) -> TinyVLA:
-    settings: dict[str, Any] = {"action_dim": 2, "chunk_size": 4, "action_head": "tokens", "vocab_size": 8} | options
+    settings: dict[str, Any] = {
+        "action_dim": 2,
+        "chunk_size": 4,
+        "action_head": "tokens",
+        "vocab_size": 8,
+    } | options
     return TinyVLA(**settings, return_vla_action_container=False)
 
 
@@ -50,7 +55,9 @@ def seen() -> TensorDict:
         "image": torch.randint(0, 256, (3, 3, 16, 16), dtype=torch.uint8, generator=rng),
         "state": torch.randn(3, 4, generator=rng),
     }
-    return TensorDict({"observation": observation, "language_instruction": NonTensorStack(*WORDS)}, [3])
+    return TensorDict(
+        {"observation": observation, "language_instruction": NonTensorStack(*WORDS)}, [3]
+    )
 
 
 def agent_of(policy: TinyVLA, tmp_path: Path) -> TorchRLPolicy:
@@ -71,7 +78,11 @@ def sessions_of(agent: TorchRLPolicy, number: int = 3) -> list[Any]:
 def observations(**info: Any) -> list[Obs]:
     rows = seen()["observation"]
     return [
-        Obs({"front": rows["image"][i].permute(1, 2, 0).numpy()}, state={"state": rows["state"][i].numpy()}, info=info)
+        Obs(
+            {"front": rows["image"][i].permute(1, 2, 0).numpy()},
+            state={"state": rows["state"][i].numpy()},
+            info=info,
+        )
         for i in range(3)
     ]
 
@@ -80,7 +91,9 @@ def observations(**info: Any) -> list[Obs]:
 def test_likeliest_tokens_are_those_of_the_policy_itself(mode: str, tmp_path: Path) -> None:
     policy = loaded(log_probs_mode=mode)
     agent = agent_of(policy, tmp_path)
-    acts = [act for act in agent.act_batch(observations(), sessions_of(agent)) if isinstance(act, Act)]
+    acts = [
+        act for act in agent.act_batch(observations(), sessions_of(agent)) if isinstance(act, Act)
+    ]
     with set_interaction_type(InteractionType.DETERMINISTIC), torch.no_grad():
         theirs = policy(seen())
     assert np.array_equal([act.action for act in acts], theirs[TOKENS].numpy())
@@ -96,7 +109,8 @@ def test_drawn_tokens_depend_on_the_session_alone(tmp_path: Path) -> None:
     mixed = agent.act_batch(mixed_obs, sessions_of(agent))
     drawn = [act.action for act in together if isinstance(act, Act)]
     again = [act.action for act in mixed if isinstance(act, Act)]
-    assert not np.array_equal(drawn[0], again[0])  # the first is the likeliest, in the same batch as draws
+    # The first is the likeliest, in the same batch as draws.
+    assert not np.array_equal(drawn[0], again[0])
     assert np.array_equal(drawn[1:], again[1:])
 
 
@@ -119,7 +133,9 @@ def test_a_policy_with_a_tokenizer_returns_chunks(tmp_path: Path) -> None:
     agent = agent_of(loaded(action_tokenizer=tokenizer), tmp_path)
     act = agent.act_batch(observations(), sessions_of(agent))[0]
     assert isinstance(act, Act)
-    assert np.allclose(act.action, tokenizer.decode(torch.from_numpy(act.info["behaviour"]["replay"]["tokens"])))
+    assert np.allclose(
+        act.action, tokenizer.decode(torch.from_numpy(act.info["behaviour"]["replay"]["tokens"]))
+    )
     assert agent.contract is not None
     assert agent.contract.action.space is None
 
@@ -174,29 +190,42 @@ def test_new_weights_reach_the_next_act(server: PolicyServer) -> None:
     try:
         before = client(seen())["policy_version"]
         learner = loaded(seed=1)
-        assert server.update_model_weights(TensorDict.from_module(learner).data) == {"accepted": True}
+        assert server.update_model_weights(TensorDict.from_module(learner).data) == {
+            "accepted": True
+        }
         after = client(seen())
         assert (after["policy_version"] == before + 1).all()
         assert torch.equal(after[TOKENS], learner(seen())[TOKENS])
-        assert server.update_model_weights(TensorDict.from_module(tiny()).data) == {"accepted": True}  # lazy: none
+        # lazy: none.
+        assert server.update_model_weights(TensorDict.from_module(tiny()).data) == {
+            "accepted": True
+        }
         assert torch.equal(client(seen())["policy_version"], after["policy_version"])
     finally:
         client.close()
 
 
-def test_episodes_begin_where_torchrl_says(server: PolicyServer, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_episodes_begin_where_torchrl_says(
+    server: PolicyServer, monkeypatch: pytest.MonkeyPatch
+) -> None:
     begun: list[list[str]] = []
     client = ServedPolicy(server.transport.client()._url)
     client(seen())
     agent: Any = client._sessions[0]
     reset = agent.reset_batch
     monkeypatch.setattr(
-        agent, "reset_batch", lambda obs, words, *args, **k: (begun.append(words), reset(obs, words, *args, **k))[1]
+        agent,
+        "reset_batch",
+        lambda obs, words, *args, **k: (begun.append(words), reset(obs, words, *args, **k))[1],
     )
     try:
         client(seen())
         client(seen().set("is_init", torch.tensor([[False], [True], [False]])))
-        client(seen().set("language_instruction", NonTensorStack(WORDS[0], WORDS[1], "open the drawer")))
+        client(
+            seen().set(
+                "language_instruction", NonTensorStack(WORDS[0], WORDS[1], "open the drawer")
+            )
+        )
         assert [list(words) for words in begun] == [["lift the block"], ["open the drawer"]]
     finally:
         client.close()
@@ -206,6 +235,11 @@ def test_the_program_of_the_page_runs(tmp_path: Path) -> None:
     [_, program] = re.findall(r"```python\n(.*?)```", PAGE.read_text(), re.DOTALL)
     (tmp_path / "program.py").write_text(program)
     command = [sys.executable, "program.py"]
-    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=300, check=False)
+    done = subprocess.run(
+        command, cwd=tmp_path, capture_output=True, text=True, timeout=300, check=False
+    )
     assert done.returncode == 0, done.stderr[-4000:]
-    assert done.stdout.splitlines() == ["torch.Size([3, 10, 4, 2]) [0]", "torch.Size([3, 10, 4, 2]) [1]"]
+    assert done.stdout.splitlines() == [
+        "torch.Size([3, 10, 4, 2]) [0]",
+        "torch.Size([3, 10, 4, 2]) [1]",
+    ]

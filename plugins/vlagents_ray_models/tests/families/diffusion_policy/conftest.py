@@ -17,7 +17,8 @@ from vlagents_ray_models.diffusion_policy import DiffusionPolicy
 
 Checkpoint = Callable[[str], Path]
 LIBRARIES = [
-    # The authors' save_checkpoint leaves its file open; robomimic 0.2.0 asks torchvision for a network as of old.
+    # The authors' save_checkpoint leaves its file open; robomimic 0.2.0 asks torchvision for a
+    # network as of old.
     pytest.mark.filterwarnings("ignore:unclosed file .*latest.ckpt:ResourceWarning"),
     pytest.mark.filterwarnings("ignore:The parameter 'pretrained' is deprecated:UserWarning"),
     pytest.mark.filterwarnings("ignore:Arguments other than a weight enum:UserWarning"),
@@ -27,11 +28,15 @@ LIBRARIES = [
 @pytest.fixture(scope="session")
 def checkpoint(tmp_path_factory: pytest.TempPathFactory) -> Checkpoint:
     """The file of a kind, made when it is first asked for."""
-    return lru_cache(lambda kind: tiny.save(tmp_path_factory.mktemp("diffusion_policy") / kind, kind))
+    return lru_cache(
+        lambda kind: tiny.save(tmp_path_factory.mktemp("diffusion_policy") / kind, kind)
+    )
 
 
 def made(checkpoint: Path, **config: Any) -> DiffusionPolicy:
-    return DiffusionPolicy.from_config({"checkpoint": str(checkpoint), "trust_checkpoint": True, **config})
+    return DiffusionPolicy.from_config(
+        {"checkpoint": str(checkpoint), "trust_checkpoint": True, **config}
+    )
 
 
 def loaded(checkpoint: Path, **config: Any) -> DiffusionPolicy:

@@ -1,4 +1,6 @@
-"""The authors' own code, asked through the policy: the same actions, in any company, and with compiled cores."""
+"""The authors' own code, asked through the policy: the same actions, in any company, and with
+compiled cores.
+"""
 
 from __future__ import annotations
 
@@ -70,7 +72,9 @@ def test_gives_what_the_authors_code_gives(
     frames = tuple(policy.perceive(view) for view in views)
     [found] = policy.predict([Row(frames, "", TorchDraws())])  # type: ignore[arg-type]
 
-    stacked: dict[str, np.ndarray] = {"obs": np.stack([view.state["state"] for view in views])[None]}
+    stacked: dict[str, np.ndarray] = {
+        "obs": np.stack([view.state["state"] for view in views])[None]
+    }
     if kind in ("image", "hybrid"):
         pictures = np.stack([view.cameras["front"] for view in views]).astype(np.float32) / 255
         positions = np.stack([view.state["agent_pos"] for view in views])[None]
@@ -78,7 +82,9 @@ def test_gives_what_the_authors_code_gives(
     torch.manual_seed(0)
     monkeypatch.delattr(policy.model.module, "conditional_sample")  # ours, in the place of theirs
     with torch.no_grad():
-        wanted = policy.model.module.predict_action({name: torch.from_numpy(x) for name, x in stacked.items()})
+        wanted = policy.model.module.predict_action(
+            {name: torch.from_numpy(x) for name, x in stacked.items()}
+        )
     np.testing.assert_allclose(found.actions, wanted["action"][0].numpy(), atol=ATOL)
 
 
@@ -89,7 +95,9 @@ def test_keeps_the_contract(kind: str, checkpoint: Checkpoint) -> None:
 
 @pytest.mark.verifies("batches")
 @pytest.mark.parametrize("kind", KINDS)
-def test_a_session_gets_the_same_in_any_company(kind: str, policies: Callable[[str], DiffusionPolicy]) -> None:
+def test_a_session_gets_the_same_in_any_company(
+    kind: str, policies: Callable[[str], DiffusionPolicy]
+) -> None:
     policy = policies(kind)
     views = [seen(i) for i in range(8)]
     alone = [begun(policy, seed=i).act(view).action for i, view in enumerate(views)]
@@ -100,7 +108,9 @@ def test_a_session_gets_the_same_in_any_company(kind: str, policies: Callable[[s
     assert np.ptp(np.stack(alone), axis=0).min() > 100 * ATOL  # eight answers, not one
 
 
-def test_an_image_of_another_size_is_made_as_the_authors_make_it(policies: Callable[[str], DiffusionPolicy]) -> None:
+def test_an_image_of_another_size_is_made_as_the_authors_make_it(
+    policies: Callable[[str], DiffusionPolicy],
+) -> None:
     policy, view = policies("image"), seen(1, (96, 200))
     from diffusion_policy.real_world.real_inference_util import get_real_obs_dict
 
@@ -121,12 +131,15 @@ def test_the_state_may_be_of_several_parts(checkpoint: Checkpoint) -> None:
 @pytest.mark.parametrize("kind", KINDS)
 def test_it_acts_with_pushed_weights(kind: str, checkpoint: Checkpoint) -> None:
     policy = loaded(checkpoint(kind))  # of this test alone
-    assert policy.parameters().keys() == policy.model.module.state_dict().keys()  # those of the authors' training
+    # Those of the authors' training.
+    assert policy.parameters().keys() == policy.model.module.state_dict().keys()
     check_pushed_weights(policy, lambda: begun(policy).act(seen(0)).action)
 
 
 @pytest.mark.verifies("isolation")
-def test_a_missing_camera_fails_its_own_session_alone(policies: Callable[[str], DiffusionPolicy]) -> None:
+def test_a_missing_camera_fails_its_own_session_alone(
+    policies: Callable[[str], DiffusionPolicy],
+) -> None:
     policy = policies("image")
     blind = Obs(state=seen(0).state)
     bad, good = policy.act_batch([blind, seen(1)], [begun(policy), begun(policy)])
@@ -134,7 +147,8 @@ def test_a_missing_camera_fails_its_own_session_alone(policies: Callable[[str], 
     assert not isinstance(good, Exception)
 
 
-CORES = {"unet": 1, "transformer": 1, "image": 2, "hybrid": 2}  # a step from noise, and what is seen in images
+# A step from noise, and what is seen in images.
+CORES = {"unet": 1, "transformer": 1, "image": 2, "hybrid": 2}
 SIZE = 3
 
 

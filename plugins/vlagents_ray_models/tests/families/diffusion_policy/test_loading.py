@@ -9,7 +9,11 @@ from typing import Any
 import pytest
 
 from plugins.vlagents_ray_models.tests.families.diffusion_policy import tiny
-from plugins.vlagents_ray_models.tests.families.diffusion_policy.conftest import LIBRARIES, Checkpoint, loaded
+from plugins.vlagents_ray_models.tests.families.diffusion_policy.conftest import (
+    LIBRARIES,
+    Checkpoint,
+    loaded,
+)
 from vlagents_ray.errors import ConfigError
 
 pytestmark = [pytest.mark.source("DIFFUSION_POLICY_SRC"), *LIBRARIES]
@@ -26,14 +30,19 @@ def test_a_file_of_something_else_is_named(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("config", "message"),
     [
-        ({"cameras": {"image": "front", "top": "front"}}, r"got \['image', 'top'\], want \['image'\]"),
+        (
+            {"cameras": {"image": "front", "top": "front"}},
+            r"got \['image', 'top'\], want \['image'\]",
+        ),
         ({"cameras": {}}, r"got \[\], want \['image'\]"),
         ({"device": "nowhere"}, "not here"),
         ({"dtype": "bfloat16"}, "dtype"),
         ({"checkpoint_step": 3}, "checkpoint_step"),
     ],
 )
-def test_settings_that_do_not_fit_the_checkpoint(checkpoint: Checkpoint, config: dict[str, Any], message: str) -> None:
+def test_settings_that_do_not_fit_the_checkpoint(
+    checkpoint: Checkpoint, config: dict[str, Any], message: str
+) -> None:
     with pytest.raises(ConfigError, match=message):
         loaded(checkpoint("image"), **config)
 
@@ -65,8 +74,14 @@ def _spoilt(path: Path, to: Path, change: Callable[[Any], None]) -> Path:
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda payload: payload["state_dicts"]["ema_model"].popitem(last=False), "does not fill its own policy"),
-        (lambda payload: payload["cfg"].policy.model.update(down_dims=[16, 16]), "does not fill its own policy"),
+        (
+            lambda payload: payload["state_dicts"]["ema_model"].popitem(last=False),
+            "does not fill its own policy",
+        ),
+        (
+            lambda payload: payload["cfg"].policy.model.update(down_dims=[16, 16]),
+            "does not fill its own policy",
+        ),
         (lambda payload: payload.pop("cfg"), "no payload"),
     ],
 )
@@ -77,7 +92,9 @@ def test_a_checkpoint_that_is_not_whole(
         loaded(_spoilt(checkpoint("unet"), tmp_path / "spoilt.ckpt", change))
 
 
-def test_weights_that_training_began_with_are_not_downloaded(checkpoint: Checkpoint, tmp_path: Path) -> None:
+def test_weights_that_training_began_with_are_not_downloaded(
+    checkpoint: Checkpoint, tmp_path: Path
+) -> None:
     def began(payload: Any) -> None:
         payload["cfg"].policy.obs_encoder.rgb_model.weights = "IMAGENET1K_V1"
 

@@ -1,7 +1,8 @@
-"""A small random Diffusion Policy, saved by its authors' own code: `python …/tiny.py OUT_FOLDER [KIND]`.
+"""A small random Diffusion Policy, saved by its authors' own code: `python …/tiny.py OUT_FOLDER
+[KIND]`.
 
-KIND is `unet` or `transformer` (a state of 4 numbers), `image` or `hybrid` (one camera and a state of 2), or
-`random_crops`, a hybrid that crops at random while it acts.
+KIND is `unet` or `transformer` (a state of 4 numbers), `image` or `hybrid` (one camera and a state
+of 2), or `random_crops`, a hybrid that crops at random while it acts.
 """
 
 from __future__ import annotations
@@ -20,20 +21,28 @@ HORIZON, OBS_STEPS, ACTION_STEPS, OBS, ACTION, SIDE = 8, 2, 4, 4, 2, 48
 SCHEDULER = {
     "_target_": "diffusers.schedulers.scheduling_ddpm.DDPMScheduler",
     "num_train_timesteps": 5,
-    "beta_schedule": "linear",  # squaredcos_cap_v2 first divides by nearly zero: rounding is amplified
+    # squaredcos_cap_v2 first divides by nearly zero: rounding is amplified.
+    "beta_schedule": "linear",
     "variance_type": "fixed_small",
     "clip_sample": True,
     "prediction_type": "epsilon",
 }
 SHAPES = {
-    "obs": {"image": {"shape": [3, SIDE, SIDE], "type": "rgb"}, "agent_pos": {"shape": [2], "type": "low_dim"}},
+    "obs": {
+        "image": {"shape": [3, SIDE, SIDE], "type": "rgb"},
+        "agent_pos": {"shape": [2], "type": "low_dim"},
+    },
     "action": {"shape": [ACTION]},
 }
 UNET = {"diffusion_step_embed_dim": 16, "down_dims": [16, 32], "kernel_size": 3, "n_groups": 8}
 
 
-def save(folder: Path, kind: str = "unet", *, normalizer: bool = True, use_ema: bool = True) -> Path:
-    """Write `folder`/checkpoints/latest.ckpt as the workspaces of the training do; returns the file."""
+def save(
+    folder: Path, kind: str = "unet", *, normalizer: bool = True, use_ema: bool = True
+) -> Path:
+    """Write `folder`/checkpoints/latest.ckpt as the workspaces of the training do; returns the
+    file.
+    """
     ensure_torchvision()
     use_source("diffusion_policy", "DIFFUSION_POLICY_SRC")
     import hydra
@@ -41,9 +50,12 @@ def save(folder: Path, kind: str = "unet", *, normalizer: bool = True, use_ema: 
     from diffusion_policy.workspace.base_workspace import BaseWorkspace
     from omegaconf import OmegaConf
 
-    torch.set_num_threads(1)  # the models are too small for more: threads would wait for one another
+    # The models are too small for more: threads would wait for one another.
+    torch.set_num_threads(1)
     torch.manual_seed(0)
-    settings = OmegaConf.create({"policy": _policy(kind), "training": {"use_ema": use_ema}, "task": {}})
+    settings = OmegaConf.create(
+        {"policy": _policy(kind), "training": {"use_ema": use_ema}, "task": {}}
+    )
     workspace: Any = BaseWorkspace(settings, output_dir=str(folder))
     workspace.ema_model = hydra.utils.instantiate(settings.policy)
     if normalizer:

@@ -15,7 +15,9 @@ if importlib.util.find_spec("lerobot") is not None:
     from plugins.vlagents_ray_models.tests.families.lerobot.conftest import loaded, made
 
     __all__ = ["loaded", "made"]
-    LEFT_OUT |= dict.fromkeys(("test_gr00t.py", "test_loading.py"), "it is the policy `gr00t`, tried without LeRobot")
+    LEFT_OUT |= dict.fromkeys(
+        ("test_gr00t.py", "test_loading.py"), "it is the policy `gr00t`, tried without LeRobot"
+    )
 else:
     LEFT_OUT |= {"test_groot.py": "it is the policy `lerobot`, tried with LeRobot 0.6"}
 collect_ignore = list(LEFT_OUT)
@@ -42,7 +44,9 @@ def checkpoint(tmp_path_factory: pytest.TempPathFactory, checkout: Path) -> Chec
     """The checkpoint of a kind, written once."""
     from plugins.vlagents_ray_models.tests.families.gr00t import tiny
 
-    return functools.cache(lambda kind: tiny.save(tmp_path_factory.mktemp(kind) / "checkpoint", kind))
+    return functools.cache(
+        lambda kind: tiny.save(tmp_path_factory.mktemp(kind) / "checkpoint", kind)
+    )
 
 
 @pytest.fixture(scope="session")
@@ -52,7 +56,9 @@ def policy_of(checkpoint: Checkpoint, checkout: Path) -> Policy:
 
     @functools.cache
     def load(kind: str, **config: Any) -> Gr00t:
-        policy = Gr00t.from_config({"checkpoint": str(checkpoint(kind)), "source_dir": str(checkout), **config})
+        policy = Gr00t.from_config(
+            {"checkpoint": str(checkpoint(kind)), "source_dir": str(checkout), **config}
+        )
         policy.initialize()
         return policy
 

@@ -58,14 +58,20 @@ def begun(policy: Gr00t, number: int = 0, kind: str = "relative") -> Gr00t:
 class Theirs:
     """A checkpoint in NVIDIA's `Gr00tPolicy`."""
 
-    def __init__(self, folder: Path, robot: str, patch: pytest.MonkeyPatch, dtype: torch.dtype) -> None:
+    def __init__(
+        self, folder: Path, robot: str, patch: pytest.MonkeyPatch, dtype: torch.dtype
+    ) -> None:
         from gr00t.data.embodiment_tags import EmbodimentTag
         from gr00t.policy import gr00t_policy
 
         with built_without_flash_attention():
             self.policy = gr00t_policy.Gr00tPolicy(EmbodimentTag(robot), str(folder), device="cpu")
             if dtype != torch.bfloat16:  # to which the class rounds weights, buffers and inputs
-                model = gr00t_policy.AutoModel.from_pretrained(folder, torch_dtype=dtype).to(dtype).eval()
+                model = (
+                    gr00t_policy.AutoModel.from_pretrained(folder, torch_dtype=dtype)
+                    .to(dtype)
+                    .eval()
+                )
                 model.load_state_dict(load_file(folder / "model.safetensors"), strict=False)
                 self.policy.model = model
                 patch.setattr(gr00t_policy, "_rec_to_dtype", lambda value, **_: value)
@@ -81,7 +87,10 @@ class Theirs:
             state["gripper"] = last.state["gripper_qpos"]
         found, _ = self.policy.get_action(
             {
-                "video": {key: np.stack([one.cameras[ours] for one in frames])[None] for key, ours in cameras.items()},
+                "video": {
+                    key: np.stack([one.cameras[ours] for one in frames])[None]
+                    for key, ours in cameras.items()
+                },
                 "state": {key: state[key][None, None] for key in configs["state"].modality_keys},
                 "language": {configs["language"].modality_keys[0]: [[task]]},
             }
@@ -90,9 +99,13 @@ class Theirs:
 
 
 @pytest.fixture
-def upstream(checkpoint: Checkpoint, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[..., Theirs]]:
+def upstream(
+    checkpoint: Checkpoint, monkeypatch: pytest.MonkeyPatch
+) -> Iterator[Callable[..., Theirs]]:
     state = torch.random.get_rng_state()
-    yield lambda kind, dtype=torch.float32: Theirs(checkpoint(kind), ROBOTS[kind], monkeypatch, dtype)
+    yield lambda kind, dtype=torch.float32: Theirs(
+        checkpoint(kind), ROBOTS[kind], monkeypatch, dtype
+    )
     torch.random.set_rng_state(state)
 
 
@@ -141,26 +154,32 @@ def test_in_bfloat16_its_actions_are_those_of_their_class_as_it_is(
     ours = begun(policy).act(view(0)).action
     with RowDraws([draws_of(0)]):  # torch's own numbers of a seed are others in bfloat16
         wanted = theirs.act([view(0)], "relative", TASKS[0])
-    np.testing.assert_allclose(ours, wanted, atol=0.05)  # of 2, the width of an action's range; its steps are of 2**-8
+    # Of 2, the width of an action's range; its steps are of 2**-8.
+    np.testing.assert_allclose(ours, wanted, atol=0.05)
     other = begun(policy, 3).act(view(3)).action
     assert np.abs(other - wanted).max() > 0.3
 
 
 def test_it_acts_with_pushed_weights(policy_of: Policy) -> None:
     policy = policy_of("relative", seed=1)  # of this test alone
-    assert policy.parameters().keys() == policy.model.model.state_dict().keys()  # those of NVIDIA's trainer
+    # Those of NVIDIA's trainer.
+    assert policy.parameters().keys() == policy.model.model.state_dict().keys()
     check_pushed_weights(policy, lambda: begun(policy).act(view(0)).action)
 
 
 @pytest.mark.verifies("batches")
 @pytest.mark.parametrize("kind", ["relative", "history"])
 def test_a_session_gets_the_same_in_any_company(policy_of: Policy, kind: str) -> None:
-    """Those of other tasks have prompts of other lengths, those of other sizes more tokens of an image."""
+    """Those of other tasks have prompts of other lengths, those of other sizes more tokens of an
+    image.
+    """
     policy = policy_of(kind)
     views = [view(0), view(1), view(2), view(3, size=(48, 120)), view(4), view(5)]
     alone = [begun(policy, number).act(one).action for number, one in enumerate(views)]
     for company in ([1, 0], [2, 3, 4], [5, 4, 3, 2, 1, 0]):
-        acts = policy.act_batch([views[number] for number in company], [begun(policy, number) for number in company])
+        acts = policy.act_batch(
+            [views[number] for number in company], [begun(policy, number) for number in company]
+        )
         for number, act in zip(company, acts, strict=True):
             assert isinstance(act, Act), act
             np.testing.assert_allclose(act.action, alone[number], atol=ATOL)
@@ -174,7 +193,9 @@ def test_rows_share_a_pass_unless_padding_would_change_them(
     policy, found = policy_of(kind), list[int]()
     model = policy.model.model
     act = model.get_action
-    monkeypatch.setattr(model, "get_action", lambda inputs: found.append(len(inputs["state"])) or act(inputs))
+    monkeypatch.setattr(
+        model, "get_action", lambda inputs: found.append(len(inputs["state"])) or act(inputs)
+    )
     sessions = [begun(policy, number) for number in (0, 1, 3, 4, 6)]  # TASKS[0], [1], [0], [1], [0]
     policy.act_batch([view(number) for number in range(5)], sessions)
     assert sorted(found) == ([2, 3] if tiny.N17 else sizes)  # N1.7 attends to padding
@@ -211,13 +232,20 @@ def test_samples_are_draws_of_their_own(policy_of: Policy) -> None:
 
 
 def test_the_checkpoints_metadata_are_the_contract(policy_of: Policy) -> None:
-    relative, libero = policy_of("relative").contract, policy_of("libero", embodiment=tiny.LIBERO).contract
+    relative, libero = (
+        policy_of("relative").contract,
+        policy_of("libero", embodiment=tiny.LIBERO).contract,
+    )
     stated = Trained.from_statistics(policy_of("relative").statistics)
     assert stated.parts == ("arm", "gripper")
     assert stated.state is not None
     assert [len(low) for low in stated.state] == [6, 6]
     assert relative.cameras == {"ego_view": CameraSpec()}
-    assert (relative.state, relative.gripper, relative.instruction) == ({"arm": StateSpec(5)}, True, True)
+    assert (relative.state, relative.gripper, relative.instruction) == (
+        {"arm": StateSpec(5)},
+        True,
+        True,
+    )
     assert relative.action == ActionSpec(dim=6, space="joint", delta=False)
     assert (relative.chunk, relative.history) == (tiny.HORIZON, 1)
     assert set(libero.cameras) == {"front", "wrist"}
@@ -227,28 +255,42 @@ def test_the_checkpoints_metadata_are_the_contract(policy_of: Policy) -> None:
     assert (libero.gripper, libero.action) == (False, ActionSpec(dim=7))
 
 
-def test_parts_of_a_state_with_other_names_are_set(policy_of: Policy, checkpoint: Checkpoint, checkout: Path) -> None:
+def test_parts_of_a_state_with_other_names_are_set(
+    policy_of: Policy, checkpoint: Checkpoint, checkout: Path
+) -> None:
     policy = policy_of("libero", embodiment=tiny.LIBERO)
-    settings = {"checkpoint": str(checkpoint("libero")), "source_dir": str(checkout), "embodiment": tiny.LIBERO}
+    settings = {
+        "checkpoint": str(checkpoint("libero")),
+        "source_dir": str(checkout),
+        "embodiment": tiny.LIBERO,
+    }
     other = Gr00t.from_config({**settings, "state": ["xyz_axis_angle", "gripper_qpos"]})
     other.model = policy.model
     seen = view(0, "libero")
     pose = np.concatenate([seen.state[axis] for axis in ("x", "y", "z", "roll", "pitch", "yaw")])
-    named = Obs(seen.cameras, None, {"xyz_axis_angle": pose, "gripper_qpos": seen.state["gripper_qpos"]})
+    named = Obs(
+        seen.cameras, None, {"xyz_axis_angle": pose, "gripper_qpos": seen.state["gripper_qpos"]}
+    )
     ours = begun(policy, 0, "libero").act(seen).action
     session = copy.copy(other)
     session.reset(named, TASKS[0], seed=0)
     np.testing.assert_allclose(session.act(named).action, ours, atol=ATOL)
 
 
-def test_the_whole_folder_is_the_policys_identity(checkpoint: Checkpoint, checkout: Path, tmp_path: Path) -> None:
-    """Also where the processor's files are in a folder of their own, as the training of N1.7 leaves them."""
+def test_the_whole_folder_is_the_policys_identity(
+    checkpoint: Checkpoint, checkout: Path, tmp_path: Path
+) -> None:
+    """Also where the processor's files are in a folder of their own, as the training of N1.7
+    leaves them.
+    """
     folder = Path(shutil.copytree(checkpoint("relative"), tmp_path / "trained"))
     (folder / "processor").mkdir()
     for name in ("processor_config.json", "statistics.json", "embodiment_id.json"):
         (folder / name).rename(folder / "processor" / name)
     with used_checkpoints() as used:
-        policy = Gr00t.from_config({"checkpoint": str(folder), "source_dir": str(checkout), "steps": 2})
+        policy = Gr00t.from_config(
+            {"checkpoint": str(folder), "source_dir": str(checkout), "steps": 2}
+        )
         policy.initialize()
     assert used == [folder]
     assert policy.model is not None
@@ -259,7 +301,9 @@ def test_the_whole_folder_is_the_policys_identity(checkpoint: Checkpoint, checko
 
 @pytest.mark.parametrize("lengths", [[4, 4, 4], [2, 5, 3]])
 def test_packed_images_do_not_see_each_other(lengths: list[int]) -> None:
-    query, key, value = torch.randn(3, 1, 2, sum(lengths), 8, generator=torch.Generator().manual_seed(0))
+    query, key, value = torch.randn(
+        3, 1, 2, sum(lengths), 8, generator=torch.Generator().manual_seed(0)
+    )
     image = torch.repeat_interleave(torch.arange(3), torch.tensor(lengths))
     wanted = attend(query, key, value, 0.3, image[:, None] == image[None, :]).transpose(1, 2)
     found, _ = packed_attention(None, query, key, value, scaling=0.3, seq_len_list=lengths)

@@ -1,4 +1,6 @@
-"""What of a checkpoint or its settings does not fit is said before anything is served, and none of its code is run."""
+"""What of a checkpoint or its settings does not fit is said before anything is served, and none
+of its code is run.
+"""
 
 from __future__ import annotations
 
@@ -41,7 +43,10 @@ def copied(checkpoint: Checkpoint, tmp_path: Path) -> Path:
         ({}, rf"embodiment: got None, want one of \['{tiny.LIBERO}', 'new_embodiment'\]"),
         ({"embodiment": "ours"}, rf"got 'ours', want one of \['{tiny.LIBERO}', 'new_embodiment'\]"),
         ({"embodiment": tiny.LIBERO, "device": "tpu:1"}, "device 'tpu:1': not here"),
-        ({"embodiment": tiny.LIBERO, "checkpoint_step": 8, "checkpoint": "/nowhere/{step}"}, "no such file"),
+        (
+            {"embodiment": tiny.LIBERO, "checkpoint_step": 8, "checkpoint": "/nowhere/{step}"},
+            "no such file",
+        ),
     ],
 )
 def test_settings_that_do_not_fit_the_checkpoint(
@@ -85,7 +90,11 @@ def tensor(name: str, *, drop: bool) -> Spoil:
 
         saved = load_file(folder / "model.safetensors")
         whole = saved.pop(name)
-        save_file(saved if drop else {**saved, name: whole[:-1]}, folder / "model.safetensors", {"format": "pt"})
+        save_file(
+            saved if drop else {**saved, name: whole[:-1]},
+            folder / "model.safetensors",
+            {"format": "pt"},
+        )
 
     return spoil
 
@@ -100,23 +109,46 @@ MODALITIES = ("processor_config.json", "processor_kwargs", "modality_configs")
     [
         (without("config.json"), r"misses \['config.json'\]"),
         (without("model.safetensors"), r"misses \['\*.safetensors'\]"),
-        (without("processor_config.json"), "has no processor_config.json.*save the checkpoint's processor"),
+        (
+            without("processor_config.json"),
+            "has no processor_config.json.*save the checkpoint's processor",
+        ),
         (without("statistics.json"), "has no statistics.json.*save the checkpoint's processor"),
-        (changed(*STATISTICS, "state", "arm"), r"no \['min', 'max'\] of state 'arm', has those of \['gripper'\]"),
+        (
+            changed(*STATISTICS, "state", "arm"),
+            r"no \['min', 'max'\] of state 'arm', has those of \['gripper'\]",
+        ),
         (changed(*STATISTICS, "action", "arm", "max"), "of action 'arm'.*numbers have no units"),
-        (changed(*STATISTICS, "state", "arm", "min", value=[float("nan")] * 5), "state 'arm' are not all finite"),
+        (
+            changed(*STATISTICS, "state", "arm", "min", value=[float("nan")] * 5),
+            "state 'arm' are not all finite",
+        ),
         (changed(*STATISTICS, "relative_action"), "Relative action statistics"),
         (changed(*STATISTICS), r"want one of \[\]; \['new_embodiment'\] have no statistics"),
         (changed(*MODALITIES, value={}), r"embodiment: got None, want one of \[\]"),
-        (changed(*MODALITIES, "new_embodiment", "action", "delta_indices", value=[*range(9)]), "9 rows.*at most 8"),
-        (changed("config.json", "model_type", value="gr00t_n1_5"), "got model_type 'gr00t_n1_5'.*policy `upstream`"),
-        (changed("config.json", "model_type", value="Gr00tN1d9"), "'Gr00tN1d9'.*name the checkout of its version"),
-        (changed("config.json", "model_type"), "got model_type None.*is served by the policy `lerobot`"),
+        (
+            changed(*MODALITIES, "new_embodiment", "action", "delta_indices", value=[*range(9)]),
+            "9 rows.*at most 8",
+        ),
+        (
+            changed("config.json", "model_type", value="gr00t_n1_5"),
+            "got model_type 'gr00t_n1_5'.*policy `upstream`",
+        ),
+        (
+            changed("config.json", "model_type", value="Gr00tN1d9"),
+            "'Gr00tN1d9'.*name the checkout of its version",
+        ),
+        (
+            changed("config.json", "model_type"),
+            "got model_type None.*is served by the policy `lerobot`",
+        ),
         (tensor("action_head.vlln.weight", drop=True), r"does not fill.*action_head.vlln.weight"),
         (tensor("action_head.vlln.weight", drop=False), "action_head.vlln.weight|size mismatch"),
     ],
 )
-def test_a_checkpoint_that_is_not_whole(copied: Path, checkout: Path, spoil: Spoil, message: str) -> None:
+def test_a_checkpoint_that_is_not_whole(
+    copied: Path, checkout: Path, spoil: Spoil, message: str
+) -> None:
     spoil(copied)
     with pytest.raises(ConfigError, match=message):
         load(copied, checkout)
@@ -127,7 +159,10 @@ def test_a_robot_of_which_the_model_has_no_number(copied: Path, checkout: Path) 
     for name in ("statistics.json", "processor_config.json"):
         text = (copied / name).read_text()
         (copied / name).write_text(text.replace('"new_embodiment"', '"ours"'))
-    with pytest.raises(ConfigError, match=r"embodiment 'ours': has no number in embodiment_id.json, which has .*'new_"):
+    with pytest.raises(
+        ConfigError,
+        match=r"embodiment 'ours': has no number in embodiment_id.json, which has .*'new_",
+    ):
         load(copied, checkout)
 
 
@@ -164,7 +199,9 @@ def evil(folder: Path, *names: str) -> Path:
 @pytest.mark.verifies("loading")
 def test_the_code_of_a_checkpoint_is_not_run(copied: Path, checkout: Path) -> None:
     done = evil(copied, "evil")
-    names = dict.fromkeys(("AutoConfig", "AutoModel", "AutoProcessor", "AutoTokenizer"), "evil.Evil")
+    names = dict.fromkeys(
+        ("AutoConfig", "AutoModel", "AutoProcessor", "AutoTokenizer"), "evil.Evil"
+    )
     changed("config.json", "auto_map", value=names)(copied)
     changed("processor_config.json", "auto_map", value=names)(copied)
     assert load(copied, checkout).model is not None
@@ -176,17 +213,26 @@ def test_the_code_of_a_checkpoint_is_not_run(copied: Path, checkout: Path) -> No
 
 
 @pytest.mark.verifies("loading")
-def test_transformers_imports_the_checkouts_code_and_none_of_the_same_name(checkout: Path, tmp_path: Path) -> None:
-    """As a backbone is imported, whose library says `trust_remote_code=True` of whatever it is given."""
+def test_transformers_imports_the_checkouts_code_and_none_of_the_same_name(
+    checkout: Path, tmp_path: Path
+) -> None:
+    """As a backbone is imported, whose library says `trust_remote_code=True` of whatever it is
+    given.
+    """
     from transformers import AutoConfig
 
     own = checkout / "gr00t/model/family/parts"
     theirs = tmp_path / "parts"
     for folder in (own, theirs):
         folder.mkdir(parents=True)
-        (folder / "config.json").write_text(json.dumps({"auto_map": {"AutoConfig": "settings.Own"}}))
+        (folder / "config.json").write_text(
+            json.dumps({"auto_map": {"AutoConfig": "settings.Own"}})
+        )
     done = evil(theirs, "settings")
-    code = "from transformers import PretrainedConfig\nclass Own(PretrainedConfig):\n    model_type = 'own'\n"
+    code = (
+        "from transformers import PretrainedConfig\nclass Own(PretrainedConfig):\n    "
+        "model_type = 'own'\n"
+    )
     (own / "settings.py").write_text(code)
     with remote_code(allowed=False, source=checkout / "gr00t/model"):
         assert AutoConfig.from_pretrained(own, trust_remote_code=True).model_type == "own"

@@ -1,7 +1,9 @@
 """A small random GR00T, saved by NVIDIA's own code: `python tiny.py OUT_FOLDER [KIND]`.
 
-N1.6's network has the size that a file of the checkout says, so that a copy of the checkout with smaller numbers comes
-first: `checkout`. KIND is `relative` (joints relative to the state), `libero` (two robots, one of them LIBERO's), or
+N1.6's network has the size that a file of the checkout says, so that a copy of the checkout with
+smaller numbers comes
+first: `checkout`. KIND is `relative` (joints relative to the state), `libero` (two robots, one of
+    them LIBERO's), or
 `history` (frames of two moments, and a transformer that attends to padding, as all of N1.7 do).
 """
 
@@ -16,16 +18,30 @@ from typing import Any
 
 import numpy as np
 
-HORIZON, ROWS, WIDTH = 6, 8, 8  # rows of a chunk, rows that the model computes, most numbers of a state or an action
-N17 = (Path(os.environ.get("GR00T_SRC", ".")) / "gr00t/model/gr00t_n1d7").is_dir()  # the checkout's version
+# Rows of a chunk, rows that the model computes, most numbers of a state or an action.
+HORIZON, ROWS, WIDTH = 6, 8, 8
+# The checkout's version.
+N17 = (Path(os.environ.get("GR00T_SRC", ".")) / "gr00t/model/gr00t_n1d7").is_dir()
 LIBERO = "libero_sim" if N17 else "libero_panda"  # its name of that robot
-_SMALL = {"hidden_size": 32, "intermediate_size": 64, "num_hidden_layers": 2, "num_attention_heads": 2}
-_HEAD = {"num_attention_heads": 2, "attention_head_dim": 16, "positional_embeddings": None, "dropout": 0.2}
+_SMALL = {
+    "hidden_size": 32,
+    "intermediate_size": 64,
+    "num_hidden_layers": 2,
+    "num_attention_heads": 2,
+}
+_HEAD = {
+    "num_attention_heads": 2,
+    "attention_head_dim": 16,
+    "positional_embeddings": None,
+    "dropout": 0.2,
+}
 _EAGLE = "gr00t/model/modules/nvidia/Eagle-Block2A-2B-v2"
 
 
 def checkout(folder: Path) -> Path:
-    """Copy the code of the checkout that GR00T_SRC names, with a small backbone, and import from the copy."""
+    """Copy the code of the checkout that GR00T_SRC names, with a small backbone, and import from
+    the copy.
+    """
     from vlagents_ray_models.gr00t import _use_checkout
 
     shutil.copytree(Path(os.environ["GR00T_SRC"]) / "gr00t", folder / "gr00t")
@@ -50,7 +66,8 @@ def save(folder: Path, kind: str = "relative") -> Path:
     [(config_class, pipeline)] = MODEL_REGISTRY.items()
     model_class, processor_class = pipeline.model_class, pipeline.processor_class
     own = {"model_name": _qwen(folder / "nvidia/Cosmos-Reason2-2B")} if N17 else {}
-    over = {"vl_self_attention_cfg": {**_HEAD, "num_layers": 1}} if N17 else {}  # as in the published N1.7
+    # As in the published N1.7.
+    over = {"vl_self_attention_cfg": {**_HEAD, "num_layers": 1}} if N17 else {}
     with built_without_flash_attention(), no_init_weights():
         model = model_class(
             config_class(
@@ -81,7 +98,9 @@ def save(folder: Path, kind: str = "relative") -> Path:
         for name, values in model.named_parameters():
             drawn = torch.randn(values.shape, generator=generator)
             one = values.ndim == 1 and name.endswith("weight")  # of a norm
-            values.copy_(float(one) + 0.1 * drawn if values.ndim == 1 else drawn * _scale(name, values))
+            values.copy_(
+                float(one) + 0.1 * drawn if values.ndim == 1 else drawn * _scale(name, values)
+            )
     model.save_pretrained(folder)
     configs, statistics = _robots(kind)
     processor_class(
@@ -100,7 +119,9 @@ def save(folder: Path, kind: str = "relative") -> Path:
 
 
 def _scale(name: str, values: Any) -> float:
-    """The size of random weights with which a signal keeps its own, and actions stay within their bounds."""
+    """The size of random weights with which a signal keeps its own, and actions stay within
+    their bounds.
+    """
     if name.endswith(("embed_tokens.weight", "position_embedding.weight")):
         return 1.0
     inputs = values.shape[1] if values.ndim == 3 else values[0].numel()
@@ -128,22 +149,41 @@ def _robots(kind: str) -> tuple[dict[str, Any], dict[str, Any]]:
 
     def bounds(*shape: int) -> dict[str, Any]:
         low, width = rng.uniform(-1, 0, shape), rng.uniform(1, 2, shape)
-        found = {"min": low, "max": low + width, "mean": low, "std": width, "q01": low, "q99": low + width}
+        found = {
+            "min": low,
+            "max": low + width,
+            "mean": low,
+            "std": width,
+            "q01": low,
+            "q99": low + width,
+        }
         return {name: value.tolist() for name, value in found.items()}
 
     def config(cameras: list[str], groups: list[str], **action: Any) -> dict[str, Any]:
         return {
-            "video": {"delta_indices": [-2, 0] if kind == "history" else [0], "modality_keys": cameras},
+            "video": {
+                "delta_indices": [-2, 0] if kind == "history" else [0],
+                "modality_keys": cameras,
+            },
             "state": {"delta_indices": [0], "modality_keys": groups},
             "action": {"delta_indices": list(range(HORIZON)), "modality_keys": groups, **action},
-            "language": {"delta_indices": [0], "modality_keys": ["annotation.human.task_description"]},
+            "language": {
+                "delta_indices": [0],
+                "modality_keys": ["annotation.human.task_description"],
+            },
         }
 
-    represented = [{"rep": rep, "type": "NON_EEF", "format": "DEFAULT"} for rep in ("RELATIVE", "ABSOLUTE")]
+    represented = [
+        {"rep": rep, "type": "NON_EEF", "format": "DEFAULT"} for rep in ("RELATIVE", "ABSOLUTE")
+    ]
     groups = {"arm": bounds(5), "gripper": bounds(1)}
     relative = {"arm": bounds(HORIZON, 5)}
-    configs = {"new_embodiment": config(["ego_view"], ["arm", "gripper"], action_configs=represented)}
-    statistics = {"new_embodiment": {"state": groups, "action": groups, "relative_action": relative}}
+    configs = {
+        "new_embodiment": config(["ego_view"], ["arm", "gripper"], action_configs=represented)
+    }
+    statistics = {
+        "new_embodiment": {"state": groups, "action": groups, "relative_action": relative}
+    }
     if kind == "libero":
         axes = ["x", "y", "z", "roll", "pitch", "yaw"]
         configs[LIBERO] = config(["image", "wrist_image"], [*axes, "gripper"])

@@ -1,4 +1,6 @@
-"""Servers for LeRobot's own commands, and how these are run as users type them, with the plug-in of plugins/."""
+"""Servers for LeRobot's own commands, and how these are run as users type them, with the plug-in
+of plugins/.
+"""
 
 from __future__ import annotations
 
@@ -38,7 +40,11 @@ class Server:
         """The options of a command whose policy is here, with the key in a file in `folder`."""
         file = folder / self.key
         file.write_text(f"{self.key}\n")
-        options = ["--policy.type=vlagents", f"--policy.url={self.url}", f"--policy.key_file={file}"]
+        options = [
+            "--policy.type=vlagents",
+            f"--policy.url={self.url}",
+            f"--policy.key_file={file}",
+        ]
         return [*options, "--policy.state=[joints, gripper]"]
 
 
@@ -57,13 +63,17 @@ def serving(policy: Agent) -> Iterator[Server]:
     def describe() -> dict[str, object]:
         return metadata | {"continues_plans": engine.models.continues_plans}
 
-    with served(AccessMiddleware(build_http_app(engine, describe, DEFAULT_LIMITS), known.keys, "app")) as port:
+    with served(
+        AccessMiddleware(build_http_app(engine, describe, DEFAULT_LIMITS), known.keys, "app")
+    ) as port:
         yield Server(f"http://127.0.0.1:{port}", key, engine)
     engine.close()
 
 
 def make_site(folder: Path, scratch: Path) -> str:
-    """The PYTHONPATH on which LeRobot finds the plug-in, built as pip does, and the robot of these tests."""
+    """The PYTHONPATH on which LeRobot finds the plug-in, built as pip does, and the robot of
+    these tests.
+    """
     shutil.copytree(PLUGIN, scratch / "plugin")
     build = [sys.executable, "-c", BUILD, str(folder)]
     subprocess.run(build, cwd=scratch / "plugin", check=True, capture_output=True, timeout=300)
@@ -72,7 +82,9 @@ def make_site(folder: Path, scratch: Path) -> str:
         archive.extractall(folder)
     info = folder / "lerobot_robot_mirror-1.dist-info"
     info.mkdir()
-    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: lerobot_robot_mirror\nVersion: 1\n")
+    (info / "METADATA").write_text(
+        "Metadata-Version: 2.1\nName: lerobot_robot_mirror\nVersion: 1\n"
+    )
     (folder / "rerun.py").touch()  # LeRobot's commands import it, to show what they record
     support = Path(mirror_policy.__file__).parent
     return os.pathsep.join(map(str, (folder, support, ROOT)))

@@ -20,18 +20,22 @@ from vlagents_ray_models.lerobot import LeRobot
 from vlagents_ray_models.lerobot.kinds import LONGEST_PREFIX
 
 torch.set_num_threads(1)  # the models are too small for more: threads would wait for one another
-# LeRobot 0.4 runs pi0 and pi0.5 only with a transformers that has openpi's changes, such as this module.
+# LeRobot 0.4 runs pi0 and pi0.5 only with a transformers that has openpi's changes, such as this
+# module.
 PATCHED = tiny.NEW or importlib.util.find_spec("transformers.models.siglip.check") is not None
 LEFT_OUT: dict[str, str] = {}  # why a file is not run here, for the family's page
 if tiny.NEW:
     of_both = ("adapters", "hilserl", "learning", "pi_recipe", "plugins", "recipe")
     LEFT_OUT |= dict.fromkeys(
-        (f"test_{name}.py" for name in of_both), "the code is that of the other version, with which it is tried"
+        (f"test_{name}.py" for name in of_both),
+        "the code is that of the other version, with which it is tried",
     )
 else:
     LEFT_OUT |= {"test_rollout.py": "LeRobot 0.4 has no lerobot-rollout"}
 if not PATCHED:
-    LEFT_OUT |= dict.fromkeys(("test_pi.py", "test_pi_recipe.py"), "transformers is without openpi's changes")
+    LEFT_OUT |= dict.fromkeys(
+        ("test_pi.py", "test_pi_recipe.py"), "transformers is without openpi's changes"
+    )
 if not hasattr(PI05Config, LONGEST_PREFIX):
     LEFT_OUT["test_prefixes.py"] = "the newest release of LeRobot, 0.6.1, gives π0.5 no prefixes"
 if importlib.util.find_spec("ray") is None:
@@ -81,7 +85,9 @@ def view(seed: int = 0, side: int = tiny.SIDE, **info: Any) -> Obs:
     rng = np.random.default_rng(seed)
     image = rng.integers(0, 256, (side, side, 3), dtype=np.uint8)
     return Obs(
-        cameras={tiny.CAMERA: image}, state={"joints": rng.uniform(-1, 1, tiny.STATE).astype(np.float32)}, info=info
+        cameras={tiny.CAMERA: image},
+        state={"joints": rng.uniform(-1, 1, tiny.STATE).astype(np.float32)},
+        info=info,
     )
 
 

@@ -1,9 +1,11 @@
-"""LeRobot's commands as their console scripts start them, each in a process forked from one that has imported them.
+"""LeRobot's commands as their console scripts start them, each in a process forked from one that
+has imported them.
 
-Importing LeRobot's commands takes ten seconds: `python entry_points.py` does it once for all lines of its input, each
-a command and its options as JSON, and prints the exit status of each. A command's output is in the file NUMBER.log.
-Options have no help, which draccus reads in the sources of all types of policies and robots for three seconds.
-A command's terminal is one on which the simulated robot's operator types.
+Importing LeRobot's commands takes ten seconds: `python entry_points.py` does it once for all lines
+of its input, each a command and its options as JSON, and prints the exit status of each. A
+command's output is in the file NUMBER.log. Options have no help, which draccus reads in the sources
+of all types of policies and robots for three seconds. A command's terminal is one on which the
+simulated robot's operator types.
 """
 
 from __future__ import annotations

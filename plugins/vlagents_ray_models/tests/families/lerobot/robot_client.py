@@ -1,6 +1,8 @@
-"""LeRobot's own asynchronous client with a simulated arm, as a process: `python robot_client.py PORT ACTIONS`.
+"""LeRobot's own asynchronous client with a simulated arm, as a process: `python robot_client.py
+PORT ACTIONS`.
 
-It plays until the arm has performed so many actions, and prints these as JSON. As a module, it is the arm alone.
+It plays until the arm has performed so many actions, and prints these as JSON. As a module, it is
+the arm alone.
 """
 
 from __future__ import annotations
@@ -65,7 +67,8 @@ def main(port: int, actions: int) -> None:
         def configure(self) -> None: ...
         def disconnect(self) -> None: ...
 
-    vars(sys.modules[__name__])["SimulatedArm"] = SimulatedArm  # LeRobot finds it beside its configuration
+    # LeRobot finds it beside its configuration.
+    vars(sys.modules[__name__])["SimulatedArm"] = SimulatedArm
     client = RobotClient(
         RobotClientConfig(
             robot=SimulatedArmConfig(),

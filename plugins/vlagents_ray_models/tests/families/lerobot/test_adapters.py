@@ -1,4 +1,6 @@
-"""LoRA adapters over SmolVLA, chosen by session in one batch, against each one merged into a checkpoint of its own."""
+"""LoRA adapters over SmolVLA, chosen by session in one batch, against each one merged into a
+checkpoint of its own.
+"""
 
 from __future__ import annotations
 
@@ -17,7 +19,14 @@ from lerobot.policies.factory import make_pre_post_processors
 from pushed_weights import check_pushed_weights
 
 from plugins.vlagents_ray_models.tests.families.lerobot import tiny
-from plugins.vlagents_ray_models.tests.families.lerobot.conftest import FILTERS, TASKS, Load, Made, begun, view
+from plugins.vlagents_ray_models.tests.families.lerobot.conftest import (
+    FILTERS,
+    TASKS,
+    Load,
+    Made,
+    begun,
+    view,
+)
 from vlagents_ray import Obs
 from vlagents_ray.contract import ActionSpec, Contract, StateSpec
 from vlagents_ray.dataset_contract import DatasetContract
@@ -28,17 +37,18 @@ from vlagents_ray_models.lerobot import LeRobot
 
 pytestmark = FILTERS
 
-ATOL = 1e-4  # of actions of size 1, which four steps of a flow and the merged sums round differently
+# Of actions of size 1, which four steps of a flow and the merged sums round differently.
+ATOL = 1e-4
 # LeRobot's own targets for SmolVLA, then some of the language model and the cameras' encoder
-TARGETS = (
-    r"model\.vlm_with_expert\.lm_expert\..*\.(q|v)_proj|model\.(state_proj|action_(in|out)_proj|action_time_mlp_\w+)"
-)
+TARGETS = r"model\.vlm_with_expert\.lm_expert\..*\.(q|v)_proj|model\.(state_proj|action_(in|out)_proj|action_time_mlp_\w+)"
 SEEING = r"model\.vlm_with_expert\.vlm\.model\.(text_model|vision_model)\..*\.(q_proj|o_proj|out_proj|down_proj|fc1)"
 
 
 def layers(network: Any, pattern: str) -> list[str]:
     found = [
-        name for name, one in network.named_modules() if type(one) is torch.nn.Linear and re.fullmatch(pattern, name)
+        name
+        for name, one in network.named_modules()
+        if type(one) is torch.nn.Linear and re.fullmatch(pattern, name)
     ]
     assert len(found) > 3
     return found
@@ -46,12 +56,17 @@ def layers(network: Any, pattern: str) -> list[str]:
 
 @pytest.fixture(scope="module")
 def saved(made: Made, loaded: Load, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
-    """Folders of adapters, and under "merged/NAME" of whole checkpoints; "units" has statistics of its own."""
+    """Folders of adapters, and under "merged/NAME" of whole checkpoints; "units" has statistics
+    of its own.
+    """
     root, folders = tmp_path_factory.mktemp("adapters"), {}
     network = loaded("smolvla").model.kind.policy
     kinds = [("expert", TARGETS, 4), ("all", f"{TARGETS}|{SEEING}", 2), ("units", TARGETS, 8)]
     for seed, (name, pattern, rank) in enumerate(kinds):
-        values = {key: 0.3 * value for key, value in pairs(network, layers(network, pattern), rank, seed).items()}
+        values = {
+            key: 0.3 * value
+            for key, value in pairs(network, layers(network, pattern), rank, seed).items()
+        }
         folders[name] = save(root / name, values)
         whole = shutil.copytree(made("smolvla"), root / f"merged-{name}")
         merged = LeRobot.from_config({"checkpoint": str(whole)})
@@ -66,8 +81,12 @@ def saved(made: Made, loaded: Load, tmp_path_factory: pytest.TempPathFactory) ->
 
 
 def write_processors(settings: Any, beside: dict[str, Any], *folders: Path) -> None:
-    """Write the processors of a training on another dataset than the base's, with statistics `beside` its own."""
-    dataset = {key: {k: 2 * v + 0.5 for k, v in one.items()} for key, one in tiny.statistics().items()}
+    """Write the processors of a training on another dataset than the base's, with statistics
+    `beside` its own.
+    """
+    dataset = {
+        key: {k: 2 * v + 0.5 for k, v in one.items()} for key, one in tiny.statistics().items()
+    }
     for pipeline in make_pre_post_processors(settings, dataset_stats=dataset | beside):
         for folder in folders:
             pipeline.save_pretrained(folder)
@@ -116,14 +135,18 @@ def test_each_row_of_one_pass_acts_as_its_adapter_merged_alone(
     adapted: LeRobot, alone: Callable[[str | None], LeRobot]
 ) -> None:
     sessions = [session(adapted, number, name) for number, name in enumerate(CHOSEN)]
-    acts = adapted.act_batch([view(number, **infos(number)) for number in range(len(CHOSEN))], sessions)
+    acts = adapted.act_batch(
+        [view(number, **infos(number)) for number in range(len(CHOSEN))], sessions
+    )
     for number, (name, act) in enumerate(zip(CHOSEN, acts, strict=True)):
         wanted = begun(alone(name), number).act(view(number, **infos(number)))
         assert isinstance(act, Act)
         np.testing.assert_allclose(act.action, wanted.action, atol=ATOL)
         if DISTRIBUTION in wanted.info:
             for part in ("mean", "samples"):
-                np.testing.assert_allclose(act.info[DISTRIBUTION][part], wanted.info[DISTRIBUTION][part], atol=ATOL)
+                np.testing.assert_allclose(
+                    act.info[DISTRIBUTION][part], wanted.info[DISTRIBUTION][part], atol=ATOL
+                )
         if name is not None:
             base = begun(alone(None), number).act(view(number, **infos(number)))
             assert np.abs(base.action - wanted.action).max() > 100 * ATOL
@@ -137,40 +160,67 @@ def test_a_learner_pushes_one_of_them(adapted: LeRobot) -> None:
 
 
 def test_types_without_a_flow_take_no_adapters(made: Made, saved: dict[str, Path]) -> None:
-    policy = LeRobot.from_config({"checkpoint": str(made("act")), "adapters": {"expert": str(saved["expert"])}})
-    with pytest.raises(ConfigError, match=r"adapters: got them for LeRobot's 'act', want one of \['pi0'"):
+    policy = LeRobot.from_config(
+        {"checkpoint": str(made("act")), "adapters": {"expert": str(saved["expert"])}}
+    )
+    with pytest.raises(
+        ConfigError, match=r"adapters: got them for LeRobot's 'act', want one of \['pi0'"
+    ):
         policy.initialize()
 
 
-def test_processors_of_another_kind_are_refused(made: Made, saved: dict[str, Path], tmp_path: Path) -> None:
+def test_processors_of_another_kind_are_refused(
+    made: Made, saved: dict[str, Path], tmp_path: Path
+) -> None:
     folder = shutil.copytree(saved["expert"], tmp_path / "expert")
     file = shutil.copy(made("smolvla") / "policy_preprocessor.json", folder)
     config = {"checkpoint": str(made("smolvla")), "adapters": {"expert": str(folder)}}
-    with pytest.raises(ConfigError, match=r"adapter 'expert': .* misses .*'policy_postprocessor.json'.*, want both"):
+    with pytest.raises(
+        ConfigError, match=r"adapter 'expert': .* misses .*'policy_postprocessor.json'.*, want both"
+    ):
         LeRobot.from_config(config).initialize()
     for other in made("smolvla").glob("policy_*"):
         shutil.copy(other, folder)
     pipeline = json.loads(Path(file).read_text())
-    pipeline["steps"] = [step for step in pipeline["steps"] if step["registry_name"] != "to_batch_processor"]
+    pipeline["steps"] = [
+        step for step in pipeline["steps"] if step["registry_name"] != "to_batch_processor"
+    ]
     Path(file).write_text(json.dumps(pipeline))
-    with pytest.raises(ConfigError, match=r"adapter 'expert': .*other steps than those of the base"):
+    with pytest.raises(
+        ConfigError, match=r"adapter 'expert': .*other steps than those of the base"
+    ):
         LeRobot.from_config(config).initialize()
 
 
 def arm(control_hz: float) -> DatasetContract:
     """The contract of a dataset whose first joint is near a half turn."""
     action = ActionSpec(dim=tiny.ACTION, space="joints", delta=False)
-    contract = Contract(state={"joints": StateSpec(tiny.STATE - 1)}, gripper=True, action=action, control_hz=control_hz)
-    return DatasetContract(contract, ("joints", "gripper"), {"observation.images.top": "front"}, {0: 3.0})
+    contract = Contract(
+        state={"joints": StateSpec(tiny.STATE - 1)},
+        gripper=True,
+        action=action,
+        control_hz=control_hz,
+    )
+    return DatasetContract(
+        contract, ("joints", "gripper"), {"observation.images.top": "front"}, {0: 3.0}
+    )
 
 
 @pytest.fixture(scope="module")
-def stated(saved: dict[str, Path], loaded: Load, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
-    """Folders of the adapter "units" with the contracts of two datasets, and "whole", the first one merged."""
+def stated(
+    saved: dict[str, Path], loaded: Load, tmp_path_factory: pytest.TempPathFactory
+) -> dict[str, Path]:
+    """Folders of the adapter "units" with the contracts of two datasets, and "whole", the first
+    one merged.
+    """
     root, settings = tmp_path_factory.mktemp("stated"), loaded("smolvla").model.kind.policy.config
-    folders = {name: shutil.copytree(saved["units"], root / name) for name in ("ten", "twenty", "again")}
+    folders = {
+        name: shutil.copytree(saved["units"], root / name) for name in ("ten", "twenty", "again")
+    }
     folders["whole"] = shutil.copytree(saved["merged/units"], root / "whole")
-    write_processors(settings, arm(10.0).to_statistics(9), folders["ten"], folders["again"], folders["whole"])
+    write_processors(
+        settings, arm(10.0).to_statistics(9), folders["ten"], folders["again"], folders["whole"]
+    )
     write_processors(settings, arm(20.0).to_statistics(9), folders["twenty"])
     return folders
 
@@ -190,7 +240,8 @@ def test_a_base_that_states_no_dataset_gets_the_contract_of_its_adapters(
     assert alone.contract is not None
     assert alone.contract.gripper
     assert policy.contract == alone.contract
-    joints = np.linspace(-3.1, 3.1, tiny.STATE - 1).astype(np.float32)  # the first one is wrapped to 3.18
+    # The first one is wrapped to 3.18.
+    joints = np.linspace(-3.1, 3.1, tiny.STATE - 1).astype(np.float32)
     seen = Obs({"front": view(0).cameras["top"]}, 0.5, {"joints": joints})
     acts = []
     for one, name in ((policy, "ten"), (alone, None)):
@@ -210,8 +261,18 @@ def test_adapters_of_different_contracts_are_refused(made: Made, stated: dict[st
 @pytest.mark.parametrize(
     ("change", "says"),
     [
-        ({"chunk_size": 7}, r"was trained with {'chunk_size': 7}, the base with {'chunk_size': 8}, want the same"),
-        ({"input_features": {"observation.images.side": {"type": "VISUAL", "shape": [3, 64, 64]}}}, "cameras.*side"),
+        (
+            {"chunk_size": 7},
+            r"was trained with {'chunk_size': 7}, the base with {'chunk_size': 8}, want the same",
+        ),
+        (
+            {
+                "input_features": {
+                    "observation.images.side": {"type": "VISUAL", "shape": [3, 64, 64]}
+                }
+            },
+            "cameras.*side",
+        ),
         ({"input_features": [3]}, "is no config of a LeRobot policy"),
     ],
 )
@@ -233,8 +294,14 @@ def test_an_adapter_whose_instructions_were_other_tokens_is_refused(
     folder = shutil.copytree(saved["units"], tmp_path / "units")
     file = folder / "policy_preprocessor.json"
     pipeline = json.loads(file.read_text())
-    [tokens] = [step["config"] for step in pipeline["steps"] if step["registry_name"] == "tokenizer_processor"]
+    [tokens] = [
+        step["config"]
+        for step in pipeline["steps"]
+        if step["registry_name"] == "tokenizer_processor"
+    ]
     tokens["max_length"] += 1
     file.write_text(json.dumps(pipeline))
-    with pytest.raises(ConfigError, match=r"adapter 'units': .*other settings of \['tokenizer_processor'\]"):
+    with pytest.raises(
+        ConfigError, match=r"adapter 'units': .*other settings of \['tokenizer_processor'\]"
+    ):
         served(made("smolvla"), {"units": folder})

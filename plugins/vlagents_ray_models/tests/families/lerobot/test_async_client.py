@@ -1,4 +1,6 @@
-"""LeRobot's own asynchronous client, in a process of its own, drives an arm by a policy behind our gateway."""
+"""LeRobot's own asynchronous client, in a process of its own, drives an arm by a policy behind
+our gateway.
+"""
 
 from __future__ import annotations
 
@@ -30,7 +32,9 @@ ACTIONS = 20
 def test_it_performs_the_policys_actions(loaded: Load, made: Made, tmp_path: Path) -> None:
     replicas = Replicas([LeRobot.from_config({"checkpoint": str(made("act"))})])
     cls, port, contract = dialect_class("lerobot"), free_port(), loaded("act").contract
-    context = GatewayContext("app", lambda *_: replicas.agent(), Limits(), 4, 60.0, contract, NoKey.OPEN)
+    context = GatewayContext(
+        "app", lambda *_: replicas.agent(), Limits(), 4, 60.0, contract, NoKey.OPEN
+    )
     dialect = cls("lerobot", cls.Config(port=port, checkpoint="me/tiny"), context)
     dialect.serve(reserve("lerobot", "127.0.0.1", port))
     try:
@@ -47,7 +51,9 @@ def test_it_performs_the_policys_actions(loaded: Load, made: Made, tmp_path: Pat
 
 
 def expected(policy: LeRobot) -> np.ndarray:
-    """The arm's actions: all rows of each chunk but the first of later ones, whose number the client has performed."""
+    """The arm's actions: all rows of each chunk but the first of later ones, whose number the
+    client has performed.
+    """
     session, joints, rows = begun(policy), np.zeros(6, np.float32), list[np.ndarray]()
     while len(rows) < ACTIONS:
         obs = Obs(cameras={robot_client.CAMERA: robot_client.image()}, state={"joints": joints})

@@ -40,9 +40,9 @@ def counted(policy: LeRobot, **info: Any) -> TorchCalls:
     return calls
 
 
-# The waits beside that for the actions are LeRobot's: ACT makes its latent on the CPU, DDPM draws the noise of each
-# step but the last there, SmolVLA's processor copies three tensors of tokens. Calls are of tiny networks: with a tenth
-# more than measured, something was added.
+# The waits beside that for the actions are LeRobot's: ACT makes its latent on the CPU, DDPM draws
+# the noise of each step but the last there, SmolVLA's processor copies three tensors of tokens.
+# Calls are of tiny networks: with a tenth more than measured, something was added.
 @pytest.mark.skipif(bool(tiny.NEW), reason="the counts are those of LeRobot 0.4")
 @pytest.mark.parametrize(
     ("kind", "info", "waits", "most"),

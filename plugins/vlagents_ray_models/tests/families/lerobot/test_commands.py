@@ -1,4 +1,6 @@
-"""LeRobot's own commands, as users type them, with the plug-in of plugins/ and a policy on a server."""
+"""LeRobot's own commands, as users type them, with the plug-in of plugins/ and a policy on a
+server.
+"""
 
 from __future__ import annotations
 
@@ -23,7 +25,12 @@ from lerobot_policy_vlagents.configuration_vlagents import VlagentsConfig
 from lerobot_policy_vlagents.modeling_vlagents import VlagentsPolicy
 from lerobot_policy_vlagents.observations import ObservationMapping
 from plugins.vlagents_ray_models.tests.families.lerobot import tiny
-from plugins.vlagents_ray_models.tests.families.lerobot.commands import Server, make_site, run, serving
+from plugins.vlagents_ray_models.tests.families.lerobot.commands import (
+    Server,
+    make_site,
+    run,
+    serving,
+)
 from vlagents_ray.contract import differences
 from vlagents_ray.errors import ConfigError, ContractMismatch
 from vlagents_ray_learn.open_loop.recorded_dataset import Names, RecordedDataset
@@ -54,23 +61,55 @@ def ended(server: Server, tmp_path_factory: pytest.TempPathFactory) -> dict[str,
     folder = tmp_path_factory.mktemp("commands")
     policy = server.options(folder)
     robot = ["lerobot-record", "--robot.type=mirror", *policy, "--dataset.repo_id=me/eval_mirror"]
-    robot += [f"--dataset.single_task={TASK}", "--dataset.num_episodes=2", "--dataset.episode_time_s=0.5"]
-    robot += ["--dataset.reset_time_s=0", "--dataset.push_to_hub=false", "--dataset.vcodec=h264", "--play_sounds=false"]
-    env = ["lerobot-eval", "--env.discover_packages_path=lerobot_env_mirror", "--env.type=mirror", *policy]
+    robot += [
+        f"--dataset.single_task={TASK}",
+        "--dataset.num_episodes=2",
+        "--dataset.episode_time_s=0.5",
+    ]
+    robot += [
+        "--dataset.reset_time_s=0",
+        "--dataset.push_to_hub=false",
+        "--dataset.vcodec=h264",
+        "--play_sounds=false",
+    ]
+    env = [
+        "lerobot-eval",
+        "--env.discover_packages_path=lerobot_env_mirror",
+        "--env.type=mirror",
+        *policy,
+    ]
     commands = {
-        "record": [*robot, "--dataset.fps=20", f"--dataset.root={folder / 'recorded'}", "--policy.seed=7"],
-        "refused": [*robot, "--dataset.fps=30", f"--dataset.root={folder / 'refused'}", "--robot.camera=side"],
-        "eval": [
-            *env, "--eval.batch_size=2", "--eval.n_episodes=4", f"--output_dir={folder / 'evaluated'}",
-            f"--policy.instruction={INSTRUCTION}", "--policy.rank=simulation",
+        "record": [
+            *robot,
+            "--dataset.fps=20",
+            f"--dataset.root={folder / 'recorded'}",
+            "--policy.seed=7",
         ],
-    }  # fmt: skip
-    if tiny.NEW:  # its lerobot-record takes no policy; a process for each environment would import LeRobot again
+        "refused": [
+            *robot,
+            "--dataset.fps=30",
+            f"--dataset.root={folder / 'refused'}",
+            "--robot.camera=side",
+        ],
+        "eval": [
+            *env,
+            "--eval.batch_size=2",
+            "--eval.n_episodes=4",
+            f"--output_dir={folder / 'evaluated'}",
+            f"--policy.instruction={INSTRUCTION}",
+            "--policy.rank=simulation",
+        ],
+    }
+    # Its lerobot-record takes no policy; a process for each environment would import LeRobot again.
+    if tiny.NEW:
         commands = {"eval": [*commands["eval"], "--eval.use_async_envs=false"]}
     MirrorPolicy.begun.clear()
     site = make_site(tmp_path_factory.mktemp("site"), tmp_path_factory.mktemp("source"))
     found = run(list(commands.values()), site, folder)
-    return {name: Ended(*each, folder, list(MirrorPolicy.begun)) for name, each in zip(commands, found, strict=True)}
+    return {
+        name: Ended(*each, folder, list(MirrorPolicy.begun))
+        for name, each in zip(commands, found, strict=True)
+    }
 
 
 @BY_RECORD
@@ -85,8 +124,11 @@ def test_lerobot_record_records_the_actions_of_the_servers_policy(ended: dict[st
     images = count(1)
     for session in sessions:
         chunk = np.zeros((0, 3), np.float32)
-        for step in dataset.steps(session.episodes[0], Names(state=["joints", "gripper"]), CONTRACT):
-            colour = colour_of(next(images))  # of the robot's image, which the video has only nearly
+        for step in dataset.steps(
+            session.episodes[0], Names(state=["joints", "gripper"]), CONTRACT
+        ):
+            # Of the robot's image, which the video has only nearly.
+            colour = colour_of(next(images))
             if step.frame % ROWS == 0:
                 state = np.array([*step.obs.state["joints"], step.obs.gripper], np.float32)
                 chunk = mirrored(state, colour, step.frame // ROWS + 1, TASK)
@@ -99,7 +141,8 @@ def test_lerobot_eval_gives_each_environment_a_session_of_its_own(ended: dict[st
     assert done.status == 0, done.log
     assert done.begun[-4:] == [(INSTRUCTION, None)] * 4
     [task] = json.loads((done.folder / "evaluated/eval_info.json").read_text())["per_task"]
-    assert task["metrics"]["sum_rewards"] == [STEPS] * 4  # the environment rewards the actions of its own session
+    # The environment rewards the actions of its own session.
+    assert task["metrics"]["sum_rewards"] == [STEPS] * 4
 
 
 @BY_RECORD
@@ -112,7 +155,9 @@ def test_a_command_refuses_what_does_not_fit_before_it_moves(ended: dict[str, En
 
 
 def batch(*rows: int) -> dict[str, Any]:
-    """Observations as LeRobot's commands hand them to a policy, each of another colour and state."""
+    """Observations as LeRobot's commands hand them to a policy, each of another colour and
+    state.
+    """
     frames = [
         prepare_observation_for_inference(
             {
@@ -123,7 +168,11 @@ def batch(*rows: int) -> dict[str, Any]:
         )
         for row in rows
     ]
-    joined = {key: torch.cat([one[key] for one in frames]) for key in frames[0] if key.startswith("observation")}
+    joined = {
+        key: torch.cat([one[key] for one in frames])
+        for key in frames[0]
+        if key.startswith("observation")
+    }
     return joined | {"task": [TASK] * len(rows)}
 
 
@@ -150,7 +199,9 @@ def key(server: Server, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("VLAGENTS_RAY_API_KEY", server.key)
 
 
-def test_each_row_of_a_batch_is_a_session_until_there_is_another_number(policy: Callable[..., VlagentsPolicy]) -> None:
+def test_each_row_of_a_batch_is_a_session_until_there_is_another_number(
+    policy: Callable[..., VlagentsPolicy],
+) -> None:
     made = policy()
     first, second = made.select_action(batch(3, 200)), made.select_action(batch(9, 9))
     np.testing.assert_array_equal(torch.stack([first, second], dim=1), [expected(3), expected(200)])
@@ -166,15 +217,21 @@ def test_an_episode_begins_after_a_reset_and_every_action_wants_an_observation_i
     for acts in (1, 2):
         np.testing.assert_array_equal(made.select_action(batch(8))[0], expected(8, acts)[0])
     made.reset()
-    np.testing.assert_array_equal(made.predict_action_chunk(batch(8, 7)), [expected(8), expected(7)])
+    np.testing.assert_array_equal(
+        made.predict_action_chunk(batch(8, 7)), [expected(8), expected(7)]
+    )
     assert MirrorPolicy.begun == [(TASK, 3), (TASK, 4), (TASK, 5)]
 
 
-def test_threads_that_share_a_policy_have_sessions_of_their_own(policy: Callable[..., VlagentsPolicy]) -> None:
+def test_threads_that_share_a_policy_have_sessions_of_their_own(
+    policy: Callable[..., VlagentsPolicy],
+) -> None:
     made = policy()
     made.select_action(batch(1))
     with ThreadPoolExecutor(1) as another:
-        np.testing.assert_array_equal(another.submit(made.select_action, batch(2)).result()[0], expected(2)[0])
+        np.testing.assert_array_equal(
+            another.submit(made.select_action, batch(2)).result()[0], expected(2)[0]
+        )
     np.testing.assert_array_equal(made.select_action(batch(2))[0], expected(1)[1])
 
 
@@ -187,7 +244,8 @@ def test_images_are_sent_as_the_bytes_that_the_camera_gave_and_states_by_their_n
     config, names = VlagentsConfig(cameras={"top": "left"}), ["gripper", "joints_0", "joints_1"]
     mapping = ObservationMapping(config, CONTRACT, shapes, names)
     obs = mapping.observation(prepare_observation_for_inference(frame, torch.device("cpu")), 0)
-    assert (list(obs.cameras), mapping.unused) == (["top"], ["top"])  # the robot's own camera of that name is not sent
+    # The robot's own camera of that name is not sent.
+    assert (list(obs.cameras), mapping.unused) == (["top"], ["top"])
     np.testing.assert_array_equal(obs.cameras["top"], image)
     np.testing.assert_array_equal(obs.state["joints"], np.array([0.25, 0.5], np.float32))
     assert obs.gripper == 0.0
@@ -234,7 +292,8 @@ def test_other_actions_a_missing_task_and_training_are_refused(
 
 def test_a_policy_without_features_learns_them_from_the_first_observation(server: Server) -> None:
     config = VlagentsConfig(url=server.url, state=["joints", "gripper"])
-    made = VlagentsPolicy.from_pretrained(None, config=config, revision=None)  # as lerobot-rollout of LeRobot 0.6 does
+    # As lerobot-rollout of LeRobot 0.6 does.
+    made = VlagentsPolicy.from_pretrained(None, config=config, revision=None)
     np.testing.assert_array_equal(made.select_action(batch(5))[0], expected(5)[0])
     made.reset()
     with pytest.raises(ContractMismatch, match="camera 'top': the policy needs it"):
@@ -246,7 +305,10 @@ class Trained(MirrorPolicy):
 
     def __init__(self, part: str, low: float, high: float) -> None:
         super().__init__()
-        self.statistics = {"parts": ["joints", "gripper"], part: {"min": [low] * 3, "max": [high] * 3}}
+        self.statistics = {
+            "parts": ["joints", "gripper"],
+            part: {"min": [low] * 3, "max": [high] * 3},
+        }
 
 
 @pytest.mark.parametrize(
@@ -264,7 +326,9 @@ def test_a_robot_outside_of_the_training_is_found_before_the_first_motion(
         monkeypatch.setenv("VLAGENTS_RAY_API_KEY", server.key)
 
         def act(**options: Any) -> None:
-            config = VlagentsConfig(url=server.url, state=["joints", "gripper"], connect_timeout_s=20, **options)
+            config = VlagentsConfig(
+                url=server.url, state=["joints", "gripper"], connect_timeout_s=20, **options
+            )
             make_policy(config, env_cfg=MirrorEnvConfig()).select_action(batch(9))
 
         if said is None:

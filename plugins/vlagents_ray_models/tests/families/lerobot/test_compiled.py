@@ -11,7 +11,13 @@ from counting_compiler import counting_compiler
 from pushed_weights import check_pushed_weights
 
 from plugins.vlagents_ray_models.tests.families.lerobot import tiny
-from plugins.vlagents_ray_models.tests.families.lerobot.conftest import FILTERS, Load, Made, begun, view
+from plugins.vlagents_ray_models.tests.families.lerobot.conftest import (
+    FILTERS,
+    Load,
+    Made,
+    begun,
+    view,
+)
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.interface import BEHAVIOUR, DELAY, DISTRIBUTION, LEFTOVER, SAMPLES, WANT, Act, Obs
 from vlagents_ray_models.lerobot import LeRobot
@@ -31,15 +37,23 @@ def programs() -> Iterator[list[int]]:
 
 
 @pytest.fixture(scope="module", params=KINDS)
-def both(request: pytest.FixtureRequest, loaded: Load, made: Made, programs: list[int]) -> tuple[LeRobot, LeRobot]:
+def both(
+    request: pytest.FixtureRequest, loaded: Load, made: Made, programs: list[int]
+) -> tuple[LeRobot, LeRobot]:
     """A policy, and the same one compiled."""
     before = len(programs)
     settings: dict[str, Any] = {"noise_level": 0.5} if request.param == "smolvla" else {}
     compiled = LeRobot.from_config(
-        {"checkpoint": str(made(request.param)), "compile": "require", "batch_sizes": [SIZE], **settings}
+        {
+            "checkpoint": str(made(request.param)),
+            "compile": "require",
+            "batch_sizes": [SIZE],
+            **settings,
+        }
     )
     compiled.initialize()
-    assert programs[before:] == [SIZE] * (1 if request.param == "act" else 2)  # what is seen, and a step from noise
+    # What is seen, and a step from noise.
+    assert programs[before:] == [SIZE] * (1 if request.param == "act" else 2)
     return loaded(request.param, **settings), compiled
 
 
@@ -49,7 +63,9 @@ def acts(policy: LeRobot, views: list[Obs]) -> list[Act]:
     return found  # type: ignore[return-value]
 
 
-def test_batches_of_any_size_are_those_without_compilation(both: tuple[LeRobot, LeRobot], programs: list[int]) -> None:
+def test_batches_of_any_size_are_those_without_compilation(
+    both: tuple[LeRobot, LeRobot], programs: list[int]
+) -> None:
     before = len(programs)
     for size in (1, 2, SIZE, SIZE + 1):
         plain, compiled = (acts(policy, [view(i) for i in range(size)]) for policy in both)
@@ -64,12 +80,19 @@ def test_plans_samples_and_random_steps_are_those_without_compilation(
     before = len(programs)
     plan = np.ones((6, tiny.ACTION), np.float32)
     flow = both[0].contract.behaviour is not None
-    views = [view(0, **{LEFTOVER: plan, DELAY: 2}), view(1, **({SAMPLES: 2, WANT: ["logprob"]} if flow else {}))]
+    views = [
+        view(0, **{LEFTOVER: plan, DELAY: 2}),
+        view(1, **({SAMPLES: 2, WANT: ["logprob"]} if flow else {})),
+    ]
     for one, other in zip(*(acts(policy, views) for policy in both), strict=True):
         np.testing.assert_allclose(one.action, other.action, atol=ATOL)
         if DISTRIBUTION in one.info:
-            np.testing.assert_allclose(*(act.info[DISTRIBUTION]["samples"] for act in (one, other)), atol=ATOL)
-            np.testing.assert_allclose(*(act.info[BEHAVIOUR]["logprob"] for act in (one, other)), atol=2e-3)
+            np.testing.assert_allclose(
+                *(act.info[DISTRIBUTION]["samples"] for act in (one, other)), atol=ATOL
+            )
+            np.testing.assert_allclose(
+                *(act.info[BEHAVIOUR]["logprob"] for act in (one, other)), atol=2e-3
+            )
     assert len(programs) == before
 
 
@@ -83,9 +106,14 @@ def test_it_acts_with_pushed_weights(both: tuple[LeRobot, LeRobot], programs: li
 @pytest.mark.parametrize("kind", ["diffusion", "smolvla"])
 def test_lerobots_own_compilation_is_refused_where_ours_replaces_it(kind: str, made: Made) -> None:
     with pytest.raises(ConfigError, match="got compile_model, want `compile: true`"):
-        LeRobot.from_config({"checkpoint": str(made(kind)), "overrides": {"compile_model": True}}).initialize()
+        LeRobot.from_config(
+            {"checkpoint": str(made(kind)), "overrides": {"compile_model": True}}
+        ).initialize()
 
 
 def test_a_type_without_cores_is_refused(made: Made) -> None:
-    with pytest.raises(ConfigError, match=r"compile: not for LeRobot's 'vqbet'; leave it out, .*compile_model: true"):
+    with pytest.raises(
+        ConfigError,
+        match=r"compile: not for LeRobot's 'vqbet'; leave it out, .*compile_model: true",
+    ):
         LeRobot.from_config({"checkpoint": str(made("vqbet")), "compile": True}).initialize()

@@ -1,4 +1,6 @@
-"""LeRobot's HIL-SERL: its learner trains a policy on a server, from episodes of our control loop and our recordings."""
+"""LeRobot's HIL-SERL: its learner trains a policy on a server, from episodes of our control loop
+and our recordings.
+"""
 
 from __future__ import annotations
 
@@ -48,28 +50,53 @@ INPUTS = ["observation.state"]
 
 def config(folder: Path, port: int, dataset: Path) -> Path:
     """The configuration of a learner, as its users write it."""
-    features = {"action": {"type": "ACTION", "shape": [ACTION]}, INPUTS[0]: {"type": "STATE", "shape": [STATE]}}
+    features = {
+        "action": {"type": "ACTION", "shape": [ACTION]},
+        INPUTS[0]: {"type": "STATE", "shape": [STATE]},
+    }
     statistics = {
         INPUTS[0]: {"min": [-1.0] * STATE, "max": [1.0] * STATE},
         "action": {"min": [-1.0] * ACTION, "max": [1.0] * ACTION},
     }
     policy = {
-        "type": "sac", "device": "cpu", "storage_device": "cpu", "use_torch_compile": False, "push_to_hub": False,
-        "num_discrete_actions": 3, "latent_dim": 8, "state_encoder_hidden_dim": 8,
-        "online_buffer_capacity": 200, "offline_buffer_capacity": 200,
-        "online_step_before_learning": 6, "input_features": {INPUTS[0]: features[INPUTS[0]]},
-        "output_features": {"action": features["action"]}, "dataset_stats": statistics,
+        "type": "sac",
+        "device": "cpu",
+        "storage_device": "cpu",
+        "use_torch_compile": False,
+        "push_to_hub": False,
+        "num_discrete_actions": 3,
+        "latent_dim": 8,
+        "state_encoder_hidden_dim": 8,
+        "online_buffer_capacity": 200,
+        "offline_buffer_capacity": 200,
+        "online_step_before_learning": 6,
+        "input_features": {INPUTS[0]: features[INPUTS[0]]},
+        "output_features": {"action": features["action"]},
+        "dataset_stats": statistics,
         "actor_learner_config": {
-            "learner_host": "127.0.0.1", "learner_port": port, "policy_parameters_push_frequency": 1,
+            "learner_host": "127.0.0.1",
+            "learner_port": port,
+            "policy_parameters_push_frequency": 1,
             "queue_get_timeout": 0.1,
         },
-    }  # fmt: skip
-    env = {"type": "gym_manipulator", "fps": HZ, "features": features, "features_map": {key: key for key in features}}
+    }
+    env = {
+        "type": "gym_manipulator",
+        "fps": HZ,
+        "features": features,
+        "features_map": {key: key for key in features},
+    }
     whole = {
-        "policy": policy, "env": env, "dataset": {"repo_id": "me/corrections", "root": str(dataset)},
-        "output_dir": str(folder / "learner"), "job_name": "learner", "batch_size": 8, "log_freq": 1,
-        "save_checkpoint": False, "wandb": {"enable": False},
-    }  # fmt: skip
+        "policy": policy,
+        "env": env,
+        "dataset": {"repo_id": "me/corrections", "root": str(dataset)},
+        "output_dir": str(folder / "learner"),
+        "job_name": "learner",
+        "batch_size": 8,
+        "log_freq": 1,
+        "save_checkpoint": False,
+        "wandb": {"enable": False},
+    }
     (folder / "train.json").write_text(json.dumps(whole))
     return folder / "train.json"
 
@@ -89,8 +116,12 @@ def record(root: Path) -> Path:
 @pytest.fixture
 def policy(tmp_path: Path) -> LeRobot:
     """The policy that a configuration describes."""
-    write_checkpoint(config(tmp_path, free_port(), tmp_path / "corrections"), tmp_path / "checkpoint")
-    return LeRobot.from_config({"checkpoint": str(tmp_path / "checkpoint"), "state": ["joints", "gripper"]})
+    write_checkpoint(
+        config(tmp_path, free_port(), tmp_path / "corrections"), tmp_path / "checkpoint"
+    )
+    return LeRobot.from_config(
+        {"checkpoint": str(tmp_path / "checkpoint"), "state": ["joints", "gripper"]}
+    )
 
 
 @pytest.fixture
@@ -103,7 +134,9 @@ def play(server: Server, actor: Any, wants: ScriptedLeader | None = None) -> Non
     """Run one episode of the control loop, with the newest weights."""
     agent = RemoteAgent(server.url, api_key=server.key)
     guard = Guard(agent.contract, low=-10.0, high=10.0)
-    player = ChunkPlayer(agent, PlayerSettings(mode="open_loop", safe="hold"), check=guard, override=wants)
+    player = ChunkPlayer(
+        agent, PlayerSettings(mode="open_loop", safe="hold"), check=guard, override=wants
+    )
     with player:
         options, robot = {"weights": "follow"}, SimulatedRobot(agent.contract)
         run_loop(robot, player, hz=HZ, seconds=FRAMES / HZ, reset_options=options, recorder=actor)
@@ -126,8 +159,14 @@ class Learner:
 
     def __init__(self, folder: Path) -> None:
         self.ended = threading.Event()
-        self.parameters, self.transitions, self.reports = Queue[bytes](), Queue[bytes](), Queue[bytes]()
-        service = LearnerService(self.ended, self.parameters, 0.0, self.transitions, self.reports, 0.01)
+        self.parameters, self.transitions, self.reports = (
+            Queue[bytes](),
+            Queue[bytes](),
+            Queue[bytes](),
+        )
+        service = LearnerService(
+            self.ended, self.parameters, 0.0, self.transitions, self.reports, 0.01
+        )
         self.server = grpc.server(ThreadPoolExecutor(3))
         services_pb2_grpc.add_LearnerServiceServicer_to_server(service, self.server)
         self.config = config(folder, self.server.add_insecure_port("127.0.0.1:0"), folder)
@@ -185,18 +224,34 @@ def test_an_operators_actions_reach_the_learner_unless_discarded(
     led = [bool(one["complementary_info"]["is_intervention"]) for one in sent]
     assert led == sorted(led)
     assert any(led)
-    assert all(torch.equal(one["action"][0], torch.from_numpy(COMMAND)) for one in sent[led.index(True) :])
+    assert all(
+        torch.equal(one["action"][0], torch.from_numpy(COMMAND)) for one in sent[led.index(True) :]
+    )
 
 
 def test_a_label_is_the_reward_and_ends_the_episode() -> None:
-    frames = [(Obs({"top": np.full((4, 6, 3), 51, np.uint8)}, 0.5, {"joints": np.full(2, i, np.float32)}),
-               np.ones(2, np.float32), i == 1) for i in range(3)]  # fmt: skip
+    frames = [
+        (
+            Obs(
+                {"top": np.full((4, 6, 3), 51, np.uint8)},
+                0.5,
+                {"joints": np.full(2, i, np.float32)},
+            ),
+            np.ones(2, np.float32),
+            i == 1,
+        )
+        for i in range(3)
+    ]
     inputs = {"observation.state": (3,), "observation.images.top": (3, 4, 6)}
     for label, reward, done in (("success", 1.0, True), ("failure", 0.0, True), (None, 0.0, False)):
         *_, last = found = transitions(frames, label, inputs)  # type: ignore[arg-type]
         assert [one["reward"] for one in found] == [0.0, 0.0, reward]
         assert (last["done"], last["truncated"]) == (done, not done)
-        assert [one["complementary_info"]["is_intervention"] for one in found] == [False, True, False]
+        assert [one["complementary_info"]["is_intervention"] for one in found] == [
+            False,
+            True,
+            False,
+        ]
     assert found[0]["next_state"]["observation.state"].tolist() == [[1, 1, 0.5]]
     assert found[0]["state"]["observation.images.top"].shape == (1, 3, 4, 6)
     assert float(found[0]["state"]["observation.images.top"].max()) == pytest.approx(0.2)
@@ -204,9 +259,13 @@ def test_a_label_is_the_reward_and_ends_the_episode() -> None:
         transitions(frames, None, inputs | {"observation.images.wrist": (3, 4, 6)})
 
 
-def test_what_goes_wrong_is_raised_where_the_caller_sees_it(server: Server, learner: Learner, tmp_path: Path) -> None:
+def test_what_goes_wrong_is_raised_where_the_caller_sees_it(
+    server: Server, learner: Learner, tmp_path: Path
+) -> None:
     with pytest.raises(PolicyUnavailable, match=r"no learner at .*python -m lerobot\.rl\.learner"):
-        Actor(config(tmp_path, free_port(), tmp_path), Publisher(server.engine), connect_timeout_s=0.3)
+        Actor(
+            config(tmp_path, free_port(), tmp_path), Publisher(server.engine), connect_timeout_s=0.3
+        )
     actor = Actor(learner.config, Publisher(server.engine))
     learner.parameters.put(state_to_bytes({"policy": {"encoder.unknown": torch.zeros(1)}}))
     wait_for(lambda: actor._error is not None)
@@ -224,8 +283,11 @@ def test_lerobots_learner_trains_the_served_policy_on_recorded_and_new_correctio
     with log.open("w") as out:
         process = subprocess.Popen(
             [sys.executable, "-m", "lerobot.rl.learner", f"--config_path={file}"],
-            stdout=out, stderr=subprocess.STDOUT, cwd=tmp_path, env=os.environ | {"HF_HUB_OFFLINE": "1"},
-        )  # fmt: skip
+            stdout=out,
+            stderr=subprocess.STDOUT,
+            cwd=tmp_path,
+            env=os.environ | {"HF_HUB_OFFLINE": "1"},
+        )
     weights = Pushes(server.engine)
     try:
         with Actor(file, weights, connect_timeout_s=240) as actor:

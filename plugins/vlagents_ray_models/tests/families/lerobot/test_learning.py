@@ -11,7 +11,13 @@ from normal_steps import logprob_of_steps
 from shared_readings import check_shared_readings
 
 from plugins.vlagents_ray_models.tests.families.lerobot import tiny
-from plugins.vlagents_ray_models.tests.families.lerobot.conftest import FILTERS, Load, Made, begun, view
+from plugins.vlagents_ray_models.tests.families.lerobot.conftest import (
+    FILTERS,
+    Load,
+    Made,
+    begun,
+    view,
+)
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.interface import BEHAVIOUR, DISTRIBUTION, SAMPLES, WANT, Act
 from vlagents_ray.policies.base import Row
@@ -37,7 +43,9 @@ def velocity(policy: LeRobot, number: int, noisy: Any, time: float) -> Any:
     batch = network._prepare_batch(policy.model.processors.observe([row], 1))
     images, masks = network.prepare_images(batch)
     words = [batch[f"observation.language.{name}"] for name in ("tokens", "attention_mask")]
-    hook = network.model.action_out_proj.register_forward_hook(lambda _module, _inputs, output: seen.append(output))
+    hook = network.model.action_out_proj.register_forward_hook(
+        lambda _module, _inputs, output: seen.append(output)
+    )
     try:
         with torch.no_grad():  # noise and actions are the same, and so is what is between them
             state, times = network.prepare_state(batch), torch.tensor([time])
@@ -81,7 +89,9 @@ def test_neighbours_change_neither_what_is_drawn_nor_what_is_not(learnt: LeRobot
         alone = begun(learnt, number).act(views[number])
         np.testing.assert_allclose(act.action, alone.action, atol=ATOL)
         if BEHAVIOUR in alone.info:
-            np.testing.assert_allclose(act.info[BEHAVIOUR]["logprob"], alone.info[BEHAVIOUR]["logprob"], atol=SUMMED)
+            np.testing.assert_allclose(
+                act.info[BEHAVIOUR]["logprob"], alone.info[BEHAVIOUR]["logprob"], atol=SUMMED
+            )
 
 
 def test_the_samples_of_an_observation_are_of_one_reading_of_it(

@@ -16,7 +16,14 @@ import torch
 from safetensors.torch import load_file, save_file
 
 from plugins.vlagents_ray_models.tests.families.lerobot import tiny
-from plugins.vlagents_ray_models.tests.families.lerobot.conftest import FILTERS, PATCHED, Load, Made, begun, view
+from plugins.vlagents_ray_models.tests.families.lerobot.conftest import (
+    FILTERS,
+    PATCHED,
+    Load,
+    Made,
+    begun,
+    view,
+)
 from vlagents_ray.contract import CameraSpec
 from vlagents_ray.errors import ConfigError
 from vlagents_ray_models.lerobot import LeRobot, checkpoint
@@ -77,28 +84,45 @@ def step(added: dict[str, Any]) -> Change:
         (lambda folder: (folder / "model.safetensors").unlink(), "model.safetensors"),
         (lambda folder: (folder / f"{PRE}.json").unlink(), "migrate_policy_normalization"),
         (lambda folder: (folder / f"{POST}.json").unlink(), f"{POST}.json"),
-        (lambda folder: next(folder.glob(f"{POST}*.safetensors")).unlink(), "processors do not load"),
+        (
+            lambda folder: next(folder.glob(f"{POST}*.safetensors")).unlink(),
+            "processors do not load",
+        ),
         (
             tensors(f"{PRE}*.safetensors", lambda saved: saved.pop("observation.state.mean")),
             "'mean'.* of 'observation.state'",
         ),
-        (tensors(f"{PRE}*.safetensors", lambda saved: saved.pop(f"{TOP}.std")), f"'std'.* of '{TOP}'"),
-        (tensors(f"{POST}*.safetensors", lambda saved: saved.pop("action.std")), "'std'.* of 'action'"),
+        (
+            tensors(f"{PRE}*.safetensors", lambda saved: saved.pop(f"{TOP}.std")),
+            f"'std'.* of '{TOP}'",
+        ),
+        (
+            tensors(f"{POST}*.safetensors", lambda saved: saved.pop("action.std")),
+            "'std'.* of 'action'",
+        ),
         (
             tensors(f"{POST}*.safetensors", lambda saved: saved["action.mean"].fill_(float("nan"))),
             "'mean'.* of 'action'",
         ),
-        (tensors("model*", lambda saved: saved.pop("model.action_head.weight")), "model.action_head.weight"),
+        (
+            tensors("model*", lambda saved: saved.pop("model.action_head.weight")),
+            "model.action_head.weight",
+        ),
         (settings(type="unheard_of"), "unheard_of"),
         (settings(of_another_version=1), f"env make lerobot{'' if tiny.NEW else '06'}`"),
         (settings(chunk_size="many"), "chunk_size"),
         (settings(use_peft=True), "merge_and_unload"),
         (settings(dim_model=64), "cannot load"),
-        (step({"class": "subprocess.Popen", "config": {"args": ["/bin/true"]}}), "trust_remote_code: true"),
+        (
+            step({"class": "subprocess.Popen", "config": {"args": ["/bin/true"]}}),
+            "trust_remote_code: true",
+        ),
         (step({"class": "lerobot.processor.pipeline.importlib"}), "trust_remote_code: true"),
     ],
 )
-def test_a_spoilt_checkpoint_is_refused(spoil: Change, text: str, copied: Callable[[str], Path]) -> None:
+def test_a_spoilt_checkpoint_is_refused(
+    spoil: Change, text: str, copied: Callable[[str], Path]
+) -> None:
     folder = copied("act")
     spoil(folder)
     with pytest.raises(ConfigError, match=text):
@@ -137,16 +161,29 @@ def test_a_step_of_the_checkpoints_own_runs_only_if_it_is_trusted(
 def test_a_step_that_takes_code_from_the_hub_by_itself_is_refused(
     copied: Callable[[str], Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """LeRobot's own tokenizer of actions passes `trust_remote_code=True` with a name that the checkpoint gives."""
+    """LeRobot's own tokenizer of actions passes `trust_remote_code=True` with a name that the
+    checkpoint gives.
+    """
     folder, proof, hub = copied("act"), tmp_path / "proof", tmp_path / "hub"
-    monkeypatch.setattr("transformers.dynamic_module_utils.HF_MODULES_CACHE", str(tmp_path / "modules"))
+    monkeypatch.setattr(
+        "transformers.dynamic_module_utils.HF_MODULES_CACHE", str(tmp_path / "modules")
+    )
     hub.mkdir()
     (hub / "processor_config.json").write_text(
         json.dumps({"processor_class": "Own", "auto_map": {"AutoProcessor": "own.Own"}})
     )
-    (hub / "own.py").write_text(f"from pathlib import Path\nPath({str(proof)!r}).touch()\nclass Own: ...")
-    step({"registry_name": "action_tokenizer_processor", "config": {"action_tokenizer_name": str(hub)}})(folder)
-    with pytest.raises(ConfigError, match=r"Python code of the checkpoint.*trust_remote_code: true"):
+    (hub / "own.py").write_text(
+        f"from pathlib import Path\nPath({str(proof)!r}).touch()\nclass Own: ..."
+    )
+    step(
+        {
+            "registry_name": "action_tokenizer_processor",
+            "config": {"action_tokenizer_name": str(hub)},
+        }
+    )(folder)
+    with pytest.raises(
+        ConfigError, match=r"Python code of the checkpoint.*trust_remote_code: true"
+    ):
         opened(folder)
     assert not proof.exists()
     with pytest.raises(ConfigError, match="processors do not load"):  # it is no processor
@@ -201,7 +238,9 @@ def test_float32_that_nobody_chose_is_warned_of_on_a_gpu(
 @pytest.mark.verifies("loading")
 def test_a_residual_vq_that_is_not_trained_is_refused(copied: Callable[[str], Path]) -> None:
     folder = copied("vqbet")
-    tensors("model*", lambda saved: saved["vqbet.action_head.vqvae_model.discretized"].fill_(False))(folder)
+    tensors(
+        "model*", lambda saved: saved["vqbet.action_head.vqvae_model.discretized"].fill_(False)
+    )(folder)
     with pytest.raises(ConfigError, match="not trained"):
         opened(folder)
 
@@ -210,13 +249,19 @@ def test_a_residual_vq_that_is_not_trained_is_refused(copied: Callable[[str], Pa
 @pytest.mark.parametrize(
     ("name", "text"),
     [
-        *([("lingbot_va", "for one robot"), ("sac", "gaussian_actor.*env make lerobot`")] if tiny.NEW else []),
+        *(
+            [("lingbot_va", "for one robot"), ("sac", "gaussian_actor.*env make lerobot`")]
+            if tiny.NEW
+            else []
+        ),
         *([] if tiny.NEW else [("groot", "GR00T"), ("multi_task_dit", "env make lerobot06`")]),
         ("sarm", "rewards"),
         *((name, "openpi's changes") for name in UNPATCHED),
     ],
 )
-def test_a_type_that_cannot_be_served_says_why(name: str, text: str, copied: Callable[[str], Path]) -> None:
+def test_a_type_that_cannot_be_served_says_why(
+    name: str, text: str, copied: Callable[[str], Path]
+) -> None:
     folder = copied("act")
     config = {**json.loads((folder / "config.json").read_text()), "type": name}
     known = ("type", "input_features", "output_features", "device")

@@ -1,4 +1,5 @@
-"""π0, π0.5 and π0-FAST, where transformers has openpi's changes; conftest.py leaves this file out where it has not.
+"""π0, π0.5 and π0-FAST, where transformers has openpi's changes; conftest.py leaves this file out
+where it has not.
 
 LeRobot makes these models in two sizes only, so their sizes are changed under its hands.
 """
@@ -56,7 +57,9 @@ def shrunk() -> Iterator[pytest.MonkeyPatch]:
     with pytest.MonkeyPatch.context() as patch:
         for kind in (*KINDS, FAST):
             modeling = importlib.import_module(f"lerobot.policies.{kind}.modeling_{kind}")
-            size = modeling.GemmaConfig(width=32, depth=2, mlp_dim=64, num_heads=4, num_kv_heads=1, head_dim=16)
+            size = modeling.GemmaConfig(
+                width=32, depth=2, mlp_dim=64, num_heads=4, num_kv_heads=1, head_dim=16
+            )
             patch.setattr(modeling, "get_gemma_config", lambda _, size=size: size)
             new = ("PaliGemmaForConditionalGenerationWithPiGemma", "PiGemmaForCausalLM")
             names = new if tiny.NEW else ("PaliGemmaForConditionalGeneration", "GemmaForCausalLM")
@@ -64,20 +67,33 @@ def shrunk() -> Iterator[pytest.MonkeyPatch]:
                 if not hasattr(modeling, name):  # π0-FAST has no second network
                     continue
                 made = getattr(modeling, name)
-                patch.setattr(modeling, name, lambda config, made=made, change=change: made(config=change(config)))
+                patch.setattr(
+                    modeling,
+                    name,
+                    lambda config, made=made, change=change: made(config=change(config)),
+                )
         yield patch
 
 
 @pytest.fixture(scope="module")
-def made(shrunk: pytest.MonkeyPatch, tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Path]:
+def made(
+    shrunk: pytest.MonkeyPatch, tmp_path_factory: pytest.TempPathFactory
+) -> Callable[[str], Path]:
     """The checkpoint of a kind, with a tokenizer beside it."""
     folder = tmp_path_factory.mktemp("pi")
     fast_tokenizer().save_pretrained(folder / "tokenizer")
     for kind in KINDS:
-        chunk = {"chunk_size": tiny.CHUNK, "n_action_steps": tiny.EXECUTED, "num_inference_steps": 3}
+        chunk = {
+            "chunk_size": tiny.CHUNK,
+            "n_action_steps": tiny.EXECUTED,
+            "num_inference_steps": 3,
+        }
         (folder / kind).mkdir()
         with local_tokenizer(kind, folder / "tokenizer"):
-            tiny.write(folder / kind, tiny.config_of(kind, dtype="float32", image_resolution=(56, 56), **chunk))
+            tiny.write(
+                folder / kind,
+                tiny.config_of(kind, dtype="float32", image_resolution=(56, 56), **chunk),
+            )
     if tiny.NEW:
         _write_fast(folder)
     return lambda kind: folder / kind
@@ -95,7 +111,9 @@ def test_a_session_gets_the_same_in_any_company(kind: str, made: Callable[[str],
     alone = begun(policy, 1).act(view(1)).action
     for size in (2, 3, 8):
         numbers = range(1, size + 1)
-        acts = policy.act_batch([view(number) for number in numbers], [begun(policy, number) for number in numbers])
+        acts = policy.act_batch(
+            [view(number) for number in numbers], [begun(policy, number) for number in numbers]
+        )
         assert isinstance(acts[0], Act)
         np.testing.assert_allclose(acts[0].action, alone, atol=ATOL)
 
@@ -103,10 +121,14 @@ def test_a_session_gets_the_same_in_any_company(kind: str, made: Callable[[str],
 @pytest.mark.verifies("parity")
 @pytest.mark.parametrize("delay", [None, 2])
 @pytest.mark.parametrize("kind", KINDS)
-def test_flow_matching_and_its_guidance_are_theirs(kind: str, delay: int | None, made: Callable[[str], Path]) -> None:
+def test_flow_matching_and_its_guidance_are_theirs(
+    kind: str, delay: int | None, made: Callable[[str], Path]
+) -> None:
     policy, theirs = _loaded(made(kind), execute=tiny.CHUNK), Theirs(made(kind))
     shape = (1, tiny.CHUNK, theirs.policy.config.max_action_dim)
-    given: dict[str, Any] = {"noise": torch.from_numpy(draws_of(policy).standard_normal(shape, dtype=np.float32))}
+    given: dict[str, Any] = {
+        "noise": torch.from_numpy(draws_of(policy).standard_normal(shape, dtype=np.float32))
+    }
     info: dict[str, Any] = {}
     if delay is not None:
         plan = np.random.default_rng(5).uniform(-1, 1, (5, tiny.ACTION)).astype(np.float32)
@@ -136,7 +158,9 @@ def test_actions_relative_to_the_state_and_their_leftovers_are_theirs(
     both = policy.act_batch(views, [begun(policy, 1), begun(policy, 2)])
     for number, act in zip((1, 2), both, strict=True):
         assert isinstance(act, Act)
-        np.testing.assert_allclose(act.action, begun(policy, number).act(view(number)).action, atol=ATOL)
+        np.testing.assert_allclose(
+            act.action, begun(policy, number).act(view(number)).action, atol=ATOL
+        )
 
     plan = np.random.default_rng(5).uniform(-1, 1, (5, tiny.ACTION)).astype(np.float32)
     theirs.policy.config.rtc_config = RTCConfig(enabled=True)
@@ -185,7 +209,9 @@ def test_random_steps_have_the_log_probability_of_the_networks_own_steps(
 
     def velocity(noisy: Any, time: float) -> Any:
         with torch.inference_mode():
-            return step(**alone | {"x_t": noisy, "timestep": torch.tensor([time], dtype=torch.float32)})
+            return step(
+                **alone | {"x_t": noisy, "timestep": torch.tensor([time], dtype=torch.float32)}
+            )
 
     own, found = act.info[BEHAVIOUR], act.info[DISTRIBUTION]
     chains = [own["replay"]["chain"], *found["replay"]["chain"]]
@@ -202,7 +228,10 @@ def test_compiled_passes_act_as_without(kind: str, made: Callable[[str], Path]) 
         assert programs.rows == [2, 2]  # what is seen, and a step of the flow
         for size in (1, 2, 3):
             views = [view(i) for i in range(size)]
-            found = [policy.act_batch(views, [begun(policy, i) for i in range(size)]) for policy in (plain, compiled)]
+            found = [
+                policy.act_batch(views, [begun(policy, i) for i in range(size)])
+                for policy in (plain, compiled)
+            ]
             for one, other in zip(*found, strict=True):
                 assert isinstance(one, Act)
                 assert isinstance(other, Act)
@@ -214,7 +243,9 @@ OF_FAST = pytest.mark.skipif(not tiny.NEW, reason="π0-FAST is tried with LeRobo
 
 
 def settings_of_fast(made: Callable[[str], Path]) -> dict[str, Any]:
-    """Of the checkpoint of π0-FAST; LeRobot does not save the name of its action tokenizer's text tokenizer."""
+    """Of the checkpoint of π0-FAST; LeRobot does not save the name of its action tokenizer's
+    text tokenizer.
+    """
     step = {"paligemma_tokenizer_name": str(made(FAST).parent / "tokenizer")}
     return {"trust_remote_code": True, "processors": {"action_tokenizer_processor": step}}
 
@@ -251,7 +282,8 @@ def test_tokens_that_are_no_actions_fail_their_own_session(
 
     def checked(*tokens: Any, **shape: Any) -> Any:
         read.append(1)
-        network.config.validate_action_token_prefix = len(read) == 1  # those of the first row, which are random
+        # Those of the first row, which are random.
+        network.config.validate_action_token_prefix = len(read) == 1
         return decode(*tokens, **shape)
 
     monkeypatch.setattr(network, "detokenize_actions", checked)
@@ -270,28 +302,38 @@ def test_the_code_of_an_action_tokenizer_wants_trust(made: Callable[[str], Path]
 
 @pytest.mark.verifies("loading")
 @pytest.mark.parametrize("kind", KINDS)
-def test_weights_that_lerobot_would_replace_by_random_ones_are_an_error(kind: str, made: Callable[[str], Path]) -> None:
+def test_weights_that_lerobot_would_replace_by_random_ones_are_an_error(
+    kind: str, made: Callable[[str], Path]
+) -> None:
     file = made(kind) / "model.safetensors"
     whole = load_file(file)
     try:
-        save_file({name: tensor for name, tensor in whole.items() if "action_out_proj" not in name}, file)
+        save_file(
+            {name: tensor for name, tensor in whole.items() if "action_out_proj" not in name}, file
+        )
         with pytest.raises(ConfigError, match="action_out_proj"):
             _loaded(made(kind))
         file.write_bytes(b"not a checkpoint")
         with pytest.raises(ConfigError, match="is it complete"):
             _loaded(made(kind))
-        save_file({name.removeprefix("model."): tensor for name, tensor in whole.items()}, file)  # as openpi names them
+        # As openpi names them.
+        save_file({name.removeprefix("model."): tensor for name, tensor in whole.items()}, file)
         _loaded(made(kind))
     finally:
         save_file(whole, file)
 
 
 def _write_fast(folder: Path) -> None:
-    """A checkpoint of π0-FAST in a folder with a tokenizer, and the code of an action tokenizer beside it."""
+    """A checkpoint of π0-FAST in a folder with a tokenizer, and the code of an action tokenizer
+    beside it.
+    """
     code = folder / "actions"
     code.mkdir()
     (code / "characters.py").write_text(ACTION_TOKENIZER)
-    named = {"processor_class": "Characters", "auto_map": {"AutoProcessor": "characters.Characters"}}
+    named = {
+        "processor_class": "Characters",
+        "auto_map": {"AutoProcessor": "characters.Characters"},
+    }
     (code / "processor_config.json").write_text(json.dumps(named))
     names = {"text_tokenizer_name": str(folder / "tokenizer"), "action_tokenizer_name": str(code)}
     tokens = {
@@ -300,9 +342,12 @@ def _write_fast(folder: Path) -> None:
         "temperature": 1.0,
         "validate_action_token_prefix": False,
     }
-    sizes = {"dtype": "float32", "n_action_steps": tiny.EXECUTED}  # images of 224 pixels, as it has no other
+    # Images of 224 pixels, as it has no other.
+    sizes = {"dtype": "float32", "n_action_steps": tiny.EXECUTED}
     (folder / FAST).mkdir()
-    tiny.write(folder / FAST, tiny.config_of(FAST, chunk_size=tiny.CHUNK, **names, **tokens, **sizes))
+    tiny.write(
+        folder / FAST, tiny.config_of(FAST, chunk_size=tiny.CHUNK, **names, **tokens, **sizes)
+    )
 
 
 def _loaded(folder: Path, **config: Any) -> LeRobot:

@@ -1,4 +1,6 @@
-"""π0.5 of `python -m benchmarks.checkpoints`, where transformers has openpi's changes: see `collect_ignore`."""
+"""π0.5 of `python -m benchmarks.checkpoints`, where transformers has openpi's changes: see
+`collect_ignore`.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""A policy type that somebody else registers with LeRobot is served one row at a time, and its sessions stay apart."""
+"""A policy type that somebody else registers with LeRobot is served one row at a time, and its
+sessions stay apart.
+"""
 
 from __future__ import annotations
 
@@ -72,7 +74,9 @@ def checkpoint(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tiny.write(tmp_path / "checkpoint", tiny.config_of("wobble", **chunk))
 
 
-def test_an_unknown_type_is_served_row_by_row_and_refused_if_it_keeps_a_history(checkpoint: Path) -> None:
+def test_an_unknown_type_is_served_row_by_row_and_refused_if_it_keeps_a_history(
+    checkpoint: Path,
+) -> None:
     check_agent(LeRobot.from_config({"checkpoint": str(checkpoint)}), instructions=TASKS)
     policy = LeRobot.from_config({"checkpoint": str(checkpoint)})
     policy.initialize()
@@ -81,4 +85,6 @@ def test_an_unknown_type_is_served_row_by_row_and_refused_if_it_keeps_a_history(
     assert first.shape == (tiny.EXECUTED, tiny.ACTION)
     assert not np.allclose(first, second, atol=1e-3)  # it draws
     with pytest.raises(ConfigError, match="by itself"):
-        LeRobot.from_config({"checkpoint": str(checkpoint), "overrides": {"n_obs_steps": 2}}).initialize()
+        LeRobot.from_config(
+            {"checkpoint": str(checkpoint), "overrides": {"n_obs_steps": 2}}
+        ).initialize()

@@ -1,4 +1,6 @@
-"""What every type of LeRobot policy keeps: the contract, and sessions that do not notice one another."""
+"""What every type of LeRobot policy keeps: the contract, and sessions that do not notice one
+another.
+"""
 
 from __future__ import annotations
 
@@ -10,7 +12,14 @@ from pushed_weights import check_pushed_weights
 from shared_readings import check_shared_readings
 
 from plugins.vlagents_ray_models.tests.families.lerobot import tiny
-from plugins.vlagents_ray_models.tests.families.lerobot.conftest import FILTERS, TASKS, Load, Made, begun, view
+from plugins.vlagents_ray_models.tests.families.lerobot.conftest import (
+    FILTERS,
+    TASKS,
+    Load,
+    Made,
+    begun,
+    view,
+)
 from vlagents_ray import Obs
 from vlagents_ray.contract import CameraSpec, StateSpec
 from vlagents_ray.errors import InvalidObservation
@@ -38,7 +47,9 @@ def test_a_session_gets_the_same_in_any_company(kind: str, loaded: Load) -> None
     for size in (2, 3, 8):
         company = [begun(policy, number) for number in range(1, size + 1)]
         for tick, wanted in enumerate((first, second)):
-            acts = policy.act_batch([view(10 * tick + number) for number in range(1, size + 1)], company)
+            acts = policy.act_batch(
+                [view(10 * tick + number) for number in range(1, size + 1)], company
+            )
             assert isinstance(acts[0], Act)
             np.testing.assert_allclose(acts[0].action, wanted, atol=ATOL)
 
@@ -83,9 +94,11 @@ def test_the_contract_is_what_the_checkpoint_was_trained_with(loaded: Load) -> N
     contract = loaded("diffusion").contract
     assert contract.cameras == {tiny.CAMERA: CameraSpec(tiny.SIDE, tiny.SIDE)}
     assert contract.state == {"joints": StateSpec(tiny.STATE)}
-    assert (contract.action.dim, contract.chunk, contract.history) == (tiny.ACTION, 1, 2)  # a queue, for its history
+    # A queue, for its history.
+    assert (contract.action.dim, contract.chunk, contract.history) == (tiny.ACTION, 1, 2)
     assert loaded("diffusion", actions="chunk").contract.chunk == tiny.EXECUTED
-    assert loaded("smolvla").contract.cameras == {tiny.CAMERA: CameraSpec()}  # it resizes any image itself
+    # It resizes any image itself.
+    assert loaded("smolvla").contract.cameras == {tiny.CAMERA: CameraSpec()}
 
 
 def test_the_ranges_of_the_training_are_stated(loaded: Load) -> None:
@@ -97,10 +110,13 @@ def test_the_ranges_of_the_training_are_stated(loaded: Load) -> None:
         np.testing.assert_allclose(stated[key]["min"], made[key]["min"], rtol=1e-6)
 
 
-def test_the_names_of_the_joints_are_those_of_the_training(loaded: Load, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_names_of_the_joints_are_those_of_the_training(
+    loaded: Load, monkeypatch: pytest.MonkeyPatch
+) -> None:
     policy, names = loaded("act"), [f"joint{number}.pos" for number in range(tiny.ACTION)]
     model = policy.model
-    monkeypatch.setattr(model.kind.config, "action_feature_names", names, raising=False)  # as LeRobot 0.6 saves it
+    # As LeRobot 0.6 saves it.
+    monkeypatch.setattr(model.kind.config, "action_feature_names", names, raising=False)
     found = policy._described(model.kind, model.processors, model.trained, {})
     assert found.contract.action.names == tuple(names)
     assert policy.contract.action.names is None
@@ -119,7 +135,11 @@ def test_images_of_any_size_meet_in_a_batch_of_a_policy_that_resizes(loaded: Loa
 
 def test_an_ensemble_and_its_coefficient_are_the_checkpoints_defaults(loaded: Load) -> None:
     policy = loaded("ensemble")
-    assert (policy.config.actions, policy.config.ensemble_m, policy.contract.chunk) == ("ensemble", 0.1, 1)
+    assert (policy.config.actions, policy.config.ensemble_m, policy.contract.chunk) == (
+        "ensemble",
+        0.1,
+        1,
+    )
     assert loaded("ensemble", actions="chunk").contract.chunk == tiny.CHUNK
     assert loaded("act", actions="ensemble").config.execute is None
 
@@ -136,12 +156,18 @@ def test_samples_change_no_action_of_the_session(kind: str, loaded: Load) -> Non
 
 def test_other_names_for_cameras_and_state(loaded: Load, made: Made) -> None:
     policy = LeRobot.from_config(
-        {"checkpoint": str(made("act")), "cameras": {tiny.CAMERA: "front"}, "state": ["left/joints", "gripper"]}
+        {
+            "checkpoint": str(made("act")),
+            "cameras": {tiny.CAMERA: "front"},
+            "state": ["left/joints", "gripper"],
+        }
     )
     policy.initialize()
     plain = view()
     plain.state["joints"][-1] = 0.5
-    renamed = Obs({"front": plain.cameras[tiny.CAMERA]}, 0.5, {"left/joints": plain.state["joints"][:-1]})
+    renamed = Obs(
+        {"front": plain.cameras[tiny.CAMERA]}, 0.5, {"left/joints": plain.state["joints"][:-1]}
+    )
     session = begun(loaded("act"))
     policy.reset(renamed, "go")
     np.testing.assert_array_equal(policy.act(renamed).action, session.act(plain).action)
@@ -151,5 +177,6 @@ def test_other_names_for_cameras_and_state(loaded: Load, made: Made) -> None:
 def test_acts_with_pushed_weights(kind: str, made: Made) -> None:
     policy = LeRobot.from_config({"checkpoint": str(made(kind))})
     policy.initialize()
-    assert policy.parameters().keys() == policy.model.kind.policy.state_dict().keys()  # those of LeRobot's trainer
+    # Those of LeRobot's trainer.
+    assert policy.parameters().keys() == policy.model.kind.policy.state_dict().keys()
     check_pushed_weights(policy, lambda: begun(policy, 1).act(view(1)).action)

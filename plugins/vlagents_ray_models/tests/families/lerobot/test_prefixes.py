@@ -1,4 +1,6 @@
-"""Prefixes of π0.5 as LeRobot gives them; conftest.py leaves this file out where LeRobot has none, as 0.6.1."""
+"""Prefixes of π0.5 as LeRobot gives them; conftest.py leaves this file out where LeRobot has
+none, as 0.6.1.
+"""
 
 from __future__ import annotations
 
@@ -50,7 +52,11 @@ def test_given_prefixes_are_theirs(delay: int, mode: str, trained: Path) -> None
         "prev_chunk_left_over": torch.from_numpy(left)[None],
         "inference_delay": delay,
     }
-    wanted = theirs.after(theirs.policy.predict_action_chunk(theirs.see(view()), **given))[0].detach().numpy()
+    wanted = (
+        theirs.after(theirs.policy.predict_action_chunk(theirs.see(view()), **given))[0]
+        .detach()
+        .numpy()
+    )
     act = begun(policy).act(view(**{LEFTOVER: plan, DELAY: delay}))
     ours = act.action
     assert act.info.get(GIVEN) == (delay if mode == "trained" else None)

@@ -1,4 +1,6 @@
-"""Real-time chunking: new chunks go on from what each robot is doing, whatever its neighbours do."""
+"""Real-time chunking: new chunks go on from what each robot is doing, whatever its neighbours
+do.
+"""
 
 from __future__ import annotations
 
@@ -12,7 +14,13 @@ import torch
 from lerobot.policies.rtc import configuration_rtc
 
 from plugins.vlagents_ray_models.tests.families.lerobot import tiny
-from plugins.vlagents_ray_models.tests.families.lerobot.conftest import FILTERS, Load, Made, begun, view
+from plugins.vlagents_ray_models.tests.families.lerobot.conftest import (
+    FILTERS,
+    Load,
+    Made,
+    begun,
+    view,
+)
 from vlagents_ray.errors import InvalidObservation
 from vlagents_ray.interface import DELAY, GIVEN, LEFTOVER
 from vlagents_ray_models.lerobot import LeRobot, checkpoint
@@ -58,8 +66,14 @@ def test_a_chunk_goes_on_from_what_the_robot_is_doing(loaded: Load) -> None:
 
 
 def test_the_settings_of_the_guidance_can_be_overridden(made: Made) -> None:
-    settings = {"execution_horizon": 4, "max_guidance_weight": 2.0, "prefix_attention_schedule": "EXP"}
-    policy = LeRobot.from_config({"checkpoint": str(made("smolvla")), "overrides": {"rtc_config": settings}})
+    settings = {
+        "execution_horizon": 4,
+        "max_guidance_weight": 2.0,
+        "prefix_attention_schedule": "EXP",
+    }
+    policy = LeRobot.from_config(
+        {"checkpoint": str(made("smolvla")), "overrides": {"rtc_config": settings}}
+    )
     policy.initialize()
     assert policy.continues_plans
     used = policy.model.kind.policy.rtc_processor.rtc_config
@@ -76,7 +90,9 @@ LONGEST, STEP = 3, 0.1  # rows of a prefix, and what the network below adds in e
 
 
 def _continue(self: Any, encoded: Any, seen: Any, state: Any, actions: Any, times: Any) -> Any:
-    """The velocity of a network that goes on from the last row at time 0; neither 0.4.4 nor 0.6.1 has one."""
+    """The velocity of a network that goes on from the last row at time 0; neither 0.4.4 nor
+    0.6.1 has one.
+    """
     given = times == 0
     last = given.sum(1) - 1
     start = actions[torch.arange(len(actions)), last.clamp(min=0)] * (last >= 0)[:, None]
@@ -86,7 +102,9 @@ def _continue(self: Any, encoded: Any, seen: Any, state: Any, actions: Any, time
 
 @pytest.fixture
 def prefixed(made: Made, monkeypatch: pytest.MonkeyPatch) -> LeRobot:
-    """A policy whose checkpoint says that it was trained with prefixes, as those of LeRobot after 0.6.1 do."""
+    """A policy whose checkpoint says that it was trained with prefixes, as those of LeRobot
+    after 0.6.1 do.
+    """
 
     @dataclasses.dataclass
     class Config(configuration_rtc.RTCConfig):  # type: ignore[misc]
@@ -116,4 +134,6 @@ def test_a_checkpoint_trained_with_prefixes_is_given_them(prefixed: LeRobot) -> 
         assert not isinstance(act, Exception)
         assert act.info.get(GIVEN, 0) == given
         np.testing.assert_allclose(act.action[:given], plan[:given], atol=1e-5)
-        np.testing.assert_allclose(np.diff(act.action[max(given - 1, 0) :], axis=0) / scale, STEP, atol=1e-4)
+        np.testing.assert_allclose(
+            np.diff(act.action[max(given - 1, 0) :], axis=0) / scale, STEP, atol=1e-4
+        )

@@ -1,4 +1,6 @@
-"""`python -m benchmarks.checkpoints` writes LeRobot checkpoints that the policy loads and acts with."""
+"""`python -m benchmarks.checkpoints` writes LeRobot checkpoints that the policy loads and acts
+with.
+"""
 
 from __future__ import annotations
 
@@ -46,7 +48,9 @@ def test_others_load_and_act(tmp_path: Path, family: str) -> None:
 )
 def test_the_full_size_is_the_published_one(tmp_path: Path, family: str, millions: float) -> None:
     policy, _ = recipe.make_policy(Recipe(family, tmp_path, "full", "bfloat16"))
-    assert sum(one.numel() for one in policy.parameters()) == pytest.approx(millions * 1e6, rel=0.03)
+    assert sum(one.numel() for one in policy.parameters()) == pytest.approx(
+        millions * 1e6, rel=0.03
+    )
 
 
 def test_a_pi05_of_another_size_is_refused(tmp_path: Path) -> None:
@@ -54,9 +58,12 @@ def test_a_pi05_of_another_size_is_refused(tmp_path: Path) -> None:
         write_checkpoint("pi05", tmp_path / "made", "small")
 
 
-def test_a_pi05_needs_the_transformers_that_serves_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_pi05_needs_the_transformers_that_serves_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setitem(sys.modules, "transformers.models.siglip.check", None)
-    monkeypatch.setattr("vlagents_ray_models.lerobot.checkpoint.is_new", lambda: False)  # LeRobot 0.6 does without
+    # LeRobot 0.6 does without.
+    monkeypatch.setattr("vlagents_ray_models.lerobot.checkpoint.is_new", lambda: False)
     with pytest.raises(ConfigError, match="openpi's changes"):
         write_checkpoint("pi05", tmp_path / "made")
     assert list(tmp_path.iterdir()) == []

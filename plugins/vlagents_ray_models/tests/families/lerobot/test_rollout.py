@@ -1,4 +1,6 @@
-"""LeRobot 0.6's own `lerobot-rollout`, as users type it, with the plug-in of plugins/ and policies on servers."""
+"""LeRobot 0.6's own `lerobot-rollout`, as users type it, with the plug-in of plugins/ and
+policies on servers.
+"""
 
 from __future__ import annotations
 
@@ -19,7 +21,12 @@ from mirror_policy import COUNT, HZ, ROWS, CountingPolicy, MirrorPolicy, colour_
 
 from lerobot_policy_vlagents.configuration_vlagents import VlagentsConfig
 from lerobot_policy_vlagents.modeling_vlagents import VlagentsPolicy
-from plugins.vlagents_ray_models.tests.families.lerobot.commands import Server, make_site, run, serving
+from plugins.vlagents_ray_models.tests.families.lerobot.commands import (
+    Server,
+    make_site,
+    run,
+    serving,
+)
 from plugins.vlagents_ray_models.tests.families.lerobot.test_commands import TASK, batch
 from vlagents_ray.errors import ConfigError
 from vlagents_ray_learn.open_loop.recorded_dataset import Names, RecordedDataset
@@ -33,7 +40,8 @@ class Rollout:
 
     status: int
     log: str
-    sent: list[dict[str, Any]]  # what the robot was seen to be when it got an action, and the action
+    # What the robot was seen to be when it got an action, and the action.
+    sent: list[dict[str, Any]]
     folder: Path  # of all rollouts
 
 
@@ -50,29 +58,55 @@ def counting() -> Iterator[Server]:
 
 
 @pytest.fixture(scope="module")
-def rollouts(mirror: Server, counting: Server, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Rollout]:
+def rollouts(
+    mirror: Server, counting: Server, tmp_path_factory: pytest.TempPathFactory
+) -> dict[str, Rollout]:
     """The commands of these tests, after they ended."""
     folder = tmp_path_factory.mktemp("rollouts")
-    usual = ["lerobot-rollout", "--robot.type=mirror", f"--fps={HZ}", f"--task={TASK}", "--play_sounds=false"]
+    usual = [
+        "lerobot-rollout",
+        "--robot.type=mirror",
+        f"--fps={HZ}",
+        f"--task={TASK}",
+        "--play_sounds=false",
+    ]
     usual += ["--return_to_initial_position=false"]
-    record = ["--dataset.repo_id=me/rollout_mirror", "--dataset.push_to_hub=false", f"--dataset.fps={HZ}"]
+    record = [
+        "--dataset.repo_id=me/rollout_mirror",
+        "--dataset.push_to_hub=false",
+        f"--dataset.fps={HZ}",
+    ]
     record += [f"--dataset.root={folder / 'recorded'}", "--dataset.rgb_encoder.vcodec=h264"]
     rtc = ["--inference.type=rtc", f"--inference.rtc.execution_horizon={HORIZON}"]
     commands = {
-        "base": [*mirror.options(folder), "--strategy.type=base", "--policy.seed=3", "--robot.actions=9"],
+        "base": [
+            *mirror.options(folder),
+            "--strategy.type=base",
+            "--policy.seed=3",
+            "--robot.actions=9",
+        ],
         "dagger": [
-            *mirror.options(folder), *record, "--strategy.type=dagger", "--teleop.type=mirror", "--policy.seed=5",
-            f"--strategy.num_episodes={CORRECTIONS}", "--strategy.smooth_handover=false",
+            *mirror.options(folder),
+            *record,
+            "--strategy.type=dagger",
+            "--teleop.type=mirror",
+            "--policy.seed=5",
+            f"--strategy.num_episodes={CORRECTIONS}",
+            "--strategy.smooth_handover=false",
         ],
         "rtc": [*counting.options(folder), *rtc, "--strategy.type=base", "--robot.actions=40"],
         "refused": [*mirror.options(folder), *rtc, "--strategy.type=base", "--robot.actions=1"],
-    }  # fmt: skip
+    }
     MirrorPolicy.begun.clear()
     CountingPolicy.plans.clear()
     logs = {name: folder / f"{name}.jsonl" for name in commands}
     typed = [[*usual, *command, f"--robot.log={logs[name]}"] for name, command in commands.items()]
-    ended = run(typed, make_site(tmp_path_factory.mktemp("site"), tmp_path_factory.mktemp("source")), folder)
-    lines = {name: log.read_text().splitlines() if log.exists() else [] for name, log in logs.items()}
+    ended = run(
+        typed, make_site(tmp_path_factory.mktemp("site"), tmp_path_factory.mktemp("source")), folder
+    )
+    lines = {
+        name: log.read_text().splitlines() if log.exists() else [] for name, log in logs.items()
+    }
     return {
         name: Rollout(*each, [json.loads(line) for line in lines[name]], folder)
         for name, each in zip(commands, ended, strict=True)
@@ -80,7 +114,9 @@ def rollouts(mirror: Server, counting: Server, tmp_path_factory: pytest.TempPath
 
 
 def policys(sent: list[dict[str, Any]]) -> int:
-    """Check that each action is the policy's, the operator's, or the last one again; the number of the policy's."""
+    """Check that each action is the policy's, the operator's, or the last one again; the number
+    of the policy's.
+    """
     row = acts = moves = found = 0
     last: list[float] = []
     for one in sent:
@@ -90,7 +126,9 @@ def policys(sent: list[dict[str, Any]]) -> int:
         elif one["action"] != last:
             if row == 0:
                 acts += 1
-                chunk = mirrored(np.array(one["state"], np.float32), colour_of(one["image"]), acts, TASK)
+                chunk = mirrored(
+                    np.array(one["state"], np.float32), colour_of(one["image"]), acts, TASK
+                )
             np.testing.assert_array_equal(np.array(one["action"], np.float32), chunk[row])
             row, found = (row + 1) % ROWS, found + 1
         last = one["action"]
@@ -105,7 +143,9 @@ def test_a_rollout_executes_the_actions_of_the_servers_policy(rollouts: dict[str
     assert MirrorPolicy.begun[0] == (TASK, 3)
 
 
-def test_dagger_records_the_corrections_and_begins_an_episode_after_each(rollouts: dict[str, Rollout]) -> None:
+def test_dagger_records_the_corrections_and_begins_an_episode_after_each(
+    rollouts: dict[str, Rollout],
+) -> None:
     done = rollouts["dagger"]
     assert done.status == 0, done.log
     assert policys(done.sent) >= CORRECTIONS * WATCHED
@@ -114,7 +154,10 @@ def test_dagger_records_the_corrections_and_begins_an_episode_after_each(rollout
     episodes = [session.episodes[0] for session in RecordedDataset(recorded).sessions()]
     names = Names(state=["joints", "gripper"])
     actions = [
-        [step.expected[0].tolist() for step in RecordedDataset(recorded).steps(part, names, MirrorPolicy.contract)]
+        [
+            step.expected[0].tolist()
+            for step in RecordedDataset(recorded).steps(part, names, MirrorPolicy.contract)
+        ]
         for part in episodes
     ]
     assert [len(one) >= MOVED for one in actions] == [True] * CORRECTIONS
@@ -131,7 +174,8 @@ def test_real_time_chunking_sends_the_plan_that_is_executed(rollouts: dict[str, 
     first, *others = CountingPolicy.plans
     assert first[0][0, 0] >= 10 * COUNT  # LeRobot asks again when 30 of 40 rows are left
     for plan, delay in (first, *others):
-        np.testing.assert_array_equal(plan, plan[0] + COUNT * np.arange(len(plan))[:, None])  # no row of zeros
+        # No row of zeros.
+        np.testing.assert_array_equal(plan, plan[0] + COUNT * np.arange(len(plan))[:, None])
         assert len(plan) <= HORIZON
         assert 1 <= delay <= len(plan)
     sent = np.array([one["action"] for one in done.sent]) / COUNT
@@ -158,21 +202,32 @@ def policy(counting: Server, monkeypatch: pytest.MonkeyPatch) -> VlagentsPolicy:
     return policy
 
 
-@pytest.mark.parametrize("setting", [{"max_guidance_weight": 5.0}, {"prefix_attention_schedule": "EXP"}])
-def test_settings_of_the_guidance_are_the_servers(setting: dict[str, Any], policy: VlagentsPolicy) -> None:
+@pytest.mark.parametrize(
+    "setting", [{"max_guidance_weight": 5.0}, {"prefix_attention_schedule": "EXP"}]
+)
+def test_settings_of_the_guidance_are_the_servers(
+    setting: dict[str, Any], policy: VlagentsPolicy
+) -> None:
     policy.config.rtc_config = RTCConfig(**setting)
-    with pytest.raises(ConfigError, match=rf"inference\.rtc\.{next(iter(setting))}.*its deployment file"):
+    with pytest.raises(
+        ConfigError, match=rf"inference\.rtc\.{next(iter(setting))}.*its deployment file"
+    ):
         policy.init_rtc_processor()
 
 
-def test_a_reset_on_another_thread_begins_an_episode_without_its_plan(policy: VlagentsPolicy) -> None:
+def test_a_reset_on_another_thread_begins_an_episode_without_its_plan(
+    policy: VlagentsPolicy,
+) -> None:
     """LeRobot computes chunks on a thread of its own, and resets the policy on the main one."""
     policy.config.rtc_config = RTCConfig(execution_horizon=3)
     policy.init_rtc_processor()
-    plan = torch.tensor([[7.0] * 3, [8.0] * 3, [0.0] * 3]) * COUNT  # the last row is LeRobot's filling
+    # The last row is LeRobot's filling.
+    plan = torch.tensor([[7.0] * 3, [8.0] * 3, [0.0] * 3]) * COUNT
 
     def chunk() -> list[float]:
-        rows = policy.predict_action_chunk(batch(1), inference_delay=1, prev_chunk_left_over=plan)[0, :3, 0]
+        rows = policy.predict_action_chunk(batch(1), inference_delay=1, prev_chunk_left_over=plan)[
+            0, :3, 0
+        ]
         return (rows / COUNT).tolist()
 
     CountingPolicy.plans.clear()

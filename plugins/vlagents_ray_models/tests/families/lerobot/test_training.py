@@ -38,24 +38,49 @@ from vlagents_ray_results.lerobot import to_lerobot
 
 STEPS = 10
 IMAGES, STATE_ALONE = 0, 1  # in the order of the page
-TINY = ["dim_model=32", "n_heads=2", "dim_feedforward=64", "n_encoder_layers=1", "chunk_size=8", "n_action_steps=4"]
+TINY = [
+    "dim_model=32",
+    "n_heads=2",
+    "dim_feedforward=64",
+    "n_encoder_layers=1",
+    "chunk_size=8",
+    "n_action_steps=4",
+]
 
 
 def documented(command: str) -> list[list[str]]:
-    """The words of each such command on the page about training, then in its example, without the command itself."""
+    """The words of each such command on the page about training, then in its example, without
+    the command itself.
+    """
     root = Path(__file__).parents[5]
-    text = "".join((root / name).read_text() for name in ("docs/training.md", "examples/train_and_watch.sh"))
+    text = "".join(
+        (root / name).read_text() for name in ("docs/training.md", "examples/train_and_watch.sh")
+    )
     found = re.findall(rf"^{re.escape(command)} ((?:.*\\\n)*.*)$", text, re.MULTILINE)
     return [shlex.split(re.sub(r" >.*", "", words.replace("\\\n", " "))) for words in found]
 
 
 def train(dataset: Path, out: Path, route: int = IMAGES) -> Path:
-    """The documented training, but ten steps of a tiny ACT; returns the folder of the checkpoint."""
-    own = [f"--dataset.root={dataset}", f"--output_dir={out}", f"--steps={STEPS}", f"--save_freq={STEPS}"]
-    small = [*(f"--policy.{word}" for word in TINY), "--policy.device=cpu", "--batch_size=2", "--num_workers=1"]
+    """The documented training, but ten steps of a tiny ACT; returns the folder of the
+    checkpoint.
+    """
+    own = [
+        f"--dataset.root={dataset}",
+        f"--output_dir={out}",
+        f"--steps={STEPS}",
+        f"--save_freq={STEPS}",
+    ]
+    small = [
+        *(f"--policy.{word}" for word in TINY),
+        "--policy.device=cpu",
+        "--batch_size=2",
+        "--num_workers=1",
+    ]
     changed = {word.partition("=")[0] for word in [*own, *small]}
     kept = [
-        word for word in documented(".venv-lerobot/bin/lerobot-train")[route] if word.partition("=")[0] not in changed
+        word
+        for word in documented(".venv-lerobot/bin/lerobot-train")[route]
+        if word.partition("=")[0] not in changed
     ]
     done = subprocess.run(
         [str(Path(sys.executable).parent / "lerobot-train"), *kept, *own, *small],
@@ -72,7 +97,10 @@ def train(dataset: Path, out: Path, route: int = IMAGES) -> Path:
 def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Of an env with 32 x 48 pixels, and a roll that jumps from pi to -pi."""
     folder = tmp_path_factory.mktemp("recorded")
-    results = play(flat_config(envs=[ROLLER], episodes=4, record="all", video="none", out=folder / "out"), Turner)
+    results = play(
+        flat_config(envs=[ROLLER], episodes=4, record="all", video="none", out=folder / "out"),
+        Turner,
+    )
     chosen: dict[str, Any] = {"cameras": ["base"], "state": ["xyzrpy", "gripper", "joints"]}
     assert to_lerobot(results, folder / "roller", **chosen, successes=True, cut_idle=True) == 2
     return folder / "roller"
@@ -108,14 +136,25 @@ def test_a_policy_of_lerobots_own_command_is_served_without_settings(policy: LeR
 
 
 @pytest.mark.parametrize("route", [IMAGES, STATE_ALONE])
-def test_the_documented_commands_lead_from_recordings_to_a_policy_that_acts(route: int, tmp_path: Path) -> None:
+def test_the_documented_commands_lead_from_recordings_to_a_policy_that_acts(
+    route: int, tmp_path: Path
+) -> None:
     record, *evaluations = documented("vlagents-ray eval")
     watched = [words for words in evaluations if "--watch" in words]
     task, options = record[0], settings_of(record, "--env-set")
-    run = flat_config(envs=[task], env_options=options, episodes=2, record="all", video="none", out=tmp_path / "run")
+    run = flat_config(
+        envs=[task],
+        env_options=options,
+        episodes=2,
+        record="all",
+        video="none",
+        out=tmp_path / "run",
+    )
     play(run, Scripted)
     _, _, _, *chosen = documented("vlagents-ray export")[route]
-    exported = CliRunner().invoke(app, ["export", str(tmp_path / "run"), "--out", str(tmp_path / "dataset"), *chosen])
+    exported = CliRunner().invoke(
+        app, ["export", str(tmp_path / "run"), "--out", str(tmp_path / "dataset"), *chosen]
+    )
     assert exported.exit_code == 0, exported.output
     policy = served(train(tmp_path / "dataset", tmp_path / "act", route))
     assert watched[route][0] == task
@@ -136,7 +175,9 @@ def settings_of(words: list[str], option: str) -> dict[str, Any]:
     return parse_settings([value for name, value in pairwise(words) if name == option], option)
 
 
-def test_a_server_records_what_lerobot_trains_on_and_the_policy_is_replayed_on(tmp_path: Path) -> None:
+def test_a_server_records_what_lerobot_trains_on_and_the_policy_is_replayed_on(
+    tmp_path: Path,
+) -> None:
     with recorded(tmp_path / "traces") as server:
         for seed in range(2):
             server.robot().play(8, seed=seed)
@@ -145,7 +186,9 @@ def test_a_server_records_what_lerobot_trains_on_and_the_policy_is_replayed_on(t
     other = replayed(root, checkpoint, tmp_path / "other")
     assert (other["frames"], len(other["by_step"])) == (16, 4)
     assert 0 < other["mae"] < np.inf
-    with recorded(tmp_path / "own", LeRobot.from_config({"checkpoint": str(checkpoint), "device": "cpu"})) as server:
+    with recorded(
+        tmp_path / "own", LeRobot.from_config({"checkpoint": str(checkpoint), "device": "cpu"})
+    ) as server:
         for seed in range(2):
             server.robot().play(4, seed=seed)
     same = replayed(tmp_path / "own", checkpoint, tmp_path / "same")
@@ -167,7 +210,12 @@ def deployment(checkpoint: Path, folder: Path) -> Path:
     """The file of a server of the checkpoint."""
     config = {"checkpoint": str(checkpoint), "device": "cpu"}
     args = {"policy": "lerobot", "config": config}
-    application = {"name": "act", "route_prefix": "/", "import_path": "vlagents_ray.serve.app:build", "args": args}
+    application = {
+        "name": "act",
+        "route_prefix": "/",
+        "import_path": "vlagents_ray.serve.app:build",
+        "args": args,
+    }
     path = folder / "act.yaml"
     path.write_text(json.dumps({"applications": [application]}))
     return path
@@ -192,15 +240,24 @@ def test_the_policy_sees_the_state_as_its_dataset_has_it(policy: LeRobot, tmp_pa
     for _ in range(6):
         seen.append(policy.perceive(obs)["observation.state"])
         obs, *_ = env.step(Act(np.array([Roller.TURN, 1.0], np.float32)))
-    assert np.abs(np.diff([state[3] for state in seen])).max() == pytest.approx(Roller.TURN, abs=1e-5), "the roll"
+    assert np.abs(np.diff([state[3] for state in seen])).max() == pytest.approx(
+        Roller.TURN, abs=1e-5
+    ), "the roll"
     assert [state[6] for state in seen] == [1.0] * 6, "the gripper"
-    results = play(flat_config(envs=[ROLLER], episodes=1, record="all", video="none", out=tmp_path / "out"), Turner)
+    results = play(
+        flat_config(envs=[ROLLER], episodes=1, record="all", video="none", out=tmp_path / "out"),
+        Turner,
+    )
     to_lerobot(results, tmp_path / "again", state=["xyzrpy", "gripper", "joints"])
-    written = pq.read_table(tmp_path / "again/data/chunk-000/file-000.parquet").to_pydict()["observation.state"]
+    written = pq.read_table(tmp_path / "again/data/chunk-000/file-000.parquet").to_pydict()[
+        "observation.state"
+    ]
     np.testing.assert_allclose(seen, written[:6], atol=1e-6)
 
 
-def test_parts_that_are_set_by_hand_win_and_are_seen_alike(checkpoint: Path, policy: LeRobot) -> None:
+def test_parts_that_are_set_by_hand_win_and_are_seen_alike(
+    checkpoint: Path, policy: LeRobot
+) -> None:
     renamed = served(checkpoint, state=["pose", "gripper", "q"])
     obs = Roller().reset(seed=0)[0]
     obs.state["xyzrpy"][3] = 3.0
@@ -208,9 +265,9 @@ def test_parts_that_are_set_by_hand_win_and_are_seen_alike(checkpoint: Path, pol
     np.testing.assert_array_equal(
         renamed.perceive(other)["observation.state"], policy.perceive(obs)["observation.state"]
     )
-    assert renamed.perceive(other)["observation.state"][3] == pytest.approx(3 - 2 * np.pi, abs=1e-5), (
-        "the arc's middle is -2.9"
-    )
+    assert renamed.perceive(other)["observation.state"][3] == pytest.approx(
+        3 - 2 * np.pi, abs=1e-5
+    ), "the arc's middle is -2.9"
 
 
 def test_without_a_contract_features_and_statistics_tell_the_parts_and_their_angles(
@@ -219,7 +276,9 @@ def test_without_a_contract_features_and_statistics_tell_the_parts_and_their_ang
     old = tmp_path / "old"
     shutil.copytree(checkpoint, old)
     [statistics] = old.glob("policy_preprocessor_*normalizer*.safetensors")
-    tensors = {name: one for name, one in load_file(statistics).items() if not name.startswith(STATISTICS)}
+    tensors = {
+        name: one for name, one in load_file(statistics).items() if not name.startswith(STATISTICS)
+    }
     save_file(tensors, statistics)
     policy_without = served(old)
     contract = policy_without.contract
@@ -231,7 +290,9 @@ def test_without_a_contract_features_and_statistics_tell_the_parts_and_their_ang
     for roll in (2.5, 3.1, -3.1, -2.0):
         obs.state["xyzrpy"][3] = roll
         seen = [one.perceive(obs)["observation.state"] for one in (policy, policy_without)]
-        np.testing.assert_allclose(seen[1], seen[0], atol=1e-6, err_msg="order of the parts, and the angle")
+        np.testing.assert_allclose(
+            seen[1], seen[0], atol=1e-6, err_msg="order of the parts, and the angle"
+        )
         assert seen[1][3] < 0, "wrapped"
 
 
@@ -251,15 +312,25 @@ def test_a_contract_of_another_width_is_not_used(
 
 
 def test_lerobots_trainer_takes_what_a_human_corrected(tmp_path: Path) -> None:
-    with Recorder(tmp_path / "corrected", 10, interventions=True) as recorder, recorder.episode("stack the cups"):
+    with (
+        Recorder(tmp_path / "corrected", 10, interventions=True) as recorder,
+        recorder.episode("stack the cups"),
+    ):
         for i in range(20):
-            seen = Obs({"front": np.full((32, 48, 3), 10 * i, np.uint8)}, state={"joints": np.full(3, i, np.float32)})
+            seen = Obs(
+                {"front": np.full((32, 48, 3), 10 * i, np.uint8)},
+                state={"joints": np.full(3, i, np.float32)},
+            )
             recorder.add(seen, np.full(2, i, np.float32), tick=i, intervention=i > 9)
         recorder.label("success")
-    policy = LeRobot.from_config({"checkpoint": str(train(tmp_path / "corrected", tmp_path / "run")), "device": "cpu"})
+    policy = LeRobot.from_config(
+        {"checkpoint": str(train(tmp_path / "corrected", tmp_path / "run")), "device": "cpu"}
+    )
     policy.initialize()
     assert policy.contract is not None
     assert (policy.contract.action.dim, list(policy.contract.state or {})) == (2, ["joints"])
-    config = json.loads((tmp_path / f"run/checkpoints/{STEPS:06d}/pretrained_model/config.json").read_text())
+    config = json.loads(
+        (tmp_path / f"run/checkpoints/{STEPS:06d}/pretrained_model/config.json").read_text()
+    )
     assert set(config["output_features"]) == {"action"}, "it does not learn what the policy wanted"
     assert not any("policy" in name or "intervention" in name for name in config["input_features"])

@@ -15,7 +15,14 @@ from lerobot.policies.rtc.configuration_rtc import RTCConfig
 from lerobot.policies.utils import prepare_observation_for_inference
 
 from plugins.vlagents_ray_models.tests.families.lerobot import tiny
-from plugins.vlagents_ray_models.tests.families.lerobot.conftest import FILTERS, TASKS, Load, Made, begun, view
+from plugins.vlagents_ray_models.tests.families.lerobot.conftest import (
+    FILTERS,
+    TASKS,
+    Load,
+    Made,
+    begun,
+    view,
+)
 from vlagents_ray import Obs
 from vlagents_ray.interface import DELAY, LEFTOVER
 from vlagents_ray_models.lerobot import LeRobot
@@ -74,7 +81,9 @@ def test_act_is_theirs(loaded: Load, upstream: Callable[[str], Theirs]) -> None:
 def test_the_ensemble_is_theirs(loaded: Load, upstream: Callable[[str], Theirs]) -> None:
     theirs, session = upstream("ensemble"), begun(loaded("ensemble"))
     for tick in range(2 * tiny.CHUNK):
-        np.testing.assert_allclose(session.act(view(tick)).action, theirs.select(view(tick)), atol=ATOL)
+        np.testing.assert_allclose(
+            session.act(view(tick)).action, theirs.select(view(tick)), atol=ATOL
+        )
 
 
 @pytest.mark.verifies("parity")
@@ -86,7 +95,9 @@ def test_flow_matching_is_theirs_with_the_same_noise(
     shape = (1, tiny.CHUNK, theirs.policy.config.max_action_dim)
     noise = draws_of(policy).standard_normal(shape, dtype=np.float32)
     rows = begun(policy).act(view()).action
-    np.testing.assert_allclose(rows[0], theirs.select(view(), noise=torch.from_numpy(noise)), atol=ATOL)
+    np.testing.assert_allclose(
+        rows[0], theirs.select(view(), noise=torch.from_numpy(noise)), atol=ATOL
+    )
     for row in rows[1:]:
         np.testing.assert_allclose(row, theirs.select(view()), atol=ATOL)
 
@@ -120,14 +131,18 @@ def test_diffusion_is_theirs_over_several_chunks(
     session = begun(policy)
     for tick in range(2 * tiny.EXECUTED):
         if tick % tiny.EXECUTED == 0:
-            noise = torch.from_numpy(draws.standard_normal((1, config.horizon, tiny.ACTION), dtype=np.float32))
+            noise = torch.from_numpy(
+                draws.standard_normal((1, config.horizon, tiny.ACTION), dtype=np.float32)
+            )
             torch_draws = torch.Generator().manual_seed(int(draws.integers(2**63)))
         wanted = theirs.select(view(tick), noise=noise)
         np.testing.assert_allclose(session.act(view(tick)).action, wanted, atol=ATOL)
 
 
 @pytest.mark.verifies("parity")
-def test_tdmpc_plans_as_theirs_from_its_last_plan(loaded: Load, upstream: Callable[[str], Theirs]) -> None:
+def test_tdmpc_plans_as_theirs_from_its_last_plan(
+    loaded: Load, upstream: Callable[[str], Theirs]
+) -> None:
     theirs, policy = upstream("tdmpc"), loaded("tdmpc")
     draws, session = draws_of(policy), begun(policy)
     for tick in range(3):
@@ -140,7 +155,9 @@ def test_tdmpc_plans_as_theirs_from_its_last_plan(loaded: Load, upstream: Callab
 
 @pytest.mark.verifies("parity")
 def test_smolvla_with_its_language_model_in_bfloat16_is_theirs(tmp_path: Path) -> None:
-    """LeRobot reads those weights from the hub first; here they come from the checkpoint alone, in the same types."""
+    """LeRobot reads those weights from the hub first; here they come from the checkpoint alone,
+    in the same types.
+    """
     folder = tiny.make(tmp_path / "smolvla", "smolvla", load_vlm_weights=True)
     theirs, policy = Theirs(folder), LeRobot.from_config({"checkpoint": str(folder)})
     for file in (folder / "vlm").glob("*.safetensors"):
@@ -151,7 +168,9 @@ def test_smolvla_with_its_language_model_in_bfloat16_is_theirs(tmp_path: Path) -
     assert torch.bfloat16 in ours.values()
     shape = (1, tiny.CHUNK, theirs.policy.config.max_action_dim)
     noise = torch.from_numpy(draws_of(policy).standard_normal(shape, dtype=np.float32))
-    np.testing.assert_allclose(begun(policy).act(view()).action[0], theirs.select(view(), noise=noise), atol=ATOL)
+    np.testing.assert_allclose(
+        begun(policy).act(view()).action[0], theirs.select(view(), noise=noise), atol=ATOL
+    )
     exact = LeRobot.from_config({"checkpoint": str(folder), "dtype": "float32"})
     exact.initialize()
     assert {one.dtype for one in exact.model.kind.policy.parameters()} == {torch.float32}
@@ -159,7 +178,9 @@ def test_smolvla_with_its_language_model_in_bfloat16_is_theirs(tmp_path: Path) -
 
 @pytest.mark.verifies("parity")
 @pytest.mark.parametrize(("left", "delay"), [(6, 2), (3, 2), (8, 0), (2, 5)])
-def test_real_time_chunking_is_theirs(left: int, delay: int, loaded: Load, upstream: Callable[[str], Theirs]) -> None:
+def test_real_time_chunking_is_theirs(
+    left: int, delay: int, loaded: Load, upstream: Callable[[str], Theirs]
+) -> None:
     theirs, policy = upstream("smolvla"), loaded("smolvla", execute=tiny.CHUNK)
     plan = np.random.default_rng(5).uniform(-1, 1, (left, tiny.ACTION)).astype(np.float32)
     rows = begun(policy).act(view(1, **{LEFTOVER: plan, DELAY: delay})).action

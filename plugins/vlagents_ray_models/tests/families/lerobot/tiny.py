@@ -43,9 +43,18 @@ def statistics(state: int = STATE, action: int = ACTION) -> dict[str, dict[str, 
 
 
 def act(**settings: Any) -> Any:
-    small = {"dim_model": 32, "n_heads": 2, "dim_feedforward": 64, "n_encoder_layers": 1, "n_vae_encoder_layers": 1}
+    small = {
+        "dim_model": 32,
+        "n_heads": 2,
+        "dim_feedforward": 64,
+        "n_encoder_layers": 1,
+        "n_vae_encoder_layers": 1,
+    }
     chunk = {"chunk_size": CHUNK, "n_action_steps": EXECUTED}
-    return config_of("act", **{"pretrained_backbone_weights": None, "latent_dim": 8, **small, **chunk, **settings})
+    return config_of(
+        "act",
+        **{"pretrained_backbone_weights": None, "latent_dim": 8, **small, **chunk, **settings},
+    )
 
 
 def ensemble(**settings: Any) -> Any:
@@ -53,28 +62,61 @@ def ensemble(**settings: Any) -> Any:
 
 
 def full_act(**settings: Any) -> Any:
-    """Not tiny: ACT of LeRobot's own sizes (52 million parameters), with two cameras of 224 pixels, to be measured."""
+    """Not tiny: ACT of LeRobot's own sizes (52 million parameters), with two cameras of 224
+    pixels, to be measured.
+    """
     features = recipes.features(("top", "wrist"), 224, STATE)
     return config_of("act", pretrained_backbone_weights=None, input_features=features, **settings)
 
 
 def diffusion(**settings: Any) -> Any:
-    small = {"down_dims": (16, 32), "diffusion_step_embed_dim": 16, "spatial_softmax_num_keypoints": 8}
-    steps = {"horizon": CHUNK, "n_obs_steps": 2, "n_action_steps": EXECUTED, "num_train_timesteps": 10}
+    small = {
+        "down_dims": (16, 32),
+        "diffusion_step_embed_dim": 16,
+        "spatial_softmax_num_keypoints": 8,
+    }
+    steps = {
+        "horizon": CHUNK,
+        "n_obs_steps": 2,
+        "n_action_steps": EXECUTED,
+        "num_train_timesteps": 10,
+    }
     steps |= {"num_inference_steps": 3, "pretrained_backbone_weights": None}
     return config_of("diffusion", crop_shape=(56, 56), **small, **steps, **settings)
 
 
 def vqbet(**settings: Any) -> Any:
-    small = {"gpt_input_dim": 32, "gpt_output_dim": 32, "gpt_hidden_dim": 32, "gpt_n_layer": 1, "gpt_n_head": 2}
-    codes = {"vqvae_n_embed": 8, "vqvae_embedding_dim": 16, "vqvae_enc_hidden_dim": 16, "bet_softmax_temperature": 5.0}
+    small = {
+        "gpt_input_dim": 32,
+        "gpt_output_dim": 32,
+        "gpt_hidden_dim": 32,
+        "gpt_n_layer": 1,
+        "gpt_n_head": 2,
+    }
+    codes = {
+        "vqvae_n_embed": 8,
+        "vqvae_embedding_dim": 16,
+        "vqvae_enc_hidden_dim": 16,
+        "bet_softmax_temperature": 5.0,
+    }
     codes |= {"pretrained_backbone_weights": None}
     return config_of("vqbet", crop_shape=(56, 56), n_obs_steps=3, **small, **codes, **settings)
 
 
 def tdmpc(**settings: Any) -> Any:
-    small = {"latent_dim": 8, "mlp_dim": 16, "image_encoder_hidden_dim": 4, "state_encoder_hidden_dim": 8}
-    plan = {"horizon": 3, "n_gaussian_samples": 16, "n_pi_samples": 4, "n_elites": 4, "cem_iterations": 2}
+    small = {
+        "latent_dim": 8,
+        "mlp_dim": 16,
+        "image_encoder_hidden_dim": 4,
+        "state_encoder_hidden_dim": 8,
+    }
+    plan = {
+        "horizon": 3,
+        "n_gaussian_samples": 16,
+        "n_pi_samples": 4,
+        "n_elites": 4,
+        "cem_iterations": 2,
+    }
     return config_of("tdmpc", **small, **plan, **settings)
 
 
@@ -114,7 +156,9 @@ def smolvla(folder: Path, **settings: Any) -> Any:
         SmolVLMForConditionalGeneration(model).save_pretrained(folder / "vlm")
     chunk = {"chunk_size": CHUNK, "n_action_steps": EXECUTED, "num_steps": 4}
     sizes = {"num_vlm_layers": 2, "resize_imgs_with_padding": (64, 64), "load_vlm_weights": False}
-    return config_of("smolvla", vlm_model_name=str(folder / "vlm"), **{**sizes, **chunk, **settings})
+    return config_of(
+        "smolvla", vlm_model_name=str(folder / "vlm"), **{**sizes, **chunk, **settings}
+    )
 
 
 def xvla(folder: Path, **settings: Any) -> Any:
@@ -138,15 +182,35 @@ def xvla(folder: Path, **settings: Any) -> Any:
         "image_pos_embed": {"type": "learned_abs_2d", "max_pos_embeddings": 50},
         "visual_temporal_embedding": {"type": "COSINE", "max_temporal_embeddings": 100},
     }
-    layers = {f"{part}_{name}": n for part in ("encoder", "decoder") for name, n in (("layers", 1), ("ffn_dim", 64))}
+    layers = {
+        f"{part}_{name}": n
+        for part in ("encoder", "decoder")
+        for name, n in (("layers", 1), ("ffn_dim", 64))
+    }
     heads = {"encoder_attention_heads": 2, "decoder_attention_heads": 2}
     tokens = {"vocab_size": 400, "pad_token_id": 1, "bos_token_id": 0, "eos_token_id": 2}
     text = {"d_model": 32, "max_position_embeddings": 256, **layers, **heads, **tokens}
-    florence = {"vision_config": vision, "text_config": text, "projection_dim": 32, "vocab_size": 400}
-    sizes = {"hidden_size": 32, "depth": 1, "num_heads": 2, "num_domains": 2, "len_soft_prompts": 4, "max_len_seq": 128}
+    florence = {
+        "vision_config": vision,
+        "text_config": text,
+        "projection_dim": 32,
+        "vocab_size": 400,
+    }
+    sizes = {
+        "hidden_size": 32,
+        "depth": 1,
+        "num_heads": 2,
+        "num_domains": 2,
+        "len_soft_prompts": 4,
+        "max_len_seq": 128,
+    }
     chunk = {"chunk_size": CHUNK, "n_action_steps": EXECUTED, "num_denoising_steps": 3}
     images = {"num_image_views": 1, "resize_imgs_with_padding": (64, 64)}
-    own = {"florence_config": florence, "tokenizer_name": str(folder / "tokenizer"), "action_mode": "auto"}
+    own = {
+        "florence_config": florence,
+        "tokenizer_name": str(folder / "tokenizer"),
+        "action_mode": "auto",
+    }
     return config_of("xvla", **own, **sizes, **chunk, **images, **settings)
 
 
@@ -155,7 +219,9 @@ def groot(folder: Path, **settings: Any) -> Any:
 
 
 def vla_jepa(folder: Path, **settings: Any) -> Any:
-    return config_of("vla_jepa", **{**tiny06.vla_jepa(folder), "n_action_steps": EXECUTED, **settings})
+    return config_of(
+        "vla_jepa", **{**tiny06.vla_jepa(folder), "n_action_steps": EXECUTED, **settings}
+    )
 
 
 def eo1(folder: Path, **settings: Any) -> Any:
@@ -171,7 +237,10 @@ def evo1(folder: Path, **settings: Any) -> Any:
 
 
 def multi_task_dit(folder: Path, **settings: Any) -> Any:
-    return config_of("multi_task_dit", **{**tiny06.multi_task_dit(folder), "n_action_steps": EXECUTED, **settings})
+    return config_of(
+        "multi_task_dit",
+        **{**tiny06.multi_task_dit(folder), "n_action_steps": EXECUTED, **settings},
+    )
 
 
 def dit_flow(folder: Path, **settings: Any) -> Any:
@@ -203,15 +272,40 @@ _MAKERS: dict[str, Callable[..., Any]] = {
 # What each kind is tried for, by version: those whose code differs, and all that the older one has.
 KINDS = ("act", "diffusion", "smolvla", "xvla", "ensemble", "vqbet", "tdmpc", "sac")
 if NEW:
-    KINDS = (*KINDS[:4], "gaussian_actor", "groot", "multi_task_dit", "dit_flow", "vla_jepa", "eo1", "evo1", "wall_x")
+    KINDS = (
+        *KINDS[:4],
+        "gaussian_actor",
+        "groot",
+        "multi_task_dit",
+        "dit_flow",
+        "vla_jepa",
+        "eo1",
+        "evo1",
+        "wall_x",
+    )
 # Those with files of a tokenizer beside the checkpoint.
-_WITH_FILES = {"dit_flow", "eo1", "evo1", "groot", "multi_task_dit", "smolvla", "vla_jepa", "wall_x", "xvla"}
+_WITH_FILES = {
+    "dit_flow",
+    "eo1",
+    "evo1",
+    "groot",
+    "multi_task_dit",
+    "smolvla",
+    "vla_jepa",
+    "wall_x",
+    "xvla",
+}
 
 
 def make(folder: Path, kind: str = "act", **settings: Any) -> Path:
-    """A checkpoint of that kind in `folder`, with `settings` of its LeRobot config; returns `folder`."""
+    """A checkpoint of that kind in `folder`, with `settings` of its LeRobot config; returns
+    `folder`.
+    """
     folder.mkdir(parents=True, exist_ok=True)
-    return write(folder, _MAKERS[kind](folder, **settings) if kind in _WITH_FILES else _MAKERS[kind](**settings))
+    return write(
+        folder,
+        _MAKERS[kind](folder, **settings) if kind in _WITH_FILES else _MAKERS[kind](**settings),
+    )
 
 
 def write(folder: Path, config: Any) -> Path:
@@ -223,7 +317,11 @@ def write(folder: Path, config: Any) -> Path:
     if config.type == "vqbet":
         policy.vqbet.action_head.vqvae_model.discretized.fill_(True)
     policy.save_pretrained(folder)
-    with tiny06.local_backbone(folder / "vlm") if config.type == "groot" else contextlib.nullcontext():
+    with (
+        tiny06.local_backbone(folder / "vlm")
+        if config.type == "groot"
+        else contextlib.nullcontext()
+    ):
         recipes.write_processors(folder, config)
     return folder
 
@@ -234,7 +332,8 @@ def config_of(name: str, **settings: Any) -> Any:
 
 
 def _unsettle(policy: Any) -> None:
-    """Parameters that begin at one value would hide what they multiply: they get values of their own.
+    """Parameters that begin at one value would hide what they multiply: they get values of their
+    own.
 
     X-VLA leaves one as it finds the memory, to be read from a checkpoint.
     """

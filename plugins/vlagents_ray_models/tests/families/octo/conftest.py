@@ -10,7 +10,8 @@ from plugins.vlagents_ray_models.tests.families.octo import tiny
 
 MARKS = [
     pytest.mark.source("OCTO_SRC"),
-    # JAX 0.4.20, flax 0.7.5, tensorflow-probability 0.23 and Octo itself use what was deprecated since.
+    # JAX 0.4.20, flax 0.7.5, tensorflow-probability 0.23 and Octo itself use what was deprecated
+    # since.
     pytest.mark.filterwarnings("ignore::DeprecationWarning"),
 ]
 

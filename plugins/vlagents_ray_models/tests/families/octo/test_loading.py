@@ -21,7 +21,9 @@ pytestmark = MARKS
 
 
 def load(checkpoint: Path | str, **config: Any) -> Octo:
-    policy = Octo.from_config({"checkpoint": str(checkpoint), "dataset": "bridge_dataset", **config})
+    policy = Octo.from_config(
+        {"checkpoint": str(checkpoint), "dataset": "bridge_dataset", **config}
+    )
     policy.model = policy.load()
     return policy
 
@@ -32,14 +34,22 @@ def load(checkpoint: Path | str, **config: Any) -> Octo:
     [
         ({"dataset": "bridge"}, r"no statistics of 'action'.*bridge_dataset.*fractal20220817_data"),
         ({"dataset": None}, "no statistics of 'action'.*bridge_dataset"),
-        ({"cameras": {"image_top": "front"}}, r"got \['image_top'\], want \['image_primary', 'image_wrist'\]"),
-        ({"normalization": "bounds"}, r"have \['mask', 'mean', 'std'\].*p01.*set it as in training"),
+        (
+            {"cameras": {"image_top": "front"}},
+            r"got \['image_top'\], want \['image_primary', 'image_wrist'\]",
+        ),
+        (
+            {"normalization": "bounds"},
+            r"have \['mask', 'mean', 'std'\].*p01.*set it as in training",
+        ),
         ({"window": 5}, "got 5, want at most 4; trained: 2"),
         ({"state": ["joints"]}, "reads no state"),
         ({"device": "tpu:1"}, "not here"),
     ],
 )
-def test_settings_that_do_not_fit_the_checkpoint(pretrained: Path, config: dict[str, Any], message: str) -> None:
+def test_settings_that_do_not_fit_the_checkpoint(
+    pretrained: Path, config: dict[str, Any], message: str
+) -> None:
     with pytest.raises(ConfigError, match=message):
         load(pretrained, **config)
 
@@ -104,7 +114,9 @@ def test_a_step_is_taken_by_its_number(pretrained: Path) -> None:
         load(f"{pretrained}/{{step}}", checkpoint_step=8)
 
 
-def test_images_are_as_octos_own_wrapper_makes_them(monkeypatch: pytest.MonkeyPatch, pretrained: Path) -> None:
+def test_images_are_as_octos_own_wrapper_makes_them(
+    monkeypatch: pytest.MonkeyPatch, pretrained: Path
+) -> None:
     class Wrapper:
         def __init__(self, env: Any) -> None:
             self.observation_space = env.observation_space
@@ -124,10 +136,17 @@ def test_images_are_as_octos_own_wrapper_makes_them(monkeypatch: pytest.MonkeyPa
     env = types.SimpleNamespace(observation_space=Dict({}))
     wrapper = ResizeImageWrapper(env, {"primary": (256, 256), "wrist": (128, 128)})
     rng = np.random.default_rng(0)
-    images = {f"image_{name}": rng.integers(0, 256, (90, 160, 3), np.uint8) for name in ("primary", "wrist")}
+    images = {
+        f"image_{name}": rng.integers(0, 256, (90, 160, 3), np.uint8)
+        for name in ("primary", "wrist")
+    }
     wanted = wrapper.observation(dict(images))
-    assert np.array_equal(resized(images["image_primary"], 256, 256, crop=True), wanted["image_primary"])
-    assert np.array_equal(resized(images["image_wrist"], 128, 128, crop=False), wanted["image_wrist"])
+    assert np.array_equal(
+        resized(images["image_primary"], 256, 256, crop=True), wanted["image_primary"]
+    )
+    assert np.array_equal(
+        resized(images["image_wrist"], 128, 128, crop=False), wanted["image_wrist"]
+    )
 
 
 def test_an_image_of_the_right_size_is_kept_as_it_is_in_memory_of_its_own() -> None:
@@ -138,6 +157,10 @@ def test_an_image_of_the_right_size_is_kept_as_it_is_in_memory_of_its_own() -> N
 
 
 def test_bounds_are_turned_back_into_units() -> None:
-    statistics = {"p01": np.array([-2.0, 0.0]), "p99": np.array([4.0, 1.0]), "mask": np.array([True, False])}
+    statistics = {
+        "p01": np.array([-2.0, 0.0]),
+        "p99": np.array([4.0, 1.0]),
+        "mask": np.array([True, False]),
+    }
     found = real_actions(np.array([[-1.0, 0.7], [1.0, 0.2]]), statistics, "bounds")
     np.testing.assert_allclose(found, [[-2.0, 0.7], [4.0, 0.2]])

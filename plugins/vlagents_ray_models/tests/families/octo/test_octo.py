@@ -20,12 +20,15 @@ from vlagents_ray_models.octo import Octo
 
 pytestmark = MARKS
 
-ATOL = 1e-4  # float32 on a CPU, actions of up to 5; measured: 3e-5, as untrained weights amplify what differs
+# float32 on a CPU, actions of up to 5; measured: 3e-5, as untrained weights amplify what differs.
+ATOL = 1e-4
 INSTRUCTIONS = ["pick up the cube", "push the cube", "open the drawer"]
 
 
 def made(checkpoint: Path, **config: Any) -> Octo:
-    return Octo.from_config({"checkpoint": str(checkpoint), "dataset": "bridge_dataset", "batch_sizes": None, **config})
+    return Octo.from_config(
+        {"checkpoint": str(checkpoint), "dataset": "bridge_dataset", "batch_sizes": None, **config}
+    )
 
 
 @pytest.fixture(scope="module")
@@ -47,14 +50,22 @@ def begun(policy: Octo, obs: Obs, instruction: str | None = "push the cube", see
     return session
 
 
-def upstream(policy: Octo, frames: list[Obs], mask: list[bool], tasks: dict[str, Any], seed: int) -> np.ndarray:
-    """What Octo's `sample_actions` gives for one robot, with the key that a session of this seed draws first."""
+def upstream(
+    policy: Octo, frames: list[Obs], mask: list[bool], tasks: dict[str, Any], seed: int
+) -> np.ndarray:
+    """What Octo's `sample_actions` gives for one robot, with the key that a session of this seed
+    draws first.
+    """
     model, perceived = policy.model.model, [policy.perceive(obs) for obs in frames]
-    observations = {name: np.stack([frame[name] for frame in perceived])[None] for name in perceived[0]}
+    observations = {
+        name: np.stack([frame[name] for frame in perceived])[None] for name in perceived[0]
+    }
     observations["timestep_pad_mask"] = np.array([mask])
     key = np.random.default_rng([0, seed]).integers(2**32, size=2, dtype=np.uint32)
     statistics = policy.model.statistics(policy.config.dataset, "action")
-    return np.asarray(model.sample_actions(observations, tasks, unnormalization_statistics=statistics, rng=key)[0])
+    return np.asarray(
+        model.sample_actions(observations, tasks, unnormalization_statistics=statistics, rng=key)[0]
+    )
 
 
 def test_keeps_the_contract(pretrained: Path) -> None:
@@ -81,7 +92,11 @@ def test_a_goal_image_gives_what_octo_gives(policy: Octo) -> None:
     obs = seen(1, **{GOAL_IMAGE: goal})
     as_seen = policy.perceive(Obs(cameras={"front": goal, "wrist": goal}))["image_primary"]
     wanted = upstream(
-        policy, [obs, obs], [False, True], policy.model.model.create_tasks(goals={"image_primary": as_seen[None]}), 3
+        policy,
+        [obs, obs],
+        [False, True],
+        policy.model.model.create_tasks(goals={"image_primary": as_seen[None]}),
+        3,
     )
     np.testing.assert_allclose(begun(policy, obs, None, seed=3).act(obs).action, wanted, atol=ATOL)
 
@@ -129,7 +144,10 @@ def test_a_finetuned_checkpoint_reads_the_state(finetuned: Path) -> None:
     assert contract.state is not None
     assert contract.state["joints"].dim == 3
     assert list(contract.cameras or {}) == ["front"]
-    obs = Obs(cameras={"front": seen(1).cameras["front"]}, state={"joints": np.array([2, 1, -4], np.float32)})
+    obs = Obs(
+        cameras={"front": seen(1).cameras["front"]},
+        state={"joints": np.array([2, 1, -4], np.float32)},
+    )
     np.testing.assert_allclose(policy.perceive(obs)["proprio"], [1, 0, -3], atol=1e-6)
     tasks = policy.model.model.create_tasks(texts=["push the cube"])
     wanted = upstream(policy, [obs, obs], [False, True], tasks, seed=0)
@@ -171,7 +189,9 @@ def test_no_act_compiles_a_program(pretrained: Path) -> None:
     with jax_compiles() as compiled:
         for batch in batches:
             views = [seen(i, **info) for i, info in enumerate(batch)]
-            acts = policy.act_batch(views, [begun(policy, view, seed=i) for i, view in enumerate(views)])
+            acts = policy.act_batch(
+                views, [begun(policy, view, seed=i) for i, view in enumerate(views)]
+            )
             assert all(isinstance(act, Act) for act in acts)
     assert compiled == []
 
@@ -181,6 +201,7 @@ def test_it_acts_with_pushed_weights(pretrained: Path) -> None:
 
     policy = made(pretrained, batch_sizes=[1])
     policy.initialize()
-    assert policy.parameters().keys() == flatten_dict(policy.model.model.params, sep="/").keys()  # those of OctoModel
+    # Those of OctoModel.
+    assert policy.parameters().keys() == flatten_dict(policy.model.model.params, sep="/").keys()
     obs = seen(1)
     check_pushed_weights(policy, lambda: begun(policy, obs).act(obs).action)

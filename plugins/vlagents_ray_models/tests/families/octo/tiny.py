@@ -1,7 +1,7 @@
 """A small random Octo, made and saved by Octo's own code: `python tiny.py OUT_FOLDER [KIND]`.
 
-KIND is `pretrained` (two cameras, statistics of two datasets, as octo-base) or `finetuned` (one camera and the
-proprioception, statistics of its own).
+KIND is `pretrained` (two cameras, statistics of two datasets, as octo-base) or `finetuned` (one
+camera and the proprioception, statistics of its own).
 """
 
 from __future__ import annotations
@@ -25,13 +25,20 @@ ACTION = {
 
 
 def save(folder: Path, kind: str = "pretrained", head: str = "DiffusionActionHead") -> Path:
-    """Write the checkpoint of step 7, with the language encoder's configuration and tokenizer beside it."""
+    """Write the checkpoint of step 7, with the language encoder's configuration and tokenizer
+    beside it.
+    """
     model_class = octo_model_class(None)
     from octo.data.utils.text_processing import HFTokenizer
     from octo.utils.spec import ModuleSpec
 
     encoder = str(_language(folder.parent / f"{folder.name}-t5"))
-    tokenizer = {"max_length": TOKENS, "padding": "max_length", "truncation": True, "return_tensors": "np"}
+    tokenizer = {
+        "max_length": TOKENS,
+        "padding": "max_length",
+        "truncation": True,
+        "return_tensors": "np",
+    }
     text = ModuleSpec.create(HFTokenizer, tokenizer_name=encoder, tokenizer_kwargs=tokenizer)
     finetuned = kind == "finetuned"
     config = {"model": _model(encoder, head, finetuned), "text_processor": text}
@@ -67,20 +74,29 @@ def _language(folder: Path) -> Path:
 
 def _model(encoder: str, head: str, finetuned: bool) -> dict[str, Any]:
     from octo.model.components import action_heads
-    from octo.model.components.tokenizers import ImageTokenizer, LanguageTokenizer, LowdimObsTokenizer
+    from octo.model.components.tokenizers import (
+        ImageTokenizer,
+        LanguageTokenizer,
+        LowdimObsTokenizer,
+    )
     from octo.model.components.vit_encoders import SmallStem32
     from octo.utils.spec import ModuleSpec
 
     stem = ModuleSpec.create(SmallStem32, features=(32, 32, 32, 32), num_features=EMBEDDING)
     observations = {
         camera: ModuleSpec.create(
-            ImageTokenizer, obs_stack_keys=[f"image_{camera}"], task_stack_keys=[f"image_{camera}"], encoder=stem
+            ImageTokenizer,
+            obs_stack_keys=[f"image_{camera}"],
+            task_stack_keys=[f"image_{camera}"],
+            encoder=stem,
         )
         for camera in (["primary"] if finetuned else ["primary", "wrist"])
     }
     if finetuned:
         observations["proprio"] = ModuleSpec.create(LowdimObsTokenizer, obs_keys=["proprio"])
-    discrete = {"token_per": "action_horizon", "use_map": True} if head == "DiscreteActionHead" else {}
+    discrete = (
+        {"token_per": "action_horizon", "use_map": True} if head == "DiscreteActionHead" else {}
+    )
     return {
         "observation_tokenizers": observations,
         "task_tokenizers": {"language": ModuleSpec.create(LanguageTokenizer, encoder=encoder)},
@@ -120,17 +136,31 @@ def _example(finetuned: bool) -> dict[str, Any]:
     observation["timestep"] = np.zeros((1, WINDOW), np.int32)
     observation["timestep_pad_mask"] = np.ones((1, WINDOW), bool)
     observation["pad_mask_dict"] = {name: np.ones((1, WINDOW), bool) for name in images}
-    task: dict[str, Any] = {name: np.zeros((1, side, side, 3), np.uint8) for name, side in images.items()}
-    task["language_instruction"] = {name: np.ones((1, TOKENS), np.int64) for name in ("input_ids", "attention_mask")}
+    task: dict[str, Any] = {
+        name: np.zeros((1, side, side, 3), np.uint8) for name, side in images.items()
+    }
+    task["language_instruction"] = {
+        name: np.ones((1, TOKENS), np.int64) for name in ("input_ids", "attention_mask")
+    }
     task["pad_mask_dict"] = {name: np.ones(1, bool) for name in (*images, "language_instruction")}
-    return {"observation": observation, "task": task, "action": np.zeros((1, WINDOW, HORIZON, 7), np.float32)}
+    return {
+        "observation": observation,
+        "task": task,
+        "action": np.zeros((1, WINDOW, HORIZON, 7), np.float32),
+    }
 
 
 def _statistics(finetuned: bool) -> dict[str, Any]:
     action = {name: np.array(values) for name, values in ACTION.items()}
     if finetuned:
-        return {"action": action, "proprio": {"mean": np.arange(STATE) * 1.0, "std": np.full(STATE, 2.0)}}
-    return {"bridge_dataset": {"action": action}, "fractal20220817_data": {"action": action | {"mean": np.ones(7)}}}
+        return {
+            "action": action,
+            "proprio": {"mean": np.arange(STATE) * 1.0, "std": np.full(STATE, 2.0)},
+        }
+    return {
+        "bridge_dataset": {"action": action},
+        "fractal20220817_data": {"action": action | {"mean": np.ones(7)}},
+    }
 
 
 if __name__ == "__main__":

@@ -18,8 +18,12 @@ MARKS = [
     # ml_collections 1.0.0 has a pattern that is no raw string.
     pytest.mark.filterwarnings("ignore:invalid escape sequence:DeprecationWarning"),
     # flax 0.10.2 calls JAX in ways that 0.5.3 deprecates.
-    pytest.mark.filterwarnings("ignore:linear_util.wrap_init is missing a DebugInfo object:DeprecationWarning"),
-    pytest.mark.filterwarnings("ignore:shape requires ndarray or scalar arguments:DeprecationWarning:flax.core.scope"),
+    pytest.mark.filterwarnings(
+        "ignore:linear_util.wrap_init is missing a DebugInfo object:DeprecationWarning"
+    ),
+    pytest.mark.filterwarnings(
+        "ignore:shape requires ndarray or scalar arguments:DeprecationWarning:flax.core.scope"
+    ),
 ]
 
 
@@ -80,11 +84,17 @@ def upstream(tiny: ModuleType, monkeypatch: pytest.MonkeyPatch) -> Made:
 
     models = policy_config._model
     restore = models.restore_params
-    monkeypatch.setattr(models, "restore_params", lambda path, **kwargs: restore(path, **kwargs | {"dtype": "float32"}))
+    monkeypatch.setattr(
+        models,
+        "restore_params",
+        lambda path, **kwargs: restore(path, **kwargs | {"dtype": "float32"}),
+    )
 
     def make(kind: str, folder: Path) -> Any:
         config = tiny.CONFIGS[kind]
-        config = dataclasses.replace(config, model=dataclasses.replace(config.model, dtype="float32"))
+        config = dataclasses.replace(
+            config, model=dataclasses.replace(config.model, dtype="float32")
+        )
         settings = {} if kind == "fast" else {"num_steps": 4}
         return policy_config.create_trained_policy(config, folder, sample_kwargs=settings)
 

@@ -26,14 +26,21 @@ def whole(checkpoint: Any, tmp_path: Path) -> Path:
 def load(folder: Path, **settings: Any) -> Any:
     from vlagents_ray_models.openpi import OpenPi
 
-    config = {"config": "plugins.vlagents_ray_models.tests.families.openpi.tiny:PI0", "batch_sizes": [1], **settings}
+    config = {
+        "config": "plugins.vlagents_ray_models.tests.families.openpi.tiny:PI0",
+        "batch_sizes": [1],
+        **settings,
+    }
     return OpenPi.from_config({"checkpoint": str(folder), **config}).load()
 
 
 @pytest.mark.verifies("loading")
 def test_missing_statistics_are_an_error_that_names_those_that_are_there(whole: Path) -> None:
     (whole / "assets" / "tiny").rename(whole / "assets" / "other")
-    with pytest.raises(ConfigError, match=r"no assets/tiny/libero/norm_stats\.json, has those of \['other/libero'\]"):
+    with pytest.raises(
+        ConfigError,
+        match=r"no assets/tiny/libero/norm_stats\.json, has those of \['other/libero'\]",
+    ):
         load(whole)
 
 
@@ -54,12 +61,16 @@ def test_quantiles_that_a_config_needs_must_be_there(checkpoint: Any, tmp_path: 
     stats["norm_stats"]["state"]["q01"] = None
     file.write_text(json.dumps(stats))
     with pytest.raises(ConfigError, match="quantile"):
-        load(tmp_path / "step", config="plugins.vlagents_ray_models.tests.families.openpi.tiny:PI05")
+        load(
+            tmp_path / "step", config="plugins.vlagents_ray_models.tests.families.openpi.tiny:PI05"
+        )
 
 
 def test_the_folder_of_a_run_is_told_from_that_of_a_step(whole: Path) -> None:
     shutil.rmtree(whole / "params")
-    with pytest.raises(ConfigError, match=r"want params/ or model\.safetensors; name the folder of one step"):
+    with pytest.raises(
+        ConfigError, match=r"want params/ or model\.safetensors; name the folder of one step"
+    ):
         load(whole)
 
 

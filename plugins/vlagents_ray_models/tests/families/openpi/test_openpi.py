@@ -26,7 +26,12 @@ BATCHED = 1e-5  # how far a batch's actions may be off those of a lone row, in f
 KINDS = ("pi0", "pi05", "aloha")
 PROGRAMS = {"pi0": ("_encode", "_follow"), "fast": ("_sample",)}
 # openpi's observation -> ours, as a client of each would send it
-MAPPINGS = {"pi0": "openpi-libero", "pi05": "openpi-droid", "aloha": "openpi-aloha", "fast": "openpi-droid"}
+MAPPINGS = {
+    "pi0": "openpi-libero",
+    "pi05": "openpi-droid",
+    "aloha": "openpi-aloha",
+    "fast": "openpi-droid",
+}
 
 
 def theirs(kind: str, seed: int) -> dict[str, Any]:
@@ -41,7 +46,11 @@ def theirs(kind: str, seed: int) -> dict[str, Any]:
 
     if kind == "pi0":
         state = np.concatenate([numbers(6), 0.04 * numbers(2)])
-        return {"observation/image": picture(), "observation/wrist_image": picture(), "observation/state": state}
+        return {
+            "observation/image": picture(),
+            "observation/wrist_image": picture(),
+            "observation/state": state,
+        }
     if kind in ("pi05", "fast"):
         return {
             "observation/exterior_image_1_left": picture(),
@@ -50,7 +59,10 @@ def theirs(kind: str, seed: int) -> dict[str, Any]:
             "observation/gripper_position": numbers(1),
         }
     cameras = ("cam_high", "cam_left_wrist", "cam_right_wrist")
-    return {"images": {name: picture().transpose(2, 0, 1) for name in cameras}, "state": numbers(14)}
+    return {
+        "images": {name: picture().transpose(2, 0, 1) for name in cameras},
+        "state": numbers(14),
+    }
 
 
 def seen(kind: str, seed: int, **info: Any) -> Obs:
@@ -68,17 +80,27 @@ def begun(policy: Any, kind: str, i: int) -> Any:
 
 @pytest.mark.verifies("parity")
 @pytest.mark.parametrize("kind", KINDS)
-def test_actions_are_those_of_openpis_own_policy(kind: str, loaded: Any, upstream: Any, checkpoint: Any) -> None:
+def test_actions_are_those_of_openpis_own_policy(
+    kind: str, loaded: Any, upstream: Any, checkpoint: Any
+) -> None:
     policy = loaded(kind)
     theirs_policy = upstream(kind, checkpoint(kind))
     for i in range(2):
-        noise = np.random.default_rng([0, i]).standard_normal(policy.model.model.noise_shape, dtype=np.float32)
+        noise = np.random.default_rng([0, i]).standard_normal(
+            policy.model.model.noise_shape, dtype=np.float32
+        )
         want = theirs_policy.infer({**theirs(kind, i), "prompt": WORDS[i]}, noise=noise)["actions"]
-        np.testing.assert_allclose(begun(policy, kind, i).act(seen(kind, i)).action, want, atol=1e-4, rtol=1e-4)
+        np.testing.assert_allclose(
+            begun(policy, kind, i).act(seen(kind, i)).action, want, atol=1e-4, rtol=1e-4
+        )
 
 
-@pytest.mark.parametrize(("kind", "known"), [("pi0", (8, 1)), ("pi05", (8, 8)), ("aloha", (12, 2)), ("fast", (8, 8))])
-def test_the_ranges_of_the_training_are_in_the_robots_units(kind: str, known: tuple[int, int], loaded: Any) -> None:
+@pytest.mark.parametrize(
+    ("kind", "known"), [("pi0", (8, 1)), ("pi05", (8, 8)), ("aloha", (12, 2)), ("fast", (8, 8))]
+)
+def test_the_ranges_of_the_training_are_in_the_robots_units(
+    kind: str, known: tuple[int, int], loaded: Any
+) -> None:
     trained = Trained.from_statistics(loaded(kind).statistics)
     assert trained.state is not None
     assert trained.action is not None
@@ -94,7 +116,9 @@ def test_neighbours_change_nothing(kind: str, loaded: Any) -> None:
     policy = loaded(kind)
     alone = [begun(policy, kind, i).act(seen(kind, i)).action for i in range(6)]
     for size in (2, 3, 6):  # of batches of 1 and 4
-        acts = policy.act_batch([seen(kind, i) for i in range(size)], [begun(policy, kind, i) for i in range(size)])
+        acts = policy.act_batch(
+            [seen(kind, i) for i in range(size)], [begun(policy, kind, i) for i in range(size)]
+        )
         for one, act in zip(alone, acts, strict=False):
             np.testing.assert_allclose(act.action, one, atol=BATCHED, rtol=1e-5)
 
@@ -125,7 +149,8 @@ def test_the_samples_of_an_observation_are_of_one_reading_of_it(
         np.testing.assert_allclose(one.action, other.action, atol=BATCHED, rtol=1e-5)
         samples = [act.info[DISTRIBUTION]["samples"] for act in (one, other)]
         np.testing.assert_allclose(*samples, atol=BATCHED, rtol=1e-5)
-    assert (encode._cache_size(), follow._cache_size()) == (2, 2)  # of the two sizes, from the start
+    # Of the two sizes, from the start.
+    assert (encode._cache_size(), follow._cache_size()) == (2, 2)
 
 
 def test_no_act_compiles_a_program(loaded: Any) -> None:
@@ -138,12 +163,16 @@ def test_no_act_compiles_a_program(loaded: Any) -> None:
     with jax_compiles() as compiled:
         for batch in batches:
             sessions = [begun(policy, "pi0", i) for i in range(len(batch))]
-            acts = policy.act_batch([seen("pi0", i, **info) for i, info in enumerate(batch)], sessions)
+            acts = policy.act_batch(
+                [seen("pi0", i, **info) for i, info in enumerate(batch)], sessions
+            )
             assert all(isinstance(act, Act) for act in acts)
     assert compiled == []
     with jax_compiles() as compiled:  # the count sees other sizes
         policy.config = policy.config.model_copy(update={"batch_sizes": None})
-        policy.act_batch([seen("pi0", i) for i in range(3)], [begun(policy, "pi0", i) for i in range(3)])
+        policy.act_batch(
+            [seen("pi0", i) for i in range(3)], [begun(policy, "pi0", i) for i in range(3)]
+        )
     assert len(compiled) >= 2
 
 
@@ -160,12 +189,19 @@ def test_its_programs_never_call_the_host(loaded: Any, monkeypatch: pytest.Monke
         monkeypatch.setattr(model, name, lowered)
     begun(policy, "pi0", 0).act(seen("pi0", 0))
     assert len(texts) == 2
-    assert not [word for text in texts for word in ("callback", "infeed", "outfeed", "send(") if word in text]
+    assert not [
+        word
+        for text in texts
+        for word in ("callback", "infeed", "outfeed", "send(")
+        if word in text
+    ]
 
 
 def test_it_keeps_what_an_agent_promises(loaded: Any, checkpoint: Any) -> None:
     policy = type(loaded("pi0"))(loaded("pi0").config)
-    check_agent(policy, obs=[seen("pi0", i) for i in range(3)], instructions=WORDS, steps=2, atol=BATCHED)
+    check_agent(
+        policy, obs=[seen("pi0", i) for i in range(3)], instructions=WORDS, steps=2, atol=BATCHED
+    )
 
 
 def test_contracts_fit_the_mappings_of_their_clients(loaded: Any) -> None:
@@ -181,16 +217,21 @@ def test_a_session_that_fails_leaves_its_neighbours_alone(loaded: Any) -> None:
     long = copy.copy(policy)
     long.reset(seen("pi0", 1), "pick up the cube " * 50, seed=1)
     acts = policy.act_batch(
-        [bad, seen("pi0", 1), seen("pi0", 2)], [begun(policy, "pi0", 0), long, begun(policy, "pi0", 2)]
+        [bad, seen("pi0", 1), seen("pi0", 2)],
+        [begun(policy, "pi0", 0), long, begun(policy, "pi0", 2)],
     )
     assert isinstance(acts[0], MissingCamera)
     assert isinstance(acts[1], InvalidObservation)
     assert "shorten it" in str(acts[1])
-    np.testing.assert_allclose(acts[2].action, begun(policy, "pi0", 2).act(seen("pi0", 2)).action, atol=BATCHED)
+    np.testing.assert_allclose(
+        acts[2].action, begun(policy, "pi0", 2).act(seen("pi0", 2)).action, atol=BATCHED
+    )
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_frozen_rows_come_back_as_planned_also_where_actions_are_relative(kind: str, loaded: Any) -> None:
+def test_frozen_rows_come_back_as_planned_also_where_actions_are_relative(
+    kind: str, loaded: Any
+) -> None:
     policy = loaded(kind)
     plan = begun(policy, kind, 1).act(seen(kind, 1)).action[1:]
     free = begun(policy, kind, 0).act(seen(kind, 0)).action
@@ -206,7 +247,9 @@ def test_a_config_with_its_own_prompt_needs_no_instruction(loaded: Any) -> None:
     session.reset(seen("aloha", 0), None, seed=0)
     told = copy.copy(policy)
     told.reset(seen("aloha", 0), "uncap", seed=0)
-    np.testing.assert_array_equal(session.act(seen("aloha", 0)).action, told.act(seen("aloha", 0)).action)
+    np.testing.assert_array_equal(
+        session.act(seen("aloha", 0)).action, told.act(seen("aloha", 0)).action
+    )
 
 
 @pytest.mark.verifies("parity")
@@ -214,9 +257,13 @@ def test_fast_says_what_openpis_own_policy_says_alone_and_in_company(
     loaded: Any, upstream: Any, checkpoint: Any
 ) -> None:
     policy, theirs_policy = loaded("fast"), upstream("fast", checkpoint("fast"))
-    want = [theirs_policy.infer({**theirs("fast", i), "prompt": WORDS[i]})["actions"] for i in range(3)]
+    want = [
+        theirs_policy.infer({**theirs("fast", i), "prompt": WORDS[i]})["actions"] for i in range(3)
+    ]
     alone = [begun(policy, "fast", i).act(seen("fast", i)).action for i in range(3)]
-    acts = policy.act_batch([seen("fast", i) for i in range(3)], [begun(policy, "fast", i) for i in range(3)])
+    acts = policy.act_batch(
+        [seen("fast", i) for i in range(3)], [begun(policy, "fast", i) for i in range(3)]
+    )
     for i in range(3):
         np.testing.assert_allclose(alone[i], want[i], rtol=1e-5)
         np.testing.assert_array_equal(acts[i].action, alone[i])
@@ -235,7 +282,10 @@ def test_it_acts_with_pushed_weights(kind: str, loaded: Any, checkpoint: Any) ->
     from openpi.models.model import restore_params
 
     policy = loaded(kind)
-    assert policy.parameters().keys() == flatten_dict(restore_params(checkpoint(kind) / "params"), sep="/").keys()
+    assert (
+        policy.parameters().keys()
+        == flatten_dict(restore_params(checkpoint(kind) / "params"), sep="/").keys()
+    )
     programs = [getattr(policy.model.model, name) for name in PROGRAMS[kind]]
     compiled = [one._cache_size() for one in programs]
     check_pushed_weights(policy, lambda: begun(policy, kind, 0).act(seen(kind, 0)).action)
@@ -244,7 +294,9 @@ def test_it_acts_with_pushed_weights(kind: str, loaded: Any, checkpoint: Any) ->
 
 def test_a_learner_of_adapters_pushes_these_alone(loaded: Any) -> None:
     policy = loaded("lora")
-    check_pushed_weights(policy, lambda: begun(policy, "pi0", 0).act(seen("pi0", 0)).action, part="lora")
+    check_pushed_weights(
+        policy, lambda: begun(policy, "pi0", 0).act(seen("pi0", 0)).action, part="lora"
+    )
 
 
 def test_a_compiled_loop_has_no_random_steps(loaded: Any) -> None:

@@ -1,4 +1,6 @@
-"""openpi's PyTorch port, where transformers is patched as openpi wants it; without that it is refused."""
+"""openpi's PyTorch port, where transformers is patched as openpi wants it; without that it is
+refused.
+"""
 
 from __future__ import annotations
 
@@ -15,16 +17,25 @@ from normal_steps import logprob_of_steps
 from pushed_weights import check_pushed_weights
 
 from plugins.vlagents_ray_models.tests.families.openpi.conftest import MARKS
-from plugins.vlagents_ray_models.tests.families.openpi.test_openpi import BATCHED, WORDS, begun, seen, theirs
+from plugins.vlagents_ray_models.tests.families.openpi.test_openpi import (
+    BATCHED,
+    WORDS,
+    begun,
+    seen,
+    theirs,
+)
 from vlagents_ray.errors import ConfigError, InvalidObservation
 from vlagents_ray.interface import BEHAVIOUR, DELAY, DISTRIBUTION, LEFTOVER, SAMPLES, WANT
 from vlagents_ray.policies.base import policy as base_policy
 from vlagents_ray_models.openpi import OpenPi, _observation
 
 pytestmark = MARKS
-PATCHED = all(importlib.util.find_spec(name) for name in ("transformers", "transformers.models.siglip.check"))
+PATCHED = all(
+    importlib.util.find_spec(name) for name in ("transformers", "transformers.models.siglip.check")
+)
 patched = pytest.mark.skipif(
-    not PATCHED, reason="transformers is not patched by openpi's models_pytorch/transformers_replace"
+    not PATCHED,
+    reason="transformers is not patched by openpi's models_pytorch/transformers_replace",
 )
 
 
@@ -48,7 +59,9 @@ def made(folder: Path, **settings: Any) -> OpenPi:
 
 @patched
 @pytest.mark.verifies("parity")
-def test_actions_are_those_of_openpis_own_policy_alone_and_in_company(port: Path, tiny: ModuleType) -> None:
+def test_actions_are_those_of_openpis_own_policy_alone_and_in_company(
+    port: Path, tiny: ModuleType
+) -> None:
     import torch
     from openpi.policies.policy import Policy
 
@@ -61,7 +74,9 @@ def test_actions_are_those_of_openpis_own_policy_alone_and_in_company(port: Path
         sample_kwargs={"num_steps": 3},
         is_pytorch=True,
     )
-    acts = policy.act_batch([seen("pi0", i) for i in range(3)], [begun(policy, "pi0", i) for i in range(3)])
+    acts = policy.act_batch(
+        [seen("pi0", i) for i in range(3)], [begun(policy, "pi0", i) for i in range(3)]
+    )
     for i, act in enumerate(acts):
         noise = np.random.default_rng([0, i]).standard_normal((8, 32), dtype=np.float32)
         with torch.inference_mode():
@@ -78,7 +93,11 @@ def test_compiled_passes_act_as_without(port: Path) -> None:
         for size in (1, 2, 3):
             views = [seen("pi0", i) for i in range(size)]
             for one, other in zip(
-                *(p.act_batch(views, [begun(p, "pi0", i) for i in range(size)]) for p in (plain, compiled)), strict=True
+                *(
+                    p.act_batch(views, [begun(p, "pi0", i) for i in range(size)])
+                    for p in (plain, compiled)
+                ),
+                strict=True,
             ):
                 np.testing.assert_allclose(one.action, other.action, atol=BATCHED)
         assert programs.rows == [2, 2]
@@ -87,7 +106,8 @@ def test_compiled_passes_act_as_without(port: Path) -> None:
 @patched
 def test_it_acts_with_pushed_weights(port: Path) -> None:
     policy = made(port)
-    assert policy.parameters().keys() == policy.model.model.trained.state_dict().keys()  # those of openpi's trainer
+    # Those of openpi's trainer.
+    assert policy.parameters().keys() == policy.model.model.trained.state_dict().keys()
     check_pushed_weights(policy, lambda: begun(policy, "pi0", 0).act(seen("pi0", 0)).action)
 
 
@@ -107,7 +127,9 @@ ALL = ["logprob", "entropy", "replay"]
 
 
 @patched
-def test_the_log_probability_is_that_of_the_network_itself(port: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_log_probability_is_that_of_the_network_itself(
+    port: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     import torch
 
     policy = made(port, noise_level=LEVEL)
@@ -118,19 +140,29 @@ def test_the_log_probability_is_that_of_the_network_itself(port: Path, monkeypat
     inputs = session.perceive(seen("pi0", 0)).inputs
     observation = _observation({key: _tensors(value) for key, value in inputs.items()})
     plain = network._preprocess_observation
-    monkeypatch.setattr(network, "_preprocess_observation", lambda one, **_: plain(one, train=False))
-    hook = network.action_out_proj.register_forward_hook(lambda _module, _inputs, out: seen_velocities.append(out))
+    monkeypatch.setattr(
+        network, "_preprocess_observation", lambda one, **_: plain(one, train=False)
+    )
+    hook = network.action_out_proj.register_forward_hook(
+        lambda _module, _inputs, out: seen_velocities.append(out)
+    )
 
     def velocity(noisy: Any, time: float) -> Any:
-        """The network's in training: noise and actions are the same, and so is what is between them."""
+        """The network's in training: noise and actions are the same, and so is what is between
+        them.
+        """
         with torch.no_grad():
-            network.forward(observation, noisy, noise=noisy, time=torch.tensor([time], dtype=torch.float32))
+            network.forward(
+                observation, noisy, noise=noisy, time=torch.tensor([time], dtype=torch.float32)
+            )
         return seen_velocities[-1]
 
     own, found = act.info[BEHAVIOUR], act.info[DISTRIBUTION]
     chains = [own["replay"]["chain"], *found["replay"]["chain"]]
     for chain, logprob in zip(chains, [own["logprob"], *found["logprob"]], strict=True):
-        np.testing.assert_allclose(logprob, logprob_of_steps(velocity, chain, LEVEL)[:, :7], atol=5e-3)
+        np.testing.assert_allclose(
+            logprob, logprob_of_steps(velocity, chain, LEVEL)[:, :7], atol=5e-3
+        )
     hook.remove()
 
 
@@ -144,7 +176,9 @@ def _tensors(value: Any) -> Any:
 
 
 @patched
-def test_the_samples_of_an_observation_are_of_one_reading_of_it(port: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_samples_of_an_observation_are_of_one_reading_of_it(
+    port: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     policy, read = made(port, noise_level=LEVEL), []
     network = policy.model.model.trained
     embed = network.embed_prefix
@@ -158,7 +192,8 @@ def test_the_samples_of_an_observation_are_of_one_reading_of_it(port: Path, monk
 
     def acted() -> list[Any]:
         sessions = [begun(policy, "pi0", i) for i in range(3)]
-        sessions[0].reset(views[0], "pick up the cube " * 50)  # too long, so that it is not computed
+        # Too long, so that it is not computed.
+        sessions[0].reset(views[0], "pick up the cube " * 50)
         return policy.act_batch(views, sessions)
 
     shared = acted()
@@ -167,7 +202,9 @@ def test_the_samples_of_an_observation_are_of_one_reading_of_it(port: Path, monk
     assert read == [2, 10]
     assert isinstance(shared[0], InvalidObservation)
     alone = begun(policy, "pi0", 1).act(views[1]).info[BEHAVIOUR]["replay"]["chain"]
-    np.testing.assert_allclose(shared[1].info[BEHAVIOUR]["replay"]["chain"], alone, atol=10 * BATCHED)
+    np.testing.assert_allclose(
+        shared[1].info[BEHAVIOUR]["replay"]["chain"], alone, atol=10 * BATCHED
+    )
     for one, other in zip(shared[1:], each[1:], strict=True):
         np.testing.assert_allclose(one.action, other.action, atol=10 * BATCHED)
     samples = [acts[1].info[DISTRIBUTION]["samples"] for acts in (shared, each)]

@@ -24,7 +24,11 @@ LIBRARIES = [
     # timm 0.9.10 scripts some activations, which torch 2.13 deprecates
     pytest.mark.filterwarnings("ignore:`torch.jit.:DeprecationWarning"),
 ]
-WORDS = ("Pick up the black bowl", "open the drawer", "put the bowl, which stands on the stove, into the top drawer")
+WORDS = (
+    "Pick up the black bowl",
+    "open the drawer",
+    "put the bowl, which stands on the stove, into the top drawer",
+)
 
 
 @pytest.fixture(scope="session")
@@ -43,7 +47,9 @@ def loaded(checkpoint: Callable[[str], Path]) -> Callable[..., ModelPolicy]:
     @lru_cache
     def load(kind: str, **config: Any) -> ModelPolicy:
         settings = {"checkpoint": str(checkpoint(kind)), "unnorm_key": "bridge_orig"} | config
-        policy: ModelPolicy = policy_class("openvla_oft" if "oft" in kind else "openvla").from_config(settings)
+        policy: ModelPolicy = policy_class(
+            "openvla_oft" if "oft" in kind else "openvla"
+        ).from_config(settings)
         policy.initialize()
         return policy
 
@@ -54,7 +60,9 @@ def seen(seed: int, **info: Any) -> Obs:
     """What session `seed` sees: LIBERO's cameras and states."""
     rng = np.random.default_rng(seed)
     return Obs(
-        cameras={name: rng.integers(0, 256, (80, 96, 3), dtype=np.uint8) for name in ("front", "wrist")},
+        cameras={
+            name: rng.integers(0, 256, (80, 96, 3), dtype=np.uint8) for name in ("front", "wrist")
+        },
         state={
             "xyz_axis_angle": rng.normal(size=6).astype(np.float32),
             "gripper_qpos": rng.normal(size=2).astype(np.float32),

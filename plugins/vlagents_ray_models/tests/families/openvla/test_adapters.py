@@ -1,4 +1,6 @@
-"""LoRA adapters over OpenVLA, as PEFT trains and saves them, against each one merged into its base by PEFT."""
+"""LoRA adapters over OpenVLA, as PEFT trains and saves them, against each one merged into its
+base by PEFT.
+"""
 
 from __future__ import annotations
 
@@ -30,8 +32,12 @@ CHOSEN = ("first", None, "second", "first")
 
 
 @pytest.fixture(scope="module")
-def saved(checkpoint: Callable[[str], Path], tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
-    """Folders of adapters, and under "merged/NAME" of whole checkpoints; "second" has a dataset of its own."""
+def saved(
+    checkpoint: Callable[[str], Path], tmp_path_factory: pytest.TempPathFactory
+) -> dict[str, Path]:
+    """Folders of adapters, and under "merged/NAME" of whole checkpoints; "second" has a dataset
+    of its own.
+    """
     root, folders = tmp_path_factory.mktemp("adapters"), {}
     cls = module("OPENVLA_SRC", "extern.hf.modeling_prismatic").OpenVLAForActionPrediction
     for seed, (name, rank) in enumerate((("first", 4), ("second", 8))):
@@ -39,14 +45,21 @@ def saved(checkpoint: Callable[[str], Path], tmp_path_factory: pytest.TempPathFa
         network = cls.from_pretrained(checkpoint("openvla"))
         # as OpenVLA's vla-scripts/finetune.py, but not at zero
         config = LoraConfig(
-            r=rank, lora_alpha=min(rank, 16), lora_dropout=0.0, target_modules="all-linear", init_lora_weights=False
+            r=rank,
+            lora_alpha=min(rank, 16),
+            lora_dropout=0.0,
+            target_modules="all-linear",
+            init_lora_weights=False,
         )
         trained = get_peft_model(network, config)
         folders[name] = root / name
-        with warnings.catch_warnings():  # that it saves the base's last layer as well, since that has an adapter
+        # That it saves the base's last layer as well, since that has an adapter.
+        with warnings.catch_warnings():
             warnings.filterwarnings("ignore", "Setting `save_embedding_layers`", UserWarning)
             trained.save_pretrained(folders[name])
-        whole = folders[f"merged/{name}"] = shutil.copytree(checkpoint("openvla"), root / f"merged-{name}")
+        whole = folders[f"merged/{name}"] = shutil.copytree(
+            checkpoint("openvla"), root / f"merged-{name}"
+        )
         trained.merge_and_unload().save_pretrained(whole)
         if name == "second":
             datasets = json.loads((whole / "dataset_statistics.json").read_text())
@@ -80,7 +93,9 @@ def test_each_row_of_one_pass_acts_as_its_adapter_merged_alone(
         "second": load(saved["merged/second"], unnorm_key=None),
     }
     sessions = [session(policy, seed, adapter=name) for seed, name in enumerate(CHOSEN)]
-    acts = policy.act_batch([seen(seed, **{SAMPLES: 2 * seed}) for seed in range(len(CHOSEN))], sessions)
+    acts = policy.act_batch(
+        [seen(seed, **{SAMPLES: 2 * seed}) for seed in range(len(CHOSEN))], sessions
+    )
     for seed, (name, act) in enumerate(zip(CHOSEN, acts, strict=True)):
         wanted = session(alone[name], seed).act(seen(seed, **{SAMPLES: 2 * seed}))
         assert isinstance(act, Act)
@@ -92,7 +107,9 @@ def test_each_row_of_one_pass_acts_as_its_adapter_merged_alone(
             assert np.array_equal(stated["samples"], other["samples"])
         assert (POLICY in act.info) == (name is not None)
         if name is not None:
-            assert not np.array_equal(wanted.action, session(alone[None], seed).act(seen(seed)).action)
+            assert not np.array_equal(
+                wanted.action, session(alone[None], seed).act(seen(seed)).action
+            )
 
 
 def test_a_learner_pushes_the_layers_alone_that_its_adapters_change(
@@ -103,20 +120,36 @@ def test_a_learner_pushes_the_layers_alone_that_its_adapters_change(
         cls.OpenVLAForActionPrediction.from_pretrained(checkpoint("openvla")), saved["first"]
     )
     trained.merge_adapter()
-    merged = {name: value for name, value in trained.state_dict().items() if name.endswith(".base_layer.weight")}
-    pushed = {name.removeprefix("base_model.model.").replace(".base_layer", ""): merged[name] for name in merged}
+    merged = {
+        name: value
+        for name, value in trained.state_dict().items()
+        if name.endswith(".base_layer.weight")
+    }
+    pushed = {
+        name.removeprefix("base_model.model.").replace(".base_layer", ""): merged[name]
+        for name in merged
+    }
     weights, options = ModelWeights(policy, threading.Lock()), PushOptions(partial=True)
     weights.stage(1, pushed, options)
     weights.commit(1, options, list)
     weights.use(weights.newest)
-    acts = [session(one, 1).act(seen(1, **{SAMPLES: 2})) for one in (policy, load(saved["merged/first"]))]
+    acts = [
+        session(one, 1).act(seen(1, **{SAMPLES: 2}))
+        for one in (policy, load(saved["merged/first"]))
+    ]
     assert np.array_equal(*(act.action for act in acts))
     np.testing.assert_allclose(*(act.info[DISTRIBUTION]["mean"] for act in acts), atol=ATOL)
     assert len(pushed) < len(policy.parameters())
 
 
-def test_statistics_of_another_action_are_refused(checkpoint: Callable[[str], Path], saved: dict[str, Path]) -> None:
+def test_statistics_of_another_action_are_refused(
+    checkpoint: Callable[[str], Path], saved: dict[str, Path]
+) -> None:
     folder = shutil.copytree(saved["first"], saved["first"].parent / "short")
-    (folder / "dataset_statistics.json").write_text(json.dumps({"d": {"action": {"q01": [0.0], "q99": [1.0]}}}))
-    with pytest.raises(ConfigError, match=r"adapter 'short': .*got actions of \[1\] numbers, want \[7\], as"):
+    (folder / "dataset_statistics.json").write_text(
+        json.dumps({"d": {"action": {"q01": [0.0], "q99": [1.0]}}})
+    )
+    with pytest.raises(
+        ConfigError, match=r"adapter 'short': .*got actions of \[1\] numbers, want \[7\], as"
+    ):
         load(checkpoint("openvla"), adapters={"short": str(folder)})

@@ -34,9 +34,14 @@ SIZE = 4
     ids=lambda value: "-".join(value) if isinstance(value, dict) else str(value),
 )
 def test_an_act_waits_only_for_its_results(
-    checkpoint: Callable[[str], Path], monkeypatch: pytest.MonkeyPatch, kind: str, info: dict[str, Any], most: int
+    checkpoint: Callable[[str], Path],
+    monkeypatch: pytest.MonkeyPatch,
+    kind: str,
+    info: dict[str, Any],
+    most: int,
 ) -> None:
-    monkeypatch.setattr(torch, "autocast", lambda **_: nullcontext())  # which Llama turns off, and meta has none
+    # Which Llama turns off, and meta has none.
+    monkeypatch.setattr(torch, "autocast", lambda **_: nullcontext())
     heads = {"oft": "l1", "oft-diffusion": "diffusion", "oft-tokens": "tokens"}
     settings = {"head": heads[kind]} if kind in heads else {}
     policy = policy_class("openvla_oft" if kind in heads else "openvla").from_config(

@@ -9,7 +9,12 @@ import numpy as np
 import pytest
 from counting_compiler import CountingCompiler, counting_compiler
 
-from plugins.vlagents_ray_models.tests.families.openvla.conftest import LIBRARIES, WORDS, begun, seen
+from plugins.vlagents_ray_models.tests.families.openvla.conftest import (
+    LIBRARIES,
+    WORDS,
+    begun,
+    seen,
+)
 from plugins.vlagents_ray_models.tests.families.openvla.test_oft import SAME, SETTINGS
 from vlagents_ray.interface import BEHAVIOUR, DISTRIBUTION, SAMPLES, WANT, Act, Obs
 
@@ -60,7 +65,9 @@ def test_acts_are_those_without_compilation_also_of_long_prompts(
         assert compiler.calls > calls  # images, at least
     if plain.contract.behaviour:
         wanted = {SAMPLES: 2, WANT: ["logprob"]}
-        for one, other in zip(acts(plain, [0, 1], **wanted), acts(compiled, [0, 1], **wanted), strict=True):
+        for one, other in zip(
+            acts(plain, [0, 1], **wanted), acts(compiled, [0, 1], **wanted), strict=True
+        ):
             samples = [act.info[DISTRIBUTION]["samples"] for act in (one, other)]
             np.testing.assert_allclose(*samples, atol=ATOL[kind])
             said = [act.info[BEHAVIOUR]["logprob"] for act in (one, other)]

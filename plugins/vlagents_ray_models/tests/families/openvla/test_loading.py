@@ -22,13 +22,17 @@ pytestmark = [pytest.mark.source("OPENVLA_SRC"), pytest.mark.source("OPENVLA_OFT
 
 
 def load(policy: str, checkpoint: Path, **config: Any) -> None:
-    policy_class(policy).from_config({"checkpoint": str(checkpoint), "device": "cpu", **config}).initialize()
+    policy_class(policy).from_config(
+        {"checkpoint": str(checkpoint), "device": "cpu", **config}
+    ).initialize()
 
 
 @pytest.fixture
 def copied(checkpoint: Callable[[str], Path], tmp_path: Path) -> Callable[[str], Path]:
     """A copy of a kind's checkpoint, to be damaged; large files are links."""
-    return lambda kind: Path(shutil.copytree(checkpoint(kind), tmp_path / kind, copy_function=_link))
+    return lambda kind: Path(
+        shutil.copytree(checkpoint(kind), tmp_path / kind, copy_function=_link)
+    )
 
 
 def _link(source: str, target: str) -> None:
@@ -42,12 +46,37 @@ def _link(source: str, target: str) -> None:
 @pytest.mark.parametrize(
     ("policy", "kind", "config", "message"),
     [
-        ("openvla", "openvla", {"unnorm_key": "bridge"}, r"got 'bridge', want one of .*bridge_orig.*libero_spatial"),
-        ("openvla", "openvla", {"cameras": {"image_top": "front"}}, r"got \['image_top'\], want \['image'\]"),
-        ("openvla", "openvla", {"source_dir": "/nowhere"}, r"got \['/nowhere'\], want a folder with prismatic"),
+        (
+            "openvla",
+            "openvla",
+            {"unnorm_key": "bridge"},
+            r"got 'bridge', want one of .*bridge_orig.*libero_spatial",
+        ),
+        (
+            "openvla",
+            "openvla",
+            {"cameras": {"image_top": "front"}},
+            r"got \['image_top'\], want \['image'\]",
+        ),
+        (
+            "openvla",
+            "openvla",
+            {"source_dir": "/nowhere"},
+            r"got \['/nowhere'\], want a folder with prismatic",
+        ),
         ("openvla", "openvla", {"trust_remote_code": True}, "names no code"),
-        ("openvla", "openvla", {"trust_remote_code": True, "source_dir": "."}, "got both, want .* one of them"),
-        ("openvla_oft", "oft", {"film": True}, r"'vision_backbone', want one file vision_backbone--STEP"),
+        (
+            "openvla",
+            "openvla",
+            {"trust_remote_code": True, "source_dir": "."},
+            "got both, want .* one of them",
+        ),
+        (
+            "openvla_oft",
+            "oft",
+            {"film": True},
+            r"'vision_backbone', want one file vision_backbone--STEP",
+        ),
         ("openvla_oft", "oft", {"head": "diffusion"}, "'noisy_action_projector', want one file"),
         ("openvla_oft", "oft", {"head": "tokens"}, "has action_head--.*do not use"),
         ("openvla_oft", "oft", {"state": []}, "has proprio_projector--.*do not use"),
@@ -59,7 +88,12 @@ def _link(source: str, target: str) -> None:
             {"cameras": {"full_image": "front", "top": "top"}},
             r"got \['full_image', 'top'\], want",
         ),
-        ("openvla_oft", "oft", {"cameras": {"wrist_image": "wrist"}}, r"want \['full_image', 'wrist_image'\]"),
+        (
+            "openvla_oft",
+            "oft",
+            {"cameras": {"wrist_image": "wrist"}},
+            r"want \['full_image', 'wrist_image'\]",
+        ),
         ("openvla_oft", "oft", {"attention": "flash_attention_2"}, "attention"),
         ("openvla_oft", "oft", {"inference_steps": 51}, "got 51, want at most 50"),
     ],
@@ -73,7 +107,8 @@ def test_settings_that_do_not_fit(
 
 @pytest.mark.verifies("loading")
 @pytest.mark.parametrize(
-    "file", ["config.json", "preprocessor_config.json", "tokenizer_config.json", "model.safetensors"]
+    "file",
+    ["config.json", "preprocessor_config.json", "tokenizer_config.json", "model.safetensors"],
 )
 def test_a_checkpoint_that_is_not_whole(copied: Callable[[str], Path], file: str) -> None:
     folder = copied("openvla")
@@ -83,11 +118,15 @@ def test_a_checkpoint_that_is_not_whole(copied: Callable[[str], Path], file: str
 
 
 @pytest.mark.verifies("loading")
-def test_statistics_are_in_the_checkpoint_or_nothing_is_served(copied: Callable[[str], Path]) -> None:
+def test_statistics_are_in_the_checkpoint_or_nothing_is_served(
+    copied: Callable[[str], Path],
+) -> None:
     folder = copied("openvla")
     found = (folder / "dataset_statistics.json").read_text()
     (folder / "dataset_statistics.json").unlink()
-    with pytest.raises(ConfigError, match=r"got no normalisation statistics, want dataset_statistics.json"):
+    with pytest.raises(
+        ConfigError, match=r"got no normalisation statistics, want dataset_statistics.json"
+    ):
         load("openvla", folder)
     config = json.loads((folder / "config.json").read_text())
     (folder / "config.json").write_text(json.dumps(config | {"norm_stats": json.loads(found)}))
@@ -110,11 +149,15 @@ def test_no_source_and_no_leave_to_run_remote_code(
 ) -> None:
     for name in VARIABLES:
         monkeypatch.delenv(name)
-    with pytest.raises(ConfigError, match=r"got no source tree, want .*OPENVLA_SRC.*trust_remote_code: true"):
+    with pytest.raises(
+        ConfigError, match=r"got no source tree, want .*OPENVLA_SRC.*trust_remote_code: true"
+    ):
         load("openvla", copied("remote"))
 
 
-def test_either_source_serves_either_policy(checkpoint: Callable[[str], Path], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_either_source_serves_either_policy(
+    checkpoint: Callable[[str], Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
     sources = [os.environ[name] for name in VARIABLES]
     for name in VARIABLES:
         monkeypatch.delenv(name)
@@ -125,7 +168,9 @@ def test_either_source_serves_either_policy(checkpoint: Callable[[str], Path], m
 
 def test_components_of_two_steps_are_not_guessed_between(copied: Callable[[str], Path]) -> None:
     folder = copied("oft")
-    shutil.copy(folder / "action_head--100_checkpoint.pt", folder / "action_head--200_checkpoint.pt")
+    shutil.copy(
+        folder / "action_head--100_checkpoint.pt", folder / "action_head--200_checkpoint.pt"
+    )
     with pytest.raises(ConfigError, match=r"got .*100.*200.* for 'action_head', want one file"):
         load("openvla_oft", folder)
 
@@ -136,5 +181,7 @@ def test_a_component_of_another_kind(copied: Callable[[str], Path]) -> None:
     saved["module.model.fc3.weight"] = saved.pop("module.model.fc2.weight")
     (folder / "action_head--100_checkpoint.pt").unlink()
     torch.save(saved, folder / "action_head--100_checkpoint.pt")
-    with pytest.raises(ConfigError, match=r"misses \['model.fc2.weight'\], has \['model.fc3.weight'\] too"):
+    with pytest.raises(
+        ConfigError, match=r"misses \['model.fc2.weight'\], has \['model.fc3.weight'\] too"
+    ):
         load("openvla_oft", folder)

@@ -15,7 +15,12 @@ from pushed_weights import check_pushed_weights
 from transformers import AutoTokenizer
 
 from plugins.vlagents_ray_models.tests.families.openvla import tiny
-from plugins.vlagents_ray_models.tests.families.openvla.conftest import LIBRARIES, WORDS, begun, seen
+from plugins.vlagents_ray_models.tests.families.openvla.conftest import (
+    LIBRARIES,
+    WORDS,
+    begun,
+    seen,
+)
 from plugins.vlagents_ray_models.tests.families.openvla.upstream import module
 from vlagents_ray import Obs
 from vlagents_ray.errors import InvalidObservation, MissingCamera, MissingState
@@ -28,15 +33,20 @@ from vlagents_ray_models.openvla.prismatic import middle, resized
 
 pytestmark = [pytest.mark.source("OPENVLA_OFT_SRC"), *LIBRARIES]
 
-DIFFUSION = {"head": "diffusion", "diffusion_steps": tiny.DIFFUSION_STEPS, "inference_steps": tiny.DIFFUSION_STEPS}
+DIFFUSION = {
+    "head": "diffusion",
+    "diffusion_steps": tiny.DIFFUSION_STEPS,
+    "inference_steps": tiny.DIFFUSION_STEPS,
+}
 SETTINGS: dict[str, dict[str, Any]] = {
     "oft": {},
     "oft-film": {"film": True},
     "oft-diffusion": DIFFUSION,
     "oft-tokens": {"head": "tokens"},
 }
-# How far actions may be off those of a lone row, or upstream's, in float32 on a CPU, where they reach to about 3. The
-# first step of diffusion divides by what is left of the signal in almost pure noise.
+# How far actions may be off those of a lone row, or upstream's, in float32 on a CPU, where they
+# reach to about 3. The first step of diffusion divides by what is left of the signal in almost pure
+# noise.
 SAME = {"oft": 5e-5, "oft-film": 5e-5, "oft-tokens": 1e-6, "oft-diffusion": 1e-3}
 
 
@@ -52,11 +62,15 @@ def policy(loaded: Callable[..., Any], kind: str) -> OpenVLAOFT:
 
 @pytest.fixture
 def fork(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Attention as in the transformers that OFT brings: each token sees all that the last one sees."""
+    """Attention as in the transformers that OFT brings: each token sees all that the last one
+    sees.
+    """
     attend = torch.nn.functional.scaled_dot_product_attention
 
     def both_ways(*args: Any, attn_mask: Any = None, is_causal: bool = False, **kwargs: Any) -> Any:
-        return attend(*args, attn_mask=None if attn_mask is None else attn_mask[:, :, -1:], **kwargs)
+        return attend(
+            *args, attn_mask=None if attn_mask is None else attn_mask[:, :, -1:], **kwargs
+        )
 
     monkeypatch.setattr(torch.nn.functional, "scaled_dot_product_attention", both_ways)
 
@@ -64,14 +78,20 @@ def fork(monkeypatch: pytest.MonkeyPatch) -> None:
 class Upstream:
     """A checkpoint as OFT's own code loads it, and asks it (experiments/robot/openvla_utils.py)."""
 
-    def __init__(self, folder: Path, kind: str, inference_steps: int = tiny.DIFFUSION_STEPS) -> None:
+    def __init__(
+        self, folder: Path, kind: str, inference_steps: int = tiny.DIFFUSION_STEPS
+    ) -> None:
         def of(name: str, part: torch.nn.Module) -> torch.nn.Module:
             saved = torch.load(folder / f"{name}--100_checkpoint.pt", weights_only=True)
-            part.load_state_dict({key.removeprefix("module."): tensor for key, tensor in saved.items()})
+            part.load_state_dict(
+                {key.removeprefix("module."): tensor for key, tensor in saved.items()}
+            )
             return part.eval()
 
         self.kind = kind
-        network = self._module("extern.hf.modeling_prismatic").OpenVLAForActionPrediction.from_pretrained(folder)
+        network = self._module(
+            "extern.hf.modeling_prismatic"
+        ).OpenVLAForActionPrediction.from_pretrained(folder)
         if kind == "oft-film":
             network.vision_backbone = of("vision_backbone", tiny.filmed(network, trained=False))
         network.vision_backbone.set_num_images_in_input(2)
@@ -79,12 +99,15 @@ class Upstream:
         self.network = network.eval()
         processing = self._module("extern.hf.processing_prismatic")
         self.processor = processing.PrismaticProcessor(
-            processing.PrismaticImageProcessor.from_pretrained(folder), AutoTokenizer.from_pretrained(folder)
+            processing.PrismaticImageProcessor.from_pretrained(folder),
+            AutoTokenizer.from_pretrained(folder),
         )
         heads, projectors = self._module("models.action_heads"), self._module("models.projectors")
         sizes = tiny.LLM_DIM, tiny.LLM_DIM, tiny.ACTION_DIM
         self.parts = {
-            "proprio_projector": of("proprio_projector", projectors.ProprioProjector(tiny.LLM_DIM, tiny.PROPRIO_DIM))
+            "proprio_projector": of(
+                "proprio_projector", projectors.ProprioProjector(tiny.LLM_DIM, tiny.PROPRIO_DIM)
+            )
         }
         if kind == "oft-diffusion":
             head = heads.DiffusionActionHead(*sizes, tiny.DIFFUSION_STEPS)
@@ -103,7 +126,9 @@ class Upstream:
     def act(self, obs: Obs, words: str, key: str = "bridge_orig") -> np.ndarray:
         """(8, 7)."""
         prompt = f"In: What action should the robot take to {words.lower()}?\nOut:"
-        images = [Image.fromarray(middle(resized(obs.cameras[name]))) for name in ("front", "wrist")]
+        images = [
+            Image.fromarray(middle(resized(obs.cameras[name]))) for name in ("front", "wrist")
+        ]
         both = [self.processor(prompt, image) for image in images]
         ranges = self.network.norm_stats[key]["proprio"]
         low, high = np.array(ranges["q01"]), np.array(ranges["q99"])
@@ -124,20 +149,31 @@ class Upstream:
 def test_keeps_the_contract(checkpoint: Callable[[str], Path], kind: str) -> None:
     config = {"checkpoint": str(checkpoint(kind)), "unnorm_key": "bridge_orig", **SETTINGS[kind]}
     views = [seen(seed) for seed in range(3)]
-    check_agent(OpenVLAOFT.from_config(config), obs=views, instructions=WORDS, steps=2, atol=SAME[kind])
+    check_agent(
+        OpenVLAOFT.from_config(config), obs=views, instructions=WORDS, steps=2, atol=SAME[kind]
+    )
 
 
 @pytest.mark.verifies("parity")
 @pytest.mark.usefixtures("fork")
 @pytest.mark.parametrize("seed", [0, 2])
 def test_answers_what_upstream_answers(
-    policy: OpenVLAOFT, checkpoint: Callable[[str], Path], kind: str, seed: int, monkeypatch: pytest.MonkeyPatch
+    policy: OpenVLAOFT,
+    checkpoint: Callable[[str], Path],
+    kind: str,
+    seed: int,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     session = begun(policy, seed)
-    noise = np.random.default_rng([0, seed]).standard_normal((tiny.CHUNK, tiny.ACTION_DIM), dtype=np.float32)
+    noise = np.random.default_rng([0, seed]).standard_normal(
+        (tiny.CHUNK, tiny.ACTION_DIM), dtype=np.float32
+    )
     theirs = Upstream(checkpoint(kind), kind)
     monkeypatch.setattr(torch, "randn", lambda size, **_: torch.from_numpy(noise).reshape(size))
-    assert np.abs(session.act(seen(seed)).action - theirs.act(seen(seed), WORDS[seed])).max() <= SAME[kind]
+    assert (
+        np.abs(session.act(seen(seed)).action - theirs.act(seen(seed), WORDS[seed])).max()
+        <= SAME[kind]
+    )
 
 
 @pytest.mark.verifies("parity")
@@ -146,21 +182,29 @@ def test_fewer_steps_of_diffusion_are_upstreams(
     checkpoint: Callable[[str], Path], loaded: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     policy = loaded("oft-diffusion", **DIFFUSION | {"inference_steps": 2})
-    noise = np.random.default_rng([0, 0]).standard_normal((tiny.CHUNK, tiny.ACTION_DIM), dtype=np.float32)
+    noise = np.random.default_rng([0, 0]).standard_normal(
+        (tiny.CHUNK, tiny.ACTION_DIM), dtype=np.float32
+    )
     theirs = Upstream(checkpoint("oft-diffusion"), "oft-diffusion", 2)
     monkeypatch.setattr(torch, "randn", lambda size, **_: torch.from_numpy(noise).reshape(size))
-    assert np.abs(begun(policy, 0).act(seen(0)).action - theirs.act(seen(0), WORDS[0])).max() <= SAME["oft-diffusion"]
+    assert (
+        np.abs(begun(policy, 0).act(seen(0)).action - theirs.act(seen(0), WORDS[0])).max()
+        <= SAME["oft-diffusion"]
+    )
 
 
 @pytest.mark.verifies("batches")
 def test_a_session_gets_the_same_in_any_company(policy: OpenVLAOFT, kind: str) -> None:
     alone = [begun(policy, seed).act(seen(seed)).action for seed in range(8)]
     for size in (2, 3, 8):
-        acts = policy.act_batch([seen(seed) for seed in range(size)], [begun(policy, seed) for seed in range(size)])
+        acts = policy.act_batch(
+            [seen(seed) for seed in range(size)], [begun(policy, seed) for seed in range(size)]
+        )
         for one, act in zip(alone, acts, strict=False):
             assert isinstance(act, Act)
             assert np.abs(one - act.action).max() <= SAME[kind]
-    assert len({one.round(3).tobytes() for one in alone}) == 8  # they differ by what they see and are told
+    # They differ by what they see and are told.
+    assert len({one.round(3).tobytes() for one in alone}) == 8
 
 
 @pytest.mark.parametrize(
@@ -187,7 +231,9 @@ def test_everything_that_is_seen_counts(loaded: Callable[..., Any], part: str, k
         ("oft-tokens", {"proprio_projector"}),
     ],
 )
-def test_it_acts_with_pushed_weights(loaded: Callable[..., Any], kind: str, parts: set[str]) -> None:
+def test_it_acts_with_pushed_weights(
+    loaded: Callable[..., Any], kind: str, parts: set[str]
+) -> None:
     policy = loaded(kind, seed=1, **SETTINGS[kind])  # of this test alone
     assert {name.partition("/")[0] for name in policy.parameters()} == {"vla", *parts}
     check_pushed_weights(policy, lambda: begun(policy, 0).act(seen(0)).action)
@@ -209,10 +255,14 @@ def test_samples_share_the_images_of_their_session(
     read: list[int] = []
     backbone = policy.model.base.network.vision_backbone
     forward = backbone.forward
-    monkeypatch.setattr(backbone, "forward", lambda pixels: read.append(len(pixels)) or forward(pixels))
+    monkeypatch.setattr(
+        backbone, "forward", lambda pixels: read.append(len(pixels)) or forward(pixels)
+    )
     views = [seen(0, **{SAMPLES: 3}), seen(1)]
     shared = policy.act_batch(views, [begun(policy, 0), begun(policy, 1)])
-    monkeypatch.setattr(base_policy, "shared_frames", lambda rows: (list(range(len(rows))), list(range(len(rows)))))
+    monkeypatch.setattr(
+        base_policy, "shared_frames", lambda rows: (list(range(len(rows))), list(range(len(rows))))
+    )
     each = policy.act_batch(views, [begun(policy, 0), begun(policy, 1)])
     assert read == [4, 10]  # of two cameras
     for one, other in zip(shared, each, strict=True):
@@ -221,14 +271,18 @@ def test_samples_share_the_images_of_their_session(
     assert np.abs(samples[0] - samples[1]).max() <= SAME[kind]
 
 
-def test_action_tokens_have_log_probabilities_and_other_heads_have_none(loaded: Callable[..., Any]) -> None:
+def test_action_tokens_have_log_probabilities_and_other_heads_have_none(
+    loaded: Callable[..., Any],
+) -> None:
     assert loaded("oft").contract.behaviour is None
     policy = loaded("oft-tokens", **SETTINGS["oft-tokens"])
     assert policy.contract.behaviour == ("logprob", "entropy", "replay")
     act = begun(policy, 0).act(seen(0, **{SAMPLES: 2, WANT: ["logprob", "entropy", "replay"]}))
     said = act.info[BEHAVIOUR]
     bins = policy.model.base.bins
-    tokens = torch.tensor(np.concatenate([said["replay"]["tokens"][None], act.info[DISTRIBUTION]["replay"]["tokens"]]))
+    tokens = torch.tensor(
+        np.concatenate([said["replay"]["tokens"][None], act.info[DISTRIBUTION]["replay"]["tokens"]])
+    )
     session = begun(policy, 0)
     inputs = [policy._model_input(Row((session.perceive(seen(0)),), WORDS[0], None), "bridge_orig")]
     _, over = policy.model.choose(inputs, [0], np.full((1, tiny.CHUNK, tiny.ACTION_DIM), np.nan))
@@ -269,7 +323,9 @@ def test_a_dataset_whose_actions_are_longer_than_the_heads_is_refused_alone(
     policy = loaded("oft")
     longer = {"q01": [0.0] * 14, "q99": [1.0] * 14}
     monkeypatch.setitem(policy.model.base.statistics._datasets, "aloha", {"action": longer})
-    bad, good = policy.act_batch([seen(0, unnorm_key="aloha"), seen(1)], [begun(policy, 0), begun(policy, 1)])
+    bad, good = policy.act_batch(
+        [seen(0, unnorm_key="aloha"), seen(1)], [begun(policy, 0), begun(policy, 1)]
+    )
     assert isinstance(bad, InvalidObservation)
     assert "'aloha' of 14 numbers, want one of 7" in str(bad)
     assert isinstance(good, Act)

@@ -14,7 +14,12 @@ from PIL import Image
 from pushed_weights import check_pushed_weights
 from transformers import AutoTokenizer
 
-from plugins.vlagents_ray_models.tests.families.openvla.conftest import LIBRARIES, WORDS, begun, seen
+from plugins.vlagents_ray_models.tests.families.openvla.conftest import (
+    LIBRARIES,
+    WORDS,
+    begun,
+    seen,
+)
 from plugins.vlagents_ray_models.tests.families.openvla.upstream import module
 from vlagents_ray.errors import InvalidObservation, MissingCamera
 from vlagents_ray.interface import BEHAVIOUR, DISTRIBUTION, SAMPLES, WANT, Act
@@ -33,24 +38,35 @@ def policy(loaded: Callable[..., Any]) -> OpenVLA:
 def upstream(folder: Path, image: np.ndarray, words: str, unnorm_key: str) -> np.ndarray:
     """What OpenVLA's own `predict_action` answers, (7,)."""
     hf = "extern.hf."
-    network = module("OPENVLA_SRC", hf + "modeling_prismatic").OpenVLAForActionPrediction.from_pretrained(folder).eval()
+    network = (
+        module("OPENVLA_SRC", hf + "modeling_prismatic")
+        .OpenVLAForActionPrediction.from_pretrained(folder)
+        .eval()
+    )
     network.norm_stats = json.loads((folder / "dataset_statistics.json").read_text())
     processing = module("OPENVLA_SRC", hf + "processing_prismatic")
     processor = processing.PrismaticProcessor(
-        processing.PrismaticImageProcessor.from_pretrained(folder), AutoTokenizer.from_pretrained(folder)
+        processing.PrismaticImageProcessor.from_pretrained(folder),
+        AutoTokenizer.from_pretrained(folder),
     )
-    inputs = processor(f"In: What action should the robot take to {words.lower()}?\nOut:", Image.fromarray(image))
+    inputs = processor(
+        f"In: What action should the robot take to {words.lower()}?\nOut:", Image.fromarray(image)
+    )
     return network.predict_action(**inputs, unnorm_key=unnorm_key, do_sample=False)
 
 
 def test_keeps_the_contract(checkpoint: Callable[[str], Path]) -> None:
-    agent = OpenVLA.from_config({"checkpoint": str(checkpoint("openvla")), "unnorm_key": "bridge_orig"})
+    agent = OpenVLA.from_config(
+        {"checkpoint": str(checkpoint("openvla")), "unnorm_key": "bridge_orig"}
+    )
     check_agent(agent, instructions=WORDS, steps=2, atol=0)
 
 
 @pytest.mark.verifies("parity")
 @pytest.mark.parametrize("seed", range(3))
-def test_answers_what_upstream_answers(policy: OpenVLA, checkpoint: Callable[[str], Path], seed: int) -> None:
+def test_answers_what_upstream_answers(
+    policy: OpenVLA, checkpoint: Callable[[str], Path], seed: int
+) -> None:
     [row] = begun(policy, seed).act(seen(seed)).action
     want = upstream(checkpoint("openvla"), seen(seed).cameras["front"], WORDS[seed], "bridge_orig")
     assert np.array_equal(row, want.astype(np.float32))
@@ -60,18 +76,27 @@ def test_answers_what_upstream_answers(policy: OpenVLA, checkpoint: Callable[[st
 @pytest.mark.parametrize("size", [2, 3, 8])
 def test_a_session_gets_the_same_in_any_company(policy: OpenVLA, size: int) -> None:
     alone = [begun(policy, seed).act(seen(seed)).action for seed in range(size)]
-    together = policy.act_batch([seen(seed) for seed in range(size)], [begun(policy, seed) for seed in range(size)])
+    together = policy.act_batch(
+        [seen(seed) for seed in range(size)], [begun(policy, seed) for seed in range(size)]
+    )
     for one, act in zip(alone, together, strict=True):
         assert isinstance(act, Act)
         assert np.array_equal(one, act.action)
-    assert len({one.tobytes() for one in alone}) == size  # they differ by what they see and are told
+    # They differ by what they see and are told.
+    assert len({one.tobytes() for one in alone}) == size
 
 
-def test_a_session_may_have_another_datasets_units(policy: OpenVLA, checkpoint: Callable[[str], Path]) -> None:
+def test_a_session_may_have_another_datasets_units(
+    policy: OpenVLA, checkpoint: Callable[[str], Path]
+) -> None:
     here, told = begun(policy, 0), begun(policy, 0, unnorm_key="libero_spatial")
     asked = seen(0, unnorm_key="libero_spatial_no_noops")
-    plain, reset, observed = policy.act_batch([seen(0), seen(0), asked], [here, told, begun(policy, 0)])
-    want = upstream(checkpoint("openvla"), seen(0).cameras["front"], WORDS[0], "libero_spatial_no_noops")
+    plain, reset, observed = policy.act_batch(
+        [seen(0), seen(0), asked], [here, told, begun(policy, 0)]
+    )
+    want = upstream(
+        checkpoint("openvla"), seen(0).cameras["front"], WORDS[0], "libero_spatial_no_noops"
+    )
     assert np.array_equal(reset.action[0], want.astype(np.float32))
     assert np.array_equal(observed.action, reset.action)
     assert not np.array_equal(plain.action, reset.action)
@@ -86,7 +111,9 @@ def test_a_session_may_have_another_datasets_units(policy: OpenVLA, checkpoint: 
         (lambda obs: obs.cameras.pop("front"), MissingCamera),
     ],
 )
-def test_a_bad_request_fails_alone(policy: OpenVLA, change: Callable[[Any], Any], error: type[Exception]) -> None:
+def test_a_bad_request_fails_alone(
+    policy: OpenVLA, change: Callable[[Any], Any], error: type[Exception]
+) -> None:
     obs = seen(0)
     change(obs)
     bad, good = policy.act_batch([obs, seen(1)], [begun(policy, 0), begun(policy, 1)])
@@ -102,7 +129,9 @@ def test_an_instruction_longer_than_the_model_was_trained_for_is_refused(policy:
 
 
 def test_an_unknown_dataset_is_refused_when_an_episode_begins(policy: OpenVLA) -> None:
-    with pytest.raises(InvalidObservation, match=r"got 'aloha', want one of .*bridge_orig.*libero_spatial_no_noops"):
+    with pytest.raises(
+        InvalidObservation, match=r"got 'aloha', want one of .*bridge_orig.*libero_spatial_no_noops"
+    ):
         begun(policy, 0, unnorm_key="aloha")
 
 
@@ -123,17 +152,24 @@ def test_samples_are_drawn_from_the_distribution_whose_moments_are_stated(policy
     assert np.array_equal(act.action, begun(policy, 0).act(seen(0)).action)
     found = act.info[DISTRIBUTION]
     assert found["samples"].shape == (1000, 1, 7)
-    # the first number does not depend on those before it, so that its draws have just the stated moments
+    # the first number does not depend on those before it, so that its draws have just the stated
+    # moments
     first = found["samples"][:, 0, 0]
-    assert first.mean() == pytest.approx(found["mean"][0, 0], abs=4 * found["std"][0, 0] / 1000**0.5)
+    assert first.mean() == pytest.approx(
+        found["mean"][0, 0], abs=4 * found["std"][0, 0] / 1000**0.5
+    )
     assert first.std() == pytest.approx(found["std"][0, 0], rel=0.1)
 
 
-def test_samples_share_their_sessions_prompt(policy: OpenVLA, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_samples_share_their_sessions_prompt(
+    policy: OpenVLA, monkeypatch: pytest.MonkeyPatch
+) -> None:
     read = []
     backbone = policy.model.base.network.vision_backbone
     forward = backbone.forward
-    monkeypatch.setattr(backbone, "forward", lambda pixels: read.append(len(pixels)) or forward(pixels))
+    monkeypatch.setattr(
+        backbone, "forward", lambda pixels: read.append(len(pixels)) or forward(pixels)
+    )
     policy.act_batch([seen(0, **{SAMPLES: 5}), seen(1)], [begun(policy, 0), begun(policy, 1)])
     assert read == [2]
 
@@ -142,9 +178,13 @@ ALL = ["logprob", "entropy", "replay"]
 
 
 def scored(policy: OpenVLA, seed: int, tokens: np.ndarray) -> torch.distributions.Categorical:
-    """The distributions over bins of each token after those before it, all in one pass of the whole sequence."""
+    """The distributions over bins of each token after those before it, all in one pass of the
+    whole sequence.
+    """
     model = policy.model.base
-    patches = model.network.projector(model.network.vision_backbone(model.pixels([policy.perceive(seen(seed))])[0]))[0]
+    patches = model.network.projector(
+        model.network.vision_backbone(model.pixels([policy.perceive(seen(seed))])[0])
+    )[0]
     words = model.embed(torch.tensor(model.tokens(WORDS[seed])))
     sequence = torch.cat([words[:1], patches, words[1:], model.embed(torch.tensor(tokens[:-1]))])
     logits = model.network.language_model(inputs_embeds=sequence[None]).logits[0, -len(tokens) :]
@@ -152,13 +192,19 @@ def scored(policy: OpenVLA, seed: int, tokens: np.ndarray) -> torch.distribution
 
 
 @pytest.mark.parametrize("seed", range(2))
-def test_the_log_probability_is_that_of_the_tokens_in_one_pass_over_them(policy: OpenVLA, seed: int) -> None:
-    acts = policy.act_batch([seen(i, **{WANT: ALL}) for i in range(2)], [begun(policy, i) for i in range(2)])
+def test_the_log_probability_is_that_of_the_tokens_in_one_pass_over_them(
+    policy: OpenVLA, seed: int
+) -> None:
+    acts = policy.act_batch(
+        [seen(i, **{WANT: ALL}) for i in range(2)], [begun(policy, i) for i in range(2)]
+    )
     said = acts[seed].info[BEHAVIOUR]
     [tokens] = said["replay"]["tokens"]
     with torch.no_grad():
         categorical = scored(policy, seed, tokens)
-    np.testing.assert_allclose(said["logprob"][0], categorical.log_prob(torch.tensor(tokens) - 31744), atol=1e-4)
+    np.testing.assert_allclose(
+        said["logprob"][0], categorical.log_prob(torch.tensor(tokens) - 31744), atol=1e-4
+    )
     assert said["entropy"] == pytest.approx(categorical.entropy().sum().item(), abs=1e-4)
     assert np.array_equal(acts[seed].action[0], unit(policy, tokens))
 
@@ -167,10 +213,14 @@ def unit(policy: OpenVLA, tokens: np.ndarray) -> np.ndarray:
     """The action of tokens."""
     scale = policy.model.base.statistics.scale("bridge_orig")
     chosen = torch.tensor(tokens)
-    return scale.restore(policy.model.base.bins.stated(chosen, torch.zeros(*chosen.shape, 256).double())[0])
+    return scale.restore(
+        policy.model.base.bins.stated(chosen, torch.zeros(*chosen.shape, 256).double())[0]
+    )
 
 
-def test_an_act_of_which_something_is_wanted_is_drawn_and_others_are_the_likeliest(policy: OpenVLA) -> None:
+def test_an_act_of_which_something_is_wanted_is_drawn_and_others_are_the_likeliest(
+    policy: OpenVLA,
+) -> None:
     drawn = [begun(policy, 0).act(seen(0, **{WANT: ["logprob"]})) for _ in range(2)]
     assert np.array_equal(drawn[0].action, drawn[1].action)  # it is of the session's own generator
     likeliest = begun(policy, 0).act(seen(0))
@@ -196,7 +246,8 @@ def test_pictures_may_be_those_of_libero(loaded: Callable[..., Any]) -> None:
     assert not np.array_equal(got, plain)
 
 
-@pytest.mark.filterwarnings("ignore:the load_module:DeprecationWarning")  # transformers 4.40 imports such code with it
+# Transformers 4.40 imports such code with it.
+@pytest.mark.filterwarnings("ignore:the load_module:DeprecationWarning")
 def test_a_checkpoints_own_code_runs_where_that_is_allowed(
     loaded: Callable[..., Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -208,9 +259,13 @@ def test_a_checkpoints_own_code_runs_where_that_is_allowed(
     assert np.array_equal(begun(policy, 0).act(seen(0)).action, begun(same, 0).act(seen(0)).action)
 
 
-def test_the_first_version_has_its_own_prompt(checkpoint: Callable[[str], Path], tmp_path: Path) -> None:
+def test_the_first_version_has_its_own_prompt(
+    checkpoint: Callable[[str], Path], tmp_path: Path
+) -> None:
     (tmp_path / "openvla-v01-7b").symlink_to(checkpoint("openvla"))
-    policy = OpenVLA.from_config({"checkpoint": str(tmp_path / "openvla-v01-7b"), "unnorm_key": "bridge_orig"})
+    policy = OpenVLA.from_config(
+        {"checkpoint": str(tmp_path / "openvla-v01-7b"), "unnorm_key": "bridge_orig"}
+    )
     policy.initialize()
     prompt = policy.model.base.tokenizer.decode(policy.model.base.tokens("Push")[1:-1])
     assert prompt.startswith("A chat between a curious user")

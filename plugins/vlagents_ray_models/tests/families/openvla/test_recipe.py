@@ -32,14 +32,16 @@ def test_it_loads_and_acts_with_every_dimension_inside_its_range(tmp_path: Path)
     scale = policy.model.base.statistics.scale("bridge_orig")
     assert np.shape(found) == (4, 1, recipe.ACTION_DIM)
     inside = (np.array(found) > scale.low + 1e-6) & (np.array(found) < scale.high - 1e-6)
-    assert inside[..., scale.mask].mean() > 0.5  # tokens of other words than actions would all be at an end
+    # Tokens of other words than actions would all be at an end.
+    assert inside[..., scale.mask].mean() > 0.5
     assert len(np.unique(np.array(found), axis=0)) > 1
 
 
 @pytest.mark.verifies("size")
 def test_the_full_size_is_the_published_one(tmp_path: Path) -> None:
     model, _ = recipe.make_model(Recipe("openvla", tmp_path, "full", "bfloat16"), find_source(None))
-    assert sum(one.numel() for one in model.parameters()) == pytest.approx(7.54e9, rel=0.01)  # its files have 15.1 GB
+    # Its files have 15.1 GB.
+    assert sum(one.numel() for one in model.parameters()) == pytest.approx(7.54e9, rel=0.01)
 
 
 def test_the_models_code_must_be_there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

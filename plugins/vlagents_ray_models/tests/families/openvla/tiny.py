@@ -1,6 +1,8 @@
-"""Tiny checkpoints with random weights, made with OpenVLA's own code: `python tiny.py OUT_FOLDER [KIND]`.
+"""Tiny checkpoints with random weights, made with OpenVLA's own code: `python tiny.py OUT_FOLDER
+[KIND]`.
 
-Kinds: openvla, remote (with the code beside the weights), oft, oft-diffusion, oft-film, oft-tokens. They need
+Kinds: openvla, remote (with the code beside the weights), oft, oft-diffusion, oft-film, oft-tokens.
+    They need
 $OPENVLA_SRC, the OFT ones $OPENVLA_OFT_SRC too.
 """
 
@@ -19,7 +21,8 @@ from plugins.vlagents_ray_models.tests.families.openvla.upstream import module
 
 KINDS = ("openvla", "remote", "oft", "oft-diffusion", "oft-film", "oft-tokens")
 DATASETS = ("bridge_orig", "libero_spatial_no_noops")
-ACTION_DIM, PROPRIO_DIM, CHUNK = recipe.ACTION_DIM, recipe.PROPRIO_DIM, 8  # OFT's constants for LIBERO
+# OFT's constants for LIBERO.
+ACTION_DIM, PROPRIO_DIM, CHUNK = recipe.ACTION_DIM, recipe.PROPRIO_DIM, 8
 VOCABULARY = recipe.VOCABULARY
 LLM_DIM = 32
 DIFFUSION_STEPS = 5
@@ -46,10 +49,16 @@ def make(folder: Path, kind: str = "openvla", datasets: tuple[str, ...] = DATASE
 def _network(variable: str, *, small: bool) -> Any:
     """The model, whose two backbones give 16 patches each.
 
-    The first one of the larger has layer scales, whose name transformers would change if OpenVLA did not.
+    The first one of the larger has layer scales, whose name transformers would change if OpenVLA
+    did not.
     """
     modeling = module(variable, "extern.hf.modeling_prismatic")
-    text = {"intermediate_size": 64, "num_hidden_layers": 2, "num_attention_heads": 4, "initializer_range": 0.3}
+    text = {
+        "intermediate_size": 64,
+        "num_hidden_layers": 2,
+        "num_attention_heads": 4,
+        "initializer_range": 0.3,
+    }
     size = recipe.PrismaticSize(
         {"hidden_size": LLM_DIM, **text},
         ("vit_tiny_patch16_224" if small else "deit3_small_patch16_224", "vit_tiny_patch16_224"),
@@ -72,7 +81,9 @@ def _add_code(folder: Path) -> None:
         shutil.copy(hf / f"{name}_prismatic.py", folder)
     named = {
         "config.json": {"AutoModelForVision2Seq": "modeling_prismatic.OpenVLAForActionPrediction"},
-        "preprocessor_config.json": {"AutoImageProcessor": "processing_prismatic.PrismaticImageProcessor"},
+        "preprocessor_config.json": {
+            "AutoImageProcessor": "processing_prismatic.PrismaticImageProcessor"
+        },
     }
     for name, auto_map in named.items():
         config = json.loads((folder / name).read_text())
@@ -83,9 +94,13 @@ def _add_components(folder: Path, kind: str, network: Any) -> None:
     """OFT's heads, as its fine-tuning saves them."""
     heads = module("OPENVLA_OFT_SRC", "models.action_heads")
     projectors = module("OPENVLA_OFT_SRC", "models.projectors")
-    parts: dict[str, torch.nn.Module] = {"proprio_projector": projectors.ProprioProjector(LLM_DIM, PROPRIO_DIM)}
+    parts: dict[str, torch.nn.Module] = {
+        "proprio_projector": projectors.ProprioProjector(LLM_DIM, PROPRIO_DIM)
+    }
     if kind == "oft-diffusion":
-        parts["action_head"] = heads.DiffusionActionHead(LLM_DIM, LLM_DIM, ACTION_DIM, DIFFUSION_STEPS)
+        parts["action_head"] = heads.DiffusionActionHead(
+            LLM_DIM, LLM_DIM, ACTION_DIM, DIFFUSION_STEPS
+        )
         parts["noisy_action_projector"] = projectors.NoisyActionProjector(LLM_DIM)
     elif kind != "oft-tokens":
         parts["action_head"] = heads.L1RegressionActionHead(LLM_DIM, LLM_DIM, ACTION_DIM)
@@ -99,7 +114,9 @@ def _add_components(folder: Path, kind: str, network: Any) -> None:
 
 
 def filmed(network: Any, *, trained: bool = True) -> torch.nn.Module:
-    """The network's vision backbone with LoRA and FiLM, as OFT+ trains it; untrained adapters change nothing."""
+    """The network's vision backbone with LoRA and FiLM, as OFT+ trains it; untrained adapters
+    change nothing.
+    """
     from peft import LoraConfig, get_peft_model
 
     config = LoraConfig(
@@ -110,7 +127,9 @@ def filmed(network: Any, *, trained: bool = True) -> torch.nn.Module:
     )
     adapted = get_peft_model(network, config).model
     film = module("OPENVLA_OFT_SRC", "models.film_vit_wrapper")
-    return film.FiLMedPrismaticVisionBackbone(vision_backbone=adapted.vision_backbone, llm_dim=LLM_DIM)
+    return film.FiLMedPrismaticVisionBackbone(
+        vision_backbone=adapted.vision_backbone, llm_dim=LLM_DIM
+    )
 
 
 if __name__ == "__main__":

@@ -1,4 +1,5 @@
-"""OpenVLA's and OpenVLA-OFT's own code, out of the source trees that $OPENVLA_SRC and $OPENVLA_OFT_SRC name.
+"""OpenVLA's and OpenVLA-OFT's own code, out of the source trees that $OPENVLA_SRC and
+$OPENVLA_OFT_SRC name.
 
 OFT's also needs `diffusers==0.30.3` and `peft==0.11.1`, which serving does not.
 """
@@ -18,7 +19,8 @@ from pathlib import Path
 from vlagents_ray.policies.base.accelerator import ensure_torchvision
 
 VARIABLES = ("OPENVLA_SRC", "OPENVLA_OFT_SRC")
-_PACKAGES = ("", ".extern", ".extern.hf", ".models", ".training", ".vla")  # their __init__ import TensorFlow and more
+# Their __init__ import TensorFlow and more.
+_PACKAGES = ("", ".extern", ".extern.hf", ".models", ".training", ".vla")
 
 
 def source(variable: str) -> Path | None:
@@ -29,7 +31,9 @@ def source(variable: str) -> Path | None:
 
 @lru_cache
 def module(variable: str, name: str) -> types.ModuleType:
-    """A module of that tree's package `prismatic`, by its name there; those of one tree share what they import."""
+    """A module of that tree's package `prismatic`, by its name there; those of one tree share
+    what they import.
+    """
     with _packages(variable):
         return importlib.import_module(f"prismatic.{name}")
 

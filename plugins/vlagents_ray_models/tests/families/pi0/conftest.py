@@ -34,7 +34,9 @@ def made(folder: Path, **config: Any) -> Pi0:
 def seen(seed: int, side: tuple[int, int] = (224, 224), **info: Any) -> Obs:
     rng = np.random.default_rng(seed)
     return Obs(
-        cameras={name: rng.integers(0, 256, (*side, 3), dtype=np.uint8) for name in ("front", "wrist")},
+        cameras={
+            name: rng.integers(0, 256, (*side, 3), dtype=np.uint8) for name in ("front", "wrist")
+        },
         state={
             "xyz_axis_angle": rng.normal(size=6).astype(np.float32),
             "gripper_qpos": rng.normal(size=2).astype(np.float32),

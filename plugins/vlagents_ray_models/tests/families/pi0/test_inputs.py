@@ -23,7 +23,8 @@ from vlagents_ray.policies.base.staging import Staging
 from vlagents_ray.policies.compilation import Compilation
 from vlagents_ray_models.pi0 import LoadedPi0, Pi0, Pi0HfPasses, _scale
 
-# ATen calls that are no views of one act, 10 steps: 15,546 with transformers 5.23, of which each costs microseconds.
+# ATen calls that are no views of one act, 10 steps: 15,546 with transformers 5.23, of which each
+# costs microseconds.
 MOST_CALLS = 16_500
 
 
@@ -35,14 +36,18 @@ def row(policy: Pi0, i: int, obs: Obs) -> Row:
 
 
 @pytest.mark.verifies("parity")
-@pytest.mark.parametrize("settings", [{}, {"do_normalize": False}, {"do_normalize": False, "do_rescale": False}])
+@pytest.mark.parametrize(
+    "settings", [{}, {"do_normalize": False}, {"do_normalize": False, "do_rescale": False}]
+)
 def test_inputs_are_those_of_the_processor_itself(folder: Path, settings: dict[str, bool]) -> None:
     policy = made(folder)
     assert policy.model is not None
     processor, views = policy.model.processor, [seen(i) for i in range(3)]
     for name, value in settings.items():
         setattr(processor.image_processor, name, value)
-    policy.model = LoadedPi0(**{**vars(policy.model), "scale": _scale(processor, policy.model.staging)})
+    policy.model = LoadedPi0(
+        **{**vars(policy.model), "scale": _scale(processor, policy.model.staging)}
+    )
     found = policy._inputs([row(policy, i, obs) for i, obs in enumerate(views)])
     wanted = processor(
         images=[[obs.cameras["front"], obs.cameras["wrist"]] for obs in views],
@@ -53,7 +58,8 @@ def test_inputs_are_those_of_the_processor_itself(folder: Path, settings: dict[s
     )
     assert found.keys() == wanted.keys()
     for name, tensor in wanted.items():
-        assert found[name].dtype == tensor.dtype or name == "pixel_values"  # bytes without `do_rescale`
+        # Bytes without `do_rescale`.
+        assert found[name].dtype == tensor.dtype or name == "pixel_values"
         torch.testing.assert_close(found[name].to(tensor.dtype), tensor, rtol=1e-6, atol=1e-6)
 
 
@@ -62,7 +68,9 @@ SIDES = ((480, 640), (640, 480), (224, 224), (100, 37), (1080, 1920))
 
 @pytest.mark.verifies("parity")
 @pytest.mark.parametrize("images", [None, "transformers"])
-def test_images_of_any_size_are_those_of_the_processor_itself(folder: Path, images: str | None) -> None:
+def test_images_of_any_size_are_those_of_the_processor_itself(
+    folder: Path, images: str | None
+) -> None:
     policy = made(folder, images=images)
     assert policy.model is not None
     for i, side in enumerate(SIDES):
@@ -70,16 +78,22 @@ def test_images_of_any_size_are_those_of_the_processor_itself(folder: Path, imag
         obs.cameras["wrist"] = seen(i, SIDES[i - 1]).cameras["wrist"]  # of another size
         found = policy._inputs([row(policy, i, obs)])
         wanted = policy.model.processor(
-            images=[[obs.cameras["front"], obs.cameras["wrist"]]], text=[WORDS[0]], return_tensors="pt"
+            images=[[obs.cameras["front"], obs.cameras["wrist"]]],
+            text=[WORDS[0]],
+            return_tensors="pt",
         )
-        torch.testing.assert_close(found["pixel_values"], wanted["pixel_values"], rtol=1e-6, atol=1e-6)
+        torch.testing.assert_close(
+            found["pixel_values"], wanted["pixel_values"], rtol=1e-6, atol=1e-6
+        )
 
 
 def test_images_for_openpis_weights_are_those_of_openpi(folder: Path) -> None:
     policy = made(folder, images="openpi")
     for i, side in enumerate(SIDES):
         image = seen(i, side).cameras["front"]
-        np.testing.assert_array_equal(policy._resized([image])["images"][0], resize_with_pad(image, 224, 224))
+        np.testing.assert_array_equal(
+            policy._resized([image])["images"][0], resize_with_pad(image, 224, 224)
+        )
 
 
 @pytest.mark.parametrize(
@@ -92,7 +106,9 @@ def test_images_for_openpis_weights_are_those_of_openpi(folder: Path) -> None:
         ({"do_resize": False}, "openpi"),
     ],
 )
-def test_the_image_processor_decides_unless_the_settings_do(folder: Path, settings: dict[str, Any], style: str) -> None:
+def test_the_image_processor_decides_unless_the_settings_do(
+    folder: Path, settings: dict[str, Any], style: str
+) -> None:
     processor = made(folder).loaded().processor
     for name, value in settings.items():
         setattr(processor.image_processor, name, value)
@@ -131,16 +147,25 @@ def published() -> Pi0:
     network = network.eval().requires_grad_(False).to(META)
     policy, staging = Pi0.from_config({"checkpoint": "none", "noise_level": 0.5}), Staging(META)
     passes = Pi0HfPasses(network, Compilation(False))
-    policy.model = LoadedPi0(network, processor, torch.bfloat16, passes, staging, _scale(processor, staging))
+    policy.model = LoadedPi0(
+        network, processor, torch.bfloat16, passes, staging, _scale(processor, staging)
+    )
     return policy
 
 
 @pytest.mark.parametrize(
     ("info", "waits"),
-    [({}, 1), ({SAMPLES: 2}, 1), ({WANT: ["logprob", "replay"]}, 2), ({LEFTOVER: np.ones((6, 7)), DELAY: 2}, 1)],
+    [
+        ({}, 1),
+        ({SAMPLES: 2}, 1),
+        ({WANT: ["logprob", "replay"]}, 2),
+        ({LEFTOVER: np.ones((6, 7)), DELAY: 2}, 1),
+    ],
     ids=["an act", "samples", "log-probabilities", "a plan"],
 )
-def test_an_act_waits_only_for_its_results(published: Pi0, info: dict[str, Any], waits: int) -> None:
+def test_an_act_waits_only_for_its_results(
+    published: Pi0, info: dict[str, Any], waits: int
+) -> None:
     sessions = [begun(published, i) for i in range(4)]
     counted = calls_of_an_act(published, sessions, [seen(i, **info) for i in range(4)])
     assert sum(counted.waits.values()) == waits, counted.waits

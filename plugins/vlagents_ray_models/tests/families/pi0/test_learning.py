@@ -1,4 +1,6 @@
-"""What π0 states of its acts for learners, what its samples cost, and that compiled cores act as it does without."""
+"""What π0 states of its acts for learners, what its samples cost, and that compiled cores act as
+it does without.
+"""
 
 from __future__ import annotations
 
@@ -17,7 +19,13 @@ from pushed_weights import check_pushed_weights
 from shared_readings import check_shared_readings
 
 from plugins.vlagents_ray_models.tests.families.pi0 import tiny
-from plugins.vlagents_ray_models.tests.families.pi0.conftest import BATCHED, WORDS, begun, made, seen
+from plugins.vlagents_ray_models.tests.families.pi0.conftest import (
+    BATCHED,
+    WORDS,
+    begun,
+    made,
+    seen,
+)
 from vlagents_ray.interface import BEHAVIOUR, DELAY, DISTRIBUTION, LEFTOVER, SAMPLES, WANT, Act, Obs
 from vlagents_ray.policies.flow import logprob_of_chain
 from vlagents_ray.protocol.messages import Request
@@ -31,7 +39,8 @@ from vlagents_ray_models.pi0 import Pi0
 ROOT = Path(__file__).parents[5]
 ALL = ["logprob", "entropy", "replay"]
 LEVEL = 0.5
-SUMMED = 2e-3  # how far a sum of 25 log-probabilities may be off, in float32: each is of a step of about 0.1
+# How far a sum of 25 log-probabilities may be off, in float32: each is of a step of about 0.1.
+SUMMED = 2e-3
 
 
 @pytest.fixture(scope="module")
@@ -88,25 +97,33 @@ def test_a_learner_recomputes_what_was_stated_of_several_acts(learnt: Pi0) -> No
     chain = torch.from_numpy(np.stack([one["replay"]["chain"] for one in said]))
     with torch.no_grad():
         velocity = pi0.flow_velocity(learnt.model.network, encoded(learnt, 0, 1, 2), torch.float32)
-        again = logprob_of_chain(velocity, chain, said[0]["replay"]["noise_level"])[:, :, : tiny.ACTION_DIM]
+        again = logprob_of_chain(velocity, chain, said[0]["replay"]["noise_level"])[
+            :, :, : tiny.ACTION_DIM
+        ]
     np.testing.assert_allclose(again, np.stack([one["logprob"] for one in said]), atol=SUMMED)
     for act, one in zip(acts, said, strict=True):
         np.testing.assert_array_equal(act.action, learnt.model.actions(one["replay"]["chain"][-1]))
 
 
-def test_a_log_probability_for_each_sample_and_for_the_rows_that_are_used(folder: Path, learnt: Pi0) -> None:
+def test_a_log_probability_for_each_sample_and_for_the_rows_that_are_used(
+    folder: Path, learnt: Pi0
+) -> None:
     short = made(folder, noise_level=LEVEL, execute=4)
     act = begun(short, 0).act(seen(0, **{WANT: ALL, SAMPLES: 3}))
     found = act.info[DISTRIBUTION]
     assert act.info[BEHAVIOUR]["logprob"].shape == act.action.shape == (4, tiny.ACTION_DIM)
     assert found["logprob"].shape == found["samples"].shape == (3, 4, tiny.ACTION_DIM)
     with torch.no_grad():
-        velocity = pi0.flow_velocity(learnt.model.network, encoded(learnt, 0), torch.float32, [0, 0, 0])
+        velocity = pi0.flow_velocity(
+            learnt.model.network, encoded(learnt, 0), torch.float32, [0, 0, 0]
+        )
         again = logprob_of_chain(velocity, torch.from_numpy(found["replay"]["chain"]), LEVEL)
     np.testing.assert_allclose(again[:, :4, : tiny.ACTION_DIM], found["logprob"], atol=SUMMED)
 
 
-def test_the_samples_of_an_observation_are_of_one_reading_of_it(learnt: Pi0, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_samples_of_an_observation_are_of_one_reading_of_it(
+    learnt: Pi0, monkeypatch: pytest.MonkeyPatch
+) -> None:
     read: list[int] = []
     embed = learnt.model.network.model.embed_prefix
 
@@ -175,13 +192,18 @@ def test_it_acts_with_pushed_weights(compiled: Pi0, programs: list[int]) -> None
 
 def test_in_a_child_process_it_acts_with_pushed_weights(folder: Path) -> None:
     policy = made(folder)
-    pushed = {name: 0.8 * value if value.is_floating_point() else value for name, value in policy.parameters().items()}
+    pushed = {
+        name: 0.8 * value if value.is_floating_point() else value
+        for name, value in policy.parameters().items()
+    }
     settings = Settings("pi0", {"checkpoint": str(folder)}, 1, "1")
     served = Engine(ChildAgent(Child(sys.executable, settings, {"PYTHONPATH": str(ROOT)})))
     served.start()
     try:
         Publisher(served).push(pushed)
-        answered(served, "a", Request("reset", seen(0), WORDS[0], kwargs={"seed": 0}, rank="simulation"))
+        answered(
+            served, "a", Request("reset", seen(0), WORDS[0], kwargs={"seed": 0}, rank="simulation")
+        )
         act = answered(served, "a", Request("act", seen(0), rank="simulation")).act
     finally:
         served.close()

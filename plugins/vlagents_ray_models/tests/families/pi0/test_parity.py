@@ -20,11 +20,15 @@ def scaled(core: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def without_state(core: Callable[..., Any]) -> Callable[..., Any]:
-    return lambda encoded, seen, state, actions, times: core(encoded, seen, 0 * state, actions, times)
+    return lambda encoded, seen, state, actions, times: core(
+        encoded, seen, 0 * state, actions, times
+    )
 
 
 def at_the_next_time(core: Callable[..., Any]) -> Callable[..., Any]:
-    return lambda encoded, seen, state, actions, times: core(encoded, seen, state, actions, times - 0.1)
+    return lambda encoded, seen, state, actions, times: core(
+        encoded, seen, state, actions, times - 0.1
+    )
 
 
 def with_padding(core: Callable[..., Any]) -> Callable[..., Any]:
@@ -32,7 +36,9 @@ def with_padding(core: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def cameras_exchanged(core: Callable[..., Any]) -> Callable[..., Any]:
-    return lambda tokens, mask, cameras, state, images: core(tokens, mask, cameras, state, images.flip(1))
+    return lambda tokens, mask, cameras, state, images: core(
+        tokens, mask, cameras, state, images.flip(1)
+    )
 
 
 def unchanged(core: Callable[..., Any]) -> Callable[..., Any]:
@@ -51,7 +57,11 @@ def unchanged(core: Callable[..., Any]) -> Callable[..., Any]:
     ],
 )
 def test_wrong_programs_in_bfloat16_are_refused(
-    folder: Path, monkeypatch: pytest.MonkeyPatch, name: str, change: Callable[..., Any], refused: bool
+    folder: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    name: str,
+    change: Callable[..., Any],
+    refused: bool,
 ) -> None:
     def compile_core(core: Callable[..., Any], **_: Any) -> Callable[..., Any]:
         return change(core) if core.__code__.co_name == f"{name}_{ROWS}" else core

@@ -12,7 +12,13 @@ import torch
 from safetensors.torch import load_file, save_file
 
 from plugins.vlagents_ray_models.tests.families.pi0 import tiny
-from plugins.vlagents_ray_models.tests.families.pi0.conftest import BATCHED, WORDS, begun, made, seen
+from plugins.vlagents_ray_models.tests.families.pi0.conftest import (
+    BATCHED,
+    WORDS,
+    begun,
+    made,
+    seen,
+)
 from vlagents_ray import Obs
 from vlagents_ray.errors import ConfigError, InvalidObservation, MissingCamera, NotTrainable
 from vlagents_ray.interface import DELAY, LEFTOVER
@@ -42,7 +48,11 @@ def test_it_states_what_it_needs_and_gives(loaded: Pi0) -> None:
     contract = loaded.contract
     assert set(contract.cameras or ()) == {"front", "wrist"}
     assert set(contract.state or ()) == {"xyz_axis_angle", "gripper_qpos"}
-    assert (contract.action.dim, contract.chunk, contract.instruction) == (tiny.ACTION_DIM, tiny.CHUNK, True)
+    assert (contract.action.dim, contract.chunk, contract.instruction) == (
+        tiny.ACTION_DIM,
+        tiny.CHUNK,
+        True,
+    )
 
 
 @pytest.mark.verifies("parity")
@@ -57,7 +67,9 @@ def test_actions_are_those_of_transformers_own_sampling(loaded: Pi0) -> None:
         state=np.concatenate([obs.state["xyz_axis_angle"], obs.state["gripper_qpos"]])[None],
         padding=False,
     )
-    flow = network.sample_actions(**inputs, noise=torch.from_numpy(noise))[0, :, : tiny.ACTION_DIM].numpy()
+    flow = network.sample_actions(**inputs, noise=torch.from_numpy(noise))[
+        0, :, : tiny.ACTION_DIM
+    ].numpy()
     mean, std = np.array(processor.actions_mean), np.array(processor.actions_std)
     np.testing.assert_allclose(session.act(obs).action, flow * (std + 1e-8) + mean, atol=1e-5)
 
@@ -66,7 +78,9 @@ def test_actions_are_those_of_transformers_own_sampling(loaded: Pi0) -> None:
 @pytest.mark.parametrize("size", [2, 3, 8])
 def test_neighbours_change_nothing(loaded: Pi0, size: int) -> None:
     alone = [begun(loaded, i).act(seen(i)).action for i in range(size)]
-    batch = loaded.act_batch([seen(i) for i in range(size)], [begun(loaded, i) for i in range(size)])
+    batch = loaded.act_batch(
+        [seen(i) for i in range(size)], [begun(loaded, i) for i in range(size)]
+    )
     for one, act in zip(alone, batch, strict=True):
         np.testing.assert_allclose(act.action, one, atol=BATCHED)
 
@@ -92,7 +106,9 @@ def test_cameras_are_in_the_models_order_however_they_are_listed(folder: Path, l
         {"checkpoint": str(folder), "cameras": {"left_wrist_0_rgb": "wrist", "base_0_rgb": "front"}}
     )
     turned.model = loaded.model
-    np.testing.assert_array_equal(begun(turned, 0).act(seen(0)).action, begun(loaded, 0).act(seen(0)).action)
+    np.testing.assert_array_equal(
+        begun(turned, 0).act(seen(0)).action, begun(loaded, 0).act(seen(0)).action
+    )
 
 
 def test_frozen_rows_come_back_as_planned_and_later_ones_follow_the_plan(loaded: Pi0) -> None:
@@ -100,7 +116,10 @@ def test_frozen_rows_come_back_as_planned_and_later_ones_follow_the_plan(loaded:
     free = begun(loaded, 0).act(seen(0)).action
     guided = begun(loaded, 0).act(seen(0, **{LEFTOVER: plan, DELAY: 3})).action
     np.testing.assert_allclose(guided[:3], plan[:3], atol=1e-5)
-    off, without = np.abs(guided[: len(plan)] - plan).mean(1), np.abs(free[: len(plan)] - plan).mean(1)
+    off, without = (
+        np.abs(guided[: len(plan)] - plan).mean(1),
+        np.abs(free[: len(plan)] - plan).mean(1),
+    )
     assert (off[3:] < without[3:]).all()
     assert off[3] < off[-1]  # it follows closely at first, loosely at the end
 
@@ -172,7 +191,9 @@ def test_cameras_that_the_model_does_not_have_are_an_error(cameras: dict[str, st
 
 def test_in_bfloat16_it_stays_near_float32(folder: Path, loaded: Pi0) -> None:
     half = made(folder, dtype="bfloat16")
-    np.testing.assert_allclose(begun(half, 0).act(seen(0)).action, begun(loaded, 0).act(seen(0)).action, atol=0.1)
+    np.testing.assert_allclose(
+        begun(half, 0).act(seen(0)).action, begun(loaded, 0).act(seen(0)).action, atol=0.1
+    )
 
 
 def test_statistics_are_those_that_were_saved(whole: Path) -> None:
@@ -185,12 +206,16 @@ def test_statistics_are_those_that_were_saved(whole: Path) -> None:
 
 @pytest.mark.library("torchao")
 @pytest.mark.parametrize(("kind", "error"), [("int8", 0.02), ("float8", 0.1)])
-def test_quantized_it_acts_nearly_alike_from_less_memory(loaded: Pi0, folder: Path, kind: str, error: float) -> None:
+def test_quantized_it_acts_nearly_alike_from_less_memory(
+    loaded: Pi0, folder: Path, kind: str, error: float
+) -> None:
     quantized = made(folder, quantization=kind)
     whole = begun(loaded, 0).act(seen(0)).action
     off = np.abs(begun(quantized, 0).act(seen(0)).action - whole).max() / np.abs(whole).max()
     assert 0 < off < error
-    layers = [layer for layer in quantized.model.network.modules() if isinstance(layer, torch.nn.Linear)]
+    layers = [
+        layer for layer in quantized.model.network.modules() if isinstance(layer, torch.nn.Linear)
+    ]
     assert layers
     assert all(type(layer.weight).__name__.lower().startswith(kind) for layer in layers)
     with pytest.raises(NotTrainable, match="quantization"):

@@ -16,12 +16,20 @@ from vlagents_ray_models.pi0 import Pi0
 
 
 @pytest.mark.parametrize("shard_bytes", [weights.SHARD_BYTES, 200_000])
-def test_it_loads_and_acts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, shard_bytes: int) -> None:
+def test_it_loads_and_acts(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, shard_bytes: int
+) -> None:
     size = recipe.Pi0Size(width=64, expert_width=32, layers=2, vision_layers=1, patch=56)
     monkeypatch.setattr(recipe, "SMALL", size)
-    monkeypatch.setattr(recipe, "write_weights", lambda *given: weights.write_weights(*given, shard_bytes=shard_bytes))
+    monkeypatch.setattr(
+        recipe,
+        "write_weights",
+        lambda *given: weights.write_weights(*given, shard_bytes=shard_bytes),
+    )
     written = write_checkpoint("pi0", tmp_path / "made", "small", "float32")
-    assert (tmp_path / "made" / "model.safetensors").is_file() == (shard_bytes == weights.SHARD_BYTES)
+    assert (tmp_path / "made" / "model.safetensors").is_file() == (
+        shard_bytes == weights.SHARD_BYTES
+    )
     policy = Pi0.from_config(written.config)
     policy.initialize()
     assert policy.model is not None
@@ -38,10 +46,17 @@ def test_the_full_size_is_the_published_one(tmp_path: Path) -> None:
     model, _ = recipe.make_model(Recipe("pi0", tmp_path, "full", "bfloat16"))
     parameters = dict(model.named_parameters())
     assert all(one.is_meta for one in parameters.values())
-    # 3.3 billion (arXiv 2410.24164), which counts the words once: transformers' expert has an unused table of them
-    unused = [one.numel() for name, one in parameters.items() if "dit" in name and "embed_tokens" in name]
+    # 3.3 billion (arXiv 2410.24164), which counts the words once: transformers' expert has an
+    # unused table of them
+    unused = [
+        one.numel() for name, one in parameters.items() if "dit" in name and "embed_tokens" in name
+    ]
     assert 3.2e9 < sum(one.numel() for one in parameters.values()) - sum(unused) < 3.4e9
-    assert model.config.dit_config.num_hidden_layers == model.config.vlm_config.text_config.num_hidden_layers == 18
+    assert (
+        model.config.dit_config.num_hidden_layers
+        == model.config.vlm_config.text_config.num_hidden_layers
+        == 18
+    )
 
 
 def chunk_of(policy: Pi0, seed: int) -> np.ndarray:

@@ -15,7 +15,10 @@ from benchmarks.checkpoints import pi0 as recipe
 STATE_DIM, ACTION_DIM = recipe.STATE_DIM, recipe.ACTION_DIM
 CHUNK = 10
 _PATCH = 56  # px: 16 tokens an image
-_SIZES = {"tiny": recipe.Pi0Size(64, 32, 2, 1, _PATCH), "small": recipe.Pi0Size(512, 256, 4, 4, _PATCH)}
+_SIZES = {
+    "tiny": recipe.Pi0Size(64, 32, 2, 1, _PATCH),
+    "small": recipe.Pi0Size(512, 256, 4, 4, _PATCH),
+}
 
 
 def save(folder: str | Path, kind: str = "tiny", seed: int = 0, statistics: bool = True) -> Path:

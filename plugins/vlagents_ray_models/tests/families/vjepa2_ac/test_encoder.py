@@ -9,7 +9,12 @@ import numpy as np
 import pytest
 import torch
 
-from plugins.vlagents_ray_models.tests.families.vjepa2_ac.tiny import PATCH, SIDE, WIDTH, make_hf_encoder
+from plugins.vlagents_ray_models.tests.families.vjepa2_ac.tiny import (
+    PATCH,
+    SIDE,
+    WIDTH,
+    make_hf_encoder,
+)
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.policies.compilation import Compilation
 from vlagents_ray_models.vjepa2_ac import VJepa2AcConfig, WorldModel, load_encoder, to_pixels
@@ -26,11 +31,15 @@ def config(**settings: Any) -> VJepa2AcConfig:
 
 def pixels(count: int) -> np.ndarray:
     rng = np.random.default_rng(0)
-    return np.stack([to_pixels(rng.integers(0, 256, (40, 60, 3), dtype=np.uint8), SIDE) for _ in range(count)])
+    return np.stack(
+        [to_pixels(rng.integers(0, 256, (40, 60, 3), dtype=np.uint8), SIDE) for _ in range(count)]
+    )
 
 
 def encoding(model: Any, normalize: bool) -> Any:
-    return WorldModel(model, None, config(normalize=normalize), torch.float32, Compilation(mode=False)).encode
+    return WorldModel(
+        model, None, config(normalize=normalize), torch.float32, Compilation(mode=False)
+    ).encode
 
 
 @torch.inference_mode()
@@ -72,7 +81,9 @@ def test_weights_that_are_missing_are_never_random(folder: Path, tmp_path: Path)
     tensors = load_file(folder / "model.safetensors")
     del tensors["encoder.layer.1.attention.key.weight"]
     save_file(tensors, tmp_path / "model.safetensors", metadata={"format": "pt"})
-    with pytest.raises(ConfigError, match=r"does not fill VJEPA2Model.*layer\.1\.attention\.key\.weight"):
+    with pytest.raises(
+        ConfigError, match=r"does not fill VJEPA2Model.*layer\.1\.attention\.key\.weight"
+    ):
         load_encoder(config(encoder=str(tmp_path)), None)
 
 

@@ -30,7 +30,9 @@ from vlagents_ray_models.vjepa2_ac import VJepa2Ac
 pytestmark = [
     pytest.mark.source("VJEPA2_SRC"),
     # Upstream names things that its libraries have renamed since.
-    pytest.mark.filterwarnings("ignore:Importing from timm.models.layers is deprecated:FutureWarning"),
+    pytest.mark.filterwarnings(
+        "ignore:Importing from timm.models.layers is deprecated:FutureWarning"
+    ),
     pytest.mark.filterwarnings("ignore:`torch.backends.cuda.sdp_kernel:FutureWarning"),
 ]
 
@@ -88,8 +90,12 @@ def test_a_session_gets_the_same_in_any_company(policy: VJepa2Ac) -> None:
 
 
 @pytest.mark.parametrize("between", ["act", "observe"])
-def test_a_goal_is_taken_from_an_observation_that_no_plan_is_made_for(checkpoint: Path, between: str) -> None:
-    queueing = VJepa2Ac.from_config({"checkpoint": str(checkpoint), **SETTINGS, "actions": "queue", "execute": 2})
+def test_a_goal_is_taken_from_an_observation_that_no_plan_is_made_for(
+    checkpoint: Path, between: str
+) -> None:
+    queueing = VJepa2Ac.from_config(
+        {"checkpoint": str(checkpoint), **SETTINGS, "actions": "queue", "execute": 2}
+    )
     queueing.initialize()
     turned, wanted = begun(queueing, 0, goal=0), begun(queueing, 0, goal=1)
     for session in (turned, wanted):
@@ -106,12 +112,17 @@ def test_bfloat16_plans_nearly_as_float32(checkpoint: Path, policy: VJepa2Ac) ->
     quick.initialize()
     one, other = (begun(which, 3).act(obs(4)) for which in (quick, policy))
     assert one.info["energy"] == pytest.approx(other.info["energy"], rel=0.05)
-    assert np.allclose(one.action[:, :3], other.action[:, :3], atol=0.05)  # of at most 0.05 to each side
+    # Of at most 0.05 to each side.
+    assert np.allclose(one.action[:, :3], other.action[:, :3], atol=0.05)
 
 
 @pytest.mark.verifies("parity")
-def test_plans_are_those_of_upstreams_own_planner(policy: VJepa2Ac, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The same images, pose and draws, through upstream's encoder, predictor, transform and `cem`."""
+def test_plans_are_those_of_upstreams_own_planner(
+    policy: VJepa2Ac, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The same images, pose and draws, through upstream's encoder, predictor, transform and
+    `cem`.
+    """
     import torch
 
     ours = begun(policy, seed=3).act(obs(4))
@@ -154,7 +165,9 @@ def test_plans_are_those_of_upstreams_own_planner(policy: VJepa2Ac, monkeypatch:
 
 
 def upstream_transform(monkeypatch: pytest.MonkeyPatch) -> Any:
-    """That of upstream's notebook; OpenCV, which its augmentations for training are made with, is not needed."""
+    """That of upstream's notebook; OpenCV, which its augmentations for training are made with,
+    is not needed.
+    """
     monkeypatch.setitem(sys.modules, "cv2", ModuleType("cv2"))
     import src.datasets.utils.video.transforms as video
 
@@ -164,16 +177,23 @@ def upstream_transform(monkeypatch: pytest.MonkeyPatch) -> Any:
         frames = torch.tensor(buffer, dtype=torch.float32).permute(3, 0, 1, 2)
         frames = video.random_resized_crop(frames, SIDE, SIDE, scale=(1.0, 1.0), ratio=(1.0, 1.0))
         mean, std = (
-            torch.tensor(values)[:, None, None, None] * 255 for values in ((0.485, 0.456, 0.406), (0.229, 0.224, 0.225))
+            torch.tensor(values)[:, None, None, None] * 255
+            for values in ((0.485, 0.456, 0.406), (0.229, 0.224, 0.225))
         )
         return (frames - mean) / std
 
     return transform
 
 
-def test_an_encoder_of_transformers_may_take_the_place_of_the_checkpoints(checkpoint: Path, tmp_path: Path) -> None:
+def test_an_encoder_of_transformers_may_take_the_place_of_the_checkpoints(
+    checkpoint: Path, tmp_path: Path
+) -> None:
     other = VJepa2Ac.from_config(
-        {"checkpoint": str(checkpoint), **SETTINGS, "encoder": str(make_hf_encoder(tmp_path / "encoder"))}
+        {
+            "checkpoint": str(checkpoint),
+            **SETTINGS,
+            "encoder": str(make_hf_encoder(tmp_path / "encoder")),
+        }
     )
     other.initialize()
     assert begun(other, 0).act(obs(1)).action.shape == (1, 7)
@@ -196,9 +216,16 @@ def test_the_goal_may_come_later_and_change(policy: VJepa2Ac) -> None:
 
 @pytest.mark.verifies("isolation")
 def test_a_bad_observation_fails_its_own_session_alone(policy: VJepa2Ac) -> None:
-    bad = [Obs(cameras=obs(0).cameras, gripper=1.0), Obs(state=obs(0).state, gripper=1.0), obs(0), obs(1)]
+    bad = [
+        Obs(cameras=obs(0).cameras, gripper=1.0),
+        Obs(state=obs(0).state, gripper=1.0),
+        obs(0),
+        obs(1),
+    ]
     bad[2].info[GOAL_IMAGE] = np.zeros((4, 4), np.uint8)
-    no_state, no_camera, odd_goal, good = policy.act_batch(bad, [begun(policy, i) for i in range(4)])
+    no_state, no_camera, odd_goal, good = policy.act_batch(
+        bad, [begun(policy, i) for i in range(4)]
+    )
     assert isinstance(no_state, MissingState)
     assert isinstance(no_camera, MissingCamera)
     assert isinstance(odd_goal, InvalidObservation)
@@ -235,13 +262,19 @@ def altered(checkpoint: Path, folder: Path, part: str, lose: str | None) -> Path
         ("encoder", None, "it has no 'encoder'"),
         ("predictor", "module.predictor_proj.bias", r"does not fit.*predictor_proj\.bias"),
         ("encoder", "module.backbone.blocks.1.mlp.fc2.bias", r"encoder lacks.*mlp\.fc2\.bias"),
-        ("encoder", "module.backbone.patch_embed.proj.weight", "want names as 'patch_embed.proj.weight'"),
+        (
+            "encoder",
+            "module.backbone.patch_embed.proj.weight",
+            "want names as 'patch_embed.proj.weight'",
+        ),
     ],
 )
 def test_a_checkpoint_that_is_not_whole_is_refused(
     part: str, lose: str | None, says: str, checkpoint: Path, tmp_path: Path
 ) -> None:
-    made = VJepa2Ac.from_config({**SETTINGS, "checkpoint": str(altered(checkpoint, tmp_path, part, lose))})
+    made = VJepa2Ac.from_config(
+        {**SETTINGS, "checkpoint": str(altered(checkpoint, tmp_path, part, lose))}
+    )
     with pytest.raises(ConfigError, match=f"(?s){says}"):
         made.initialize()
 
@@ -255,7 +288,9 @@ def test_a_checkpoint_that_is_not_whole_is_refused(
         ({"checkpoint": "./none.pt"}, "no such file or folder"),
     ],
 )
-def test_what_cannot_be_loaded_says_why(settings: dict[str, Any], says: str, checkpoint: Path) -> None:
+def test_what_cannot_be_loaded_says_why(
+    settings: dict[str, Any], says: str, checkpoint: Path
+) -> None:
     with pytest.raises(ConfigError, match=says):
         VJepa2Ac.from_config({"checkpoint": str(checkpoint), **SETTINGS, **settings}).initialize()
 
@@ -272,7 +307,8 @@ def test_a_file_that_is_no_checkpoint_is_refused_and_never_unpickled(tmp_path: P
 SIZE = 2  # of compiled batches
 
 
-@pytest.mark.parametrize("pass_size", [400, 5])  # more than the 12 plans of an iteration, and no divisor of them
+# More than the 12 plans of an iteration, and no divisor of them.
+@pytest.mark.parametrize("pass_size", [400, 5])
 def test_plans_of_batches_of_any_size_are_those_without_compilation(
     pass_size: int, checkpoint: Path, policy: VJepa2Ac
 ) -> None:
@@ -281,12 +317,14 @@ def test_plans_of_batches_of_any_size_are_those_without_compilation(
         compiled = VJepa2Ac.from_config({**settings, "compile": "require", "batch_sizes": [SIZE]})
         compiled.initialize()
         plans = min(pass_size, SETTINGS["samples"])
-        assert sorted(compiler.rows) == sorted([SIZE, plans, plans])  # the encoder, and each step of a plan
+        # The encoder, and each step of a plan.
+        assert sorted(compiler.rows) == sorted([SIZE, plans, plans])
         for size in (1, SIZE, SIZE + 1):
             views = [obs(10 + i) for i in range(size)]
             views[0].info[SAMPLES] = 2
             acts = [
-                which.act_batch(views, [begun(which, i, goal=i) for i in range(size)]) for which in (policy, compiled)
+                which.act_batch(views, [begun(which, i, goal=i) for i in range(size)])
+                for which in (policy, compiled)
             ]
             for one, other in zip(*acts, strict=True):
                 assert isinstance(one, Act)

@@ -89,14 +89,20 @@ def make_models() -> tuple[Any, Any]:
 
 
 def make_checkpoint(file: Path) -> Path:
-    """As upstream's training writes it: a file with several state dicts and the prefixes of its wrappers."""
+    """As upstream's training writes it: a file with several state dicts and the prefixes of its
+    wrappers.
+    """
     import torch
 
     encoder, predictor = make_models()
     torch.save(
         {
-            "encoder": {f"module.backbone.{name}": tensor for name, tensor in encoder.state_dict().items()},
-            "predictor": {f"module.{name}": tensor for name, tensor in predictor.state_dict().items()},
+            "encoder": {
+                f"module.backbone.{name}": tensor for name, tensor in encoder.state_dict().items()
+            },
+            "predictor": {
+                f"module.{name}": tensor for name, tensor in predictor.state_dict().items()
+            },
             "epoch": 1,
         },
         file,

@@ -22,7 +22,9 @@ class Bus:
     def __init__(self, port: str, motors: dict[str, object], calibration: object) -> None:
         self.positions = dict.fromkeys(motors, 10.0)
         self.motors, self.goals, self.at_s = motors, dict(self.positions), CLOCK.monotonic()
-        self.calibration = {name: MotorCalibration(i, 0, 0, 1024, 3071) for i, name in enumerate(motors)}
+        self.calibration = {
+            name: MotorCalibration(i, 0, 0, 1024, 3071) for i, name in enumerate(motors)
+        }
         self.model_resolution_table = {"sts3215": 4096}
         self.is_connected, self.is_calibrated = False, port != "/dev/new"
 
@@ -73,7 +75,14 @@ class Person:
 
 def test_an_so101_is_driven_by_name_in_lerobots_order_and_units() -> None:
     arm = robot_named("--robot", "lerobot:so101_follower", ["port=/dev/ttyACM0", "id=mine"])()
-    assert arm.joint_names == ["shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex", "wrist_roll", "gripper"]
+    assert arm.joint_names == [
+        "shoulder_pan",
+        "shoulder_lift",
+        "elbow_flex",
+        "wrist_flex",
+        "wrist_roll",
+        "gripper",
+    ]
     assert arm.contract.state["joints"].unit == "deg"
     half = 360 * 2047 / 4095 / 2  # of the calibrated range
     np.testing.assert_allclose(arm.joint_limits, [*[(-half, half)] * 5, (0, 100)])
@@ -84,9 +93,18 @@ def test_an_so101_is_driven_by_name_in_lerobots_order_and_units() -> None:
         arm.apply(np.zeros(7, np.float32))
     report = examine(arm, operator=Person(), clock=CLOCK)
     assert report.ok, report.lines()
-    assert {"limits", "meaning", "order", "sign", "size", "latency", "rate", "commands", "stop", "clock"} <= set(
-        report.passed
-    )
+    assert {
+        "limits",
+        "meaning",
+        "order",
+        "sign",
+        "size",
+        "latency",
+        "rate",
+        "commands",
+        "stop",
+        "clock",
+    } <= set(report.passed)
     arm.close()
     assert not arm._robot.is_connected
 
@@ -106,10 +124,16 @@ def test_a_robot_of_a_plugin_is_driven_by_name() -> None:
         ("so101_folower", ["port=/dev/ttyACM0"], "did you mean 'so101_follower'"),
         ("so101_follower", [], "port"),
         ("so101_follower", ["port=/dev/ttyACM0", "speed=3"], "speed"),
-        ("so101_follower", ["port=/dev/new", "id=none"], "lerobot-calibrate --robot.type=so101_follower"),
+        (
+            "so101_follower",
+            ["port=/dev/new", "id=none"],
+            "lerobot-calibrate --robot.type=so101_follower",
+        ),
         ("so101_follower", ["/dev/ttyACM0"], "want KEY=VALUE"),
     ],
 )
-def test_a_wrong_robot_or_setting_is_named_with_its_cure(name: str, settings: list[str], message: str) -> None:
+def test_a_wrong_robot_or_setting_is_named_with_its_cure(
+    name: str, settings: list[str], message: str
+) -> None:
     with pytest.raises(ConfigError, match=message):
         robot_named("--robot", f"lerobot:{name}", settings)()

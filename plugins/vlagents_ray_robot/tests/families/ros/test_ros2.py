@@ -1,6 +1,8 @@
-"""A robot behind topics of a real ROS 2: rclpy and its middleware, with a driver that knows nothing of this package.
+"""A robot behind topics of a real ROS 2: rclpy and its middleware, with a driver that knows nothing
+of this package.
 
-If ROSBRIDGE_URL names a rosbridge_server of the same ROS_DOMAIN_ID, the tests run through it as well.
+If ROSBRIDGE_URL names a rosbridge_server of the same ROS_DOMAIN_ID, the tests run through it as
+well.
 """
 
 from __future__ import annotations
@@ -38,12 +40,16 @@ from vlagents_ray_robot.ros.links import Ros2
 from vlagents_ray_robot.ros.robot import settings_from
 
 pytestmark = [
-    pytest.mark.filterwarnings("ignore:module 'sre_:DeprecationWarning"),  # of a parser that rclpy imports
-    pytest.mark.filterwarnings("ignore:Deprecated in favor of:DeprecationWarning"),  # of rclpy's own, of logging
+    # Of a parser that rclpy imports.
+    pytest.mark.filterwarnings("ignore:module 'sre_:DeprecationWarning"),
+    # Of rclpy's own, of logging.
+    pytest.mark.filterwarnings("ignore:Deprecated in favor of:DeprecationWarning"),
 ]
 
 STEP, MAX_STEP = 0.01, 0.05
-each_link = pytest.mark.parametrize("link", ["ros2", *filter(None, [os.environ.get("ROSBRIDGE_URL")])])
+each_link = pytest.mark.parametrize(
+    "link", ["ros2", *filter(None, [os.environ.get("ROSBRIDGE_URL")])]
+)
 
 
 class Driver:
@@ -179,7 +185,8 @@ def test_each_type_of_action_arrives_as_a_message_of_ros(driver: Driver, link: s
         action = np.array([0.1, 0.2, 0.3, 0.4, 0.5], np.float32)
 
         def came(topic: str) -> Any:
-            wait_for(lambda: robot.apply(action) or driver.came[topic])  # until both nodes have found each other
+            # Until both nodes have found each other.
+            wait_for(lambda: robot.apply(action) or driver.came[topic])
             return driver.came[topic][-1]
 
         trajectory, state, twist = came("/t"), came("/s"), came("/v")
@@ -187,9 +194,17 @@ def test_each_type_of_action_arrives_as_a_message_of_ros(driver: Driver, link: s
         assert list(trajectory.points[0].positions) == pytest.approx([0.1, 0.2])
         start = trajectory.points[0].time_from_start
         assert (start.sec, start.nanosec) == (1, 500_000_000)
-        assert (list(state.name), list(state.velocity), list(state.position)) == (["finger"], pytest.approx([0.3]), [])
+        assert (list(state.name), list(state.velocity), list(state.position)) == (
+            ["finger"],
+            pytest.approx([0.3]),
+            [],
+        )
         assert abs(time.time() - state.header.stamp.sec) < 60
-        assert (twist.linear.x, twist.angular.z, twist.linear.y) == (pytest.approx(0.4), pytest.approx(0.5), 0.0)
+        assert (twist.linear.x, twist.angular.z, twist.linear.y) == (
+            pytest.approx(0.4),
+            pytest.approx(0.5),
+            0.0,
+        )
         robot.stop()
         wait_for(lambda: list(driver.came["/t"][-1].points[0].positions) == [0.25, -0.25])
         wait_for(lambda: driver.came["/v"][-1] == Twist())
@@ -200,7 +215,9 @@ def test_a_message_that_ros_does_not_have_is_an_error_with_the_cure() -> None:
     link = Ros2()
     try:
         for kind in ("no_msgs/msg/Image", "sensor_msgs/msg/Picture"):
-            with pytest.raises(ConfigError, match=r"ROS has no such message here.*install the package"):
+            with pytest.raises(
+                ConfigError, match=r"ROS has no such message here.*install the package"
+            ):
                 link.advertise("/a", kind)
     finally:
         link.close()

@@ -23,7 +23,8 @@ from vlagents_ray_sims.calvin import STEPS, Calvin, Chains, fnv1_32, quietly
 
 pytestmark = pytest.mark.source("CALVIN_SRC")
 MOVE = Act(np.array([1, 0.3, -1, 0, 0.1, 1, -1], np.float32))
-STILL = np.tile(np.array([0, 0, 0, 0, 0, 0, 1], np.float32), (60, 1))  # a chunk, between whose rows nothing is drawn
+# A chunk, between whose rows nothing is drawn.
+STILL = np.tile(np.array([0, 0, 0, 0, 0, 0, 1], np.float32), (60, 1))
 LED = 1  # the chain that begins with "turn_off_led"
 
 
@@ -47,7 +48,9 @@ def alone(env: Calvin) -> Iterator[None]:
 
 
 def test_the_chains_are_upstreams(checkout: Path) -> None:
-    """The first ones, as its evaluation prints them; and one state's, drawn by its own functions."""
+    """The first ones, as its evaluation prints them; and one state's, drawn by its own
+    functions.
+    """
     chains = Chains(checkout)
     assert chains[0].tasks == (
         "rotate_blue_block_right",
@@ -61,7 +64,9 @@ def test_the_chains_are_upstreams(checkout: Path) -> None:
     before = np.random.get_state()  # noqa: NPY002 - upstream's
     theirs = chains._rules["get_sequences_for_state2"]((state, 2, seed))
     np.random.set_state(before)  # noqa: NPY002
-    places = {place: number for number, (_, (one, place)) in enumerate(chains._order) if one == seed}
+    places = {
+        place: number for number, (_, (one, place)) in enumerate(chains._order) if one == seed
+    }
     assert [tuple(chain) for chain in theirs] == [chains[places[place]].tasks for place in range(2)]
     assert len(chains._order) == 1000
     assert len({seed for _, (seed, _) in chains._order}) == 192
@@ -70,7 +75,9 @@ def test_the_chains_are_upstreams(checkout: Path) -> None:
 def test_the_initial_states_are_upstreams(checkout: Path) -> None:
     tree = ast.parse((checkout / "calvin_models/calvin_agent/evaluation/utils.py").read_text())
     wanted = ("get_env_state_for_initial_condition", "temp_seed")
-    tree.body = [node for node in tree.body if isinstance(node, ast.FunctionDef) and node.name in wanted]
+    tree.body = [
+        node for node in tree.body if isinstance(node, ast.FunctionDef) and node.name in wanted
+    ]
     names: dict[str, Any] = {"np": np, "pi": math.pi, "contextlib": contextlib, "hasher": fnv1_32}
     exec(compile(tree, "utils.py", "exec"), names)  # noqa: S102
     chains = Chains(checkout)
@@ -96,7 +103,9 @@ def test_what_it_shows_is_upstreams_to_the_bit(checkout: Path, renderer: str) ->
             changed = ["cameras=static_and_gripper", "use_vr=false"]
             plain = [f"hydra/{log}=default" for log in ("job_logging", "hydra_logging")]
             settings = hydra.compose("config_data_collection", overrides=[*changed, *plain])
-        theirs = hydra.utils.instantiate(settings.env, use_scene_info=True, use_egl=renderer == "egl")
+        theirs = hydra.utils.instantiate(
+            settings.env, use_scene_info=True, use_egl=renderer == "egl"
+        )
         raw = theirs.reset(robot_obs=chain.robot, scene_obs=chain.scene)
         for obs in seen:
             for camera in ("static", "gripper"):
@@ -122,7 +131,9 @@ class Still(Agent):
 
 
 class PressesTheButton(Agent):
-    """Presses the button of scene D with a closed gripper while it is told so, and else stays where it is."""
+    """Presses the button of scene D with a closed gripper while it is told so, and else stays
+    where it is.
+    """
 
     def __init__(self) -> None:
         self.told: list[str] = []
@@ -145,9 +156,16 @@ def test_a_scripted_arm_solves_a_task_and_is_told_the_next_one(env: Calvin) -> N
     agent, rewards = PressesTheButton(), []
     key = EpisodeKey("calvin/D", LED, LED, "0")
     result = run_episode(
-        env, agent, key, images=False, executed=lambda _action, reward, _success: rewards.append(reward)
+        env,
+        agent,
+        key,
+        images=False,
+        executed=lambda _action, reward, _success: rewards.append(reward),
     )
-    first, second = "press the button to turn off the led light", "slide the block that it falls into the drawer"
+    first, second = (
+        "press the button to turn off the led light",
+        "slide the block that it falls into the drawer",
+    )
     assert agent.told == [first, second]
     assert result.instruction == f"{first}; {second}"
     assert (result.episode_return, result.success_once, result.ending) == (1.0, False, "terminated")
@@ -157,7 +175,9 @@ def test_a_scripted_arm_solves_a_task_and_is_told_the_next_one(env: Calvin) -> N
 
 def test_holding_still_solves_nothing(env: Calvin) -> None:
     for number in range(3):
-        result = run_episode(env, Still(), EpisodeKey("calvin/D", number, number, "0"), images=False)
+        result = run_episode(
+            env, Still(), EpisodeKey("calvin/D", number, number, "0"), images=False
+        )
         assert (result.episode_return, result.steps, result.ending) == (0.0, STEPS, "terminated")
 
 
@@ -181,11 +201,15 @@ def test_an_episode_of_five_solved_tasks_is_a_success_and_shows_each_beginning(
 
 
 @pytest.mark.usefixtures("alone")
-def test_a_machine_without_egl_is_told_of_the_other_renderer(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_machine_without_egl_is_told_of_the_other_renderer(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     import pybullet
 
     monkeypatch.setattr(pybullet, "loadPlugin", lambda *_: -1)
-    with pytest.raises(EnvFailed, match=r"cannot draw through EGL; install EGL: .*, or set renderer to tiny"):
+    with pytest.raises(
+        EnvFailed, match=r"cannot draw through EGL; install EGL: .*, or set renderer to tiny"
+    ):
         Calvin("D")
 
 

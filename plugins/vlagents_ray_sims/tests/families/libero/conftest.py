@@ -11,7 +11,9 @@ from vlagents_ray_sims.libero import Libero
 
 @pytest.fixture(scope="package")
 def bowl() -> Iterator[Libero]:
-    """Picks a bowl from between a plate and a ramekin; the cabinet stands where the simulator draws."""
+    """Picks a bowl from between a plate and a ramekin; the cabinet stands where the simulator
+    draws.
+    """
     with Libero("libero_spatial/0", width=64, height=64) as env:
         yield env
 

@@ -1,4 +1,6 @@
-"""LIBERO keeps its promises and the protocol's, as its literature evaluates: seen in the simulator and its files."""
+"""LIBERO keeps its promises and the protocol's, as its literature evaluates: seen in the
+simulator and its files.
+"""
 
 from __future__ import annotations
 
@@ -27,7 +29,9 @@ def test_it_keeps_the_promises_of_an_env() -> None:
     check_env(Libero("libero_object/1", width=32, height=32, max_steps=4), steps=3)
 
 
-def test_an_initial_state_gives_one_episode_whatever_was_played_and_whatever_the_seed(soup: Libero) -> None:
+def test_an_initial_state_gives_one_episode_whatever_was_played_and_whatever_the_seed(
+    soup: Libero,
+) -> None:
     first = fingerprint(play(soup, state=5))
     play(soup, state=6)
     begin(soup, state=5, seed=1234)
@@ -44,12 +48,16 @@ def test_two_envs_of_one_process_do_not_disturb_each_other(bowl: Libero, soup: L
     assert fingerprint(play(bowl)) == alone
 
 
-def test_doing_nothing_solves_no_task_and_ends_at_the_limit(soup: Libero, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_doing_nothing_solves_no_task_and_ends_at_the_limit(
+    soup: Libero, monkeypatch: pytest.MonkeyPatch
+) -> None:
     assert soup.max_steps == 280
     monkeypatch.setattr(soup, "max_steps", 20)
     begin(soup)
     ended = [soup.step(STILL)[1:] for _ in range(20)]
-    assert {(reward, terminated, info["success"]) for reward, terminated, _, info in ended} == {(0.0, False, False)}
+    assert {(reward, terminated, info["success"]) for reward, terminated, _, info in ended} == {
+        (0.0, False, False)
+    }
     assert [truncated for _, _, truncated, _ in ended] == [False] * 19 + [True]
 
 
@@ -61,7 +69,9 @@ with Libero("libero_object/0", width=32, height=32) as env:
 
 
 @pytest.mark.slow
-def test_another_process_plays_the_same_episode_and_leaves_the_home_alone(soup: Libero, tmp_path: Path) -> None:
+def test_another_process_plays_the_same_episode_and_leaves_the_home_alone(
+    soup: Libero, tmp_path: Path
+) -> None:
     """In a process such as Ray's without a GPU, and a home in which nobody has used LIBERO yet."""
     support = Path(__file__).parents[2] / "support"
     variables = {"HOME": str(tmp_path), "PYTHONHASHSEED": "5", "CUDA_VISIBLE_DEVICES": ""}
@@ -83,7 +93,8 @@ def test_tasks_go_by_number_and_by_name() -> None:
     by_number = find_task("libero_object/7")
     assert find_task(f"libero_object/{by_number.name}") == by_number
     assert by_number.language == by_number.name.replace("_", " ")
-    assert find_task("libero_90/0").language == "close the top drawer of the cabinet"  # without "KITCHEN_SCENE10"
+    # Without "KITCHEN_SCENE10".
+    assert find_task("libero_90/0").language == "close the top drawer of the cabinet"
     for suite, known in SUITES.items():
         with pytest.raises(UnknownEnv, match=f"{known.tasks}.*want 0 to {known.tasks - 1}"):
             find_task(f"{suite}/{known.tasks}")
@@ -94,7 +105,11 @@ def test_a_description_states_task_versions_and_protocol(bowl: Libero) -> None:
     assert facts["task"] == "libero_spatial/0"
     assert facts["name"] == facts["language"].replace(" ", "_")
     assert bowl.instruction == facts["language"]
-    assert (facts["hf-libero"], facts["robosuite"], facts["render_backend"]) == ("0.1.4", "1.4.0", "egl")
+    assert (facts["hf-libero"], facts["robosuite"], facts["render_backend"]) == (
+        "0.1.4",
+        "1.4.0",
+        "egl",
+    )
     assert facts["protocol"]["deviations"] == ["image_size: (64, 64), the protocol says (256, 256)"]
     assert facts["protocol"]["max_steps"] == bowl.max_steps == 220
     assert bowl.contract.cameras == {"front": CameraSpec(64, 64), "wrist": CameraSpec(64, 64)}
@@ -108,7 +123,9 @@ def test_images_that_nobody_looks_at_are_not_rendered_and_change_nothing(
     require_same_without_unseen_images(soup)
 
 
-@pytest.mark.parametrize("suite", ["libero_spatial", "libero_object", "libero_goal", "libero_10", "libero_90"])
+@pytest.mark.parametrize(
+    "suite", ["libero_spatial", "libero_object", "libero_goal", "libero_10", "libero_90"]
+)
 def test_each_suite_has_fifty_initial_states_a_task(suite: str) -> None:
     states = read_states(find_task(f"{suite}/3").states)
     assert states.shape[0] == 50
@@ -136,17 +153,23 @@ def test_axis_angles_are_robosuites_for_both_signs_of_a_quaternion() -> None:
     drawn = np.random.default_rng(0).normal(size=(20, 4))
     for quaternion in drawn / np.linalg.norm(drawn, axis=1, keepdims=True):
         for signed in (quaternion, -quaternion):
-            np.testing.assert_allclose(axis_angle(signed), quat2axisangle(signed.copy()), atol=1e-12)
+            np.testing.assert_allclose(
+                axis_angle(signed), quat2axisangle(signed.copy()), atol=1e-12
+            )
     np.testing.assert_array_equal(axis_angle(np.array([0.0, 0.0, 0.0, 1.0])), np.zeros(3))
 
 
 @pytest.mark.slow
 def test_what_it_shows_is_what_peers_see_to_the_bit(bowl: Libero) -> None:
-    """The loop of openpi's and OpenVLA's evaluation, on LIBERO's own class with all its rendering."""
+    """The loop of openpi's and OpenVLA's evaluation, on LIBERO's own class with all its
+    rendering.
+    """
     from libero.libero.envs import OffScreenRenderEnv
 
     ours = play(bowl, state=3)
-    theirs = OffScreenRenderEnv(bddl_file_name=str(bowl._task.problem), camera_heights=64, camera_widths=64)
+    theirs = OffScreenRenderEnv(
+        bddl_file_name=str(bowl._task.problem), camera_heights=64, camera_widths=64
+    )
     before = np.random.get_state()  # noqa: NPY002
     theirs.seed(7)
     theirs.reset()
@@ -156,14 +179,22 @@ def test_what_it_shows_is_what_peers_see_to_the_bit(bowl: Libero) -> None:
     np.random.set_state(before)  # noqa: NPY002
     for i, obs in enumerate(ours):
         np.testing.assert_array_equal(obs.cameras["front"], raw["agentview_image"][::-1, ::-1])
-        np.testing.assert_array_equal(obs.cameras["wrist"], raw["robot0_eye_in_hand_image"][::-1, ::-1])
-        np.testing.assert_array_equal(obs.state["gripper_qpos"], raw["robot0_gripper_qpos"].astype(np.float32))
-        np.testing.assert_array_equal(obs.state["xyz_axis_angle"][:3], raw["robot0_eef_pos"].astype(np.float32))
+        np.testing.assert_array_equal(
+            obs.cameras["wrist"], raw["robot0_eye_in_hand_image"][::-1, ::-1]
+        )
+        np.testing.assert_array_equal(
+            obs.state["gripper_qpos"], raw["robot0_gripper_qpos"].astype(np.float32)
+        )
+        np.testing.assert_array_equal(
+            obs.state["xyz_axis_angle"][:3], raw["robot0_eef_pos"].astype(np.float32)
+        )
         raw, *_ = theirs.step([0.5, -0.5, np.float32(0.2 * i), 0, 0, np.float32(0.3), (-1) ** i])
     theirs.close()
 
 
-def test_an_episode_begins_with_a_reset_and_then_the_files_state(bowl: Libero, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_episode_begins_with_a_reset_and_then_the_files_state(
+    bowl: Libero, monkeypatch: pytest.MonkeyPatch
+) -> None:
     calls: list[str] = []
     states: list[np.ndarray] = []
     simulator = world(bowl)._env
@@ -188,7 +219,9 @@ def test_an_episode_begins_with_a_reset_and_then_the_files_state(bowl: Libero, m
     assert bowl.init_states == 50
 
 
-def test_each_reset_seeds_what_the_state_leaves_open(bowl: Libero, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_each_reset_seeds_what_the_state_leaves_open(
+    bowl: Libero, monkeypatch: pytest.MonkeyPatch
+) -> None:
     def cabinet() -> np.ndarray:
         domain = world(bowl)._env.env
         return np.array(domain.object_states_dict["wooden_cabinet_1"].get_geom_state()["pos"])
@@ -217,7 +250,8 @@ def test_images_are_upright_and_mirrored(bowl: Libero) -> None:
     assert dark[:, 1].mean() > 44  # the cabinet, on the right
     assert obs.info["sim_state"]["positions"]["wooden_cabinet_1"][1] < -0.2
     wrist = obs.cameras["wrist"].astype(int)
-    assert wrist[-8:].mean() < 80 < wrist[:32].mean()  # the dark hand below, from where the fingers reach up
+    # The dark hand below, from where the fingers reach up.
+    assert wrist[-8:].mean() < 80 < wrist[:32].mean()
 
 
 def test_the_gripper_opens_at_minus_one_and_closes_at_one(soup: Libero) -> None:

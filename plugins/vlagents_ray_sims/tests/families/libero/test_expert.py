@@ -1,4 +1,6 @@
-"""LIBERO's expert meets each kind of goal that it is for, tries again, and says what it cannot do."""
+"""LIBERO's expert meets each kind of goal that it is for, tries again, and says what it cannot
+do.
+"""
 
 from __future__ import annotations
 
@@ -13,10 +15,18 @@ from vlagents_ray_sims.libero import Libero
 _IN = ["in", "milk_1", "basket_1_contain_region"]
 
 
-def observation(*goal: list[str], unmet: list[list[str]] | None = None, hand: tuple[float, ...] = (0, 0, 1.1)) -> Obs:
-    positions = {name: np.array([0.0, 0.1, 0.9]) for name in ("milk_1", "basket_1_contain_region", "stove_1")}
+def observation(
+    *goal: list[str], unmet: list[list[str]] | None = None, hand: tuple[float, ...] = (0, 0, 1.1)
+) -> Obs:
+    positions = {
+        name: np.array([0.0, 0.1, 0.9]) for name in ("milk_1", "basket_1_contain_region", "stove_1")
+    }
     pose = np.array([*hand, np.pi, 0.0, 0.0], np.float32)
-    state = {"goal": list(goal), "unmet": list(goal) if unmet is None else unmet, "positions": positions}
+    state = {
+        "goal": list(goal),
+        "unmet": list(goal) if unmet is None else unmet,
+        "positions": positions,
+    }
     return Obs(state={"xyz_axis_angle": pose}, info={"sim_state": state | {"quaternions": {}}})
 
 
@@ -60,7 +70,8 @@ def test_what_is_met_is_left_alone_and_what_failed_is_tried_again() -> None:
     expert = LiberoExpert("libero/libero_10/2")
     obs = observation(_IN, ["turnon", "stove_1"], unmet=[_IN])
     expert.reset(obs, "")
-    acts = [expert.act(obs).action for _ in range(400)]  # the hand never arrives: each phase takes all its steps
+    # The hand never arrives: each phase takes all its steps.
+    acts = [expert.act(obs).action for _ in range(400)]
     first, second = np.flatnonzero(np.diff([act[6] for act in acts]) > 0)
     assert acts[first][5] == 0  # the hand is turned for the second try
     assert abs(acts[second][5]) > 0.1

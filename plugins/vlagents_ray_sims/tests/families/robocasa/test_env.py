@@ -18,7 +18,14 @@ from vlagents_ray import Agent
 from vlagents_ray.errors import EnvFailed
 from vlagents_ray.interface import Act, Obs
 from vlagents_ray.testing import check_env
-from vlagents_ray_sims.robocasa import ATOMIC_SEEN, COMPOSITE_SEEN, COMPOSITE_UNSEEN, CONTROL_HZ, TYPES, RoboCasa
+from vlagents_ray_sims.robocasa import (
+    ATOMIC_SEEN,
+    COMPOSITE_SEEN,
+    COMPOSITE_UNSEEN,
+    CONTROL_HZ,
+    TYPES,
+    RoboCasa,
+)
 
 STILL = (0.0,) * 11 + (-1.0,)
 MOVE = np.array([0.9, -0.8, 0.7, 0.2, 1.0, 0.5, -0.5, -0.3, 0, 0, 0.3, 1], np.float32)
@@ -51,7 +58,10 @@ class Driver(Agent):
         yaw = 2 * np.arctan2(obs.state["base_rotation"][2], obs.state["base_rotation"][3])
         east, north = self._env.target_pos[:2] - obs.state["base_position"][:2]
         turn = (self._env.target_ori[2] - yaw + np.pi) % (2 * np.pi) - np.pi
-        forward, left = east * np.cos(yaw) + north * np.sin(yaw), north * np.cos(yaw) - east * np.sin(yaw)
+        forward, left = (
+            east * np.cos(yaw) + north * np.sin(yaw),
+            north * np.cos(yaw) - east * np.sin(yaw),
+        )
         speeds = [1.5 * error + BREAKAWAY * np.sign(error) for error in (forward, left, turn)]
         return Act(np.clip([*speeds, 0, 1, *[0] * 6, -1], -1, 1).astype(np.float32))
 
@@ -62,7 +72,9 @@ def test_it_keeps_the_promises_of_an_env() -> None:
     check_env(env, steps=2)
 
 
-def test_what_it_shows_is_robocasas_own_to_the_bit_in_both_orders_of_an_action(drive: RoboCasa) -> None:
+def test_what_it_shows_is_robocasas_own_to_the_bit_in_both_orders_of_an_action(
+    drive: RoboCasa,
+) -> None:
     from robocasa.utils.env_utils import convert_action
     from robocasa.wrappers.gym_wrapper import RoboCasaGymEnv
 
@@ -78,7 +90,9 @@ def test_what_it_shows_is_robocasas_own_to_the_bit_in_both_orders_of_an_action(d
             for part, value in obs.state.items():
                 np.testing.assert_array_equal(value, raw[f"state.{part}"])
                 np.testing.assert_array_equal(value, unseen.state[part])
-            assert drive.instruction == other.instruction == raw["annotation.human.task_description"]
+            assert (
+                drive.instruction == other.instruction == raw["annotation.human.task_description"]
+            )
             raw, reward, *_ = theirs.step(convert_action(arm_first))
             obs, got, *_ = drive.step(Act(MOVE))
             unseen, *_ = other.step(Act(arm_first))
@@ -86,7 +100,9 @@ def test_what_it_shows_is_robocasas_own_to_the_bit_in_both_orders_of_an_action(d
     theirs.close()
 
 
-def test_an_episode_is_its_seeds_with_a_kitchen_and_an_instruction_of_its_own(drive: RoboCasa) -> None:
+def test_an_episode_is_its_seeds_with_a_kitchen_and_an_instruction_of_its_own(
+    drive: RoboCasa,
+) -> None:
     begins = [drive.reset(seed=seed) for seed in (0, 1, 2**32)]
     for part, value in begins[0][0].state.items():
         np.testing.assert_array_equal(value, begins[2][0].state[part])
@@ -126,11 +142,18 @@ def test_the_last_number_opens_and_closes_the_gripper_and_success_is_robocasas_c
         for command, wider in ((1.0, False), (0.0, True)):  # 0 to 1, as well as -1 to 1
             before = obs.gripper
             for _ in range(8):
-                obs, reward, done, _, info = env.step(Act(np.array([*STILL[:11], command], np.float32)))
+                obs, reward, done, _, info = env.step(
+                    Act(np.array([*STILL[:11], command], np.float32))
+                )
             assert (obs.gripper > before) is wider
         assert (reward, done, info["success"]) == (0.0, False, False)
         env._env.drawer.open_door(env._env, min=1.0, max=1.0, partial_open=False)  # sets the joint
-        assert env.step(Act(np.array(STILL, np.float32)))[1:] == (1.0, True, False, {"success": True})
+        assert env.step(Act(np.array(STILL, np.float32)))[1:] == (
+            1.0,
+            True,
+            False,
+            {"success": True},
+        )
 
 
 @pytest.mark.parametrize(
@@ -148,7 +171,12 @@ def test_it_begins_in_the_kitchens_of_either_split(task: str, instruction: str) 
             assert re.match(instruction, env.instruction), env.instruction
             assert info["layout"] in layouts
             assert info["style"] in layouts
-            assert env.step(Act(np.array(STILL, np.float32)))[1:] == (0.0, False, False, {"success": False})
+            assert env.step(Act(np.array(STILL, np.float32)))[1:] == (
+                0.0,
+                False,
+                False,
+                {"success": False},
+            )
             assert {thing["info"]["split"] for thing in env._env.object_cfgs} <= {split}
 
 
@@ -159,18 +187,35 @@ def test_the_table_of_tasks_and_the_downloads_are_robocasas(kitchen: object) -> 
     from robocasa.utils.dataset_registry_utils import get_task_horizon
 
     longer = 1.5 if robocasa.__version__ == "1.0.0" else 1  # 1.0.1 lengthened all horizons
-    ours = {"atomic_seen": ATOMIC_SEEN, "composite_seen": COMPOSITE_SEEN, "composite_unseen": COMPOSITE_UNSEEN}
-    theirs = {name: {task: get_task_horizon(task) * longer for task in tasks} for name, tasks in TARGET_TASKS.items()}
+    ours = {
+        "atomic_seen": ATOMIC_SEEN,
+        "composite_seen": COMPOSITE_SEEN,
+        "composite_unseen": COMPOSITE_UNSEEN,
+    }
+    theirs = {
+        name: {task: get_task_horizon(task) * longer for task in tasks}
+        for name, tasks in TARGET_TASKS.items()
+    }
     assert ours == theirs
     assert set(TYPES.values()) <= set(DOWNLOAD_ASSET_REGISTRY)
     for folder, name in TYPES.items():
-        assert f"models/assets/{folder.removesuffix('/stoves')}" in DOWNLOAD_ASSET_REGISTRY[name]["folder"]
+        assert (
+            f"models/assets/{folder.removesuffix('/stoves')}"
+            in DOWNLOAD_ASSET_REGISTRY[name]["folder"]
+        )
 
 
 def test_a_description_states_versions_protocol_and_what_deviates_from_it(drive: RoboCasa) -> None:
     facts = drive.describe()
-    assert (facts["task"], facts["robosuite"], facts["control_mode"]) == ("NavigateKitchen", "1.5.2", "OSC_POSE")
-    assert (facts["protocol"]["name"], facts["protocol"]["deviations"]) == ("RoboCasa365, split target", [])
+    assert (facts["task"], facts["robosuite"], facts["control_mode"]) == (
+        "NavigateKitchen",
+        "1.5.2",
+        "OSC_POSE",
+    )
+    assert (facts["protocol"]["name"], facts["protocol"]["deviations"]) == (
+        "RoboCasa365, split target",
+        [],
+    )
     with RoboCasa("OpenDrawer", cameras=(), object_registries=["lightwheel"], max_steps=5) as env:
         env.reset(seed=0)
         assert env._env.control_freq == CONTROL_HZ

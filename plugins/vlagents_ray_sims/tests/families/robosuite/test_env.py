@@ -52,7 +52,9 @@ def test_what_it_shows_is_robosuites_own_to_the_bit(lift: Robosuite) -> None:
     for _ in range(3):
         for camera in ("agentview", "robot0_eye_in_hand"):
             np.testing.assert_array_equal(obs.cameras[camera], raw[f"{camera}_image"][::-1])
-        np.testing.assert_array_equal(obs.state["robot0_eef_quat"], raw["robot0_eef_quat"].astype(np.float32))
+        np.testing.assert_array_equal(
+            obs.state["robot0_eef_quat"], raw["robot0_eef_quat"].astype(np.float32)
+        )
         np.testing.assert_array_equal(obs.info["sim_state"]["cube_pos"], raw["cube_pos"])
         raw, reward, *_ = theirs.step(MOVE.action.astype(np.float64))
         obs, got, *_ = lift.step(MOVE)
@@ -61,7 +63,9 @@ def test_what_it_shows_is_robosuites_own_to_the_bit(lift: Robosuite) -> None:
 
 
 def test_a_reset_frees_the_last_episodes_renderer_at_once(lift: Robosuite) -> None:
-    """One that is freed later, by a garbage collection, takes buffers from the renderer that is in use then."""
+    """One that is freed later, by a garbage collection, takes buffers from the renderer that is
+    in use then.
+    """
     lift.reset(seed=1)
     last = weakref.ref(lift._env.sim._render_context_offscreen)
     gc.disable()
@@ -98,13 +102,19 @@ def test_the_expert_lifts_the_cube_and_doing_nothing_does_not() -> None:
 
 def test_a_description_states_versions_protocol_and_what_deviates_from_it(lift: Robosuite) -> None:
     facts = lift.describe()
-    assert (facts["task"], facts["robosuite"], facts["control_mode"]) == ("Lift", version("robosuite"), "OSC_POSE")
+    assert (facts["task"], facts["robosuite"], facts["control_mode"]) == (
+        "Lift",
+        version("robosuite"),
+        "OSC_POSE",
+    )
     assert (facts["protocol"]["name"], facts["protocol"]["deviations"]) == ("robomimic", [])
 
 
 def test_errors_say_what_is_wanted() -> None:
     if version("robosuite").startswith("1.4"):
-        with pytest.raises(ConfigError, match=r"robosuite 1\.4.* has no such task, 1\.5 has.*env make robosuite"):
+        with pytest.raises(
+            ConfigError, match=r"robosuite 1\.4.* has no such task, 1\.5 has.*env make robosuite"
+        ):
             Robosuite("ToolHang")
     with pytest.raises(EnvFailed, match=r"Lift failed to make.*eagle"):
         Robosuite("Lift", cameras=("eagle",), width=8, height=8)
