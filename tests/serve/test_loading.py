@@ -50,6 +50,7 @@ def replica(start: Any) -> Bare:
         _gateway=None,
         _rebalancer=SimpleNamespace(run=lambda: asyncio.sleep(0)),
         _pusher=SimpleNamespace(catch_up=lambda: asyncio.sleep(0)),
+        _parts=SimpleNamespace(before_ready=lambda: asyncio.sleep(0), run=lambda: asyncio.sleep(0)),
         _watch_shutdown=lambda: asyncio.sleep(0),
         _keep_catching_up=lambda: asyncio.sleep(0),
     )
@@ -70,6 +71,29 @@ def test_a_replica_runs_when_its_policy_has_loaded() -> None:
         return [before, running.done()]
 
     assert asyncio.run(start()) == [False, True]
+
+
+def test_a_replica_runs_when_its_parts_have_prepared_for_the_loaded_policy() -> None:
+    events: list[str] = []
+
+    class Parts:
+        async def before_ready(self) -> None:
+            events.append("prepares")
+            await asyncio.sleep(0.05)
+            events.append("has prepared")
+
+        async def run(self) -> None:
+            events.append("works")
+
+    async def start() -> None:
+        one = replica(lambda: events.append("policy is loaded"))
+        vars(one).update(_parts=Parts())
+        await one.reconfigure({}, None)
+        events.append("is ready")
+        await asyncio.gather(*one._tasks)
+
+    asyncio.run(start())
+    assert events == ["policy is loaded", "prepares", "has prepared", "is ready", "works"]
 
 
 @pytest.mark.parametrize(

@@ -109,6 +109,30 @@ class Neighbour:
         return await asyncio.wait_for(self._parts.call(part, method, *args), limit_s)
 
 
+class Periodic(ReplicaPart):
+    """Prepares for the loaded policy, and then works until it is cancelled or fails."""
+
+    Config: ClassVar[type[PartConfig]] = CountConfig
+
+    async def before_ready(self) -> None:
+        if self.settings.limit < 0:
+            raise ConfigError("periodic: no weights")
+        self.has_prepared = True
+
+    async def run(self) -> None:
+        events.append(f"works {self.settings.limit} {self.has_prepared}")
+        if self.settings.limit == 0:
+            raise RuntimeError("no more work")
+        try:
+            await asyncio.sleep(600)
+        finally:
+            events.append("ends")
+
+
+class EndsAtOnce(Periodic):
+    """Fails in its periodic work."""
+
+
 class NoPart:
     """Has no settings."""
 
@@ -146,6 +170,35 @@ def test_parts_that_were_opened_are_closed_if_a_later_one_fails(context: PartCon
     assert events[0] == "open 3"
     assert set(events[1:]) == {"close 3"}
     assert not context.engine.observers.any
+
+
+def test_a_part_prepares_for_the_loaded_policy_and_works_until_it_is_cancelled(
+    context: PartContext, caplog: pytest.LogCaptureFixture
+) -> None:
+    parts = open_parts(args(EndsAtOnce={"limit": 0}, Periodic={"limit": 5}), context)
+
+    async def run() -> None:
+        await parts.before_ready()
+        working = asyncio.ensure_future(parts.run())
+        await asyncio.wait({working}, timeout=0.1)
+        assert not working.done(), "the error of one part has ended the work of the others"
+        working.cancel()
+        await asyncio.gather(working, return_exceptions=True)
+
+    asyncio.run(run())
+    assert events == ["works 0 True", "works 5 True", "ends"]
+    assert f"part '{HERE}:EndsAtOnce': its periodic work has ended" in caplog.text
+    assert "no more work" in caplog.text
+    parts.close()
+
+
+def test_a_part_that_cannot_prepare_for_the_policy_keeps_the_replica_from_starting(
+    context: PartContext,
+) -> None:
+    parts = open_parts(args(Periodic={"limit": -1}), context)
+    with pytest.raises(ConfigError, match="no weights"):
+        asyncio.run(parts.before_ready())
+    parts.close()
 
 
 def test_a_server_without_parts_has_none(context: PartContext) -> None:

@@ -26,6 +26,8 @@ the others by the methods that it lists in `sibling_methods`:
             counts = [sibling.call(Counter.count) for sibling in await self.siblings()]
             return self.count() + sum(await asyncio.gather(*counts))
 
+A part that needs the loaded policy overrides `before_ready`, and one with periodic work `run`.
+
 `examples/plugin` has a complete part.
 """
 
@@ -81,6 +83,7 @@ class PartContext:
     siblings: Callable[[], Awaitable[Sequence[OtherReplica]]] = no_siblings
     # Whether clients on other machines need no key, `access: {insecure: true}`.
     open_to_network: bool = False
+    slow_s: float = 30.0  # maximum time that a message may take to arrive, `limits.slow_s`, s
 
     @property
     def short_name(self) -> str:
@@ -121,8 +124,10 @@ class SiblingPart:
 class ReplicaPart:
     """A part of a replica; a class overrides the methods that it needs.
 
-    `open` is called before the policy is loaded, and `close` after the last answer was sent. If
-    `open` raises an error, the replica does not start, and `serve status` has the reason.
+    A replica calls them in this order: `open` before it loads the policy, `before_ready` when the
+    policy is loaded, `run` while the replica is ready, and `close` after the last answer was sent.
+    If `open` or `before_ready` raises an error, the replica does not start, and `serve status` has
+    the reason.
     """
 
     Config: ClassVar[type[PartConfig]] = PartConfig
@@ -144,6 +149,18 @@ class ReplicaPart:
 
     def open(self) -> None:
         """Open files and start threads."""
+
+    async def before_ready(self) -> None:
+        """Prepare what needs the loaded policy, on the replica's event loop.
+
+        Serve sends the replica no requests before this returns.
+        """
+
+    async def run(self) -> None:
+        """Do periodic work on the replica's event loop; the replica cancels it before it closes.
+
+        An error is logged, and ends this work alone.
+        """
 
     def close(self) -> None:
         """Close what `open` has opened."""
@@ -237,6 +254,21 @@ class ReplicaParts:
         if inspect.iscoroutinefunction(call):
             return await call(*args)
         return await asyncio.to_thread(call, *args)
+
+    async def before_ready(self) -> None:
+        """Let each part prepare what needs the loaded policy, in the order of the parts."""
+        for part in self._parts.values():
+            await part.before_ready()
+
+    async def run(self) -> None:
+        """Do the periodic work of all parts."""
+        await asyncio.gather(*(self._run(name, part) for name, part in self._parts.items()))
+
+    async def _run(self, name: str, part: ReplicaPart) -> None:
+        try:
+            await part.run()
+        except Exception:
+            logger.exception("part %r: its periodic work has ended", name)
 
     def close(self) -> None:
         """Close all parts in reverse order."""

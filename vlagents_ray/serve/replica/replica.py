@@ -121,6 +121,7 @@ class PolicyReplica(ClientApi, SiblingApi):
             metric_tags=tags,
             open_to_network=settings.access.insecure,
             siblings=self._peers.others,
+            slow_s=settings.limits.slow_s,
         )
         self._parts = open_parts(settings.parts, context)
         self._meter = LoadMeter(self._engine.queue)
@@ -172,7 +173,13 @@ class PolicyReplica(ClientApi, SiblingApi):
             # both tracebacks first.
             raise PolicyFailed(str(error)) from None
         await self._catch_up()  # gets the other replicas' versions before this replica is ready
-        works = [self._watch_shutdown(), self._keep_catching_up(), self._rebalancer.run()]
+        await self._parts.before_ready()
+        works = [
+            self._watch_shutdown(),
+            self._keep_catching_up(),
+            self._rebalancer.run(),
+            self._parts.run(),
+        ]
         if self._gateway is not None:
             works.append(self._poll_gateways())
         self._tasks = [asyncio.ensure_future(work) for work in works]
