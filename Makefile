@@ -52,7 +52,7 @@ TEST_PROCESSES ?= 3
 CHECK_PROCESSES ?= 4
 # Marked so: what wants more than Python, takes long, or wants the machine for itself (pyproject.toml, tests/support/needs.py).
 NOT_QUICK := ray or server or hosts or sim or vulkan or torch or gpu or browser or node or compiler or alone or slow or integration
-# Environments of model families and simulators, in $(VENV)-NAME: NAME.txt in requirements/ of a plug-in, or here. What is
+# Environments of model families and simulators, in $(VENV)-NAME: NAME.txt in requirements/ of a plug-in, or of tests/. What is
 # tested in each is in the folders families/NAME of tests/ and of the plug-ins' tests. Those whose code is on no package
 # index want its source, too: OPENPI_SRC, OPENVLA_SRC,
 # OPENVLA_OFT_SRC, OCTO_SRC, DIFFUSION_POLICY_SRC, VJEPA2_SRC, GR00T_SRC.
@@ -77,7 +77,7 @@ demo: $(if $(wildcard $(STAMP)),$(STAMP),$(VENV)/.demo)
 
 # The reference policy from nothing in runs/reference, in two hours; an interrupted one continues.
 reference: setup
-	BIN=$(BIN) reference/make.sh
+	BIN=$(BIN) examples/reference/make.sh
 
 # More than half an hour; the other policy servers get two environments of their own, .venv-peers and .venv-peers-torch.
 bench: setup
@@ -153,11 +153,11 @@ programs: setup $(patsubst %,$(VENV)-%/.installed,$(filter lerobot%,$(FAMILIES))
 
 # Made once for each state of the family's requirements, of what a server installs and of what `env make` adds: not removed as a mere step.
 .PRECIOUS: $(VENV)-%/.installed
-vpath %.txt requirements $(REQUIREMENTS)
-$(VENV)-%/.installed: %.txt requirements/testing.txt $(wildcard $(REQUIREMENTS:%=%/*.cpu.txt)) $(VENV)/server.txt \
+vpath %.txt tests/requirements $(REQUIREMENTS)
+$(VENV)-%/.installed: %.txt tests/requirements/testing.txt $(wildcard $(REQUIREMENTS:%=%/*.cpu.txt)) $(VENV)/server.txt \
     $(PROJECTS) \
     vlagents_ray/policies/base/import_fixes.py
-	$(BIN)/vlagents-ray env make $< $(addprefix --with ,requirements/testing.txt $(wildcard requirements/$*.testing.txt)) \
+	$(BIN)/vlagents-ray env make $< $(addprefix --with ,tests/requirements/testing.txt $(wildcard tests/requirements/$*.testing.txt)) \
 	  $(if $(TORCH_CUDA),--cuda) --out $(VENV)-$*
 	@touch $@
 

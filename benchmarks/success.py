@@ -353,7 +353,7 @@ def _pairs(one: Played, standard: Played) -> Pairs:
 def main(
     checkpoint: Annotated[
         Path, typer.Option(help="Folder of the reference policy's weights.")
-    ] = Path("reference/checkpoint"),
+    ] = Path("examples/reference/checkpoint"),
     folder: Annotated[
         Path, typer.Option("--out", help="Folder of the results; what it has is not played again.")
     ] = Path("runs/success"),

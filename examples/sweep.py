@@ -6,8 +6,8 @@ process, in seconds, with the policy and the environment of own_policy.py and ow
 it continues an interrupted sweep.
 
 As a file, the same plan is played by `vlagents-ray eval FILE` with a served policy and many
-workers: evaluations/sweep.yaml sweeps over the checkpoints of a training run,
-evaluations/realtime.yaml over latencies.
+workers: examples/evaluations/sweep.yaml sweeps over the checkpoints of a training run,
+examples/evaluations/realtime.yaml over latencies.
 """
 
 from itertools import groupby

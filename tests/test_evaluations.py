@@ -27,7 +27,7 @@ from vlagents_ray.registry import env_suite, names
 from vlagents_ray.serve.launch.deployment_file import read_deployment
 
 ROOT = Path(__file__).parents[1]
-FILES = sorted((ROOT / "evaluations").glob("*.yaml"))
+FILES = sorted((ROOT / "examples" / "evaluations").glob("*.yaml"))
 PAGE = (ROOT / "docs" / "evaluation" / "running.md").read_text()
 MODELS = [
     EvalConfig,

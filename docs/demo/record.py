@@ -22,7 +22,7 @@ from vlagents_ray.serve.launch.deployment_file import deployment
 from vlagents_ray.serve.launch.server import running_server
 
 FILE = Path(__file__).with_name("session.js")
-CHECKPOINT = Path(__file__).parents[2] / "reference/checkpoint"
+CHECKPOINT = Path(__file__).parents[2] / "examples/reference/checkpoint"
 POLICY = {"checkpoint": str(CHECKPOINT), "embodiment": "tabletop"}
 TASKS, SEEDS = ("pick_place", "slide", "stack"), range(4)
 EXECUTE = 4  # rows of each chunk

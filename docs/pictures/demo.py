@@ -62,7 +62,7 @@ def with_words(frame: np.ndarray, words: str) -> Image.Image:
 def main() -> None:
     """Play the episodes, and write them side by side."""
     agent = Reference.from_config(
-        {"checkpoint": "reference/checkpoint", "embodiment": "tabletop", "execute": 4}
+        {"checkpoint": "examples/reference/checkpoint", "embodiment": "tabletop", "execute": 4}
     )
     agent.initialize()
     clips = [played(agent, task, seed) for task, seed in EPISODES.items()]

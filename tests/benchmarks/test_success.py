@@ -13,7 +13,7 @@ from benchmarks import success
 pytest.importorskip("torch")
 pytestmark = pytest.mark.torch
 
-CHECKPOINT = Path(__file__).parents[2] / "reference/checkpoint"
+CHECKPOINT = Path(__file__).parents[2] / "examples/reference/checkpoint"
 
 
 def played(folder: Path, *names: str, episodes: int = 2) -> dict[str, dict[str, object]]:

@@ -17,7 +17,7 @@ from vlagents_ray_learn.open_loop.recorded_dataset import Names, RecordedDataset
 torch = pytest.importorskip("torch")
 pytestmark = pytest.mark.torch
 
-REFERENCE = Path(__file__).parents[2] / "reference"
+REFERENCE = Path(__file__).parents[2] / "examples" / "reference"
 CAMERAS = {"tabletop": {"scene": "front", "wrist": "wrist"}}
 
 

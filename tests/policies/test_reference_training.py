@@ -31,7 +31,9 @@ CAMERAS = {"tabletop": {"scene": "front", "wrist": "wrist"}}
 @pytest.fixture(scope="module")
 def train() -> Any:
     """The program, by a name that no other program of a test has."""
-    spec = importlib.util.spec_from_file_location("reference_training", ROOT / "reference/train.py")
+    spec = importlib.util.spec_from_file_location(
+        "reference_training", ROOT / "examples/reference/train.py"
+    )
     assert spec is not None
     assert spec.loader is not None
     module = sys.modules["reference_training"] = importlib.util.module_from_spec(spec)
@@ -45,7 +47,7 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
     demonstrations.
     """
     folder = tmp_path_factory.mktemp("data")
-    plan = yaml.safe_load((ROOT / "reference/demonstrations/tabletop.yaml").read_text())
+    plan = yaml.safe_load((ROOT / "examples/reference/demonstrations/tabletop.yaml").read_text())
     plan["suites"] = [suite | {"episodes": 2} for suite in plan["suites"]]
     plan["policies"] = [{"name": "expert"}]
     evaluate(EvalConfig(**plan | {"out": folder / "runs", "workers": 0}), agent_factory=Scripted)

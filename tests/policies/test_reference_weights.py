@@ -21,7 +21,7 @@ torch = pytest.importorskip("torch")
 pytestmark = pytest.mark.torch
 
 ROOT = Path(__file__).parents[2]
-CHECKPOINT = ROOT / "reference/checkpoint"
+CHECKPOINT = ROOT / "examples/reference/checkpoint"
 RATES = json.loads((CHECKPOINT / "rates.json").read_text())
 EPISODES = 20
 TASKS = [env for env, (solved, episodes) in RATES["tabletop"].items() if solved / episodes > 0.8]
@@ -67,7 +67,9 @@ def test_they_succeed_as_often_as_their_card_says(env: str, tmp_path: Path) -> N
 
 
 def test_their_card_and_rates_are_those_of_their_bundles(tmp_path: Path) -> None:
-    spec = importlib.util.spec_from_file_location("reference_card", ROOT / "reference/card.py")
+    spec = importlib.util.spec_from_file_location(
+        "reference_card", ROOT / "examples/reference/card.py"
+    )
     assert spec is not None
     assert spec.loader is not None
     card = sys.modules["reference_card"] = importlib.util.module_from_spec(spec)

@@ -104,7 +104,7 @@ def test_the_watchdog_of_a_wrapped_robot_also_watches_the_robots_own_sources(
 
 
 def classes() -> Iterator[tuple[str, ast.ClassDef]]:
-    for folder in ("vlagents_ray", "plugins", "examples", "benchmarks", "reference"):
+    for folder in ("vlagents_ray", "plugins", "examples", "benchmarks"):
         for path in sorted((ROOT / folder).rglob("*.py")):
             for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
                 if isinstance(node, ast.ClassDef):

@@ -139,12 +139,12 @@ def _block(language: str, above: list[tuple[int, str]], code: list[tuple[int, st
 
 
 def checkout(folder: Path) -> None:
-    """Put into `folder` what pages name as paths in a checkout, with two episodes of each env in
-    `evaluations`.
+    """Copy the folders of a checkout that pages name into `folder`. Evaluations of the examples get
+    two episodes of each environment.
     """
-    for name in ("cluster", "deployments", "evaluations", "examples", "reference"):
+    for name in ("cluster", "deployments", "examples"):
         shutil.copytree(ROOT / name, folder / name)
-    for file in (folder / "evaluations").glob("*.yaml"):
+    for file in (folder / "examples" / "evaluations").glob("*.yaml"):
         file.write_text(re.sub(r"\bepisodes: \d+", "episodes: 2", file.read_text()))
 
 

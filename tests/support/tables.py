@@ -28,9 +28,9 @@ PLUGIN, PLUGIN_NAME = ROOT / "examples" / "plugin", "homing"
 # Which the tests that it names find again.
 RATES = json.loads((ROOT / "tests/rates.json").read_text())
 # Of the reference policy, by simulator.
-LEARNT = json.loads((ROOT / "reference/checkpoint/rates.json").read_text())
+LEARNT = json.loads((ROOT / "examples/reference/checkpoint/rates.json").read_text())
 # Of serving it, by `benchmarks.success`.
-WAYS = json.loads((ROOT / "reference/success.json").read_text())["ways"]
+WAYS = json.loads((ROOT / "examples/reference/success.json").read_text())["ways"]
 
 
 def _listed(adapters: dict[str, RegistryEntry]) -> Iterator[tuple[str, RegistryEntry]]:

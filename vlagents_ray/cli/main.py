@@ -96,7 +96,7 @@ def demo(
     from vlagents_ray.evaluate import EvalConfig, PolicyConfig, SuiteConfig
 
     policy = PolicyConfig(name="scripted", source="scripted")
-    if (rates := Path("reference/checkpoint/rates.json")).is_file():
+    if (rates := Path("examples/reference/checkpoint/rates.json")).is_file():
         solved, episodes = map(
             sum, zip(*json.loads(rates.read_text())["tabletop"].values(), strict=True)
         )

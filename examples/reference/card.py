@@ -1,4 +1,4 @@
-"""Writes the card of a reference policy: `python reference/card.py CHECKPOINT EVALUATION...`.
+"""Writes the card of a reference policy: `python examples/reference/card.py CHECKPOINT EVALUATION...`.
 
 It states the data, the seeds, the commit, the rates of success with their intervals, and the
 limits.
@@ -39,7 +39,7 @@ names other colours, or another deed, so that a policy that reads it must fail.
 
 ## Data
 
-Demonstrations by scripted experts, recorded and exported by this project (`reference/demonstrations/`). Episodes that
+Demonstrations by scripted experts, recorded and exported by this project (`examples/reference/demonstrations/`). Episodes that
 failed were left out.
 
 | robot | episodes | frames | cameras |

@@ -1,4 +1,6 @@
-"""Record an expert's corrections of the reference policy: `python reference/dagger.py --help`.
+"""Record an expert's corrections of the reference policy.
+
+Options: `python examples/reference/dagger.py --help`.
 
 The policy plays the tabletop until the expert takes over, at a tick drawn by the seed, as soon as
 the gripper is open, so that it drops nothing. What it then shows are states that the policy reaches

@@ -1,5 +1,6 @@
-"""Train the reference policy on LeRobotDatasets, one for each robot: `python reference/train.py
---help`.
+"""Train the reference policy on LeRobotDatasets, one for each robot.
+
+Options: `python examples/reference/train.py --help`.
 
 An interrupted run continues where its last state was kept, and ends with the same weights: each
 batch, and its noise, follow from the seed and the number of the step. So does a second run, on the
