@@ -48,7 +48,7 @@ from vlagents_ray.errors import (
     VLAgentsError,
 )
 from vlagents_ray.interface import CAPTURED, Act, Agent, Obs
-from vlagents_ray.robot import Guard, Limits, Watchdog, loop, run_loop, watchdog
+from vlagents_ray.robot import Guard, MotionLimits, Watchdog, loop, run_loop, watchdog
 from vlagents_ray.robot.simulated import SimulatedRobot
 
 HZ = 50.0
@@ -64,7 +64,8 @@ _SMOOTHING = 0.5  # share of the distance to its target that a joint moves in a 
 _LAG = 1.0  # ticks by which the joints are behind their targets, with that smoothing
 REST = (_RADIUS, 0.0, 0.3, 0.0, 0.0, 0.0, 1.0)
 SPEED = 2.0  # rad/s
-LIMITS = Limits(velocity=SPEED, acceleration=15.0, jerk=1000.0, rest=(*REST[:6], None))  # of an arm
+# The motion limits of an arm.
+LIMITS = MotionLimits(velocity=SPEED, acceleration=15.0, jerk=1000.0, rest=(*REST[:6], None))
 _PULL = 0.0005  # rad, largest correction of a relative action towards the path in a tick
 FAULTS = {  # the mean duration of each, s; 0: a moment
     "killed": 15.0,
@@ -520,7 +521,7 @@ class CirclePolicy(Agent):
         return np.full(self._joints, _RADIUS * (1 - math.cos(_TURN * tick)), np.float32)
 
 
-def limits_of(joints: int) -> Limits:
+def limits_of(joints: int) -> MotionLimits:
     """Return limits of speed, acceleration, jerk and the workspace of an arm's tip behind its
     first seven joints.
     """
@@ -537,7 +538,7 @@ def limits_of(joints: int) -> Limits:
         Path(folder, "arm.json").write_text(
             json.dumps({"urdf": "arm.urdf", "tip": "7", **workspace})
         )
-        read = Limits.read(Path(folder, "arm.json"))
+        read = MotionLimits.read(Path(folder, "arm.json"))
     return replace(read, acceleration=LIMITS.acceleration, jerk=LIMITS.jerk)
 
 

@@ -22,7 +22,7 @@ from vlagents_ray.errors import BY_CODE, Overloaded
 from vlagents_ray.evaluate import EvalConfig
 from vlagents_ray.interface import Act
 from vlagents_ray.protocol import frame_layout, frames, json_messages, messages, values
-from vlagents_ray.protocol.messages import Limits, Reply
+from vlagents_ray.protocol.messages import MessageLimits, Reply
 from vlagents_ray.serve.config.deployment import EnvironmentArgs, ServerArgs
 from vlagents_ray_sims import aloha, calvin, metaworld, robocasa
 from vlagents_ray_sims.robosuite import TASKS
@@ -231,7 +231,7 @@ def test_the_protocol_has_every_key_header_limit_and_type() -> None:
     )
     failed = Reply("r", error=Overloaded("full"))
     for one in (reply, failed):
-        header, _ = frame_layout.unpack(frames.encode_replies([one, one]), Limits())
+        header, _ = frame_layout.unpack(frames.encode_replies([one, one]), MessageLimits())
         keys |= header.keys() | header["replies"][0].keys()
         keys |= (
             header["replies"][0].get("act", {}).keys()
@@ -240,7 +240,10 @@ def test_the_protocol_has_every_key_header_limit_and_type() -> None:
     keys |= {name for name in dir(messages) if name.endswith("_HEADER")}
     names = {getattr(messages, key, key) for key in keys} - {messages.MACHINE_HEADER}
     types = {np.dtype(code).newbyteorder("<").str.replace("|", "\\|") for code in "?bhiqBHIQefd"}
-    names |= types | {field.name for field in fields(Limits)} - {"reply_bytes", "in_flight_bytes"}
+    names |= types | {field.name for field in fields(MessageLimits)} - {
+        "reply_bytes",
+        "in_flight_bytes",
+    }
     assert {
         name for name in names if f"`{name}`" not in PROTOCOL and f'"{name}"' not in PROTOCOL
     } == set()
@@ -249,7 +252,7 @@ def test_the_protocol_has_every_key_header_limit_and_type() -> None:
 @pytest.mark.parametrize("name", ["pixels", "state_values", "text", "requests", "history"])
 def test_the_protocol_states_the_limits_that_hold(name: str) -> None:
     rows = [line for line in PROTOCOL.splitlines() if line.startswith(f"| `{name}` |")]
-    assert any(f" {getattr(Limits(), name):,} " in row for row in rows)
+    assert any(f" {getattr(MessageLimits(), name):,} " in row for row in rows)
 
 
 def test_the_figures_of_the_readme_are_the_measured_ones() -> None:

@@ -106,8 +106,8 @@ def test_the_extras_and_files_that_cures_name_exist() -> None:
         "optional-dependencies"
     ]
     assert set(registry._EXTRAS.keys()) <= extras.keys()
-    adapters = (registry.entries("policies") | registry.entries("envs")).values()
-    for entry in adapters:
+    registered = (registry.entries("policies") | registry.entries("envs")).values()
+    for entry in registered:
         project = tomllib.loads((ROOT / tables.folder_of(entry) / "pyproject.toml").read_text())[
             "project"
         ]
@@ -115,7 +115,7 @@ def test_the_extras_and_files_that_cures_name_exist() -> None:
     assert {
         one.requirements[0] for one in registry.entries("policies").values() if one.requirements
     } == set(FAMILIES)
-    for file in {file for one in adapters for file in one.requirements}:
+    for file in {file for entry in registered for file in entry.requirements}:
         assert registry.requirements_file(file).exists()
 
 

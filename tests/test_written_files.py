@@ -39,9 +39,9 @@ def test_the_example_of_a_plugin_is_what_the_skeleton_writes() -> None:
     assert written - ignored == set(expected)
 
 
-def test_each_adapter_has_a_page_and_each_page_an_adapter() -> None:
-    for folder, adapters in (("policies", entries("policies")), ("benchmarks", entries("envs"))):
-        named = {tables.page_of(name, one) for name, one in adapters.items() if one.about}
+def test_each_policy_and_environment_has_a_page_and_each_page_one_of_them() -> None:
+    for folder, registered in (("policies", entries("policies")), ("benchmarks", entries("envs"))):
+        named = {tables.page_of(name, entry) for name, entry in registered.items() if entry.about}
         assert {page.stem for page in (tables.ROOT / "docs" / folder).glob("*.md")} - {
             "index"
         } == named - {""}

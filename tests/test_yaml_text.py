@@ -18,7 +18,7 @@ import vlagents_ray
 from vlagents_ray import ConfigError
 from vlagents_ray.cli.main import app
 from vlagents_ray.cli.options import parse_settings, read_run_file
-from vlagents_ray.robot.limits import Limits
+from vlagents_ray.robot.limits import MotionLimits
 from vlagents_ray.serve.access.key_store import read_keys
 from vlagents_ray.serve.launch.deployment_file import read_deployment
 from vlagents_ray.yaml_text import load_yaml
@@ -80,8 +80,8 @@ def test_a_number_with_an_exponent_is_a_number(text: str, value: object) -> None
 READERS = {
     "deployment": ("x.yaml", lambda file: read_deployment(str(file))),
     "run": ("x.yaml", lambda file: read_run_file(file, "file of runs", "`policies`")),
-    "limits": ("x.yaml", Limits.read),
-    "limits as JSON": ("x.json", Limits.read),
+    "limits": ("x.yaml", MotionLimits.read),
+    "limits as JSON": ("x.json", MotionLimits.read),
     "topics": ("x.yaml", read_settings),
     "keys": ("x.json", read_keys),
     "setting": ("x.txt", lambda file: parse_settings([f"a={file.read_text()}"], "--set")),

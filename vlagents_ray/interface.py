@@ -166,7 +166,7 @@ class Agent:
     """
 
     control: Any = None
-    """Optional: the `vlagents_ray.chunking.control.Control` of the robot, which `act` reads at
+    """Optional: the `vlagents_ray.chunking.control.RobotControl` of the robot, which `act` reads at
     each tick.
     """
 

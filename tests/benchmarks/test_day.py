@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from benchmarks import day
-from vlagents_ray.robot import Limits
+from vlagents_ray.robot import MotionLimits
 
 MINUTES = 1 / 60
 
@@ -40,7 +40,7 @@ def test_a_seed_replays_each_command() -> None:
 def test_a_guard_without_limits_lets_jumps_through_which_the_day_finds(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(day, "LIMITS", Limits())
+    monkeypatch.setattr(day, "LIMITS", MotionLimits())
     report = day.play_day(3, 3 * MINUTES, normal_step=0.02)
     assert any("a step of" in one for one in report.violations)
 

@@ -16,7 +16,7 @@ from in_process_replicas import Replicas
 from scripted_leader import ScriptedLeader
 
 from vlagents_ray import Act, ActionSpec, Agent, ConfigError, Contract, Obs, PolicyFailed
-from vlagents_ray.chunking.control import Control
+from vlagents_ray.chunking.control import RobotControl
 from vlagents_ray.chunking.player import ChunkPlayer, PlayerSettings
 from vlagents_ray.errors import InvalidAction, InvalidObservation
 from vlagents_ray.interface import DELAY, EXECUTED, INTERVENTION, LEFTOVER, SAFE, WANTED
@@ -484,16 +484,16 @@ def lines_of(function: Any) -> list[int]:
 
 
 # From the second line on: a pause of before the tick is one that a human takes over from.
-@pytest.mark.parametrize("line", range(2, len(lines_of(Control.update))))
+@pytest.mark.parametrize("line", range(2, len(lines_of(RobotControl.update))))
 @pytest.mark.parametrize("command", ["pause", "stop"])
 def test_a_command_between_any_two_lines_of_a_tick_is_not_lost(line: int, command: str) -> None:
     leader = ScriptedLeader(ahead)
     leader.held = True
-    control = Control(leader)
-    wanted, threads = lines_of(Control.update)[line], []
+    control = RobotControl(leader)
+    wanted, threads = lines_of(RobotControl.update)[line], []
 
     def trace(frame: Any, event: str, _: object) -> Any:
-        if frame.f_code is not Control.update.__code__:
+        if frame.f_code is not RobotControl.update.__code__:
             return None
         if event == "line" and frame.f_lineno == wanted and not threads:
             threads.append(
@@ -518,7 +518,7 @@ def test_a_command_between_any_two_lines_of_a_tick_is_not_lost(line: int, comman
 
 
 def test_a_stop_that_is_over_before_the_loop_looks_still_drops_the_plan() -> None:
-    control = Control()
+    control = RobotControl()
     control.update()
     control.stop("by the operator")
     assert control.restart()

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from vlagents_ray.chunking.control import Control
+from vlagents_ray.chunking.control import RobotControl
 from vlagents_ray.client.commands import COMMAND, COMMANDED, CommandInbox
 from vlagents_ray.errors import ConfigError, PolicyFailed
 from vlagents_ray.interface import Act, Obs
@@ -18,7 +18,7 @@ def told(do: str, **more: str) -> Act:
 
 
 def test_commands_are_obeyed_and_answered_once_an_answer_has_come() -> None:
-    inbox, control = CommandInbox(), Control()
+    inbox, control = CommandInbox(), RobotControl()
     for act in (told("pause"), told("stop", by="lab"), told("success")):
         assert inbox.asking(Obs()).info == {}
         inbox.came(act)
@@ -40,7 +40,7 @@ def test_commands_are_obeyed_and_answered_once_an_answer_has_come() -> None:
 
 @pytest.mark.parametrize("do", ["resume", "instruct", "restart", "take over", "move", "dance"])
 def test_a_command_that_could_start_a_motion_does_not_exist(do: str) -> None:
-    inbox, control = CommandInbox(), Control()
+    inbox, control = CommandInbox(), RobotControl()
     control.pause("by the operator")
     control.stop("by the operator")
     inbox.came(told(do, text="fold the cloth"))
@@ -50,7 +50,7 @@ def test_a_command_that_could_start_a_motion_does_not_exist(do: str) -> None:
 
 
 def test_what_is_not_allowed_is_refused_and_what_has_another_form_left_out() -> None:
-    inbox, control = CommandInbox(allow=["stop"]), Control()
+    inbox, control = CommandInbox(allow=["stop"]), RobotControl()
     for act in (told("pause"), told("stop")):
         inbox.came(act)
     inbox.obey(control)
@@ -61,7 +61,7 @@ def test_what_is_not_allowed_is_refused_and_what_has_another_form_left_out() -> 
     for stated in (None, "stop", {"do": "stop"}, {"id": 1, "do": "stop"}):
         inbox = CommandInbox()
         inbox.came(Act(np.zeros(2, np.float32), info={COMMAND: stated}))
-        assert inbox.obey(Control()) == []
+        assert inbox.obey(RobotControl()) == []
         assert inbox.asking(Obs()).info == {}
 
 
@@ -70,7 +70,7 @@ def test_the_name_of_a_key_forges_no_line_of_the_robots_log(
 ) -> None:
     inbox = CommandInbox()
     inbox.came(told("stop", by="lab\n2026-11-28 INFO robot: restarted by \x1b[2Janna"))
-    inbox.obey(Control())
+    inbox.obey(RobotControl())
     [record] = caplog.records
     first, *further = record.getMessage().split("\n")
     assert "\x1b" not in record.getMessage()

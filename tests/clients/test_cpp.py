@@ -43,7 +43,7 @@ from vlagents_ray.protocol.messages import (
     DEFAULT_LIMITS,
     PROTOCOL_VERSION,
     Budget,
-    Limits,
+    MessageLimits,
     Reply,
     Request,
 )
@@ -233,7 +233,7 @@ def replica(*, keyed: bool = False) -> Iterator[Replica]:
     known, policy = ChangingKeys(), Watcher()
     engine = Engine(policy)
     admit = (lambda token: known.keys.check(token, "app")) if keyed else NoKey.OPEN
-    own = WebSocketServer(engine, Limits(), "127.0.0.1", None, admit)
+    own = WebSocketServer(engine, MessageLimits(), "127.0.0.1", None, admit)
     own.open()
     engine.start()
     found = Replica(engine, policy, own, known, 0, asdict(own.address))
@@ -247,7 +247,7 @@ def replica(*, keyed: bool = False) -> Iterator[Replica]:
         }
         return stated if found.stream is None else stated | {"stream": found.stream}
 
-    inside = build_http_app(engine, metadata, Limits())
+    inside = build_http_app(engine, metadata, MessageLimits())
     with ExitStack() as stack:
         found.port = stack.enter_context(
             served(AccessMiddleware(inside, known.keys if keyed else None, "app"))
@@ -380,7 +380,7 @@ def test_written_frames_mean_what_the_golden_ones_do(name: str, shared_driver: C
         "history": [observed(each) for each in meaning.get("history", [])],
     }
     data = bytes.fromhex(shared_driver.call("request", **asked))
-    [request] = read_requests(data, Budget(Limits()))
+    [request] = read_requests(data, Budget(MessageLimits()))
     assert isinstance(request, Request)
     written = of_request(request)
     assert written == {key: value for key, value in meaning.items() if key in written}

@@ -102,7 +102,8 @@ def benchmarks() -> Iterator[Trace]:
     """vla-eval's."""
 
     def message(kind: Any, seq: int, **payload: Any) -> bytes:
-        return masked(vla_eval.encode(vla_eval.Message(kind, payload, seq)))  # without the time
+        message = vla_eval.VlaEvalMessage(kind, payload, seq)
+        return masked(vla_eval.encode(message))  # without the time
 
     def seen(seq: int, task: str = "pick", **images: Any) -> bytes:
         return message(

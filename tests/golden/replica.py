@@ -34,7 +34,7 @@ from tests.golden.lines import (
 from tests.golden.masks import masked
 from vlagents_ray.contract import ActionSpec, CameraSpec, Contract, StateSpec
 from vlagents_ray.interface import Act, Agent, Obs
-from vlagents_ray.protocol.messages import Limits
+from vlagents_ray.protocol.messages import MessageLimits
 from vlagents_ray.registry import dialect_class
 from vlagents_ray.serve.access.api_keys import NoKey
 from vlagents_ray.serve.config.dialects import DialectArgs
@@ -47,7 +47,9 @@ from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.models.checkpoints import Checkpoints
 from vlagents_ray.serve.ports import free_port, reserve
 
-LIMITS = Limits(body_bytes=4096, pixels=8 * 16, state_values=8, requests=4, items=300, text=80)
+LIMITS = MessageLimits(
+    body_bytes=4096, pixels=8 * 16, state_values=8, requests=4, items=300, text=80
+)
 STRICT = Contract(
     cameras={"front": CameraSpec(8, 8)},
     state={"joints": StateSpec(2)},

@@ -16,7 +16,7 @@ LOCAL = ("shared memory", "plasma")
 EVERYWHERE = (*FRAMES, "http", *LOCAL)
 TOGETHER = EVERYWHERE[:-1]  # plasma reads what shared memory does
 
-Message = Request | list[Request] | bytes | tuple[bytes, ...]
+ScenarioMessage = Request | list[Request] | bytes | tuple[bytes, ...]
 """A request, or several; a frame that no encoder writes; or all that goes out, and what travels
 outside of it.
 """
@@ -26,13 +26,13 @@ class Send(NamedTuple):
     """Send a message."""
 
     who: str
-    message: Message
+    message: ScenarioMessage
 
 
 Steps = Send | Step | list["Steps"]
 
 
-def asks(*messages: Message, who: str = "a") -> list[Steps]:
+def asks(*messages: ScenarioMessage, who: str = "a") -> list[Steps]:
     """Messages, and the answer to each before the next."""
     return [step for one in messages for step in (Send(who, one), gets(who))]
 
@@ -48,7 +48,7 @@ def server(what: str) -> Step:
 def scenario(name: str, at: Sequence[str], *steps: Steps, **settings: Any) -> Iterator[Trace]:
     """What is sent at each of the endpoints, without the answers."""
     for endpoint in at:
-        encoders: dict[str, Callable[[Message], tuple[bytes, ...]]] = {}
+        encoders: dict[str, Callable[[ScenarioMessage], tuple[bytes, ...]]] = {}
         found = []
         for step in _flat(list(steps)):
             if isinstance(step, Send):
@@ -82,11 +82,11 @@ def http(
     return "\r\n".join(lines).encode() + body
 
 
-def _encoder(endpoint: str, who: str) -> Callable[[Message], tuple[bytes, ...]]:
+def _encoder(endpoint: str, who: str) -> Callable[[ScenarioMessage], tuple[bytes, ...]]:
     """What a client makes of messages, as the transports of `vlagents_ray.client` do."""
     writer, sent = ShmWriter(), iter(range(1000))
 
-    def encode(message: Message) -> tuple[bytes, ...]:
+    def encode(message: ScenarioMessage) -> tuple[bytes, ...]:
         if isinstance(message, tuple):
             return message
         requests = [message] if isinstance(message, Request) else message

@@ -52,7 +52,7 @@ LIBERO = {
     "prompt": "task 4",
 }
 SEEN = {"images": {"front": PICTURE}, "task_description": "task 4", "state": np.ones(3)}
-FENCE = vla_eval_codec.encode(vla_eval_codec.Message("hello", {"protocol_version": 1}, 77))
+FENCE = vla_eval_codec.encode(vla_eval_codec.VlaEvalMessage("hello", {"protocol_version": 1}, 77))
 
 
 @pytest.fixture(scope="module")
@@ -100,7 +100,7 @@ def as_json(tree: dict[str, Any]) -> bytes:
 def as_vla_eval(tree: dict[str, Any]) -> bytes:
     fields = {"kind": "observation", "payload": {}, "seq": 3} | tree
     return vla_eval_codec.encode(
-        vla_eval_codec.Message(fields["kind"], fields["payload"], fields["seq"])
+        vla_eval_codec.VlaEvalMessage(fields["kind"], fields["payload"], fields["seq"])
     )
 
 
@@ -154,9 +154,9 @@ TARGETS = [
         [
             FENCE,
             vla_eval_codec.encode(
-                vla_eval_codec.Message("episode_start", {"task": {"name": "a"}}, 2)
+                vla_eval_codec.VlaEvalMessage("episode_start", {"task": {"name": "a"}}, 2)
             ),
-            vla_eval_codec.encode(vla_eval_codec.Message("observation", SEEN, 3)),
+            vla_eval_codec.encode(vla_eval_codec.VlaEvalMessage("observation", SEEN, 3)),
         ],
         lambda a: vla_eval_codec.decode(a).payload["actions"][0],
         fence=FENCE,

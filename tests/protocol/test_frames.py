@@ -34,13 +34,13 @@ from vlagents_ray.protocol.json_messages import request_from_parts
 from vlagents_ray.protocol.messages import (
     DEFAULT_LIMITS,
     Budget,
-    Limits,
+    MessageLimits,
     Reply,
     Request,
 )
 
 
-def decode_request(frame: Buffer, limits: Limits = DEFAULT_LIMITS) -> Request:
+def decode_request(frame: Buffer, limits: MessageLimits = DEFAULT_LIMITS) -> Request:
     """The only request of a frame; raises why it is refused."""
     [request] = read_requests(frame, Budget(limits))
     if isinstance(request, Reply):
@@ -303,7 +303,9 @@ IMAGE_NODE, BYTES_NODE = {"$": ["img", 0]}, {"$": ["bin", 1]}
 def test_a_small_file_that_is_named_again_and_again_does_not_become_much_memory(
     requests: list[dict],
 ) -> None:
-    limits = Limits(body_bytes=100_000, pixels=256 * 256, cameras=2, decoded_bytes=10_000_000)
+    limits = MessageLimits(
+        body_bytes=100_000, pixels=256 * 256, cameras=2, decoded_bytes=10_000_000
+    )
     file = encode_jpeg(np.zeros((256, 256, 3), np.uint8))
     frame = b"".join(pack({"requests": requests}, [file, bytes(50_000)]))
     tracemalloc.start()
@@ -338,7 +340,7 @@ def test_a_long_header_is_refused_unread(values: int, reason: str) -> None:
 def test_a_body_over_the_limit_is_too_large() -> None:
     frame = encode_requests([Request("act", Obs({"a": np.zeros((64, 64, 3), np.uint8)}))])
     with pytest.raises(MessageTooLarge, match="limit is 4096"):
-        decode_request(frame, Limits(body_bytes=4096))
+        decode_request(frame, MessageLimits(body_bytes=4096))
 
 
 @pytest.mark.parametrize("value", [object(), {1: 2}, {"$": 1}, np.array(["text"]), np.array([1j])])
@@ -416,7 +418,7 @@ def test_a_frame_of_requests_is_a_list(requests: object) -> None:
     with pytest.raises(MalformedMessage):
         read_requests(b"".join(pack({"requests": requests}, [])), Budget(DEFAULT_LIMITS))
     with pytest.raises(MessageTooLarge):
-        read_requests(b"".join(pack({"requests": [{}] * 5}, [])), Budget(Limits(requests=4)))
+        read_requests(b"".join(pack({"requests": [{}] * 5}, [])), Budget(MessageLimits(requests=4)))
 
 
 @pytest.mark.parametrize(

@@ -19,7 +19,7 @@ from vlagents_ray.errors import (
 from vlagents_ray.images.jpeg_png import encode_jpeg
 from vlagents_ray.interface import Act
 from vlagents_ray.protocol.json_messages import problem, reply_to_json, request_from_parts
-from vlagents_ray.protocol.messages import DEFAULT_LIMITS, Budget, Limits, Reply
+from vlagents_ray.protocol.messages import DEFAULT_LIMITS, Budget, MessageLimits, Reply
 from vlagents_ray.protocol.values import from_text, to_text
 
 IMAGE = np.full((16, 16, 3), 200, np.uint8)
@@ -31,7 +31,7 @@ IMAGE = np.full((16, 16, 3), 200, np.uint8)
 def test_a_long_document_is_refused_unread(values: int, reason: str) -> None:
     document = b'{"info":{"a":[' + b"[]," * values + b"1]}}"
     with pytest.raises(MessageTooLarge, match=reason):
-        request_from_parts("act", document, {}, Budget(Limits()))
+        request_from_parts("act", document, {}, Budget(MessageLimits()))
 
 
 def test_a_request_is_read_from_json_and_images() -> None:
@@ -74,7 +74,7 @@ def test_a_request_is_read_from_json_and_images() -> None:
 )
 def test_each_fault_has_its_error(text: str | bytes, images: dict, error: type[Exception]) -> None:
     with pytest.raises(error):
-        request_from_parts("act", text, images, Budget(Limits()))
+        request_from_parts("act", text, images, Budget(MessageLimits()))
 
 
 def test_a_reply_becomes_plain_json() -> None:

@@ -19,7 +19,7 @@ from many import many
 from vlagents_ray.errors import InvalidInput, MalformedMessage, PolicyFailed
 from vlagents_ray.interface import Act, Obs
 from vlagents_ray.protocol import shm_layout
-from vlagents_ray.protocol.messages import Limits, Reply, Request
+from vlagents_ray.protocol.messages import MessageLimits, Reply, Request
 from vlagents_ray.protocol.shm_layout import (
     ANSWER,
     COUNT,
@@ -66,7 +66,7 @@ def test_acts_come_back_as_they_were_also_when_their_layout_is_known(
         )
         for i, obs in enumerate(seen)
     ]
-    writer, reader = ShmWriter(), ShmReader(Limits())
+    writer, reader = ShmWriter(), ShmReader(MessageLimits())
     sizes = []
     for _ in range(2):
         written = writer.write(sent)
@@ -91,7 +91,7 @@ def seeing(side: int, session: str = "s") -> Request:
 
 
 def test_a_session_may_change_what_it_sees_even_within_a_message() -> None:
-    writer, reader = ShmWriter(), ShmReader(Limits())
+    writer, reader = ShmWriter(), ShmReader(MessageLimits())
     for sides in ((4,), (5,), (4,), (4, 5, 4), (6, 6), (4, 4)):
         written = writer.write([seeing(side) for side in sides])
         read = reader.read(memoryview(written.message), placed(written))
@@ -111,7 +111,7 @@ def test_a_session_may_change_what_it_sees_even_within_a_message() -> None:
     ids=["rank", "session", "name", "more", "less"],
 )
 def test_what_is_not_like_the_last_act_has_a_layout_of_its_own(change: dict[str, Any]) -> None:
-    writer, reader = ShmWriter(), ShmReader(Limits())
+    writer, reader = ShmWriter(), ShmReader(MessageLimits())
     for request in (seeing(4), replace(seeing(4), **change)):
         written = writer.write([request])
         assert len(written.message) > COUNT.size + ITEM.size
@@ -127,7 +127,7 @@ def test_nothing_of_a_message_that_travels_as_a_frame_is_taken_for_known() -> No
     writer = ShmWriter()
     assert writer.write([seeing(4), Request("reset", Obs())]) is None
     written = writer.write([seeing(4)])
-    assert len(ShmReader(Limits()).read(memoryview(written.message), placed(written))) == 1
+    assert len(ShmReader(MessageLimits()).read(memoryview(written.message), placed(written))) == 1
 
 
 @pytest.mark.parametrize(
@@ -153,7 +153,7 @@ def test_what_does_not_fit_travels_as_a_frame(request_: Request) -> None:
 @example(COUNT.pack(1) + ITEM.pack(0, 2**31, 0, 0.0, 0.0, b"r"))
 def test_garbage_is_refused_by_name(data: bytes) -> None:
     with pytest.raises(InvalidInput):
-        ShmReader(Limits()).read(memoryview(data), np.zeros(64, np.uint8))
+        ShmReader(MessageLimits()).read(memoryview(data), np.zeros(64, np.uint8))
 
 
 @pytest.mark.parametrize(
@@ -180,7 +180,7 @@ def test_layouts_are_checked(layout: object) -> None:
     text = json.dumps(layout).encode()
     message = COUNT.pack(1) + ITEM.pack(0, len(text), -1, 1.0, 0.5, b"r") + text
     with pytest.raises(InvalidInput):
-        ShmReader(Limits()).read(memoryview(message), np.zeros(4096, np.uint8))
+        ShmReader(MessageLimits()).read(memoryview(message), np.zeros(4096, np.uint8))
 
 
 @given(
@@ -262,7 +262,7 @@ def test_names_forge_no_line_in_a_log() -> None:
     for names in ({"request_id": "a\nb"}, {"session": "a\nb"}):
         written = ShmWriter().write([Request("act", Obs(), **names)])
         with pytest.raises(MalformedMessage):
-            ShmReader(Limits()).read(memoryview(written.message), placed(written))
+            ShmReader(MessageLimits()).read(memoryview(written.message), placed(written))
 
 
 class WritersAndReaders(RuleBasedStateMachine):
@@ -279,7 +279,7 @@ class WritersAndReaders(RuleBasedStateMachine):
 
     @rule()
     def reconnect(self) -> None:
-        self.writer, self.reader = ShmWriter(), ShmReader(Limits(requests=8))
+        self.writer, self.reader = ShmWriter(), ShmReader(MessageLimits(requests=8))
 
     def written(
         self, sides: list[int], sessions: list[int]
@@ -343,7 +343,7 @@ def test_a_writer_and_a_reader_agree_on_layouts_whatever_was_lost_or_refused() -
 
 
 def test_a_reader_takes_no_layout_beyond_the_limit_and_no_message_of_too_many_acts() -> None:
-    reader = ShmReader(Limits(requests=2))
+    reader = ShmReader(MessageLimits(requests=2))
     text = json.dumps(["s", "robot", [], []]).encode()
     item = ITEM.pack(4, len(text), -1, float("nan"), float("nan"), b"")
     with pytest.raises(InvalidInput, match="below 4"):
@@ -358,4 +358,6 @@ def test_names_have_the_limits_of_a_frame_in_layouts_also(name: str) -> None:
     text = json.dumps(["s", "robot", [], [[name, [1]]]]).encode()
     item = ITEM.pack(0, len(text), -1, float("nan"), float("nan"), b"")
     with pytest.raises(InvalidInput, match="named"):
-        ShmReader(Limits()).read(memoryview(COUNT.pack(1) + item + text), np.zeros(64, np.uint8))
+        ShmReader(MessageLimits()).read(
+            memoryview(COUNT.pack(1) + item + text), np.zeros(64, np.uint8)
+        )

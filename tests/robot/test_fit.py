@@ -13,7 +13,7 @@ from vlagents_ray import Act, ActionSpec, Agent, ConfigError, Contract, Obs
 from vlagents_ray.cli.robot import _require_fit, parse
 from vlagents_ray.contract import StateSpec, require_match
 from vlagents_ray.errors import ContractMismatch
-from vlagents_ray.robot import Limits
+from vlagents_ray.robot import MotionLimits
 from vlagents_ray.robot.fit import Trained, require_fit
 from vlagents_ray.robot.loop import contract_of
 
@@ -90,7 +90,7 @@ def test_a_first_chunk_and_limits_are_compared_with_the_training() -> None:
     chunk[3, 2] = 4.0
     [found] = TRAINED.misfits(None, chunk, None)
     assert found.startswith("first chunk[2]: got 4, was trained from 0 to 1")
-    [found] = TRAINED.misfits(None, None, Limits(low=(-1.0, -1.5, 0.0), joints=NAMES))
+    [found] = TRAINED.misfits(None, None, MotionLimits(low=(-1.0, -1.5, 0.0), joints=NAMES))
     assert found.startswith("action[1] (lift): was trained to -2, the arm's limit is -1.5")
 
 
@@ -103,7 +103,7 @@ def test_an_accepted_misfit_is_logged(caplog: pytest.LogCaptureFixture) -> None:
 def test_the_first_chunk_is_drawn_beside_the_training_and_the_limits() -> None:
     chunk = np.array([[0.0, 0.1, 1.0], [0.3, 0.2, 0.9]])
     header, *lines = TRAINED.drawn(
-        chunk, Limits(low=(-1.5, -2.5, 0.0), high=(1.5, 1.0, 1.0)), NAMES
+        chunk, MotionLimits(low=(-1.5, -2.5, 0.0), high=(1.5, 1.0, 1.0)), NAMES
     )
     assert header.split()[-3:] == ["chunk", "training", "limits"]
     assert [line.split("|")[0].strip() for line in lines] == [
@@ -122,12 +122,12 @@ def test_a_chunk_is_drawn_without_training_and_limits() -> None:
 
 
 def test_joints_in_another_order_than_that_of_the_limits_are_found_by_name() -> None:
-    limits = Limits(joints=("lift.pos", "pan.pos", "gripper.pos"))
+    limits = MotionLimits(joints=("lift.pos", "pan.pos", "gripper.pos"))
     first, second = Trained().misfits(None, None, limits, NAMES)
     assert first == "joints: number 0 is 'pan' of the arm and 'lift' of its limits; use one order"
     assert "number 1 is 'lift'" in second
-    assert Trained().misfits(None, None, Limits(joints=("pan.pos", "lift.pos")), NAMES) == []
-    assert Trained().misfits(None, None, Limits(joints=("joint1", "joint2")), NAMES) == [], (
+    assert Trained().misfits(None, None, MotionLimits(joints=("pan.pos", "lift.pos")), NAMES) == []
+    assert Trained().misfits(None, None, MotionLimits(joints=("joint1", "joint2")), NAMES) == [], (
         "other names say nothing"
     )
 

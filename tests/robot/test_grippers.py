@@ -23,7 +23,7 @@ from vlagents_ray import (
 from vlagents_ray.chunking.fallback import SafeAction, neutral
 from vlagents_ray.errors import PolicyUnavailable
 from vlagents_ray.interface import SAFE
-from vlagents_ray.robot import Guard, Limits, run_loop
+from vlagents_ray.robot import Guard, MotionLimits, run_loop
 from vlagents_ray.robot.simulated import SimulatedRobot
 
 HZ = 50.0
@@ -48,9 +48,9 @@ def spec_of(delta: bool, arms: int) -> ActionSpec:
     )
 
 
-def limits_of(arms: int, gripper: float) -> Limits:
+def limits_of(arms: int, gripper: float) -> MotionLimits:
     """Return limits with a speed of the grippers, units/s."""
-    return Limits(
+    return MotionLimits(
         velocity=(1.0, 1.0, 1.0, gripper) * arms,
         acceleration=(20.0, 20.0, 20.0, 20 * gripper) * arms,
         jerk=(800.0, 800.0, 800.0, 800 * gripper) * arms,

@@ -21,12 +21,12 @@ from vlagents_ray import (
     Obs,
     PlayerSettings,
 )
-from vlagents_ray.chunking.control import Control
+from vlagents_ray.chunking.control import RobotControl
 from vlagents_ray.errors import InvalidAction
-from vlagents_ray.robot import Guard, Limits, run_loop
+from vlagents_ray.robot import Guard, MotionLimits, run_loop
 
 HZ = 50.0
-LIMITS = Limits(velocity=1.0, acceleration=10.0, jerk=500.0)
+LIMITS = MotionLimits(velocity=1.0, acceleration=10.0, jerk=500.0)
 
 URDF = """<robot name="arm">
   <joint name="pan" type="revolute">
@@ -45,7 +45,7 @@ def row(*values: float) -> np.ndarray:
     return np.array(values, np.float32)
 
 
-def guard(limits: Limits = LIMITS, **options: float) -> Guard:
+def guard(limits: MotionLimits = LIMITS, **options: float) -> Guard:
     return Guard(limits=limits, hz=HZ, **{"soft_start_s": 0.0, **options})
 
 
@@ -56,7 +56,7 @@ def run(checked: Guard, *positions: float) -> None:
 
 
 def test_speeding_up_is_limited_and_braking_is_not() -> None:
-    limits = Limits(velocity=1.0, acceleration=10.0)
+    limits = MotionLimits(velocity=1.0, acceleration=10.0)
     # braking, and away in the other direction from rest.
     run(guard(limits), 0, 0.0039, 0.0078, 0.0078, 0.0039)
     for positions, said, cause in (
@@ -72,12 +72,19 @@ def test_speeding_up_is_limited_and_braking_is_not() -> None:
 
 def test_a_jerk_is_refused_by_its_number() -> None:
     with pytest.raises(InvalidAction, match="jerk 250, want 200 at most") as refused:
-        run(guard(Limits(velocity=1.0, jerk=200.0)), 0, 0.002)
+        run(guard(MotionLimits(velocity=1.0, jerk=200.0)), 0, 0.002)
     assert refused.value.cause == "dynamics"
 
 
 def test_holding_always_passes() -> None:
-    run(guard(Limits(velocity=1.0, acceleration=1.0, jerk=1e4)), 0, 0.0003, 0.0009, 0.0009, 0.0009)
+    run(
+        guard(MotionLimits(velocity=1.0, acceleration=1.0, jerk=1e4)),
+        0,
+        0.0003,
+        0.0009,
+        0.0009,
+        0.0009,
+    )
 
 
 def test_the_limits_of_relative_actions_are_of_the_actions_themselves() -> None:
@@ -91,7 +98,7 @@ def test_the_limits_of_relative_actions_are_of_the_actions_themselves() -> None:
 
 def test_the_first_minutes_of_motion_have_half_of_the_limits() -> None:
     slow, fast = 0.009, 0.015  # 0.45 and 0.75 units/s
-    checked = guard(Limits(velocity=1.0), soft_start_s=1.0)
+    checked = guard(MotionLimits(velocity=1.0), soft_start_s=1.0)
     with pytest.raises(InvalidAction, match="which the soft start lowers"):
         run(checked, 0, fast)
     last = checked(row(0))
@@ -104,7 +111,7 @@ def test_limits_need_the_rate_and_as_many_numbers_as_an_action_has() -> None:
     with pytest.raises(ConfigError, match="hz=None"):
         Guard(limits=LIMITS)
     with pytest.raises(ConfigError, match="want one number, or 3"):
-        Guard(Contract(action=ActionSpec(dim=3)), limits=Limits(velocity=(1.0, 1.0)), hz=HZ)
+        Guard(Contract(action=ActionSpec(dim=3)), limits=MotionLimits(velocity=(1.0, 1.0)), hz=HZ)
     with pytest.raises(ConfigError, match=r"limits for 50.0 Hz in a loop of 20"):
         run_loop(Arm(), Line(), hz=20, seconds=0.1, guard=guard())
 
@@ -141,7 +148,7 @@ class Line(Agent):
         return Act(np.stack([column, column], 1).astype(np.float32), done=True)
 
 
-def driven(arm: Arm, agent: Agent, limits: Limits, **options: float) -> np.ndarray:
+def driven(arm: Arm, agent: Agent, limits: MotionLimits, **options: float) -> np.ndarray:
     checked = Guard(
         agent.contract,
         limits=limits,
@@ -158,7 +165,7 @@ def driven(arm: Arm, agent: Agent, limits: Limits, **options: float) -> np.ndarr
 def test_the_first_action_is_eased_in_from_the_measured_pose_and_the_plan_follows_with_rising_speed() -> (
     None
 ):
-    limits = Limits(velocity=4.0, acceleration=80.0, jerk=16000.0)
+    limits = MotionLimits(velocity=4.0, acceleration=80.0, jerk=16000.0)
     path = driven(Arm(), Line(begin=0.3), limits)
     steps, rows = np.diff(path), 0.3 + 0.01 * np.arange(1, 201)
     assert 0 < steps[0] < 1e-4
@@ -176,7 +183,7 @@ def test_a_first_action_that_is_far_away_is_refused_with_the_distance() -> None:
 
 
 def test_a_run_ends_with_a_slow_way_to_the_rest_pose() -> None:
-    limits = Limits(velocity=4.0, acceleration=80.0, jerk=16000.0, rest=(-0.2, 0.1))
+    limits = MotionLimits(velocity=4.0, acceleration=80.0, jerk=16000.0, rest=(-0.2, 0.1))
     path = driven(arm := Arm(), Line(rows=20), limits)
     assert np.allclose(arm.path[-1], limits.rest)
     assert np.abs(np.diff(path)).max() <= 4.0 / 200
@@ -185,7 +192,7 @@ def test_a_run_ends_with_a_slow_way_to_the_rest_pose() -> None:
 
 def test_a_stopped_robot_does_not_go_to_rest() -> None:
     class Stopping(Line):
-        control = Control()
+        control = RobotControl()
 
         def act(self, obs: Obs) -> Act:
             if len(arm.path) == 5:
@@ -193,7 +200,7 @@ def test_a_stopped_robot_does_not_go_to_rest() -> None:
             return Act(arm.path[-1] + row(0.001, 0.001))
 
     arm = Arm()
-    limits = Limits(velocity=4.0, rest=(-0.2, 0.1))
+    limits = MotionLimits(velocity=4.0, rest=(-0.2, 0.1))
     run_loop(arm, Stopping(), hz=200, seconds=0.2, guard=Guard(limits=limits, hz=200))
     assert len(arm.path) == 5
     assert np.allclose(arm.path[-1], 0.004)
@@ -205,7 +212,7 @@ def test_a_file_of_limits_is_read_with_its_urdf(tmp_path: Path) -> None:
         "# of our arm\njoints: [pan, lift]\nvelocity: 2.5  # rad/s\nacceleration: [8, null]\n"
         "urdf: arm.urdf\ntip: tip\nworkspace_low: [-1, -1, 0.05]\n"
     )
-    limits = Limits.read(tmp_path / "arm.yaml")
+    limits = MotionLimits.read(tmp_path / "arm.yaml")
     assert limits.joints == ("pan", "lift")
     assert limits.velocity == (2.0, 2.5)  # the stricter of the file and the URDF
     assert limits.acceleration == (8, math.inf)
@@ -232,7 +239,7 @@ def test_the_tip_is_where_the_chain_of_transforms_puts_it(tmp_path: Path) -> Non
             }
         )
     )
-    chain = Limits.read(tmp_path / "arm.json").chain
+    chain = MotionLimits.read(tmp_path / "arm.json").chain
     assert chain is not None
     pan, lift = 0.7, -0.4
     reach = 0.2 + 0.3 * math.cos(lift)
@@ -255,7 +262,7 @@ def test_the_tip_is_where_the_chain_of_transforms_puts_it(tmp_path: Path) -> Non
 def test_a_file_with_a_mistake_is_refused(tmp_path: Path, text: str, said: str) -> None:
     (tmp_path / "arm.yaml").write_text(text)
     with pytest.raises(ConfigError, match=said):
-        Limits.read(tmp_path / "arm.yaml")
+        MotionLimits.read(tmp_path / "arm.yaml")
 
 
 def test_a_dataset_gives_the_limits_of_its_demonstrations(tmp_path: Path) -> None:
@@ -273,7 +280,7 @@ def test_a_dataset_gives_the_limits_of_its_demonstrations(tmp_path: Path) -> Non
     (tmp_path / "data/chunk-000").mkdir(parents=True)
     columns = {"action": np.concatenate(episodes).tolist(), "episode_index": np.repeat([0, 1], 300)}
     pq.write_table(pa.table(columns), tmp_path / "data/chunk-000/file-000.parquet")
-    limits = Limits.read(tmp_path)
+    limits = MotionLimits.read(tmp_path)
     assert limits.joints == ("a.pos", "b.pos")
     # Twice that of the path, without a jump between.
     assert limits.velocity == pytest.approx((1.3, math.inf), rel=0.01)

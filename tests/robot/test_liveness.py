@@ -12,7 +12,7 @@ import pytest
 
 from vlagents_ray import Act, ActionSpec, Agent, ChunkPlayer, Contract, Obs, PlayerSettings
 from vlagents_ray.interface import SAFE
-from vlagents_ray.robot import Guard, Limits
+from vlagents_ray.robot import Guard, MotionLimits
 
 SPEED, ACCELERATION, JERK = 1.5, 15.0, 600.0  # those of docs/control_loop.md
 RUN_S = 4.0
@@ -75,7 +75,7 @@ def executed(
     pose = np.float32(policy.pose(random.choice([0.0, -1.0, -0.5, 0.3])))
     guard = Guard(
         policy.contract,
-        limits=Limits(velocity=SPEED, acceleration=ACCELERATION, jerk=JERK),
+        limits=MotionLimits(velocity=SPEED, acceleration=ACCELERATION, jerk=JERK),
         hz=hz,
         measure=None if delta else (lambda obs: obs.state["joints"]),
         soft_start_s=soft_start_s,

@@ -25,11 +25,11 @@ from vlagents_ray import (
 from vlagents_ray.datasets.writer import Dataset
 from vlagents_ray.errors import InvalidAction
 from vlagents_ray.interface import SAFE
-from vlagents_ray.robot import Guard, Limits
+from vlagents_ray.robot import Guard, MotionLimits
 
 HZ = 50.0
 SPEED, ACCELERATION, JERK = 1.0, 20.0, 800.0
-LIMITS = Limits(velocity=SPEED, acceleration=ACCELERATION, jerk=JERK)
+LIMITS = MotionLimits(velocity=SPEED, acceleration=ACCELERATION, jerk=JERK)
 KINDS = [
     pytest.param(delta, arms, id=f"{'relative' if delta else 'absolute'}, {arms or 1} arms")
     for delta, arms in itertools.product((False, True), (None, 2))
@@ -57,7 +57,7 @@ def path_of(spec: ActionSpec, actions: list[np.ndarray]) -> np.ndarray:
     return np.concatenate([[rest] * 3, rows])
 
 
-def require_within(path: np.ndarray, limits: Limits, hz: float = HZ) -> None:
+def require_within(path: np.ndarray, limits: MotionLimits, hz: float = HZ) -> None:
     """Raise if a path speeds up beyond the limits; braking is always allowed."""
     speeds = np.diff(path, axis=0)
     for before, now, change_before in zip(
@@ -160,11 +160,13 @@ def test_a_step_of_exactly_the_limit_is_inside_in_float32(
     contract = Contract(action=ActionSpec(dim=1, delta=delta))
     guards = {
         "max_step": Guard(contract, max_step=limit),
-        "velocity": Guard(contract, limits=Limits(velocity=limit * HZ), hz=HZ, soft_start_s=0),
-        "acceleration": Guard(
-            contract, limits=Limits(acceleration=limit * HZ**2), hz=HZ, soft_start_s=0
+        "velocity": Guard(
+            contract, limits=MotionLimits(velocity=limit * HZ), hz=HZ, soft_start_s=0
         ),
-        "jerk": Guard(contract, limits=Limits(jerk=limit * HZ**3), hz=HZ, soft_start_s=0),
+        "acceleration": Guard(
+            contract, limits=MotionLimits(acceleration=limit * HZ**2), hz=HZ, soft_start_s=0
+        ),
+        "jerk": Guard(contract, limits=MotionLimits(jerk=limit * HZ**3), hz=HZ, soft_start_s=0),
     }
     for offset in np.linspace(0, 1, 200):
         begin = np.array([0.0 if delta else position + offset], np.float32)
@@ -178,7 +180,7 @@ def test_a_step_of_exactly_the_limit_is_inside_in_float32(
 
 @pytest.mark.parametrize("bound", [0.1, 1.7, 3.14159265])
 def test_a_bound_is_inside_in_float32(bound: float) -> None:
-    guard = Guard(limits=Limits(low=-bound, high=bound), hz=HZ)
+    guard = Guard(limits=MotionLimits(low=-bound, high=bound), hz=HZ)
     for sign in (-1, 1):
         guard(np.array([sign * bound], np.float32))
 
@@ -191,7 +193,7 @@ def test_the_distance_of_the_first_action_is_limited_by_first_alone_if_it_is_giv
         (5.0, 1.0, 5.0),
         (1, None, 1),
     ):
-        limits = Limits(velocity=velocity, acceleration=10.0, jerk=500.0, first=first)
+        limits = MotionLimits(velocity=velocity, acceleration=10.0, jerk=500.0, first=first)
         guard = Guard(limits=limits, hz=HZ, soft_start_s=0)
         zero = np.zeros(2, np.float32)
         assert guard.ease_in(zero, np.array([0, accepted], np.float32)) is not None
@@ -230,7 +232,7 @@ def written(folder: Path, document: dict[str, object]) -> Path:
 
 
 def test_the_table_of_effects_has_each_key_of_a_file() -> None:
-    named = {field.name for field in fields(Limits)} - {"chain"} | {"urdf", "tip"}
+    named = {field.name for field in fields(MotionLimits)} - {"chain"} | {"urdf", "tip"}
     # These two are not of a sequence of actions; see the tests of each.
     assert {*EFFECTS, "first", "rest"} == named
 
@@ -269,7 +271,7 @@ def test_each_key_of_a_file_refuses_a_relative_action_or_is_an_error(
 
 def test_bounds_of_a_gripper_have_an_effect_for_relative_actions_as_well() -> None:
     contract = Contract(action=spec_of(delta=True, arms=2))
-    limits = Limits(low=(-np.inf, -np.inf, 0.0) * 2, high=(np.inf, np.inf, 1.0) * 2)
+    limits = MotionLimits(low=(-np.inf, -np.inf, 0.0) * 2, high=(np.inf, np.inf, 1.0) * 2)
     guard = Guard(contract, limits=limits, hz=HZ)
     guard(np.array([0, 0, 1, 0, 0, 0.5], np.float32))
     with pytest.raises(InvalidAction, match=r"action\[2\]: got 1.1, above"):
@@ -306,21 +308,21 @@ def test_a_number_or_key_of_a_file_that_would_have_no_effect_is_an_error(
     tmp_path: Path, document: dict[str, object], said: str
 ) -> None:
     with pytest.raises(ConfigError, match=said):
-        Limits.read(written(tmp_path, document))
+        MotionLimits.read(written(tmp_path, document))
 
 
 @pytest.mark.parametrize(
     ("limits", "said"),
     [
-        (Limits(rest=(0.0,)), "rest: expected 3 numbers"),
-        (Limits(low=1.0, high=0.0), "expected low below high"),
-        (Limits(first=(1.0, 2.0)), "want one number, or 3"),
-        (Limits(rest=(0.0, 0.0, 0.0)), "rest: expected null for the grippers"),
+        (MotionLimits(rest=(0.0,)), "rest: expected 3 numbers"),
+        (MotionLimits(low=1.0, high=0.0), "expected low below high"),
+        (MotionLimits(first=(1.0, 2.0)), "want one number, or 3"),
+        (MotionLimits(rest=(0.0, 0.0, 0.0)), "rest: expected null for the grippers"),
     ],
     ids=str,
 )
 def test_limits_that_do_not_fit_the_actions_are_an_error_before_the_first_one(
-    limits: Limits, said: str
+    limits: MotionLimits, said: str
 ) -> None:
     with pytest.raises(ConfigError, match=said):
         Guard(Contract(action=spec_of(delta=False, arms=None)), limits=limits, hz=HZ)
@@ -390,11 +392,13 @@ def test_a_dataset_without_a_contract_has_actions_of_the_policys_kind(tmp_path: 
     del info["vlagents_ray"]
     (folder / "meta/info.json").write_text(json.dumps(info))
     speeds = np.abs(np.concatenate(episodes)).max(0) * HZ
-    assert np.asarray(Limits.read(folder, spec).velocity) == pytest.approx(2 * speeds, rel=0.05)
+    assert np.asarray(MotionLimits.read(folder, spec).velocity) == pytest.approx(
+        2 * speeds, rel=0.05
+    )
     guard = Guard(Contract(action=spec), limits=folder, hz=HZ)
     guard(episodes[0][1], guard(episodes[0][0]))
     with pytest.raises(ConfigError, match="low, high for relative actions"):
-        Guard(Contract(action=spec), limits=Limits.read(folder), hz=HZ)
+        Guard(Contract(action=spec), limits=MotionLimits.read(folder), hz=HZ)
 
 
 @pytest.mark.parametrize("delta", [False, True])

@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 
 from vlagents_ray.chunking import control as control_module
-from vlagents_ray.chunking.control import Control
+from vlagents_ray.chunking.control import RobotControl
 from vlagents_ray.contract import ActionSpec, Contract
 from vlagents_ray.interface import Act, Agent, Obs
 from vlagents_ray.robot import Watchdog, loop, run_loop
@@ -28,7 +28,11 @@ AFTER = 4  # observations until the end of a run
 LIMIT_S = 60.0  # a wait that ends by this has failed
 
 Tracer = Callable[[FrameType, str, Any], Any]
-STOPPER = {Watchdog.trip.__code__, Watchdog.bark.__code__, Control.stopping.__wrapped__.__code__}  # type: ignore[attr-defined]
+STOPPER = {
+    Watchdog.trip.__code__,
+    Watchdog.bark.__code__,
+    RobotControl.stopping.__wrapped__.__code__,  # type: ignore[attr-defined]
+}
 
 
 class Arm:

@@ -31,12 +31,12 @@ from vlagents_ray.evaluate.robot import (
     evaluate_on_robot,
 )
 from vlagents_ray.interface import Act, Agent, Obs
-from vlagents_ray.robot import Guard, Limits, Watchdog, run_loop
+from vlagents_ray.robot import Guard, MotionLimits, Watchdog, run_loop
 from vlagents_ray.robot.record import Recorder
 
 HZ = 200.0
 EVENT_AT = 6  # the observation at which the robot is stopped
-MOTION = Limits(velocity=20.0, acceleration=2000.0, jerk=2e6)  # deltas have no rest pose
+MOTION = MotionLimits(velocity=20.0, acceleration=2000.0, jerk=2e6)  # deltas have no rest pose
 REST = replace(MOTION, rest=(-0.5, -0.5))
 WAY_TO_REST = -0.05  # targets below it are on the way to the rest pose; the policy's are above 0
 

@@ -36,7 +36,7 @@ from vlagents_ray.images import jpeg_png
 from vlagents_ray.interface import Act, Agent, Obs
 from vlagents_ray.protocol import frame_layout
 from vlagents_ray.protocol.frames import decode_replies, encode_requests
-from vlagents_ray.protocol.messages import PROTOCOL_VERSION, Limits, Request
+from vlagents_ray.protocol.messages import PROTOCOL_VERSION, MessageLimits, Request
 from vlagents_ray.protocol.websocket_frames import ReceiveBuffer, frame_head
 from vlagents_ray.serve import periodic
 from vlagents_ray.serve.access import api_keys
@@ -50,7 +50,7 @@ from vlagents_ray.serve.endpoints.websocket import WebSocketServer
 from vlagents_ray.serve.engine.admission import MessageAdmission
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.engine.sender import Sender
-from vlagents_ray.serve.requests import Message
+from vlagents_ray.serve.requests import IncomingMessage
 
 BASE = urlsplit("http://127.0.0.1")
 # Where a test is about those; others hold though this process stands still.
@@ -111,8 +111,10 @@ def replica(*, keyed: bool = True, slow_s: float = 60.0, idle_s: float = 60.0) -
     known, policy = ChangingKeys(), Witness()
     engine = Engine(policy, session_limit=8)
     admit = (lambda token: known.keys.check(token, "app")) if keyed else NoKey.OPEN
-    own = WebSocketServer(engine, Limits(), "127.0.0.1", None, admit, slow_s=slow_s, idle_s=idle_s)
-    near = ShmServer(engine, Limits(), admit)
+    own = WebSocketServer(
+        engine, MessageLimits(), "127.0.0.1", None, admit, slow_s=slow_s, idle_s=idle_s
+    )
+    near = ShmServer(engine, MessageLimits(), admit)
     own.open()
     near.open()
     engine.start()
@@ -224,7 +226,7 @@ def test_who_forgets_to_say_whose_requests_they_are_fails(keyed: Replica) -> Non
     with pytest.raises(TypeError, match="want a Caller"):
         Sender(keyed.engine, "http", caller=None)  # type: ignore[arg-type]
     unguarded = TestClient(
-        build_http_app(keyed.engine, dict, Limits()), raise_server_exceptions=False
+        build_http_app(keyed.engine, dict, MessageLimits()), raise_server_exceptions=False
     )
     assert (
         unguarded.post("/v1/reset", json={"obs": {}}, headers={"x-session-id": "a"}).status_code
@@ -416,7 +418,7 @@ def serving() -> Iterator[Callable[..., str]]:
 
         def start(engine: Engine, keys: api_keys.Keys) -> str:
             port = stack.enter_context(
-                served(AccessMiddleware(build_http_app(engine, dict, Limits()), keys, "app"))
+                served(AccessMiddleware(build_http_app(engine, dict, MessageLimits()), keys, "app"))
             )
             return f"ws://127.0.0.1:{port}/v1/stream"
 
@@ -443,7 +445,7 @@ def test_a_client_goes_through_the_proxy_where_the_replicas_own_port_is_full(
         "protocol": PROTOCOL_VERSION,
         "stream": asdict(keyed.own.address),
     }
-    inside = build_http_app(keyed.engine, lambda: about, Limits())
+    inside = build_http_app(keyed.engine, lambda: about, MessageLimits())
     with served(AccessMiddleware(inside, keyed.known.keys, "app")) as port:
 
         def agent() -> RemoteAgent:
@@ -479,7 +481,8 @@ def test_a_full_replica_closes_a_proxied_websocket_with_its_reason(
 def test_a_probe_is_answered_without_a_session_and_a_broken_one_leaves_the_stream_as_it_was(
     keyed: Replica, size: int
 ) -> None:
-    probe, app = bytes_probe(size), build_http_app(keyed.engine, dict, Limits(body_bytes=100_000))
+    probe = bytes_probe(size)
+    app = build_http_app(keyed.engine, dict, MessageLimits(body_bytes=100_000))
     with TestClient(AccessMiddleware(app, None, "app")).websocket_connect("/v1/stream") as stream:
         stream.send_bytes(probe)
         assert is_probe_answer(stream.receive_bytes(), probe)
@@ -498,9 +501,9 @@ FAULTS = [
     (Sender, "send"),
     (Sender, "throttled_s"),
     (Sender, "release"),
-    (Message, "decoded"),
-    (Message, "frame"),
-    (Message, "packed"),
+    (IncomingMessage, "decoded"),
+    (IncomingMessage, "frame"),
+    (IncomingMessage, "packed"),
     (MessageAdmission, "begin_message"),
     (MessageAdmission, "begin"),
     (MessageAdmission, "hold"),

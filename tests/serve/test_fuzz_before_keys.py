@@ -121,7 +121,7 @@ def frames(choose: random.Random) -> Sequence:
         RESET,
         ACT,
         libero(1, "task"),
-        vla_eval_codec.encode(vla_eval_codec.Message("observation", seen(1), 3)),
+        vla_eval_codec.encode(vla_eval_codec.VlaEvalMessage("observation", seen(1), 3)),
         b"VLA?" * 3,
     ]
     return [

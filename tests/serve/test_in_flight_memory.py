@@ -25,7 +25,7 @@ from vlagents_ray.client.transports.websocket import Stream
 from vlagents_ray.interface import Act, Agent, Obs
 from vlagents_ray.protocol import frame_layout, shm_layout
 from vlagents_ray.protocol.frames import encode_requests
-from vlagents_ray.protocol.messages import Limits, LocalAddress, Request
+from vlagents_ray.protocol.messages import LocalAddress, MessageLimits, Request
 from vlagents_ray.protocol.websocket_frames import frame_head
 from vlagents_ray.serve.access.api_keys import NoKey
 from vlagents_ray.serve.endpoints.connection import MOST_UNANSWERED
@@ -72,7 +72,7 @@ class Replica:
 
 @pytest.fixture
 def replica() -> Iterator[Replica]:
-    limits = Limits(in_flight_bytes=IN_FLIGHT)
+    limits = MessageLimits(in_flight_bytes=IN_FLIGHT)
     policy = Gate()
     engine = Engine(policy, in_flight_bytes=IN_FLIGHT)
     own, near = (

@@ -72,8 +72,8 @@ from vlagents_ray.protocol.messages import (
     DEFAULT_LIMITS,
     STREAM_BYTES,
     Budget,
-    Limits,
     LocalAddress,
+    MessageLimits,
     Reply,
     Request,
 )
@@ -119,7 +119,7 @@ def reset(**more: Any) -> dict[str, Any]:
 
 def message_admission(
     most: int = 10**9,
-    limits: Limits = DEFAULT_LIMITS,
+    limits: MessageLimits = DEFAULT_LIMITS,
     admit: Callable[[object], bool] = lambda _: True,
 ) -> MessageAdmission:
     return MessageAdmission(Admission(most), limits, admit)
@@ -334,7 +334,7 @@ def test_each_image_is_decoded_once_however_often_it_is_named(decoded: list[str]
 
 
 def test_what_a_request_names_is_counted_each_time_and_taken_once() -> None:
-    limits = Limits(decoded_bytes=4 * DECODED)
+    limits = MessageLimits(decoded_bytes=4 * DECODED)
     held = Admission(10**9)
     message = MessageAdmission(held, limits, lambda _: True)
     good, bad = (
@@ -358,7 +358,7 @@ def test_what_a_request_names_is_counted_each_time_and_taken_once() -> None:
         }
 
     arrays = frame(named(4), named(5), files=[bytes(1000)])
-    good_one, bad_one = read_requests(arrays, Budget(Limits(decoded_bytes=4000)))
+    good_one, bad_one = read_requests(arrays, Budget(MessageLimits(decoded_bytes=4000)))
     assert isinstance(good_one, Request)
     assert isinstance(bad_one, Reply)
     assert isinstance(bad_one.error, MessageTooLarge)
@@ -366,9 +366,9 @@ def test_what_a_request_names_is_counted_each_time_and_taken_once() -> None:
 
 def test_what_images_declare_is_refused_before_the_first_is_decoded(decoded: list[str]) -> None:
     with pytest.raises(MessageTooLarge):
-        decode_files([JPEG, JPEG, JPEG], Budget(Limits(decoded_bytes=2 * DECODED)))
+        decode_files([JPEG, JPEG, JPEG], Budget(MessageLimits(decoded_bytes=2 * DECODED)))
     with pytest.raises(MessageTooLarge, match=r"limits\.pixels"):
-        decode_files([PNG], Budget(Limits(pixels=32 * 31)))
+        decode_files([PNG], Budget(MessageLimits(pixels=32 * 31)))
     assert decoded == []
 
 
@@ -507,8 +507,8 @@ def held_up(monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[threading.Event, 
 @pytest.fixture
 def endpoints() -> Iterator[tuple[WebSocketServer, ShmServer]]:
     engine = Engine(Sees())
-    own = WebSocketServer(engine, Limits(), "127.0.0.1", None, NoKey.OPEN)
-    near = ShmServer(engine, Limits(), NoKey.OPEN)
+    own = WebSocketServer(engine, MessageLimits(), "127.0.0.1", None, NoKey.OPEN)
+    near = ShmServer(engine, MessageLimits(), NoKey.OPEN)
     own.open(), near.open()
     engine.start()
     yield own, near

@@ -45,8 +45,8 @@ from vlagents_ray.interface import Act, Agent, Obs
 from vlagents_ray.protocol.frames import decode_replies, encode_requests
 from vlagents_ray.protocol.messages import (
     PROTOCOL_VERSION,
-    Limits,
     LocalAddress,
+    MessageLimits,
     PlasmaAddress,
     RankName,
     Request,
@@ -72,7 +72,7 @@ from vlagents_ray.weights.safetensors import ValueSpec, header_of, read_header
 from vlagents_ray_dialects.messages import vla_eval as vla_eval_codec
 
 ANSWER_S = 10.0
-LIMITS = Limits(body_bytes=2**20)
+LIMITS = MessageLimits(body_bytes=2**20)
 _NUMBERS = itertools.count()
 _WORDS = {  # of refusals, where a protocol has no code
     "401": r"revoked|expired|not known|needs an API key",
@@ -257,7 +257,9 @@ class _Near(ShmTransport):
         return {"protocol": PROTOCOL_VERSION, "contract": None}
 
 
-def plasma_server(engine: Engine, limits: Limits, patch: pytest.MonkeyPatch, folder: Path) -> Any:
+def plasma_server(
+    engine: Engine, limits: MessageLimits, patch: pytest.MonkeyPatch, folder: Path
+) -> Any:
     """The plasma endpoint, with channels that hold a frame as it is."""
     import ray
 
@@ -627,7 +629,7 @@ def _act(mark: str) -> dict[str, Any]:
 
 
 def _see(mark: str) -> bytes:
-    return vla_eval_codec.encode(vla_eval_codec.Message("observation", seen(1, mark), 3))
+    return vla_eval_codec.encode(vla_eval_codec.VlaEvalMessage("observation", seen(1, mark), 3))
 
 
 def _arena(mark: str) -> bytes:

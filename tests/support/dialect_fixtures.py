@@ -14,14 +14,14 @@ from served_agents import Mirror, Witness
 from starlette.testclient import TestClient
 
 from vlagents_ray.client.agent import RemoteAgent
-from vlagents_ray.protocol.messages import Limits, RankName
+from vlagents_ray.protocol.messages import MessageLimits, RankName
 from vlagents_ray.registry import dialect_class
 from vlagents_ray.serve.access.api_keys import NoKey
 from vlagents_ray.serve.dialects.base import GatewayContext, PortDialect
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.ports import free_port, reserve
 
-LIMITS = Limits(body_bytes=2 * 2**20)
+LIMITS = MessageLimits(body_bytes=2 * 2**20)
 OpenPort = Callable[..., int]
 
 

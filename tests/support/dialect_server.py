@@ -11,7 +11,7 @@ import numpy as np
 from starlette.testclient import TestClient
 
 from vlagents_ray.interface import Agent
-from vlagents_ray.protocol.messages import Limits
+from vlagents_ray.protocol.messages import MessageLimits
 from vlagents_ray.registry import dialect_class, names
 from vlagents_ray.serve.access.api_keys import Keys
 from vlagents_ray.serve.config.dialects import DialectArgs
@@ -23,7 +23,7 @@ from vlagents_ray_dialects.messages import openpi as openpi_codec
 from vlagents_ray_dialects.messages import openvla as openvla_codec
 from vlagents_ray_dialects.messages import vla_eval as vla_eval_codec
 
-LIMITS = Limits(body_bytes=300_000, pixels=64 * 64)
+LIMITS = MessageLimits(body_bytes=300_000, pixels=64 * 64)
 METADATA = {"policy": "mirror", "version": "0", "protocol": 1, "checkpoint": None}
 ALL: dict[str, Any] = {  # those on the server's own port, with settings where tests need them
     **{name: {} for name in names("dialects") if issubclass(dialect_class(name), RouteDialect)},
@@ -77,10 +77,10 @@ def body(pixel: int, instruction: str = "task 1", **more: Any) -> dict[str, Any]
 
 
 def send(socket: Any, kind: Any, payload: dict[str, Any], seq: int) -> None:
-    socket.send_bytes(vla_eval_codec.encode(vla_eval_codec.Message(kind, payload, seq)))
+    socket.send_bytes(vla_eval_codec.encode(vla_eval_codec.VlaEvalMessage(kind, payload, seq)))
 
 
-def receive(socket: Any) -> vla_eval_codec.Message:
+def receive(socket: Any) -> vla_eval_codec.VlaEvalMessage:
     return vla_eval_codec.decode(socket.receive_bytes())
 
 

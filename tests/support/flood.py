@@ -54,7 +54,7 @@ from vlagents_ray.images import jpeg_png
 from vlagents_ray.interface import Act, Agent, Obs
 from vlagents_ray.protocol import frame_layout
 from vlagents_ray.protocol.frames import CONTENT_TYPE, encode_requests
-from vlagents_ray.protocol.messages import Limits, LocalAddress, Op, PlasmaAddress, Request
+from vlagents_ray.protocol.messages import LocalAddress, MessageLimits, Op, PlasmaAddress, Request
 from vlagents_ray.protocol.websocket_frames import frame_head
 from vlagents_ray.registry import dialect_class
 from vlagents_ray.serve.access.api_keys import Keys, NoKey
@@ -105,7 +105,7 @@ def serve() -> None:
     """Say where it is, as JSON, and serve until the standard input ends."""
     rated = [_key(key_of(way), rate=1, rank="simulation") for way in (*WAYS, *HTTP)]
     keys = Keys.from_text(json.dumps({"keys": [_key("robot"), *rated]}))
-    admit, limits = partial(keys.check, app="app"), Limits()
+    admit, limits = partial(keys.check, app="app"), MessageLimits()
     engine = Engine(_Policy())
     own = WebSocketServer(engine, limits, "127.0.0.1", None, admit, slow_s=SLOW_S)
     near = ShmServer(engine, limits, admit)
@@ -118,7 +118,7 @@ def serve() -> None:
 def _serve_replica(
     engine: Engine, keys: Keys, own: WebSocketServer, near: ShmServer, plasma: PlasmaServer
 ) -> None:
-    limits = Limits()
+    limits = MessageLimits()
     for endpoint in (own, near, plasma):
         endpoint.open()
     engine.start()
@@ -214,7 +214,7 @@ def serve_gateways() -> None:
     """Serve the dialects with their own port, without a replica; print their ports as JSON."""
     rated = [_key(key_of(way), rate=1, rank="simulation") for way in GATEWAYS]
     keys = Keys.from_text(json.dumps({"keys": [_key("robot"), *rated]}))
-    limits = Limits()
+    limits = MessageLimits()
     gr00t._MESSAGE_S = vlagents._FRAME_S = lerobot_dialect._UPLOAD_S = SLOW_S
     dialects, ports = [], {}
     for name, check in (
@@ -321,7 +321,7 @@ def _map(**more: Any) -> bytes:
 def _of_vla_eval() -> bytes:
     image = {"__image__": True, "format": "jpeg", "data": _jpeg(), "shape": [HEIGHT, WIDTH, 3]}
     seen = {"images": {f"camera{i}": image for i in range(IMAGES)}, "task_description": "x"}
-    return vla_eval_codec.encode(vla_eval_codec.Message("observation", seen, 1))
+    return vla_eval_codec.encode(vla_eval_codec.VlaEvalMessage("observation", seen, 1))
 
 
 def _form() -> bytes:

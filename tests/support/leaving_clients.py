@@ -44,7 +44,7 @@ from vlagents_ray.client.transports.shm import ShmTransport
 from vlagents_ray.errors import ConnectionLost, VLAgentsError
 from vlagents_ray.interface import Act, Agent, Obs
 from vlagents_ray.protocol.frames import decode_replies, encode_requests
-from vlagents_ray.protocol.messages import Limits, RankName, Reply, Request
+from vlagents_ray.protocol.messages import MessageLimits, RankName, Reply, Request
 from vlagents_ray.registry import dialect_class
 from vlagents_ray.serve.access.api_keys import NoKey
 from vlagents_ray.serve.config.dialects import DialectArgs
@@ -70,7 +70,7 @@ HELD = 250  # the policy acts on pictures from this brightness on when its gate 
 OTHERS = ("another", "a third")  # sessions of other clients
 SLOW_S = 0.02  # of each act, so that another thread reads the connections while the policy acts
 ACTED = "acted"
-LIMITS = Limits(body_bytes=2**20)
+LIMITS = MessageLimits(body_bytes=2**20)
 
 
 _LARGE_ACTION = np.random.default_rng(0).random(2**21, np.float32)  # which no protocol can compress
@@ -608,7 +608,7 @@ def _read_map(data: bytes | str) -> str:
 
 def _see(brightness: int) -> bytes:
     return vla_eval_codec.encode(
-        vla_eval_codec.Message("observation", seen(brightness), brightness)
+        vla_eval_codec.VlaEvalMessage("observation", seen(brightness), brightness)
     )
 
 

@@ -124,7 +124,7 @@ PROGRAMS = {
     "Stable-Baselines3": Program(
         ("stable-baselines3",),
         "`as_vector_env`",
-        said="the adapter of `docs/evaluation/stable_baselines.py`",
+        said="the wrapper of `docs/evaluation/stable_baselines.py`",
     ),
     "TorchRL": Program(
         ("torchrl",), "`as_vector_env`", said='`GymWrapper(as_vector_env(…, autoreset="disabled"))`'

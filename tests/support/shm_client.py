@@ -10,10 +10,10 @@ import numpy as np
 
 from vlagents_ray.client.transports.shm import ShmTransport
 from vlagents_ray.interface import Act, Agent, Obs
-from vlagents_ray.protocol.messages import Limits, Reply, Request
+from vlagents_ray.protocol.messages import MessageLimits, Reply, Request
 from vlagents_ray.serve.endpoints.shm import ShmServer
 
-LIMITS = Limits(body_bytes=4 * 2**20)
+LIMITS = MessageLimits(body_bytes=4 * 2**20)
 
 
 class Keeper(Agent):

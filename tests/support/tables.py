@@ -33,8 +33,8 @@ LEARNT = json.loads((ROOT / "examples/reference/checkpoint/rates.json").read_tex
 WAYS = json.loads((ROOT / "examples/reference/success.json").read_text())["ways"]
 
 
-def _listed(adapters: dict[str, RegistryEntry]) -> Iterator[tuple[str, RegistryEntry]]:
-    return ((name, one) for name, one in adapters.items() if one.about)
+def _listed(registered: dict[str, RegistryEntry]) -> Iterator[tuple[str, RegistryEntry]]:
+    return ((name, entry) for name, entry in registered.items() if entry.about)
 
 
 def _link(name: str, text: str, one: RegistryEntry, folder: str) -> str:
@@ -77,9 +77,9 @@ def example_plugin() -> dict[Path, str]:
     }
 
 
-def page_of(name: str, one: RegistryEntry) -> str:
-    """Return the name of an adapter's page; empty if it has none."""
-    return name if one.page is None else one.page.partition("#")[0]
+def page_of(name: str, entry: RegistryEntry) -> str:
+    """Return the name of the page of a policy or an environment; empty if it has none."""
+    return name if entry.page is None else entry.page.partition("#")[0]
 
 
 def section(folder: str, page: str) -> str:
@@ -205,15 +205,15 @@ TABLES: dict[str, dict[str, list[str]]] = {
 
 def with_tables(file: str, text: str) -> str:
     """Return the text of a page with its tables, or that of mkdocs.yml with the pages of the
-    adapters.
+    policies and the environments.
     """
     if file == "mkdocs.yml":
-        for folder, adapters in (
+        for folder, registered in (
             ("policies", entries("policies")),
             ("benchmarks", entries("envs")),
         ):
-            found = dict.fromkeys(page_of(name, one) for name, one in _listed(adapters))
-            pages = "".join(f"          - {folder}/{page}.md\n" for page in found if page)
+            names = dict.fromkeys(page_of(name, entry) for name, entry in _listed(registered))
+            pages = "".join(f"          - {folder}/{page}.md\n" for page in names if page)
             index = f"          - {folder}/index.md\n"
             text = re.sub(
                 f"{index}(?:          - {folder}/.*\n)*", lambda _, new=index + pages: new, text

@@ -21,7 +21,7 @@ from vlagents_ray.errors import (
     MissingState,
     VLAgentsError,
 )
-from vlagents_ray.protocol.messages import Limits
+from vlagents_ray.protocol.messages import MessageLimits
 from vlagents_ray.serve.config.dialects import presets, read_mapping
 from vlagents_ray.wire.mapping import KeyMapping
 
@@ -115,7 +115,7 @@ def test_what_is_wrong_is_said_with_their_key(
 ) -> None:
     flat = {name: value for name, value in (LIBERO | change).items() if value is not None}
     with pytest.raises(error, match=key):
-        presets()["openpi-libero"].obs(flat, Limits(pixels=64 * 64))
+        presets()["openpi-libero"].obs(flat, MessageLimits(pixels=64 * 64))
 
 
 def test_an_observation_without_camera_or_state_that_the_mapping_reads_is_refused() -> None:

@@ -49,7 +49,7 @@ class Leader(Protocol):
         """
 
 
-class Control:
+class RobotControl:
     """The state machine of a robot.
 
     | state | source of motion | ends by |
@@ -92,8 +92,8 @@ class Control:
         self._engaged = False  # at the last update
         self._outcome: Outcome | None = None
 
-    def __deepcopy__(self, memo: dict[int, Any]) -> Control:
-        return Control(copy.deepcopy(self.leader, memo))  # the copy controls another robot
+    def __deepcopy__(self, memo: dict[int, Any]) -> RobotControl:
+        return RobotControl(copy.deepcopy(self.leader, memo))  # the copy controls another robot
 
     @property
     def state(self) -> ControlState:
@@ -199,7 +199,7 @@ class Control:
         with self._lock:
             self._outcome = "success" if label == "success" else "failure"
 
-    def adopt(self, other: Control) -> None:
+    def adopt(self, other: RobotControl) -> None:
         """Copy the stop and the pause of another control, which is no longer used."""
         with other._lock, self._lock:
             self._stop, self._barked = self._stop or other._stop, self._barked or other._barked

@@ -24,7 +24,7 @@ from vlagents_ray.chunking.buffer import (
     Step,
     stamped,
 )
-from vlagents_ray.chunking.control import Control, Leader
+from vlagents_ray.chunking.control import Leader, RobotControl
 from vlagents_ray.chunking.fallback import (
     LATE,
     OLD,
@@ -202,7 +202,7 @@ class ChunkPlayer(Agent):
     raised.
     """
 
-    control: Control
+    control: RobotControl
     """The state of the robot, which selects the source of motion at each `act`."""
 
     def __init__(
@@ -231,7 +231,7 @@ class ChunkPlayer(Agent):
         """
         self.settings = settings = settings or PlayerSettings()
         self.check = check
-        self.control = Control(override)
+        self.control = RobotControl(override)
         self._agent = agent
         self._plan = ChunkBuffer(
             ENSEMBLE if settings.mode == "ensemble" else settings.merge, settings.ensemble_m

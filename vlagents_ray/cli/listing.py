@@ -99,8 +99,8 @@ def _in_other_plugins(kind: str, registered: str) -> Iterator[Listed]:
 
 
 def installing(listed: Sequence[Listed]) -> Iterator[str]:
-    """Yield a line for each way to install missing packages: a command and its adapters, or an
-    environment's cure.
+    """Yield a line for each way to install missing packages: a command and the policies that need
+    it, or an environment's cure.
     """
     wanted: dict[str, list[str]] = {}
     for one in listed:

@@ -24,7 +24,7 @@ from functools import partial
 from typing import Any, get_args
 
 from vlagents_ray.chunking.buffer import ENSEMBLE, MERGES, Mode
-from vlagents_ray.chunking.control import Control
+from vlagents_ray.chunking.control import RobotControl
 from vlagents_ray.chunking.player import ChunkPlayer, PlayerSettings
 from vlagents_ray.cli.arguments import number, one_of, parse_all
 from vlagents_ray.client.agent import RemoteAgent
@@ -36,7 +36,7 @@ from vlagents_ray.registry import entries, names, not_installed, pip_install, re
 from vlagents_ray.robot.fit import Fit, Trained
 from vlagents_ray.robot.guard import SOFT_START_S, Guard, measured_state
 from vlagents_ray.robot.leaders import leader_named
-from vlagents_ray.robot.limits import Limits
+from vlagents_ray.robot.limits import MotionLimits
 from vlagents_ray.robot.loop import (
     LoopReport,
     Restart,
@@ -291,7 +291,7 @@ def _require_fit(
     options: argparse.Namespace,
     agent: Agent,
     robot: Robot,
-    limits: Limits | None,
+    limits: MotionLimits | None,
     say: Callable[[str], None],
 ) -> Fit:
     """Show the first chunk beside the training of the checkpoint and the limits of the arm, and
@@ -368,7 +368,7 @@ class _RunKeys:
         self._recorder = recorder
         self._say = say
 
-    def press(self, key: str, control: Control) -> bool:
+    def press(self, key: str, control: RobotControl) -> bool:
         """Do what a key means; return whether it has a meaning."""
         if key == "p" and control.reason is None:
             control.pause()
@@ -392,7 +392,7 @@ class _RunKeys:
 def _restarting(
     watchdog: Watchdog,
     say: Callable[[str], None],
-    press: Callable[[str, Control], bool] = lambda *_: False,
+    press: Callable[[str, RobotControl], bool] = lambda *_: False,
 ) -> Iterator[bool]:
     """Restart motion after a stop or a pause by the operator: Enter or C at the terminal, or
     SIGUSR1.

@@ -10,7 +10,7 @@ from collections.abc import Iterable
 
 import typer
 
-from vlagents_ray.chunking.control import Control, Leader
+from vlagents_ray.chunking.control import Leader, RobotControl
 from vlagents_ray.chunking.player import ChunkPlayer, PlayerSettings
 from vlagents_ray.cli.console import errors, out
 from vlagents_ray.cli.options import parse_settings
@@ -88,7 +88,7 @@ class RobotRun:
         self.verdict: Label | None = None  # the operator's label of the running episode
         self.over = False  # the operator has ended the run
         self.recorder: Recorder | None = None
-        self._control: Control | None = None
+        self._control: RobotControl | None = None
         self._viewer: EpisodeViewer | None = None
         self._said: str | None = None  # the printed source of motion
 

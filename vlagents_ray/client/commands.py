@@ -9,7 +9,7 @@ from collections import deque
 from collections.abc import Collection
 from dataclasses import dataclass, replace
 
-from vlagents_ray.chunking.control import Control
+from vlagents_ray.chunking.control import RobotControl
 from vlagents_ray.errors import ConfigError, printable
 from vlagents_ray.interface import Act, Obs
 
@@ -44,7 +44,7 @@ class CommandInbox:
         """
         if unknown := sorted(set(allow) - set(COMMANDS)):
             raise ConfigError(f"allow: got {unknown}, want some of {list(COMMANDS)}")
-        self.control = Control()  # that of the last run
+        self.control = RobotControl()  # that of the last run
         self._allow = frozenset(allow)
         self._waiting: deque[Command] = deque()
         self._answers: dict[str, str] = {}  # refusal by id of a command, empty if it was executed
@@ -83,7 +83,7 @@ class CommandInbox:
         """The commands that were received and not executed yet, oldest first."""
         return list(self._waiting)
 
-    def obey(self, control: Control) -> list[Command]:
+    def obey(self, control: RobotControl) -> list[Command]:
         """Apply the commands received since the last call to the state of the robot, and return
         them.
         """

@@ -41,7 +41,7 @@ DATA, VIDEO, EPISODES = (
     f"meta/episodes/{FILE}.parquet",
 )
 FILES_IN_CHUNK = 1000
-UNFINISHED = "unfinished"  # folder of the running episodes
+UNFINISHED_FOLDER = "unfinished"  # the folder of the running episodes in a dataset
 
 
 class Dataset:
@@ -93,12 +93,12 @@ class Dataset:
         self.tasks: list[str] = []
         if (root / "meta/info.json").exists():
             self._open(rate)
-        elif root.is_dir() and any(path.name != UNFINISHED for path in root.iterdir()):
+        elif root.is_dir() and any(path.name != UNFINISHED_FOLDER for path in root.iterdir()):
             raise ConfigError(
                 f"{root}: not a LeRobotDataset, and not empty; record into a new folder"
             )
         # Remove the files of a running or uncounted episode after a crash.
-        shutil.rmtree(root / UNFINISHED, ignore_errors=True)
+        shutil.rmtree(root / UNFINISHED_FOLDER, ignore_errors=True)
         stray = FILE.format(**_place(self.episodes))
         for folder in ("data", "videos/*", "meta/episodes"):
             for path in root.glob(f"{folder}/{stray}.*"):
@@ -113,7 +113,7 @@ class Dataset:
 
         Several may run at once. `meaning` describes the actions' numbers, if it is known.
         """
-        unfinished = self.root / UNFINISHED
+        unfinished = self.root / UNFINISHED_FOLDER
         unfinished.mkdir(parents=True, exist_ok=True)
         folder = Path(tempfile.mkdtemp(dir=unfinished))
         meaning = meaning or ActionSpec()
@@ -286,7 +286,7 @@ class Dataset:
         self._move(part, self.root / name)
 
     def _part(self, name: str) -> Path:
-        folder = self.root / UNFINISHED
+        folder = self.root / UNFINISHED_FOLDER
         folder.mkdir(parents=True, exist_ok=True)
         return folder / name.replace("/", "_")
 

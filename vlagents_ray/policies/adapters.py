@@ -35,7 +35,7 @@ DIGITS = 16  # hexadecimal digits of the fingerprint of a checkpoint
 
 
 @dataclass(frozen=True, slots=True)
-class Adapter:
+class LoraAdapter:
     """The adapter of a session; by default, no adapter."""
 
     source: str = ""  # path or hub id, as in the settings
@@ -82,14 +82,14 @@ class _Values(dict[str, Any]):
             super().__setitem__(name, value)
 
 
-class Adapters:
+class LoraAdapters:
     """The adapters of one network."""
 
     def __init__(self) -> None:
         self.base = ""  # fingerprint of the base alone
         # Memory of the base that is on the host while the policy sleeps.
         self.moved: list[tuple[Any, Any]] = []
-        self._named: dict[str, Adapter] = {}
+        self._named: dict[str, LoraAdapter] = {}
         self._values = {"": _Values(0)}  # by fingerprint; those of the base are zeros
         self._device: Any = None
 
@@ -108,7 +108,7 @@ class Adapters:
         self,
         network: Any,
         sources: Mapping[str, str],
-        find: Callable[[str], tuple[Adapter, Path]],
+        find: Callable[[str], tuple[LoraAdapter, Path]],
         adapt: Callable[[str, Path], None],
     ) -> None:
         """Read adapters, and make the network's layers apply them.
@@ -153,12 +153,12 @@ class Adapters:
             modules[layer].register_forward_hook(partial(self._add, downs, ups))
             self._device = weight.device
 
-    def named(self, name: object) -> Adapter:
+    def named(self, name: object) -> LoraAdapter:
         """Return the adapter with this name, or no adapter for None; raises `UnknownCheckpoint`
         for an unknown name.
         """
         if name is None:
-            return Adapter()
+            return LoraAdapter()
         if not isinstance(name, str) or name not in self._named:
             raise UnknownCheckpoint(
                 f"{ADAPTER}: got {name!r}, want one of {sorted(self._named)}, or none, for the base"

@@ -22,7 +22,7 @@ from typing import Any
 
 import numpy as np
 
-from vlagents_ray.policies.adapters import Adapters
+from vlagents_ray.policies.adapters import LoraAdapters
 from vlagents_ray.policies.base.accelerator import fetch
 from vlagents_ray.policies.base.model_inputs import Row
 from vlagents_ray.policies.compilation import Compilation
@@ -289,7 +289,7 @@ class FlowPasses(abc.ABC):
     def __init__(self, model: Any, compilation: Compilation) -> None:
         """Use the passes of a model, in their compiled form if there is one."""
         self.model = model
-        self.adapters = Adapters()  # of the policy
+        self.adapters = LoraAdapters()  # of the policy
         # With the functions of its authors' own passes.
         self.module = sys.modules[type(model).__module__]
         self._compilation = compilation

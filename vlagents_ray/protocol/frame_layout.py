@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from vlagents_ray.errors import MalformedMessage, MessageTooLarge, shown
-from vlagents_ray.protocol.messages import PROTOCOL_VERSION, Budget, Limits
+from vlagents_ray.protocol.messages import PROTOCOL_VERSION, Budget, MessageLimits
 
 Buffer = bytes | memoryview
 _PREFIX = struct.Struct("<3sBI")
@@ -55,7 +55,7 @@ def assemble(header: str, blobs: list[Buffer]) -> list[Buffer]:
 
 
 def unpack(
-    data: Buffer, limits: Limits, budget: Budget | None = None
+    data: Buffer, limits: MessageLimits, budget: Budget | None = None
 ) -> tuple[dict[str, Any], list[Buffer]]:
     """Return the header of a frame, and views of its blobs.
 

@@ -32,7 +32,7 @@ from vlagents_ray.protocol.messages import (
     OPS,
     RANKS,
     Budget,
-    Limits,
+    MessageLimits,
     Op,
     Reply,
     Request,
@@ -187,7 +187,7 @@ def _step(node: dict[str, Any]) -> Any:
     return int(step)
 
 
-def check_request(request: Request, limits: Limits) -> Request:
+def check_request(request: Request, limits: MessageLimits) -> Request:
     """Check the types and sizes that JSON itself does not enforce, for a request of any format;
     return the request.
     """

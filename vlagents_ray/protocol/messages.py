@@ -116,7 +116,7 @@ class Reply:
 
 
 @dataclass(frozen=True, slots=True)
-class Limits:
+class MessageLimits:
     """The limits of a decoder; anything larger raises `MessageTooLarge` before memory is
     allocated for it.
     """
@@ -137,7 +137,7 @@ class Limits:
     in_flight_bytes: int = 512 * 2**20
 
 
-DEFAULT_LIMITS = Limits()
+DEFAULT_LIMITS = MessageLimits()
 
 
 @dataclass(frozen=True, slots=True)
@@ -291,7 +291,7 @@ class Budget:
 
     __slots__ = ("_left", "_seconds_left", "files", "limits", "serial")
 
-    def __init__(self, limits: Limits) -> None:
+    def __init__(self, limits: MessageLimits) -> None:
         self.limits = limits
         self.serial = False  # whether images are decoded one after the other
         # Receives the files of decoded images; None if not needed.

@@ -25,7 +25,7 @@ from vlagents_ray.errors import InvalidInput, MalformedMessage, MessageTooLarge
 from vlagents_ray.interface import POLICY, Act, Obs
 from vlagents_ray.protocol.frame_layout import Buffer
 from vlagents_ray.protocol.frames import check_request
-from vlagents_ray.protocol.messages import Limits, RankName, Reply, Request, is_name
+from vlagents_ray.protocol.messages import MessageLimits, RankName, Reply, Request, is_name
 from vlagents_ray.protocol.values import require_array_name
 
 _ALIGN = 64
@@ -179,7 +179,7 @@ class Written:
 class ShmReader:
     """Reads the acts of one connection."""
 
-    def __init__(self, limits: Limits) -> None:
+    def __init__(self, limits: MessageLimits) -> None:
         self._limits = limits
         self._known: dict[int, Layout] = {}
 

@@ -22,7 +22,7 @@ from vlagents_ray.errors import (
 from vlagents_ray.images.codecs import ImageCodec, decode_files, encode_files
 from vlagents_ray.interface import Obs
 from vlagents_ray.protocol.frame_layout import Buffer, is_plain, parse_json, read_array
-from vlagents_ray.protocol.messages import NAME_CHARACTERS, Budget, Limits
+from vlagents_ray.protocol.messages import NAME_CHARACTERS, Budget, MessageLimits
 from vlagents_ray.validation import described
 
 _UINT8, _FLOAT32 = np.dtype(np.uint8), np.dtype(np.float32)
@@ -248,7 +248,7 @@ def require_array_name(name: str) -> None:
         )
 
 
-def as_camera(name: str, image: Any, limits: Limits) -> np.ndarray:
+def as_camera(name: str, image: Any, limits: MessageLimits) -> np.ndarray:
     """Return `image` unchanged if it is (H, W, 3) uint8 RGB within the limits; errors mention
     `name`.
     """
@@ -270,7 +270,7 @@ def as_camera(name: str, image: Any, limits: Limits) -> np.ndarray:
     return image
 
 
-def as_state(name: str, part: Any, limits: Limits) -> np.ndarray:
+def as_state(name: str, part: Any, limits: MessageLimits) -> np.ndarray:
     """Convert `part`, a list of numbers or an array, to (D,) float32 within the limits; errors
     mention `name`.
     """

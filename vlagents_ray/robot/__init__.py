@@ -2,20 +2,20 @@
 of `client`.
 """
 
-from vlagents_ray.chunking.control import Control
+from vlagents_ray.chunking.control import RobotControl
 from vlagents_ray.client.commands import CommandInbox
 from vlagents_ray.robot.guard import Guard
-from vlagents_ray.robot.limits import Limits
+from vlagents_ray.robot.limits import MotionLimits
 from vlagents_ray.robot.loop import LoopReport, Robot, run_loop
 from vlagents_ray.robot.watchdog import Watchdog
 
 __all__ = [
     "CommandInbox",
-    "Control",
     "Guard",
-    "Limits",
     "LoopReport",
+    "MotionLimits",
     "Robot",
+    "RobotControl",
     "Watchdog",
     "run_loop",
 ]

@@ -16,7 +16,7 @@ import numpy as np
 from vlagents_ray.contract import reordered
 from vlagents_ray.errors import ConfigError, ContractMismatch
 from vlagents_ray.interface import Obs
-from vlagents_ray.robot.limits import Limits
+from vlagents_ray.robot.limits import MotionLimits
 
 logger = logging.getLogger(__name__)
 # Share of the trained range by which a number may leave it: other tables and mounts differ a
@@ -95,7 +95,7 @@ class Trained:
         self,
         state: np.ndarray | None,
         chunk: np.ndarray | None,
-        limits: Limits | None,
+        limits: MotionLimits | None,
         names: Sequence[str] = (),
     ) -> list[str]:
         """List what does not fit before the first motion, a sentence with the number and a cure
@@ -134,19 +134,19 @@ class Trained:
         return found
 
     def drawn(
-        self, chunk: np.ndarray, limits: Limits | None, names: Sequence[str] = ()
+        self, chunk: np.ndarray, limits: MotionLimits | None, names: Sequence[str] = ()
     ) -> list[str]:
         """Draw the first chunk, (H, D), beside the training's actions and the limits: a line for
         each number.
         """
         dim = chunk.shape[1]
         trained = (
-            Limits().bounds(dim)
+            MotionLimits().bounds(dim)
             if self.action is None or len(self.action[0]) != dim
             else self.action
         )
         spans: list[Span] = [
-            (limits or Limits()).bounds(dim),
+            (limits or MotionLimits()).bounds(dim),
             trained,
             (chunk.min(0), chunk.max(0)),
         ]
@@ -177,7 +177,7 @@ class Fit:
     """
 
     trained: Trained
-    limits: Limits | None = None  # of the arm
+    limits: MotionLimits | None = None  # of the arm
     names: tuple[str, ...] = ()  # of the arm's joints, by its driver
     parts: tuple[str, ...] = ()  # of the state, in order, if the training names none
     accept: bool = False  # whether misfits are only logged

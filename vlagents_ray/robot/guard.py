@@ -13,7 +13,7 @@ from vlagents_ray.chunking.ease import EaseIn
 from vlagents_ray.contract import ActionSpec, Contract
 from vlagents_ray.errors import ConfigError, InvalidAction, MissingState
 from vlagents_ray.interface import Obs
-from vlagents_ray.robot.limits import Limits
+from vlagents_ray.robot.limits import MotionLimits
 
 SOFT_START_S = 120.0
 _ROUNDING = 2.0**-23  # of a float32, with a margin for actions of earlier ticks that were larger
@@ -49,7 +49,7 @@ class Guard:
             checks none.
         measure: Returns the measured pose in an observation, (D,) in the action's order and units,
             e.g. `lambda obs: obs.state["joints"]`; not for relative actions.
-        limits: The limits of the robot's motion, or the path that `Limits.read` reads.
+        limits: The limits of the robot's motion, or the path that `MotionLimits.read` reads.
         hz: The control rate, Hz; needed with `limits`.
         soft_start_s: The time of motion, s, within which the limits of speed, acceleration and jerk
             rise from half to their values, since most accidents happen in the first minutes of a
@@ -69,18 +69,18 @@ class Guard:
         high: float | np.ndarray | None = None,
         max_step: float | np.ndarray | None = None,
         measure: Callable[[Obs], np.ndarray] | None = None,
-        limits: Limits | str | Path | None = None,
+        limits: MotionLimits | str | Path | None = None,
         hz: float | None = None,
         soft_start_s: float = SOFT_START_S,
     ) -> None:
         spec = contract.action if contract is not None else ActionSpec()
         self.limits = limits = (
-            Limits.read(limits, spec) if isinstance(limits, (str, Path)) else limits
+            MotionLimits.read(limits, spec) if isinstance(limits, (str, Path)) else limits
         )
         self.hz = hz
         self._spec = spec
         self._dim = spec.dim
-        own = limits or Limits()
+        own = limits or MotionLimits()
         self._low = _bounds("low", np.maximum, spec.low, low, own.low)
         self._high = _bounds("high", np.minimum, spec.high, high, own.high)
         self._max_step = None if max_step is None else np.asarray(max_step, np.float64)
@@ -227,7 +227,7 @@ class Guard:
             pose.
 
         Raises:
-            InvalidAction: The action is farther from the pose than `Limits.first`.
+            InvalidAction: The action is farther from the pose than `MotionLimits.first`.
         """
         if self.limits is None or (start is None and not self._spec.relative):
             return None
@@ -259,7 +259,7 @@ class Guard:
         return EaseIn(start, ticks, 2 * math.ceil(ramp / 2), deltas=self._deltas, at_once=at_once)
 
     def _check_first(
-        self, limits: Limits, start: np.ndarray, goal: np.ndarray, velocity: list[float]
+        self, limits: MotionLimits, start: np.ndarray, goal: np.ndarray, velocity: list[float]
     ) -> None:
         """Raise `InvalidAction` if the first action is too far from the pose at rest."""
         dim, hz = len(goal), self.hz or 0.0
@@ -307,7 +307,7 @@ class Guard:
         its meaning.
         """
         if not self._columns or len(self._columns[0]) != dim:
-            limits, tick_s = self.limits or Limits(), 1.0 / (self.hz or 1.0)
+            limits, tick_s = self.limits or MotionLimits(), 1.0 / (self.hz or 1.0)
             self._grippers = self._spec.gripper_columns(dim)
             self._deltas = self._spec.delta_columns(dim)
             try:
@@ -334,7 +334,7 @@ class Guard:
             self._columns = columns
         return self._columns
 
-    def _check_places(self, limits: Limits, dim: int) -> None:
+    def _check_places(self, limits: MotionLimits, dim: int) -> None:
         """Raise `ConfigError` if a limit of places has no effect, or would move a gripper."""
         if limits.rest is not None and len(limits.rest) != dim:
             raise ConfigError(
@@ -407,7 +407,7 @@ class Guard:
             cause="max_step" if order == 1 else "dynamics",
         )
 
-    def _check_workspace(self, limits: Limits, tip: tuple[float, float, float]) -> None:
+    def _check_workspace(self, limits: MotionLimits, tip: tuple[float, float, float]) -> None:
         for bound, wrong, name in (
             (limits.workspace_low, 1, "below"),
             (limits.workspace_high, -1, "above"),

@@ -32,7 +32,7 @@ _ROOM = 0.1  # share of the demonstrated range by which an action may leave it
 
 
 @dataclass(frozen=True, slots=True)
-class Limits:
+class MotionLimits:
     """The limits of the actions, (D,) in their units and order; None checks nothing.
 
     Raises:
@@ -89,7 +89,7 @@ class Limits:
             raise ConfigError(f"unit: got {self.unit!r}, want 'rad' or 'deg'")
 
     @classmethod
-    def read(cls, path: str | Path, action: ActionSpec | None = None) -> Limits:
+    def read(cls, path: str | Path, action: ActionSpec | None = None) -> MotionLimits:
         """Read limits from a `.yaml` or `.json` file, a `.urdf` file, or the folder of a
         LeRobotDataset v3.0.
 
@@ -132,7 +132,7 @@ class Limits:
             ) from error
 
     @classmethod
-    def _of_document(cls, path: Path, document: Any) -> Limits:
+    def _of_document(cls, path: Path, document: Any) -> MotionLimits:
         urdf, tip = document.pop("urdf", None), document.pop("tip", None)
         known = {field.name for field in fields(cls)} - {"chain"} | {"urdf", "tip"}
         if unknown := sorted(set(document) - known):
@@ -171,7 +171,7 @@ class Limits:
         )
         return low, high
 
-    def stricter(self, other: Limits) -> Limits:
+    def stricter(self, other: MotionLimits) -> MotionLimits:
         """Return these limits, each replaced by the other's where that is stricter."""
 
         def least(name: str) -> Numbers | None:
@@ -189,7 +189,7 @@ class Limits:
         return replace(self, chain=chain, joints=joints, **bounds)  # type: ignore[arg-type]
 
     @classmethod
-    def _of_dataset(cls, folder: Path, action: ActionSpec | None) -> Limits:
+    def _of_dataset(cls, folder: Path, action: ActionSpec | None) -> MotionLimits:
         info = json.loads((folder / "meta/info.json").read_text())
         if INFO in info:
             action = DatasetContract.from_json(info[INFO]).contract.action
@@ -235,7 +235,9 @@ class Limits:
         )
 
     @classmethod
-    def _of_urdf(cls, file: Path, joints: Sequence[str], tip: str | None, scale: float) -> Limits:
+    def _of_urdf(
+        cls, file: Path, joints: Sequence[str], tip: str | None, scale: float
+    ) -> MotionLimits:
         robot = ET.parse(file).getroot()  # noqa: S314 - a file of this robot's owner
         elements = {
             one.attrib["name"]: one for one in robot.iter("joint") if one.find("child") is not None

@@ -18,7 +18,7 @@ from typing import Any, Literal, Protocol, get_args
 
 import numpy as np
 
-from vlagents_ray.chunking.control import Control
+from vlagents_ray.chunking.control import RobotControl
 from vlagents_ray.chunking.fallback import Cause, Held
 from vlagents_ray.client.commands import CommandInbox
 from vlagents_ray.contract import Contract, require_match
@@ -39,7 +39,7 @@ from vlagents_ray.naming import did_you_mean
 from vlagents_ray.registry import names, not_installed, registered_class
 from vlagents_ray.robot.fit import Fit, Trained
 from vlagents_ray.robot.guard import Guard
-from vlagents_ray.robot.limits import Limits
+from vlagents_ray.robot.limits import MotionLimits
 from vlagents_ray.robot.pacing import KEPT_TICKS, Pacer, jitter, undisturbed
 from vlagents_ray.robot.record import Recorder
 from vlagents_ray.robot.watchdog import Watchdog
@@ -103,7 +103,7 @@ def contract_of(robot: Robot) -> Contract:
 def fit_of(
     agent: Agent,
     robot: Robot,
-    limits: Limits | None = None,
+    limits: MotionLimits | None = None,
     *,
     trained: Trained | None = None,
     accept: bool = False,
@@ -380,8 +380,8 @@ def run_loop(
         viewer: Shows the run as one episode (see `vlagents_ray.viewers`).
         real_time: Run the thread with SCHED_FIFO (see `vlagents_ray.robot.pacing.undisturbed`).
         until: Ends the loop when it returns True; called before each tick, and after the last one.
-            This is not a stop:
-            with a rest pose the robot goes there. Use `Watchdog.trip` or `Control.stop` for a stop.
+            This is not a stop: with a rest pose the robot goes there. Use `Watchdog.trip` or
+            `RobotControl.stop` for a stop.
         commands: The commands of the live page, from `RemoteAgent(url, commands=...)`: pause, stop,
             mark.
         fit: The comparison of policy and robot, for misfits that are accepted; default:
@@ -406,14 +406,14 @@ def run_loop(
     if seconds is not None and not seconds > 0:
         raise ConfigError(f"seconds: got {seconds}, want above 0, or None")
     # The shared state of this robot: the player's, else the watchdog's, else that of the commands.
-    control: Control | None = agent.control
+    control: RobotControl | None = agent.control
     if control is None:
         control = (
             watchdog.control
             if watchdog is not None
             else commands.control
             if commands is not None
-            else Control()
+            else RobotControl()
         )
     if watchdog is not None:
         watchdog.share(control)
@@ -474,7 +474,7 @@ class _Run:
 
     robot: Robot
     agent: Agent
-    control: Control
+    control: RobotControl
     guard: Guard
     watchdog: Watchdog | None
     recorder: Recorder | None

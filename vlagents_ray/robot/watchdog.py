@@ -7,7 +7,7 @@ import threading
 import time
 from collections.abc import Callable, Mapping
 
-from vlagents_ray.chunking.control import Control
+from vlagents_ray.chunking.control import RobotControl
 from vlagents_ray.errors import ConfigError
 
 
@@ -37,7 +37,7 @@ class Watchdog:
                 raise ConfigError(f"watchdog: got {limit_s} s for {name!r}, want above 0")
         self.barks: list[str] = []  # the reasons given to `stop`
         self.error: Exception | None = None
-        self.control = Control()
+        self.control = RobotControl()
         """The state of the robot, which `run_loop` lets it share with a chunk player."""
         self._stop = stop
         self._limits = dict(silent_s)
@@ -67,7 +67,7 @@ class Watchdog:
                 self.control.heard(name)
                 self._changed.notify_all()
 
-    def share(self, control: Control) -> None:
+    def share(self, control: RobotControl) -> None:
         """Use the state of a chunk player, to which earlier stops are moved."""
         with self._changed:
             if control is not self.control:

@@ -1,10 +1,10 @@
 """Requests in flight: the message that contained them, and each request from the endpoint to its
 answer.
 
-An endpoint creates a `Message` when the last byte has arrived, decodes it, and passes its requests
-to a `Sender`, which creates a `PendingRequest` for each. The engine finishes each of these once;
-when the last one is finished, the endpoint writes all answers of the message. The decoded `Request`
-is not modified on the way: the server's decisions are in the `PendingRequest`. Only the
+An endpoint creates an `IncomingMessage` when the last byte has arrived, decodes it, and passes its
+requests to a `Sender`, which creates a `PendingRequest` for each. The engine finishes each of these
+once; when the last one is finished, the endpoint writes all answers of the message. The decoded
+`Request` is not modified on the way: the server's decisions are in the `PendingRequest`. Only the
 observations are removed after use, since their memory may belong to the sender.
 
 Requests arrive on the thread that reads the connections (the policy's own, or a reader while a
@@ -38,7 +38,7 @@ if TYPE_CHECKING:
     from vlagents_ray.serve.engine.metrics_buffer import MetricsBuffer
 
 T = TypeVar("T")
-Answered = Callable[["Message"], None]
+Answered = Callable[["IncomingMessage"], None]
 
 logger = logging.getLogger(__name__)
 
@@ -200,7 +200,7 @@ class PendingRequest:
         return self.over or self.origin.ended
 
 
-class Message:
+class IncomingMessage:
     """The requests of one message, from the arrival of its last byte until their answers are
     written.
 

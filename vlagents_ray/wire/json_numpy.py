@@ -14,13 +14,13 @@ import numpy as np
 
 from vlagents_ray.errors import InvalidInput, MalformedMessage, MessageTooLarge, shown
 from vlagents_ray.protocol.frame_layout import read_array
-from vlagents_ray.protocol.messages import Limits
+from vlagents_ray.protocol.messages import MessageLimits
 from vlagents_ray.protocol.values import require_plain
 
 _KEYS = {"__numpy__", "dtype", "shape"}
 
 
-def loads(text: str | bytes, limits: Limits, levels: int = 0) -> Any:
+def loads(text: str | bytes, limits: MessageLimits, levels: int = 0) -> Any:
     """Return the value of a document, nested up to `levels` deeper than the limit; arrays are
     read-only.
     """

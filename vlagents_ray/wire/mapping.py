@@ -45,7 +45,7 @@ from vlagents_ray.errors import (
     shown,
 )
 from vlagents_ray.interface import Obs
-from vlagents_ray.protocol.messages import DEFAULT_LIMITS, Limits
+from vlagents_ray.protocol.messages import DEFAULT_LIMITS, MessageLimits
 from vlagents_ray.protocol.values import as_camera, as_state, is_number
 
 logger = logging.getLogger(__name__)
@@ -253,7 +253,7 @@ def pick(
 # Conversion of values in another system's observation to ours.
 
 
-def read_image(key: str, value: Any, layout: str, limits: Limits) -> np.ndarray:
+def read_image(key: str, value: Any, layout: str, limits: MessageLimits) -> np.ndarray:
     """Return an image as (H, W, 3) uint8 RGB; raise `InvalidObservation` or `MessageTooLarge`."""
     if isinstance(value, np.ndarray):
         value = _newest(key, value, 3)
@@ -289,7 +289,7 @@ def may_be_state(value: Any) -> bool:
 
 
 def read_state(
-    flat: Mapping[str, Any], name: str, sources: tuple[StateKey, ...], limits: Limits
+    flat: Mapping[str, Any], name: str, sources: tuple[StateKey, ...], limits: MessageLimits
 ) -> dict[str, np.ndarray]:
     """Return the state `name`, its parts concatenated, (D,) float32; several states if the name
     ends with `*`.
@@ -310,7 +310,7 @@ def read_state(
     }
 
 
-def read_vector(key: str, value: Any, limits: Limits) -> np.ndarray:
+def read_vector(key: str, value: Any, limits: MessageLimits) -> np.ndarray:
     if isinstance(value, np.ndarray):
         value = np.atleast_1d(_newest(key, value, 1))
     elif isinstance(value, np.number):
@@ -335,7 +335,7 @@ def _newest(key: str, value: np.ndarray, ndim: int) -> np.ndarray:
 
 
 def read_text(
-    key: str, value: Any, texts: Mapping[str, str], limits: Limits, *, needed: bool
+    key: str, value: Any, texts: Mapping[str, str], limits: MessageLimits, *, needed: bool
 ) -> str | None:
     """Return an instruction: a text, a list or array of one text, or the one of `texts` for an
     array of one integer.
@@ -417,7 +417,7 @@ class KeyMapping:
     def obs(
         self,
         flat: Mapping[str, Any],
-        limits: Limits = DEFAULT_LIMITS,
+        limits: MessageLimits = DEFAULT_LIMITS,
         contract: Contract | None = None,
     ) -> tuple[Obs, str | None]:
         """Convert a client's observation.
@@ -461,7 +461,7 @@ class KeyMapping:
     def read_instruction(
         self,
         flat: Mapping[str, Any],
-        limits: Limits = DEFAULT_LIMITS,
+        limits: MessageLimits = DEFAULT_LIMITS,
         contract: Contract | None = None,
     ) -> str | None:
         """Return the instruction of a client's observation, or None without one; raises
@@ -601,7 +601,9 @@ class KeyMapping:
                     f"mapping.{kind}, or to mapping.info if the policy does without"
                 )
 
-    def _opening(self, flat: Mapping[str, Any], limits: Limits, *, needed: bool) -> float | None:
+    def _opening(
+        self, flat: Mapping[str, Any], limits: MessageLimits, *, needed: bool
+    ) -> float | None:
         """Return the gripper's opening in [0, 1], 1 = open; None if it is missing, or invalid
         and not `needed`.
         """

@@ -25,7 +25,7 @@ from rpyc_client import call, document
 
 from vlagents_ray.errors import InvalidInput, MalformedMessage, MessageTooLarge, VLAgentsError
 from vlagents_ray.images.jpeg_png import encode_jpeg, encode_png
-from vlagents_ray.protocol.messages import DEFAULT_LIMITS, Budget, Limits
+from vlagents_ray.protocol.messages import DEFAULT_LIMITS, Budget, MessageLimits
 from vlagents_ray_dialects.messages import gr00t, rpyc, vlagents
 from vlagents_ray_dialects.messages import openpi as openpi_codec
 from vlagents_ray_dialects.messages import openvla as openvla_codec
@@ -39,7 +39,7 @@ OBS = {
     "prompt": "lift",
     "nested": {"a": [1, 2.5, None, True]},
 }
-SMALL = Limits(body_bytes=20_000, pixels=64 * 64, items=200, depth=4)
+SMALL = MessageLimits(body_bytes=20_000, pixels=64 * 64, items=200, depth=4)
 
 arrays = hnp.arrays(
     dtype=st.sampled_from([np.dtype(t) for t in ("?", "u1", "i2", "i8", "f2", "f4", "f8")]),
@@ -71,15 +71,15 @@ def as_openvla(value: Any) -> bytes:
     return json.dumps(value, default=node).encode()
 
 
-def from_vla_eval(data: bytes, limits: Limits = DEFAULT_LIMITS) -> dict[str, Any]:
+def from_vla_eval(data: bytes, limits: MessageLimits = DEFAULT_LIMITS) -> dict[str, Any]:
     return vla_eval_codec.decode_images(vla_eval_codec.decode(data, limits).payload, Budget(limits))
 
 
 def as_vla_eval(value: Any) -> bytes:
-    return vla_eval_codec.encode(vla_eval_codec.Message("observation", value, 3))
+    return vla_eval_codec.encode(vla_eval_codec.VlaEvalMessage("observation", value, 3))
 
 
-DECODERS: dict[str, tuple[Callable[[Any], bytes], Callable[[bytes, Limits], Any]]] = {
+DECODERS: dict[str, tuple[Callable[[Any], bytes], Callable[[bytes, MessageLimits], Any]]] = {
     "openpi": (openpi_codec.encode, openpi_codec.decode),
     "openvla": (as_openvla, lambda data, limits: openvla_codec.decode(data, limits)[0]),
     "vla_eval": (as_vla_eval, lambda data, limits: vla_eval_codec.decode(data, limits).payload),
@@ -106,10 +106,10 @@ def require_equal(a: Any, b: Any) -> None:
 @given(value=messages)
 def test_a_message_comes_back_as_it_was(dialect: str, value: dict[str, Any]) -> None:
     encode, decode = DECODERS[dialect]
-    require_equal(value, decode(encode(value), Limits()))
+    require_equal(value, decode(encode(value), MessageLimits()))
 
 
-def read_gr00t(data: bytes, limits: Limits) -> gr00t.Observations:
+def read_gr00t(data: bytes, limits: MessageLimits) -> gr00t.Observations:
     return gr00t.read_observations(gr00t.read_request(data, limits).data)
 
 
@@ -122,13 +122,13 @@ def as_gr00t(encode: Callable[[Any], Any]) -> bytes:
     return msgpack.packb({"endpoint": "get_action", "data": {"observation": seen}}, default=encode)
 
 
-def read_vlagents(data: bytes, limits: Limits) -> vlagents.ObservationRequest:
+def read_vlagents(data: bytes, limits: MessageLimits) -> vlagents.ObservationRequest:
     return vlagents.read_act(
         data.decode(errors="replace"), Budget(limits), SharedMemory(same_machine=False)
     )
 
 
-MESSAGES: dict[str, tuple[bytes, Callable[[bytes, Limits], Any]]] = {
+MESSAGES: dict[str, tuple[bytes, Callable[[bytes, MessageLimits], Any]]] = {
     **{name: (encode(OBS), decode) for name, (encode, decode) in DECODERS.items()},
     "gr00t": (as_gr00t(gr00t_client.encode), read_gr00t),
     "gr00t, packed": (as_gr00t(gr00t_client.encode_packed), read_gr00t),
@@ -165,10 +165,10 @@ def test_garbage_is_refused_by_name(message: str, data: bytes) -> None:
 @any_message
 def test_every_truncation_is_malformed(message: str) -> None:
     data, decode = MESSAGES[message]
-    decode(data, Limits())
+    decode(data, MessageLimits())
     for end in range(len(data)):
         with pytest.raises(MalformedMessage):
-            decode(data[:end], Limits())
+            decode(data[:end], MessageLimits())
 
 
 @any_message
@@ -309,7 +309,7 @@ def test_vla_evals_images_may_be_files() -> None:
         with pytest.raises(MalformedMessage):
             from_vla_eval(as_vla_eval({"a": wrong}))
     with pytest.raises(MessageTooLarge):
-        from_vla_eval(as_vla_eval({"a": png}), Limits(pixels=20))
+        from_vla_eval(as_vla_eval({"a": png}), MessageLimits(pixels=20))
     with pytest.raises(MessageTooLarge):
         vla_eval_codec.decode(as_vla_eval({"a": [png] * 17}))
 

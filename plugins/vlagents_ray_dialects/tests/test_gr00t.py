@@ -28,7 +28,7 @@ from in_process_replicas import Replicas
 from many import many
 
 from vlagents_ray.errors import InvalidObservation, MalformedMessage, MessageTooLarge, VLAgentsError
-from vlagents_ray.protocol.messages import Limits
+from vlagents_ray.protocol.messages import MessageLimits
 from vlagents_ray.serve.access import api_keys
 from vlagents_ray.serve.access.api_keys import NoKey
 from vlagents_ray.serve.dialects.base import GatewayContext
@@ -36,7 +36,7 @@ from vlagents_ray.serve.ports import free_port, reserve
 from vlagents_ray_dialects.gr00t import GR00TDialect
 from vlagents_ray_dialects.messages import gr00t as gr00t_codec
 
-LIMITS = Limits()
+LIMITS = MessageLimits()
 
 
 def said(
@@ -182,7 +182,7 @@ def test_too_many_values_and_too_deep_ones_are_refused() -> None:
     with pytest.raises(MalformedMessage):
         gr00t_codec.read_request(b"\x91" * 100_000, LIMITS)
     with pytest.raises(MessageTooLarge):
-        gr00t_codec.read_request(bytes(2000), Limits(body_bytes=1024))
+        gr00t_codec.read_request(bytes(2000), MessageLimits(body_bytes=1024))
 
 
 def test_a_header_made_to_be_searched_for_long_is_refused_at_once() -> None:
@@ -566,7 +566,7 @@ def test_a_dialect_that_ends_answers_every_request(replicas: Replicas) -> None:
     context = GatewayContext(
         "noop",
         lambda _key, rank: replicas.agent(rank=rank or "robot", timeout_s=20.0),
-        Limits(),
+        MessageLimits(),
         8,
         30.0,
         None,

@@ -27,7 +27,7 @@ from lerobot_messages import FEATURES, HELPERS, TimedObservation, pickled, robot
 from many import many
 
 from vlagents_ray.errors import InvalidInput, MalformedMessage, MessageTooLarge
-from vlagents_ray.protocol.messages import Budget, Limits
+from vlagents_ray.protocol.messages import Budget, MessageLimits
 from vlagents_ray.serve.config.dialects import read_mapping
 from vlagents_ray_dialects.messages import lerobot
 
@@ -128,7 +128,7 @@ def _places(data: bytes) -> list[int]:
     return [at for _, _, at in pickletools.genops(data) if at is not None]
 
 
-LIMITS = Limits(body_bytes=2**20)
+LIMITS = MessageLimits(body_bytes=2**20)
 MUTATED = int(os.environ.get("VLAGENTS_RAY_FUZZ", many(5000)))
 GROWTH = 64 * 2**20  # bytes, whatever the number of pickles
 
@@ -181,7 +181,7 @@ OBSERVATIONS = {
 IMAGE = np.arange(12, dtype=np.uint8).reshape(2, 2, 3)
 
 
-def read(data: bytes, limits: Limits = LIMITS) -> lerobot.RobotObservation:
+def read(data: bytes, limits: MessageLimits = LIMITS) -> lerobot.RobotObservation:
     return lerobot.read_observation(data, Budget(limits))
 
 

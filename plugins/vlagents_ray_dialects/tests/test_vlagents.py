@@ -36,14 +36,14 @@ from vlagents_ray.errors import (
 )
 from vlagents_ray.images.jpeg_png import encode_jpeg
 from vlagents_ray.interface import GOAL_IMAGE, Act
-from vlagents_ray.protocol.messages import Budget, Limits
+from vlagents_ray.protocol.messages import Budget, MessageLimits
 from vlagents_ray.serve.ports import reserve
 from vlagents_ray.wire import json_numpy
 from vlagents_ray_dialects.messages import rpyc, vlagents
 from vlagents_ray_dialects.messages.rpyc import Handler
 from vlagents_ray_dialects.vlagents import SharedMemory
 
-LIMITS = Limits()
+LIMITS = MessageLimits()
 
 
 JPEG = encode_jpeg(np.full((32, 24, 3), 200, np.uint8))
@@ -62,7 +62,7 @@ class Memory:
 
 
 def act(
-    value: object, memory: Memory | None = None, limits: Limits = LIMITS
+    value: object, memory: Memory | None = None, limits: MessageLimits = LIMITS
 ) -> vlagents.ObservationRequest:
     text = value if isinstance(value, str) else json_numpy.dumps(value)
     return vlagents.read_act(text, Budget(limits), memory or Memory())

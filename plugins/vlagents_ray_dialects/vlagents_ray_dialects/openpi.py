@@ -40,7 +40,7 @@ from vlagents_ray.serve.dialects import base
 from vlagents_ray.serve.endpoints.http_messages import public_problem
 from vlagents_ray.serve.engine.admission import MessageAdmission
 from vlagents_ray.serve.engine.sender import REFUSED, Sender
-from vlagents_ray.serve.requests import Message
+from vlagents_ray.serve.requests import IncomingMessage
 from vlagents_ray_dialects.messages import openpi
 
 
@@ -248,7 +248,7 @@ class MapConnection:
             session.episode.end()
 
     async def answer(
-        self, message: dict[str, Any], incoming: Message, request_id: str, gate: Sender
+        self, message: dict[str, Any], incoming: IncomingMessage, request_id: str, gate: Sender
     ) -> bytes | str:
         """Return the reply to one message; `gate` counts the observations of a batch after the
         first for the key.

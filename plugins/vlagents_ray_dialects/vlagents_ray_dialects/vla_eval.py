@@ -108,7 +108,7 @@ class VlaEvalDialect(base.RouteDialect):
 
     async def _answer(
         self, received: _Received, session: base.ImplicitSession, chunk: ChunkBuffer
-    ) -> vla_eval.Message | None:
+    ) -> vla_eval.VlaEvalMessage | None:
         message = received.message
         if isinstance(message, VLAgentsError):
             return _error(message, 0, uuid.uuid4().hex)
@@ -122,7 +122,7 @@ class VlaEvalDialect(base.RouteDialect):
             return None  # the client reports an error
         return await self._act(message, received.admission, session, chunk)
 
-    def _hello(self, message: vla_eval.Message) -> vla_eval.Message:
+    def _hello(self, message: vla_eval.VlaEvalMessage) -> vla_eval.VlaEvalMessage:
         version = message.payload.get("protocol_version")
         if type(version) is not int or version != vla_eval.PROTOCOL_VERSION:
             error = MalformedMessage(
@@ -138,15 +138,15 @@ class VlaEvalDialect(base.RouteDialect):
         }
         if self.config.observation_params:
             payload["observation_params"] = self.config.observation_params
-        return vla_eval.Message("hello", payload, message.seq)
+        return vla_eval.VlaEvalMessage("hello", payload, message.seq)
 
     async def _act(
         self,
-        message: vla_eval.Message,
+        message: vla_eval.VlaEvalMessage,
         admission: MessageAdmission,
         session: base.ImplicitSession,
         chunk: ChunkBuffer,
-    ) -> vla_eval.Message:
+    ) -> vla_eval.VlaEvalMessage:
         incoming = self.arrived()
         request_id = uuid.uuid4().hex
         try:
@@ -164,7 +164,7 @@ class VlaEvalDialect(base.RouteDialect):
                 reply = await session.act(incoming, obs, instruction, request_id)
                 rows = incoming.written(lambda: self.rows(reply))
                 chunk.replace(rows[: self.config.execute])
-            return vla_eval.Message("action", {"actions": chunk.take().action}, message.seq)
+            return vla_eval.VlaEvalMessage("action", {"actions": chunk.take().action}, message.seq)
         except Exception as error:  # noqa: BLE001 - the error is the reply to the client
             problem = public_problem(error, self.name, request_id)
             incoming.record_failure(problem.code)
@@ -177,12 +177,14 @@ class VlaEvalDialect(base.RouteDialect):
 class _Received:
     """A received message, whose images are not decoded yet, or the error of a refused message."""
 
-    message: vla_eval.Message | VLAgentsError
+    message: vla_eval.VlaEvalMessage | VLAgentsError
     admission: MessageAdmission
 
     @property
     def is_observation(self) -> bool:
-        return isinstance(self.message, vla_eval.Message) and self.message.kind == "observation"
+        return (
+            isinstance(self.message, vla_eval.VlaEvalMessage) and self.message.kind == "observation"
+        )
 
 
 class _Inbox:
@@ -246,7 +248,7 @@ class _Inbox:
         self._there.set()
 
 
-def _error(error: VLAgentsError, seq: int, request_id: str) -> vla_eval.Message:
-    return vla_eval.Message(
+def _error(error: VLAgentsError, seq: int, request_id: str) -> vla_eval.VlaEvalMessage:
+    return vla_eval.VlaEvalMessage(
         "error", {"error": f"{error} (request {request_id})", "code": error.code}, seq
     )

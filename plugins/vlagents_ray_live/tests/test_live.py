@@ -159,19 +159,19 @@ LARGE = 2**20  # bytes of one part of a message; a server accepts up to 64 MiB
 BUDGET = 2**21  # of each kind of what is kept
 SLACK = 2**20  # bytes of everything besides
 
-Message = tuple[Obs, Reply]
+ObsAndReply = tuple[Obs, Reply]
 
 
 def acted(**info: Any) -> Reply:
     return Reply(act=Act(np.zeros((2, 7), np.float32), info=info))
 
 
-def small_image_of_a_large_message() -> Message:
+def small_image_of_a_large_message() -> ObsAndReply:
     pixels = np.frombuffer(bytes(LARGE), np.uint8)
     return Obs({"front": pixels[:192].reshape(8, 8, 3)}), acted()
 
 
-MESSAGES: dict[str, Callable[[], Message]] = {
+MESSAGES: dict[str, Callable[[], ObsAndReply]] = {
     "a text in info": lambda: (Obs(info={"note": "x" * LARGE}), acted()),
     "a large state": lambda: (Obs(state={"joints": np.zeros(LARGE // 4, np.float32)}), acted()),
     "many parts of a state": lambda: (
@@ -215,7 +215,7 @@ def budgets(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def send(
-    watched: LiveObserver, session: str, message: Message, files: DecodedFiles | None = None
+    watched: LiveObserver, session: str, message: ObsAndReply, files: DecodedFiles | None = None
 ) -> None:
     obs, reply = message
     observe(watched, session, Request("act", obs), reply, files)

@@ -42,7 +42,7 @@ from vlagents_ray.datasets.episode import (
     video_feature,
     without_slash,
 )
-from vlagents_ray.datasets.writer import UNFINISHED, Dataset
+from vlagents_ray.datasets.writer import UNFINISHED_FOLDER, Dataset
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.evaluate.artifacts.recorder import DEFAULT_FPS, Trajectory, videos_of
 from vlagents_ray.evaluate.artifacts.storage import link_or_copy, require_there
@@ -122,7 +122,7 @@ def to_lerobot(
     with _new_folder(path) as root:
         dataset = Dataset(root, rates.pop(), durable=False)
         for demonstration in selection.demonstrations(recorded):
-            finished = _finished(demonstration, angles, root / UNFINISHED)
+            finished = _finished(demonstration, angles, root / UNFINISHED_FOLDER)
             features = dataset.info["features"]
             if dataset.episodes and finished.features != features:
                 differing = sorted(
@@ -138,7 +138,7 @@ def to_lerobot(
                 f"{results.out}: in none of the {len(recorded)} recorded episodes did the policy "
                 "act"
             )
-        shutil.rmtree(root / UNFINISHED, ignore_errors=True)
+        shutil.rmtree(root / UNFINISHED_FOLDER, ignore_errors=True)
         return dataset.episodes
 
 

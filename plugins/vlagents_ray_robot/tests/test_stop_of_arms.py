@@ -95,7 +95,7 @@ class FakeFollower:
 
 
 def robot_of(follower: FakeFollower) -> LeRobotRobot:
-    """Return the adapter of a fake arm, without LeRobot's registry."""
+    """Return the robot of a fake arm, without LeRobot's registry."""
     robot = LeRobotRobot.__new__(LeRobotRobot)
     robot._robot, robot._keys, robot._unit = follower, list(follower.action_features), "deg"
     robot._lock_buses()

@@ -28,7 +28,7 @@ from vlagents_ray import (
 from vlagents_ray.envs import make_env
 from vlagents_ray.errors import MissingDependency, MissingState
 from vlagents_ray.policies.noop import Noop, NoopConfig
-from vlagents_ray.robot import Guard, Limits, run_loop
+from vlagents_ray.robot import Guard, MotionLimits, run_loop
 from vlagents_ray.robot.leaders import TeleoperatedAgent
 from vlagents_ray.robot.simulated import EnvRobot
 from vlagents_ray_robot.teleoperation import AxesLeader, Keyboard, SpaceMouse
@@ -209,7 +209,7 @@ class Idle(Agent):
 FORWARDS, TICKS, STEP = 60, 100, 0.01
 REFUSALS = {
     "a bound": Guard(JOINTS, high=0.2),
-    "a bound of a file": Guard(JOINTS, limits=Limits(high=(0.2, 9.0, 9.0)), hz=200.0),
+    "a bound of a file": Guard(JOINTS, limits=MotionLimits(high=(0.2, 9.0, 9.0)), hz=200.0),
     "a measured pose": Guard(
         JOINTS, high=0.2, max_step=0.05, measure=lambda obs: obs.state["joints"]
     ),

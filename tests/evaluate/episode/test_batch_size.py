@@ -35,7 +35,7 @@ EXPLOSIONS: dict[str, Exception] = {  # by which simulators tell that they diver
     "numpy": FloatingPointError("overflow encountered in multiply"),
     "linear algebra": np.linalg.LinAlgError("Eigenvalues did not converge"),
     "SciPy": ValueError("array must not contain infs or NaNs"),
-    "adapter": EnvFailed("env step: the state of 'arm' is not finite"),
+    "environment's own check": EnvFailed("env step: the state of 'arm' is not finite"),
 }
 TROUBLES = ["refuses", "diverges", "reward", "raises", "answers badly", "wrong state", *EXPLOSIONS]
 _OTHERS = itertools.count(10)

@@ -16,7 +16,7 @@ from adapted_network import DIM, LAYERS, Small, base, merge, pairs, save
 from vlagents_ray import Obs
 from vlagents_ray.errors import ConfigError, UnknownCheckpoint, UnknownSession
 from vlagents_ray.interface import DISTRIBUTION, POLICY, SAMPLES, Act
-from vlagents_ray.policies.adapters import Adapter, Adapters, read_adapter
+from vlagents_ray.policies.adapters import LoraAdapter, LoraAdapters, read_adapter
 from vlagents_ray.serve.models.agent_copies import AgentCopies
 
 pytestmark = pytest.mark.torch
@@ -372,11 +372,11 @@ def test_values_are_scaled_before_they_are_rounded(tmp_path: Path) -> None:
         save(tmp_path / "tiny", tiny, lora_alpha=2e9),
         small["see"].weight.new_tensor(np.eye(DIM)),
     )
-    adapters, plain = Adapters(), small["see"](x)
+    adapters, plain = LoraAdapters(), small["see"](x)
     adapters.load(
         small,
         {"tiny": str(folder)},
-        lambda source: (Adapter(source, "a", "a"), folder),
+        lambda source: (LoraAdapter(source, "a", "a"), folder),
         lambda *_: None,
     )
     with adapters.rows([adapters.named("tiny").fingerprint] * DIM):

@@ -27,7 +27,7 @@ from websockets.sync.client import connect
 
 from vlagents_ray import Forbidden, Obs, RemoteAgent, TooManyRequests, Unauthorized
 from vlagents_ray.interface import Act, Agent
-from vlagents_ray.protocol.messages import PROTOCOL_VERSION, Limits
+from vlagents_ray.protocol.messages import PROTOCOL_VERSION, MessageLimits
 from vlagents_ray.serve.access import api_keys
 from vlagents_ray.serve.access.api_keys import Keys
 from vlagents_ray.serve.access.key_store import new_key, revoke
@@ -92,7 +92,7 @@ def endpoint(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Endpoint]:
     inside = build_http_app(
         engine,
         lambda: {"policy": "p", "version": "0", "protocol": PROTOCOL_VERSION},
-        Limits(body_bytes=2**24),
+        MessageLimits(body_bytes=2**24),
     )
     guard = AccessMiddleware(inside, Keys.from_file(file), "noop", slow_s=SLOW_S, idle_s=3600)
     with served(guard) as port:
@@ -164,7 +164,7 @@ def test_without_keys_pages_of_other_sites_are_refused(endpoint: Endpoint) -> No
         build_http_app(
             endpoint.engine,
             lambda: {"policy": "p", "version": "0", "protocol": PROTOCOL_VERSION},
-            Limits(),
+            MessageLimits(),
         ),
         None,
         "noop",
@@ -420,7 +420,7 @@ def test_a_websocket_that_stays_silent_or_sends_half_a_message_is_cut_off() -> N
     engine = Engine(Big())
     engine.start()
     with served(
-        AccessMiddleware(build_http_app(engine, dict, Limits()), None, "noop", idle_s=SLOW_S)
+        AccessMiddleware(build_http_app(engine, dict, MessageLimits()), None, "noop", idle_s=SLOW_S)
     ) as port:
         with socket.create_connection(("127.0.0.1", port), timeout=30) as half:
             half.sendall(

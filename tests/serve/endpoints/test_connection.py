@@ -11,7 +11,7 @@ from typing import Any, cast
 
 import pytest
 
-from vlagents_ray.protocol.messages import Limits
+from vlagents_ray.protocol.messages import MessageLimits
 from vlagents_ray.serve.access.api_keys import NoKey
 from vlagents_ray.serve.endpoints.connection import PolledServer
 
@@ -22,7 +22,7 @@ class Endpoint(PolledServer[Any]):
     def __init__(self) -> None:
         listener = socket.create_server(("127.0.0.1", 0))
         listener.settimeout(5)
-        super().__init__(cast(Any, None), Limits(), NoKey.OPEN, listener)
+        super().__init__(cast(Any, None), MessageLimits(), NoKey.OPEN, listener)
         self.clients: list[socket.socket] = []
         self.broken = False
 

@@ -17,7 +17,7 @@ from vlagents_ray.images.jpeg_png import encode_jpeg
 from vlagents_ray.interface import Act, Agent, Obs
 from vlagents_ray.policies.loading import report_progress, report_uncompiled
 from vlagents_ray.protocol.frames import CONTENT_TYPE, encode_requests
-from vlagents_ray.protocol.messages import Limits, Request
+from vlagents_ray.protocol.messages import MessageLimits, Request
 from vlagents_ray.serve.endpoints.access_middleware import AccessMiddleware
 from vlagents_ray.serve.endpoints.http import build_http_app
 from vlagents_ray.serve.engine.engine import Engine
@@ -25,7 +25,7 @@ from vlagents_ray.serve.engine.engine import Engine
 IMAGE = np.random.default_rng(0).integers(0, 255, (32, 48, 3), np.uint8)
 JPEG = encode_jpeg(IMAGE, quality=95)
 GOOD = {"gripper": 0.5, "state": {"joints": [0.1, 0.2]}}
-LIMITS = Limits(body_bytes=300_000, pixels=64 * 64)
+LIMITS = MessageLimits(body_bytes=300_000, pixels=64 * 64)
 
 
 class Mean(Agent):

@@ -23,7 +23,7 @@ from vlagents_ray.client.transports.websocket import Stream
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.interface import Act, Agent, Obs
 from vlagents_ray.protocol.frames import Decoded, decode_replies, decode_requests, encode_requests
-from vlagents_ray.protocol.messages import STREAM_BYTES, Budget, Limits, Reply, Request
+from vlagents_ray.protocol.messages import STREAM_BYTES, Budget, MessageLimits, Reply, Request
 from vlagents_ray.serve.access.api_keys import NoKey
 from vlagents_ray.serve.endpoints import websocket
 from vlagents_ray.serve.endpoints.websocket import WebSocketServer
@@ -45,7 +45,7 @@ class Echo(Agent):
 @pytest.fixture
 def endpoint() -> Iterator[WebSocketServer]:
     engine = Engine(Echo(), session_limit=3)
-    endpoint = WebSocketServer(engine, Limits(), "127.0.0.1", None, NoKey.OPEN)
+    endpoint = WebSocketServer(engine, MessageLimits(), "127.0.0.1", None, NoKey.OPEN)
     endpoint.open()
     engine.start()
     yield endpoint
@@ -137,7 +137,7 @@ def test_who_stays_after_a_wrong_message_is_cut_off(
     endpoint: WebSocketServer, floods: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(websocket, "_HANDSHAKE_S", 1e9 if floods else 0.2)
-    endpoint.limits = Limits(body_bytes=1_000_000)
+    endpoint.limits = MessageLimits(body_bytes=1_000_000)
     client = stream(endpoint)
     ask(client, "reset")
     # A message of a TB begins.
@@ -262,8 +262,10 @@ def test_an_endpoint_takes_a_free_port_of_those_it_may() -> None:
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
         with pytest.raises(ConfigError, match=str(port)):
-            WebSocketServer(engine, Limits(), "127.0.0.1", (port, port), NoKey.OPEN)
-        endpoint = WebSocketServer(engine, Limits(), "127.0.0.1", (port, port + 20), NoKey.OPEN)
+            WebSocketServer(engine, MessageLimits(), "127.0.0.1", (port, port), NoKey.OPEN)
+        endpoint = WebSocketServer(
+            engine, MessageLimits(), "127.0.0.1", (port, port + 20), NoKey.OPEN
+        )
         assert port < endpoint.address.port <= port + 20
         endpoint.close()
     engine.close()
@@ -271,7 +273,7 @@ def test_an_endpoint_takes_a_free_port_of_those_it_may() -> None:
 
 def test_a_replica_that_stops_closes_its_connections_with_a_code_and_a_reason() -> None:
     engine = Engine(Echo())
-    endpoint = WebSocketServer(engine, Limits(), "127.0.0.1", None, NoKey.OPEN)
+    endpoint = WebSocketServer(engine, MessageLimits(), "127.0.0.1", None, NoKey.OPEN)
     endpoint.open()
     engine.start()
     url = f"ws://127.0.0.1:{endpoint.address.port}{endpoint.address.path}"

@@ -37,7 +37,7 @@ from vlagents_ray.errors import (
 )
 from vlagents_ray.interface import Act, Agent, Obs
 from vlagents_ray.protocol.frames import read_error
-from vlagents_ray.protocol.messages import Limits
+from vlagents_ray.protocol.messages import MessageLimits
 from vlagents_ray.serve import weights as versions
 from vlagents_ray.serve.access import api_keys
 from vlagents_ray.serve.access.api_keys import Keys
@@ -109,7 +109,7 @@ def serving(monkeypatch: pytest.MonkeyPatch) -> Iterator[Serving]:
         engine = Engine(agent or Gain())
         engine.start()
         routes = weights_routes(Alone(engine), slow_s, open_to_network=insecure)
-        inside = build_http_app(engine, dict, Limits(), more=routes)
+        inside = build_http_app(engine, dict, MessageLimits(), more=routes)
         server = served(AccessMiddleware(inside, keys, "app"))
         opened.extend((server, engine))
         return SimpleNamespace(url=f"http://127.0.0.1:{server.__enter__()}", engine=engine)

@@ -28,7 +28,13 @@ from vlagents_ray.client.transports.websocket import Stream
 from vlagents_ray.errors import DeadlineExceeded
 from vlagents_ray.interface import Act, Agent, Obs
 from vlagents_ray.protocol.frames import decode_replies, encode_requests
-from vlagents_ray.protocol.messages import DEADLINE_HEADER, SESSION_HEADER, Limits, Reply, Request
+from vlagents_ray.protocol.messages import (
+    DEADLINE_HEADER,
+    SESSION_HEADER,
+    MessageLimits,
+    Reply,
+    Request,
+)
 from vlagents_ray.serve.access.api_keys import NoKey
 from vlagents_ray.serve.endpoints.access_middleware import AccessMiddleware
 from vlagents_ray.serve.endpoints.connection import STAMP_SPACE, enable_timestamps, time_in_socket_s
@@ -125,9 +131,9 @@ def test_an_act_that_lay_in_the_socket_until_its_deadline_is_not_executed(
     Gated.entered.clear()
     engine = Engine(Gated())
     endpoint = (
-        ShmServer(engine, Limits(), NoKey.OPEN)
+        ShmServer(engine, MessageLimits(), NoKey.OPEN)
         if transport == "shm"
-        else WebSocketServer(engine, Limits(), "127.0.0.1", None, NoKey.OPEN)
+        else WebSocketServer(engine, MessageLimits(), "127.0.0.1", None, NoKey.OPEN)
     )
     endpoint.open()
     engine.start()
@@ -224,7 +230,7 @@ def test_after_a_pause_an_http_request_is_refused_only_if_it_was_late(
     engine.pauses.stop()
     engine.pauses = PauseDetector(lambda: now)
     loops: queue.SimpleQueue[asyncio.AbstractEventLoop] = queue.SimpleQueue()
-    inside = build_http_app(engine, dict, Limits())
+    inside = build_http_app(engine, dict, MessageLimits())
 
     async def app(scope: Scope, receive: Receive, send: Send) -> None:
         loops.put(asyncio.get_running_loop())

@@ -19,7 +19,7 @@ from starlette.testclient import TestClient
 from vlagents_ray.images.codecs import JPEG
 from vlagents_ray.interface import Act, Agent, Obs
 from vlagents_ray.protocol.frames import CONTENT_TYPE, decode_replies, encode_requests
-from vlagents_ray.protocol.messages import Limits, Op, Request
+from vlagents_ray.protocol.messages import MessageLimits, Op, Request
 from vlagents_ray.serve.access.api_keys import NoKey
 from vlagents_ray.serve.endpoints.access_middleware import AccessMiddleware
 from vlagents_ray.serve.endpoints.http import build_http_app
@@ -56,7 +56,7 @@ def client(engine: Engine) -> Iterator[TestClient]:
     engine.start()
     engine.stats.enable()
     with TestClient(
-        AccessMiddleware(build_http_app(engine, dict, Limits()), None, "app")
+        AccessMiddleware(build_http_app(engine, dict, MessageLimits()), None, "app")
     ) as client:
         yield client
 

@@ -26,13 +26,13 @@ from vlagents_ray.errors import (
 from vlagents_ray.interface import Act, Agent, Obs
 from vlagents_ray.protocol import frames
 from vlagents_ray.protocol.frames import Decoded, decode_replies
-from vlagents_ray.protocol.messages import Limits, Reply, Request
+from vlagents_ray.protocol.messages import MessageLimits, Reply, Request
 from vlagents_ray.serve.access.api_keys import NoKey
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.engine.metrics_buffer import MetricsBuffer
 from vlagents_ray.serve.engine.observer import Observer
 from vlagents_ray.serve.engine.sender import Sender
-from vlagents_ray.serve.requests import Message, PendingRequest
+from vlagents_ray.serve.requests import IncomingMessage, PendingRequest
 
 
 class Gated(Agent):
@@ -242,10 +242,10 @@ def test_a_reset_whose_caller_is_gone_is_as_if_it_had_never_been(
 def test_too_many_replies_for_one_frame_are_errors_and_recorded(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(frames, "DEFAULT_LIMITS", Limits(body_bytes=2000))
+    monkeypatch.setattr(frames, "DEFAULT_LIMITS", MessageLimits(body_bytes=2000))
     stats = MetricsBuffer()
     stats.enable()
-    message = Message(stats, "test")
+    message = IncomingMessage(stats, "test")
     message.decoded_alike(2)
     message.replies = [
         Reply(act=Act(np.zeros(300, np.float32)), timing={"queue_ms": 1.0}) for _ in range(2)
@@ -300,7 +300,7 @@ def test_the_requests_of_a_message_are_seen_around_its_answer_without_those_that
     served.engine.observers.add(Noting(seen))
     sender = served.sender("a")
 
-    def sent(_: Message) -> None:
+    def sent(_: IncomingMessage) -> None:
         seen.append("sent")
 
     message = sender.message()

@@ -12,7 +12,7 @@ import pytest
 
 from vlagents_ray.errors import PolicyFailed
 from vlagents_ray.interface import Act, Obs
-from vlagents_ray.protocol.messages import Limits, Reply, Request
+from vlagents_ray.protocol.messages import MessageLimits, Reply, Request
 from vlagents_ray.serve.config.deployment import LimitArgs
 from vlagents_ray.serve.engine import responses
 from vlagents_ray.serve.engine.responses import (
@@ -105,7 +105,7 @@ def test_a_deployment_sets_the_limits_as_far_as_clients_read() -> None:
     assert LimitArgs(reply_bytes=2000).limits().reply_bytes == 2000
     assert LimitArgs(act_s=1, warm_up_s=2, load_s=3).call_limits() == CallLimits(1, 2, 3)
     with pytest.raises(ValueError, match="reply_bytes"):
-        LimitArgs(reply_bytes=Limits().body_bytes + 1)
+        LimitArgs(reply_bytes=MessageLimits().body_bytes + 1)
 
 
 def test_an_error_in_this_process_names_no_server() -> None:

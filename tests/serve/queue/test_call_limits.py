@@ -23,7 +23,7 @@ from starlette.testclient import TestClient
 
 from vlagents_ray.errors import InvalidObservation, OutcomeUnknown, PolicyFailed, PolicyUnavailable
 from vlagents_ray.interface import Act, Agent, Obs
-from vlagents_ray.protocol.messages import Limits, Reply, Request
+from vlagents_ray.protocol.messages import MessageLimits, Reply, Request
 from vlagents_ray.serve.access.api_keys import NoKey
 from vlagents_ray.serve.endpoints.http import build_http_app
 from vlagents_ray.serve.endpoints.shm import ShmServer
@@ -223,7 +223,7 @@ def test_health_answers_at_once_though_the_policys_own_check_hangs(
 ) -> None:
     monkeypatch.setattr("vlagents_ray.serve.endpoints.http._HEALTH_S", 0.05 if hangs else 30.0)
     monkeypatch.setattr(Hanging, "check_health", lambda self: self.over.wait(60) if hangs else None)
-    with TestClient(build_http_app(engine, dict, Limits())) as client:
+    with TestClient(build_http_app(engine, dict, MessageLimits())) as client:
         assert client.get("/healthz").status_code == (503 if hangs else 200)
         agent.over.set()
 
@@ -231,7 +231,7 @@ def test_health_answers_at_once_though_the_policys_own_check_hangs(
 def test_a_local_client_is_refused_though_the_thread_that_reads_its_requests_hangs(
     engine: Engine, clock: Clock
 ) -> None:
-    endpoint = ShmServer(engine, Limits(), NoKey.OPEN)
+    endpoint = ShmServer(engine, MessageLimits(), NoKey.OPEN)
     endpoint.open()
     waiting = client(endpoint)
     assert call(waiting, request("reset"), 60).error is None

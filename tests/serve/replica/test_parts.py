@@ -19,7 +19,7 @@ from starlette.routing import BaseRoute, Route
 from vlagents_ray import registry
 from vlagents_ray.errors import ConfigError, InvalidInput
 from vlagents_ray.policies.noop import Noop
-from vlagents_ray.protocol.messages import Limits
+from vlagents_ray.protocol.messages import MessageLimits
 from vlagents_ray.registry import RegistryEntry
 from vlagents_ray.serve.config.deployment import ServerArgs
 from vlagents_ray.serve.config.parts import PartArgs, PartConfig
@@ -331,7 +331,7 @@ def test_only_a_parts_own_route_is_a_page_without_a_key(
 ) -> None:
     monkeypatch.setattr(OfEverybody, "pages", {"page": path})
     parts = open_parts(args(OfEverybody={}), context)
-    app = build_http_app(Engine(Noop()), dict, Limits(), more=list(parts.routes()))
+    app = build_http_app(Engine(Noop()), dict, MessageLimits(), more=list(parts.routes()))
     if is_own:
         assert parts.pages(app.routes) == {path}
     else:

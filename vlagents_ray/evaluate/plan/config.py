@@ -260,7 +260,7 @@ class RobotConfig(_PlanModel):
     safe: Literal["auto", "hold", "zero"] = "auto"
     max_step: Annotated[float, Field(gt=0, le=1e6)] | None = None
     measure: str | None = None  # the part of the state that is the measured pose
-    limits: str | None = None  # a file of `Limits.read`, without the soft start
+    limits: str | None = None  # a file of `MotionLimits.read`, without the soft start
     # Play although the training's statistics do not fit the arm; the log shows it.
     accept_misfit: bool = False
     silent_s: Seconds = 2.0  # a server that is silent for longer ends the trial, which is repeated

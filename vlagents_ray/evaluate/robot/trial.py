@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from vlagents_ray.chunking.control import Control
+from vlagents_ray.chunking.control import RobotControl
 from vlagents_ray.chunking.player import ChunkPlayer, PlayerSettings
 from vlagents_ray.client.commands import Command, CommandInbox
 from vlagents_ray.errors import (
@@ -37,7 +37,7 @@ from vlagents_ray.naming import plain
 from vlagents_ray.robot import Guard, LoopReport, run_loop
 from vlagents_ray.robot.fit import Trained
 from vlagents_ray.robot.guard import measured_state
-from vlagents_ray.robot.limits import Limits
+from vlagents_ray.robot.limits import MotionLimits
 from vlagents_ray.robot.loop import fit_of, robot_watchdog
 from vlagents_ray.robot.record import Recorder
 from vlagents_ray.robot.wrapper import RobotWrapper
@@ -176,7 +176,7 @@ class _OperatorStop(CommandInbox):
         super().__init__()
         self._operator = operator
 
-    def obey(self, control: Control) -> list[Command]:
+    def obey(self, control: RobotControl) -> list[Command]:
         if self._operator.stops() and not control.stopped:
             control.stop(_STOPPED)
         return super().obey(control)
@@ -307,7 +307,7 @@ def rehearse(
     unused = EpisodeStats(EpisodeKey(cell.env, 0, 0, cell.fingerprint))
     with _player(cell, factory, unused, robot, operator) as (agent, player):
         player.initialize()
-        limits = None if settings.limits is None else Limits.read(settings.limits)
+        limits = None if settings.limits is None else MotionLimits.read(settings.limits)
         fit = fit_of(agent, robot, limits, accept=settings.accept_misfit)
         fit.require(obs, None)
         if fit.trained.action is not None:

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from vlagents_ray.errors import ConfigError
-from vlagents_ray.policies.adapters import DIGITS, FILES, Adapter, base_of
+from vlagents_ray.policies.adapters import DIGITS, FILES, LoraAdapter, base_of
 from vlagents_ray.policies.base.checkpoint_files import digest, revision
 from vlagents_ray.registry import require
 
@@ -95,7 +95,7 @@ def _holds(folder: Path, path: Path) -> bool:
 
 def find_adapter(
     source: str, checkpoint: str, base: Sequence[Path], digest_of_base: str
-) -> tuple[Adapter, Path]:
+) -> tuple[LoraAdapter, Path]:
     """Find a LoRA adapter.
 
     Args:
@@ -125,7 +125,7 @@ def find_adapter(
         )
     own = digest([folder])
     both = hashlib.sha256(f"{digest_of_base} {own}".encode()).hexdigest()
-    return Adapter(
+    return LoraAdapter(
         source, f"{own.partition(':')[0]}:{both}", both[:DIGITS], revision(folder)
     ), folder
 

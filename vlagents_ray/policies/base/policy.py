@@ -39,7 +39,7 @@ from vlagents_ray.interface import (
     Agent,
     Obs,
 )
-from vlagents_ray.policies.adapters import ADAPTER, DIGITS, Adapters
+from vlagents_ray.policies.adapters import ADAPTER, DIGITS, LoraAdapters
 from vlagents_ray.policies.base.accelerator import (
     free_memory,
     gpu_timer,
@@ -126,7 +126,7 @@ class ModelPolicy(Agent, abc.ABC):
         self.model: Any = None
         # `load` marks the model's cores with it.
         self.compilation = Compilation(self.config.compile)
-        self.adapters = Adapters()
+        self.adapters = LoraAdapters()
         self.report = LoadingReport(lambda _: None, COMPILED_SIZES)  # the server's, once loaded
         self.episode: PolicyEpisode | None = None
         if self.config.adapters and not self.adaptable:
@@ -337,7 +337,7 @@ class ModelPolicy(Agent, abc.ABC):
     def close(self) -> None:
         self.model, self.adapters, self.compilation = (
             None,
-            Adapters(),
+            LoraAdapters(),
             Compilation(self.config.compile),
         )
 

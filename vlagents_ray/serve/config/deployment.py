@@ -13,7 +13,7 @@ from vlagents_ray.bounds import MOST_BYTES, MOST_CPUS, MOST_ROWS, MOST_S, MOST_W
 from vlagents_ray.interface import Agent
 from vlagents_ray.policies.adapters import ADAPTER
 from vlagents_ray.policies.base.program import Program, loaded_code
-from vlagents_ray.protocol.messages import DEFAULT_LIMITS, Limits
+from vlagents_ray.protocol.messages import DEFAULT_LIMITS, MessageLimits
 from vlagents_ray.ray_tools.git_state import GitState, code_of
 from vlagents_ray.ray_tools.runtime_env import require_no_secrets
 from vlagents_ray.registry import target_of
@@ -285,9 +285,11 @@ class LimitArgs(_DeploymentModel):
         default=DEFAULT_LIMITS.text, ge=1, le=1_000_000, description="characters of an instruction"
     )
 
-    def limits(self) -> Limits:
+    def limits(self) -> MessageLimits:
         """Return the limits of the decoders."""
-        return Limits(**self.model_dump(include={field.name for field in fields(Limits)}))
+        return MessageLimits(
+            **self.model_dump(include={field.name for field in fields(MessageLimits)})
+        )
 
     def call_limits(self) -> CallLimits:
         """Return the time limits of the engine's calls."""

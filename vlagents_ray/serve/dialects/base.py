@@ -71,7 +71,7 @@ from vlagents_ray.protocol.messages import (
     DEFAULT_LIMITS,
     SESSION_HEADER,
     Budget,
-    Limits,
+    MessageLimits,
     Op,
     RankName,
     Reply,
@@ -98,7 +98,7 @@ from vlagents_ray.serve.engine.admission import Admission, MessageAdmission
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.engine.sender import Sender, settle
 from vlagents_ray.serve.ports import LOOPBACK
-from vlagents_ray.serve.requests import Message
+from vlagents_ray.serve.requests import IncomingMessage
 
 T = TypeVar("T")
 Stream = Callable[[WebSocket], Awaitable[None]]
@@ -125,7 +125,7 @@ class ReplicaContext:
 
     engine: Engine
     metadata: Callable[[], dict[str, Any]]
-    limits: Limits
+    limits: MessageLimits
 
     @property
     def contract(self) -> Contract | None:
@@ -139,7 +139,7 @@ class GatewayContext:
 
     app: str
     connect: Connect  # connects one client to the application
-    limits: Limits
+    limits: MessageLimits
     sessions: int  # maximum number of clients of one dialect
     idle_s: float  # time without a message after which a client's sessions end
     contract: Contract | None
@@ -279,9 +279,9 @@ class RouteDialect(Dialect):
             self.context.limits, 0 if data is None else len(data), self.config.rank
         )
 
-    def arrived(self) -> Message:
-        """Create the `Message` of an observation that has just arrived."""
-        return Message(self.context.engine.stats, self.name, "act", self.config.rank)
+    def arrived(self) -> IncomingMessage:
+        """Create the `IncomingMessage` of an observation that has just arrived."""
+        return IncomingMessage(self.context.engine.stats, self.name, "act", self.config.rank)
 
 
 class PortDialect(Dialect):
@@ -432,7 +432,7 @@ class ImplicitSession:
         self._engine, self._sender, self._rank, self._name = engine, sender, rank, name
 
     async def act(
-        self, message: Message, obs: Obs, instruction: str | None, request_id: str
+        self, message: IncomingMessage, obs: Obs, instruction: str | None, request_id: str
     ) -> Reply:
         """Return the policy's reply to an observation; see `act_together`."""
         (reply,) = await act_together(message, [SessionObs(self, obs, instruction)], request_id)
@@ -461,7 +461,7 @@ class SessionObs(NamedTuple):
 
 
 async def act_together(
-    message: Message, seen: Sequence[SessionObs], request_id: str
+    message: IncomingMessage, seen: Sequence[SessionObs], request_id: str
 ) -> list[Reply]:
     """Return the policy's reply to each observation in a client's message; their acts are queued
     together.
@@ -512,7 +512,7 @@ async def _reset(seen: Sequence[SessionObs], request_id: str) -> None:
 
 
 async def _ask(
-    message: Message,
+    message: IncomingMessage,
     op: Op,
     seen: Sequence[SessionObs],
     instructions: Sequence[str | None],

@@ -28,13 +28,13 @@ from typing import Any, BinaryIO, ClassVar, Generic, TypeVar
 
 from vlagents_ray.errors import VLAgentsError
 from vlagents_ray.protocol.frames import Decoded
-from vlagents_ray.protocol.messages import Budget, Limits
+from vlagents_ray.protocol.messages import Budget, MessageLimits
 from vlagents_ray.serve.access.api_keys import Caller, Identity, NoKey
 from vlagents_ray.serve.engine.admission import MessageAdmission, NeedsDecodingThread
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.engine.sender import Sender
 from vlagents_ray.serve.periodic import each_half_second
-from vlagents_ray.serve.requests import Message
+from vlagents_ray.serve.requests import IncomingMessage
 from vlagents_ray.serve.token_bucket import TokenBucket
 
 logger = logging.getLogger(__name__)
@@ -56,7 +56,7 @@ ANSWERS_S = 1.0  # maximum time for clients to receive their last answers when a
 _POLL_MS = 2
 LEAST_WAIT_S = 1e-3  # a shorter wait cannot be distinguished from the time to read a message
 
-Control = Sequence[tuple[int, int, bytes]]
+AncillaryData = Sequence[tuple[int, int, bytes]]
 # Returns the caller with that key; raises `Unauthorized` or `Forbidden`.
 Admit = Callable[[str | None], Caller]
 
@@ -71,7 +71,7 @@ class ReadBuffer(threading.local):
 
     def receive(
         self, connection: socket.socket, size: int, space: int = STAMP_SPACE
-    ) -> tuple[memoryview, Control]:
+    ) -> tuple[memoryview, AncillaryData]:
         """Read at most `size` bytes, and `space` bytes of control data, from a connection that is
         readable.
 
@@ -103,7 +103,7 @@ class PolledConnection(ABC):
         """Read from the connection, which is readable."""
 
     @abstractmethod
-    def _write(self, message: Message) -> None:
+    def _write(self, message: IncomingMessage) -> None:
         """Send and record the answers of a message, on the thread of the last one.
 
         An unexpected error ends this connection, and nothing else.
@@ -193,7 +193,7 @@ class PolledConnection(ABC):
 
     def _decode(
         self,
-        message: Message,
+        message: IncomingMessage,
         read: Callable[[Budget], Decoded],
         admission: MessageAdmission,
         submit: Callable[[Decoded], None],
@@ -213,7 +213,10 @@ class PolledConnection(ABC):
             submit(decoded)
 
     def _decoded(
-        self, message: Message, submit: Callable[[Decoded], None], result: Callable[[], Decoded]
+        self,
+        message: IncomingMessage,
+        submit: Callable[[Decoded], None],
+        result: Callable[[], Decoded],
     ) -> None:
         """Submit the requests that another thread has decoded; called on the polling thread."""
         try:
@@ -298,7 +301,7 @@ class PolledServer(ABC, Generic[C]):
     name: ClassVar[str]
 
     def __init__(
-        self, engine: Engine, limits: Limits, admit: Admit | NoKey, listener: socket.socket
+        self, engine: Engine, limits: MessageLimits, admit: Admit | NoKey, listener: socket.socket
     ) -> None:
         self.engine, self.limits, self.admit = engine, limits, admit
         self._clients: set[C] = set()
@@ -394,7 +397,7 @@ def enable_timestamps(connection: socket.socket) -> None:
         connection.setsockopt(socket.SOL_SOCKET, _TIMESTAMP, 1)
 
 
-def time_in_socket_s(control: Control) -> float:
+def time_in_socket_s(control: AncillaryData) -> float:
     """Return how long the message with this control data has waited, s; 0 if that is negligible
     or unknown.
     """

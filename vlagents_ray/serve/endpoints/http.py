@@ -36,7 +36,7 @@ from vlagents_ray.serve.endpoints import http_messages
 from vlagents_ray.serve.endpoints.docs_page import STYLE, docs_page
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.engine.sender import REFUSED, Sender
-from vlagents_ray.serve.requests import Message as Incoming
+from vlagents_ray.serve.requests import IncomingMessage
 
 _POLICY_VIOLATION, _TRY_AGAIN_LATER = 1008, 1013  # WebSocket close codes
 _HEALTH_S = 1.5  # `/healthz` replies within this time
@@ -46,7 +46,7 @@ _NO_PATH = "no such path; GET /docs lists what there is"
 def build_http_app(
     engine: Engine,
     metadata: Callable[[], dict[str, Any]],
-    limits: messages.Limits,
+    limits: messages.MessageLimits,
     machine_metadata: Callable[[str], Awaitable[dict[str, Any]]] | None = None,
     more: Sequence[BaseRoute] = (),
 ) -> Starlette:
@@ -86,7 +86,7 @@ def build_http_app(
 class _HttpEndpoint:
     engine: Engine
     metadata: Callable[[], dict[str, Any]]
-    limits: messages.Limits
+    limits: messages.MessageLimits
     machine_metadata: Callable[[str], Awaitable[dict[str, Any]]] | None
 
     async def health(self, http: HttpRequest) -> Response:
@@ -126,7 +126,7 @@ class _HttpEndpoint:
         """Return the handler of `POST /v1/<op>`."""
 
         async def handle(http: HttpRequest) -> Response:
-            incoming = Incoming(self.engine.stats, "http", op)
+            incoming = IncomingMessage(self.engine.stats, "http", op)
             name, headers = http_messages.request_id(http), http_messages.headers_of(http.scope)
             try:
                 session_id = http_messages.session_id(http)
@@ -210,7 +210,7 @@ class _HttpEndpoint:
         return incoming.frame()
 
 
-def _timed(http: HttpRequest, incoming: Incoming) -> HttpRequest:
+def _timed(http: HttpRequest, incoming: IncomingMessage) -> HttpRequest:
     """Return a request whose times start when its body has arrived, so that the upload counts as
     network time.
     """

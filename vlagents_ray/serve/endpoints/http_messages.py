@@ -43,7 +43,7 @@ from vlagents_ray.protocol.messages import (
     REQUEST_ID_HEADER,
     SESSION_HEADER,
     STEP_HEADER,
-    Limits,
+    MessageLimits,
     Op,
     Request,
     is_name,
@@ -101,7 +101,7 @@ async def read_requests(
 
 
 def _read_headers(
-    op: Op, requests: list[Request], headers: dict[str, str], name: str, limits: Limits
+    op: Op, requests: list[Request], headers: dict[str, str], name: str, limits: MessageLimits
 ) -> None:
     """Check the requests, and add the deadline, step and class in the headers to them."""
     stated = headers.get(REQUEST_ID_HEADER, "")

@@ -32,7 +32,7 @@ import ray
 from ray.exceptions import RayChannelError, RayChannelTimeoutError
 
 from vlagents_ray.errors import MalformedMessage, MessageTooLarge
-from vlagents_ray.protocol.messages import Limits, LocalAddress, PlasmaAddress
+from vlagents_ray.protocol.messages import LocalAddress, MessageLimits, PlasmaAddress
 from vlagents_ray.ray_tools import private
 from vlagents_ray.serve.access.api_keys import NoKey
 from vlagents_ray.serve.endpoints.connection import BACKLOG
@@ -98,7 +98,7 @@ class Channel:
 class Pool:
     """The channels of one replica, whose number is the largest number used at once; thread-safe."""
 
-    def __init__(self, limits: Limits) -> None:
+    def __init__(self, limits: MessageLimits) -> None:
         self._limits = limits
         self._lock = threading.Lock()
         self._free: list[Channel] = []
@@ -190,7 +190,7 @@ class PlasmaServer(UnixServer):
 
     name: ClassVar[str] = "plasma"
 
-    def __init__(self, engine: Engine, limits: Limits) -> None:
+    def __init__(self, engine: Engine, limits: MessageLimits) -> None:
         """Prepare the pool and the socket; `limits` are the limits of a frame."""
         self.pool = Pool(limits)
         super().__init__(

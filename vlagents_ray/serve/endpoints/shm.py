@@ -32,8 +32,8 @@ from vlagents_ray.protocol import shm_layout
 from vlagents_ray.protocol.frames import Decoded, decode_requests, encode_replies
 from vlagents_ray.protocol.messages import (
     OPS,
-    Limits,
     LocalAddress,
+    MessageLimits,
     Op,
     Reply,
     boot_id,
@@ -59,7 +59,7 @@ from vlagents_ray.serve.endpoints.connection import (
 from vlagents_ray.serve.engine.admission import Admission, MessageAdmission
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.engine.sender import REFUSALS, REFUSED, Sender
-from vlagents_ray.serve.requests import Message
+from vlagents_ray.serve.requests import IncomingMessage
 
 logger = logging.getLogger(__name__)
 
@@ -103,7 +103,7 @@ class UnixServer(PolledServer["UnixConnection"]):
         self,
         engine: Engine,
         admit: Admit | NoKey,
-        limits: Limits,
+        limits: MessageLimits,
         payload: Callable[[], Payload],
         ops: Sequence[Op] = OPS,
     ) -> None:
@@ -156,7 +156,7 @@ class UnixConnection(PolledConnection):
     def _read(self) -> None:
         if self._sender is not None and self._sender.rated and self._is_throttled():
             return
-        message = Message(self._engine.stats, self._name)
+        message = IncomingMessage(self._engine.stats, self._name)
         try:
             data, control = _read_buffer.receive(self._connection, _MESSAGE_BYTES, _CONTROL)
         except BlockingIOError:
@@ -204,7 +204,7 @@ class UnixConnection(PolledConnection):
     def _receive(
         self,
         sender: Sender,
-        message: Message,
+        message: IncomingMessage,
         waited_s: float,
         data: memoryview,
         descriptors: list[int],
@@ -232,7 +232,7 @@ class UnixConnection(PolledConnection):
     def _submit(
         self,
         sender: Sender,
-        message: Message,
+        message: IncomingMessage,
         admission: MessageAdmission,
         waited_s: float,
         decoded: Decoded,
@@ -278,7 +278,7 @@ class UnixConnection(PolledConnection):
             while self._connection.recv(1):
                 pass
 
-    def _write(self, message: Message) -> None:
+    def _write(self, message: IncomingMessage) -> None:
         try:
             self._send(*message.packed())
             message.record()
@@ -320,7 +320,7 @@ class ShmServer(UnixServer):
     name: ClassVar[str] = "shm"
 
     def __init__(
-        self, engine: Engine, limits: Limits, admit: Admit | NoKey, ops: Sequence[Op] = OPS
+        self, engine: Engine, limits: MessageLimits, admit: Admit | NoKey, ops: Sequence[Op] = OPS
     ) -> None:
         """Create the server and the address for the metadata; see `UnixServer`."""
         super().__init__(engine, admit, limits, partial(MemoryFiles, limits, engine.admission), ops)
@@ -340,7 +340,7 @@ class MemoryFiles:
     left.
     """
 
-    def __init__(self, limits: Limits, admission: Admission) -> None:
+    def __init__(self, limits: MessageLimits, admission: Admission) -> None:
         self._limits, self._admission = limits, admission
         self._files: dict[int, mmap.mmap] = {}
         # The array over each file, until it is garbage-collected.

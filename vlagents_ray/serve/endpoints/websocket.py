@@ -70,7 +70,7 @@ from vlagents_ray.serve.endpoints.connection import (
 from vlagents_ray.serve.engine.admission import ArrivingBytes, MessageAdmission, image_bytes
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.engine.sender import REFUSED, Sender
-from vlagents_ray.serve.requests import Message
+from vlagents_ray.serve.requests import IncomingMessage
 from vlagents_ray.serve.token_bucket import TokenBucket
 
 logger = logging.getLogger(__name__)
@@ -108,7 +108,7 @@ class WebSocketServer(PolledServer["WebSocketConnection"]):
     def __init__(
         self,
         engine: Engine,
-        limits: messages.Limits,
+        limits: messages.MessageLimits,
         host: str,
         ports: tuple[int, int] | None,
         admit: Admit | NoKey,
@@ -522,7 +522,7 @@ class WebSocketConnection(PolledConnection):
     def _submit(
         self,
         sender: Sender,
-        message: Message,
+        message: IncomingMessage,
         admission: MessageAdmission,
         size: int,
         arrived: float,
@@ -545,7 +545,7 @@ class WebSocketConnection(PolledConnection):
             waited_s=waited_s if waited_s > LEAST_WAIT_S else 0.0,
         )
 
-    def _answered(self, size: int, message: Message) -> None:
+    def _answered(self, size: int, message: IncomingMessage) -> None:
         with self._sending:
             self._unanswered -= 1
             self._unanswered_bytes -= size
@@ -555,7 +555,7 @@ class WebSocketConnection(PolledConnection):
             self._call_soon(partial(self._resume, BACKLOGGED))
         self._write(message)
 
-    def _write(self, message: Message) -> None:
+    def _write(self, message: IncomingMessage) -> None:
         try:
             self._send(message.frame())
         except Exception:

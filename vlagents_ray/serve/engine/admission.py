@@ -28,7 +28,7 @@ from typing import Any, TypeVar
 
 from vlagents_ray.errors import MessageTooLarge, Overloaded, PolicyUnavailable, VLAgentsError
 from vlagents_ray.images import thread_map
-from vlagents_ray.protocol.messages import Budget, Limits, Request
+from vlagents_ray.protocol.messages import Budget, MessageLimits, Request
 
 T = TypeVar("T")
 
@@ -254,7 +254,7 @@ class MessageAdmission(Budget):
     def __init__(
         self,
         admission: Admission,
-        limits: Limits,
+        limits: MessageLimits,
         admit: Callable[[object], bool] | None,
         size: int = 0,
         *,

@@ -11,10 +11,17 @@ from typing import TYPE_CHECKING, TypeVar
 
 from vlagents_ray.errors import DeadlineExceeded, OutcomeUnknown, TooManyRequests, VLAgentsError
 from vlagents_ray.protocol.frames import Decoded
-from vlagents_ray.protocol.messages import Limits, Reply
+from vlagents_ray.protocol.messages import MessageLimits, Reply
 from vlagents_ray.serve.access.api_keys import Caller, Identity, NoKey
 from vlagents_ray.serve.engine.admission import REQUEST_BYTES, MessageAdmission
-from vlagents_ray.serve.requests import RANKS, Answered, Message, Origin, PendingRequest, Rank
+from vlagents_ray.serve.requests import (
+    RANKS,
+    Answered,
+    IncomingMessage,
+    Origin,
+    PendingRequest,
+    Rank,
+)
 
 if TYPE_CHECKING:
     from vlagents_ray.serve.engine.engine import Engine
@@ -87,11 +94,13 @@ class Sender:
             transport, owner, self.session_id, self._caller, self._prefix, opened=engine.clock()
         )
 
-    def message(self, op: str = "unknown", rank: str = "robot") -> Message:
-        """Return a message that has just arrived from the sender, see `Message`."""
-        return Message(self._engine.stats, self._origin.transport, op, rank)
+    def message(self, op: str = "unknown", rank: str = "robot") -> IncomingMessage:
+        """Return a message that has just arrived from the sender, see `IncomingMessage`."""
+        return IncomingMessage(self._engine.stats, self._origin.transport, op, rank)
 
-    def admission(self, limits: Limits, size: int = 0, rank: str = "robot") -> MessageAdmission:
+    def admission(
+        self, limits: MessageLimits, size: int = 0, rank: str = "robot"
+    ) -> MessageAdmission:
         """Return the admission of a message of `size` bytes, which charges its requests to the
         key; see `counted`.
         """
@@ -160,7 +169,7 @@ class Sender:
 
     def send(
         self,
-        message: Message,
+        message: IncomingMessage,
         decoded: Decoded,
         then: Answered,
         *,
@@ -260,7 +269,7 @@ class Sender:
         then: Answered,
         admission: MessageAdmission | None,
         watched: Sequence[PendingRequest],
-        message: Message,
+        message: IncomingMessage,
     ) -> None:
         if self._engine.drain_list.ask(self.session_id):
             self._asked_to_reconnect = True
@@ -278,7 +287,7 @@ class Sender:
             observers.on_answer(pending, message.replies[pending.place])
 
     async def ask(
-        self, message: Message, decoded: Decoded, admission: MessageAdmission | None = None
+        self, message: IncomingMessage, decoded: Decoded, admission: MessageAdmission | None = None
     ) -> list[Reply]:
         """Submit the requests of a message, and wait for the replies until the requests' deadlines.
 
@@ -308,7 +317,7 @@ class Sender:
             if timer is not None:
                 timer.cancel()
 
-    def _expire(self, message: Message, sent: Sequence[PendingRequest]) -> None:
+    def _expire(self, message: IncomingMessage, sent: Sequence[PendingRequest]) -> None:
         """Answer the unanswered requests, whose deadlines have passed; withdraw those that have
         not begun.
         """

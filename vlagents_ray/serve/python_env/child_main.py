@@ -34,7 +34,7 @@ from vlagents_ray.errors import (
 from vlagents_ray.interface import Agent
 from vlagents_ray.policies.wrapper import build_agent, unloaded_contract
 from vlagents_ray.protocol.json_messages import problem
-from vlagents_ray.protocol.messages import INNER_OPS, Limits
+from vlagents_ray.protocol.messages import INNER_OPS, MessageLimits
 from vlagents_ray.serve.access.api_keys import NoKey
 from vlagents_ray.serve.endpoints.shm import ShmServer
 from vlagents_ray.serve.engine.engine import Engine
@@ -47,7 +47,7 @@ from vlagents_ray.weights.trainable import dtype_name
 
 # The replica checks requests, removes idle sessions and detects calls that take too long, so the
 # child does not.
-_NO_LIMITS = Limits(**dict.fromkeys([limit.name for limit in fields(Limits)], 2**40))
+_NO_LIMITS = MessageLimits(**dict.fromkeys([limit.name for limit in fields(MessageLimits)], 2**40))
 _NEVER_S = 1e6
 _CHECK_S = 1.0  # interval of the checks whether the accelerator still computes
 
@@ -110,7 +110,7 @@ def run() -> None:
             session_idle_s=_NEVER_S,
             version=settings.version,
             limits=CallLimits(load_s=_NEVER_S),
-            reply_bytes=Limits().body_bytes,  # the replica applies its own limit
+            reply_bytes=MessageLimits().body_bytes,  # the replica applies its own limit
             in_flight_bytes=_NO_LIMITS.in_flight_bytes,
         )
         server = ShmServer(engine, _NO_LIMITS, NoKey.INSIDE, INNER_OPS)

@@ -21,7 +21,7 @@ from vlagents_ray.client.transports.serve_handle import ClientApi
 from vlagents_ray.errors import PolicyFailed, PolicyUnavailable, VLAgentsError
 from vlagents_ray.policies.base.accelerator import GPU_SHARE, VISIBLE
 from vlagents_ray.protocol.frames import Decoded, decode_requests
-from vlagents_ray.protocol.messages import PROTOCOL_VERSION, SERVERS_MACHINE, Limits, boot_id
+from vlagents_ray.protocol.messages import PROTOCOL_VERSION, SERVERS_MACHINE, MessageLimits, boot_id
 from vlagents_ray.ray_tools.private import gpus_here, http_options, replica_is_ending
 from vlagents_ray.serve.access.api_keys import NoKey, require_access, warn_of_plain_http
 from vlagents_ray.serve.access.audit import write_audit
@@ -458,7 +458,7 @@ def hide_gpus(given: Sequence[str]) -> None:
     os.environ[VISIBLE] = ""
 
 
-async def answer_frame(engine: Engine, limits: Limits, session_id: str, frame: Any) -> bytes:
+async def answer_frame(engine: Engine, limits: MessageLimits, session_id: str, frame: Any) -> bytes:
     """Execute a frame of requests from inside the cluster, and return the frame of the replies."""
     sender = Sender(engine, "handle", session_id, caller=NoKey.INSIDE, connected=False)
     message, decoded = sender.message(), Decoded([], {})

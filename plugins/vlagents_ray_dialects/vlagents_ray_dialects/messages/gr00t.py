@@ -22,7 +22,7 @@ import numpy as np
 
 from vlagents_ray.errors import InvalidObservation, MalformedMessage, MessageTooLarge, shown
 from vlagents_ray.protocol.frame_layout import read_array
-from vlagents_ray.protocol.messages import DEFAULT_LIMITS, Limits
+from vlagents_ray.protocol.messages import DEFAULT_LIMITS, MessageLimits
 from vlagents_ray.registry import require
 from vlagents_ray.validation import described
 from vlagents_ray_dialects.messages import msgpack
@@ -57,7 +57,7 @@ class Observations:
 _TOKEN_BYTES = 4096  # maximum size of an API key, and of the names of the fields before it
 
 
-def read_token(payload: bytes | memoryview, limits: Limits) -> str | None:
+def read_token(payload: bytes | memoryview, limits: MessageLimits) -> str | None:
     """Return the API key in a message without decoding the other fields; None if it has none."""
     if len(payload) > limits.body_bytes:
         raise MessageTooLarge(
@@ -89,7 +89,7 @@ def read_token(payload: bytes | memoryview, limits: Limits) -> str | None:
     return None
 
 
-def read_request(payload: bytes | memoryview, limits: Limits) -> GR00TRequest:
+def read_request(payload: bytes | memoryview, limits: MessageLimits) -> GR00TRequest:
     """Return the request in a message; raise `MalformedMessage` or `MessageTooLarge` if it is
     invalid.
     """
@@ -312,7 +312,7 @@ _HEADER = re.compile(
 _TEXT_DTYPE = re.compile(r"<U\d{1,5}")
 
 
-def read_npy(data: Any, limits: Limits) -> Any:
+def read_npy(data: Any, limits: MessageLimits) -> Any:
     """Return the array in the bytes of an .npy file as a read-only view; an array of text as a
     list.
     """
@@ -341,7 +341,7 @@ def read_npy(data: Any, limits: Limits) -> Any:
     )
 
 
-def _array(node: dict[Any, Any], limits: Limits) -> Any:
+def _array(node: dict[Any, Any], limits: MessageLimits) -> Any:
     """Return the array that a map of either format stands for; any other map unchanged."""
     if "__ndarray_class__" in node:
         return read_npy(node.get("as_npy"), limits)
@@ -429,7 +429,7 @@ def write(endpoint: str, data: Any, api_token: str | None, *, packed: bool = Fal
     return pack(message | ({"api_token": api_token} if api_token else {}), packed=packed)
 
 
-def read(payload: bytes, limits: Limits = DEFAULT_LIMITS) -> Any:
+def read(payload: bytes, limits: MessageLimits = DEFAULT_LIMITS) -> Any:
     """Return the value of a reply; raise `MalformedMessage` or `MessageTooLarge` if it is
     invalid.
     """

@@ -26,7 +26,7 @@ from vlagents_ray.errors import (
     MissingState,
 )
 from vlagents_ray.protocol.frame_layout import Buffer
-from vlagents_ray.protocol.messages import Budget, Limits
+from vlagents_ray.protocol.messages import Budget, MessageLimits
 from vlagents_ray.protocol.values import is_number
 from vlagents_ray_dialects.messages.pickles import NUMPY_CALLS, Name, fields_of, read_pickle
 
@@ -66,7 +66,7 @@ class RobotObservation:
     must_go: bool  # whether the client has no actions left
 
 
-def read_instructions(data: Buffer, limits: Limits) -> PolicyInstructions:
+def read_instructions(data: Buffer, limits: MessageLimits) -> PolicyInstructions:
     """Return the policy instructions in a pickle; raises `InvalidObservation` for features that
     are not served.
     """
@@ -217,7 +217,7 @@ def _global(memo: int, module: str, name: str) -> bytes:
     return f"c{module}\n{name}\n".encode() + bytes([ord("q"), memo, ord("0")])
 
 
-def _pickled_fields(data: Buffer, limits: Limits, wanted: Name) -> dict[str, Any]:
+def _pickled_fields(data: Buffer, limits: MessageLimits, wanted: Name) -> dict[str, Any]:
     return fields_of(read_pickle(data, limits, _REQUESTS, NUMPY_CALLS), wanted)
 
 

@@ -13,14 +13,16 @@ import numpy as np
 
 from vlagents_ray.errors import InvalidInput, MalformedMessage, MessageTooLarge
 from vlagents_ray.protocol.frame_layout import read_array
-from vlagents_ray.protocol.messages import Limits
+from vlagents_ray.protocol.messages import MessageLimits
 from vlagents_ray.protocol.values import require_plain
 from vlagents_ray.registry import require
 
 Hook = Callable[[dict[Any, Any]], Any]
 
 
-def unpack(data: bytes | memoryview, limits: Limits, hook: Hook, text: int | None = None) -> Any:
+def unpack(
+    data: bytes | memoryview, limits: MessageLimits, hook: Hook, text: int | None = None
+) -> Any:
     """Read the value in `data`; the keys of maps that the hook returns must be text.
 
     Args:

@@ -12,12 +12,12 @@ import numpy as np
 
 from vlagents_ray.errors import MalformedMessage, MessageTooLarge, shown
 from vlagents_ray.protocol.frame_layout import plain_dtype, read_array
-from vlagents_ray.protocol.messages import DEFAULT_LIMITS, Limits
+from vlagents_ray.protocol.messages import DEFAULT_LIMITS, MessageLimits
 from vlagents_ray_dialects.messages.layouts import ALOHA_ACTION, ALOHA_STATE, libero_state
 from vlagents_ray_dialects.messages.msgpack import pack, unpack
 
 
-def decode(data: bytes, limits: Limits = DEFAULT_LIMITS) -> dict[str, Any]:
+def decode(data: bytes, limits: MessageLimits = DEFAULT_LIMITS) -> dict[str, Any]:
     """Return the map in a message; arrays are read-only views, and an array of text becomes a
     list.
     """
@@ -27,7 +27,7 @@ def decode(data: bytes, limits: Limits = DEFAULT_LIMITS) -> dict[str, Any]:
     return value
 
 
-def decode_any(data: bytes, limits: Limits = DEFAULT_LIMITS) -> Any:
+def decode_any(data: bytes, limits: MessageLimits = DEFAULT_LIMITS) -> Any:
     """Return the value in a message, which may be of any type; otherwise like `decode`."""
     return unpack(data, limits, lambda node: _array(node, limits.items))
 

@@ -14,12 +14,12 @@ from typing import Any
 import numpy as np
 
 from vlagents_ray.errors import MalformedMessage, MessageTooLarge
-from vlagents_ray.protocol.messages import DEFAULT_LIMITS, Limits
+from vlagents_ray.protocol.messages import DEFAULT_LIMITS, MessageLimits
 from vlagents_ray.wire import json_numpy
 from vlagents_ray_dialects.messages.layouts import ALOHA_ACTION, ALOHA_STATE, libero_state
 
 
-def decode(body: bytes, limits: Limits = DEFAULT_LIMITS) -> tuple[dict[str, Any], bool]:
+def decode(body: bytes, limits: MessageLimits = DEFAULT_LIMITS) -> tuple[dict[str, Any], bool]:
     """Return the observation in a request's body, and whether it was encoded twice."""
     if len(body) > limits.body_bytes:
         raise MessageTooLarge(f"body: got {len(body)} bytes, the limit is {limits.body_bytes}")
@@ -39,14 +39,14 @@ def encode(
     return (json.dumps(text) if twice else text).encode()
 
 
-def _load(text: bytes, limits: Limits) -> dict[str, Any]:
+def _load(text: bytes, limits: MessageLimits) -> dict[str, Any]:
     payload = json_numpy.loads(text, limits)
     if not isinstance(payload, dict):
         raise MalformedMessage(f"body: got {type(payload).__name__}, want an object")
     return payload
 
 
-def decode_action(body: bytes, limits: Limits = DEFAULT_LIMITS) -> np.ndarray | None:
+def decode_action(body: bytes, limits: MessageLimits = DEFAULT_LIMITS) -> np.ndarray | None:
     """Return the action in a reply, (D,) or (H, D); None if the reply is "error", the error of
     OpenVLA's own server.
     """

@@ -7,9 +7,9 @@ lists of its caller, whose entries represent the caller's own functions. An opco
 shape that is not listed is refused.
 
 The opcodes are those that Python's own pickler writes in protocol 4 and 5 for dicts, lists, tuples,
-texts, numbers, numpy's arrays and data classes. `Limits` bound the number of opcodes (`items`), the
-nesting (`depth`) and the texts. Bytes are not copied, so that arrays take no memory beyond that of
-the message.
+texts, numbers, numpy's arrays and data classes. `MessageLimits` bounds the number of opcodes
+(`items`), the nesting (`depth`) and the texts. Bytes are not copied, so that arrays take no memory
+beyond that of the message.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ import numpy as np
 
 from vlagents_ray.errors import MalformedMessage, MessageTooLarge, shown
 from vlagents_ray.protocol.frame_layout import Buffer, read_array
-from vlagents_ray.protocol.messages import Limits
+from vlagents_ray.protocol.messages import MessageLimits
 
 _PROTOCOLS = (4, 5)
 _INTEGER = 9  # largest number of bytes of an integer
@@ -67,7 +67,7 @@ class _StackValue(NamedTuple):
 
 def read_pickle(
     data: Buffer,
-    limits: Limits,
+    limits: MessageLimits,
     records: Mapping[Name, Sequence[str]],
     calls: Mapping[Name, Call | None],
 ) -> Any:
@@ -104,7 +104,7 @@ class _StackMachine:
     def __init__(
         self,
         data: Buffer,
-        limits: Limits,
+        limits: MessageLimits,
         records: Mapping[Name, Sequence[str]],
         calls: Mapping[Name, Call | None],
     ) -> None:

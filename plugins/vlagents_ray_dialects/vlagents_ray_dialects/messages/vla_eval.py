@@ -15,7 +15,7 @@ import numpy as np
 from vlagents_ray.errors import MalformedMessage, MessageTooLarge, shown
 from vlagents_ray.images.codecs import decode_files
 from vlagents_ray.protocol.frame_layout import read_array
-from vlagents_ray.protocol.messages import DEFAULT_LIMITS, Budget, Limits
+from vlagents_ray.protocol.messages import DEFAULT_LIMITS, Budget, MessageLimits
 from vlagents_ray_dialects.messages.msgpack import pack, unpack
 
 PROTOCOL_VERSION = 1
@@ -23,7 +23,7 @@ Kind = Literal["hello", "observation", "action", "episode_start", "episode_end",
 
 
 @dataclass(slots=True)
-class Message:
+class VlaEvalMessage:
     """One message, in either direction; a reply has the sequence number of its request."""
 
     kind: Kind
@@ -35,7 +35,7 @@ class _File(bytes):
     """A JPEG or PNG image that is not decoded yet."""
 
 
-def decode(data: bytes, limits: Limits = DEFAULT_LIMITS) -> Message:
+def decode(data: bytes, limits: MessageLimits = DEFAULT_LIMITS) -> VlaEvalMessage:
     """Return the message in `data`, with its JPEG and PNG images still encoded, see
     `decode_images`.
     """
@@ -62,7 +62,7 @@ def decode(data: bytes, limits: Limits = DEFAULT_LIMITS) -> Message:
         raise MalformedMessage(f"payload: got {type(payload).__name__}, want a map")
     if type(seq) is not int or not 0 <= seq < 2**63:
         raise MalformedMessage(f"seq: got {shown(seq)}, want a whole number")
-    return Message(kind, payload, seq)  # type: ignore[arg-type]  # the kind was checked above
+    return VlaEvalMessage(kind, payload, seq)  # type: ignore[arg-type]  # the kind was checked above
 
 
 def decode_images(payload: dict[str, Any], budget: Budget) -> dict[str, Any]:
@@ -95,7 +95,7 @@ def decode_images(payload: dict[str, Any], budget: Budget) -> dict[str, Any]:
     return {key: filled(item) for key, item in payload.items()}
 
 
-def encode(message: Message) -> bytes:
+def encode(message: VlaEvalMessage) -> bytes:
     fields = {
         "type": message.kind,
         "payload": message.payload,

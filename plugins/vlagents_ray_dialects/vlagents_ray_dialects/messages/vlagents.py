@@ -25,7 +25,7 @@ from vlagents_ray.errors import (
 from vlagents_ray.images.codecs import decode_files
 from vlagents_ray.interface import GOAL_IMAGE, Act, Obs
 from vlagents_ray.protocol.frame_layout import read_array
-from vlagents_ray.protocol.messages import DEFAULT_LIMITS, Budget, Limits
+from vlagents_ray.protocol.messages import DEFAULT_LIMITS, Budget, MessageLimits
 from vlagents_ray.protocol.values import is_number
 from vlagents_ray.wire import json_numpy
 from vlagents_ray_dialects.messages import rpyc
@@ -206,7 +206,7 @@ def _robot(robot: Mapping[str, Any], prefix: str, budget: Budget, segments: Segm
     return obs
 
 
-def _part(part: Any, name: str, limits: Limits) -> np.ndarray:
+def _part(part: Any, name: str, limits: MessageLimits) -> np.ndarray:
     if isinstance(part, list) and all(is_number(x) for x in part):
         part = np.asarray(part, np.float32)
     if not isinstance(part, np.ndarray) or part.dtype.kind not in "fiu":
@@ -267,7 +267,7 @@ def _shared(payload: Mapping[str, Any], budget: Budget, segments: Segments) -> n
     return read_array(memoryview(segments.read(name, size)), "|u1", shape)
 
 
-def _instruction(value: Any, limits: Limits) -> str | None:
+def _instruction(value: Any, limits: MessageLimits) -> str | None:
     if value is not None and not isinstance(value, str):
         raise MalformedMessage(f"instruction: got {type(value).__name__}, want text")
     if value is not None and len(value) > limits.text:
@@ -359,7 +359,7 @@ def write_observation(observation: Mapping[str, Any]) -> str:
     )
 
 
-def read_actions(text: str, limits: Limits = DEFAULT_LIMITS) -> dict[str, np.ndarray]:
+def read_actions(text: str, limits: MessageLimits = DEFAULT_LIMITS) -> dict[str, np.ndarray]:
     """Return the actions in the reply to `act` by robot, each (H, D); a gripper is the last
     column, 1 = open.
     """

@@ -17,7 +17,7 @@ from vlagents_ray.errors import (
     PolicyUnavailable,
     shown,
 )
-from vlagents_ray.protocol.messages import DEFAULT_LIMITS, Limits
+from vlagents_ray.protocol.messages import DEFAULT_LIMITS, MessageLimits
 from vlagents_ray.wire.mapping import matches
 from vlagents_ray_dialects.messages.outgoing import Outgoing
 
@@ -35,7 +35,7 @@ class ClientOptions:
     url: str
     timeout_s: float  # s; after this time the answer counts as lost
     key: str | None = field(default=None, repr=False)  # the upstream's API key
-    limits: Limits = DEFAULT_LIMITS
+    limits: MessageLimits = DEFAULT_LIMITS
 
 
 class UpstreamClient(abc.ABC):

@@ -316,7 +316,7 @@ class VlaEvalClient(WebSocketClient):
 
     def _send(self, kind: vla_eval.Kind, payload: dict[str, Any]) -> None:
         self._seq += 1
-        self.send(vla_eval.encode(vla_eval.Message(kind, payload, self._seq)))
+        self.send(vla_eval.encode(vla_eval.VlaEvalMessage(kind, payload, self._seq)))
 
     def _answer(self, kind: vla_eval.Kind, timeout_s: float) -> dict[str, Any]:
         """Return the payload of the answer to the last message; older answers are skipped."""

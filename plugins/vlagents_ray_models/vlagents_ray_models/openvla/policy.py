@@ -18,7 +18,7 @@ from pydantic import Field
 
 from vlagents_ray.contract import Contract
 from vlagents_ray.interface import Obs
-from vlagents_ray.policies.adapters import Adapters
+from vlagents_ray.policies.adapters import LoraAdapters
 from vlagents_ray.policies.base import Prediction, Row
 from vlagents_ray.policies.base.model_inputs import camera_images, choose_cameras
 from vlagents_ray.policies.base.staging import StagedRow
@@ -111,7 +111,7 @@ class TokenDecoder:
 
     base: prismatic.Prismatic
     longest: int  # the largest number of tokens of an answer
-    adapters: Adapters = field(default_factory=Adapters)  # of the policy
+    adapters: LoraAdapters = field(default_factory=LoraAdapters)  # of the policy
 
     def compile_with(self, compilation: Compilation) -> None:
         self.encode_images = compilation.core("vision encoder", self.encode_images)  # type: ignore[method-assign]

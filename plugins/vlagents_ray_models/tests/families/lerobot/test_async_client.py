@@ -16,7 +16,7 @@ from in_process_replicas import Replicas
 from plugins.vlagents_ray_models.tests.families.lerobot import robot_client
 from plugins.vlagents_ray_models.tests.families.lerobot.conftest import FILTERS, Load, Made, begun
 from vlagents_ray import Obs
-from vlagents_ray.protocol.messages import Limits
+from vlagents_ray.protocol.messages import MessageLimits
 from vlagents_ray.registry import dialect_class
 from vlagents_ray.serve.access.api_keys import NoKey
 from vlagents_ray.serve.dialects.base import GatewayContext
@@ -33,7 +33,7 @@ def test_it_performs_the_policys_actions(loaded: Load, made: Made, tmp_path: Pat
     replicas = Replicas([LeRobot.from_config({"checkpoint": str(made("act"))})])
     cls, port, contract = dialect_class("lerobot"), free_port(), loaded("act").contract
     context = GatewayContext(
-        "app", lambda *_: replicas.agent(), Limits(), 4, 60.0, contract, NoKey.OPEN
+        "app", lambda *_: replicas.agent(), MessageLimits(), 4, 60.0, contract, NoKey.OPEN
     )
     dialect = cls("lerobot", cls.Config(port=port, checkpoint="me/tiny"), context)
     dialect.serve(reserve("lerobot", "127.0.0.1", port))
