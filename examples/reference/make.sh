@@ -4,7 +4,7 @@
 set -euo pipefail
 cd "$(dirname "$0")/../.."
 bin=${BIN:-.venv/bin} runs=runs/reference
-export PYTHONPATH=examples:examples/reference # the experts of Meta-World; the control
+export PYTHONPATH=examples/reference # the folder of the control, misled.py
 # The training's memory is kept, not given back to the system after each step: it takes a fifth of the time.
 export MALLOC_ARENA_MAX=1 MALLOC_MMAP_THRESHOLD_=33554432 MALLOC_TRIM_THRESHOLD_=8589934592
 for robot in tabletop metaworld; do

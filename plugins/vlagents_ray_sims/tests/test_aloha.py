@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from experts.aloha import AlohaExpert
 from in_process_episode import Always, play
 
 from vlagents_ray.contract import CameraSpec
@@ -19,6 +18,7 @@ from vlagents_ray.errors import (
 from vlagents_ray.interface import Act, Obs
 from vlagents_ray.testing import check_env
 from vlagents_ray_sims.aloha import Aloha
+from vlagents_ray_sims.experts.aloha import AlohaExpert
 
 gym_aloha = pytest.importorskip("gym_aloha.env")
 pytestmark = [pytest.mark.sim, pytest.mark.integration]
@@ -36,7 +36,9 @@ def test_it_keeps_the_promises_of_an_env() -> None:
 def test_the_expert_solves_the_task_and_staying_put_does_not(task: str) -> None:
     with Aloha(task, cameras=()) as env:  # rendering would take most of the time
         for seed in (0, 1000):
-            solved = play(env, f"aloha/{task}", "experts.aloha:AlohaExpert", seed=seed)
+            solved = play(
+                env, f"aloha/{task}", "vlagents_ray_sims.experts.aloha:AlohaExpert", seed=seed
+            )
             assert (solved.success_once, solved.ending) == (True, "terminated")
             assert solved.steps <= 400
         idle = play(env, f"aloha/{task}", Always(*FIRST, *FIRST), seed=0)

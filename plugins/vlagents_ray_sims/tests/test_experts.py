@@ -8,14 +8,14 @@ import math
 
 import numpy as np
 import pytest
-from experts.metaworld import MetaWorldExpert
-from experts.rcs import RcsPick
-from experts.simpler import SimplerExpert
 
 from vlagents_ray.envs import make_env
 from vlagents_ray.errors import ContractMismatch, InvalidObservation, MissingState
 from vlagents_ray.interface import Obs
 from vlagents_ray.policies.scripted import Scripted
+from vlagents_ray_sims.experts.metaworld import MetaWorldExpert
+from vlagents_ray_sims.experts.rcs import RcsPick
+from vlagents_ray_sims.experts.simpler import SimplerExpert
 from vlagents_ray_sims.metaworld import MetaWorld
 from vlagents_ray_sims.simpler import Simpler
 
@@ -61,7 +61,7 @@ def test_the_expert_of_simpler_solves_every_task_however_the_object_lies(
     name = f"simpler/{task}"
     with make_env(name, shader="minimal") as env:  # experts do not look at the image
         obs, _ = env.reset(seed=0, options={"init_state": state})
-        agent = Scripted.from_config({"expert": "experts.simpler:SimplerExpert"})
+        agent = Scripted.from_config({"expert": "vlagents_ray_sims.experts.simpler:SimplerExpert"})
         assert agent.reset(obs, env.instruction, env=name) == {"expert": "SimplerExpert"}
         over = False
         while not over:

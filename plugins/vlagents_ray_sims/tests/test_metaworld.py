@@ -123,7 +123,9 @@ def test_fifty_initial_states_are_those_of_mt1() -> None:
 @pytest.mark.parametrize("ends", [True, False])
 def test_success_ends_the_episode_unless_told_otherwise(ends: bool) -> None:
     with MetaWorld("reach-v3", cameras=(), max_steps=120, ends_on_success=ends) as env:
-        solved = play(env, "metaworld/reach-v3", "experts.metaworld:MetaWorldExpert")
+        solved = play(
+            env, "metaworld/reach-v3", "vlagents_ray_sims.experts.metaworld:MetaWorldExpert"
+        )
         assert solved.success_once
         assert (solved.ending == "terminated") is ends
         assert (solved.steps == 120) is not ends

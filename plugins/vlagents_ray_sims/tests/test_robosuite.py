@@ -8,7 +8,6 @@ import math
 
 import numpy as np
 import pytest
-from experts.osc_pose import RobosuiteExpert
 
 from vlagents_ray.contract import CameraSpec
 from vlagents_ray.envs.base import known_contract, make_env
@@ -21,6 +20,7 @@ from vlagents_ray.errors import (
     UnknownEnv,
 )
 from vlagents_ray.interface import Obs
+from vlagents_ray_sims.experts.osc_pose import RobosuiteExpert
 from vlagents_ray_sims.robosuite import TASKS, Robosuite
 
 

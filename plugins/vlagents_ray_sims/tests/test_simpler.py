@@ -7,7 +7,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from experts.simpler import SimplerExpert
 from scipy.spatial.transform import Rotation
 
 from vlagents_ray.contract import CameraSpec
@@ -16,6 +15,7 @@ from vlagents_ray.errors import ConfigError, EnvFailed
 from vlagents_ray.interface import Act, Obs
 from vlagents_ray.testing import check_env
 from vlagents_ray.validation import check_observation
+from vlagents_ray_sims.experts.simpler import SimplerExpert
 from vlagents_ray_sims.simpler import Simpler
 
 pytestmark = [pytest.mark.vulkan, pytest.mark.assets("simpler")]

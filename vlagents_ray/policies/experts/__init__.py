@@ -1,8 +1,8 @@
 """Scripted experts: small classes that solve simulated tasks without learning.
 
 `EXPERTS` maps the full name of an env, or of a suite, to "module:Class"; the full name has
-priority. A module is imported when the first of its experts is used. Experts for more simulators
-are in `examples/experts`.
+priority. A module is imported when the first of its experts is used. `examples/experts/README.md`
+lists experts for more simulators.
 """
 
 from __future__ import annotations
@@ -41,9 +41,8 @@ def expert_class(env_name: str) -> type[Expert]:
     if (target := EXPERTS.get(env_name) or EXPERTS.get(env_suite(env_name))) is None:
         raise ContractMismatch(
             f"no scripted expert for env {env_name!r}: there are experts for {sorted(EXPERTS)}; "
-            "choose one of these "
-            "envs, set `expert` to one of examples/experts, 'experts.pusht:PushTExpert', or "
-            "choose another policy"
+            "choose one of these envs, set `expert` to one of examples/experts/README.md, such as "
+            "'experts.pusht:PushTExpert', or choose another policy"
         )
     return named_class(target)
 

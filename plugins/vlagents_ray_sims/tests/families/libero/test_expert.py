@@ -6,10 +6,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from experts.libero import LiberoExpert
 
 from vlagents_ray.errors import ContractMismatch, InvalidObservation, NotReset
 from vlagents_ray.interface import Obs
+from vlagents_ray_sims.experts.libero import LiberoExpert
 from vlagents_ray_sims.libero import Libero
 
 _IN = ["in", "milk_1", "basket_1_contain_region"]

@@ -44,7 +44,7 @@ def led(env: Rcs, command: Sequence[float], steps: int = 40) -> Obs:
 
 def test_the_expert_picks_the_cuboid_up_and_that_ends_the_episode(pick: Rcs) -> None:
     for seed in range(4):
-        result = play(pick, "rcs/pick", "experts.rcs:RcsPick", seed=seed)
+        result = play(pick, "rcs/pick", "vlagents_ray_sims.experts.rcs:RcsPick", seed=seed)
         assert (result.success_once, result.success_at_end, result.ending) == (
             True,
             True,

@@ -94,7 +94,9 @@ def test_an_episode_is_its_seeds_and_what_nobody_looks_at_is_not_rendered(lift: 
 
 def test_the_expert_lifts_the_cube_and_doing_nothing_does_not() -> None:
     with Robosuite("Lift", cameras=(), max_steps=80) as env:
-        solved = play(env, "robosuite/Lift", "experts.osc_pose:RobosuiteExpert", seed=0)
+        solved = play(
+            env, "robosuite/Lift", "vlagents_ray_sims.experts.osc_pose:RobosuiteExpert", seed=0
+        )
         assert (solved.success_once, solved.ending) == (True, "terminated")
         idle = play(env, "robosuite/Lift", Always(*STILL), seed=0)
         assert (idle.success_once, idle.episode_return, idle.steps) == (False, 0.0, 80)

@@ -9,10 +9,19 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from experts.osc_pose import CLOSED, OPEN, OVER_M, UP, PickExpert, PickPhase, rotation, yaw_of
 
 from vlagents_ray.errors import ContractMismatch, InvalidObservation
 from vlagents_ray.interface import Obs
+from vlagents_ray_sims.experts.osc_pose import (
+    CLOSED,
+    OPEN,
+    OVER_M,
+    UP,
+    PickExpert,
+    PickPhase,
+    rotation,
+    yaw_of,
+)
 
 _LIFT_M = 0.2  # to pass over other objects
 _DOWNWARDS_M = 0.08  # the same where the place is lower
