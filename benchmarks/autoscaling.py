@@ -168,16 +168,16 @@ def _rollouts(plan: AutoscalingPlan, name: str, out: Path) -> LoadPhase:
         out=out,
     )
     evaluate(config)
-    [cell] = Results.load(out).cells
+    [case] = Results.load(out).cases
     acts = [
         (one.finished, one.result.policy_ms)
-        for one in cell.episodes
+        for one in case.episodes
         if one.result.policy_ms is not None
     ]
-    failed = [attempt.error for attempt in cell.attempts]
+    failed = [attempt.error for attempt in case.attempts]
     failed += [
         f"{one.result.key}: {one.result.error}"
-        for one in cell.episodes
+        for one in case.episodes
         if one.result.status != "done"
     ]
     return LoadPhase(name, begun, time.time(), sorted(acts), None, 0, failed)

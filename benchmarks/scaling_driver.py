@@ -106,7 +106,7 @@ class ScalingLedger(Progress):
         self.failures = 0
         self.first: dict[str, float] = {}
 
-    def episode(self, cell: EvalCase, result: EpisodeResult) -> None:
+    def episode(self, case: EvalCase, result: EpisodeResult) -> None:
         """Record the time."""
         self.first = self.first or daemons_s()
         self.at_s.append(time.monotonic())
@@ -143,7 +143,7 @@ def play(one: ScalingRound, out: Path) -> PlayedEpisodes:
     first = min(each.ended for each in played)
     results = Results.load(out)
     near = [worker.transport in NEAR for worker in results.workers]
-    acts = sum(episode.result.acts for cell in results.cells for episode in cell.episodes)
+    acts = sum(episode.result.acts for case in results.cases for episode in case.episodes)
     return PlayedEpisodes(
         None if one.app is None else 60 * steady(played, one.workers).rate / one.steps,
         wall_s,

@@ -31,7 +31,7 @@ from benchmarks.report import Outcome, show_outcomes, unmeasured
 from vlagents_ray.cli.console import errors, out, progress
 from vlagents_ray.evaluate import EvalConfig, PolicyConfig, Progress, Results, SuiteConfig, evaluate
 from vlagents_ray.evaluate.episode.records import EpisodeResult
-from vlagents_ray.evaluate.plan.cases import EvalCase, cells
+from vlagents_ray.evaluate.plan.cases import EvalCase, plan_cases
 from vlagents_ray.evaluate.plan.jobs import plan as planned
 from vlagents_ray.serve.launch.deployment_file import deployment
 from vlagents_ray.serve.launch.server import running_server
@@ -103,7 +103,7 @@ def measure_soak(
         with SoakWatcher(notes, ledger, soak) as watcher:
             evaluate(config, progress=ledger)
         found = Results.load(config.out)
-        wanted = sorted(str(job.key) for job in planned(cells(config)))
+        wanted = sorted(str(job.key) for job in planned(plan_cases(config)))
         return report(soak, ledger, watcher, read_episode_times(notes), found, wanted)
 
 
@@ -115,12 +115,12 @@ class SoakLedger(Progress):
         self.at_s, self.cpu_s = array("d"), array("d")
         self._progress = progress
 
-    def episode(self, cell: EvalCase, result: EpisodeResult) -> None:
+    def episode(self, case: EvalCase, result: EpisodeResult) -> None:
         """Record the time."""
         self.at_s.append(time.time())
         self.cpu_s.append(time.process_time())
         if len(self.at_s) % 1000 == 0:
-            self._progress(f"{len(self.at_s)} of {cell.planned} episodes")
+            self._progress(f"{len(self.at_s)} of {case.planned} episodes")
 
 
 class SoakWatcher:
@@ -203,8 +203,8 @@ def report(
     wanted: Sequence[str],
 ) -> dict[str, Any]:
     """Return all figures as plain JSON values."""
-    episodes = [one for cell in results.cells for one in cell.episodes]
-    attempts = [one for cell in results.cells for one in cell.attempts]
+    episodes = [one for case in results.cases for one in case.episodes]
+    attempts = [one for case in results.cases for one in case.attempts]
     at, cpu, window = ledger.at_s, ledger.cpu_s, soak.window
     between = gaps(notes.values())
     return {

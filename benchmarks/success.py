@@ -197,7 +197,7 @@ class Players:
             policies=[policy], suites=[suite], out=place, video="none", workers=0, resume=True
         )
         evaluate(plan, agent_factory=lambda: self._agent(way))
-        counted = [one for cell in Results.load(place).cells for one in cell.counted]
+        counted = [one for case in Results.load(place).cases for one in case.counted]
         found = {one.key.seed: (bool(one.success_once), str(one.actions_sha256)) for one in counted}
         return Played(
             way, found, float(np.median([one.policy_ms for one in counted if one.policy_ms]))

@@ -1,7 +1,7 @@
 """Evaluate a sweep over the rotation of a camera from its calibration and the noise of actions.
 
 Two policies differ in an option of their resets, and five suites in an option of the environment:
-ten cells, all on the same seeds. `python sweep.py`, in the folder of this file, plays them in this
+ten cases, all on the same seeds. `python sweep.py`, in the folder of this file, plays them in this
 process, in seconds, with the policy and the environment of own_policy.py and own_env.py; run again,
 it continues an interrupted sweep.
 
@@ -41,10 +41,10 @@ def main():
     )
     summary = evaluate(plan, agent_factory=lambda: Servo(ServoConfig(camera_turn=CALIBRATED)))
     print("success, 95 % interval".ljust(24), *(f"{turn}°".ljust(15) for turn in TURNS))
-    for policy, group in groupby(summary.cells, lambda cell: cell.contender):
-        cells = list(group)
-        print(policy.ljust(24), *(str(cell.success_once).ljust(15) for cell in cells))
-        print("".ljust(24), *(f"{cell.mean_steps:.1f} steps".ljust(15) for cell in cells))
+    for policy, group in groupby(summary.cases, lambda case: case.contender):
+        cases = list(group)
+        print(policy.ljust(24), *(str(case.success_once).ljust(15) for case in cases))
+        print("".ljust(24), *(f"{case.mean_steps:.1f} steps".ljust(15) for case in cases))
     print("with curves, and policies compared pairwise: runs/sweep/report.html")
 
 

@@ -13,7 +13,7 @@ from pathlib import Path
 import typer
 
 from vlagents_ray.evaluate import Results
-from vlagents_ray.evaluate.results.reader import CellResults, rate_of
+from vlagents_ray.evaluate.results.reader import CaseResults, rate_of
 from vlagents_ray.policies.reference.checkpoint import read_checkpoint
 
 _TEXT = """---
@@ -67,19 +67,19 @@ def rates(results: Sequence[Results]) -> list[str]:
     """Return the rows of the table of rates, a task each; `misled` is the control, told of other
     things.
     """
-    cells = {(cell.policy, cell.env): cell for one in results for cell in one.cells}
+    cases = {(case.policy, case.env): case for one in results for case in one.cases}
     lines = ["| task | success, % | misled, % | seeds |", "|---|---|---|---|"]
-    for (policy, env), cell in cells.items():
+    for (policy, env), case in cases.items():
         if policy == "reference":
-            last = max(one.key.seed for one in cell.counted)
+            last = max(one.key.seed for one in case.counted)
             lines.append(
-                f"| `{env}` | {_rate(cell)} | {_rate(cells['misled', env])} | 0 to {last} |"
+                f"| `{env}` | {_rate(case)} | {_rate(cases['misled', env])} | 0 to {last} |"
             )
     return lines
 
 
-def _rate(cell: CellResults) -> str:
-    rate = rate_of([cell], "success_once")
+def _rate(case: CaseResults) -> str:
+    rate = rate_of([case], "success_once")
     low, high = rate.interval
     return f"{100 * rate.successes / rate.episodes:.1f} [{100 * low:.1f}, {100 * high:.1f}]"
 
@@ -107,9 +107,9 @@ def main(checkpoint: Path, evaluations: list[Path]) -> None:
     )
     (checkpoint / "README.md").write_text(text, encoding="utf-8")
     solved: dict[str, dict[str, tuple[int, int]]] = {}
-    for cell in (cell for one in results for cell in one.cells if cell.policy == "reference"):
-        rate = rate_of([cell], "success_once")
-        solved.setdefault(cell.env.partition("/")[0], {})[cell.env] = rate.successes, rate.episodes
+    for case in (case for one in results for case in one.cases if case.policy == "reference"):
+        rate = rate_of([case], "success_once")
+        solved.setdefault(case.env.partition("/")[0], {})[case.env] = rate.successes, rate.episodes
     (checkpoint / "rates.json").write_text(json.dumps(solved) + "\n")
 
 

@@ -33,7 +33,7 @@ from vlagents_ray.evaluate import (
 )
 from vlagents_ray.evaluate.episode.failures import Failure
 from vlagents_ray.evaluate.episode.records import EpisodeResult
-from vlagents_ray.evaluate.plan.cases import cells
+from vlagents_ray.evaluate.plan.cases import plan_cases
 from vlagents_ray.evaluate.plan.jobs import plan
 from vlagents_ray.evaluate.results.store import Store
 from vlagents_ray.evaluate.results.summary import summarize
@@ -142,13 +142,13 @@ def test_a_file_of_several_policies_is_refused_with_its_cure(tmp_path: Path) -> 
 
 
 def lost(out: Path, **changes: Any) -> EvalConfig:
-    """Record every episode of two cells but one, which infrastructure lost."""
+    """Record every episode of two cases but one, which infrastructure lost."""
     of_a = [{"name": "a", "url": "http://127.0.0.1:9"}]
     suites = [{"envs": ["tabletop"], "episodes": 4}]
     config = EvalConfig.model_validate({"policies": of_a, "suites": suites, "out": out, **changes})
     with Store(config) as store:
         store.begin_run(config, {})
-        first, *others = plan(store.cells)
+        first, *others = plan(store.cases)
         failure = Failure(
             "worker", "env_failed", "env step: RuntimeError: it exploded\nand more", ""
         )
@@ -187,16 +187,16 @@ def test_an_episode_without_a_result_ends_the_command_with_status_1(
     )
 
 
-def test_a_cell_that_stopped_early_misses_nothing(
+def test_a_case_that_stopped_early_misses_nothing(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     config = lost(tmp_path, stop={"target": 0.01, "at_least": 1})
     with Store(config.model_copy(update={"resume": True})) as store:
-        store.record(EpisodeResult(plan(store.cells)[0].key, "done", True, True, 3), 1)
-    [cell] = Results.load(tmp_path).cells
-    assert cell.stopped_at is not None
+        store.record(EpisodeResult(plan(store.cases)[0].key, "done", True, True, 3), 1)
+    [case] = Results.load(tmp_path).cases
+    assert case.stopped_at is not None
     with closing(sqlite3.connect(tmp_path / "results.db")) as db, db:
-        db.execute("DELETE FROM episodes WHERE episode >= ?", (cell.stopped_at,))
+        db.execute("DELETE FROM episodes WHERE episode >= ?", (case.stopped_at,))
     assert end_of(config, monkeypatch) == (0, "")
 
 
@@ -207,7 +207,7 @@ def test_only_what_was_asked_for_now_is_missed(
     suite = SuiteConfig(envs=["tabletop"], name="b", seeds=[9])
     other = config.model_copy(update={"resume": True, "accept_changes": True, "suites": [suite]})
     with Store(other) as store:
-        for job in plan(store.cells):
+        for job in plan(store.cases):
             store.record(EpisodeResult(job.key, "done", True, True, 3), 1)
     assert end_of(other, monkeypatch) == (0, "")
 
@@ -311,16 +311,16 @@ def test_what_was_played_is_not_planned_again_and_tells_the_time(
     config: Callable[..., EvalConfig],
 ) -> None:
     results = play(config(episodes=3))
-    [played, other] = forecasts(cells(config(envs=[LINE, OTHER_LINE], episodes=9)), results)
+    [played, other] = forecasts(plan_cases(config(envs=[LINE, OTHER_LINE], episodes=9)), results)
     assert (played.finished, played.left) == (3, 6)
-    assert played.seconds == pytest.approx(sum(one.seconds for one in results.cells[0].counted) / 3)
+    assert played.seconds == pytest.approx(sum(one.seconds for one in results.cases[0].counted) / 3)
     assert (other.finished, other.left, other.seconds) == (0, 9, None)
 
 
-def test_nothing_is_left_of_a_cell_that_stopped(config: Callable[..., EvalConfig]) -> None:
+def test_nothing_is_left_of_a_case_that_stopped(config: Callable[..., EvalConfig]) -> None:
     settings = config(episodes=30, stop={"target": 0.3})
     play(settings, left_out=range(20, 30))
-    [found] = forecasts(cells(settings), Results.load(settings.out))
+    [found] = forecasts(plan_cases(settings), Results.load(settings.out))
     assert (found.finished, found.left) == (20, 0)
 
 
@@ -335,9 +335,9 @@ def test_the_plan_is_printed_without_asking_any_policy(
     )
     print_plan(settings)
     text = capsys.readouterr().out
-    assert "4 cells" in text
+    assert "4 cases" in text
     assert "20 episodes, 0 of them finished" in text
     assert "policy@20" in text
     assert "unknown time" in text
-    assert "; not played yet: 4 of 4 cells" in " ".join(text.split())
+    assert "; not played yet: 4 of 4 cases" in " ".join(text.split())
     assert not settings.out.exists(), "nothing is written"

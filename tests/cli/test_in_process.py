@@ -102,14 +102,14 @@ def test_named_policies_deployment_files_and_checkpoints_are_played_without_ray(
     )
     assert done.returncode == 0, done.stdout + done.stderr
     assert "a short evaluation, in this process without Ray (--workers 1 plays" in done.stdout
-    cells = {cell.contender: cell for cell in Results.load(folder / "runs" / "runs").cells}
+    cases = {case.contender: case for case in Results.load(folder / "runs" / "runs").cases}
     actions = {
-        name: [one.result.actions_sha256 for one in cell.episodes] for name, cell in cells.items()
+        name: [one.result.actions_sha256 for one in case.episodes] for name, case in cases.items()
     }
     assert actions["swept@2"] == actions["chosen"]
     assert len({tuple(one) for one in actions.values()}) == 3
-    assert {one.result.checkpoint for one in cells["swept@1"].episodes} == {"w-1.txt"}
-    assert {one.result.transport for cell in cells.values() for one in cell.episodes} == {"local"}
+    assert {one.result.checkpoint for one in cases["swept@1"].episodes} == {"w-1.txt"}
+    assert {one.result.transport for case in cases.values() for one in case.episodes} == {"local"}
 
 
 REFUSED: Mapping[str, tuple[dict[str, object], list[str], str]] = {
@@ -179,7 +179,7 @@ def test_a_dry_run_names_the_workers_with_which_the_run_itself_is_played(
     assert done.exit_code == 0, done.output
     where = {0: "in one process, without Ray", 1: "with 1 worker;", 3: "with 3 workers;"}[workers]
     assert where in done.stdout
-    assert "1 cell: 1 policy at each checkpoint x 1 environment of suites" in done.stdout
+    assert "1 case: 1 policy at each checkpoint x 1 environment of suites" in done.stdout
     assert not (folder / "runs").exists()
 
 
@@ -212,5 +212,5 @@ def test_a_debugger_stops_in_the_policy_with_the_terminal_and_leaving_it_ends_th
             os.write(ours, answer)
         assert process.wait(60) == 130
     os.close(ours)
-    [cell] = Results.load(folder / "out").cells
-    assert cell.episodes == ()
+    [case] = Results.load(folder / "out").cases
+    assert case.episodes == ()

@@ -65,7 +65,7 @@ def test_what_a_script_reads_is_json(tmp_path: Path, monkeypatch: pytest.MonkeyP
     ]
     (pair,) = said["report"]["comparisons"]
     assert (pair["a"], pair["b"], pair["lines"][-1]["suite"]) == ("b", "a", "all")  # as on the page
-    assert sum(cell["episodes"] for cell in said["report"]["cells"]) == 4
+    assert sum(case["episodes"] for case in said["report"]["cases"]) == 4
     assert not (out / "report.html").exists()
     assert said["verify"]["holds"] is True
     assert {"subject", "verdict", "detail"} == said["verify"]["findings"][0].keys()

@@ -59,7 +59,7 @@ def test_results_that_another_process_writes_are_watched_until_ctrl_c(tmp_path: 
         watching.send_signal(signal.SIGINT)
         printed, _ = watching.communicate(timeout=60)
     assert (watching.returncode, printed) == (0, f"live: {page.url}/live\n")
-    assert (said["state"], said["done"], len(said["cells"])) == ("complete", 18, 9)
+    assert (said["state"], said["done"], len(said["cases"])) == ("complete", 18, 9)
     assert not (tmp_path / "out" / "report.html").exists()
 
 

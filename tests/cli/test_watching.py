@@ -63,9 +63,9 @@ def test_an_episode_lost_in_any_round_ends_watching_with_status_1_and_no_round_e
         played.append(config.policies[0].steps)
         with Store(config) as store:
             store.begin_run(config, {})
-            for job in plan(store.cells):
+            for job in plan(store.cases):
                 status: Status = (
-                    "infra_failed" if job.cell.step == 10 and job.key.episode == 3 else "done"
+                    "infra_failed" if job.case.step == 10 and job.key.episode == 3 else "done"
                 )
                 store.record(EpisodeResult(job.key, status, status == "done"), 1)
             store.end_run("complete")

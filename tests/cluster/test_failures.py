@@ -165,14 +165,14 @@ class Evaluation:
     def played(self) -> list[EpisodeResult]:
         """What is recorded so far."""
         try:
-            cells = Results.load(self.out).cells
+            cases = Results.load(self.out).cases
         except ConfigError:  # nothing yet
             return []
-        return [one.result for cell in cells for one in cell.episodes]
+        return [one.result for case in cases for one in case.episodes]
 
     def attempts(self) -> list[Attempt]:
         """Those that infrastructure failed."""
-        return [one for cell in Results.load(self.out).cells for one in cell.attempts]
+        return [one for case in Results.load(self.out).cases for one in case.attempts]
 
     def said(self) -> str:
         """All that it printed."""

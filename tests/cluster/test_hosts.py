@@ -97,5 +97,5 @@ def test_without_an_address_an_evaluation_has_a_ray_of_its_own(tmp_path: Path) -
         host.run([*EVALUATE, "--episodes=1", f"--out={tmp_path / 'out'}"])
         node = host.run(show).split()[-1]
     found = Results.load(tmp_path / "out")
-    assert [one.result.status for one in found.cells[0].episodes] == ["done"]
+    assert [one.result.status for one in found.cases[0].episodes] == ["done"]
     assert found.workers[0].node != node

@@ -123,8 +123,8 @@ def test_the_page_makes_a_cluster_that_serves_a_robot_and_evaluates(tmp_path: Pa
             robot.environment["VLAGENTS_RAY_API_KEY"] = key
             assert machines.run(robot, play).split() == ["websocket"]
             machines.run(first, evaluation)
-        [cell] = Results.load(tmp_path / "runs" / "lab").cells
-        assert [episode.result.status for episode in cell.episodes] == ["done"] * 8
+        [case] = Results.load(tmp_path / "runs" / "lab").cases
+        assert [episode.result.status for episode in case.episodes] == ["done"] * 8
         for host in (second, first):
             machines.run(host, stop)
 

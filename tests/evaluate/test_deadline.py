@@ -13,11 +13,11 @@ from in_process_evaluation import flat_config
 
 from vlagents_ray.evaluate import EvalConfig, OutOfTime, Progress, evaluate
 from vlagents_ray.evaluate.episode.records import EpisodeResult
-from vlagents_ray.evaluate.plan.cases import EvalCase, cells
+from vlagents_ray.evaluate.plan.cases import EvalCase, plan_cases
 from vlagents_ray.evaluate.plan.jobs import plan
 from vlagents_ray.evaluate.run import CLOSING_S, MARGIN, Deadline
 
-JOBS = plan(cells(flat_config(envs=["tabletop"], episodes=3, out="out")))
+JOBS = plan(plan_cases(flat_config(envs=["tabletop"], episodes=3, out="out")))
 
 
 def test_no_episode_is_begun_that_would_not_end_if_it_were_as_long_as_the_longest() -> None:
@@ -46,7 +46,7 @@ class SlowAfterTwo(Progress):
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         self._left, self._monkeypatch = 2, monkeypatch
 
-    def episode(self, cell: EvalCase, result: EpisodeResult) -> None:
+    def episode(self, case: EvalCase, result: EpisodeResult) -> None:
         self._left -= 1
         if not self._left:
             self._monkeypatch.setattr(Deadline, "leaves_room", False)

@@ -32,7 +32,7 @@ Config = Callable[..., EvalConfig]
 
 
 def outcomes(summary: Summary) -> list[dict[str, Any]]:
-    return [one.result.outcome for cell in summary.results.cells for one in cell.episodes]
+    return [one.result.outcome for case in summary.results.cases for one in case.episodes]
 
 
 def test_its_episodes_are_those_of_workers(
@@ -97,8 +97,8 @@ def test_a_simulator_that_does_not_repeat_itself_leaves_one_failure_without_a_vi
     summary = evaluate(settings, agent_factory=lambda: ToZero(3))
     failed = [
         one
-        for cell in summary.results.cells
-        for one in cell.episodes
+        for case in summary.results.cases
+        for one in case.episodes
         if not one.result.success_once
     ]
     bare = [str(one.result.key) for one in failed if not one.videos]
@@ -118,7 +118,7 @@ def test_it_goes_on_with_what_has_no_result(config: Config) -> None:
     with pytest.raises(ConfigError, match="already has results"):
         evaluate(config(workers=0), agent_factory=ToZero)
     summary = evaluate(config(workers=0, resume=True), agent_factory=ToZero)
-    assert [one.run for cell in summary.results.cells for one in cell.episodes] == [
+    assert [one.run for case in summary.results.cases for one in case.episodes] == [
         2,
         2,
         1,
@@ -219,7 +219,7 @@ for name in ("jinja2", "ray", "rich", "torch"):
     sys.modules[name] = None  # as if it were not installed
 from vlagents_ray.evaluate import Results, compare
 results = Results.load(sys.argv[1])
-print(sum(len(cell.episodes) for cell in results.cells))
+print(sum(len(case.episodes) for case in results.cases))
 """
 
 
@@ -260,7 +260,7 @@ def test_a_policy_that_ends_the_process_fails_its_episode_only(config: Config) -
             os._exit(0)
 
     summary = evaluate(config(episodes=1, workers=0), agent_factory=Ending)
-    errors = [one.result.error or "" for cell in summary.results.cells for one in cell.episodes]
+    errors = [one.result.error or "" for case in summary.results.cases for one in case.episodes]
     assert errors
     assert all("os._exit(0) was called (test_in_process.py:" in error for error in errors)
     assert os._exit is before

@@ -18,7 +18,7 @@ from vlagents_ray.errors import ConfigError
 from vlagents_ray.evaluate import EvalConfig, Results, compare, evaluate
 from vlagents_ray.evaluate.episode.records import EnvInfo, EpisodeResult
 from vlagents_ray.evaluate.exports import rows
-from vlagents_ray.evaluate.plan.cases import cells
+from vlagents_ray.evaluate.plan.cases import plan_cases
 from vlagents_ray.evaluate.plan.jobs import plan
 from vlagents_ray.evaluate.report.page import write_report
 from vlagents_ray.evaluate.report.success import compare_all, families_json
@@ -100,14 +100,14 @@ def played(
     said = served(own_weights) | (stated or {})
     with Store(config) as store:
         store.begin_run(config, {})
-        for job in plan(store.cells):
+        for job in plan(store.cases):
             if str(job.key) in store.finished():
                 continue
-            store.note_policy(job.cell.policy.name, said)
+            store.note_policy(job.case.policy.name, said)
             made = EnvInfo(
-                description or {}, contract or {}, program=dict(job.cell.program), host="here"
+                description or {}, contract or {}, program=dict(job.case.program), host="here"
             )
-            store.note_env(job.cell.place, made)
+            store.note_env(job.case.place, made)
             result = EpisodeResult(
                 job.key, "done", True, True, steps=4, ending="truncated", checkpoint="w.npz"
             )
@@ -150,7 +150,7 @@ def test_unchanged_files_are_gone_on_with(
     found = way(tmp_path, lambda: Path("unrelated.py").write_text("1") and None)
     assert found.accepted_changes == []
     assert len({row["env_program"] for row in rows(found)}) == 1
-    assert set(found.cells[0].program) >= {"prog_env.py", "prog_parts/sea.py", "prog_parts/wind.py"}
+    assert set(found.cases[0].program) >= {"prog_env.py", "prog_parts/sea.py", "prog_parts/wind.py"}
 
 
 @pytest.mark.parametrize(
@@ -206,11 +206,11 @@ def test_a_worker_that_has_other_files_is_refused_also_if_changes_are_accepted(
     )
     with Store(config) as store:
         store.begin_run(config, {})
-        program = store.cells[0].program | {"prog_env.py": "sha256:0"}
+        program = store.cases[0].program | {"prog_env.py": "sha256:0"}
         with pytest.raises(
             ConfigError, match=r"(?s)worker on far has other files.*prog_env.py was .*, is sha256:0"
         ):
-            store.note_env(store.cells[0].place, EnvInfo({}, {}, program=program, host="far"))
+            store.note_env(store.cases[0].place, EnvInfo({}, {}, program=program, host="far"))
 
 
 def test_two_policies_are_not_compared_in_different_environments(
@@ -388,7 +388,7 @@ def test_settings_of_the_checkpoint_and_of_the_machine_are_no_change(
 @pytest.mark.parametrize(
     "identity", ["its simulator's version", "its contract", "its policy's code", "its weights"]
 )
-def test_a_cell_in_which_a_change_was_accepted_is_not_compared_unless_that_is_accepted_again(
+def test_a_case_in_which_a_change_was_accepted_is_not_compared_unless_that_is_accepted_again(
     work: Path, tmp_path: Path, identity: str
 ) -> None:
     of_the_policy = {
@@ -444,7 +444,7 @@ def test_the_code_of_an_own_policy_is_part_of_the_program_however_it_is_given(
         run(3, resume=True)
 
 
-def test_a_cell_of_two_programs_is_not_compared(work: Path, tmp_path: Path) -> None:
+def test_a_case_of_two_programs_is_not_compared(work: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     both = {"policies": [{"name": "a"}, {"name": "b"}]}
     settings = {"suites": [{"envs": ["prog_env:Sea"], "episodes": 2}], "out": out, **both}
@@ -452,7 +452,7 @@ def test_a_cell_of_two_programs_is_not_compared(work: Path, tmp_path: Path) -> N
         config = EvalConfig.model_validate({**settings, "resume": resume, "accept_changes": resume})
         with Store(config) as store:
             store.begin_run(config, {})
-            for job in plan(store.cells):
+            for job in plan(store.cases):
                 if job.key.episode == resume:
                     store.record(EpisodeResult(job.key, "done", True, True), attempts=1)
         edit("prog_env.py")
@@ -474,7 +474,9 @@ def test_the_module_that_registers_an_env_of_gymnasium_is_part_of_the_program(
     work: Path, env: str
 ) -> None:
     config = flat_config(envs=[env], episodes=1, policy="own", out=work / "out")
-    assert {name for cell in cells(config) for name in cell.program} >= ENV_FILES - {"chart.txt"}
+    assert {name for case in plan_cases(config) for name in case.program} >= ENV_FILES - {
+        "chart.txt"
+    }
 
 
 def test_a_checkpoint_is_found_at_its_step_and_the_working_folder_is_none(work: Path) -> None:

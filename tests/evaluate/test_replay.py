@@ -17,7 +17,7 @@ from vlagents_ray.errors import ConfigError
 from vlagents_ray.evaluate import EvalConfig, Results, evaluate
 from vlagents_ray.evaluate import exports as tables
 from vlagents_ray.evaluate.episode.records import EpisodeResult
-from vlagents_ray.evaluate.plan.cases import cells
+from vlagents_ray.evaluate.plan.cases import plan_cases
 from vlagents_ray.evaluate.plan.config import PushedWeights
 from vlagents_ray.evaluate.replay import actions_difference, compare, find
 from vlagents_ray.evaluate.results.store import Store
@@ -51,7 +51,7 @@ def test_a_deterministic_policy_does_the_same_byte_for_byte(config: Config, tmp_
     here = settings.model_copy(update={"workers": 0})
     replayed = evaluate(here, agent_factory=ToZero, only=only).results
     assert compare(recorded, replayed) == []
-    [episode] = replayed.cells[0].episodes
+    [episode] = replayed.cases[0].episodes
     assert episode.result.key == recorded.episode.result.key
     assert episode.trajectory is not None
 
@@ -59,7 +59,7 @@ def test_a_deterministic_policy_does_the_same_byte_for_byte(config: Config, tmp_
 def again(results: Any, name: str, out: Path, make: Callable[[], ToZero]) -> list[str]:
     recorded = find(results, name)
     number, _ = recorded.number_and_seed
-    others = set(range(len(results.cells[0].episodes))) - {number}
+    others = set(range(len(results.cases[0].episodes))) - {number}
     return compare(recorded, play(recorded.config(out), make, left_out=others))
 
 
@@ -169,10 +169,10 @@ def test_an_episode_is_replayed_after_a_merge_that_renamed_its_suite(
     play(renamed.model_copy(update={"suites": [suite]}))
     play(config(out=tmp_path / "a", episodes=1))
     results = merge(tmp_path / "all", [tmp_path / "a", tmp_path / "b"]).results
-    for number, episode in enumerate(results.cells[0].episodes):
+    for number, episode in enumerate(results.cases[0].episodes):
         recorded = find(results, str(episode.result.key))
         replayed = play(recorded.config(tmp_path / f"again{number}"), left_out=[])
-        played = [one.result.key for one in replayed.cells[0].episodes]
+        played = [one.result.key for one in replayed.cases[0].episodes]
         assert episode.result.key in played
 
 
@@ -208,11 +208,11 @@ def test_an_episode_is_found_by_its_key_and_by_env_and_number_if_it_is_the_only_
     config: Config,
 ) -> None:
     results = play(config(envs=[LINE, OTHER_LINE], episodes=2))
-    key = results.cells[1].episodes[1].result.key
+    key = results.cases[1].episodes[1].result.key
     assert (
         find(results, str(key)).episode
         == find(results, f"{OTHER_LINE}#1").episode
-        == results.cells[1].episodes[1]
+        == results.cases[1].episodes[1]
     )
     for name in (LINE, f"{LINE}#7", "tabletop#0", f"{LINE}#0@0"):
         with pytest.raises(ConfigError, match="has no episode"):
@@ -225,19 +225,19 @@ def test_seeds_are_not_guessed_and_episodes_beyond_the_point_of_stopping_are_fou
     with pytest.raises(ConfigError, match=r"stands for 2 episodes; want one of the keys .*@0.*@10"):
         find(play(config(episodes=1, seeds=[0, 10], out=tmp_path / "seeds")), f"{LINE}#0")
     results = play(config(episodes=30, stop={"target": 0.3}))
-    assert not (last := results.cells[0].episodes[-1]).counts
+    assert not (last := results.cases[0].episodes[-1]).counts
     assert find(results, f"{LINE}#29").episode == last
 
 
 def with_weights(results: Results, weights: str) -> Results:
-    [cell] = results.cells
-    episodes = [replace(one, result=replace(one.result, weights=weights)) for one in cell.episodes]
-    return results.among([replace(cell, episodes=tuple(episodes))])
+    [case] = results.cases
+    episodes = [replace(one, result=replace(one.result, weights=weights)) for one in case.episodes]
+    return results.among([replace(case, episodes=tuple(episodes))])
 
 
 def test_a_key_ends_with_the_weights_that_played_it(config: Config) -> None:
     results = with_weights(play(config(episodes=2)), f"sampled-sha256:{'9f2c' * 16}")
-    first, second = results.cells[0].episodes
+    first, second = results.cases[0].episodes
     assert second.result.full_key == f"{second.result.key}~9f2c9f2c9f2c9f2c"
     assert [row["key"] for row in tables.rows(results)] == [
         first.result.full_key,
@@ -262,15 +262,15 @@ def test_a_replay_that_differs_says_that_the_weights_are_others(
     )
 
 
-def test_the_settings_are_those_of_the_run_and_of_that_cell_alone(
+def test_the_settings_are_those_of_the_run_and_of_that_case_alone(
     config: Config, tmp_path: Path
 ) -> None:
     settings = config(envs=[LINE, OTHER_LINE], episodes=1, steps=[10, 20], execute=1, workers=2)
     results = play(settings)
-    recorded = find(results, str(results.cells[3].episodes[0].result.key))
+    recorded = find(results, str(results.cases[3].episodes[0].result.key))
     alone = recorded.config(tmp_path / "again")
-    [cell] = cells(alone)
-    assert (cell.env, cell.step, cell.fingerprint) == (OTHER_LINE, 20, recorded.cell.cell)
+    [case] = plan_cases(alone)
+    assert (case.env, case.step, case.fingerprint) == (OTHER_LINE, 20, recorded.case.case_id)
     assert (alone.workers, alone.out) == (None, tmp_path / "again")
 
 
@@ -279,8 +279,8 @@ def test_pushed_weights_are_asked_for_again(config: Config, tmp_path: Path) -> N
     policy = config().policies[0].model_copy(update={"pushed_weights": pushed})
     results = play(config(episodes=1).model_copy(update={"policies": [policy]}))
     recorded = find(results, f"{LINE}#0")
-    [cell] = cells(recorded.config(tmp_path / "again"))
-    assert (cell.contender, cell.fingerprint) == ("policy@3", recorded.cell.cell)
+    [case] = plan_cases(recorded.config(tmp_path / "again"))
+    assert (case.contender, case.fingerprint) == ("policy@3", recorded.case.case_id)
 
 
 def test_a_policy_that_was_served_for_the_run_is_served_again_and_a_server_is_asked_again(

@@ -113,7 +113,7 @@ class TestOnACluster:
         class SignalAfterTwo(Progress):
             seen = 0
 
-            def episode(self, cell: EvalCase, result: EpisodeResult) -> None:
+            def episode(self, case: EvalCase, result: EpisodeResult) -> None:
                 self.seen += 1
                 if self.seen == 2:
                     wait_for((tmp_path / "gate-0").exists)  # the other worker may start later

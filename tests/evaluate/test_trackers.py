@@ -1,4 +1,4 @@
-"""Each cell is told once, when it is complete, and trackers never harm the evaluation."""
+"""Each case is told once, when it is complete, and trackers never harm the evaluation."""
 
 from __future__ import annotations
 
@@ -79,7 +79,7 @@ def test_rates_return_and_steps_of_each_task_and_in_total_stand_at_the_training_
     assert [(step, min(metrics).rpartition("/")[0]) for _, step, metrics in told] == [
         (10, LINE), (10, OTHER_LINE), (20, LINE), (20, OTHER_LINE), (10, "total"), (20, "total")
     ]  # fmt: skip
-    counted = results.cells[0].counted
+    counted = results.cases[0].counted
     assert told[0][2] == {
         f"{LINE}/success_once": sum(bool(one.success_once) for one in counted) / 4,
         f"{LINE}/success_at_end": sum(bool(one.success_at_end) for one in counted) / 4,
@@ -91,7 +91,7 @@ def test_rates_return_and_steps_of_each_task_and_in_total_stand_at_the_training_
     assert Listener.finished == ["policy"]
 
 
-def test_an_unfinished_cell_is_told_by_the_run_that_completes_it_and_no_other_twice(
+def test_an_unfinished_case_is_told_by_the_run_that_completes_it_and_no_other_twice(
     config: Config,
 ) -> None:
     settings = config(envs=[LINE, OTHER_LINE], episodes=3, track=["listener"])
@@ -126,11 +126,11 @@ def test_the_weights_of_the_server_are_in_the_settings_of_the_run(config: Config
     assert Listener.begun[0].config["served"] == said
 
 
-def test_a_cell_that_stopped_early_is_complete(config: Config) -> None:
+def test_a_case_that_stopped_early_is_complete(config: Config) -> None:
     settings = config(episodes=40, stop={"target": 0.3}, track=["listener"])
-    [cell] = play(settings, left_out=range(30, 40)).cells
-    assert cell.stopped_at is not None
-    assert [metrics[min(metrics)] for _, _, metrics in tell(settings)] == [cell.stopped_at] * 2
+    [case] = play(settings, left_out=range(30, 40)).cases
+    assert case.stopped_at is not None
+    assert [metrics[min(metrics)] for _, _, metrics in tell(settings)] == [case.stopped_at] * 2
 
 
 def test_of_the_videos_a_few_are_shown_failures_first(config: Config) -> None:

@@ -57,8 +57,8 @@ def test_maniskill_is_solved_whatever_the_number_of_workers(ray_home: Path, tmp_
             "--workers", workers, "--video", "none", "--out", str(out),
         )  # fmt: skip
         assert done.returncode == 0, done.stdout + done.stderr
-        [cell] = json.loads((out / "summary.json").read_text())["cells"]
-        assert cell["success_once"]["successes"] == 2, cell
+        [case] = json.loads((out / "summary.json").read_text())["cases"]
+        assert case["success_once"]["successes"] == 2, case
         found.append(rows(out))
     assert len(found[0]) == 2
     assert found[0] == found[1]
@@ -122,7 +122,7 @@ def test_results_without_workers_are_those_with_them_which_resume_them(
     found = {}
     for name in orders:
         results = Results.load(tmp_path / name)
-        found[name] = [one.result.outcome for cell in results.cells for one in cell.episodes]
+        found[name] = [one.result.outcome for case in results.cases for one in case.episodes]
         assert len(found[name]) == 8
     assert found["whole"] == found["resumed"]
     policies = [Results.load(tmp_path / name).policies["scripted"] for name in orders]
@@ -151,15 +151,15 @@ def test_a_file_of_runs_is_one_evaluation_of_all(ray_home: Path, tmp_path: Path)
     done = evaluate(ray_home, str(file), cwd=tmp_path)
     assert done.returncode == 0, done.stdout + done.stderr
     summary = json.loads((tmp_path / "runs" / "nightly" / "summary.json").read_text())
-    cells = {
+    cases = {
         (one["contender"], one["suite"], one["env"]): one["success_once"]
-        for one in summary["cells"]
+        for one in summary["cases"]
     }
     assert summary["state"] == "complete"
     assert summary["transports"] == ["shm"]
-    assert [one["episodes"] for one in cells.values()] == [4, 4, 6] * 2
-    assert cells["expert", "easy", "tabletop/lift"]["successes"] == 4
-    assert cells["still", "easy", "tabletop/slide"]["successes"] == 0
+    assert [one["episodes"] for one in cases.values()] == [4, 4, 6] * 2
+    assert cases["expert", "easy", "tabletop/lift"]["successes"] == 4
+    assert cases["still", "easy", "tabletop/slide"]["successes"] == 0
     refused = evaluate(ray_home, str(file), "--episodes", "9", cwd=tmp_path)
     assert refused.returncode == 2
     assert "says what is evaluated; got ['episodes'] beside it" in refused.stderr
@@ -197,7 +197,7 @@ def test_parts_are_merged_exported_and_one_episode_is_played_again(
         assert done.returncode == 0, done.stdout + done.stderr
     results = Results.load(parts[0])
     package = results.runs[0].versions["code"]["vlagents_ray"]
-    assert results.policies["scripted"]["code"] == (results.cells[0].code or None) == package
+    assert results.policies["scripted"]["code"] == (results.cases[0].code or None) == package
     out = str(tmp_path / "merged")
     merged = command(ray_home, "merge", *map(str, parts), "--out", out)
     assert merged.returncode == 0, merged.stdout + merged.stderr

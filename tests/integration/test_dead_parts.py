@@ -125,5 +125,5 @@ def test_an_evaluation_whose_head_dies_ends_and_can_be_resumed(tmp_path: Path) -
 def played(out: Path) -> int:
     """Episodes with a result."""
     with suppress(ConfigError):  # nothing is written yet
-        return sum(len(cell.episodes) for cell in Results.load(out).cells)
+        return sum(len(case.episodes) for case in Results.load(out).cases)
     return 0

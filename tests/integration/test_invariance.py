@@ -39,7 +39,7 @@ def plan(out: Path, url: str, **running: Any) -> EvalConfig:
 
 def outcomes(out: Path) -> dict[tuple[str, int], tuple[Any, ...]]:
     """All of each episode but times and ways, by env and number."""
-    found = [one.result for cell in Results.load(out).cells for one in cell.episodes]
+    found = [one.result for case in Results.load(out).cases for one in case.episodes]
     assert len({(one.key.env, one.key.episode) for one in found}) == len(found) == 2 * EPISODES
     return {
         (one.key.env, one.key.episode): (
@@ -66,7 +66,7 @@ class Disaster(Progress):
         self.played = 0
         self.interrupted_after = interrupted_after
 
-    def episode(self, cell: EvalCase, result: EpisodeResult) -> None:
+    def episode(self, case: EvalCase, result: EpisodeResult) -> None:
         self.played += 1
         if self.played % 5 == 0:
             for process in psutil.Process().children(recursive=True):

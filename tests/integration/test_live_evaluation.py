@@ -1,6 +1,6 @@
 """`vlagents-ray eval` beside a page and a trainer that go on: `--live-at` and `--watch`.
 
-The page is there while the evaluation runs, with cells and sessions, and then gone.
+The page is there while the evaluation runs, with cases and sessions, and then gone.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ def evaluating(ray_home: Path, log: Path, *words: str) -> Iterator[LivePage]:
     assert page.document() == {}
 
 
-def test_it_shows_cells_sessions_and_failures_while_it_runs(ray_home: Path, tmp_path: Path) -> None:
+def test_it_shows_cases_sessions_and_failures_while_it_runs(ray_home: Path, tmp_path: Path) -> None:
     settings = [f"folder={tmp_path}", "trouble={gate: [3]}"]  # the last episode waits for the test
     words = [word for setting in settings for word in ("--env-set", setting)]
     policy = [
@@ -62,8 +62,8 @@ def test_it_shows_cells_sessions_and_failures_while_it_runs(ray_home: Path, tmp_
         said = document["evaluation"]
         assert (said["state"], said["planned"], said["failed"]) == ("running", 4, 3)
         assert said["ends"] is not None
-        [cell] = said["cells"]
-        assert (cell["policy"], cell["task"], cell["rate"], cell["low"]) == ("noop", LINE, 0.0, 0.0)
+        [case] = said["cases"]
+        assert (case["policy"], case["task"], case["rate"], case["low"]) == ("noop", LINE, 0.0, 0.0)
         assert [one["outcome"] for one in said["failures"]] == ["failure"] * 3
         [replica] = document["replicas"]
         assert replica["policy"] == "noop"
@@ -75,7 +75,7 @@ def test_it_shows_cells_sessions_and_failures_while_it_runs(ray_home: Path, tmp_
 def finished(out: Path) -> dict[str, int]:
     """Episodes of each contender."""
     with suppress(ConfigError):
-        return {cell.contender: len(cell.counted) for cell in Results.load(out).cells}
+        return {case.contender: len(case.counted) for case in Results.load(out).cases}
     return {}
 
 
@@ -113,10 +113,10 @@ def test_each_checkpoint_is_evaluated_once_it_is_whole_by_one_server_and_gets_a_
         written(runs, 30, "1.0", done=True)
     results = Results.load(out)
     assert finished(out) == {"mine@10": 2, "mine@20": 2, "mine@30": 2}
-    assert [cell.counted[0].checkpoint for cell in results.cells] == [
+    assert [case.counted[0].checkpoint for case in results.cases] == [
         str(runs / f"{n}" / "number") for n in (10, 20, 30)
     ]
-    assert [cell.step for cell in results.cells] == [10, 20, 30]
+    assert [case.step for case in results.cases] == [10, 20, 30]
     assert "step 20: not yet: has no done" in (tmp_path / "log").read_text()
     assert {one["checkpoint"] for one in results.policies.values()} == {
         str(runs / "10" / "number")

@@ -192,8 +192,8 @@ def test_an_evaluation_plays_the_flights(policy: Raptor, tmp_path: Path) -> None
         workers=0,
     )
     summary = evaluate(plan, agent_factory=Raptor)
-    [cell] = summary.results.cells
-    for i, one in enumerate(cell.episodes):
+    [case] = summary.results.cases
+    for i, one in enumerate(case.episodes):
         states = fly([i], together(policy, 1), one.result.steps)
         assert one.result.success_at_end == bool(
             (np.linalg.norm(states[-100:, :3, 0], axis=1) < 0.2).all()

@@ -62,8 +62,8 @@ def test_they_succeed_as_often_as_their_card_says(env: str, tmp_path: Path) -> N
     assert (
         found.success_once.successes / EPISODES >= wilson(solved, episodes)[0] - 0.15
     )  # 30 episodes: a deviation of 0.05
-    [cell] = Results.load(tmp_path).cells
-    assert len({one.actions_sha256 for one in cell.counted}) == EPISODES
+    [case] = Results.load(tmp_path).cases
+    assert len({one.actions_sha256 for one in case.counted}) == EPISODES
 
 
 def test_their_card_and_rates_are_those_of_their_bundles(tmp_path: Path) -> None:

@@ -276,7 +276,7 @@ def blind_trial(tmp_path: Path, arm: Arm, person: Operator, policy: Policy, mode
         }
     )
     summary = evaluate_on_robot(config, person, robot=arm, agent_factory=lambda _: policy)
-    [episode] = summary.results.cells[0].episodes
+    [episode] = summary.results.cases[0].episodes
     assert episode.result.steps <= MAX_STEPS
 
 

@@ -57,7 +57,7 @@ def replica() -> Iterator[Replicas]:
 
 def outcomes(summary: Summary) -> list[dict[str, Any]]:
     """What is the same in all runs; the message of an error has the id of its request."""
-    found = [one.result.outcome for cell in summary.results.cells for one in cell.episodes]
+    found = [one.result.outcome for case in summary.results.cases for one in case.episodes]
     return [one | {"error": (one["error"] or "").partition(";")[0]} for one in found]
 
 

@@ -25,7 +25,7 @@ def with_a_lost_episode(settings: EvalConfig) -> Results:
     play(settings, left_out=[2])
     with Store(settings.model_copy(update={"resume": True})) as store:
         store.begin_run(settings, {})
-        key = next(job.key for job in plan(store.cells) if job.key.episode == 2)
+        key = next(job.key for job in plan(store.cases) if job.key.episode == 2)
         store.record(
             EpisodeResult(key, "infra_failed", error='env_failed: it hung, "again"'), attempts=4
         )

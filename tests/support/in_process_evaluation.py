@@ -24,21 +24,21 @@ def play(
     with Store(config) as store:
         store.begin_run(config, versions())
         finished = store.finished()
-        for job in plan(store.cells):
+        for job in plan(store.cases):
             if str(job.key) in finished or job.key.episode in left_out:
                 continue
             [report] = worker.run((job,))
             assert report.result is not None, report.failure
             if report.policy is not None:
-                store.note_policy(job.cell.policy.name, report.policy)
+                store.note_policy(job.case.policy.name, report.policy)
             if report.env is not None:
-                store.note_env(job.cell.place, report.env)
+                store.note_env(job.case.place, report.env)
             if report.worker is not None:
                 store.note_worker(report.worker)
             store.record(
                 report.result,
                 job.attempt,
-                *save(config.out, job.cell, report.result, report.artifacts),
+                *save(config.out, job.case, report.result, report.artifacts),
             )
         store.end_run("complete")
     worker.close()

@@ -32,7 +32,7 @@ TIMING = {
     "total_ms": 21.5,
 }
 
-# (cell, seed) -> the step that solved it, None for never.
+# (case, seed) -> the step that solved it, None for never.
 Outcome = Callable[[EvalCase, int], int | None]
 
 
@@ -55,10 +55,10 @@ def runs(
     return EvalConfig.model_validate({"policies": policies, "suites": suites, "out": out} | changes)
 
 
-def better_later(cell: EvalCase, seed: int) -> int | None:
+def better_later(case: EvalCase, seed: int) -> int | None:
     """Solved the more often the longer training was; by the base policy every fourth time."""
-    chance = 0.25 if cell.step is None else cell.step / 2500
-    drawn = np.random.default_rng([seed, len(cell.env)]).uniform()
+    chance = 0.25 if case.step is None else case.step / 2500
+    drawn = np.random.default_rng([seed, len(case.env)]).uniform()
     return 10 + seed % 60 if drawn < chance else None
 
 
@@ -76,13 +76,13 @@ def record(
     """
     with Store(config) as store:
         store.begin_run(config, versions())
-        jobs = plan(store.cells)
+        jobs = plan(store.cases)
         shown = config.video == "all"
         for job in jobs:
-            result = _result(job, outcome(job.cell, job.key.seed))
+            result = _result(job, outcome(job.case, job.key.seed))
             paths = save_videos(
                 config.out,
-                job.cell,
+                job.case,
                 result,
                 _video() if videos and (shown or not result.success_once) else {},
             )
@@ -90,7 +90,7 @@ def record(
                 _trouble(store, job, lost=job == jobs[1])
             else:
                 store.record(result, 1, paths)
-        for place in {cell.place for cell in store.cells}:
+        for place in {case.place for case in store.cases}:
             described = {
                 "simulator": "line",
                 "protocol": {"init_states": 50, "settle_steps": 10, "word": HOSTILE},

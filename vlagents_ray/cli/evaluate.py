@@ -251,7 +251,7 @@ def evaluate_command(options: EvalOptions) -> None:
 
     Exit status: 0 when every episode has its result; 75 when --end-at left some over, 130 if
     interrupted (resume both with --resume); 2 for invalid settings; 3 when an error of the policy
-    ended every episode of a cell; 1 for any other failure, and when infrastructure lost an episode
+    ended every episode of a case; 1 for any other failure, and when infrastructure lost an episode
     for good (--resume tries it again).
     """
     with errors():

@@ -40,12 +40,12 @@ from vlagents_ray.evaluate import (
     progress_for,
 )
 from vlagents_ray.evaluate.checkpoint_watcher import CheckpointWatcher, rounds
-from vlagents_ray.evaluate.plan.cases import EvalCase, cells
+from vlagents_ray.evaluate.plan.cases import EvalCase, plan_cases
 from vlagents_ray.evaluate.report.evaluation_page import EvaluationPage
 from vlagents_ray.evaluate.report.results_document import ProgressDocument, ResultsDocument
 from vlagents_ray.evaluate.report.terminal import LineProgress
 from vlagents_ray.evaluate.results.database import FILE
-from vlagents_ray.evaluate.results.summary import errors_of_policies, failing_cells, summarize
+from vlagents_ray.evaluate.results.summary import errors_of_policies, failing_cases, summarize
 from vlagents_ray.policies.base.checkpoint import STEP
 from vlagents_ray.ray_tools.private import node_of_this_process
 from vlagents_ray.registry import registered_class
@@ -54,7 +54,7 @@ from vlagents_ray.serve.launch.deployment_file import own_settings
 from vlagents_ray.serve.models.checkpoints import CHOICE
 from vlagents_ray.serve.ports import LOOPBACK, is_free
 
-POLICY_ERRORS = 3  # exit status: an error of the policy ended every episode of a cell
+POLICY_ERRORS = 3  # exit status: an error of the policy ended every episode of a case
 LOOK_S = 1.0  # period at which the folder is read
 _PORT = 8050  # of the page, if it is free
 _PAGE = "live"  # name of the page in the registry
@@ -176,7 +176,7 @@ def evaluate_and_print(
         summary = evaluate(config, agent_factory=agents, progress=progress, end_at=end_at)
     except PolicyFailed as error:
         results = Results.load(config.out)
-        if not failing_cells(results):
+        if not failing_cases(results):
             raise
         print_summary(out, summarize(results))
         fail(str(error), POLICY_ERRORS)
@@ -190,24 +190,24 @@ def evaluate_and_print(
 
 
 def require_results(config: EvalConfig, summary: Summary) -> None:
-    """End the command with status 3 if an error of the policy ended every episode of a cell that
+    """End the command with status 3 if an error of the policy ended every episode of a case that
     `config` plans.
 
     The status is 1 if infrastructure lost an episode.
     """
-    wanted = {cell.fingerprint for cell in cells(config)}
-    mine = [cell for cell in summary.results.cells if cell.cell in wanted]
-    if failing := failing_cells(summary.results.among(mine)):
+    wanted = {case.fingerprint for case in plan_cases(config)}
+    mine = [case for case in summary.results.cases if case.case_id in wanted]
+    if failing := failing_cases(summary.results.among(mine)):
         (_, _, error), _ = errors_of_policies(summary.results.among(failing))[0]
-        where = ", ".join(f"{cell.contender} in {cell.task}" for cell in failing)
+        where = ", ".join(f"{case.contender} in {case.task}" for case in failing)
         fail(
             f"every episode ended by an error of the policy: {where}; the first one: "
             f"{error.strip()}",
             POLICY_ERRORS,
         )
-    if not (missing := sum(cell.missing for cell in mine)):
+    if not (missing := sum(case.missing for case in mine)):
         return
-    lost = [attempt for cell in mine for attempt in cell.attempts if not attempt.retried]
+    lost = [attempt for case in mine for attempt in case.attempts if not attempt.retried]
     last = max(lost, key=lambda attempt: attempt.at, default=None)
     why = (
         ""
@@ -215,7 +215,7 @@ def require_results(config: EvalConfig, summary: Summary) -> None:
         else f", the last one to {last.code}: {last.error.strip().partition(chr(10))[0]}"
     )
     fail(
-        f"{missing} of {sum(cell.planned for cell in mine)} episodes have no result: lost to "
+        f"{missing} of {sum(case.planned for case in mine)} episodes have no result: lost to "
         f"infrastructure{why}; "
         f"the report lists every attempt under Errors, --resume tries them again",
         1,
@@ -325,7 +325,7 @@ def run_on_robot(
         PageOperator,
         TerminalOperator,
         evaluate_on_robot,
-        planned_cells,
+        plan_robot_cases,
         unblind,
     )
 
@@ -334,7 +334,7 @@ def run_on_robot(
             out, unblind(config.out, config.robot.key if config.robot is not None else None)
         )
         return
-    planned_cells(config)  # raises before anything starts
+    plan_robot_cases(config)  # raises before anything starts
     with served(config, address) as (ready, _), contextlib.ExitStack() as stack:
         person = (
             TerminalOperator()
@@ -347,23 +347,23 @@ def run_on_robot(
 
 @dataclass(frozen=True, slots=True)
 class Forecast:
-    """The episodes that one cell has left, and the time that one of them takes."""
+    """The episodes that one case has left, and the time that one of them takes."""
 
-    cell: EvalCase
+    case: EvalCase
     finished: int  # episodes, among those that are planned
-    left: int  # episodes to play; fewer than the rest if the cell has stopped early
+    left: int  # episodes to play; fewer than the rest if the case has stopped early
     seconds: float | None  # mean time of its policy's episodes in its env; None: not known
 
 
 def print_plan(config: EvalConfig, address: str | None = None) -> None:
-    """Print a row for each cell, and the sum. Nothing is served, played or written."""
+    """Print a row for each case, and the sum. Nothing is served, played or written."""
     for tracker in config.track:
         registered_class("trackers", tracker)  # raises an error for an unknown name
     stated = config
     config, parts = resolve_policies(stated, ask=False)
     workers = planned_workers(stated, parts, address)
     results = Results.load(config.out) if (config.out / FILE).is_file() else None
-    found = forecasts(cells(config), results)
+    found = forecasts(plan_cases(config), results)
     shown = Table(box=SIMPLE_HEAD, padding=0, pad_edge=False)
     for title in ("policy", "env"):
         shown.add_column(title, overflow="fold")
@@ -371,10 +371,10 @@ def print_plan(config: EvalConfig, address: str | None = None) -> None:
         shown.add_column(title, justify="right", no_wrap=True)
     for one in found:
         shown.add_row(
-            one.cell.contender,
-            " ".join(filter(None, one.cell.name[1:])),
-            str(len(one.cell.suite.seeds)),
-            str(one.cell.planned),
+            one.case.contender,
+            " ".join(filter(None, one.case.name[1:])),
+            str(len(one.case.suite.seeds)),
+            str(one.case.planned),
             str(one.finished),
             str(one.left),
             *(
@@ -384,7 +384,7 @@ def print_plan(config: EvalConfig, address: str | None = None) -> None:
             ),
         )
     out.print(shown)
-    cases = [one.cell for one in found]
+    cases = [one.case for one in found]
     policies, envs = (
         len({case.contender for case in cases}),
         len({(case.suite.name, case.env) for case in cases}),
@@ -394,12 +394,12 @@ def print_plan(config: EvalConfig, address: str | None = None) -> None:
     # Workers share one queue, so that at most one episode's time is lost at the end.
     seconds = sum(one.left * (one.seconds or 0.0) for one in found) / max(1, min(workers, left))
     unknown = sum(one.seconds is None for one in found)
-    beside = f"; not played yet: {unknown} of {counted(len(found), 'cell')}" if unknown else ""
+    beside = f"; not played yet: {unknown} of {counted(len(found), 'case')}" if unknown else ""
     factors = (
         f"{counted(policies, 'policy', 'policies')} at each checkpoint x "
         f"{counted(envs, 'environment')} of suites"
     )
-    out.print(f"{counted(len(found), 'cell')}: {factors}")
+    out.print(f"{counted(len(found), 'case')}: {factors}")
     out.print(
         f"{counted(planned, 'episode')}, {finished} of them finished in {config.out}, {left} to "
         "play"
@@ -410,30 +410,30 @@ def print_plan(config: EvalConfig, address: str | None = None) -> None:
 
 
 def forecasts(planned: Sequence[EvalCase], results: Results | None) -> list[Forecast]:
-    """Return the forecast of each cell, in their order, from the episodes in `results`."""
-    earlier = results.cells if results is not None else ()
+    """Return the forecast of each case, in their order, from the episodes in `results`."""
+    earlier = results.cases if results is not None else ()
     found = []
-    for cell in planned:
+    for case in planned:
         same = next(
-            (one for one in earlier if (one.contender, one.suite, one.env) == cell.name), None
+            (one for one in earlier if (one.contender, one.suite, one.env) == case.name), None
         )
         recorded = [] if same is None else [one.result for one in same.episodes]
         done = {(one.key.episode, one.key.seed) for one in recorded if one.status != "infra_failed"}
-        planned_seeds = set(cell.suite.seeds)
+        planned_seeds = set(case.suite.seeds)
         finished = sum(
-            episode < cell.suite.episodes and seed - episode in planned_seeds
+            episode < case.suite.episodes and seed - episode in planned_seeds
             for episode, seed in done
         )
         has_stopped = same is not None and same.stopped_at is not None
-        alike = [one for one in earlier if (one.policy, one.env) == (cell.policy.name, cell.env)]
+        alike = [one for one in earlier if (one.policy, one.env) == (case.policy.name, case.env)]
         seconds = [episode.seconds for one in alike for episode in one.counted]
         mean = sum(seconds) / len(seconds) if seconds else None
-        found.append(Forecast(cell, finished, 0 if has_stopped else cell.planned - finished, mean))
+        found.append(Forecast(case, finished, 0 if has_stopped else case.planned - finished, mean))
     return found
 
 
 def counted(number: int, noun: str, plural: str | None = None) -> str:
-    """Return "1 cell", or "2 cells"."""
+    """Return "1 case", or "2 cases"."""
     return f"{number} {noun if number == 1 else plural or noun + 's'}"
 
 

@@ -19,7 +19,7 @@ from vlagents_ray.contract import require_match
 from vlagents_ray.envs.base import known_contract
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.evaluate import EvalConfig, PolicyConfig, check
-from vlagents_ray.evaluate.plan.cases import cells
+from vlagents_ray.evaluate.plan.cases import plan_cases
 from vlagents_ray.evaluate.workers.base import chosen_workers
 from vlagents_ray.evaluate.workers.rollout import THREAD_VARIABLES
 from vlagents_ray.interface import Agent
@@ -107,7 +107,7 @@ def _require_cluster_workers(config: EvalConfig, address: str | None) -> None:
 
 def _require_resources(config: EvalConfig, parts: Mapping[str, Deployment]) -> None:
     """Raise `ConfigError` or `MissingDependency` unless this machine has the GPUs and packages."""
-    wanted = max(cell.worker.gpus for cell in cells(config))
+    wanted = max(case.worker.gpus for case in plan_cases(config))
     if wanted and wanted > (here := gpus_here()):  # Ray would never start these workers here
         raise ConfigError(
             f"worker.gpus: a worker wants {wanted:g} GPUs, this machine has {here:g}; want less (0 "
@@ -121,14 +121,14 @@ def _require_resources(config: EvalConfig, parts: Mapping[str, Deployment]) -> N
 def _require_fit(config: EvalConfig, parts: Mapping[str, Deployment]) -> None:
     """Raise `ContractMismatch` unless the policies that will be served fit their simulations."""
     policy_contract = cache(lambda application: stated_contract(parts[application]))
-    for cell in cells(config) if config.real_robot is None else ():
-        application = str(cell.policy.url).removeprefix("serve://")
+    for case in plan_cases(config) if config.real_robot is None else ():
+        application = str(case.policy.url).removeprefix("serve://")
         if (
             application in parts
-            and (env := known_contract(cell.env, cell.suite.env_options)) is not None
+            and (env := known_contract(case.env, case.suite.env_options)) is not None
         ):
             require_match(
-                policy_contract(application), env, f"{cell.policy.name!r} in {cell.env!r}: "
+                policy_contract(application), env, f"{case.policy.name!r} in {case.env!r}: "
             )
 
 

@@ -15,7 +15,7 @@ from typing import Any, Literal
 
 from vlagents_ray.evaluate.artifacts.storage import require_folder_of, whole
 from vlagents_ray.evaluate.plan.config import canonical
-from vlagents_ray.evaluate.results.reader import CellResults, Episode, Results
+from vlagents_ray.evaluate.results.reader import CaseResults, Episode, Results
 
 Type = Literal["string", "integer", "number", "boolean", "time", "json"]
 
@@ -27,21 +27,21 @@ class Column:
     name: str
     type: Type
     meaning: str
-    value: Callable[[CellResults, Episode], Any]
+    value: Callable[[CaseResults, Episode], Any]
 
 
 def _of_result(name: str, kind: Type, meaning: str, field: str | None = None) -> Column:
     return Column(
-        name, kind, meaning, lambda _cell, episode: getattr(episode.result, field or name)
+        name, kind, meaning, lambda _case, episode: getattr(episode.result, field or name)
     )
 
 
-def _of_cell(name: str, kind: Type, meaning: str) -> Column:
-    return Column(name, kind, meaning, lambda cell, _episode: getattr(cell, name))
+def _of_case(name: str, kind: Type, meaning: str) -> Column:
+    return Column(name, kind, meaning, lambda case, _episode: getattr(case, name))
 
 
 def _of_episode(name: str, kind: Type, meaning: str) -> Column:
-    return Column(name, kind, meaning, lambda _cell, episode: getattr(episode, name))
+    return Column(name, kind, meaning, lambda _case, episode: getattr(episode, name))
 
 
 COLUMNS = (
@@ -51,8 +51,8 @@ COLUMNS = (
         "identifies the episode by all that determines it, its weights included",
         "full_key",
     ),
-    _of_cell("policy", "string", "its name in the evaluation"),
-    _of_cell("step", "integer", "of training, in a sweep over checkpoints"),
+    _of_case("policy", "string", "its name in the evaluation"),
+    _of_case("step", "integer", "of training, in a sweep over checkpoints"),
     _of_result("checkpoint", "string", "that the policy's reset named"),
     _of_result(
         "weights", "string", "digest of the weights loaded from it; null if the policy states none"
@@ -68,27 +68,27 @@ COLUMNS = (
         "of that version, computed by its replica from the weights in memory",
     ),
     _of_result("first_policy_version", "integer", "of the weights that computed the first act"),
-    _of_cell("suite", "string", "its name in the evaluation"),
-    _of_cell("env", "string", "full name, with the task"),
+    _of_case("suite", "string", "its name in the evaluation"),
+    _of_case("env", "string", "full name, with the task"),
     Column(
         "episode",
         "integer",
         "its number, from 0",
-        lambda _cell, episode: episode.result.key.episode,
+        lambda _case, episode: episode.result.key.episode,
     ),
     Column(
         "seed",
         "integer",
         "of the env's and the policy's reset",
-        lambda _cell, episode: episode.result.key.seed,
+        lambda _case, episode: episode.result.key.seed,
     ),
-    _of_cell(
+    _of_case(
         "settings",
         "json",
         "all else that decides the episode: options of env and policy, checkpoint, codec",
     ),
-    _of_cell("described", "json", "the env's description of itself: versions, protocol"),
-    _of_cell(
+    _of_case("described", "json", "the env's description of itself: versions, protocol"),
+    _of_case(
         "code", "json", "of the env: its git commit, and the SHA-256 of the difference from it"
     ),
     _of_result(
@@ -100,7 +100,7 @@ COLUMNS = (
         "counted",
         "boolean",
         "whether it counts in the rates",
-        lambda _cell, episode: episode.counts,
+        lambda _case, episode: episode.counts,
     ),
     _of_result("success_once", "boolean", "the task was solved after some step"),
     _of_result("success_at_end", "boolean", "the task was solved after the last step"),
@@ -158,9 +158,9 @@ def rows(results: Results, *, flat: bool = False) -> Iterator[dict[str, Any]]:
     """Yield every recorded episode as Python values by column; those of type "json" are nested
     or, if `flat`, text.
     """
-    for cell in results.cells:
-        for episode in cell.episodes:
-            row = {column.name: column.value(cell, episode) for column in COLUMNS}
+    for case in results.cases:
+        for episode in case.episodes:
+            row = {column.name: column.value(case, episode) for column in COLUMNS}
             yield row | {name: canonical(row[name]) for name in _JSON if flat}
 
 

@@ -11,9 +11,9 @@ import numpy as np
 
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.evaluate.artifacts.recorder import Trajectory
-from vlagents_ray.evaluate.plan.cases import cells
+from vlagents_ray.evaluate.plan.cases import plan_cases
 from vlagents_ray.evaluate.plan.config import EvalConfig
-from vlagents_ray.evaluate.results.reader import CellResults, Episode, Results
+from vlagents_ray.evaluate.results.reader import CaseResults, Episode, Results
 
 _FEW = 5  # names in a message
 # Largest differences of actions of 1 or less, else relative. At the first step that differs, a
@@ -46,7 +46,7 @@ class Recorded:
     """An episode that can be played again."""
 
     results: Results
-    cell: CellResults
+    case: CaseResults
     episode: Episode
 
     @property
@@ -55,7 +55,7 @@ class Recorded:
         return self.episode.result.key.episode, self.episode.result.key.seed
 
     def config(self, out: Path, *, policy: dict[str, Any] | None = None) -> EvalConfig:
-        """Settings of an evaluation of this episode's cell alone into `out`, with video and
+        """Settings of an evaluation of this episode's case alone into `out`, with video and
         trajectory.
 
         They are those of its run. `policy` replaces settings of the policy.
@@ -63,20 +63,22 @@ class Recorded:
         run = next(run for run in self.results.runs if run.run == self.episode.run)
         config = EvalConfig.model_validate(run.config)
         # By its settings: `merge` may have taken the suite's name from another folder.
-        cell = next((one for one in cells(config) if one.fingerprint == self.cell.cell), None)
-        if cell is None:
+        case = next(
+            (one for one in plan_cases(config) if one.fingerprint == self.case.case_id), None
+        )
+        if case is None:
             raise ConfigError(
-                f"{self.results.out}: the settings of run {run.run} have no such cell as that of "
+                f"{self.results.out}: the settings of run {run.run} have no such case as that of "
                 f"{self.episode.result.key}; replay it in the folder in which it was played"
             )
-        given = cell.policy.model_dump() | {"steps": [cell.step] if cell.policy.steps else []}
-        if cell.policy.source is None:
+        given = case.policy.model_dump() | {"steps": [case.step] if case.policy.steps else []}
+        if case.policy.source is None:
             given |= {"config": {}}  # the server has its own configuration
         else:
             given |= {"url": None}  # it was served for that run, and is served again
         if policy is not None:
             given = {name: value for name, value in given.items() if name != "name"} | policy
-        suite = cell.suite.model_dump() | {"envs": [cell.env], "worker": cell.worker.model_dump()}
+        suite = case.suite.model_dump() | {"envs": [case.env], "worker": case.worker.model_dump()}
         alone = {
             "policies": [given],
             "suites": [suite],
@@ -96,18 +98,18 @@ def find(results: Results, name: str | None) -> Recorded:
     failed by infrastructure.
     """
     found = [
-        Recorded(results, cell, one)
-        for cell in results.cells
-        for one in cell.episodes
+        Recorded(results, case, one)
+        for case in results.cases
+        for one in case.episodes
         if name
-        in (one.result.full_key, str(one.result.key), f"{cell.env}#{one.result.key.episode}")
+        in (one.result.full_key, str(one.result.key), f"{case.env}#{one.result.key.episode}")
     ]
     if not found:
-        have = [one.result.full_key for cell in results.cells for one in cell.episodes][:_FEW]
+        have = [one.result.full_key for case in results.cases for one in case.episodes][:_FEW]
         got = "got no episode" if name is None else f"has no episode {name!r}"
         raise ConfigError(f"{results.out}: {got}, want a key as {have}, or ENV#NUMBER")
     if len(found) > 1:
-        keys = [f"{one.episode.result.full_key} ({one.cell.contender})" for one in found]
+        keys = [f"{one.episode.result.full_key} ({one.case.contender})" for one in found]
         raise ConfigError(f"{name!r} stands for {len(found)} episodes; want one of the keys {keys}")
     if found[0].episode.result.status == "infra_failed":
         raise ConfigError(f"{name!r} was never played to its end: {found[0].episode.result.error}")
@@ -122,7 +124,7 @@ def compare(recorded: Recorded, replayed: Results) -> list[str]:
     `actions_difference`), and so are then returns that differ by no more than `DRIFT`. Durations
     are not compared. Raises `ConfigError` if infrastructure failed the replay.
     """
-    [[again]] = [cell.episodes for cell in replayed.cells]
+    [[again]] = [case.episodes for case in replayed.cases]
     if again.result.status == "infra_failed":
         raise ConfigError(
             f"the replay did not end, so that there is nothing to compare: {again.result.error}"
@@ -156,7 +158,7 @@ def actions_difference(recorded: Recorded, replayed: Results) -> ActionsDifferen
         None if they are equal byte for byte, if their numbers differ, or if a trajectory is
         missing.
     """
-    [[again]] = [cell.episodes for cell in replayed.cells]
+    [[again]] = [case.episodes for case in replayed.cases]
     if recorded.episode.result.actions_sha256 == again.result.actions_sha256:
         return None
     paths = [

@@ -191,28 +191,28 @@ class _Run:
         config, store = self.config, self.store
         self._attempts = FailedAttempts(config)
         self._checked_gpus = not config.workers  # when an env first drew
-        earlier = {cell.cell: cell for cell in Results.load(config.out).cells}
+        earlier = {case.case_id: case for case in Results.load(config.out).cases}
         self._recorded = {
-            cell: rate_of([results], "success_once") for cell, results in earlier.items()
+            case: rate_of([results], "success_once") for case, results in earlier.items()
         }
         # Steps and digest of the actions.
         self._diverged: dict[EpisodeKey, tuple[int, str | None]] = {}
         self._stopping: dict[str, Stopping] = {}
         if config.stop is not None:
-            for cell in store.cells:
-                stopping = Stopping(config.stop, cell.suite.seeds, cell.planned)
-                stopping.add_all(episode.result for episode in earlier[cell.fingerprint].episodes)
-                self._stopping[cell.fingerprint] = stopping
+            for case in store.cases:
+                stopping = Stopping(config.stop, case.suite.seeds, case.planned)
+                stopping.add_all(episode.result for episode in earlier[case.fingerprint].episodes)
+                self._stopping[case.fingerprint] = stopping
         finished = store.finished()
         wanted = [
-            job for job in plan(store.cells) if self.only in (None, (job.key.episode, job.key.seed))
+            job for job in plan(store.cases) if self.only in (None, (job.key.episode, job.key.seed))
         ]
         pending = [
             job for job in wanted if str(job.key) not in finished and not self._has_stopped(job)
         ]
         self._queue = JobQueue(pending)
-        self._left = Counter(job.key.settings for job in pending)  # by cell
-        played = (one.result.seconds for cell in earlier.values() for one in cell.episodes)
+        self._left = Counter(job.key.settings for job in pending)  # by case
+        played = (one.result.seconds for case in earlier.values() for one in case.episodes)
         self._deadline = Deadline(self.end_at, played)
 
     def play(self, factory: AgentFactory) -> tuple[str, Summary]:
@@ -227,7 +227,7 @@ class _Run:
         with contextlib.ExitStack() as stack:
             pool_of = workers_class(self.config, stack)
             stop = stack.enter_context(stop_signals())
-            self.progress.begin(self.store.cells, self._recorded, len(self._queue))
+            self.progress.begin(self.store.cases, self._recorded, len(self._queue))
             try:
                 with pool_of(self.config, factory) as pool:
                     try:
@@ -274,12 +274,12 @@ class _Run:
 
     def _handle(self, job: Job, report: Report) -> None:
         if report.policy is not None:
-            name = job.cell.policy.name
+            name = job.case.policy.name
             local = {"program": self.local_programs[name]} if name in self.local_programs else {}
             self.store.note_policy(name, local | report.policy)
             save_diffs(self.config.out, [policy_code(report.policy)])
         if report.env is not None:
-            self.store.note_env(job.cell.place, report.env)
+            self.store.note_env(job.case.place, report.env)
             save_diffs(self.config.out, [report.env.code])
         if report.worker is not None:
             self.store.note_worker(report.worker)
@@ -287,7 +287,7 @@ class _Run:
                 from vlagents_ray.evaluate.workers.cluster import unused_gpus
 
                 self._checked_gpus = True
-                if (hint := unused_gpus(job.cell, report.worker)) is not None:
+                if (hint := unused_gpus(job.case, report.worker)) is not None:
                     log.warning(hint)
         if report.failure is not None:
             self._failed(job, report.failure)
@@ -342,22 +342,22 @@ class _Run:
 
     def _record(self, job: Job, result: EpisodeResult, kept: Artifacts) -> None:
         # Files first: a crash in between repeats the episode, and they are overwritten.
-        videos, trajectory = save(self.config.out, job.cell, result, kept)
+        videos, trajectory = save(self.config.out, job.case, result, kept)
         self.store.record(result, job.attempt, videos, trajectory)
-        self.progress.episode(job.cell, result)
+        self.progress.episode(job.case, result)
         self._left[job.key.settings] -= 1
-        stopping = self._stopping.get(job.cell.fingerprint)
+        stopping = self._stopping.get(job.case.fingerprint)
         if stopping is not None and not self._has_stopped(job):
             stopping.add(result)
             if stopping.at is not None:  # its outcomes suffice; running episodes are finished
-                dropped = self._queue.drop(job.cell.fingerprint)
+                dropped = self._queue.drop(job.case.fingerprint)
                 self._left[job.key.settings] -= dropped
-                self.progress.stopped(job.cell, stopping.at, dropped)
+                self.progress.stopped(job.case, stopping.at, dropped)
         if not self._left[job.key.settings]:
             self.tracking.update()
 
     def _has_stopped(self, job: Job) -> bool:
-        stopping = self._stopping.get(job.cell.fingerprint)
+        stopping = self._stopping.get(job.case.fingerprint)
         return stopping is not None and stopping.at is not None
 
 

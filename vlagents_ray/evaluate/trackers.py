@@ -15,7 +15,7 @@ from vlagents_ray.evaluate.artifacts.storage import PROVENANCE
 from vlagents_ray.evaluate.plan.config import EvalConfig, fingerprint
 from vlagents_ray.evaluate.results.changes import IDENTITY
 from vlagents_ray.evaluate.results.database import FILE, WAIT_S
-from vlagents_ray.evaluate.results.reader import CellResults, Results
+from vlagents_ray.evaluate.results.reader import CaseResults, Results
 from vlagents_ray.evaluate.results.summary import Group, summarize
 from vlagents_ray.registry import registered_class, require_needs
 
@@ -94,7 +94,7 @@ class TrackerFeed:
         )
 
     def update(self) -> None:
-        """Request a check for complete cells. Calls while trackers are busy count as one."""
+        """Request a check for complete cases. Calls while trackers are busy count as one."""
         self._updated.set()
 
     def __enter__(self) -> TrackerFeed:
@@ -117,7 +117,7 @@ class TrackerFeed:
         while not over:
             self._updated.wait()
             self._updated.clear()
-            # Read before the results, so that all cells complete by then are logged.
+            # Read before the results, so that all cases complete by then are logged.
             over = self._closing
             for tracker in list(self._working):
                 try:
@@ -137,13 +137,13 @@ class TrackerFeed:
                 log.warning("%s: %s: %s", name, type(error).__name__, error)
 
     def _log_to(self, name: str, results: Results) -> None:
-        """Log the complete cells, and then the complete policies, of which the tracker has other
+        """Log the complete cases, and then the complete policies, of which the tracker has other
         numbers or none.
         """
         summary = summarize(results)
         groups = [
-            (cell.cell, [cell], group)
-            for cell, group in zip(results.cells, summary.cells, strict=True)
+            (case.case_id, [case], group)
+            for case, group in zip(results.cases, summary.cases, strict=True)
         ]
         for policy, total in zip(results.contenders, summary.totals, strict=True):
             groups.append((policy, results.of(policy), total))
@@ -151,16 +151,16 @@ class TrackerFeed:
             logged = dict(
                 db.execute("SELECT what, episodes FROM tracked WHERE tracker = ?", (name,))
             )
-            for identity, cells, group in groups:
-                if not all(map(_is_complete, cells)) or logged.get(identity) == group.episodes:
+            for identity, cases, group in groups:
+                if not all(map(_is_complete, cases)) or logged.get(identity) == group.episodes:
                     continue
-                run = self._run_of(name, results, cells[0].policy)
+                run = self._run_of(name, results, cases[0].policy)
                 label = "/".join(filter(None, (group.suite, group.env)))
-                run.log(_metrics(label, group), cells[0].step)
-                if identity == cells[0].cell:
-                    videos = self._videos(cells[0])
+                run.log(_metrics(label, group), cases[0].step)
+                if identity == cases[0].case_id:
+                    videos = self._videos(cases[0])
                     if videos:
-                        run.videos(label, videos, cells[0].step)
+                        run.videos(label, videos, cases[0].step)
                 with db:
                     db.execute(
                         "INSERT OR REPLACE INTO tracked VALUES (?, ?, ?)",
@@ -173,9 +173,9 @@ class TrackerFeed:
             run = self._runs[name, policy] = self._classes[name](self._subject(results, policy))
         return run
 
-    def _videos(self, cell: CellResults) -> list[Path]:
-        """Return the first videos of a cell that are shown, failures first."""
-        ordered = sorted(cell.episodes, key=lambda episode: bool(episode.result.success_once))
+    def _videos(self, case: CaseResults) -> list[Path]:
+        """Return the first videos of a case that are shown, failures first."""
+        ordered = sorted(case.episodes, key=lambda episode: bool(episode.result.success_once))
         videos = [self._config.out / path for episode in ordered for path in episode.videos[:1]]
         return videos[: self._config.tracking.videos]
 
@@ -185,7 +185,7 @@ class TrackerFeed:
         served = {name: metadata.get(name) for name in IDENTITY}
         code: dict[str, Any] = dict(results.runs[-1].versions.get("code", {}))
         code[f"policy {policy}"] = metadata.get("code")
-        code |= {f"env {cell.env}": cell.code for cell in results.cells}
+        code |= {f"env {case.env}": case.code for case in results.cases}
         return TrackedPolicy(
             out, names.project, names.group or out.resolve().name, policy,
             fingerprint([results.runs[0].started, policy]),
@@ -194,10 +194,10 @@ class TrackerFeed:
         )  # fmt: skip
 
 
-def _is_complete(cell: CellResults) -> bool:
-    if cell.stopped_at is not None:
+def _is_complete(case: CaseResults) -> bool:
+    if case.stopped_at is not None:
         return True
-    return sum(not episode.beyond for episode in cell.episodes) >= cell.planned
+    return sum(not episode.beyond for episode in case.episodes) >= case.planned
 
 
 def _metrics(label: str, group: Group) -> dict[str, float]:

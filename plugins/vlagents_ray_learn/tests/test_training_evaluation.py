@@ -52,7 +52,7 @@ def served() -> Iterator[Replicas]:
 
 
 def episodes(out: Path, contender: str) -> list[EpisodeResult]:
-    return [one.result for cell in Results.load(out).of(contender) for one in cell.episodes]
+    return [one.result for case in Results.load(out).of(contender) for one in case.episodes]
 
 
 def test_each_version_is_a_checkpoint_of_the_results(plan: EvalConfig, agent: Proportional) -> None:
@@ -64,7 +64,7 @@ def test_each_version_is_a_checkpoint_of_the_results(plan: EvalConfig, agent: Pr
     assert [group.success_once.successes for group in summary.totals] == [0, 4]
     assert {one.policy_version for one in episodes(plan.out, "reach@20")} == {20}
     written = json.loads((plan.out / "summary.json").read_text())
-    assert [cell["pushed_weights"] for cell in written["cells"]] == [
+    assert [case["pushed_weights"] for case in written["cases"]] == [
         f"version 1 ({fingerprint({'gain': np.full(1, 0.1, np.float32)})})",
         f"version 20 ({fingerprint({'gain': np.ones(1, np.float32)})})",
     ]
@@ -173,12 +173,12 @@ def test_no_results_are_made_again_and_none_are_taken_for_those_of_other_weights
     plan: EvalConfig, agent: Proportional
 ) -> None:
     TrainingEvaluation(agent, plan).play(1)
-    before = Results.load(plan.out).cells
+    before = Results.load(plan.out).cases
     with pytest.raises(ConfigError, match="already has results: set resume=True"):
         TrainingEvaluation(agent, plan)
     again = TrainingEvaluation(agent, plan.model_copy(update={"resume": True}))
     again.play(1)
-    assert Results.load(plan.out).cells == before
+    assert Results.load(plan.out).cases == before
     agent.tree["gain"][:] = 2.0
     with pytest.raises(
         ConfigError, match=r"pushed_weights: the results have {.*'version': 1}, now"

@@ -16,7 +16,7 @@ from vlagents_ray.envs.base import SequentialBatch
 from vlagents_ray.errors import EnvFailed, MissingDependency
 from vlagents_ray.evaluate.episode.episode import run_episodes
 from vlagents_ray.evaluate.episode.records import EpisodeResult
-from vlagents_ray.evaluate.plan.cases import cells
+from vlagents_ray.evaluate.plan.cases import plan_cases
 from vlagents_ray.evaluate.plan.jobs import EpisodeKey, Job, plan
 from vlagents_ray.evaluate.workers.rollout import Report, Rollout
 from vlagents_ray.interface import Act, Agent, Obs
@@ -55,13 +55,13 @@ def played(
     **options: Any,
 ) -> Report:
     settings = {"env_options": options.pop("env_options", {}), "execute": execute}
-    [cell] = cells(flat_config(envs=[env], out="out", **settings))
+    [case] = plan_cases(flat_config(envs=[env], out="out", **settings))
     worker = Rollout(
         flat_config(envs=[env], out="out"),
         lambda _: agent,
         functools.partial(TransitionRecorder, **options),
     )
-    [report] = worker.run((Job(key or EpisodeKey(env, 3, 3, cell.fingerprint), cell),))
+    [report] = worker.run((Job(key or EpisodeKey(env, 3, 3, case.fingerprint), case),))
     worker.close()
     return report
 
@@ -91,7 +91,7 @@ def test_the_rows_are_the_steps_of_the_episode() -> None:
     np.testing.assert_array_equal(got["final.state.position"], [obs.state["position"]])
     assert got["t"].tolist() == list(range(10))
     assert set(got["key"]) == {
-        str(EpisodeKey(LINE, 3, 3, cells(flat_config(envs=[LINE], out="out"))[0].fingerprint))
+        str(EpisodeKey(LINE, 3, 3, plan_cases(flat_config(envs=[LINE], out="out"))[0].fingerprint))
     }
     assert set(got["episode"]) == {3}
     assert got["instruction"][0].startswith("bring ")
@@ -299,9 +299,9 @@ def test_a_key_with_a_seed_of_the_policy_is_another_episode_from_the_same_state(
     np.testing.assert_array_equal(first["state.position"][0], second["state.position"][0])
     assert (first["action"] != second["action"]).any()
     assert (str(one), str(other)) == (f"{LINE}#3@3:x", f"{LINE}#3@3/99:x")
-    assert {job.key.policy_seed for job in plan(cells(flat_config(envs=[LINE], out="out")))} == {
-        None
-    }
+    assert {
+        job.key.policy_seed for job in plan(plan_cases(flat_config(envs=[LINE], out="out")))
+    } == {None}
 
 
 def test_without_pyarrow_the_error_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -20,7 +20,7 @@ from vlagents_ray.evaluate.artifacts.recorder import Artifacts, EpisodeRecorder
 from vlagents_ray.evaluate.episode.failures import Failure
 from vlagents_ray.evaluate.episode.records import EpisodeResult, version_of
 from vlagents_ray.evaluate.episode.second_pass import SecondPass
-from vlagents_ray.evaluate.plan.cases import cells, require_envs
+from vlagents_ray.evaluate.plan.cases import plan_cases, require_envs
 from vlagents_ray.evaluate.plan.config import EpisodeChoice, EvalConfig
 from vlagents_ray.evaluate.plan.jobs import EpisodeKey, Job, JobQueue
 from vlagents_ray.evaluate.workers.base import FailedAttempts, Workers, dispatch
@@ -329,7 +329,7 @@ class Rollouts(AbstractContextManager["Rollouts"], Iterator[Any]):
         self._pa: Any = optional("pyarrow")
         config = plan.config()
         require_envs(config)
-        self._settings, self._config, self._cells = plan, config, cells(config)
+        self._settings, self._config, self._cases = plan, config, plan_cases(config)
         self._factory = agents(config, None if isinstance(plan.policy, str) else plan.policy)
         self._recorders = functools.partial(
             TransitionRecorder, want=tuple(plan.want), images=plan.images
@@ -539,16 +539,16 @@ class Rollouts(AbstractContextManager["Rollouts"], Iterator[Any]):
         """Queue the episodes up to number `limit`."""
         for number in range(self._planned, limit):
             state, member = divmod(number, self._settings.groups)
-            episode, turn = divmod(state, len(self._cells))
-            cell = self._cells[turn]
+            episode, turn = divmod(state, len(self._cases))
+            case = self._cases[turn]
             # The first of a group is the episode of an evaluation. The policy seeds of the others
             # are above all of those, so that no two episodes of an environment share their noise.
             policy_seed = self._settings.seed + _OTHER_MEMBERS + number if member else None
             job = Job(
                 EpisodeKey(
-                    cell.env, episode, self._settings.seed + episode, cell.fingerprint, policy_seed
+                    case.env, episode, self._settings.seed + episode, case.fingerprint, policy_seed
                 ),
-                cell,
+                case,
             )
             self._episodes[job.key] = _PlannedEpisode(job, number)
             self._queue.put(job)

@@ -15,7 +15,7 @@ from in_memory_keys import ChangingKeys
 from live_server import Address
 from recorded_results import record, runs
 
-from vlagents_ray.evaluate.plan.cases import cells
+from vlagents_ray.evaluate.plan.cases import plan_cases
 from vlagents_ray.evaluate.report.results_document import ProgressDocument
 from vlagents_ray.serve.access.api_keys import Keys
 from vlagents_ray_live.live_page import page_server
@@ -82,8 +82,8 @@ def until(page: Page, expression: str, want: object) -> None:
 def begun(out: Path, **options: bool) -> ProgressDocument:
     """An evaluation that runs."""
     document = ProgressDocument(out, **options)
-    planned = cells(runs(out, episodes=5))
-    document.begin(planned, {}, sum(cell.planned for cell in planned))
+    planned = plan_cases(runs(out, episodes=5))
+    document.begin(planned, {}, sum(case.planned for case in planned))
     return document
 
 
@@ -96,7 +96,7 @@ def test_it_fits_without_errors_or_requests_outside(
     with served(document.read, document.video) as url:
         show(page, url, width=width, scheme=scheme)
         until(page, STATE, "Running")
-        until(page, "document.querySelectorAll('#cells .cell').length", 9)
+        until(page, "document.querySelectorAll('#cases .case').length", 9)
         assert page.value("document.documentElement.scrollWidth") <= width
         assert page.value("document.querySelectorAll('.of-server:not([hidden])').length") == 0
         assert page.said == []
@@ -104,7 +104,7 @@ def test_it_fits_without_errors_or_requests_outside(
         assert all(address.startswith(("blob:", "data:", own)) for address in page.asked)
 
 
-def test_cells_fill_with_their_intervals_and_failures_come_with_video(
+def test_cases_fill_with_their_intervals_and_failures_come_with_video(
     page: Page, results: Path
 ) -> None:
     document = begun(results)
@@ -125,9 +125,9 @@ def test_cells_fill_with_their_intervals_and_failures_come_with_video(
         )
         assert page.value(f"{controls}(document.querySelector('#failures video'))") == [False, True]
         assert page.value(f"{PLAYING} < {CARDS} - 1")
-        cell = "document.querySelector('#cells .cell').innerText"
-        assert "5 of 5" in page.value(cell)
-        assert " to " in page.value(cell)
+        case = "document.querySelector('#cases .case').innerText"
+        assert "5 of 5" in page.value(case)
+        assert " to " in page.value(case)
         text = page.value("document.getElementById('failures').innerText")
         assert "lost to infrastructure" in text
         assert "error of the policy" in text
@@ -147,7 +147,7 @@ def test_it_says_how_it_ends_and_keeps_what_was_seen(page: Page, results: Path) 
         document.fail("StorageFailed: the disk is full")
         until(page, STATE, "Stopped by an error: StorageFailed: the disk is full")
     until(page, "document.getElementById('connection').textContent", "Ended")
-    assert page.value("document.querySelectorAll('#cells .cell').length") == 9
+    assert page.value("document.querySelectorAll('#cases .case').length") == 9
 
 
 def test_the_time_left_is_told(page: Page) -> None:

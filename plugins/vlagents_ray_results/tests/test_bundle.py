@@ -217,7 +217,7 @@ def test_summary_and_report_are_written_from_the_database(
         ("UPDATE episodes SET episode_return = episode_return + 1", "trajectories"),
         ("UPDATE episodes SET seed = seed + 100", "database"),
         (
-            "UPDATE cells SET settings = replace(settings, '\"execute\":null', '\"execute\":1')",
+            "UPDATE cases SET settings = replace(settings, '\"execute\":null', '\"execute\":1')",
             "database",
         ),
     ],
@@ -260,9 +260,9 @@ def test_options_that_could_name_files_or_code_are_not_taken_from_a_stranger(
 ) -> None:
     verify(bundle, into=tmp_path / "run", replay=0)
     with closing(sqlite3.connect(tmp_path / "run/results.db")) as db, db:
-        [settings] = db.execute("SELECT settings FROM cells").fetchone()
+        [settings] = db.execute("SELECT settings FROM cases").fetchone()
         db.execute(
-            "UPDATE cells SET settings = ?",
+            "UPDATE cases SET settings = ?",
             (json.dumps(json.loads(settings) | {"env_options": options}),),
         )
     write_bundle(tmp_path / "run", tmp_path / "b.zip")
@@ -341,7 +341,7 @@ def test_a_database_of_views_or_of_odd_values_is_refused(
     verify(bundle, into=tmp_path / "run", replay=0)
     for sql, why in (
         ("CREATE VIEW x AS SELECT 1", "got 'x', which is a view that no evaluation makes"),
-        ("UPDATE cells SET seeds = '[]'", "its database holds values that no evaluation writes"),
+        ("UPDATE cases SET seeds = '[]'", "its database holds values that no evaluation writes"),
         (
             "UPDATE runs SET config = '{\"policies\": 1}'",
             "its database holds values that no evaluation writes",
@@ -379,7 +379,7 @@ def test_an_evaluation_that_is_written_to_is_bundled_as_it_stands(
         write_bundle(tmp_path / "run", tmp_path / "b.zip")
         db.rollback()
         verify(tmp_path / "b.zip", into=tmp_path / "kept", replay=0)
-    assert all(one.result.seconds < 99 for one in Results.load(tmp_path / "kept").cells[0].episodes)
+    assert all(one.result.seconds < 99 for one in Results.load(tmp_path / "kept").cases[0].episodes)
 
 
 def test_the_commands_say_what_to_cite_and_end_with_1_if_something_differs(

@@ -49,7 +49,7 @@ class Versioned(ToZero):
 # By column: the new values, as SQL, and the rows that get them.
 FORGERIES: dict[str, list[tuple[str, str]]] = {
     "key": [("key || 'x'", SOLVED)],
-    "cell": [("'0123456789abcdef'", SOLVED)],
+    "case_id": [("'0123456789abcdef'", SOLVED)],
     "env": [("'tabletop'", SOLVED)],
     "episode": [("episode + 100", SOLVED)],
     "seed": [("seed + 100", SOLVED)],
@@ -122,7 +122,7 @@ def honest(tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("honest") / "run"
     options = {"envs": [LINE], "episodes": EPISODES, "seed": 3, "record": "all", "video": "none"}
     results = play(flat_config(**options, out=out), Versioned)
-    outcomes = {one.success_once for one in results.cells[0].counted}
+    outcomes = {one.success_once for one in results.cases[0].counted}
     assert outcomes == {True, False}, "both kinds of outcomes can be forged"
     return out
 
@@ -256,15 +256,15 @@ def test_a_recording_of_an_episode_that_was_left_out_is_named(forged: Forge) -> 
 @pytest.mark.parametrize(
     "sql",
     [
-        f"UPDATE cells SET planned = {EPISODES // 2}",
-        "UPDATE cells SET seeds = '[400]'",
-        """UPDATE cells SET stop = '{"error_rate": 0.05, "width": 0.9}'""",
-        """UPDATE cells SET settings = replace(settings, '"execute":null', '"execute":1')""",
-        "UPDATE cells SET env = 'tabletop'",
-        "UPDATE cells SET policy = 'another'",
+        f"UPDATE cases SET planned = {EPISODES // 2}",
+        "UPDATE cases SET seeds = '[400]'",
+        """UPDATE cases SET stop = '{"error_rate": 0.05, "width": 0.9}'""",
+        """UPDATE cases SET settings = replace(settings, '"execute":null', '"execute":1')""",
+        "UPDATE cases SET env = 'tabletop'",
+        "UPDATE cases SET policy = 'another'",
     ],
 )
-def test_a_changed_cell_that_would_leave_episodes_out_contradicts_the_bundle(
+def test_a_changed_case_that_would_leave_episodes_out_contradicts_the_bundle(
     forged: Forge, sql: str
 ) -> None:
     assert not forged(update(sql)).holds

@@ -46,7 +46,7 @@ def test_frames_states_actions_rewards_and_success_are_those_of_the_episodes(
     results = play(config(episodes=3, record="all", env_options=CAMERA | {"state_dim": 2}))
     root = tmp_path / "dataset"
     assert to_lerobot(results, root) == 3
-    for number, episode in enumerate(results.cells[0].episodes):
+    for number, episode in enumerate(results.cases[0].episodes):
         trajectory = Trajectory.load(results.out / str(episode.trajectory))
         rows = pq.read_table(root / f"data/chunk-000/file-{number:03d}.parquet").to_pydict()
         # LeRobot wants no lists of one number.
@@ -64,7 +64,7 @@ def test_frames_states_actions_rewards_and_success_are_those_of_the_episodes(
             ]
         assert red[:10] == pytest.approx([20 * i for i in range(10)], abs=6)
     tasks = pq.read_table(root / "meta/tasks.parquet").column("__index_level_0__").to_pylist()
-    assert tasks == [episode.result.instruction for episode in results.cells[0].episodes]
+    assert tasks == [episode.result.instruction for episode in results.cases[0].episodes]
 
 
 def test_the_trajectories_stay_as_they_are(config: Config, tmp_path: Path) -> None:
@@ -259,7 +259,7 @@ class Pushed(ToZero):
 
 def test_a_frame_names_the_weights_that_chose_its_action(config: Config, tmp_path: Path) -> None:
     results = play(config(episodes=1, record="all"), Pushed)
-    [played] = results.cells[0].episodes
+    [played] = results.cases[0].episodes
     to_lerobot(results, tmp_path / "d")
     assert info(tmp_path / "d")["features"]["policy_version"]["dtype"] == "int64"
     assert rows(tmp_path / "d", 0)["policy_version"] == list(range(3, 13))
@@ -272,7 +272,7 @@ def test_a_frame_names_the_weights_that_chose_its_action(config: Config, tmp_pat
 def test_angles_are_written_without_jumps_and_info_says_about_what(
     results: Results, tmp_path: Path
 ) -> None:
-    recorded = Trajectory.load(results.out / str(results.cells[0].episodes[0].trajectory)).state[
+    recorded = Trajectory.load(results.out / str(results.cases[0].episodes[0].trajectory)).state[
         "xyzrpy"
     ][:-1]
     assert np.abs(np.diff(recorded[:, 3])).max() > np.pi
@@ -294,7 +294,7 @@ def test_rotation_vectors_are_written_without_jumps_and_are_the_same_rotations(
     config: Config, tmp_path: Path
 ) -> None:
     results = play(config(envs=[TILTED_ROLLER], episodes=2, record="all"), Turner)
-    recorded = Trajectory.load(results.out / str(results.cells[0].episodes[0].trajectory)).state[
+    recorded = Trajectory.load(results.out / str(results.cases[0].episodes[0].trajectory)).state[
         "xyz_axis_angle"
     ][:-1]
     assert np.linalg.norm(np.diff(recorded[:, 3:], axis=0), axis=1).max() > np.pi

@@ -51,7 +51,7 @@ def part(config: Config, tmp_path: Path) -> Callable[..., Path]:
 
 def outcomes(results: Results) -> dict[str, object]:
     return {
-        str(one.result.key): one.result.outcome for cell in results.cells for one in cell.episodes
+        str(one.result.key): one.result.outcome for case in results.cases for one in case.episodes
     }
 
 
@@ -62,7 +62,7 @@ def test_parts_that_overlap_make_the_whole_each_episode_as_the_first_has_it(
     summary = merge(tmp_path / "out", [a, b])
     found = Results.load(tmp_path / "out")
     assert outcomes(found) == outcomes(Results.load(whole))
-    assert [one.run for one in found.cells[0].episodes] == [1, 1, 1, 2, 2, 2]
+    assert [one.run for one in found.cases[0].episodes] == [1, 1, 1, 2, 2, 2]
     assert (summary.total.episodes, summary.total.planned) == (6, 6)
     assert (tmp_path / "out" / "summary.json").is_file()
     assert [(one.run, one.pid, one.transport) for one in found.workers] == [
@@ -78,7 +78,7 @@ def test_a_merged_folder_is_resumed_like_any_other(
     a, b = part("a", 2, 3, 4, 5), part("b", 0, 1, 4, 5)
     merge(tmp_path / "out", [a, b])
     results = play(config(out=tmp_path / "out", resume=True))
-    assert [(one.result.key.episode, one.run) for one in results.cells[0].episodes] == [
+    assert [(one.result.key.episode, one.run) for one in results.cases[0].episodes] == [
         (0, 1), (1, 1), (2, 2), (3, 2), (4, 3), (5, 3)
     ]  # fmt: skip
 
@@ -90,8 +90,8 @@ def test_other_envs_and_seeds_join_the_table_also_of_a_suite_that_was_renamed(
     suite = renamed.suites[0].model_copy(update={"name": "b"})
     play(renamed.model_copy(update={"suites": [suite]}))
     merge(tmp_path / "out", [part("a"), tmp_path / "b", part("c", envs=[OTHER_LINE])])
-    cells = Results.load(tmp_path / "out").cells
-    assert [(cell.env, cell.planned, len(cell.counted)) for cell in cells] == [
+    cases = Results.load(tmp_path / "out").cases
+    assert [(case.env, case.planned, len(case.counted)) for case in cases] == [
         (LINE, 12, 12),
         (OTHER_LINE, 6, 6),
     ]
@@ -136,12 +136,12 @@ def test_a_lost_episode_gives_way_to_one_that_was_played(
     a, b = part("a", 5), part("b")
     with Store(config(out=a, resume=True)) as store:
         store.begin_run(config(out=a), {})
-        lost = EpisodeResult(plan(store.cells)[5].key, "infra_failed", error="it hung")
+        lost = EpisodeResult(plan(store.cases)[5].key, "infra_failed", error="it hung")
         store.record(lost, attempts=4)
     for order in ([a, b], [b, a]):
         out = tmp_path / order[0].name / "merged"
         merge(out, order)
-        assert [one.result.status for one in Results.load(out).cells[0].episodes] == ["done"] * 6
+        assert [one.result.status for one in Results.load(out).cases[0].episodes] == ["done"] * 6
 
 
 @pytest.mark.parametrize(
@@ -173,7 +173,7 @@ def test_in_a_sweep_each_server_may_have_begun_with_another_checkpoint(
     for folder in folders:
         play(config(out=folder, steps=[int(folder.name)]), functools.partial(Served, folder.name))
     merge(tmp_path / "out", folders)
-    assert [cell.step for cell in Results.load(tmp_path / "out").cells] == [10, 20]
+    assert [case.step for case in Results.load(tmp_path / "out").cases] == [10, 20]
 
 
 def test_videos_and_trajectories_go_along_without_taking_room(
@@ -182,7 +182,7 @@ def test_videos_and_trajectories_go_along_without_taking_room(
     options = {"env_options": {"camera": [32, 32]}, "record": "all", "video": "all"}
     a, b = part("a", 1, 2, 3, 4, 5, **options), part("b", 0, 2, 3, 4, 5, **options)
     merge(tmp_path / "out", [a, b])
-    for episode, home in zip(Results.load(tmp_path / "out").cells[0].episodes, (a, b), strict=True):
+    for episode, home in zip(Results.load(tmp_path / "out").cases[0].episodes, (a, b), strict=True):
         for path in [*episode.videos, str(episode.trajectory)]:
             assert os.path.samefile(tmp_path / "out" / path, home / path)
     names = {path.name for path in (tmp_path / "out" / "trajectories").rglob("*.mp4")}
@@ -262,7 +262,7 @@ def test_symbolic_links_lead_no_further_than_their_folder(
         merge(tmp_path / "out", [theirs])
     other = part("other", execute=2)  # beside the secret
     for results in (Results.load(theirs), combined([Results.load(theirs), Results.load(other)])):
-        [path] = [video for cell in results.cells for one in cell.episodes for video in one.videos]
+        [path] = [video for case in results.cases for one in case.episodes for video in one.videos]
         with pytest.raises(ConfigError, match="symbolic link out of the folder"):
             results.file(path)
         page = write_report(results, tmp_path / "page.html", inline=True).read_text()
@@ -315,7 +315,7 @@ def test_other_weights_under_the_same_name_are_not_merged(
     merge(tmp_path / "same", [a, b])
     found = {
         one.result.weights
-        for cell in Results.load(tmp_path / "same").cells
-        for one in cell.episodes
+        for case in Results.load(tmp_path / "same").cases
+        for one in case.episodes
     }
     assert found == {"x"}

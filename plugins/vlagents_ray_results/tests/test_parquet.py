@@ -42,7 +42,7 @@ def test_parquet_has_a_typed_row_an_episode(results: Results, tmp_path: Path) ->
     assert [(row["env"], row["episode"], row["seed"]) for row in rows] == [
         (LINE, 0, 0), (LINE, 1, 1), (LINE, 2, 2), (OTHER_LINE, 0, 0), (OTHER_LINE, 1, 1)
     ]  # fmt: skip
-    result = results.cells[0].episodes[0].result
+    result = results.cases[0].episodes[0].result
     assert rows[0]["return"] == result.episode_return
     assert rows[0]["actions_sha256"] == result.actions_sha256
     assert json.loads(rows[0]["settings"])["env_options"] == {"camera": [32, 32]}

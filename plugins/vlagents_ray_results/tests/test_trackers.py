@@ -46,7 +46,7 @@ WANDB_HEADER, LOG_BLOCK = 7, 32768
 
 
 def rates(results: Results) -> list[float]:
-    return [sum(bool(one.success_once) for one in cell.counted) / 3 for cell in results.cells]
+    return [sum(bool(one.success_once) for one in case.counted) / 3 for case in results.cases]
 
 
 @pytest.fixture(scope="module", autouse=True)

@@ -288,8 +288,8 @@ def write_bundle(folder: Path, archive: Path, *, videos: bool = False) -> str:
 
 def _link_files(folder: Path, stage: Path, results: Results, *, videos: bool) -> None:
     paths: list[str] = []
-    for cell in results.cells:
-        for episode in cell.episodes:
+    for case in results.cases:
+        for episode in case.episodes:
             if videos:
                 paths += episode.videos
             if episode.trajectory is not None:

@@ -46,7 +46,7 @@ from vlagents_ray.datasets.writer import UNFINISHED_FOLDER, Dataset
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.evaluate.artifacts.recorder import DEFAULT_FPS, Trajectory, videos_of
 from vlagents_ray.evaluate.artifacts.storage import link_or_copy, require_there
-from vlagents_ray.evaluate.results.reader import CellResults, Episode, Results
+from vlagents_ray.evaluate.results.reader import CaseResults, Episode, Results
 from vlagents_ray.images.mp4 import rgb_converter
 from vlagents_ray.naming import did_you_mean, distinct
 from vlagents_ray.registry import require
@@ -94,15 +94,15 @@ def to_lerobot(
             the episodes do not fit one dataset.
     """
     recorded = []
-    for cell in results.cells:
-        recorded += [(cell, episode) for episode in cell.episodes if episode.trajectory is not None]
+    for case in results.cases:
+        recorded += [(case, episode) for episode in case.episodes if episode.trajectory is not None]
     if not recorded:
         raise ConfigError(
             f"{results.out}: has no trajectories; evaluate with --record all (`record: all` in its "
             "file)"
         )
     if successes:
-        solved = [(cell, episode) for cell, episode in recorded if episode.result.success_once]
+        solved = [(case, episode) for case, episode in recorded if episode.result.success_once]
         if not solved:
             raise ConfigError(
                 f"{results.out}: in none of the {len(recorded)} recorded episodes was the task "
@@ -111,7 +111,7 @@ def to_lerobot(
         recorded = solved
     if path.exists() and any(path.iterdir()):
         raise ConfigError(f"{path}: is there, and not empty; export into a new folder")
-    rates = {_fps(cell) for cell, _ in recorded}
+    rates = {_fps(case) for case, _ in recorded}
     if len(rates) > 1:
         raise ConfigError(
             f"the envs run at {sorted(rates)} Hz, and a dataset has one rate; {_CURE}"
@@ -128,7 +128,7 @@ def to_lerobot(
                 differing = sorted(
                     key for key, value in finished.features.items() if features.get(key) != value
                 )
-                env = demonstration.cell.env
+                env = demonstration.case.env
                 raise ConfigError(
                     f"{env}: has other features than envs before ({', '.join(differing)}); {_CURE}"
                 )
@@ -152,7 +152,7 @@ _STILL = 0.01
 class _Demonstration:
     """The N frames of one episode that go into the dataset."""
 
-    cell: CellResults
+    case: CaseResults
     episode: Episode
     contract: Contract  # of the env
     actions: np.ndarray  # (N, A)
@@ -179,24 +179,24 @@ class _Selection:
     with_versions: bool  # of the weights
 
     def demonstrations(
-        self, recorded: Iterable[tuple[CellResults, Episode]]
+        self, recorded: Iterable[tuple[CaseResults, Episode]]
     ) -> Iterator[_Demonstration]:
         """Read one recorded episode after the other; an episode without frames is left out."""
-        for cell, episode in recorded:
-            demonstration = self._read(cell, episode)
+        for case, episode in recorded:
+            demonstration = self._read(case, episode)
             # A policy that failed before it acted leaves an empty episode.
             if len(demonstration.actions):
                 yield demonstration
 
-    def _read(self, cell: CellResults, episode: Episode) -> _Demonstration:
+    def _read(self, case: CaseResults, episode: Episode) -> _Demonstration:
         path = str(episode.trajectory)
         trajectory = Trajectory.load(self.results.file(path))
         parts = parts_of(trajectory.state, trajectory.gripper is not None)
         numbers = [part for part in parts if part != GRIPPER or trajectory.gripper is None]
-        environment = _chosen("environment_state", self.environment_state, numbers, cell.env)
+        environment = _chosen("environment_state", self.environment_state, numbers, case.env)
         others = [part for part in parts if part not in environment]
-        chosen = _chosen("state", others if self.state is None else self.state, parts, cell.env)
-        cameras = _chosen("cameras", self.cameras, trajectory.cameras, cell.env)
+        chosen = _chosen("state", others if self.state is None else self.state, parts, case.env)
+        cameras = _chosen("cameras", self.cameras, trajectory.cameras, case.env)
         videos = videos_of(Path(path), trajectory.cameras)
 
         gripper = trajectory.gripper if GRIPPER in chosen else None
@@ -212,9 +212,9 @@ class _Selection:
             frames = _frames_until_rest(trajectory.success, moving)
 
         return _Demonstration(
-            cell,
+            case,
             episode,
-            Contract.from_json(cell.contract),
+            Contract.from_json(case.contract),
             trajectory.actions[:frames],
             trajectory.rewards[:frames],
             trajectory.success[:frames],
@@ -244,8 +244,8 @@ def _new_folder(path: Path) -> Iterator[Path]:
         os.replace(unfinished, path)
 
 
-def _fps(cell: CellResults) -> float:
-    return float(cell.contract.get("control_hz") or DEFAULT_FPS)
+def _fps(case: CaseResults) -> float:
+    return float(case.contract.get("control_hz") or DEFAULT_FPS)
 
 
 def _chosen(option: str, named: Sequence[str] | None, known: Sequence[str], env: str) -> list[str]:
@@ -336,7 +336,7 @@ def _finished(
             for frame in islice(container.decode(stream), len(demonstration.actions)):
                 statistics.add(convert(frame))
             images[key] = statistics.result()
-            features[key] = video_feature(stream.height, stream.width, _fps(demonstration.cell))
+            features[key] = video_feature(stream.height, stream.width, _fps(demonstration.case))
         videos[key] = folder / f"{key}.mp4"
         link_or_copy(video, videos[key])
     return FinishedEpisode(
@@ -361,7 +361,7 @@ def _numbers(
         ACTION: vector_feature([f"action_{i}" for i in range(dim)]),
         **number_features(OUTCOMES | INDEX),
     }
-    features[ACTION]["spec"] = demonstration.cell.contract.get("action")
+    features[ACTION]["spec"] = demonstration.case.contract.get("action")
     if names:
         rows[STATE], features[STATE] = together, vector_feature(names)
     if demonstration.environment:

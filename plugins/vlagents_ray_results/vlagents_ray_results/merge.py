@@ -40,7 +40,7 @@ class _Merged:
 
     runs: list[Row] = field(default_factory=list)
     policies: dict[str, Row] = field(default_factory=dict)
-    cells: dict[str, Row] = field(default_factory=dict)
+    cases: dict[str, Row] = field(default_factory=dict)
     episodes: dict[str, Row] = field(default_factory=dict)
     attempts: list[Row] = field(default_factory=list)
     workers: list[Row] = field(default_factory=list)
@@ -66,7 +66,7 @@ def merge(
         The summary of the merged results.
 
     Raises:
-        ConfigError: Cells of one name have different settings, a policy or the files of an env are
+        ConfigError: Cases of one name have different settings, a policy or the files of an env are
             not the same everywhere and `accept_changes` is off, an episode has different outcomes
             and `keep_first` is off, or an episode's file is missing or outside of its folder, by
             its path or by a symbolic link.
@@ -82,7 +82,7 @@ def merge(
     conflicts: list[str] = []
     for folder in folders:
         with reading(folder) as db:
-            changes = _add_policies(merged, folder, db) + _add_cells(merged, folder, db)
+            changes = _add_policies(merged, folder, db) + _add_cases(merged, folder, db)
             if changes and not accept_changes:
                 raise ConfigError(
                     f"{folder} was not played with the same program as the folders before "
@@ -107,7 +107,7 @@ def merge(
         tables = {
             "runs": merged.runs,
             "policies": list(merged.policies.values()),
-            "cells": list(merged.cells.values()),
+            "cases": list(merged.cases.values()),
             "episodes": list(merged.episodes.values()),
             "attempts": merged.attempts,
             "workers": merged.workers,
@@ -126,7 +126,7 @@ def merge(
 def _add_policies(merged: _Merged, folder: Path, db: sqlite3.Connection) -> list[Change]:
     changes = []
     swept = {
-        name for (name,) in db.execute("SELECT DISTINCT policy FROM cells WHERE step IS NOT NULL")
+        name for (name,) in db.execute("SELECT DISTINCT policy FROM cases WHERE step IS NOT NULL")
     }
     for row in table(db, "policies"):
         known = merged.policies.setdefault(row["name"], row)
@@ -142,13 +142,13 @@ def _add_policies(merged: _Merged, folder: Path, db: sqlite3.Connection) -> list
     return changes
 
 
-def _add_cells(merged: _Merged, folder: Path, db: sqlite3.Connection) -> list[Change]:
+def _add_cases(merged: _Merged, folder: Path, db: sqlite3.Connection) -> list[Change]:
     changes: dict[Change, None] = {}
-    names = {_name(row): row for row in merged.cells.values()}
-    for row in table(db, "cells"):
+    names = {_name(row): row for row in merged.cases.values()}
+    for row in table(db, "cases"):
         # A suite may have a new name.
-        known = merged.cells.get(row["cell"]) or names.setdefault(_name(row), row)
-        if known["cell"] != row["cell"]:
+        known = merged.cases.get(row["case_id"]) or names.setdefault(_name(row), row)
+        if known["case_id"] != row["case_id"]:
             before, now = json.loads(known["settings"]), json.loads(row["settings"])
             differing = [
                 f"{k}: {before.get(k)!r} and {now.get(k)!r}"
@@ -160,7 +160,7 @@ def _add_cells(merged: _Merged, folder: Path, db: sqlite3.Connection) -> list[Ch
                 f"{'; '.join(differing)}"
             )
         if known is row:
-            merged.cells[row["cell"]] = row
+            merged.cases[row["case_id"]] = row
             continue
         if known["stop"] != row["stop"]:
             where = " ".join(filter(None, _name(row)))
@@ -168,15 +168,15 @@ def _add_cells(merged: _Merged, folder: Path, db: sqlite3.Connection) -> list[Ch
                 f"{folder}: {where} stops early by {row['stop']}, that before it by {known['stop']}"
             )
         programs = [
-            None if cell["program"] is None else json.loads(cell["program"])
-            for cell in (known, row)
+            None if case["program"] is None else json.loads(case["program"])
+            for case in (known, row)
         ]
         changes |= dict.fromkeys(program_changes(f"env {row['env']}", *programs))
         statements = [
             EnvStatement(
-                json.loads(cell["described"] or "{}"), json.loads(cell["contract"] or "{}")
+                json.loads(case["described"] or "{}"), json.loads(case["contract"] or "{}")
             )
-            for cell in (known, row)
+            for case in (known, row)
         ]
         changes |= dict.fromkeys(env_changes(row["env"], *statements))
         for name in ("described", "contract", "code", "program"):
@@ -185,26 +185,26 @@ def _add_cells(merged: _Merged, folder: Path, db: sqlite3.Connection) -> list[Ch
     return list(changes)
 
 
-def _name(cell: Row) -> tuple[str, str, str, str]:
-    step = "" if cell["step"] is None else f"step {cell['step']}"
-    return cell["policy"], step, cell["suite"], cell["env"]
+def _name(case: Row) -> tuple[str, str, str, str]:
+    step = "" if case["step"] is None else f"step {case['step']}"
+    return case["policy"], step, case["suite"], case["env"]
 
 
-def _extend(cell: Row, other: Row, folder: Path) -> None:
-    """Plan the seeds of both cells, with the larger of the two numbers of episodes for each
+def _extend(case: Row, other: Row, folder: Path) -> None:
+    """Plan the seeds of both cases, with the larger of the two numbers of episodes for each
     seed.
     """
-    seeds, added = json.loads(cell["seeds"]), json.loads(other["seeds"])
-    episodes = max(cell["planned"] // len(seeds), other["planned"] // len(added))
+    seeds, added = json.loads(case["seeds"]), json.loads(other["seeds"])
+    episodes = max(case["planned"] // len(seeds), other["planned"] // len(added))
     seeds += [seed for seed in added if seed not in seeds]
     ordered = sorted(seeds)
     if any(high - low < episodes for low, high in itertools.pairwise(ordered)):
         raise ConfigError(
-            f"{folder}: {cell['env']} has the seeds {added}; together they are {ordered}, and with "
+            f"{folder}: {case['env']} has the seeds {added}; together they are {ordered}, and with "
             f"{episodes} episodes "
             f"of each some would be played twice; want them {episodes} or more apart"
         )
-    cell |= {"seeds": canonical(seeds), "planned": episodes * len(seeds)}
+    case |= {"seeds": canonical(seeds), "planned": episodes * len(seeds)}
 
 
 def _add_episodes(merged: _Merged, folder: Path, db: sqlite3.Connection) -> list[str]:
@@ -238,22 +238,22 @@ def _add_episodes(merged: _Merged, folder: Path, db: sqlite3.Connection) -> list
 
 
 def _require_one_checkpoint(merged: _Merged, *, weights_may_differ: bool) -> None:
-    """Raise `ConfigError` for a cell of several checkpoints, or a policy's checkpoint of several
+    """Raise `ConfigError` for a case of several checkpoints, or a policy's checkpoint of several
     weights.
     """
-    checkpoints: dict[str, dict[str, str]] = {}  # the key of an episode of each, by cell
+    checkpoints: dict[str, dict[str, str]] = {}  # the key of an episode of each, by case
     # By policy, step and checkpoint.
     weights: dict[tuple[str, int | None, str | None], dict[str, str]] = {}
     for row in merged.episodes.values():
-        cell, checkpoint = merged.cells[row["cell"]], row["checkpoint"]
+        case, checkpoint = merged.cases[row["case_id"]], row["checkpoint"]
         if checkpoint is not None:
-            checkpoints.setdefault(row["cell"], {}).setdefault(checkpoint, row["key"])
+            checkpoints.setdefault(row["case_id"], {}).setdefault(checkpoint, row["key"])
         if (found := row["weights"]) is not None:
-            weights.setdefault((cell["policy"], cell["step"], checkpoint), {}).setdefault(
+            weights.setdefault((case["policy"], case["step"], checkpoint), {}).setdefault(
                 found, row["key"]
             )
     several = [
-        (merged.cells[cell]["env"], "checkpoints", found) for cell, found in checkpoints.items()
+        (merged.cases[case]["env"], "checkpoints", found) for case, found in checkpoints.items()
     ]
     named = {} if weights_may_differ else weights
     several += [

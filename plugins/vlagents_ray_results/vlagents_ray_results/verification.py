@@ -35,7 +35,7 @@ from vlagents_ray.evaluate.plan.config import fingerprint
 from vlagents_ray.evaluate.report.page import FILE as REPORT
 from vlagents_ray.evaluate.report.page import write_report
 from vlagents_ray.evaluate.results.database import FILE as DATABASE
-from vlagents_ray.evaluate.results.reader import CellResults, Episode, Results, reading, table
+from vlagents_ray.evaluate.results.reader import CaseResults, Episode, Results, reading, table
 from vlagents_ray.evaluate.results.summary import summarize, write_summary
 from vlagents_ray.interface import Obs
 from vlagents_ray.registry import env_suite, names
@@ -151,9 +151,9 @@ def _check(folder: Path, replay: int, seed: int, *, trust: bool) -> Iterator[Fin
             f"got no {DATABASE} in the bundle; want one that `vlagents-ray bundle` wrote"
         )
     results = Results.load(folder)
-    if not results.runs or not results.cells:
-        raise ConfigError(f"{DATABASE}: has no run, or no cell; want the results of an evaluation")
-    yield _check_cells(results)
+    if not results.runs or not results.cases:
+        raise ConfigError(f"{DATABASE}: has no run, or no case; want the results of an evaluation")
+    yield _check_cases(results)
     yield _check_episodes(results)
     write_summary(summarize(results))
     write_report(results, folder / REPORT)
@@ -168,83 +168,83 @@ def _check(folder: Path, replay: int, seed: int, *, trust: bool) -> Iterator[Fin
         yield Finding(
             "replay", "not checked", "no finished episode has a recording (eval --record all)"
         )
-    for cell, episode, trajectory in chosen:
+    for case, episode, trajectory in chosen:
         if trajectory is not None:
-            yield _replay(cell, episode, trajectory, trust=trust)
+            yield _replay(case, episode, trajectory, trust=trust)
 
 
-def _drawn(results: Results, seed: int) -> Iterator[tuple[CellResults, Episode]]:
-    """Yield the finished episodes in a random order: one of each cell in turns, so that each
-    cell is checked.
+def _drawn(results: Results, seed: int) -> Iterator[tuple[CaseResults, Episode]]:
+    """Yield the finished episodes in a random order: one of each case in turns, so that each
+    case is checked.
     """
     draw = random.Random(seed)
-    cells = [
-        [(cell, episode) for episode in cell.episodes if episode.result.status == "done"]
-        for cell in results.cells
+    cases = [
+        [(case, episode) for episode in case.episodes if episode.result.status == "done"]
+        for case in results.cases
     ]
-    draw.shuffle(cells)
-    for episodes in cells:
+    draw.shuffle(cases)
+    for episodes in cases:
         draw.shuffle(episodes)
-    for turn in zip_longest(*cells):
+    for turn in zip_longest(*cases):
         yield from (pair for pair in turn if pair is not None)
 
 
-def _check_cells(results: Results) -> Finding:
-    """Check that cells and keys of episodes are those of their settings, and that nothing was
+def _check_cases(results: Results) -> Finding:
+    """Check that cases and keys of episodes are those of their settings, and that nothing was
     mixed or left out.
     """
     contradictions = []
     rules = {json.dumps(run.config.get("stop"), sort_keys=True) for run in results.runs}
-    for cell in results.cells:
-        name = f"{cell.contender} in {cell.task}"
-        named = cell.settings.get("env"), cell.settings.get("policy")
-        if fingerprint(cell.settings) != cell.cell or named != (cell.env, cell.policy):
+    for case in results.cases:
+        name = f"{case.contender} in {case.task}"
+        named = case.settings.get("env"), case.settings.get("policy")
+        if fingerprint(case.settings) != case.case_id or named != (case.env, case.policy):
             contradictions.append(f"{name}: its settings are not those of its key")
-        rule = None if cell.stop is None else cell.stop.model_dump(mode="json")
+        rule = None if case.stop is None else case.stop.model_dump(mode="json")
         if json.dumps(rule, sort_keys=True) not in rules:
             contradictions.append(f"{name}: no run stopped early by its rule")
-        keys_of_cell = [episode.result.key for episode in cell.episodes]
+        keys_of_case = [episode.result.key for episode in case.episodes]
         contradictions += [
-            f"{key}: is of another cell or env" for key in keys_of_cell if key.env != cell.env
+            f"{key}: is of another case or env" for key in keys_of_case if key.env != case.env
         ]
-        contradictions += [f"{name}: {text}" for text in _mixtures(results, cell)]
-    known_keys = {str(episode.result.key) for cell in results.cells for episode in cell.episodes}
+        contradictions += [f"{name}: {text}" for text in _mixtures(results, case)]
+    known_keys = {str(episode.result.key) for case in results.cases for episode in case.episodes}
     with reading(results.out) as db:
         keys = {row["key"] for row in table(db, "episodes")}
     contradictions += [
-        f"{key}: its key does not match its columns, or it has no cell"
+        f"{key}: its key does not match its columns, or it has no case"
         for key in sorted(keys - known_keys)
     ]
     return _finding(
         "database",
         contradictions,
-        f"{len(results.cells)} cells and {len(keys)} episodes have their settings' keys",
+        f"{len(results.cases)} cases and {len(keys)} episodes have their settings' keys",
     )
 
 
-# Of all episodes of a cell. A run whose change was accepted may have added another one; checkpoints
+# Of all episodes of a case. A run whose change was accepted may have added another one; checkpoints
 # are never mixed.
-_ONE_OF_A_CELL = ("checkpoint", "weights", "env_program", "policy_program")
+_ONE_OF_A_CASE = ("checkpoint", "weights", "env_program", "policy_program")
 
 
-def _mixtures(results: Results, cell: CellResults) -> Iterator[str]:
-    """Yield what the episodes of a cell do not have in common, although an evaluation would have
+def _mixtures(results: Results, case: CaseResults) -> Iterator[str]:
+    """Yield what the episodes of a case do not have in common, although an evaluation would have
     refused to add it.
     """
-    for column in _ONE_OF_A_CELL:
+    for column in _ONE_OF_A_CASE:
         if results.accepted_changes and column != "checkpoint":
             continue
         if column.endswith("_program"):
-            values = {getattr(episode, column) for episode in cell.episodes if episode.counts}
+            values = {getattr(episode, column) for episode in case.episodes if episode.counts}
         else:  # unknown for an episode that failed in the policy's reset
-            values = {getattr(episode.result, column) for episode in cell.episodes} - {None}
+            values = {getattr(episode.result, column) for episode in case.episodes} - {None}
         if len(values) > 1:
             yield (
                 f"its episodes have {len(values)} values of {column}, and no accepted change "
                 "says so"
             )
     fingerprints: dict[int, set[str]] = {}
-    for episode in cell.episodes:
+    for episode in case.episodes:
         if (
             episode.result.policy_version is not None
             and episode.result.policy_fingerprint is not None
@@ -255,7 +255,7 @@ def _mixtures(results: Results, cell: CellResults) -> Iterator[str]:
     for version, several in fingerprints.items():
         if len(several) > 1:
             yield f"version {version} of the weights has {len(several)} fingerprints"
-    if any(episode.unplanned for episode in cell.episodes) and not any(
+    if any(episode.unplanned for episode in case.episodes) and not any(
         change.subject == "plan" for change in results.accepted_changes
     ):
         yield (
@@ -270,10 +270,10 @@ def _check_episodes(results: Results) -> Finding:
     runs = {run.run for run in results.runs}
     recordings: dict[str, int] = {}
     number = 0
-    for cell in results.cells:
-        for episode in cell.episodes:
+    for case in results.cases:
+        for episode in case.episodes:
             number += 1
-            texts = list(_inconsistencies(cell, episode))
+            texts = list(_inconsistencies(case, episode))
             if episode.run not in runs:
                 texts.append(f"there is no run {episode.run}")
             contradictions += [f"{episode.result.key}: {text}" for text in texts]
@@ -296,7 +296,7 @@ def _check_episodes(results: Results) -> Finding:
     return _finding("episodes", contradictions, f"{number} have outcomes without contradiction")
 
 
-def _inconsistencies(cell: CellResults, episode: Episode) -> Iterator[str]:
+def _inconsistencies(case: CaseResults, episode: Episode) -> Iterator[str]:
     """Yield the contradictions between the columns of one episode."""
     result = episode.result
     outcome = (result.success_once, result.success_at_end, result.first_success)
@@ -326,7 +326,7 @@ def _inconsistencies(cell: CellResults, episode: Episode) -> Iterator[str]:
         solved_after is not None and solved_after == result.steps and not result.success_at_end
     ):
         yield "success_at_end contradicts first_success"
-    pushed = cell.settings.get("pushed_weights")
+    pushed = case.settings.get("pushed_weights")
     acted = (result.first_policy_version, result.policy_version, result.policy_fingerprint)
     if pushed and result.policy_version is not None:
         expected = (pushed["version"], pushed["version"], pushed["fingerprint"])
@@ -336,7 +336,7 @@ def _inconsistencies(cell: CellResults, episode: Episode) -> Iterator[str]:
                 f"({expected[2]})"
             )
     waited = (result.ticks_waited, result.ticks_held, result.latency_ms)
-    if cell.settings.get("clock") is None and waited != (0, 0, None):
+    if case.settings.get("clock") is None and waited != (0, 0, None):
         yield "it waited for answers, but its environment stood still meanwhile"
     if not 0 <= result.ticks_held <= result.ticks_waited <= result.steps:
         yield (
@@ -351,15 +351,15 @@ def _check_trajectories(results: Results) -> Finding:
     """
     contradictions: list[str] = []
     checked, missing = 0, 0
-    for cell in results.cells:
-        for episode in cell.episodes:
+    for case in results.cases:
+        for episode in case.episodes:
             if episode.result.status == "infra_failed":
                 continue
             if (trajectory := _recorded(results, episode)) is None:
                 missing += 1
                 continue
             checked += 1
-            synchronous = cell.settings.get("clock") is None
+            synchronous = case.settings.get("clock") is None
             contradictions += [
                 f"{episode.result.key}: {text}"
                 for text in _contradictions(episode, trajectory, synchronous=synchronous)
@@ -535,19 +535,19 @@ def _difference(recorded: Trajectory, number: int, obs: Obs, step: EnvStep | Non
     return max(differences, default=None)
 
 
-def require_harmless(cell: CellResults) -> None:
+def require_harmless(case: CaseResults) -> None:
     """Raise `ConfigError` unless making this environment runs no code but that of a registered one.
 
     A bundle may come from a stranger: "module:Class" would be imported, and an option that is a
     path or a nested value could name files or code of this machine. `trust_remote_code` from a
     bundle is refused: only the local user can grant it.
     """
-    if env_suite(cell.env) not in names("envs") or ":" in cell.env:
+    if env_suite(case.env) not in names("envs") or ":" in case.env:
         raise ConfigError(
-            f"{cell.env}: is no registered environment; --trust makes it, and runs its code"
+            f"{case.env}: is no registered environment; --trust makes it, and runs its code"
         )
     for kind in ("env_options", "reset_options"):
-        options = cell.settings.get(kind) or {}
+        options = case.settings.get(kind) or {}
         risky = {
             name: value
             for name, value in options.items()
@@ -555,13 +555,13 @@ def require_harmless(cell: CellResults) -> None:
         }
         if risky:
             raise ConfigError(
-                f"{cell.env}: got the {kind} {risky}, which could name files or code; --trust "
+                f"{case.env}: got the {kind} {risky}, which could name files or code; --trust "
                 "takes them"
             )
 
 
-def replay_actions(cell: CellResults, episode: Episode, trajectory: Trajectory) -> Replayed:
-    """Play the actions of `trajectory` in the environment of `cell`, from the episode's seed on.
+def replay_actions(case: CaseResults, episode: Episode, trajectory: Trajectory) -> Replayed:
+    """Play the actions of `trajectory` in the environment of `case`, from the episode's seed on.
 
     Images are neither rendered nor compared. State, gripper, rewards and success are, bit by bit.
 
@@ -572,10 +572,10 @@ def replay_actions(cell: CellResults, episode: Episode, trajectory: Trajectory) 
     """
     key = episode.result.key
     with env_side("make"):
-        env = make_batch(cell.env, 1, **(cell.settings.get("env_options") or {}))
+        env = make_batch(case.env, 1, **(case.settings.get("env_options") or {}))
     try:
         with env_side("reset"):
-            begin = options_of_reset(env, key.episode, cell.settings.get("reset_options"))
+            begin = options_of_reset(env, key.episode, case.settings.get("reset_options"))
         success: list[bool] = []
         instructions: list[str] = []
         differences: dict[int, float] = {}
@@ -619,9 +619,9 @@ def _is_plain(value: object) -> bool:
     return value is None or isinstance(value, bool | int | float)
 
 
-def _replay(cell: CellResults, episode: Episode, trajectory: Trajectory, *, trust: bool) -> Finding:
-    subject = f"replay of {cell.env}#{episode.result.key.episode}@{episode.result.key.seed}"
-    if cell.settings.get("robot") is not None:
+def _replay(case: CaseResults, episode: Episode, trajectory: Trajectory, *, trust: bool) -> Finding:
+    subject = f"replay of {case.env}#{episode.result.key.episode}@{episode.result.key.seed}"
+    if case.settings.get("robot") is not None:
         return Finding(subject, "not checked", "it was played on a real robot")
     if not _has_one_length(trajectory):
         return Finding(
@@ -631,8 +631,8 @@ def _replay(cell: CellResults, episode: Episode, trajectory: Trajectory, *, trus
         )
     try:
         if not trust:
-            require_harmless(cell)
-        played = replay_actions(cell, episode, trajectory)
+            require_harmless(case)
+        played = replay_actions(case, episode, trajectory)
     except VLAgentsError as error:
         return Finding(subject, "not checked", str(error))
     result, outcome, steps = episode.result, _outcome(played.success), len(played.success)
@@ -662,7 +662,7 @@ def _replay(cell: CellResults, episode: Episode, trajectory: Trajectory, *, trus
     detail = f"{steps} actions, every state, reward and success to the bit"
     if first is not None:
         detail = f"the same outcome, other numbers; {differs}"
-    described, described_here = cell.described, played.described
+    described, described_here = case.described, played.described
     differing = [
         (
             f"{name} {str(described_here.get(name))[:_LENGTH]}, there "

@@ -39,7 +39,7 @@ CAMERA = {"camera": [32, 32]}
 
 def test_a_trajectory_is_what_was_seen_and_done(config: Config) -> None:
     results = play(config(episodes=4, record="all", env_options=CAMERA))
-    for episode in results.cells[0].episodes:
+    for episode in results.cases[0].episodes:
         result = episode.result
         path = results.out / str(episode.trajectory)
         found = Trajectory.load(path)
@@ -63,11 +63,11 @@ def test_trajectories_are_kept_of_the_episodes_that_are_wanted(
     results = play(config(episodes=12, record=record))
     found = {
         bool(one.result.success_once): one.trajectory is not None
-        for one in results.cells[0].episodes
+        for one in results.cases[0].episodes
     }
     assert [found[False], found[True]] == kept
     stored = {str(path.relative_to(results.out)) for path in results.out.rglob("*.npz")}
-    assert stored == {one.trajectory for one in results.cells[0].episodes} - {None}
+    assert stored == {one.trajectory for one in results.cases[0].episodes} - {None}
 
 
 def test_a_checkpoint_of_a_sweep_has_not_the_files_of_a_policy_named_almost_like_it(
@@ -76,13 +76,13 @@ def test_a_checkpoint_of_a_sweep_has_not_the_files_of_a_policy_named_almost_like
     settings = config(episodes=1, record="all", policy="pi0", steps=[2])
     other = settings.policies[0].model_copy(update={"name": "pi0_2", "steps": []})
     results = play(settings.model_copy(update={"policies": [*settings.policies, other]}))
-    paths = [episode.trajectory for cell in results.cells for episode in cell.episodes]
+    paths = [episode.trajectory for case in results.cases for episode in case.episodes]
     assert len(set(paths)) == 2
 
 
 def test_a_video_that_is_also_the_trajectorys_is_there_once(config: Config) -> None:
     results = play(config(episodes=1, record="all", video="all", env_options=CAMERA))
-    [episode] = results.cells[0].episodes
+    [episode] = results.cases[0].episodes
     paths = (
         results.out / episode.videos[0],
         videos_of(results.out / str(episode.trajectory), ["front"])["front"],
@@ -107,7 +107,7 @@ class Pushed(ToZero):
 def versions(config: EvalConfig, make: Callable[[], Agent]) -> list[int]:
     """Of the weights that chose the actions of the only episode."""
     results = play(config, make)
-    found = Trajectory.load(results.out / str(results.cells[0].episodes[0].trajectory)).versions
+    found = Trajectory.load(results.out / str(results.cases[0].episodes[0].trajectory)).versions
     assert found is not None
     assert found.dtype == np.int64
     return list(map(int, found))
@@ -245,7 +245,7 @@ def test_a_camera_that_changes_its_size_is_an_env_failure() -> None:
         record([plain(COLOURS[0]), plain(COLOURS[0], 32, 32)])
 
 
-CELL = EvalCase(
+CASE = EvalCase(
     PolicyConfig(name="act", steps=[20]),
     20,
     SuiteConfig(name="unseen", envs=[ENV]),
@@ -260,7 +260,7 @@ def result(success: bool, status: str = "done") -> EpisodeResult:
 
 
 def test_a_video_is_named_by_env_episode_outcome_and_camera(tmp_path: Path) -> None:
-    paths = save_videos(tmp_path, CELL, result(True), {"base_camera": b"1", "left/wrist": b"2"})
+    paths = save_videos(tmp_path, CASE, result(True), {"base_camera": b"1", "left/wrist": b"2"})
     assert paths == [
         "videos/act@20/unseen/maniskill_PushCube-v1/ep0003_seed3_success_base_camera.mp4",
         "videos/act@20/unseen/maniskill_PushCube-v1/ep0003_seed3_success_left_wrist.mp4",
@@ -270,17 +270,17 @@ def test_a_video_is_named_by_env_episode_outcome_and_camera(tmp_path: Path) -> N
 
 def test_two_cameras_never_share_a_video(tmp_path: Path) -> None:
     videos = {"left/wrist": b"1", "left_wrist": b"2", "left wrist": b"3"}
-    paths = save_videos(tmp_path, CELL, result(True), videos)
+    paths = save_videos(tmp_path, CASE, result(True), videos)
     assert [(tmp_path / path).read_bytes() for path in paths] == [b"1", b"2", b"3"]
     assert paths[1].endswith("success_left_wrist.mp4")
 
 
 def test_a_repeated_episode_replaces_its_videos(tmp_path: Path) -> None:
-    save_videos(tmp_path, CELL, result(True), {"front": b"old", "wrist": b"old"})
+    save_videos(tmp_path, CASE, result(True), {"front": b"old", "wrist": b"old"})
     folder = tmp_path / "videos" / "act@20" / "unseen" / "maniskill_PushCube-v1"
     (folder / "ep0003_seed3_success_side.part").write_bytes(b"cut off by a crash")
     (folder / "ep0003_seed33_success_front.mp4").write_bytes(b"another episode")
-    save_videos(tmp_path, CELL, result(False), {"front": b"new"})
+    save_videos(tmp_path, CASE, result(False), {"front": b"new"})
     assert sorted(path.name for path in folder.iterdir()) == [
         "ep0003_seed33_success_front.mp4",
         "ep0003_seed3_failure_front.mp4",

@@ -47,11 +47,11 @@ else:
     raise AssertionError("it was written")
 subprocess.run(["mount", "-o", "remount,size=64m", sys.argv[1]], check=True)
 summary = play(resume=True)
-videos = [path for cell in summary.results.cells for one in cell.episodes for path in one.videos]
+videos = [path for case in summary.results.cases for one in case.episodes for path in one.videos]
 assert len(set(videos)) == summary.total.episodes, (len(set(videos)), summary.total)
 assert all((config.out / path).stat().st_size for path in videos)
 assert not list(config.out.rglob("*.part"))
-print("runs", len({one.run for cell in summary.results.cells for one in cell.episodes}))
+print("runs", len({one.run for case in summary.results.cases for one in case.episodes}))
 print("episodes", summary.total.episodes, (config.out / "report.html").is_file())
 """
 )
@@ -149,7 +149,7 @@ def test_a_disk_that_fills_up_at_the_very_end_is_told(
         with pytest.raises(StorageFailed, match="the disk is full"):
             evaluate(config(workers=0), agent_factory=ToZero)
     summary = evaluate(config(workers=0, resume=True), agent_factory=ToZero)
-    assert {one.run for cell in summary.results.cells for one in cell.episodes} == {1}
+    assert {one.run for case in summary.results.cases for one in case.episodes} == {1}
 
 
 def test_a_folder_that_is_a_file_is_one_sentence(config: Config, tmp_path: Path) -> None:

@@ -155,7 +155,7 @@ def outcomes(summary: Summary) -> dict[int, tuple[object, ...]]:
             one.result.success_once,
             one.result.actions_sha256,
         )
-        for one in summary.results.cells[0].episodes
+        for one in summary.results.cases[0].episodes
     }
 
 
@@ -178,7 +178,7 @@ def test_an_error_of_a_simulator_of_several_environments_names_its_episode(
     alone = outcomes(run(trouble))
     together = run(trouble, num_envs=4, envs=[f"{__name__}:FragileTogether"], retries=2)
     assert outcomes(together) == alone
-    assert together.cells[0].infra_failures == 0
+    assert together.cases[0].infra_failures == 0
 
 
 @pytest.mark.parametrize("trouble", ["diverges", "reward", *EXPLOSIONS])
@@ -187,20 +187,20 @@ def test_a_simulation_that_diverges_again_under_the_same_actions_is_a_failure_of
     run: Callable[..., Summary], trouble: str, num_envs: int
 ) -> None:
     summary = run(trouble, num_envs)
-    [group] = summary.cells
+    [group] = summary.cases
     assert (group.success_once.successes, group.success_once.episodes, group.infra_failures) == (
         5,
         EPISODES,
         0,
     )
     failed = [
-        one.result for one in summary.results.cells[0].episodes if one.result.status != "done"
+        one.result for one in summary.results.cases[0].episodes if one.result.status != "done"
     ]
     assert {(one.status, one.steps, one.success_once) for one in failed} == {
         ("policy_error", 3, False)
     }
     assert all("diverged, and again under the same actions" in str(one.error) for one in failed)
-    assert len(summary.results.cells[0].attempts) == 3, "the first attempt at each"
+    assert len(summary.results.cases[0].attempts) == 3, "the first attempt at each"
 
 
 def test_a_simulation_that_diverges_under_other_actions_is_lost_and_bounds_stand_beside_the_rate(
@@ -216,14 +216,14 @@ def test_a_simulation_that_diverges_under_other_actions_is_lost_and_bounds_stand
         retries=1,
     )
     summary = evaluate(settings, agent_factory=lambda: Extreme(restless=True))
-    [group] = summary.cells
+    [group] = summary.cases
     assert (group.success_once.successes, group.success_once.episodes, group.infra_failures) == (
         5,
         5,
         3,
     )
     assert group.with_lost(group.success_once) == (5 / 8, 1.0)
-    assert summary.to_json()["cells"][0]["with_lost"]["success_once"] == (5 / 8, 1.0)
+    assert summary.to_json()["cases"][0]["with_lost"]["success_once"] == (5 / 8, 1.0)
     page = write_report(summary.results, tmp_path / "page.html").read_text()
     assert "62.5 to 100.0" in page
 
@@ -231,5 +231,5 @@ def test_a_simulation_that_diverges_under_other_actions_is_lost_and_bounds_stand
 def test_a_simulator_that_raises_is_lost_and_not_a_failure_of_the_policy(
     run: Callable[..., Summary],
 ) -> None:
-    [group] = run("raises").cells
+    [group] = run("raises").cases
     assert (group.success_once.episodes, group.infra_failures) == (5, 3)

@@ -17,7 +17,7 @@ from pydantic import ValidationError
 from vlagents_ray.envs.tabletop import Tabletop
 from vlagents_ray.errors import ConfigError, UnknownEnv
 from vlagents_ray.evaluate import EvalConfig, PolicyConfig
-from vlagents_ray.evaluate.plan.cases import cells, expand
+from vlagents_ray.evaluate.plan.cases import expand, plan_cases
 from vlagents_ray.evaluate.plan.config import ClockConfig, SuiteConfig, canonical, fingerprint
 from vlagents_ray.evaluate.plan.jobs import EpisodeKey, Job, JobQueue, plan
 
@@ -25,11 +25,11 @@ Config = Callable[..., EvalConfig]
 
 
 def jobs_of(env: str, count: int, **settings: Any) -> list[Job]:
-    return plan(cells(flat_config(envs=[env], episodes=count, out="out", **settings)))
+    return plan(plan_cases(flat_config(envs=[env], episodes=count, out="out", **settings)))
 
 
 def keys(config: EvalConfig) -> list[EpisodeKey]:
-    return [job.key for job in plan(cells(config))]
+    return [job.key for job in plan(plan_cases(config))]
 
 
 def test_a_plan_numbers_and_seeds_every_episode_of_every_env(config: Config) -> None:
@@ -52,8 +52,8 @@ def test_pushed_weights_are_a_checkpoint_and_part_of_the_key(config: Config) -> 
         }
         return usual.model_copy(update={"policies": [PolicyConfig.model_validate(given)]})
 
-    [cell] = cells(pushed("a"))
-    assert (cell.contender, cell.policy_options) == ("policy@3", {}), (
+    [case] = plan_cases(pushed("a"))
+    assert (case.contender, case.policy_options) == ("policy@3", {}), (
         "the policy is asked for no checkpoint"
     )
     assert len({str(key) for one in (usual, pushed("a"), pushed("b")) for key in keys(one)}) == 6
@@ -64,19 +64,19 @@ def test_pushed_weights_are_a_checkpoint_and_part_of_the_key(config: Config) -> 
 
 
 def test_a_sweep_plays_checkpoint_by_checkpoint(config: Config) -> None:
-    jobs = plan(cells(config(envs=[LINE, OTHER_LINE], episodes=1, steps=[10, 20])))
-    assert [(job.cell.contender, job.key.env) for job in jobs] == [
+    jobs = plan(plan_cases(config(envs=[LINE, OTHER_LINE], episodes=1, steps=[10, 20])))
+    assert [(job.case.contender, job.key.env) for job in jobs] == [
         ("policy@10", LINE),
         ("policy@10", OTHER_LINE),
         ("policy@20", LINE),
         ("policy@20", OTHER_LINE),
     ]
-    assert [job.cell.policy_options for job in jobs[::2]] == [
+    assert [job.case.policy_options for job in jobs[::2]] == [
         {"checkpoint_step": 10},
         {"checkpoint_step": 20},
     ]
     assert len({str(job.key) for job in jobs}) == 4
-    assert jobs[0].cell.place == jobs[2].cell.place, (
+    assert jobs[0].case.place == jobs[2].case.place, (
         "checkpoints share the env that a worker has made"
     )
 
@@ -132,14 +132,14 @@ def test_an_env_in_two_suites_of_one_name_or_that_do_not_differ_is_refused(
 ) -> None:
     suites = [SuiteConfig(envs=[LINE]), SuiteConfig.model_validate(second)]
     with pytest.raises(ConfigError, match=said):
-        cells(EvalConfig(policies=[PolicyConfig()], suites=suites, out=Path("out")))
+        plan_cases(EvalConfig(policies=[PolicyConfig()], suites=suites, out=Path("out")))
 
 
 def test_policies_whose_episodes_would_share_their_files_are_refused(config: Config) -> None:
     [policy] = config().policies
     policies = [policy.model_copy(update={"name": name}) for name in ("pi0/fast", "pi0_fast")]
     with pytest.raises(ConfigError, match="would share files"):
-        cells(config().model_copy(update={"policies": policies}))
+        plan_cases(config().model_copy(update={"policies": policies}))
 
 
 def test_a_pattern_stands_for_the_tasks_that_match() -> None:
@@ -152,7 +152,7 @@ def test_a_pattern_stands_for_the_tasks_that_match() -> None:
 def test_a_worker_stays_with_the_env_it_has_made() -> None:
     first, other = jobs_of(LINE, 2), jobs_of(OTHER_LINE, 5)
     queue = JobQueue(first + other)
-    kind, made = first[0].cell.kind, first[0].cell.place
+    kind, made = first[0].case.kind, first[0].case.place
     taken = [queue.take(kind, made, Counter()) for _ in range(3)]
     assert [job.key.env for [job] in taken] == [LINE, LINE, OTHER_LINE]
 
@@ -162,8 +162,8 @@ def test_workers_without_an_env_spread_over_the_envs() -> None:
     queue = JobQueue(jobs)
     working: Counter[str] = Counter()
     for _ in range(4):
-        [job] = queue.take(jobs[0].cell.kind, None, working)
-        working[job.cell.place] += 1
+        [job] = queue.take(jobs[0].case.kind, None, working)
+        working[job.case.place] += 1
     assert sorted(working.values()) == [2, 2]
 
 
@@ -171,15 +171,15 @@ def test_no_worker_idles_while_any_episode_of_its_kind_waits() -> None:
     [only] = jobs_of(LINE, 1)
     queue = JobQueue([only])
     assert queue.take("another kind", None, Counter()) == ()
-    assert queue.take(only.cell.kind, "elsewhere", Counter({only.cell.place: 5})) == (only,)
-    assert queue.take(only.cell.kind, only.cell.place, Counter()) == ()
+    assert queue.take(only.case.kind, "elsewhere", Counter({only.case.place: 5})) == (only,)
+    assert queue.take(only.case.kind, only.case.place, Counter()) == ()
     assert len(queue) == 0
 
 
 def test_a_further_attempt_comes_before_new_episodes() -> None:
     jobs = jobs_of(LINE, 3)
     queue = JobQueue(jobs)
-    kind, made = jobs[0].cell.kind, jobs[0].cell.place
+    kind, made = jobs[0].case.kind, jobs[0].case.place
     [first] = queue.take(kind, made, Counter())
     queue.put_back(first.again())
     assert queue.take(kind, made, Counter()) == (first.again(),)
@@ -190,31 +190,31 @@ def test_workers_are_wanted_where_most_wait_for_each() -> None:
     many, few = jobs_of(LINE, 6), jobs_of(OTHER_LINE, 2, cpus_per_worker=2.0)
     queue = JobQueue(many + few)
     kinds: Counter[str] = Counter()
-    while (cell := queue.needs_worker(kinds, kinds)) is not None:
-        kinds[cell.kind] += 1
-    assert kinds == {many[0].cell.kind: 6, few[0].cell.kind: 2}, "no more than there are episodes"
-    assert queue.needs_worker({many[0].cell.kind: 6}, {}) == few[0].cell
+    while (case := queue.needs_worker(kinds, kinds)) is not None:
+        kinds[case.kind] += 1
+    assert kinds == {many[0].case.kind: 6, few[0].case.kind: 2}, "no more than there are episodes"
+    assert queue.needs_worker({many[0].case.kind: 6}, {}) == few[0].case
 
 
-def test_a_cell_that_is_dropped_leaves_the_others() -> None:
+def test_a_case_that_is_dropped_leaves_the_others() -> None:
     jobs = jobs_of(LINE, 6, steps=[1, 2])
     queue = JobQueue(jobs)
-    assert queue.drop(jobs[0].cell.fingerprint) == 6
+    assert queue.drop(jobs[0].case.fingerprint) == 6
     assert len(queue) == 6
-    [job] = queue.take(jobs[0].cell.kind, None, Counter())
-    assert job.cell.step == 2
+    [job] = queue.take(jobs[0].case.kind, None, Counter())
+    assert job.case.step == 2
 
 
-def test_episodes_side_by_side_are_of_one_cell() -> None:
+def test_episodes_side_by_side_are_of_one_case() -> None:
     jobs = jobs_of(LINE, 5, steps=[1, 2], num_envs=3)
     queue = JobQueue(jobs)
-    kind = jobs[0].cell.kind
+    kind = jobs[0].case.kind
     assert queue.needs_worker({}, {kind: 3}) is not None, (
         "ten episodes, three at a time, are for four workers"
     )
     assert queue.needs_worker({}, {kind: 4}) is None
     taken = [queue.take(kind, None, Counter()) for _ in range(4)]
-    assert [[job.cell.step for job in some] for some in taken] == [
+    assert [[job.case.step for job in some] for some in taken] == [
         [1, 1, 1],
         [1, 1],
         [2, 2, 2],

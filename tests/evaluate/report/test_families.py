@@ -28,7 +28,7 @@ from vlagents_ray.evaluate.report.page import write_report
 from vlagents_ray.evaluate.report.results_document import ResultsDocument
 from vlagents_ray.evaluate.report.success import compare_all, families, families_json
 from vlagents_ray.evaluate.results.comparison import compare
-from vlagents_ray.evaluate.results.reader import CellResults, Episode, Run
+from vlagents_ray.evaluate.results.reader import CaseResults, Episode, Run
 from vlagents_ray.evaluate.results.statistics import ERROR_RATE
 from vlagents_ray.evaluate.results.summary import Summary, summarize
 from vlagents_ray_results.merge import merge
@@ -39,7 +39,7 @@ EVALUATIONS = 200
 
 @cache
 def _episode(number: int, *, solved: bool) -> Episode:
-    key = EpisodeKey(LINE, number, number, "cell")
+    key = EpisodeKey(LINE, number, number, "case")
     result = EpisodeResult(key, "done", success_once=solved, success_at_end=solved)
     return Episode(result, (), None, 1, 1, 0.0)
 
@@ -48,7 +48,7 @@ def _equal_policies(number: int, *, sweep: bool, random: np.random.Generator) ->
     """Return results of policy ids that all solve half of the episodes: policies, or checkpoints
     of one policy.
     """
-    cells = []
+    cases = []
     for index, outcomes in enumerate(random.random((number, EPISODES)) < 0.5):
         name, step = ("learner", 100 * (index + 1)) if sweep else (f"policy{index}", None)
         episodes = tuple(
@@ -56,13 +56,13 @@ def _equal_policies(number: int, *, sweep: bool, random: np.random.Generator) ->
         )
         settings = {"policy": name, "checkpoint": step, "env": LINE, "clock": None}
         identity = ({}, {}, {}, {})
-        cells.append(
-            CellResults(
-                f"cell{index}", name, step, "", LINE, EPISODES, settings, *identity, episodes, ()
+        cases.append(
+            CaseResults(
+                f"case{index}", name, step, "", LINE, EPISODES, settings, *identity, episodes, ()
             )
         )
     run = Run(1, 0.0, 1.0, "complete", {}, {})
-    return Results(Path("/nowhere"), tuple(cells), (run,), {})
+    return Results(Path("/nowhere"), tuple(cases), (run,), {})
 
 
 @pytest.mark.parametrize(
@@ -123,8 +123,8 @@ SOLVED = {
 }
 
 
-def _solved(cell: EvalCase, seed: int) -> int | None:
-    return 5 if seed < SOLVED[cell.policy.name, cell.suite.name] else None
+def _solved(case: EvalCase, seed: int) -> int | None:
+    return 5 if seed < SOLVED[case.policy.name, case.suite.name] else None
 
 
 def _suites(*, clocks: tuple[str, ...] = ("waiting", "live")) -> list[dict[str, Any]]:

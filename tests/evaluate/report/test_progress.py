@@ -19,7 +19,7 @@ from rich.console import Console
 from vlagents_ray.evaluate import Rate, Results, progress_for
 from vlagents_ray.evaluate.episode.failures import Failure
 from vlagents_ray.evaluate.episode.records import EpisodeResult, Status
-from vlagents_ray.evaluate.plan.cases import EvalCase, cells
+from vlagents_ray.evaluate.plan.cases import EvalCase, plan_cases
 from vlagents_ray.evaluate.plan.config import EvalConfig
 from vlagents_ray.evaluate.plan.jobs import EpisodeKey, Job, plan
 from vlagents_ray.evaluate.report import results_document, terminal
@@ -44,20 +44,20 @@ def read(document: ResultsDocument) -> dict[str, Any]:
 
 
 class Played:
-    """An evaluation of four episodes in one cell, whose results are recorded one by one."""
+    """An evaluation of four episodes in one case, whose results are recorded one by one."""
 
     def __init__(self, out: Path, document: ProgressDocument, **changes: Any) -> None:
         self.config = runs(out, episodes=4, **changes)
         self.document = document
         self.store = Store(self.config)
-        self.jobs = plan(self.store.cells)
+        self.jobs = plan(self.store.cases)
         self.store.begin_run(self.config, {})
-        document.begin(self.store.cells, {}, len(self.jobs))
+        document.begin(self.store.cases, {}, len(self.jobs))
 
     def play(self, job: Job, solved: bool | None, status: Status = "done") -> None:
         result = EpisodeResult(job.key, status, solved, solved, steps=5, instruction="go")
         self.store.record(result, 1)
-        self.document.episode(job.cell, result)
+        self.document.episode(job.case, result)
 
     def end(self, state: str) -> None:
         self.store.end_run(state)
@@ -78,7 +78,7 @@ def played(tmp_path: Path, document: ProgressDocument) -> Iterator[Played]:
 
 def test_it_is_empty_before_there_are_results(tmp_path: Path) -> None:
     said = read(ProgressDocument(tmp_path / "later"))
-    assert (said["name"], said["state"], said["cells"], said["failures"]) == (
+    assert (said["name"], said["state"], said["cases"], said["failures"]) == (
         "later",
         "starting",
         [],
@@ -86,7 +86,7 @@ def test_it_is_empty_before_there_are_results(tmp_path: Path) -> None:
     )
 
 
-def test_cells_fill_with_their_intervals(document: ProgressDocument, played: Played) -> None:
+def test_cases_fill_with_their_intervals(document: ProgressDocument, played: Played) -> None:
     first = played.jobs[0]
     before = read(document)
     assert (before["state"], before["done"], before["planned"], before["ends"]) == (
@@ -99,12 +99,12 @@ def test_cells_fill_with_their_intervals(document: ProgressDocument, played: Pla
         played.play(job, solved)
     said = read(document)
     assert said["done"] == 3
-    [cell] = [one for one in said["cells"] if one["done"]]
-    rate = rate_of([Results.load(played.config.out).cells[0]], "success_once")
-    assert (cell["policy"], cell["task"]) == (first.cell.contender, f"one {first.key.env}")
-    assert (cell["successes"], cell["episodes"], cell["rate"]) == (2, 3, rate.rate)
-    assert (cell["low"], cell["high"]) == rate.interval
-    assert {one["rate"] for one in said["cells"] if not one["done"]} == {None}
+    [case] = [one for one in said["cases"] if one["done"]]
+    rate = rate_of([Results.load(played.config.out).cases[0]], "success_once")
+    assert (case["policy"], case["task"]) == (first.case.contender, f"one {first.key.env}")
+    assert (case["successes"], case["episodes"], case["rate"]) == (2, 3, rate.rate)
+    assert (case["low"], case["high"]) == rate.interval
+    assert {one["rate"] for one in said["cases"] if not one["done"]} == {None}
 
 
 def test_the_time_left_is_that_of_the_episodes_to_come(
@@ -134,8 +134,8 @@ def test_failures_come_newest_first_with_what_went_wrong(
         "failure",
     ]
     assert said["failed"] == 3
-    [cell] = [one for one in said["cells"] if one["done"]]
-    assert (cell["done"], cell["episodes"]) == (4, 3)  # what infrastructure lost is in no rate
+    [case] = [one for one in said["cases"] if one["done"]]
+    assert (case["done"], case["episodes"]) == (4, 3)  # what infrastructure lost is in no rate
 
 
 @pytest.mark.parametrize(
@@ -163,7 +163,7 @@ def test_a_training_waits_between_its_versions_and_has_a_learning_curve(tmp_path
     for step in (1000, 2000):
         learner = {"name": "learner", "url": "http://localhost:1", "steps": [step]}
         config = runs(tmp_path, policies=[learner], resume=step == 2000)
-        document.begin(cells(config), {}, len(plan(cells(config))))
+        document.begin(plan_cases(config), {}, len(plan(plan_cases(config))))
         record(config)
         document.end()
         assert read(document)["state"] == "waiting"
@@ -223,7 +223,7 @@ def test_calls_reach_the_terminal_too(tmp_path: Path) -> None:
     one = Played(tmp_path, document)
     one.play(one.jobs[0], True)
     document.retry(one.jobs[1], Failure("worker", "env_failed", "it exploded"))
-    document.stopped(one.jobs[1].cell, 1, 3)
+    document.stopped(one.jobs[1].case, 1, 3)
     one.end("complete")
     one.store.close()
     assert [call[0] for call in terminal.method_calls] == [
@@ -235,15 +235,15 @@ def test_calls_reach_the_terminal_too(tmp_path: Path) -> None:
     ]
 
 
-def test_cells_that_may_stop_early_have_a_confidence_sequence(tmp_path: Path) -> None:
+def test_cases_that_may_stop_early_have_a_confidence_sequence(tmp_path: Path) -> None:
     config = EvalConfig.model_validate(
         runs(tmp_path, steps=[1000], episodes=40).model_dump()
         | {"stop": {"width": 0.9, "at_least": 5}}
     )
-    record(config, lambda _cell, _seed: 3)
-    found = read(ProgressDocument(tmp_path))["cells"]
-    assert all(cell["sequence"] and cell["stopped"] for cell in found)
-    assert all(cell["done"] == cell["planned"] < 40 for cell in found)
+    record(config, lambda _case, _seed: 3)
+    found = read(ProgressDocument(tmp_path))["cases"]
+    assert all(case["sequence"] and case["stopped"] for case in found)
+    assert all(case["done"] == case["planned"] < 40 for case in found)
 
 
 def test_a_folder_that_another_process_writes_says_how_its_last_run_stands(tmp_path: Path) -> None:
@@ -266,8 +266,8 @@ RETRY = Failure("worker", "env_failed", "the simulator exploded\nwith a long sto
 
 
 def planned(episodes: int) -> EvalCase:
-    [cell] = cells(flat_config(envs=["tabletop"], episodes=episodes, out="out"))
-    return cell
+    [case] = plan_cases(flat_config(envs=["tabletop"], episodes=episodes, out="out"))
+    return case
 
 
 TEN = planned(10)
@@ -309,7 +309,7 @@ def test_progress_tells_success_so_far_and_what_infrastructure_cost(terminal: bo
     assert " left" in last
 
 
-def test_a_cell_that_may_stop_early_shows_its_confidence_sequence() -> None:
+def test_a_case_that_may_stop_early_shows_its_confidence_sequence() -> None:
     out = StringIO()
     progress = LineProgress(Console(file=out, width=120))
     progress.begin([TEN], {TEN.fingerprint: Rate(7, 7, confidence_sequence(7, 7), 0.05)}, 3)

@@ -181,7 +181,7 @@ def test_videos_are_linked_from_where_the_page_is(results: Results, tmp_path: Pa
 
 
 def test_videos_are_in_the_page_up_to_a_budget(results: Results) -> None:
-    videos = [video for cell in results.cells for one in cell.episodes for video in one.videos]
+    videos = [video for case in results.cases for one in case.episodes for video in one.videos]
     size = (results.out / videos[0]).stat().st_size
     gallery = Gallery(results, results.out / "report.html", inline=True, budget=size)
     players = [gallery.player(video, "a label") for video in videos[:2]]
@@ -192,7 +192,7 @@ def test_videos_are_in_the_page_up_to_a_budget(results: Results) -> None:
 
 
 def test_a_video_that_is_gone_or_broken_leaves_the_rest(tmp_path: Path) -> None:
-    results = record(runs(tmp_path, episodes=2), lambda _cell, _seed: None, videos=True)
+    results = record(runs(tmp_path, episodes=2), lambda _case, _seed: None, videos=True)
     first, second, *others = sorted(tmp_path.glob("videos/**/*.mp4"))
     first.unlink()
     second.write_bytes(b"not a video")
@@ -211,7 +211,7 @@ def test_one_policy_that_solved_everything_has_no_failures_and_nothing_to_compar
             "out": tmp_path,
         }
     )
-    page = page_of(record(config, lambda _cell, _seed: 7))
+    page = page_of(record(config, lambda _case, _seed: 7))
     headings = {attributes["id"] for attributes in page.all("h2")}
     assert not headings & {"failures", "errors", "comparison", "learning-curve"}
     assert "100.0 % solved" in page.words
@@ -229,7 +229,7 @@ def test_the_headline_of_two_policies_is_their_difference(
         {"policies": policies, "suites": [{"envs": [LINE], "episodes": 40}], "out": tmp_path}
     )
     page = page_of(
-        record(config, lambda cell, seed: 7 if cell.contender == "b" or seed >= better else None)
+        record(config, lambda case, seed: 7 if case.contender == "b" or seed >= better else None)
     )
     assert f"+{100 * better / 40:.1f} points b less a{verdict} 95 % [" in page.words
     assert "solved by the best" not in page.words
@@ -260,7 +260,7 @@ def test_of_very_many_checkpoints_only_the_pairs_that_are_asked_for_most_are_com
 def test_all_episodes_are_in_a_table_with_their_videos(tmp_path: Path) -> None:
     results = record(runs(tmp_path, episodes=6, video="all"), videos=True, troubles=True)
     page = page_of(results)
-    played = [one for cell in results.cells for one in cell.episodes]
+    played = [one for case in results.cases for one in case.episodes]
     assert page.text.count("solved") + page.text.count("not solved") == len(played) - 2
     assert (page.text.count("policy error"), page.text.count("lost")) == (1, 1)
     links = {unquote(str(one["href"])) for one in page.all("a") if one.get("class") == "video"}
@@ -272,14 +272,14 @@ def test_all_episodes_are_in_a_table_with_their_videos(tmp_path: Path) -> None:
 
 
 def test_solved_episodes_have_players_too(tmp_path: Path) -> None:
-    results = record(runs(tmp_path, episodes=6, video="all"), lambda _cell, _seed: 9, videos=True)
+    results = record(runs(tmp_path, episodes=6, video="all"), lambda _case, _seed: 9, videos=True)
     page = page_of(results)
     assert len(page.all("video")) == 12
     assert "Solved: 12 videos" in page.words
 
 
 def test_an_episode_that_does_not_count_is_marked(tmp_path: Path) -> None:
-    record(runs(tmp_path, episodes=6), lambda _cell, _seed: 9)
+    record(runs(tmp_path, episodes=6), lambda _case, _seed: 9)
     fewer = runs(tmp_path, episodes=4, resume=True, accept_changes=True)
     with Store(fewer):
         page = page_of(Results.load(tmp_path))
@@ -315,7 +315,7 @@ def test_with_an_expert_the_checkpoints_before_and_after_are_not_folded_away(
     tmp_path: Path,
 ) -> None:
     config = runs(tmp_path, steps=list(range(200, 2001, 200)), episodes=6)
-    expert = record(config, lambda cell, seed: 5 if cell.step is None else better_later(cell, seed))
+    expert = record(config, lambda case, seed: 5 if case.step is None else better_later(case, seed))
     words = page_of(expert).section("Comparison")
     unfolded = words[: words.index("further pairs")]
     for step in range(200, 2000, 200):
@@ -323,10 +323,10 @@ def test_with_an_expert_the_checkpoints_before_and_after_are_not_folded_away(
     assert len(re.findall(r"learner@\d+ base", unfolded)) == 1 + 1  # and by suite
 
 
-def test_cells_that_stopped_early_have_intervals_of_another_name(tmp_path: Path) -> None:
+def test_cases_that_stopped_early_have_intervals_of_another_name(tmp_path: Path) -> None:
     config = runs(tmp_path, steps=[], episodes=60, stop={"width": 0.5, "at_least": 10})
-    results = record(config, lambda _cell, seed: 5 if seed % 2 else None)
-    assert any(cell.stopped_at is not None for cell in results.cells)
+    results = record(config, lambda _case, seed: 5 if seed % 2 else None)
+    assert any(case.stopped_at is not None for case in results.cases)
     words = page_of(results).words
     assert "the intervals of this table are confidence sequences" in words
     assert "95 % confidence sequence" in words
@@ -362,7 +362,7 @@ def test_real_time_and_synchronous_scores_are_compared_apart_and_their_gap_is_sh
         },
         {"name": "waiting", "envs": [LINE], "episodes": 4},
     ]
-    page = page_of(record(runs(tmp_path, steps=[], suites=suites), lambda _cell, _seed: 5))
+    page = page_of(record(runs(tmp_path, steps=[], suites=suites), lambda _case, _seed: 5))
     row = (
         f"learner, live in real time learner, waiting 0.0 {MINUS}50.0 to +50.0 1.00 1.00 4 4 0 0 0 "
     )

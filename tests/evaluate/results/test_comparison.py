@@ -18,7 +18,7 @@ from vlagents_ray.evaluate.results.statistics import Pairs
 
 def solved_by(**seeds: set[int]) -> Any:
     """An outcome: who solves which seeds, by policy."""
-    return lambda cell, seed: 5 if seed in seeds[cell.policy.name] else None
+    return lambda case, seed: 5 if seed in seeds[case.policy.name] else None
 
 
 def test_pairs_are_episodes_of_the_same_env_and_seed(tmp_path: Path) -> None:
@@ -76,7 +76,7 @@ def folder(out: Path, name: str, **suite: Any) -> Results:
         "suites": [{"envs": [LINE], "episodes": 4} | suite],
     }
     config = type(runs(out)).model_validate(settings | {"out": out})
-    return record(config, lambda _cell, seed: 3 if seed % 2 else None, videos=True)
+    return record(config, lambda _case, seed: 3 if seed % 2 else None, videos=True)
 
 
 def test_other_settings_of_an_env_are_no_pair(tmp_path: Path) -> None:
@@ -104,7 +104,7 @@ def test_folders_are_read_as_one(tmp_path: Path) -> None:
     results = combined([folder(tmp_path / "a", "a"), folder(tmp_path / "b", "b")])
     assert results.contenders == ["a", "b"]
     assert compare(results, "a", "b").total.pairs == Pairs(both=2, neither=2)
-    videos = [video for cell in results.cells for one in cell.episodes for video in one.videos]
+    videos = [video for case in results.cases for one in case.episodes for video in one.videos]
     assert len(videos) == 4
     assert all((results.out / video).is_file() for video in videos)
     assert [run.run for run in results.runs] == [1, 2]
@@ -121,10 +121,10 @@ def test_other_weights_under_one_name_are_told_apart_by_their_folders(tmp_path: 
 
     def played(by: str, env: str, checkpoint: str, weights: str) -> Results:
         results = folder(tmp_path / by, "pi0", envs=[env])
-        [cell] = results.cells
+        [case] = results.cases
         said = {"checkpoint": checkpoint, "weights": weights}
-        episodes = tuple(replace(one, result=replace(one.result, **said)) for one in cell.episodes)
-        return results.among([replace(cell, episodes=episodes)])
+        episodes = tuple(replace(one, result=replace(one.result, **said)) for one in case.episodes)
+        return results.among([replace(case, episodes=episodes)])
 
     first = played("first", LINE, "runs/last", "a")
     assert combined([first, played("same", OTHER_LINE, "runs/last", "a")]).contenders == ["pi0"]
@@ -151,7 +151,7 @@ def test_the_gap_to_the_synchronous_score_pairs_suites_that_differ_in_their_cloc
     suites[0]["clock"] = {"latency": 0.1, "meanwhile": "hold"}
     config = runs(tmp_path, steps=[], suites=suites)
     gaps = clock_gaps(
-        record(config, lambda cell, seed: 5 if cell.suite.name == "waiting" or seed == 0 else None)
+        record(config, lambda case, seed: 5 if case.suite.name == "waiting" or seed == 0 else None)
     )
     assert [(gap.a, gap.b) for gap in gaps] == [
         ("learner, live in real time", "learner, waiting"),

@@ -18,7 +18,7 @@ from faulty_disks import READ_ONLY, python_on
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.evaluate import EvalConfig, Results
 from vlagents_ray.evaluate.episode.records import EpisodeResult
-from vlagents_ray.evaluate.plan.cases import cells
+from vlagents_ray.evaluate.plan.cases import plan_cases
 from vlagents_ray.evaluate.plan.jobs import plan
 from vlagents_ray.evaluate.results import database
 from vlagents_ray.evaluate.results.store import Store
@@ -29,7 +29,7 @@ COUNT = """
 import sys
 from pathlib import Path
 from vlagents_ray.evaluate import Results
-print(sum(len(cell.episodes) for cell in Results.load(Path(sys.argv[1])).cells))
+print(sum(len(case.episodes) for case in Results.load(Path(sys.argv[1])).cases))
 """
 KILLED = """
 import os, sys
@@ -41,7 +41,7 @@ from vlagents_ray.evaluate.results.store import Store
 config = EvalConfig.model_validate_json(sys.argv[1])
 store = Store(config)
 store.begin_run(config, {})
-store.record(EpisodeResult(plan(store.cells)[0].key, "done", True, True), 1)
+store.record(EpisodeResult(plan(store.cases)[0].key, "done", True, True), 1)
 os._exit(9)
 """
 
@@ -55,7 +55,7 @@ def begun(config: EvalConfig) -> Store:
     """A store with an episode in it."""
     store = Store(config)
     store.begin_run(config, {})
-    store.record(EpisodeResult(plan(cells(config))[0].key, "done", True, True), 1)
+    store.record(EpisodeResult(plan(plan_cases(config))[0].key, "done", True, True), 1)
     return store
 
 
@@ -69,7 +69,7 @@ def kill_in(config: EvalConfig) -> None:
 
 
 def episodes(results: Results) -> int:
-    return sum(len(cell.episodes) for cell in results.cells)
+    return sum(len(case.episodes) for case in results.cases)
 
 
 def test_another_process_reads_meanwhile_and_commits_reach_the_disk(config: Config) -> None:
@@ -153,7 +153,7 @@ FOREIGN = 'x") VALUES (1); DROP TABLE episodes; --'
     ("table", "kind"),
     [
         (table, "")
-        for table in ("runs", "policies", "cells", "episodes", "attempts", "workers", "tracked")
+        for table in ("runs", "policies", "cases", "episodes", "attempts", "workers", "tracked")
     ]
     + [("episodes", " AS (1)")],  # generated
 )
@@ -181,7 +181,7 @@ def test_a_column_of_somebody_else_is_refused_by_all_that_open_the_file(
 
 
 @pytest.mark.parametrize(
-    ("table", "column"), [("episodes", "status"), ("cells", "stop"), ("runs", "config")]
+    ("table", "column"), [("episodes", "status"), ("cases", "stop"), ("runs", "config")]
 )
 def test_a_column_that_is_missing_is_named(config: Config, table: str, column: str) -> None:
     begun(config()).close()

@@ -68,7 +68,7 @@ def test_mcnemar_is_the_binomial_test_of_what_only_one_solved(only_a: int, only_
 
 
 # From the paper that `mcnemar` names, table 3: airway hyper-responsiveness before and after stem
-# cell transplantation,
+# case transplantation,
 # 1 and 7 discordant pairs.
 def test_mcnemar_agrees_with_published_values() -> None:
     assert mcnemar(1, 7) == pytest.approx(0.070, abs=5e-4)

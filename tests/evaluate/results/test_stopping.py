@@ -82,7 +82,7 @@ def test_the_true_rate_is_missed_no_more_often_than_is_said_whenever_one_looks(r
     )
 
 
-def test_several_cells_share_the_error_rate() -> None:
+def test_several_cases_share_the_error_rate() -> None:
     low, high = pooled([(9, 10), (5, 30), (0, 0)], 0.05)
     first, second = confidence_sequence(9, 10, 0.025), confidence_sequence(5, 30, 0.025)
     assert low == pytest.approx((first[0] * 10 + second[0] * 30) / 40)
@@ -90,14 +90,14 @@ def test_several_cells_share_the_error_rate() -> None:
     assert pooled([(9, 10)], 0.05) == confidence_sequence(9, 10, 0.05)
 
 
-def test_a_cell_stops_when_the_target_is_excluded() -> None:
+def test_a_case_stops_when_the_target_is_excluded() -> None:
     at = stopped_at(StopConfig(target=0.9), [False] * 50)
     assert at is not None
     assert confidence_sequence(0, at)[1] < 0.9 <= confidence_sequence(0, at - 1)[1]
     assert stopped_at(StopConfig(target=0.9, at_least=20), [False] * 50) == 20
 
 
-def test_a_cell_stops_when_its_interval_is_narrow() -> None:
+def test_a_case_stops_when_its_interval_is_narrow() -> None:
     at = stopped_at(StopConfig(width=0.2), [True] * 100)
     assert at is not None
     low, high = confidence_sequence(at, at)
@@ -111,7 +111,7 @@ def test_nothing_after_an_episode_without_a_result_counts() -> None:
     assert stopped_at(stop, [False, None] + [False] * 20) is None
 
 
-def test_where_a_cell_stops_does_not_depend_on_the_order_in_which_episodes_arrive() -> None:
+def test_where_a_case_stops_does_not_depend_on_the_order_in_which_episodes_arrive() -> None:
     rng = np.random.default_rng(1)
     outcomes = [
         result(seed, bool(rng.random() < 0.4), first)
@@ -154,32 +154,32 @@ class TestOnACluster:
             assert summary.state == "complete"
             found.append(
                 [
-                    (cell.stopped_at, [outcome(one) for one in cell.counted])
-                    for cell in summary.results.cells
+                    (case.stopped_at, [outcome(one) for one in case.counted])
+                    for case in summary.results.cases
                 ]
             )
         assert all(one == found[0] for one in found)
-        for (at, counted), cell in zip(found[0], summary.results.cells, strict=True):
+        for (at, counted), case in zip(found[0], summary.results.cases, strict=True):
             assert at is not None
             assert at == len(counted) < 40
-            assert len(cell.episodes) >= at, "what was played beyond is kept"
+            assert len(case.episodes) >= at, "what was played beyond is kept"
 
 
-def test_what_a_stopped_cell_says_holds_and_resuming_plays_nothing(config: Config) -> None:
+def test_what_a_stopped_case_says_holds_and_resuming_plays_nothing(config: Config) -> None:
     settings = config(episodes=40, stop=STOP, workers=0)
     summary = evaluate(settings, agent_factory=ToZero)
-    [cell] = summary.results.cells
-    rate = rate_of([cell], "success_once")
+    [case] = summary.results.cases
+    rate = rate_of([case], "success_once")
     assert rate.interval == confidence_sequence(rate.successes, rate.episodes)
     assert rate.interval[0] > 0.3
-    [written] = json.loads((settings.out / "summary.json").read_text())["cells"]
-    assert written["stopped_at"] == cell.stopped_at == written["success_once"]["episodes"]
+    [written] = json.loads((settings.out / "summary.json").read_text())["cases"]
+    assert written["stopped_at"] == case.stopped_at == written["success_once"]["episodes"]
     assert written["success_once"]["error_rate"] == 0.05
     assert "wilson_95" not in written["success_once"]
     assert summary.total.infra_failures == 0
     evaluate(config(episodes=40, stop=STOP, workers=0, resume=True), agent_factory=ToZero)
-    [again] = Results.load(settings.out).cells
-    assert again.episodes == cell.episodes
+    [again] = Results.load(settings.out).cases
+    assert again.episodes == case.episodes
     with pytest.raises(ConfigError, match=r"plan: .*early stopping was"):
         evaluate(config(episodes=40, workers=0, resume=True), agent_factory=ToZero)
     whole = evaluate(

@@ -12,7 +12,7 @@ from vlagents_ray.errors import ConfigError
 from vlagents_ray.evaluate import EvalConfig
 from vlagents_ray.evaluate.episode.failures import Failure
 from vlagents_ray.evaluate.episode.records import EnvInfo, EpisodeResult, WorkerInfo
-from vlagents_ray.evaluate.plan.cases import cells
+from vlagents_ray.evaluate.plan.cases import plan_cases
 from vlagents_ray.evaluate.plan.jobs import EpisodeKey, Job, plan
 from vlagents_ray.evaluate.results.reader import Results
 from vlagents_ray.evaluate.results.store import Store
@@ -20,7 +20,7 @@ from vlagents_ray.evaluate.results.summary import summarize
 
 
 def planned(config: EvalConfig) -> list[Job]:
-    return plan(cells(config))
+    return plan(plan_cases(config))
 
 
 FAILURE = Failure("worker", "env_failed", "it hung", "Traceback ...")
@@ -28,7 +28,7 @@ Config = Callable[..., EvalConfig]
 
 
 def recorded(config: EvalConfig) -> list[EpisodeResult]:
-    return [one.result for cell in Results.load(config.out).cells for one in cell.episodes]
+    return [one.result for case in Results.load(config.out).cases for one in case.episodes]
 
 
 def done(key: EpisodeKey, success: bool = True) -> EpisodeResult:
@@ -71,8 +71,8 @@ def test_every_failed_attempt_is_kept_with_its_error(config: Config) -> None:
         store.begin_run(config(), {})
         store.record_attempt(job, FAILURE, retried=True)
         store.record_attempt(job.again(), FAILURE, retried=False)
-        [cell] = Results.load(config().out).cells
-    assert [(one.attempt, one.retried, one.error) for one in cell.attempts] == [
+        [case] = Results.load(config().out).cases
+    assert [(one.attempt, one.retried, one.error) for one in case.attempts] == [
         (1, True, "it hung"),
         (2, False, "it hung"),
     ]
@@ -100,8 +100,8 @@ def test_a_run_without_an_episode_leaves_nothing_to_resume(config: Config, begun
         store.begin_run(config(seed=5), {})
         found = Results.load(config().out)
     assert [run.config["suites"][0]["seeds"] for run in found.runs] == [[5]]
-    assert [(cell.cell, cell.attempts) for cell in found.cells] == [
-        (one.fingerprint, ()) for one in store.cells
+    assert [(case.case_id, case.attempts) for case in found.cases] == [
+        (one.fingerprint, ()) for one in store.cases
     ]
 
 
@@ -137,7 +137,7 @@ def test_a_plan_that_becomes_smaller_or_may_stop_early_is_a_change(
     planned_first = {"envs": [LINE, OTHER_LINE], "seeds": [0, 100]}
     with Store(config(**planned_first)) as store:
         store.begin_run(config(**planned_first), {})
-        for job in plan(store.cells):
+        for job in plan(store.cases):
             store.record(done(job.key), attempts=1)
     with pytest.raises(ConfigError, match=f"plan: .*{told}"):
         Store(config(**planned_first | changes, resume=True))
@@ -167,9 +167,9 @@ def test_more_of_the_same_is_resumed(config: Config, change: dict[str, object]) 
     with Store(config()) as store:
         store.begin_run(config(), {})
     Store(config(resume=True, **change)).close()
-    known = {cell.cell for cell in Results.load(config().out).cells}
+    known = {case.case_id for case in Results.load(config().out).cases}
     assert known >= {
-        cell.fingerprint for one in (config(), config(**change)) for cell in cells(one)
+        case.fingerprint for one in (config(), config(**change)) for case in plan_cases(one)
     }
 
 
@@ -216,19 +216,19 @@ def test_a_results_file_of_another_version_is_refused(config: Config) -> None:
 
 
 def test_an_env_that_has_changed_between_runs_is_noticed(config: Config) -> None:
-    [cell] = cells(config())
+    [case] = plan_cases(config())
     with Store(config()) as store:
         store.begin_run(config(), {})
-        store.note_env(cell.place, EnvInfo({"simulator": "line", "version": 1}, {}))
-        store.note_env(cell.place, EnvInfo({"simulator": "line", "version": 1, "node": "b"}, {}))
+        store.note_env(case.place, EnvInfo({"simulator": "line", "version": 1}, {}))
+        store.note_env(case.place, EnvInfo({"simulator": "line", "version": 1, "node": "b"}, {}))
         store.record(done(planned(config())[0].key), attempts=1)
     with Store(config(resume=True)) as store:
-        assert store.cells == [cell]
+        assert store.cases == [case]
         with pytest.raises(
             ConfigError, match=r"its description 'version' was 1, is 2\n.*--accept-changes"
         ):
-            store.note_env(cell.place, EnvInfo({"simulator": "line", "version": 2}, {}))
-    assert [one.described for one in Results.load(config().out).cells] == [
+            store.note_env(case.place, EnvInfo({"simulator": "line", "version": 2}, {}))
+    assert [one.described for one in Results.load(config().out).cases] == [
         {"simulator": "line", "version": 1, "node": "b"}
     ]
 
@@ -242,16 +242,16 @@ def test_what_is_not_planned_any_more_is_kept_and_not_counted(config: Config) ->
         Store(config(episodes=3, resume=True))
     with Store(config(episodes=3, resume=True, accept_changes=True)) as store:
         store.begin_run(config(episodes=3), {})
-        [cell] = Results.load(config().out).cells
-        assert [(one.result.key.episode, one.counts) for one in cell.episodes] == [
+        [case] = Results.load(config().out).cases
+        assert [(one.result.key.episode, one.counts) for one in case.episodes] == [
             (0, True),
             (2, True),
             (4, False),
         ]
-        [group] = summarize(Results.load(config().out)).cells
+        [group] = summarize(Results.load(config().out)).cases
         assert (group.episodes, group.planned) == (2, 3)
     with Store(config(resume=True)):
-        assert [one.counts for one in Results.load(config().out).cells[0].episodes] == [True] * 3
+        assert [one.counts for one in Results.load(config().out).cases[0].episodes] == [True] * 3
 
 
 @pytest.mark.parametrize(

@@ -14,7 +14,7 @@ from vlagents_ray.evaluate import EvalConfig, Summary, print_summary, synchronou
 from vlagents_ray.evaluate.artifacts.storage import versions
 from vlagents_ray.evaluate.episode.failures import Failure
 from vlagents_ray.evaluate.episode.records import EnvInfo, EpisodeResult
-from vlagents_ray.evaluate.plan.cases import cells
+from vlagents_ray.evaluate.plan.cases import plan_cases
 from vlagents_ray.evaluate.plan.jobs import plan
 from vlagents_ray.evaluate.report.page import write_report
 from vlagents_ray.evaluate.results.reader import Results
@@ -30,11 +30,11 @@ def summary(config: Config) -> Summary:
     settings = config(
         envs=[LINE, OTHER_LINE], episodes=3, policy="act", policy_url="http://localhost:1"
     )
-    jobs = plan(cells(settings))
+    jobs = plan(plan_cases(settings))
     keys = [job.key for job in jobs]
     with Store(settings) as store:
         store.begin_run(settings, versions())
-        store.note_env(jobs[0].cell.place, EnvInfo({"simulator": "line"}, {}))
+        store.note_env(jobs[0].case.place, EnvInfo({"simulator": "line"}, {}))
         store.note_policy("act", {"policy": "act", "checkpoint": "a"})
         store.record(
             EpisodeResult(
@@ -86,7 +86,7 @@ def summary(config: Config) -> Summary:
 
 
 def test_infrastructure_failures_are_in_no_rate(summary: Summary) -> None:
-    group = summary.cells[0]
+    group = summary.cases[0]
     assert (group.planned, group.episodes, group.infra_failures, group.policy_errors) == (
         3,
         2,
@@ -111,13 +111,13 @@ def test_the_total_counts_all_envs(summary: Summary) -> None:
 def test_a_summary_is_plain_json_with_all_that_made_it(summary: Summary) -> None:
     written = json.loads(write_summary(summary).read_text())
     assert written["state"] == "interrupted"
-    assert [cell["env"] for cell in written["cells"]] == [LINE, OTHER_LINE]
+    assert [case["env"] for case in written["cases"]] == [LINE, OTHER_LINE]
     [total] = written["totals"]
     assert (total["contender"], total["env"]) == ("act", "total")
     assert total["success_once"]["wilson_95"] == pytest.approx([0.2077, 0.9385], abs=1e-4)
     assert written["config"]["suites"][0]["episodes"] == 3
     assert written["policies"] == {"act": {"policy": "act", "checkpoint": "a"}}
-    assert [cell["described"] for cell in written["cells"]] == [{"simulator": "line"}, {}]
+    assert [case["described"] for case in written["cases"]] == [{"simulator": "line"}, {}]
     assert {"python", "ray", "numpy", "vlagents-ray", "code"} <= set(written["versions"])
 
 
@@ -137,7 +137,7 @@ def test_a_summary_says_how_busy_envs_and_policy_were(config: Config) -> None:
     settings = config(envs=[LINE], episodes=2, policy="act", policy_url="http://localhost:1")
     with Store(settings) as store:
         store.begin_run(settings, versions())
-        for job in plan(store.cells):
+        for job in plan(store.cases):
             done = EpisodeResult(
                 job.key,
                 "done",
@@ -165,10 +165,10 @@ def recorded(settings: EvalConfig, outcomes: dict[str, list[bool]], **fields: in
     """The summary of an evaluation whose suites had these outcomes."""
     with Store(settings) as store:
         store.begin_run(settings, versions())
-        for job in plan(store.cells):
-            if job.key.episode < len(outcomes[job.cell.suite.name]):
-                success = outcomes[job.cell.suite.name][job.key.episode]
-                waited = fields if job.cell.suite.clock else {}
+        for job in plan(store.cases):
+            if job.key.episode < len(outcomes[job.case.suite.name]):
+                success = outcomes[job.case.suite.name][job.key.episode]
+                waited = fields if job.case.suite.clock else {}
                 store.record(
                     EpisodeResult(job.key, "done", success, success, **{"steps": 10} | waited), 1
                 )
@@ -197,14 +197,14 @@ def in_real_time(
     return summary, printed(summary)
 
 
-def test_a_cell_in_real_time_tells_its_gap_to_the_synchronous_one(tmp_path: Path) -> None:
+def test_a_case_in_real_time_tells_its_gap_to_the_synchronous_one(tmp_path: Path) -> None:
     outcomes = {"waits": [True] * 4, "moves on": [True] + [False] * 3, "smaller": [True] * 4}
     summary, text = in_real_time(tmp_path, outcomes, ticks_waited=5, ticks_held=2)
-    waits, moves, smaller = summary.results.cells
+    waits, moves, smaller = summary.results.cases
     assert synchronous_twin(summary.results, moves) is waits
     assert synchronous_twin(summary.results, waits) is None
     assert synchronous_twin(summary.results, smaller) is None, "it differs in more than its clock"
-    assert [cell["gap_to_synchronous"] for cell in summary.to_json()["cells"]] == [
+    assert [case["gap_to_synchronous"] for case in summary.to_json()["cases"]] == [
         None,
         -0.75,
         None,
@@ -213,7 +213,7 @@ def test_a_cell_in_real_time_tells_its_gap_to_the_synchronous_one(tmp_path: Path
     assert ", 4 pairs); 50% of its ticks waited for an answer, 20% with nothing to execute" in text
 
 
-def test_a_cell_in_real_time_without_a_single_step_has_no_ticks_that_waited(tmp_path: Path) -> None:
+def test_a_case_in_real_time_without_a_single_step_has_no_ticks_that_waited(tmp_path: Path) -> None:
     _, text = in_real_time(tmp_path, {"waits": [True] * 2, "moves on": [False] * 2}, steps=0)
     assert "in real time: -100.0 points to the synchronous score (" in text
     assert "; 0% of its ticks" in text
@@ -223,7 +223,7 @@ def test_console_report_and_summary_tell_the_same_gap(tmp_path: Path) -> None:
     # of the six episodes that wait, two have no pair: rates differ by -60 points, pairs by -50
     outcomes = {"waits": [True] * 3 + [False] + [True] * 2, "moves on": [True] + [False] * 3}
     summary, text = in_real_time(tmp_path, outcomes, [LINE, OTHER_LINE])
-    assert [cell["gap_to_synchronous"] for cell in summary.to_json()["cells"]] == [
+    assert [case["gap_to_synchronous"] for case in summary.to_json()["cases"]] == [
         None,
         None,
         -0.5,
@@ -248,24 +248,24 @@ def test_real_time_and_synchronous_episodes_are_in_no_rate_together(tmp_path: Pa
     assert ">0.0" in page, "of those in real time"
 
 
-def test_cells_that_stopped_after_different_numbers_have_no_rate_in_common(
+def test_cases_that_stopped_after_different_numbers_have_no_rate_in_common(
     config: Config, tmp_path: Path
 ) -> None:
     settings = config(envs=[LINE, OTHER_LINE], episodes=40, stop={"target": 0.5, "at_least": 5})
     alike = recorded(settings.model_copy(update={"out": tmp_path / "alike"}), {"": [True] * 12})
-    assert {cell.stopped_at for cell in alike.results.cells} != {None}
+    assert {case.stopped_at for case in alike.results.cases} != {None}
     assert alike.totals[0].success_once.rate == 1.0
     with Store(settings) as store:
         store.begin_run(settings, {})
-        for job in plan(store.cells):  # one task is solved at once, the other every second time
-            success = job.cell.env == LINE or bool(job.key.episode % 2)
-            if job.cell.env == OTHER_LINE or job.key.episode < 12:
+        for job in plan(store.cases):  # one task is solved at once, the other every second time
+            success = job.case.env == LINE or bool(job.key.episode % 2)
+            if job.case.env == OTHER_LINE or job.key.episode < 12:
                 store.record(
                     EpisodeResult(job.key, "done", success, success, first_success=3, steps=9), 1
                 )
         store.end_run("complete")
     summary = summarize(Results.load(settings.out))
-    first, second = summary.results.cells
+    first, second = summary.results.cases
     assert first.stopped_at is not None
     assert second.stopped_at is None
     [total] = summary.to_json()["totals"]
@@ -278,16 +278,16 @@ def test_cells_that_stopped_after_different_numbers_have_no_rate_in_common(
     assert f"{pooled:.1f}" not in page
 
 
-def test_a_cell_that_stopped_early_says_after_how_many_and_at_which_error_rate(
+def test_a_case_that_stopped_early_says_after_how_many_and_at_which_error_rate(
     config: Config,
 ) -> None:
     settings = config(episodes=40, stop={"target": 0.5, "error_rate": 0.01})
     summary = recorded(settings, {"": [True] * 20})
-    [cell] = summary.to_json()["cells"]
-    at = cell["stopped_at"]
+    [case] = summary.to_json()["cases"]
+    at = case["stopped_at"]
     assert 5 < at < 20
-    assert cell["success_once"]["confidence_sequence"][0] > 0.5
-    assert (cell["success_once"]["error_rate"], cell["episodes"], cell["planned"]) == (0.01, at, 40)
+    assert case["success_once"]["confidence_sequence"][0] > 0.5
+    assert (case["success_once"]["error_rate"], case["episodes"], case["planned"]) == (0.01, at, 40)
     text = printed(summary)
     assert f"stopped after {at} of 40 (error rate 1 %)" in text
     assert "Wilson" not in text
@@ -308,13 +308,13 @@ def test_pushed_weights_are_named_with_the_checkpoint(
     settings = config(envs=[LINE], episodes=2, policy="act")
     with Store(settings) as store:
         store.begin_run(settings, {})
-        for job, (first, last) in zip(plan(cells(settings)), versions, strict=True):
+        for job, (first, last) in zip(plan(plan_cases(settings)), versions, strict=True):
             done = EpisodeResult(
                 job.key, "done", True, True, first_policy_version=first, policy_version=last
             )
             store.record(replace(done, policy_fingerprint=f"digest {last}"), 1)
     summary = summarize(Results.load(settings.out))
-    assert summary.to_json()["cells"][0]["pushed_weights"] == says
+    assert summary.to_json()["cases"][0]["pushed_weights"] == says
     page = write_report(summary.results, settings.out / "report.html").read_text()
     printed = StringIO()
     print_summary(Console(file=printed, width=200), summary)

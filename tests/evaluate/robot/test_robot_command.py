@@ -20,7 +20,7 @@ from typer.testing import CliRunner
 
 from vlagents_ray.cli.main import app
 from vlagents_ray.evaluate import Results
-from vlagents_ray.evaluate.plan.cases import cells
+from vlagents_ray.evaluate.plan.cases import plan_cases
 from vlagents_ray.evaluate.plan.config import EvalConfig
 from vlagents_ray.evaluate.robot import TrialsInterrupted, evaluate_on_robot, schedule
 
@@ -128,13 +128,13 @@ def test_it_serves_both_is_killed_goes_on_and_then_tells(tmp_path: Path) -> None
     assert all(name.encode() in terminal.read for name in NAMES), "the table at the end"
     results = Results.load(out)
     config = EvalConfig.model_validate(results.runs[-1].config)
-    order = [trial.job.key for trial in schedule(cells(config), b"the key of the plan")]
+    order = [trial.job.key for trial in schedule(plan_cases(config), b"the key of the plan")]
     outcomes = {
-        one.result.key: one.result.success_once for cell in results.cells for one in cell.episodes
+        one.result.key: one.result.success_once for case in results.cases for one in case.episodes
     }
     assert [outcomes[key] for key in order] == [True, True, False, False]
-    assert [attempt.cause for cell in results.cells for attempt in cell.attempts] == ["operator"]
-    assert {one.result.transport for cell in results.cells for one in cell.episodes} == {"shm"}
+    assert [attempt.cause for case in results.cases for attempt in case.attempts] == ["operator"]
+    assert {one.result.transport for case in results.cases for one in case.episodes} == {"shm"}
 
 
 def test_what_was_judged_can_be_told_before_the_end(tmp_path: Path) -> None:

@@ -28,7 +28,7 @@ from robot_trials import (
 
 from vlagents_ray.errors import ConfigError, ConnectionLost, MissingState, PolicyFailed
 from vlagents_ray.evaluate import EvalConfig, evaluate
-from vlagents_ray.evaluate.plan.cases import cells
+from vlagents_ray.evaluate.plan.cases import plan_cases
 from vlagents_ray.evaluate.robot import (
     TrialsInterrupted,
     Verdict,
@@ -43,7 +43,7 @@ KEY = b"a key of the plan"
 
 
 def names_by_trial(config: EvalConfig) -> list[str]:
-    return [trial.job.cell.contender for trial in schedule(cells(config), KEY)]
+    return [trial.job.case.contender for trial in schedule(plan_cases(config), KEY)]
 
 
 def test_what_tells_the_policy_is_nowhere_until_all_are_judged(
@@ -84,7 +84,7 @@ def test_what_tells_the_policy_is_nowhere_until_all_are_judged(
     found = summary.results
     assert found.contenders == list(NAMES), "and then it is told"
     assert b"step-4711" in (tmp_path / "out" / "results.db").read_bytes()
-    assert {one.result.weights for cell in found.of(NAMES[0]) for one in cell.episodes} == {
+    assert {one.result.weights for case in found.of(NAMES[0]) for one in case.episodes} == {
         f"digest-of-{NAMES[0]}"
     }
 
@@ -108,7 +108,9 @@ def test_without_a_key_one_is_drawn_that_this_user_alone_can_read(tmp_path: Path
         evaluate_on_robot(config, ScriptedPerson(judged("s")), agent_factory=policies)
         key = tmp_path / str(number) / "trials.key"
         assert key.stat().st_mode & 0o777 == 0o600
-        drawn = [trial.job.cell.contender for trial in schedule(cells(config), key.read_bytes())]
+        drawn = [
+            trial.job.case.contender for trial in schedule(plan_cases(config), key.read_bytes())
+        ]
         assert policies.made[:2] == sorted(NAMES), (
             "each is rehearsed, in an order that tells nothing"
         )
@@ -127,7 +129,7 @@ def test_a_partial_success_is_none_and_its_score_is_the_share_of_the_rubrics_poi
 
     config = plan(tmp_path / "out", suite={"envs": ["cups"], "episodes": 1})
     summary = evaluate_on_robot(config, ScriptedPerson(answer), agent_factory=Policies())
-    [one, other] = [episode.result for cell in summary.results.cells for episode in cell.episodes]
+    [one, other] = [episode.result for case in summary.results.cases for episode in case.episodes]
     assert (
         (one.success_once, one.episode_return)
         == (other.success_once, other.episode_return)
@@ -158,14 +160,14 @@ def test_a_repeated_trial_is_counted_with_its_reason_and_played_by_the_same_poli
     assert policies.made[2:] == [order[0], *order]
     assert any("without a reason" in line for line in person.printed)
     assert any("played again: somebody walked into the scene" in line for line in person.printed)
-    [attempt] = [attempt for cell in summary.results.cells for attempt in cell.attempts]
+    [attempt] = [attempt for case in summary.results.cases for attempt in case.attempts]
     assert (attempt.cause, attempt.error, attempt.retried) == (
         "operator",
         "somebody walked into the scene",
         True,
     )
     assert summary.total.retries == 1
-    assert sorted(one.attempts for cell in summary.results.cells for one in cell.episodes) == [
+    assert sorted(one.attempts for case in summary.results.cases for one in case.episodes) == [
         1,
         1,
         1,
@@ -186,7 +188,7 @@ def test_an_arm_that_fails_is_stopped_and_its_trial_played_again_by_the_same_pol
         "the person is told what to mend"
     )
     assert arm.stops >= 5
-    [attempt] = [attempt for cell in summary.results.cells for attempt in cell.attempts]
+    [attempt] = [attempt for case in summary.results.cases for attempt in case.attempts]
     assert (attempt.cause, attempt.code) == ("worker", "env_failed")
     assert summary.total.episodes == 4
 
@@ -218,7 +220,7 @@ def test_a_lost_connection_is_told_without_the_policy_and_is_no_failure_of_it(
     summary = evaluate_on_robot(config, person, agent_factory=policies)
     [told] = [line for line in person.printed if "played again" in line]
     assert told.strip() == f"played again: it could not be played ({code})"
-    [attempt] = [attempt for cell in summary.results.cells for attempt in cell.attempts]
+    [attempt] = [attempt for case in summary.results.cases for attempt in case.attempts]
     assert attempt.cause == "policy"
     assert ".example" in attempt.error, "what was hidden is told at the end"
     assert summary.total.episodes == 2
@@ -291,7 +293,7 @@ def test_it_plays_in_each_mode_of_the_chunk_player_and_closes_what_it_opened(
         config, ScriptedPerson(judged("s")), robot=arm, agent_factory=policies
     )
     assert sorted(closed) == sorted(policies.made)
-    results = [episode.result for cell in summary.results.cells for episode in cell.episodes]
+    results = [episode.result for case in summary.results.cases for episode in case.episodes]
     assert sum(result.steps for result in results) == arm.applied > 0
     assert all(0 < result.steps <= 20 and result.acts > 0 for result in results)
     assert {result.policy_fingerprint for result in results} == {
@@ -444,7 +446,7 @@ def test_a_task_ends_early_once_all_its_policies_are_certain(tmp_path: Path) -> 
     policies = Policies()
     person = ScriptedPerson(judged("s"))
     summary = evaluate_on_robot(config, person, agent_factory=policies)
-    stopped = {cell.stopped_at for cell in summary.results.cells}
+    stopped = {case.stopped_at for case in summary.results.cases}
     assert len(stopped) == 1
     [at] = stopped
     assert at is not None
@@ -452,7 +454,7 @@ def test_a_task_ends_early_once_all_its_policies_are_certain(tmp_path: Path) -> 
     assert len(policies.made) - 2 == 2 * 2 * at
     assert policies.made[2 : 2 + 2 * at] == order[: 2 * at]
     assert summary.state == "complete"
-    assert all(cell.missing == 0 for cell in summary.results.cells)
+    assert all(case.missing == 0 for case in summary.results.cases)
 
 
 def test_results_can_be_told_before_the_end_which_the_log_says(tmp_path: Path) -> None:

@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 from robot_trials import plan
 
 from vlagents_ray.errors import ConfigError, UnknownEnv
-from vlagents_ray.evaluate.plan.cases import cells
-from vlagents_ray.evaluate.robot import Trial, planned_cells, schedule
+from vlagents_ray.evaluate.plan.cases import plan_cases
+from vlagents_ray.evaluate.robot import Trial, plan_robot_cases, schedule
 
 keys = st.binary(min_size=8, max_size=40)
 TASKS = ("cups", "drawer")
@@ -26,11 +26,11 @@ def drawn(
     robot = {"tasks": {task: {"instruction": f"use the {task}", "max_steps": 5} for task in tasks}}
     suite = {"envs": list(tasks), "episodes": episodes, "seeds": seeds}
     config = plan(Path("out"), policies=names, suite=suite, robot=robot)
-    return schedule(cells(config), key)
+    return schedule(plan_cases(config), key)
 
 
 def order(trials: list[Trial]) -> list[tuple[str, int, str]]:
-    return [(trial.job.cell.env, trial.scene, trial.job.cell.contender) for trial in trials]
+    return [(trial.job.case.env, trial.scene, trial.job.case.contender) for trial in trials]
 
 
 def orders_by_task(trials: list[Trial]) -> dict[str, list[list[str]]]:
@@ -108,7 +108,7 @@ def test_the_key_decides_whatever_order_the_plan_names_policies_in(
 ) -> None:
     def of(ordered: list[str]) -> list[tuple[str, int, str]]:
         config = plan(Path("out"), policies=[{"name": name, "url": "http://x"} for name in ordered])
-        return order(schedule(cells(config), key))
+        return order(schedule(plan_cases(config), key))
 
     assert of(names) == of(["a", "b", "c"])
 
@@ -142,30 +142,32 @@ def test_a_pair_has_the_key_of_the_same_scene() -> None:
 
 
 def test_tasks_are_those_of_the_plan_and_patterns_match_them(tmp_path: Path) -> None:
-    assert [cell.env for cell in cells(plan(tmp_path, suite={"envs": ["dr*"]}))] == [
+    assert [case.env for case in plan_cases(plan(tmp_path, suite={"envs": ["dr*"]}))] == [
         "drawer",
         "drawer",
     ]
     with pytest.raises(UnknownEnv, match="none of the plan's"):
-        cells(plan(tmp_path, suite={"envs": ["kettle"]}))
+        plan_cases(plan(tmp_path, suite={"envs": ["kettle"]}))
     with pytest.raises(ConfigError, match="got no robot"):
-        planned_cells(plan(tmp_path, robot={"arm": None}))
+        plan_robot_cases(plan(tmp_path, robot={"arm": None}))
     pushed = [
         {"name": "base", "url": "http://x", "pushed_weights": {"version": 3, "fingerprint": "ab"}}
     ]
     with pytest.raises(ConfigError, match="want checkpoints"):
-        planned_cells(plan(tmp_path, policies=pushed))
+        plan_robot_cases(plan(tmp_path, policies=pushed))
 
 
 def test_what_would_show_rates_before_the_end_is_refused(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=r"track.*before the end"):
-        planned_cells(plan(tmp_path, track=["wandb"]))
+        plan_robot_cases(plan(tmp_path, track=["wandb"]))
 
 
 def test_results_of_the_robot_are_not_those_of_its_simulation(tmp_path: Path) -> None:
     tasks = {"tabletop": {"instruction": "push"}}
     real, simulated = (
-        cells(plan(tmp_path, suite={"envs": ["tabletop"]}, robot={"arm": arm, "tasks": tasks}))[0]
+        plan_cases(
+            plan(tmp_path, suite={"envs": ["tabletop"]}, robot={"arm": arm, "tasks": tasks})
+        )[0]
         for arm in ("a:B", None)
     )
     assert real.fingerprint != simulated.fingerprint

@@ -17,7 +17,7 @@ from in_process_evaluation import flat_config
 
 from vlagents_ray.client.credentials import KEY_VARIABLE, Credentials
 from vlagents_ray.envs.graphics import GPUS
-from vlagents_ray.evaluate.plan.cases import EvalCase, cells
+from vlagents_ray.evaluate.plan.cases import EvalCase, plan_cases
 from vlagents_ray.evaluate.workers import cluster
 from vlagents_ray.evaluate.workers.cluster import (
     MOST_BYTES,
@@ -59,27 +59,27 @@ def test_a_worker_is_never_bound_to_a_node_that_is_full_or_gone() -> None:
     assert (wanted.soft, wanted._spill_on_unavailable) == (True, True)
 
 
-def cell(url: str | None = "http://box", **worker: Any) -> EvalCase:
-    [found] = cells(flat_config(envs=["tabletop/reach"], out="out", policy_url=url, **worker))
+def case(url: str | None = "http://box", **worker: Any) -> EvalCase:
+    [found] = plan_cases(flat_config(envs=["tabletop/reach"], out="out", policy_url=url, **worker))
     return found
 
 
 def test_gpus_are_hidden_from_workers_that_are_given_none() -> None:
-    assert runtime_env(cell())["env_vars"][GPUS] == ""
+    assert runtime_env(case())["env_vars"][GPUS] == ""
 
 
 def test_gpus_are_not_hidden_from_their_owner_nor_where_the_user_says_otherwise_nor_from_a_policy_in_the_worker() -> (
     None
 ):
-    assert GPUS not in runtime_env(cell(gpus_per_worker=0.25))["env_vars"]
-    assert runtime_env(cell(runtime_env={"env_vars": {GPUS: "1"}}))["env_vars"][GPUS] == "1"
-    assert GPUS not in runtime_env(cell(url=None))["env_vars"]
+    assert GPUS not in runtime_env(case(gpus_per_worker=0.25))["env_vars"]
+    assert runtime_env(case(runtime_env={"env_vars": {GPUS: "1"}}))["env_vars"][GPUS] == "1"
+    assert GPUS not in runtime_env(case(url=None))["env_vars"]
 
 
 def test_the_key_of_a_server_is_in_no_runtime_environment(monkeypatch: pytest.MonkeyPatch) -> None:
     """Ray logs those, where every user can read them. It comes with a worker's first call."""
     monkeypatch.setenv(KEY_VARIABLE, "vlr_x")
-    assert "vlr_x" not in str(runtime_env(cell()))
+    assert "vlr_x" not in str(runtime_env(case()))
     credentials = Credentials()
     assert "vlr_x" not in repr(credentials)
     monkeypatch.delenv(KEY_VARIABLE)

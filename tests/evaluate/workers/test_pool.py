@@ -17,7 +17,7 @@ from ray.exceptions import RaySystemError
 from vlagents_ray.errors import ConfigError, EnvFailed
 from vlagents_ray.evaluate import EvalConfig, WorkerConfig
 from vlagents_ray.evaluate.episode.failures import Failure
-from vlagents_ray.evaluate.plan.cases import cells
+from vlagents_ray.evaluate.plan.cases import plan_cases
 from vlagents_ray.evaluate.plan.jobs import EpisodeKey, Job, plan
 from vlagents_ray.evaluate.workers import pool
 from vlagents_ray.evaluate.workers.base import WorkerHandle
@@ -192,10 +192,10 @@ def test_between_two_episodes_nobody_gives_up_but_where_nothing_is_played_for_as
 
 def test_reports_that_have_come_are_taken_in_one_turn(config: Config) -> None:
     settings = config(workers=2)
-    jobs = plan(cells(settings))
+    jobs = plan(plan_cases(settings))
     with WorkerPool(settings, lambda _: ToZero()) as pool:
         for job in jobs[:2]:
-            pool.start(job.cell)
+            pool.start(job.case)
         wait_for(lambda: not list(pool.wait(0.1)) and len(pool.idle()) == 2)
         busy = pool.idle()
         for worker, job in zip(busy, jobs, strict=False):

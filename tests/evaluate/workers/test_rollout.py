@@ -23,7 +23,7 @@ from vlagents_ray.errors import (
 )
 from vlagents_ray.evaluate import EvalConfig, PolicyConfig
 from vlagents_ray.evaluate.episode.failures import explain
-from vlagents_ray.evaluate.plan.cases import cells
+from vlagents_ray.evaluate.plan.cases import plan_cases
 from vlagents_ray.evaluate.plan.jobs import EpisodeKey, Job
 from vlagents_ray.evaluate.workers import rollout
 from vlagents_ray.evaluate.workers.rollout import Report, Rollout
@@ -33,8 +33,8 @@ Config = Callable[..., EvalConfig]
 
 
 def job(seed: int = 0, env: str = LINE, **settings: Any) -> Job:
-    [cell] = cells(flat_config(envs=[env], out="out", **settings))
-    return Job(EpisodeKey(env, seed, seed, "0"), cell)
+    [case] = plan_cases(flat_config(envs=[env], out="out", **settings))
+    return Job(EpisodeKey(env, seed, seed, "0"), case)
 
 
 def rollout_of(config: Config, make: Callable[[], Agent], **changes: Any) -> Rollout:

@@ -28,7 +28,7 @@ def test_lerobot_reads_what_an_evaluation_recorded(tmp_path: Path) -> None:
     dataset = LeRobotDataset("evaluation/line", root=tmp_path / "dataset")
     assert (dataset.num_episodes, dataset.num_frames, dataset.fps) == (3, 30, 10)
     frames = iter(dataset)
-    for episode in results.cells[0].episodes:
+    for episode in results.cases[0].episodes:
         trajectory = Trajectory.load(results.out / str(episode.trajectory))
         for i in range(10):
             frame = next(frames)

@@ -64,7 +64,7 @@ class VideoRecorder(EpisodeObserver):
 
 
 def save_videos(
-    out: Path, cell: EvalCase, result: EpisodeResult, videos: dict[str, bytes]
+    out: Path, case: EvalCase, result: EpisodeResult, videos: dict[str, bytes]
 ) -> list[str]:
     """Write `out/videos/POLICY/SUITE/ENV/epNNNN_seedS_OUTCOME_CAMERA.mp4`; returns the paths
     relative to `out`.
@@ -75,7 +75,7 @@ def save_videos(
     Each file is complete once it has its name. Files of an earlier attempt at the episode are
     removed.
     """
-    folder, names, written = _folder_for(out, storage.VIDEOS, cell, result), distinct(videos), []
+    folder, names, written = _folder_for(out, storage.VIDEOS, case, result), distinct(videos), []
     for camera, data in videos.items():
         path = folder / f"{_stem(result)}_{storage.outcome(result)}_{names[camera]}.mp4"
         with storage.whole(path) as part:
@@ -84,11 +84,11 @@ def save_videos(
     return written
 
 
-def _folder_for(out: Path, kind: str, cell: EvalCase, result: EpisodeResult) -> Path:
+def _folder_for(out: Path, kind: str, case: EvalCase, result: EpisodeResult) -> Path:
     """Return `out/KIND/POLICY/SUITE/ENV`, without the files of an earlier attempt at the
     episode.
     """
-    folder = out.joinpath(kind, *(plain(part) for part in cell.name if part))
+    folder = out.joinpath(kind, *(plain(part) for part in case.name if part))
     for old in folder.glob(f"{_stem(result)}[_.]*"):
         old.unlink()
     return folder
@@ -319,7 +319,7 @@ class Recording(EpisodeRecorder):
 
 
 def save(
-    out: Path, cell: EvalCase, result: EpisodeResult, kept: Artifacts
+    out: Path, case: EvalCase, result: EpisodeResult, kept: Artifacts
 ) -> tuple[list[str], str | None]:
     """Write the files of an episode below `out`; returns the paths of its videos and its
     trajectory, relative to it.
@@ -328,8 +328,8 @@ def save(
     videos that are also shown are links, and the .npz is written last: if it exists, the other
     files do.
     """
-    videos = save_videos(out, cell, result, kept.shown)
-    folder = _folder_for(out, storage.TRAJECTORIES, cell, result)
+    videos = save_videos(out, case, result, kept.shown)
+    folder = _folder_for(out, storage.TRAJECTORIES, case, result)
     if kept.trajectory is None:
         return videos, None
     path, saved = folder / f"{_stem(result)}.npz", dict(zip(kept.shown, videos, strict=True))

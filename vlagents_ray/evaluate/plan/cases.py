@@ -27,7 +27,7 @@ from vlagents_ray.registry import env_class, env_suite, env_task
 
 @dataclass(frozen=True)
 class EvalCase:
-    """A cell of the table of results: the episodes of one success rate."""
+    """One policy, at one checkpoint, in one environment of a suite, with one success rate."""
 
     policy: PolicyConfig
     step: int | None  # of training, in a sweep over checkpoints; or the version of pushed weights
@@ -38,9 +38,9 @@ class EvalCase:
 
     @property
     def on_robot(self) -> tuple[RobotConfig, RobotTask]:
-        """The real robot and its task; only of a cell on one."""
+        """The real robot and its task; only of a case on one."""
         if self.robot is None:
-            raise TypeError(f"{self.env}: this cell is simulated")
+            raise TypeError(f"{self.env}: this case is simulated")
         return self.robot, self.robot.tasks[self.env]
 
     @property
@@ -50,7 +50,7 @@ class EvalCase:
 
     @property
     def name(self) -> tuple[str, str, str]:
-        """(contender, suite, env): no two cells of one evaluation have the same."""
+        """(contender, suite, env): no two cases of one evaluation have the same."""
         return self.contender, self.suite.name, self.env
 
     @property
@@ -109,22 +109,22 @@ class EvalCase:
         return self.suite.episodes * len(self.suite.seeds)
 
 
-def env_program(cell: EvalCase, code: Callable[[str], Program] = code_of_class) -> Program:
-    """Return the files of a cell's environment, or of its robot; `code` returns those of a
+def env_program(case: EvalCase, code: Callable[[str], Program] = code_of_class) -> Program:
+    """Return the files of a case's environment, or of its robot; `code` returns those of a
     class.
     """
-    if cell.robot is not None:
-        return code(cell.on_robot[0].arm or "")
-    cls = env_class(cell.env)
-    settings = with_defaults(cls, cell.suite.env_options) | {
-        "reset_options": cell.suite.reset_options
+    if case.robot is not None:
+        return code(case.on_robot[0].arm or "")
+    cls = env_class(case.env)
+    settings = with_defaults(cls, case.suite.env_options) | {
+        "reset_options": case.suite.reset_options
     }
-    task = env_task(cell.env) or ""
+    task = env_task(case.env) or ""
     # Of an id of Gymnasium; this module registers it.
     namespace = task.rpartition(":")[0] or task.rpartition("/")[0]
     modules = [
         f"{cls.__module__}:{cls.__name__}",
-        cell.suite.env_options.get("module") or namespace,
+        case.suite.env_options.get("module") or namespace,
     ]
     found = {
         name: digest
@@ -139,8 +139,8 @@ def contender(policy: str, step: int | None) -> str:
     return policy if step is None else f"{policy}@{step}"
 
 
-def cells(config: EvalConfig) -> list[EvalCase]:
-    """Return every cell of `config`: by checkpoint, then by suite and env.
+def plan_cases(config: EvalConfig) -> list[EvalCase]:
+    """Return every case of `config`: by checkpoint, then by suite and env.
 
     Raises `UnknownEnv` for an unknown env. Raises `ConfigError` for an env that is listed twice
     under one name, or in two equal suites, as their episodes would have the same keys; and for
@@ -166,7 +166,7 @@ def cells(config: EvalConfig) -> list[EvalCase]:
         for policy, step in contenders
         for suite, env in envs
     ]
-    names = Counter(cell.name for cell in found)
+    names = Counter(case.name for case in found)
     if twice := sorted({env for (_, _, env), number in names.items() if number > 1}):
         raise ConfigError(
             f"suites: {twice} are in two suites of one name; give each suite another `name`"
@@ -178,8 +178,8 @@ def cells(config: EvalConfig) -> list[EvalCase]:
                 f"{' '.join(name)!r} and {' '.join(other)!r} would share files; give one another "
                 "name"
             )
-    prints = Counter(cell.fingerprint for cell in found)
-    if twice := sorted({cell.env for cell in found if prints[cell.fingerprint] > 1}):
+    prints = Counter(case.fingerprint for case in found)
+    if twice := sorted({case.env for case in found if prints[case.fingerprint] > 1}):
         raise ConfigError(
             f"suites: {twice} stand in two suites with the same settings, so that these are the "
             "same episodes; "
@@ -190,9 +190,9 @@ def cells(config: EvalConfig) -> list[EvalCase]:
 
 def require_envs(config: EvalConfig) -> None:
     """Raise `UnknownEnv` for an unknown task, `ConfigError` for options that its env refuses."""
-    for cell in cells(config):
-        if cell.robot is None:
-            env_arguments(cell.env, cell.suite.env_options)
+    for case in plan_cases(config):
+        if case.robot is None:
+            env_arguments(case.env, case.suite.env_options)
 
 
 def expand(pattern: str) -> list[str]:

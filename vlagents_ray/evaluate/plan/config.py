@@ -163,11 +163,11 @@ class ClockConfig(_PlanModel):
 
 
 class StopConfig(_PlanModel):
-    """The rule by which a cell stops early (see `confidence_sequence`): `target`, `width`, or
+    """The rule by which a case stops early (see `confidence_sequence`): `target`, `width`, or
     whichever comes first.
     """
 
-    # Of each cell's confidence sequence, over all looks together.
+    # Of each case's confidence sequence, over all looks together.
     error_rate: float = Field(default=0.05, gt=0, lt=1)
     # Stop when this success rate is excluded.
     target: float | None = Field(default=None, ge=0, le=1)
@@ -228,7 +228,7 @@ class TrackingConfig(_PlanModel):
 
     project: Name = "vlagents-ray"
     group: str | None = None  # of runs; default: the name of the folder of results
-    # Of each cell that are uploaded, failures first.
+    # Of each case that are uploaded, failures first.
     videos: Annotated[int, Field(ge=0, le=MOST_EPISODES)] = 4
 
 

@@ -33,7 +33,7 @@ class Job:
     """One attempt at an episode."""
 
     key: EpisodeKey
-    cell: EvalCase
+    case: EvalCase
     attempt: int = 1
     # Whether it is played without others in its simulator, so that an error names this episode.
     alone: bool = False
@@ -43,13 +43,13 @@ class Job:
         return replace(self, attempt=self.attempt + 1, alone=self.alone or alone)
 
 
-def plan(cells: Iterable[EvalCase]) -> list[Job]:
-    """Return every episode of `cells`, cell by cell and seed by seed."""
+def plan(cases: Iterable[EvalCase]) -> list[Job]:
+    """Return every episode of `cases`, case by case and seed by seed."""
     return [
-        Job(EpisodeKey(cell.env, i, seed + i, cell.fingerprint), cell)
-        for cell in cells
-        for seed in cell.suite.seeds
-        for i in range(cell.suite.episodes)
+        Job(EpisodeKey(case.env, i, seed + i, case.fingerprint), case)
+        for case in cases
+        for seed in case.suite.seeds
+        for i in range(case.suite.episodes)
     ]
 
 
@@ -77,7 +77,7 @@ class JobQueue:
         """Return the next jobs for a worker of `kind` with the env at place `made`; none if no job
         of its kind waits.
 
-        They are of one cell, as many as it plays at once. A worker keeps its env while that has
+        They are of one case, as many as it plays at once. A worker keeps its env while that has
         episodes; then it takes the place with the most waiting jobs for each worker, by `working`,
         the number of busy workers at each place.
         """
@@ -95,27 +95,27 @@ class JobQueue:
     def needs_worker(
         self, workers: Mapping[str, int], unoccupied: Mapping[str, int]
     ) -> EvalCase | None:
-        """Return a cell for one more worker; None if the `unoccupied` ones suffice.
+        """Return a case for one more worker; None if the `unoccupied` ones suffice.
 
-        Both arguments count workers by kind. The cell is of the kind with the most waiting jobs for
+        Both arguments count workers by kind. The case is of the kind with the most waiting jobs for
         each of the `workers`.
         """
         waiting: Counter[str] = Counter()
         for place, jobs in self._waiting.items():
             if jobs:
-                waiting[self._kinds[place]] += math.ceil(len(jobs) / jobs[0].cell.suite.num_envs)
+                waiting[self._kinds[place]] += math.ceil(len(jobs) / jobs[0].case.suite.num_envs)
         short = [kind for kind, number in waiting.items() if number > unoccupied.get(kind, 0)]
         if not short:
             return None
         kind = max(short, key=lambda one: waiting[one] / (1 + workers.get(one, 0)))
         return next(
-            jobs[0].cell
+            jobs[0].case
             for place, jobs in self._waiting.items()
             if jobs and self._kinds[place] == kind
         )
 
     def drop(self, settings: str) -> int:
-        """Remove the waiting jobs of the cell with this fingerprint; returns their number."""
+        """Remove the waiting jobs of the case with this fingerprint; returns their number."""
         before = len(self)
         for place, jobs in self._waiting.items():
             self._waiting[place] = deque(job for job in jobs if job.key.settings != settings)
@@ -124,17 +124,17 @@ class JobQueue:
     def _first(self, place: str) -> tuple[Job, ...]:
         jobs = self._waiting[place]
         taken = [jobs.popleft()]
-        cell = taken[0].cell
-        number = 1 if taken[0].alone else cell.suite.num_envs
+        case = taken[0].case
+        number = 1 if taken[0].alone else case.suite.num_envs
         while (
             jobs
             and len(taken) < number
-            and jobs[0].cell.fingerprint == cell.fingerprint
+            and jobs[0].case.fingerprint == case.fingerprint
             and not jobs[0].alone
         ):
             taken.append(jobs.popleft())
         return tuple(taken)
 
     def _of(self, job: Job) -> deque[Job]:
-        self._kinds[job.cell.place] = job.cell.kind
-        return self._waiting.setdefault(job.cell.place, deque())
+        self._kinds[job.case.place] = job.case.kind
+        return self._waiting.setdefault(job.case.place, deque())

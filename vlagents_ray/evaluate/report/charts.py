@@ -43,7 +43,7 @@ def bounds(values: tuple[float, float] | None) -> str:
 
 
 def interval_name(rate: Rate) -> str:
-    """Return the kind of that interval: a confidence sequence if cells could stop early, else
+    """Return the kind of that interval: a confidence sequence if cases could stop early, else
     Wilson's.
     """
     if rate.error_rate is None:

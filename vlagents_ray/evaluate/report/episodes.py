@@ -14,7 +14,7 @@ import numpy as np
 
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.evaluate.artifacts.storage import outcome
-from vlagents_ray.evaluate.results.reader import Attempt, CellResults, Episode, Results
+from vlagents_ray.evaluate.results.reader import Attempt, CaseResults, Episode, Results
 from vlagents_ray.evaluate.results.summary import errors_of_policies
 from vlagents_ray.images.jpeg_png import data_url, encode_jpeg
 from vlagents_ray.registry import require
@@ -34,7 +34,7 @@ _OUTCOMES = {
     "infra_failed": "lost",
 }
 
-Found = tuple[CellResults, Episode]
+Found = tuple[CaseResults, Episode]
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,14 +48,14 @@ class Player:
     tall: float | None  # height / width
 
 
-Card = tuple[CellResults, Episode, Player]  # of a gallery
+Card = tuple[CaseResults, Episode, Player]  # of a gallery
 
 
 @dataclass(frozen=True, slots=True)
 class EpisodeRow:
     """An episode of the table."""
 
-    cell: CellResults
+    case: CaseResults
     episode: Episode
     outcome: str
     style: str | None  # a class of the stylesheet
@@ -89,7 +89,7 @@ class Errors:
 
     of_policies: list[tuple[tuple[str, str, str], int]]  # ((policy id, task, error), episodes)
     # The first `MOST_LOGS` that failed by infrastructure.
-    attempts: list[tuple[CellResults, Attempt]]
+    attempts: list[tuple[CaseResults, Attempt]]
     failed: int  # attempts
     repeated: int  # attempts
     lost: int  # episodes
@@ -110,15 +110,15 @@ class Gallery:
         """Return at most `most` of these episodes with a video, from tasks and policies in
         turns.
         """
-        by_cell: dict[str, list[Found]] = {}
-        for cell, one in found:
+        by_case: dict[str, list[Found]] = {}
+        for case, one in found:
             if one.videos:
-                by_cell.setdefault(cell.cell, []).append((cell, one))
+                by_case.setdefault(case.case_id, []).append((case, one))
         drawn: list[Card] = []
-        for cell, one in filter(None, itertools.chain(*itertools.zip_longest(*by_cell.values()))):
-            label = f"{cell.task}, episode {one.result.key.episode}, {cell.contender}"
+        for case, one in filter(None, itertools.chain(*itertools.zip_longest(*by_case.values()))):
+            label = f"{case.task}, episode {one.result.key.episode}, {case.contender}"
             if len(drawn) < most and (player := self.player(one.videos[0], label)) is not None:
-                drawn.append((cell, one, player))
+                drawn.append((case, one, player))
         return drawn
 
     def player(self, video: str, label: str) -> Player | None:
@@ -159,20 +159,20 @@ class Gallery:
 def episodes(results: Results, gallery: Gallery) -> Episodes | None:
     """Return all episodes, or None without any."""
     order = {name: index for index, name in enumerate(results.contenders)}
-    cells = sorted(results.cells, key=lambda cell: order[cell.contender])
-    if not (found := [(cell, one) for cell in cells for one in cell.episodes]):
+    cases = sorted(results.cases, key=lambda case: order[case.contender])
+    if not (found := [(case, one) for case in cases for one in case.episodes]):
         return None
-    solved = [(cell, one) for cell, one in found if one.counts and one.result.success_once]
+    solved = [(case, one) for case, one in found if one.counts and one.result.success_once]
     cards = gallery.cards(solved, MOST_SOLVED)
     rows = []
-    for cell, one in found[:MOST_LISTED]:
+    for case, one in found[:MOST_LISTED]:
         kind = outcome(one.result)
         words = f"({_OUTCOMES[kind]})" if one.beyond else _OUTCOMES[kind]
         style = {"success": "good", "failure": None}.get(kind, "bad")
         links = [(number, gallery.link(video)) for number, video in enumerate(one.videos, 1)]
         rows.append(
             EpisodeRow(
-                cell,
+                case,
                 one,
                 words,
                 style,
@@ -185,9 +185,9 @@ def episodes(results: Results, gallery: Gallery) -> Episodes | None:
 def failures(results: Results, gallery: Gallery) -> Failures | None:
     """Return the episodes that were not solved; None if there are none."""
     found = [
-        (cell, one)
-        for cell in results.cells
-        for one in cell.episodes
+        (case, one)
+        for case in results.cases
+        for one in case.episodes
         if one.counts and not one.result.success_once
     ]
     if not found:
@@ -199,7 +199,7 @@ def failures(results: Results, gallery: Gallery) -> Failures | None:
 def errors(results: Results) -> Errors | None:
     """Return the errors with their logs; None without any."""
     broken = errors_of_policies(results)
-    attempts = [(cell, attempt) for cell in results.cells for attempt in cell.attempts]
+    attempts = [(case, attempt) for case in results.cases for attempt in case.attempts]
     if not broken and not attempts:
         return None
     return Errors(
@@ -207,7 +207,7 @@ def errors(results: Results) -> Errors | None:
         attempts[:MOST_LOGS],
         len(attempts),
         sum(attempt.retried for _, attempt in attempts),
-        sum(one.result.status == "infra_failed" for cell in results.cells for one in cell.episodes),
+        sum(one.result.status == "infra_failed" for case in results.cases for one in case.episodes),
     )
 
 

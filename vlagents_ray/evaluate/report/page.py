@@ -41,7 +41,7 @@ from vlagents_ray.evaluate.report.success import (
 )
 from vlagents_ray.evaluate.results.changes import Change
 from vlagents_ray.evaluate.results.comparison import clock_gaps
-from vlagents_ray.evaluate.results.reader import CellResults, Results, Run, by_timing, rate_of
+from vlagents_ray.evaluate.results.reader import CaseResults, Results, Run, by_timing, rate_of
 from vlagents_ray.evaluate.results.summary import Summary, median, pushed_of, stated, summarize
 
 FILE = "report.html"
@@ -125,8 +125,8 @@ def report(summary: Summary, gallery: Gallery, *, accept_changes: bool = False) 
         .get_template("page.html.j2")
         .render(
             summary=summary,
-            policies=list(dict.fromkeys(cell.policy for cell in results.cells)),
-            tasks=len({(cell.suite, cell.env) for cell in results.cells}),
+            policies=list(dict.fromkeys(case.policy for case in results.cases)),
+            tasks=len({(case.suite, case.env) for case in results.cases}),
             run=results.runs[-1],
             figures=figures,
             sections=[one for one in sections if one.view],
@@ -139,9 +139,9 @@ def _answer(summary: Summary, compared: Comparisons | None) -> Figure | None:
     any other report.
 
     The rate of the better one would be too high, as it is chosen by its rate. Differences do not
-    allow for cells that may stop early.
+    allow for cases that may stop early.
     """
-    may_stop = any(group.success_once.error_rate is not None for group in summary.cells)
+    may_stop = any(group.success_once.error_rate is not None for group in summary.cases)
     differences = (
         []
         if compared is None
@@ -162,25 +162,25 @@ def _answer(summary: Summary, compared: Comparisons | None) -> Figure | None:
 def _solved(summary: Summary) -> Figure:
     """Return the headline without a comparison.
 
-    It is a rate, if the cells have a common one, of synchronous episodes if there are any.
+    It is a rate, if the cases have a common one, of synchronous episodes if there are any.
     """
     best = summary.best[0]
     timing, part = next(iter(summary.parts(best).items()))
     name = "solved" if len(summary.results.contenders) == 1 else f"solved by the best, {best}"
-    if len(by_timing(summary.results.cells)) > 1:
+    if len(by_timing(summary.results.cases)) > 1:
         name += f", {timing}"
     once = part.success_once
     if once.pooled:
         return Figure(
             f"{percent(once)} %", name, f"{charts.interval_name(once)} {interval(once)} %"
         )
-    cells = by_timing(summary.results.of(best))[timing]
-    rates = [rate for cell in cells if (rate := rate_of([cell], "success_once")).rate is not None]
+    cases = by_timing(summary.results.of(best))[timing]
+    rates = [rate for case in cases if (rate := rate_of([case], "success_once")).rate is not None]
     low, high = (percent(pick(rates, key=lambda rate: rate.rate or 0.0)) for pick in (min, max))
     return Figure(
         f"{low} to {high} %",
         name,
-        f"{quantity(len(cells), 'task')} that stopped apart: no rate in common",
+        f"{quantity(len(cases), 'task')} that stopped apart: no rate in common",
     )
 
 
@@ -243,7 +243,7 @@ def latency(summary: Summary) -> Latency | None:
     """Return the latencies; None if no episode was played."""
     results = summary.results
     by_name = {
-        name: [one for cell in results.of(name) for one in cell.counted]
+        name: [one for case in results.of(name) for one in case.counted]
         for name in results.contenders
     }
     if not (played := {name: counted for name, counted in by_name.items() if counted}):
@@ -315,18 +315,18 @@ class Repeat:
 
 def protocol(results: Results) -> list[Env]:
     """Return the description and contract of the envs; envs with the same ones are one entry."""
-    alike: dict[str, tuple[CellResults, list[str]]] = {}
-    for cell in results.cells:
-        settings = {name: cell.settings.get(name) for name in _SETTINGS}
-        same = json.dumps([cell.described, cell.contract, settings], sort_keys=True)
-        alike.setdefault(same, (cell, []))[1].append(cell.task)
+    alike: dict[str, tuple[CaseResults, list[str]]] = {}
+    for case in results.cases:
+        settings = {name: case.settings.get(name) for name in _SETTINGS}
+        same = json.dumps([case.described, case.contract, settings], sort_keys=True)
+        alike.setdefault(same, (case, []))[1].append(case.task)
     envs = []
-    for cell, tasks in alike.values():
-        described = dict(cell.described)
+    for case, tasks in alike.values():
+        described = dict(case.described)
         constants = described.pop("protocol", None)
         of_benchmark = constants if isinstance(constants, Mapping) else None
-        settings = {name: value for name in _SETTINGS if (value := cell.settings.get(name))}
-        contract = _yaml(cell.contract) if cell.contract else None
+        settings = {name: value for name in _SETTINGS if (value := case.settings.get(name))}
+        contract = _yaml(case.contract) if case.contract else None
         envs.append(Env(list(dict.fromkeys(tasks)), of_benchmark, described, settings, contract))
     return envs
 
@@ -334,15 +334,15 @@ def protocol(results: Results) -> list[Env]:
 def configuration(results: Results) -> Configuration:
     """Return the software and the machines that made the results."""
     named: list[tuple[str, str]] = []
-    for cell in results.cells:
-        commit = stated(cell, "revision")
+    for case in results.cases:
+        commit = stated(case, "revision")
         found = (
-            stated(cell, "checkpoint"),
+            stated(case, "checkpoint"),
             commit and f"commit {commit}",
-            stated(cell, "weights"),
-            pushed_of(cell),
+            stated(case, "weights"),
+            pushed_of(case),
         )
-        named += [(cell.contender, one) for one in found if one is not None]
+        named += [(case.contender, one) for one in found if one is not None]
     workers: dict[tuple[str, str, str, str], set[tuple[int, int]]] = {}
     for one in results.workers:
         where = (one.host, one.policy, one.transport, one.renderer or "none")
@@ -352,7 +352,7 @@ def configuration(results: Results) -> Configuration:
         results.runs,
         results.accepted_changes,
         list(
-            {cell.env: (cell.env, cell.program) for cell in results.cells if cell.program}.values()
+            {case.env: (case.env, case.program) for case in results.cases if case.program}.values()
         ),
         list(dict.fromkeys(named)),
         [(*where, len(alike)) for where, alike in sorted(workers.items())],

@@ -1,4 +1,4 @@
-"""The live view of a folder of results: cells, learning curves, and failures with their videos."""
+"""The live view of a folder of results: cases, learning curves, and failures with their videos."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from vlagents_ray.evaluate.plan.cases import EvalCase
 from vlagents_ray.evaluate.plan.jobs import Job
 from vlagents_ray.evaluate.report.terminal import Progress, seconds_left
 from vlagents_ray.evaluate.results.database import FILE, RUNNING
-from vlagents_ray.evaluate.results.reader import CellResults, Episode, Results, rate_of
+from vlagents_ray.evaluate.results.reader import CaseResults, Episode, Results, rate_of
 from vlagents_ray.evaluate.results.statistics import Rate
 
 STARTING = "starting"
@@ -89,27 +89,27 @@ class ResultsDocument:
         with contextlib.suppress(ConfigError):  # the file is being made
             results = Results.load(self._out) if (self._out / FILE).is_file() else None
         state = self.state(results)
-        cells = () if results is None else results.cells
+        cases = () if results is None else results.cases
         contenders = [] if results is None else results.contenders
         left_s = None
         if results is not None and state == RUNNING:
             run = results.runs[-1]
-            played = sum(one.run == run.run for cell in cells for one in cell.episodes)
-            left = sum(_planned(cell) - _done(cell) for cell in cells)
+            played = sum(one.run == run.run for case in cases for one in case.episodes)
+            left = sum(_planned(case) - _done(case) for case in cases)
             left_s = seconds_left(left, played, time.time() - run.started)
         failed = [
-            (cell, one)
-            for cell in cells
-            for one in cell.episodes
+            (case, one)
+            for case in cases
+            for one in case.episodes
             if not (one.beyond or one.result.success_once)
         ]
         failed.sort(key=lambda found: found[1].finished, reverse=True)
         # The success rate at each step or version of a policy.
         curves: dict[str, list[dict[str, Any]]] = {}
         for contender in contenders:
-            mine = [cell for cell in cells if cell.contender == contender]
+            mine = [case for case in cases if case.contender == contender]
             if mine[0].step is not None:
-                whole = all(_done(cell) == _planned(cell) for cell in mine)
+                whole = all(_done(case) == _planned(case) for case in mine)
                 point = {"step": mine[0].step, "whole": whole} | _rate(
                     rate_of(mine, "success_once")
                 )
@@ -121,32 +121,32 @@ class ResultsDocument:
             "ends": None if left_s is None else time.time() + left_s,
             "goes_on": self.goes_on,
             "contenders": contenders,
-            "tasks": list(dict.fromkeys(cell.task for cell in cells)),
-            "done": sum(_done(cell) for cell in cells),
-            "planned": sum(_planned(cell) for cell in cells),
-            "retries": sum(attempt.retried for cell in cells for attempt in cell.attempts),
-            "cells": [
+            "tasks": list(dict.fromkeys(case.task for case in cases)),
+            "done": sum(_done(case) for case in cases),
+            "planned": sum(_planned(case) for case in cases),
+            "retries": sum(attempt.retried for case in cases for attempt in case.attempts),
+            "cases": [
                 {
-                    "policy": cell.contender,
-                    "task": cell.task,
-                    "done": _done(cell),
-                    "planned": _planned(cell),
+                    "policy": case.contender,
+                    "task": case.task,
+                    "done": _done(case),
+                    "planned": _planned(case),
                 }
-                | {"stopped": cell.stopped_at is not None, "sequence": cell.stop is not None}
-                | _rate(rate_of([cell], "success_once"))
-                for cell in cells
+                | {"stopped": case.stopped_at is not None, "sequence": case.stop is not None}
+                | _rate(rate_of([case], "success_once"))
+                for case in cases
             ],
             "curves": [{"policy": policy, "points": points} for policy, points in curves.items()],
             "failed": len(failed),
-            "failures": [self._failure(cell, one) for cell, one in failed[:_FAILURES]],
+            "failures": [self._failure(case, one) for case, one in failed[:_FAILURES]],
         }
 
-    def _failure(self, cell: CellResults, one: Episode) -> dict[str, Any]:
+    def _failure(self, case: CaseResults, one: Episode) -> dict[str, Any]:
         result = one.result
         return {
             "key": result.full_key,
-            "policy": cell.contender,
-            "task": cell.task,
+            "policy": case.contender,
+            "task": case.task,
             "episode": result.key.episode,
             "seed": result.key.seed,
             "outcome": outcome(result),
@@ -158,13 +158,13 @@ class ResultsDocument:
         }
 
 
-def _done(cell: CellResults) -> int:
+def _done(case: CaseResults) -> int:
     """Return the number of episodes with a result, those that infrastructure lost included."""
-    return sum(not one.beyond for one in cell.episodes)
+    return sum(not one.beyond for one in case.episodes)
 
 
-def _planned(cell: CellResults) -> int:
-    return cell.planned if cell.stopped_at is None else _done(cell)
+def _planned(case: CaseResults) -> int:
+    return case.planned if case.stopped_at is None else _done(case)
 
 
 def _rate(rate: Rate) -> dict[str, Any]:
@@ -188,21 +188,21 @@ class ProgressDocument(ResultsDocument, Progress):
         self._state = STARTING
         self._changed = True
 
-    def begin(self, cells: Sequence[EvalCase], recorded: Mapping[str, Rate], left: int) -> None:
+    def begin(self, cases: Sequence[EvalCase], recorded: Mapping[str, Rate], left: int) -> None:
         self._change(RUNNING)
-        self._shown.begin(cells, recorded, left)
+        self._shown.begin(cases, recorded, left)
 
-    def episode(self, cell: EvalCase, result: EpisodeResult) -> None:
+    def episode(self, case: EvalCase, result: EpisodeResult) -> None:
         self._changed = True
-        self._shown.episode(cell, result)
+        self._shown.episode(case, result)
 
     def retry(self, job: Job, failure: Failure) -> None:
         self._changed = True
         self._shown.retry(job, failure)
 
-    def stopped(self, cell: EvalCase, at: int, spared: int) -> None:
+    def stopped(self, case: EvalCase, at: int, spared: int) -> None:
         self._changed = True
-        self._shown.stopped(cell, at, spared)
+        self._shown.stopped(case, at, spared)
 
     def end(self) -> None:
         if self.goes_on:

@@ -10,7 +10,7 @@ from typing import Any
 from vlagents_ray.evaluate.report.charts import RateChart, Series, rate_chart
 from vlagents_ray.evaluate.results.changes import Change
 from vlagents_ray.evaluate.results.comparison import Comparison, Line, comparable, comparisons
-from vlagents_ray.evaluate.results.reader import CellResults, Results, by_timing, rate_of
+from vlagents_ray.evaluate.results.reader import CaseResults, Results, by_timing, rate_of
 from vlagents_ray.evaluate.results.statistics import ERROR_RATE, Pairs, Rate
 from vlagents_ray.evaluate.results.summary import TOTAL, Group, Summary, group_of, summarize
 
@@ -34,8 +34,8 @@ class SuccessTable:
 
     blocks: list[Block]
     several: bool  # policy ids
-    stopped: int | None  # cells that stopped early; None: none could
-    pooled: bool  # every policy has one rate for all its cells
+    stopped: int | None  # cases that stopped early; None: none could
+    pooled: bool  # every policy has one rate for all its cases
     some_lost: bool  # infrastructure kept episodes from ending
 
 
@@ -64,8 +64,8 @@ def learning_curves(summary: Summary) -> list[LearningCurve]:
     """Return success over the training steps of each policy with several; empty if none has."""
     return [
         curve
-        for title, cells in _parts_with_a_rate(summary)
-        if (curve := _learning_curve(title, cells))
+        for title, cases in _parts_with_a_rate(summary)
+        if (curve := _learning_curve(title, cases))
     ]
 
 
@@ -73,77 +73,77 @@ def _blocks(summary: Summary) -> Iterator[Block]:
     """Yield tasks in the order of the plan, the sum of each suite after its tasks, and last the
     sum of all.
     """
-    cells: dict[str, dict[str, list[Group]]] = {}
+    cases: dict[str, dict[str, list[Group]]] = {}
     order = {name: number for number, name in enumerate(summary.results.contenders)}
 
     def in_order(groups: list[Group]) -> list[Group]:
         return sorted(groups, key=lambda group: order[group.contender])
 
-    for group in summary.cells:
-        cells.setdefault(group.suite, {}).setdefault(group.env, []).append(group)
-    for suite, envs in cells.items():
+    for group in summary.cases:
+        cases.setdefault(group.suite, {}).setdefault(group.env, []).append(group)
+    for suite, envs in cases.items():
         for env, groups in envs.items():
             yield Block(" ".join(filter(None, (suite, env))), in_order(groups))
-        if len(cells) > 1 and len(envs) > 1:
-            of_suite = [cell for cell in summary.results.cells if cell.suite == suite]
+        if len(cases) > 1 and len(envs) > 1:
+            of_suite = [case for case in summary.results.cases if case.suite == suite]
             yield Block(
                 f"all of {suite or 'the nameless suite'}",
                 in_order(_by_policy_id(of_suite, suite)),
                 is_sum=True,
             )
-    timings = by_timing(summary.results.cells)
+    timings = by_timing(summary.results.cases)
     for timing, found in timings.items():
-        suites = {cell.suite for cell in found}
-        envs_of_one = {cell.env for cell in found} if len(suites) == 1 else set()
-        if len(envs_of_one) == 1 or (envs_of_one and len(cells) > 1):
+        suites = {case.suite for case in found}
+        envs_of_one = {case.env for case in found} if len(suites) == 1 else set()
+        if len(envs_of_one) == 1 or (envs_of_one and len(cases) > 1):
             continue  # it is above, as the only row, or as the sum of its suite
         name = "all" if len(timings) == 1 else f"all {timing}"
         yield Block(name, in_order(_by_policy_id(found, TOTAL)), is_sum=True)
 
 
-def _by_policy_id(cells: Sequence[CellResults], suite: str) -> list[Group]:
-    found: dict[str, list[CellResults]] = {}
-    for cell in cells:
-        found.setdefault(cell.contender, []).append(cell)
+def _by_policy_id(cases: Sequence[CaseResults], suite: str) -> list[Group]:
+    found: dict[str, list[CaseResults]] = {}
+    for case in cases:
+        found.setdefault(case.contender, []).append(case)
     return [group_of((policy_id, suite, TOTAL), group) for policy_id, group in found.items()]
 
 
-def _parts_with_a_rate(summary: Summary) -> Iterator[tuple[str, list[CellResults]]]:
-    """Yield the cells of each chart: all, and each suite; single tasks if a suite has no common
+def _parts_with_a_rate(summary: Summary) -> Iterator[tuple[str, list[CaseResults]]]:
+    """Yield the cases of each chart: all, and each suite; single tasks if a suite has no common
     rate.
     """
-    timings = by_timing(summary.results.cells)
-    for timing, cells in timings.items():
+    timings = by_timing(summary.results.cases)
+    for timing, cases in timings.items():
         suffix = "" if len(timings) == 1 else f", {timing}"
-        suites: dict[str, list[CellResults]] = {}
-        for cell in cells:
-            suites.setdefault(cell.suite, []).append(cell)
-        if _all_have_rates(cells):
-            yield f"Success over training{suffix}", cells
-        for suite, found in suites.items() if len(suites) > 1 or not _all_have_rates(cells) else ():
+        suites: dict[str, list[CaseResults]] = {}
+        for case in cases:
+            suites.setdefault(case.suite, []).append(case)
+        if _all_have_rates(cases):
+            yield f"Success over training{suffix}", cases
+        for suite, found in suites.items() if len(suites) > 1 or not _all_have_rates(cases) else ():
             name = suite or "the nameless suite"
             if _all_have_rates(found):
                 yield f"{name}{suffix}", found
                 continue
-            for env in dict.fromkeys(cell.env for cell in found):
-                yield f"{name} {env}{suffix}", [cell for cell in found if cell.env == env]
+            for env in dict.fromkeys(case.env for case in found):
+                yield f"{name} {env}{suffix}", [case for case in found if case.env == env]
 
 
-def _all_have_rates(cells: Sequence[CellResults]) -> bool:
-    return all(group.success_once.pooled for group in _by_policy_id(cells, ""))
+def _all_have_rates(cases: Sequence[CaseResults]) -> bool:
+    return all(group.success_once.pooled for group in _by_policy_id(cases, ""))
 
 
-def _learning_curve(title: str, cells: Sequence[CellResults]) -> LearningCurve | None:
+def _learning_curve(title: str, cases: Sequence[CaseResults]) -> LearningCurve | None:
     """Return a curve for each policy with several steps, a level line for each other; None if no
     policy has several.
     """
-    by_policy: dict[str, dict[int, list[CellResults]]] = {}
-    without_steps: dict[str, list[CellResults]] = {}
-    for cell in cells:
-        if cell.step is None:
-            without_steps.setdefault(cell.policy, []).append(cell)
+    by_policy: dict[str, dict[int, list[CaseResults]]] = {}
+    without_steps: dict[str, list[CaseResults]] = {}
+    for case in cases:
+        if case.step is None:
+            without_steps.setdefault(case.policy, []).append(case)
         else:
-            by_policy.setdefault(cell.policy, {}).setdefault(cell.step, []).append(cell)
+            by_policy.setdefault(case.policy, {}).setdefault(case.step, []).append(case)
     if not (swept := {policy: found for policy, found in by_policy.items() if len(found) > 1}):
         return None
     lines = [
@@ -165,7 +165,7 @@ def _learning_curve(title: str, cells: Sequence[CellResults]) -> LearningCurve |
         (line.name, None, line.points[0][1]) for line in levels
     ]
     rows += [(line.name, step, rate) for line in lines for step, rate in line.points]
-    pushed = all("pushed_weights" in cell.settings for cell in cells if cell.step is not None)
+    pushed = all("pushed_weights" in case.settings for case in cases if case.step is not None)
     of_axis = "version of the weights" if pushed else "training step"
     return LearningCurve(rate_chart([*lines, *levels], of_axis, title), rows)
 
@@ -221,8 +221,8 @@ class Family:
 def families(summary: Summary, *, accept_changes: bool = False) -> list[Family]:
     """Compare all policy ids, apart for each timing; of very many pairs only the main ones."""
     found = []
-    for timing, cells in by_timing(summary.results.cells).items():
-        results = summary.results.among(cells)
+    for timing, cases in by_timing(summary.results.cases).items():
+        results = summary.results.among(cases)
         of_timing = summarize(results)
         every = list(itertools.combinations(results.contenders, 2))
         wanted = every if len(every) <= MOST_COMPARED else _asked_first(of_timing, every)
@@ -280,16 +280,16 @@ def _asked_first(summary: Summary, pairs: Sequence[tuple[str, str]]) -> list[tup
     """Return each checkpoint with the one before it, and the best of all with the best of each
     other policy.
     """
-    cells = {cell.contender: (cell.policy, cell.step) for cell in summary.results.cells}
+    cases = {case.contender: (case.policy, case.step) for case in summary.results.cases}
     known = dict.fromkeys(_later_first(summary.results, pairs))
     asked = [
         (b, a)
         for a, b in itertools.pairwise(summary.results.contenders)
-        if cells[a][0] == cells[b][0] and cells[a][1] is not None
+        if cases[a][0] == cases[b][0] and cases[a][1] is not None
     ]  # the checkpoints of a policy are in the order of their steps
     leaders: dict[str, str] = {}
     for name in summary.best:
-        leaders.setdefault(cells[name][0], name)
+        leaders.setdefault(cases[name][0], name)
     best = summary.best[0]
     asked += [
         pair for pair in known if best in pair and all(one in leaders.values() for one in pair)

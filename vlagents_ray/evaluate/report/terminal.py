@@ -41,20 +41,20 @@ class Progress:
     The classes of `progress_for` show them: live on a terminal, in plain lines elsewhere.
     """
 
-    def begin(self, cells: Sequence[EvalCase], recorded: Mapping[str, Rate], left: int) -> None:
+    def begin(self, cases: Sequence[EvalCase], recorded: Mapping[str, Rate], left: int) -> None:
         """Note that the evaluation begins.
 
         Args:
-            cells: All planned cells.
-            recorded: The success rates of earlier runs, by the cell's fingerprint.
+            cases: All planned cases.
+            recorded: The success rates of earlier runs, by the case's fingerprint.
             left: The number of episodes to be played.
         """
 
-    def episode(self, cell: EvalCase, result: EpisodeResult) -> None:
+    def episode(self, case: EvalCase, result: EpisodeResult) -> None:
         """Note that an episode was recorded.
 
         Args:
-            cell: The cell that it belongs to.
+            case: The case that it belongs to.
             result: Its result.
         """
 
@@ -66,11 +66,11 @@ class Progress:
             failure: The failure.
         """
 
-    def stopped(self, cell: EvalCase, at: int, spared: int) -> None:
-        """Note that a cell stopped early.
+    def stopped(self, case: EvalCase, at: int, spared: int) -> None:
+        """Note that a case stopped early.
 
         Args:
-            cell: The cell.
+            case: The case.
             at: The number of played episodes.
             spared: The number of episodes that will not be played.
         """
@@ -86,38 +86,38 @@ class _CountedProgress(Progress):
         self._console = console
         _CountedProgress.begin(self, [], {}, 0)
 
-    def begin(self, cells: Sequence[EvalCase], recorded: Mapping[str, Rate], left: int) -> None:
+    def begin(self, cases: Sequence[EvalCase], recorded: Mapping[str, Rate], left: int) -> None:
         self._started = monotonic()
-        self._cells = {cell.fingerprint: cell for cell in cells}
-        self._rates = {cell: recorded.get(cell, Rate(0, 0)) for cell in self._cells}
-        self._infra_failed = dict.fromkeys(self._cells, 0)
+        self._cases = {case.fingerprint: case for case in cases}
+        self._rates = {case: recorded.get(case, Rate(0, 0)) for case in self._cases}
+        self._infra_failed = dict.fromkeys(self._cases, 0)
         self._steps = 0
         self._played = 0  # in this run
         self._left = left
         self._retries = 0
         self._causes: set[tuple[str, str]] = set()  # (policy id, cause) of errors that were shown
-        self._alone = len({cell.contender for cell in cells}) == 1
+        self._alone = len({case.contender for case in cases}) == 1
 
-    def episode(self, cell: EvalCase, result: EpisodeResult) -> None:
+    def episode(self, case: EvalCase, result: EpisodeResult) -> None:
         self._played += 1
         self._left -= 1
         self._steps += result.steps
         if result.status == "infra_failed":
-            self._infra_failed[cell.fingerprint] += 1
+            self._infra_failed[case.fingerprint] += 1
             return
-        before = self._rates[cell.fingerprint]
+        before = self._rates[case.fingerprint]
         successes, episodes = before.successes + bool(result.success_once), before.episodes + 1
-        error_rate = before.error_rate  # of a cell that may stop early
+        error_rate = before.error_rate  # of a case that may stop early
         bounds = (
             None if error_rate is None else confidence_sequence(successes, episodes, error_rate)
         )
-        self._rates[cell.fingerprint] = Rate(successes, episodes, bounds, error_rate)
+        self._rates[case.fingerprint] = Rate(successes, episodes, bounds, error_rate)
         if result.status == "policy_error":
             error = (result.error or "").strip().partition("\n")[0]
-            cause = cell.contender, cause_of(error)
+            cause = case.contender, cause_of(error)
             if cause not in self._causes:
                 self._causes.add(cause)
-                where = f"{cell.contender} failed in {cell.env} episode {result.key.episode}"
+                where = f"{case.contender} failed in {case.env} episode {result.key.episode}"
                 self._print(f"{where}, counted as no success: {error}")
 
     def retry(self, job: Job, failure: Failure) -> None:
@@ -126,10 +126,10 @@ class _CountedProgress(Progress):
         attempt = f"{job.key.env} episode {job.key.episode}: attempt {job.attempt}"
         self._print(f"{attempt} failed, trying again: {first_line}")
 
-    def stopped(self, cell: EvalCase, at: int, spared: int) -> None:
+    def stopped(self, case: EvalCase, at: int, spared: int) -> None:
         self._left -= spared
-        name = " ".join(filter(None, cell.name))
-        self._print(f"{name}: certain enough, stopped after {at} of {cell.planned} episodes")
+        name = " ".join(filter(None, case.name))
+        self._print(f"{name}: certain enough, stopped after {at} of {case.planned} episodes")
 
     def _print(self, text: str) -> None:
         self._console.print(
@@ -137,20 +137,20 @@ class _CountedProgress(Progress):
         )
 
     def _rows(self) -> list[tuple[str, str, str]]:
-        """Return (name, "done/planned", success so far), of many cells only for those being
+        """Return (name, "done/planned", success so far), of many cases only for those being
         played.
         """
-        done = {cell: self._rates[cell].episodes + self._infra_failed[cell] for cell in self._cells}
-        cells = list(self._cells)
-        if len(cells) > MOST_ROWS:
-            cells = [cell for cell in cells if 0 < done[cell] < self._cells[cell].planned][
+        done = {case: self._rates[case].episodes + self._infra_failed[case] for case in self._cases}
+        cases = list(self._cases)
+        if len(cases) > MOST_ROWS:
+            cases = [case for case in cases if 0 < done[case] < self._cases[case].planned][
                 :MOST_ROWS
             ]
         rows = []
-        for cell in cells:
+        for case in cases:
             # Of one policy, without its id.
-            name = " ".join(filter(None, self._cells[cell].name[self._alone :]))
-            rows.append((name, f"{done[cell]}/{self._cells[cell].planned}", str(self._rates[cell])))
+            name = " ".join(filter(None, self._cases[case].name[self._alone :]))
+            rows.append((name, f"{done[case]}/{self._cases[case].planned}", str(self._rates[case])))
         return rows
 
     def _overall(self) -> str:
@@ -178,8 +178,8 @@ class LiveProgress(_CountedProgress):
             console=console, auto_refresh=True, refresh_per_second=4, get_renderable=self._drawing
         )
 
-    def begin(self, cells: Sequence[EvalCase], recorded: Mapping[str, Rate], left: int) -> None:
-        super().begin(cells, recorded, left)
+    def begin(self, cases: Sequence[EvalCase], recorded: Mapping[str, Rate], left: int) -> None:
+        super().begin(cases, recorded, left)
         self._live.start()
 
     def end(self) -> None:
@@ -195,12 +195,12 @@ class LiveProgress(_CountedProgress):
 class LineProgress(_CountedProgress):
     """Prints a line every few seconds, for logs."""
 
-    def begin(self, cells: Sequence[EvalCase], recorded: Mapping[str, Rate], left: int) -> None:
-        super().begin(cells, recorded, left)
+    def begin(self, cases: Sequence[EvalCase], recorded: Mapping[str, Rate], left: int) -> None:
+        super().begin(cases, recorded, left)
         self._print_state()
 
-    def episode(self, cell: EvalCase, result: EpisodeResult) -> None:
-        super().episode(cell, result)
+    def episode(self, case: EvalCase, result: EpisodeResult) -> None:
+        super().episode(case, result)
         if monotonic() - self._last >= LINE_EVERY_S:
             self._print_state()
 
@@ -245,7 +245,7 @@ def results_table(summary: Summary) -> Table:
     for title in ("episodes", *rates, "steps", "policy ms", "env ms"):
         table.add_column(title, justify="right", no_wrap=True)
     for name, total in zip(names, summary.totals, strict=True):
-        groups = [(group, "") for group in summary.cells if group.contender == name]
+        groups = [(group, "") for group in summary.cases if group.contender == name]
         parts = summary.parts(name)
         totals = (
             [(total, "")] if len(parts) == 1 else [(part, timing) for timing, part in parts.items()]
@@ -303,12 +303,12 @@ def print_summary(console: Console, summary: Summary) -> None:
         )
     lines += [f"accepted change: {change}" for change in summary.results.accepted_changes]
     pushed = {
-        cell.contender: words
-        for cell in summary.results.cells
-        if (words := pushed_of(cell)) is not None
+        case.contender: words
+        for case in summary.results.cases
+        if (words := pushed_of(case)) is not None
     }
     lines += [f"{name}: weights pushed by a learner, {words}" for name, words in pushed.items()]
-    for one in (group for group in summary.cells if group.stopped):
+    for one in (group for group in summary.cases if group.stopped):
         name, error_rate = (
             " ".join(filter(None, (one.contender, one.suite, one.env))),
             one.success_once.error_rate or 0,
@@ -320,11 +320,11 @@ def print_summary(console: Console, summary: Summary) -> None:
     parts = [part for name in summary.results.contenders for part in summary.parts(name).values()]
     if not all(part.success_once.pooled for part in parts):
         lines.append(
-            "cells that stopped after different numbers of episodes have no rate in common: quote "
+            "cases that stopped after different numbers of episodes have no rate in common: quote "
             "each alone"
         )
     for gap in clock_gaps(summary.results):  # as in the report, on the episodes of both clocks
-        counted = [one for cell in gap.cells for one in cell.counted]
+        counted = [one for case in gap.cases for one in case.counted]
         # 0 if the policy failed before the first step of each.
         steps = max(1, sum(one.steps for one in counted))
         waited, held = (

@@ -11,7 +11,7 @@ from typing import Any
 
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.evaluate.results.changes import changed
-from vlagents_ray.evaluate.results.reader import CellResults, Results, Run, Worker
+from vlagents_ray.evaluate.results.reader import CaseResults, Results, Run, Worker
 from vlagents_ray.evaluate.results.summary import stated
 
 
@@ -46,7 +46,7 @@ def combined(folders: Sequence[Results]) -> Results:
     clashing = _clashing_policies(folders)
     homes = [results.out.resolve() for results in folders]
     base = Path(os.path.commonpath(homes))
-    cells: list[CellResults] = []
+    cases: list[CaseResults] = []
     runs: list[Run] = []
     policies: dict[str, dict[str, Any]] = {}
     workers: list[Worker] = []
@@ -56,23 +56,23 @@ def combined(folders: Sequence[Results]) -> Results:
         labels = [str(home.relative_to(base)) for home in homes]
     for results, home, label in zip(folders, homes, labels, strict=True):
         names = {}
-        for cell in results.cells:
-            names[cell.policy] = (
-                f"{cell.policy} ({label})" if cell.policy in clashing else cell.policy
+        for case in results.cases:
+            names[case.policy] = (
+                f"{case.policy} ({label})" if case.policy in clashing else case.policy
             )
         earlier_runs = len(runs)
         prefix = home.relative_to(base)
-        for cell in results.cells:
+        for case in results.cases:
             episodes = []
-            for episode in cell.episodes:
+            for episode in case.episodes:
                 videos = tuple(str(prefix / video) for video in episode.videos)
                 episodes.append(replace(episode, run=episode.run + earlier_runs, videos=videos))
             attempts = [
-                replace(attempt, run=attempt.run + earlier_runs) for attempt in cell.attempts
+                replace(attempt, run=attempt.run + earlier_runs) for attempt in case.attempts
             ]
-            renamed = names[cell.policy]
-            cells.append(
-                replace(cell, policy=renamed, episodes=tuple(episodes), attempts=tuple(attempts))
+            renamed = names[case.policy]
+            cases.append(
+                replace(case, policy=renamed, episodes=tuple(episodes), attempts=tuple(attempts))
             )
         for policy, of_server in results.policies.items():
             policies[names.get(policy, policy)] = of_server
@@ -81,18 +81,18 @@ def combined(folders: Sequence[Results]) -> Results:
             workers.append(replace(worker, policy=renamed, run=worker.run + earlier_runs))
         runs += [replace(run, run=run.run + earlier_runs) for run in results.runs]
     parts = tuple(sorted(homes, reverse=True))  # subfolders before their parents
-    return Results(base, tuple(cells), tuple(runs), policies, tuple(workers), parts)
+    return Results(base, tuple(cases), tuple(runs), policies, tuple(workers), parts)
 
 
 def _require_different_evaluations(folders: Sequence[Results]) -> None:
-    """Raise `ConfigError` if two folders have the same cell, as parts of one evaluation do."""
+    """Raise `ConfigError` if two folders have the same case, as parts of one evaluation do."""
     first_folders: dict[str, Path] = {}
     for results in folders:
-        for cell in results.cells:
-            if (first := first_folders.setdefault(cell.cell, results.out)) is not results.out:
+        for case in results.cases:
+            if (first := first_folders.setdefault(case.case_id, results.out)) is not results.out:
                 raise ConfigError(
-                    f"report: {first} and {results.out} both have {cell.contender!r} in "
-                    f"{cell.env!r} with the same "
+                    f"report: {first} and {results.out} both have {case.contender!r} in "
+                    f"{case.env!r} with the same "
                     "settings; put parts of one evaluation into one folder first: `vlagents-ray "
                     f"merge {first} "
                     f"{results.out} --out OUT`, with --accept-changes if code or weights changed "
@@ -104,20 +104,20 @@ def _clashing_policies(folders: Sequence[Results]) -> set[str]:
     """Return the policies that are not the same in all folders, or are in one env more than
     once.
     """
-    all_cells = [cell for results in folders for cell in results.cells]
-    counts = Counter((cell.contender, cell.suite, cell.env) for cell in all_cells)
+    all_cases = [case for results in folders for case in results.cases]
+    counts = Counter((case.contender, case.suite, case.env) for case in all_cases)
     clashing = {
-        cell.policy for cell in all_cells if counts[cell.contender, cell.suite, cell.env] > 1
+        case.policy for case in all_cases if counts[case.contender, case.suite, case.env] > 1
     }
     weights_by_checkpoint: dict[tuple[str, str | None], str] = {}  # by policy id and checkpoint
-    for cell in all_cells:
-        weights, checkpoint = stated(cell, "weights"), stated(cell, "checkpoint")
+    for case in all_cases:
+        weights, checkpoint = stated(case, "weights"), stated(case, "checkpoint")
         if (
             weights is not None
-            and weights_by_checkpoint.setdefault((cell.contender, checkpoint), weights) != weights
+            and weights_by_checkpoint.setdefault((case.contender, checkpoint), weights) != weights
         ):
-            clashing.add(cell.policy)
-    swept = {cell.policy for cell in all_cells if cell.step is not None}
+            clashing.add(case.policy)
+    swept = {case.policy for case in all_cases if case.step is not None}
     metadata: dict[str, dict[str, Any]] = {}  # of the first folder with the policy
     for results in folders:
         for name, of_server in results.policies.items():

@@ -17,10 +17,10 @@ from vlagents_ray.evaluate.results.changes import (
     listed,
     program_changes,
 )
-from vlagents_ray.evaluate.results.reader import CellResults, Results, by_timing, synchronous_twin
+from vlagents_ray.evaluate.results.reader import CaseResults, Results, by_timing, synchronous_twin
 from vlagents_ray.evaluate.results.statistics import Pairs, difference_interval, holm
 
-# The policy's settings among a cell's, in which compared cells may differ. All others are the
+# The policy's settings among a case's, in which compared cases may differ. All others are the
 # env's.
 OF_POLICY = frozenset(
     {
@@ -76,7 +76,7 @@ class Comparison:
     # One for each suite, in the order of the plan; empty if they share only one.
     suites: tuple[Line, ...]
     total: Line
-    cells: tuple[CellResults, ...] = ()  # of `clock_gaps`: the cells in real time
+    cases: tuple[CaseResults, ...] = ()  # of `clock_gaps`: the cases in real time
     changes: tuple[Change, ...] = ()  # accepted differences between the two environments
 
     def to_json(self) -> dict[str, Any]:
@@ -115,7 +115,7 @@ def compare(
             or they share episodes of several clocks and `timing` names none.
     """
     if timing is not None:
-        timings = by_timing(results.cells)
+        timings = by_timing(results.cases)
         if timing not in timings:
             raise ConfigError(f"compare: got the timing {timing!r}, want one of {list(timings)}")
         results = results.among(timings[timing])
@@ -186,32 +186,32 @@ def clock_gaps(results: Results) -> list[Comparison]:
     is left out.
     """
     found: dict[tuple[str, str], Strata] = {}
-    cells: dict[tuple[str, str], list[CellResults]] = {}
+    cases: dict[tuple[str, str], list[CaseResults]] = {}
     order = {name: number for number, name in enumerate(results.contenders)}
-    for cell in sorted(results.cells, key=lambda cell: order[cell.contender]):
-        counterpart = synchronous_twin(results, cell)
-        if counterpart is not None and (pairs := _pairs(cell, counterpart)).total:
+    for case in sorted(results.cases, key=lambda case: order[case.contender]):
+        counterpart = synchronous_twin(results, case)
+        if counterpart is not None and (pairs := _pairs(case, counterpart)).total:
             name = (
-                f"{cell.contender}, {cell.suite} in real time",
-                f"{cell.contender}, {counterpart.suite}".rstrip(", "),
+                f"{case.contender}, {case.suite} in real time",
+                f"{case.contender}, {counterpart.suite}".rstrip(", "),
             )
-            found.setdefault(name, {})[cell.env] = pairs
-            cells.setdefault(name, []).append(cell)
+            found.setdefault(name, {})[case.env] = pairs
+            cases.setdefault(name, []).append(case)
     lines = _lines(ALL, [list(strata.values()) for strata in found.values()])
     return [
         Comparison(*name, (), line, tuple(of))
-        for (name, of), line in zip(cells.items(), lines, strict=True)
+        for (name, of), line in zip(cases.items(), lines, strict=True)
     ]
 
 
-def gap_to_synchronous(results: Results, cell: CellResults) -> float | None:
-    """Return the success rate of a real-time cell minus that of its synchronous counterpart, on
+def gap_to_synchronous(results: Results, case: CaseResults) -> float | None:
+    """Return the success rate of a real-time case minus that of its synchronous counterpart, on
     their common episodes.
 
     It is in [-1, 1]; None without a counterpart, or without such episodes.
     """
-    counterpart = synchronous_twin(results, cell)
-    return None if counterpart is None else _pairs(cell, counterpart).difference
+    counterpart = synchronous_twin(results, case)
+    return None if counterpart is None else _pairs(case, counterpart).difference
 
 
 def _shared(
@@ -222,20 +222,20 @@ def _shared(
         raise ConfigError(
             f"compare: got {unknown}, want two of the contenders {results.contenders}"
         )
-    others = {(cell.suite, cell.env): cell for cell in results.of(b)}
+    others = {(case.suite, case.env): case for case in results.of(b)}
     found: dict[str, Strata] = {}
     changes: dict[Change, None] = {}
-    compared: list[CellResults] = []
-    for cell in results.of(a):
-        if (other := others.get((cell.suite, cell.env))) is None:
+    compared: list[CaseResults] = []
+    for case in results.of(a):
+        if (other := others.get((case.suite, case.env))) is None:
             continue
         changes |= dict.fromkeys(
-            _changes_between(results, cell, other, accept_changes=accept_changes)
+            _changes_between(results, case, other, accept_changes=accept_changes)
         )
-        pairs = _pairs(cell, other)
+        pairs = _pairs(case, other)
         if pairs.total:
-            found.setdefault(cell.suite, {})[cell.env] = pairs
-            compared.append(cell)
+            found.setdefault(case.suite, {})[case.env] = pairs
+            compared.append(case)
     if len(timings := by_timing(compared)) > 1:
         raise ConfigError(
             f"compare: {a!r} and {b!r} share episodes of several clocks, which have no rate in "
@@ -253,39 +253,39 @@ _COMPARE_ALL_THE_SAME = "or compare them nevertheless and have the report say so
 
 
 def _changes_between(
-    results: Results, cell: CellResults, other: CellResults, *, accept_changes: bool
+    results: Results, case: CaseResults, other: CaseResults, *, accept_changes: bool
 ) -> list[Change]:
-    """Return what differs between two policies' cells of one env besides the policies.
+    """Return what differs between two policies' cases of one env besides the policies.
 
     Raises:
         ConfigError: The settings of the env differ; or its program, description or contract differ,
-            or one of the cells mixes several versions of them or of its policy, and
+            or one of the cases mixes several versions of them or of its policy, and
             `accept_changes` is off.
     """
     one, two = (
         {k: value for k, value in each.settings.items() if k not in OF_POLICY}
-        for each in (cell, other)
+        for each in (case, other)
     )
     for name in sorted(one.keys() | two.keys()):
         if one.get(name) != two.get(name):
             raise ConfigError(
-                f"compare: {cell.env!r} had {name} {one.get(name)!r} for {cell.contender!r}, but "
+                f"compare: {case.env!r} had {name} {one.get(name)!r} for {case.contender!r}, but "
                 f"{two.get(name)!r} for "
                 f"{other.contender!r}; evaluate both alike, or name the suites apart"
             )
-    changes = program_changes(f"env {cell.env}", cell.program or None, other.program or None)
-    statements = [EnvStatement(each.described, each.contract) for each in (cell, other)]
-    changes += env_changes(cell.env, *statements)
+    changes = program_changes(f"env {case.env}", case.program or None, other.program or None)
+    statements = [EnvStatement(each.described, each.contract) for each in (case, other)]
+    changes += env_changes(case.env, *statements)
     if changes and not accept_changes:
         raise ConfigError(
-            f"compare: {cell.contender!r} and {other.contender!r} were not played in the same "
+            f"compare: {case.contender!r} and {other.contender!r} were not played in the same "
             "environment:\n"
             f"{listed(changes)}\nevaluate both in the same one, {_COMPARE_ALL_THE_SAME}"
         )
-    mixed = _mixed(results, cell, other)
+    mixed = _mixed(results, case, other)
     if mixed and not accept_changes:
         raise ConfigError(
-            f"compare: episodes of {cell.contender!r} and {other.contender!r} in {cell.env!r} were "
+            f"compare: episodes of {case.contender!r} and {other.contender!r} in {case.env!r} were "
             "played with "
             f"{' and '.join(mixed)}, as --accept-changes allowed; evaluate both again in a new "
             "folder, "
@@ -294,15 +294,15 @@ def _changes_between(
     return changes
 
 
-def _mixed(results: Results, cell: CellResults, other: CellResults) -> list[str]:
-    """Return what the episodes of the two cells, or of one of them, do not have in common, in
+def _mixed(results: Results, case: CaseResults, other: CaseResults) -> list[str]:
+    """Return what the episodes of the two cases, or of one of them, do not have in common, in
     words.
     """
     env_programs = {
-        one.env_program for each in (cell, other) for one in each.episodes if one.counts
+        one.env_program for each in (case, other) for one in each.episodes if one.counts
     } - {None}
     mixed = [f"{len(env_programs)} versions of its files"] if len(env_programs) > 1 else []
-    for each in (cell, other):
+    for each in (case, other):
         counted = [one for one in each.episodes if one.counts]
         programs = {one.policy_program for one in counted} - {None}
         weights = {one.result.weights for one in counted} - {None}
@@ -317,14 +317,14 @@ def _mixed(results: Results, cell: CellResults, other: CellResults) -> list[str]
             mixed.append(
                 f"several settings of {each.contender!r} ({'; '.join(map(str, settings))})"
             )
-    stated = [change for change in results.accepted_changes if change.is_statement_of(cell.env)]
+    stated = [change for change in results.accepted_changes if change.is_statement_of(case.env)]
     if stated:
         mixed.append(f"several versions of the environment ({'; '.join(map(str, stated))})")
     return mixed
 
 
-def _pairs(a: CellResults, b: CellResults) -> Pairs:
-    """Return the episodes of both cells, by success once."""
+def _pairs(a: CaseResults, b: CaseResults) -> Pairs:
+    """Return the episodes of both cases, by success once."""
     theirs = {(one.key.episode, one.key.seed): bool(one.success_once) for one in b.counted}
     outcomes = [
         (bool(one.success_once), theirs[one.key.episode, one.key.seed])

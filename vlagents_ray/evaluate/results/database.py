@@ -35,8 +35,8 @@ CREATE TABLE runs (
     changes TEXT
 );
 CREATE TABLE policies (name TEXT PRIMARY KEY, metadata TEXT NOT NULL);
-CREATE TABLE cells (
-    cell TEXT PRIMARY KEY,
+CREATE TABLE cases (
+    case_id TEXT PRIMARY KEY,
     policy TEXT NOT NULL,
     step INTEGER,
     suite TEXT NOT NULL,
@@ -52,7 +52,7 @@ CREATE TABLE cells (
 );
 CREATE TABLE episodes (
     key TEXT PRIMARY KEY,
-    cell TEXT NOT NULL REFERENCES cells,
+    case_id TEXT NOT NULL REFERENCES cases,
     env TEXT NOT NULL,
     episode INTEGER NOT NULL,
     seed INTEGER NOT NULL,
@@ -93,10 +93,10 @@ CREATE TABLE episodes (
     run INTEGER NOT NULL REFERENCES runs,
     finished REAL NOT NULL
 );
-CREATE INDEX episodes_of_cells ON episodes (cell, checkpoint);
+CREATE INDEX episodes_of_cases ON episodes (case_id, checkpoint);
 CREATE TABLE attempts (
     key TEXT NOT NULL,
-    cell TEXT NOT NULL REFERENCES cells,
+    case_id TEXT NOT NULL REFERENCES cases,
     attempt INTEGER NOT NULL,
     run INTEGER NOT NULL REFERENCES runs,
     at REAL NOT NULL,

@@ -43,7 +43,7 @@ class Episode:
     finished: float  # seconds since 1970
     env_program: str | None = None  # digest of the files of its environment, None if installed
     policy_program: str | None = None  # the same for its policy
-    # Whether it comes after the end of its stopped cell, or is no longer planned.
+    # Whether it comes after the end of its stopped case, or is no longer planned.
     beyond: bool = False
     unplanned: bool = False  # the latter of the two
 
@@ -60,7 +60,7 @@ class Attempt:
     """An attempt at an episode that failed because of the infrastructure, not of the policy."""
 
     key: str
-    cell: str
+    case_id: str
     attempt: int
     run: int
     at: float  # seconds since 1970
@@ -97,10 +97,10 @@ class Run:
 
 
 @dataclass(frozen=True, slots=True)
-class CellResults:
-    """The results of one cell: a policy, at a checkpoint, in an env of a suite."""
+class CaseResults:
+    """The results of one case: a policy, at a checkpoint, in an env of a suite."""
 
-    cell: str  # fingerprint of its settings
+    case_id: str  # fingerprint of its settings
     policy: str
     step: int | None
     suite: str
@@ -134,7 +134,7 @@ class CellResults:
 
     @property
     def missing(self) -> int:
-        """The number of planned episodes without a result; 0 for a cell that stopped early."""
+        """The number of planned episodes without a result; 0 for a case that stopped early."""
         return self.planned - len(self.counted) if self.stopped_at is None else 0
 
 
@@ -143,7 +143,7 @@ class Results:
     """The results of an evaluation from its folder; `Results.load` reads them, without Ray."""
 
     out: Path  # the folder
-    cells: tuple[CellResults, ...]  # in the order of the plan
+    cases: tuple[CaseResults, ...]  # in the order of the plan
     runs: tuple[Run, ...]
     # The metadata of each policy's server, by the policy's name.
     policies: dict[str, dict[str, Any]]
@@ -175,10 +175,10 @@ class Results:
         with reading(out) as db:
             episodes: dict[str, list[Episode]] = {}
             for row in table(db, "episodes", "seed"):
-                episodes.setdefault(row["cell"], []).append(episode_of(row))
+                episodes.setdefault(row["case_id"], []).append(episode_of(row))
             attempts: dict[str, list[Attempt]] = {}
             for row in table(db, "attempts"):
-                attempts.setdefault(row["cell"], []).append(
+                attempts.setdefault(row["case_id"], []).append(
                     Attempt(**row | {"retried": bool(row["retried"])})
                 )
             runs = []
@@ -190,12 +190,12 @@ class Results:
             return cls(
                 out,
                 tuple(
-                    _cell(
+                    _case(
                         row,
-                        tuple(episodes.get(row["cell"], ())),
-                        tuple(attempts.get(row["cell"], ())),
+                        tuple(episodes.get(row["case_id"], ())),
+                        tuple(attempts.get(row["case_id"], ())),
                     )
-                    for row in table(db, "cells")
+                    for row in table(db, "cases")
                 ),
                 tuple(
                     replace(run, state=KILLED)
@@ -214,17 +214,17 @@ class Results:
         """
         policies = {
             policy: number
-            for number, policy in enumerate(dict.fromkeys(cell.policy for cell in self.cells))
+            for number, policy in enumerate(dict.fromkeys(case.policy for case in self.cases))
         }
         ordered = sorted(
-            self.cells,
-            key=lambda cell: (cell.step is not None, policies[cell.policy], cell.step or 0),
+            self.cases,
+            key=lambda case: (case.step is not None, policies[case.policy], case.step or 0),
         )
-        return list(dict.fromkeys(cell.contender for cell in ordered))
+        return list(dict.fromkeys(case.contender for case in ordered))
 
-    def of(self, contender: str) -> list[CellResults]:
-        """Return the cells of one policy id, in the order of the plan."""
-        return [cell for cell in self.cells if cell.contender == contender]
+    def of(self, contender: str) -> list[CaseResults]:
+        """Return the cases of one policy id, in the order of the plan."""
+        return [case for case in self.cases if case.contender == contender]
 
     def file(self, path: str) -> Path:
         """Return the absolute path of an episode's file with the relative `path`; it need not
@@ -237,30 +237,30 @@ class Results:
         home = next((one for one in self.parts if (self.out / path).is_relative_to(one)), self.out)
         return inside(home, str((self.out / path).relative_to(home)))
 
-    def among(self, cells: Sequence[CellResults]) -> Results:
-        """Return the same results with these cells only."""
-        return replace(self, cells=tuple(cells))
+    def among(self, cases: Sequence[CaseResults]) -> Results:
+        """Return the same results with these cases only."""
+        return replace(self, cases=tuple(cases))
 
     def only(self, contender: str | None = None, env: str | None = None) -> Results:
-        """Select the cells of a policy or an env.
+        """Select the cases of a policy or an env.
 
         Args:
             contender: A policy id; None for all.
             env: The full name of an env; None for all.
 
         Returns:
-            The same results with these cells only.
+            The same results with these cases only.
 
         Raises:
-            ConfigError: No cell is left.
+            ConfigError: No case is left.
         """
         left = [
             one
-            for one in self.cells
+            for one in self.cases
             if contender in (None, one.contender) and env in (None, one.env)
         ]
         if not left:
-            have = sorted({f"{one.contender} in {one.env}" for one in self.cells})
+            have = sorted({f"{one.contender} in {one.env}" for one in self.cases})
             raise ConfigError(
                 f"{self.out}: has nothing of {contender or 'any policy'} in {env or 'any env'}: "
                 f"{have}"
@@ -306,7 +306,7 @@ def episode_of(row: dict[str, Any]) -> Episode:
     known = {name: value for name, value in row.items() if name in names and name != "key"}
     for name in ("success_once", "success_at_end"):
         known[name] = None if known[name] is None else bool(known[name])
-    key = EpisodeKey(row["env"], row["episode"], row["seed"], row["cell"])
+    key = EpisodeKey(row["env"], row["episode"], row["seed"], row["case_id"])
     result = EpisodeResult(**known | {"key": key, "timing_ms": json.loads(row["timing_ms"])})
     videos = tuple(require_below(path) for path in json.loads(row["videos"]))
     trajectory = None if row["trajectory"] is None else require_below(row["trajectory"])
@@ -316,9 +316,9 @@ def episode_of(row: dict[str, Any]) -> Episode:
     )
 
 
-def _cell(
+def _case(
     row: dict[str, Any], episodes: tuple[Episode, ...], attempts: tuple[Attempt, ...]
-) -> CellResults:
+) -> CaseResults:
     seeds, rule = json.loads(row.pop("seeds")), row.pop("stop")
     names = ("settings", "described", "contract", "code", "program")
     parsed = {name: json.loads(row[name] or "{}") for name in names}
@@ -340,54 +340,54 @@ def _cell(
             replace(one, beyond=one.beyond or not stopping.counts(one.result.key))
             for one in episodes
         )
-    return CellResults(
+    return CaseResults(
         **row | parsed, episodes=episodes, attempts=attempts, stop=stop, stopped_at=stopped_at
     )
 
 
-def rate_of(cells: Sequence[CellResults], what: Literal["success_once", "success_at_end"]) -> Rate:
-    """Return the success rate of one cell, or of several together, with bounds that hold if cells
+def rate_of(cases: Sequence[CaseResults], what: Literal["success_once", "success_at_end"]) -> Rate:
+    """Return the success rate of one case, or of several together, with bounds that hold if cases
     could stop early.
 
-    Cells without a common rate (`have_common_rate`) are counted, and their rate is None.
+    Cases without a common rate (`have_common_rate`) are counted, and their rate is None.
     """
     counts = [
-        (sum(bool(getattr(one, what)) for one in cell.counted), len(cell.counted)) for cell in cells
+        (sum(bool(getattr(one, what)) for one in case.counted), len(case.counted)) for case in cases
     ]
     successes, episodes = (
         (sum(column) for column in zip(*counts, strict=True)) if counts else (0, 0)
     )
-    together = have_common_rate(cells)
-    if not (rules := [cell.stop for cell in cells if cell.stop is not None]):
+    together = have_common_rate(cases)
+    if not (rules := [case.stop for case in cases if case.stop is not None]):
         return Rate(successes, episodes, pooled=together)
     error_rate = max(rule.error_rate for rule in rules)
     return Rate(successes, episodes, pooled(counts, error_rate), error_rate, together)
 
 
-def have_common_rate(cells: Sequence[CellResults]) -> bool:
-    """Return whether the episodes of these cells may be counted in one rate.
+def have_common_rate(cases: Sequence[CaseResults]) -> bool:
+    """Return whether the episodes of these cases may be counted in one rate.
 
-    Cells that stopped after different numbers of episodes may not, as their outcomes would
-    determine their weights; nor may cells with different clocks, as success in real time differs
+    Cases that stopped after different numbers of episodes may not, as their outcomes would
+    determine their weights; nor may cases with different clocks, as success in real time differs
     from success while the env waits.
     """
-    return len({cell.stopped_at for cell in cells}) <= 1 and len(by_timing(cells)) <= 1
+    return len({case.stopped_at for case in cases}) <= 1 and len(by_timing(cases)) <= 1
 
 
 SYNCHRONOUS, REAL_TIME = "synchronous", "in real time"
 
 
-def by_timing(cells: Sequence[CellResults]) -> dict[str, list[CellResults]]:
-    """Group the cells by their clock: "synchronous" first, then "in real time", or one such
+def by_timing(cases: Sequence[CaseResults]) -> dict[str, list[CaseResults]]:
+    """Group the cases by their clock: "synchronous" first, then "in real time", or one such
     group for each clock.
     """
-    clocks: dict[str, list[CellResults]] = {}
-    for cell in sorted(cells, key=lambda cell: cell.settings.get("clock") is not None):
-        clocks.setdefault(json.dumps(cell.settings.get("clock"), sort_keys=True), []).append(cell)
+    clocks: dict[str, list[CaseResults]] = {}
+    for case in sorted(cases, key=lambda case: case.settings.get("clock") is not None):
+        clocks.setdefault(json.dumps(case.settings.get("clock"), sort_keys=True), []).append(case)
     running = [clock for clock in clocks if clock != "null"]
     found = {}
     for clock, members in clocks.items():
-        suites = ", ".join(dict.fromkeys(cell.suite or "the nameless suite" for cell in members))
+        suites = ", ".join(dict.fromkeys(case.suite or "the nameless suite" for case in members))
         name = (
             SYNCHRONOUS
             if clock == "null"
@@ -399,19 +399,19 @@ def by_timing(cells: Sequence[CellResults]) -> dict[str, list[CellResults]]:
     return found
 
 
-def synchronous_twin(results: Results, cell: CellResults) -> CellResults | None:
-    """Find the synchronous counterpart of a cell in real time: the cell that differs only in its
+def synchronous_twin(results: Results, case: CaseResults) -> CaseResults | None:
+    """Find the synchronous counterpart of a case in real time: the case that differs only in its
     clock.
 
     Args:
-        results: The results with both cells.
-        cell: Any cell of them.
+        results: The results with both cases.
+        case: Any case of them.
 
     Returns:
-        The cell in which the env waited for the policy; None if there is none, or if `cell` is
+        The case in which the env waited for the policy; None if there is none, or if `case` is
         synchronous itself.
     """
-    if cell.settings["clock"] is None:
+    if case.settings["clock"] is None:
         return None
-    wanted = cell.settings | {"clock": None}
-    return next((other for other in results.cells if other.settings == wanted), None)
+    wanted = case.settings | {"clock": None}
+    return next((other for other in results.cases if other.settings == wanted), None)

@@ -5,7 +5,7 @@ true rate is at most the error rate, so the evaluation may stop after any episod
 fixed number of episodes, such as Wilson's, is not valid then.
 
 Quick episodes end first, and failures take longest, so the finished episodes are a biased sample.
-Therefore only an unbroken prefix of the planned order counts, and the end of a cell depends on its
+Therefore only an unbroken prefix of the planned order counts, and the end of a case depends on its
 outcomes alone.
 """
 
@@ -72,7 +72,7 @@ class Rate:
     # error rate.
     bounds: tuple[float, float] | None = None
     error_rate: float | None = None
-    # False: the cells of these episodes have no common rate, so that `rate` is None.
+    # False: the cases of these episodes have no common rate, so that `rate` is None.
     pooled: bool = True
 
     @property
@@ -319,10 +319,10 @@ def confidence_sequence(
 
 
 def pooled(counts: Sequence[tuple[int, int]], error_rate: float) -> tuple[float, float]:
-    """Return bounds (low, high) of the success rate of several cells, each weighted by its
+    """Return bounds (low, high) of the success rate of several cases, each weighted by its
     episodes.
 
-    `counts` are the (successes, trials) of each cell. Stopping determines the weights, so each cell
+    `counts` are the (successes, trials) of each case. Stopping determines the weights, so each case
     gets an equal share of the error rate: then all their bounds hold at once, and so does any
     weighted mean.
     """
@@ -336,11 +336,11 @@ def pooled(counts: Sequence[tuple[int, int]], error_rate: float) -> tuple[float,
 
 
 class Stopping:
-    """Decides when one cell stops, from its episodes in any order."""
+    """Decides when one case stops, from its episodes in any order."""
 
     def __init__(self, stop: StopConfig, seeds: Sequence[int], planned: int) -> None:
         """Start without an outcome; `seeds` and `planned` episodes (of all seeds together) are
-        those of the cell.
+        those of the case.
         """
         self._stop = stop
         self._seeds = list(seeds)
@@ -348,7 +348,7 @@ class Stopping:
         self._outcomes: dict[int, bool] = {}  # by place in the plan
         self._begun = 0  # length of the unbroken prefix
         self._successes = 0  # in it
-        self.at: int | None = None  # after so many episodes the cell stops; None: not yet
+        self.at: int | None = None  # after so many episodes the case stops; None: not yet
 
     def add_all(self, results: Iterable[EpisodeResult]) -> None:
         for result in results:
@@ -373,13 +373,13 @@ class Stopping:
                 self.at = self._begun
 
     def counts(self, key: EpisodeKey) -> bool:
-        """Return whether the episode counts, as it comes before the end of the cell."""
+        """Return whether the episode counts, as it comes before the end of the case."""
         place = place_in_plan(key, self._seeds, self._each)
         return self.at is None or (place is not None and place < self.at)
 
 
 def place_in_plan(key: EpisodeKey, seeds: Sequence[int], each: int) -> int | None:
-    """Return the index of an episode in its cell's part of `jobs.plan`; None if it is no longer
+    """Return the index of an episode in its case's part of `jobs.plan`; None if it is no longer
     planned.
     """
     first = key.seed - key.episode

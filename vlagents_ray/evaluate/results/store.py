@@ -20,7 +20,7 @@ from vlagents_ray.errors import ConfigError, WeightsLost
 from vlagents_ray.evaluate.artifacts.storage import storing
 from vlagents_ray.evaluate.episode.failures import Failure
 from vlagents_ray.evaluate.episode.records import EnvInfo, EpisodeResult, WorkerInfo
-from vlagents_ray.evaluate.plan.cases import EvalCase, cells
+from vlagents_ray.evaluate.plan.cases import EvalCase, plan_cases
 from vlagents_ray.evaluate.plan.config import EvalConfig, canonical
 from vlagents_ray.evaluate.plan.jobs import Job
 from vlagents_ray.evaluate.results.changes import (
@@ -61,7 +61,7 @@ class Store(AbstractContextManager["Store"]):
                 to them.
             StorageFailed: The folder cannot be written to.
         """
-        self.cells = cells(config)
+        self.cases = plan_cases(config)
         self._out = config.out
         with storing(config.out):
             self._out.mkdir(parents=True, exist_ok=True)
@@ -69,11 +69,11 @@ class Store(AbstractContextManager["Store"]):
         self._run = 0
         self._accepts = config.accept_changes
         self._changes: list[Change] = []  # accepted in this run
-        # policies, cells and places whose change was accepted in this run.
+        # policies, cases and places whose change was accepted in this run.
         self._accepted: set[Hashable] = set()
         self._policy_programs: dict[str, str | None] = {}  # by policy; of this run
-        self._cell = {cell.fingerprint: cell for cell in self.cells}
-        # By cell, and by (policy, step, checkpoint); read when first needed.
+        self._case = {case.fingerprint: case for case in self.cases}
+        # By case, and by (policy, step, checkpoint); read when first needed.
         self._weights: dict[Hashable, str] = {}
         self._made: set[str] = set()  # places whose env is known to be that of earlier runs
         try:
@@ -106,8 +106,8 @@ class Store(AbstractContextManager["Store"]):
             )
             self._run = int(cursor.lastrowid or 0)
             self._write_changes()
-            programs = [(canonical(cell.program), cell.fingerprint) for cell in self.cells]
-            self._db.executemany("UPDATE cells SET program = ? WHERE cell = ?", programs)
+            programs = [(canonical(case.program), case.fingerprint) for case in self.cases]
+            self._db.executemany("UPDATE cases SET program = ? WHERE case_id = ?", programs)
 
     def end_run(self, state: str) -> None:
         with self._db:
@@ -138,11 +138,11 @@ class Store(AbstractContextManager["Store"]):
         It replaces one that failed by infrastructure; any other is not changed.
 
         Raises `ConfigError` if it was played by another checkpoint than earlier episodes of its
-        cell, as after a swap, by other weights of the same name, or by other weights than the
-        pushed ones of its cell: a rate has one checkpoint.
+        case, as after a swap, by other weights of the same name, or by other weights than the
+        pushed ones of its case: a rate has one checkpoint.
         """
-        cell = self._cell[result.key.settings]
-        want = cell.policy.pushed_weights
+        case = self._case[result.key.settings]
+        want = case.policy.pushed_weights
         acted = (result.first_policy_version, result.policy_version, result.policy_fingerprint)
         if (
             want
@@ -157,7 +157,7 @@ class Store(AbstractContextManager["Store"]):
                 f"policy's `options` ask for no other"
             )
         known = self._db.execute(
-            "SELECT checkpoint FROM episodes WHERE cell = ? AND checkpoint IS NOT NULL LIMIT 1",
+            "SELECT checkpoint FROM episodes WHERE case_id = ? AND checkpoint IS NOT NULL LIMIT 1",
             (result.key.settings,),
         ).fetchone()
         if known is not None and result.checkpoint not in (None, known[0]):
@@ -172,13 +172,13 @@ class Store(AbstractContextManager["Store"]):
         del key["policy_seed"]  # in an evaluation, it is that of the environment
         row |= {
             "key": str(result.key),
-            "cell": key.pop("settings"),
+            "case_id": key.pop("settings"),
             **key,
             "timing_ms": canonical(result.timing_ms),
             "videos": canonical(list(videos)),
             "trajectory": trajectory,
-            "env_program": program_id(cell.program),
-            "policy_program": self._policy_programs.get(cell.policy.name),
+            "env_program": program_id(case.program),
+            "policy_program": self._policy_programs.get(case.policy.name),
             "attempts": attempts,
             "run": self._run,
             "finished": time.time() if finished is None else finished,
@@ -194,17 +194,18 @@ class Store(AbstractContextManager["Store"]):
             return
         if not self._weights:
             query = (
-                "SELECT DISTINCT e.cell, c.policy, c.step, e.checkpoint, e.weights FROM episodes e"
-                " JOIN cells c ON c.cell = e.cell WHERE e.weights IS NOT NULL"
+                "SELECT DISTINCT e.case_id, c.policy, c.step, e.checkpoint, e.weights"
+                " FROM episodes e JOIN cases c ON c.case_id = e.case_id"
+                " WHERE e.weights IS NOT NULL"
             )
             for of, *checkpoint, weights in self._db.execute(query):
                 self._weights |= {of: weights, tuple(checkpoint): weights}
-        cell = self._cell[result.key.settings]
-        for of in (cell.fingerprint, (cell.policy.name, cell.step, result.checkpoint)):
+        case = self._case[result.key.settings]
+        for of in (case.fingerprint, (case.policy.name, case.step, result.checkpoint)):
             known = self._weights.setdefault(of, result.weights)
             if result.weights != known:
                 change = Change(
-                    f"policy {cell.contender}",
+                    f"policy {case.contender}",
                     result.checkpoint or "weights",
                     known,
                     result.weights,
@@ -258,14 +259,14 @@ class Store(AbstractContextManager["Store"]):
             insert(self._db, "workers", asdict(where) | {"run": self._run, "at": time.time()})
 
     def note_env(self, place: str, made: EnvInfo) -> None:
-        """Record the description, contract and code of the env of the cells at `place`.
+        """Record the description, contract and code of the env of the cases at `place`.
 
         Raises `ConfigError` if description or contract differ from an earlier run, as after an
         update of the simulator, or if the worker has other files than the process that made the
         plan.
         """
-        [cell, *_] = [cell for cell in self.cells if cell.place == place]
-        odd = program_changes(f"env {cell.env}", cell.program, made.program)
+        [case, *_] = [case for case in self.cases if case.place == place]
+        odd = program_changes(f"env {case.env}", case.program, made.program)
         # The environment itself may write a file that its settings name.
         if any(one.was is not None for one in odd):
             raise ConfigError(
@@ -273,34 +274,36 @@ class Store(AbstractContextManager["Store"]):
                 "since the start:\n"
                 f"{listed(odd)}\ngive both the same files, and go on with --resume"
             )
-        self._require_same_env(cell, made)
+        self._require_same_env(case, made)
         code = {} if made.code is None else made.code.to_json()
         found = (json.dumps(made.described, default=str), canonical(made.contract), canonical(code))
         with self._db:
             self._db.executemany(
-                "UPDATE cells SET described = ?, contract = ?, code = ? WHERE cell = ?",
-                [(*found, cell.fingerprint) for cell in self.cells if cell.place == place],
+                "UPDATE cases SET described = ?, contract = ?, code = ? WHERE case_id = ?",
+                [(*found, case.fingerprint) for case in self.cases if case.place == place],
             )
 
-    def _require_same_env(self, cell: EvalCase, made: EnvInfo) -> None:
+    def _require_same_env(self, case: EvalCase, made: EnvInfo) -> None:
         # By another worker of this run; descriptions may differ between nodes.
-        if cell.place in self._made:
+        if case.place in self._made:
             return
-        self._made.add(cell.place)
+        self._made.add(case.place)
         now = EnvStatement(
             json.loads(json.dumps(made.described, default=str)),
             json.loads(canonical(made.contract)),
         )
         changes: dict[Change, None] = {}
-        for other in self.cells:  # also those of other policies, which are compared with this one
-            if other.place != cell.place:
+        for other in self.cases:  # also those of other policies, which are compared with this one
+            if other.place != case.place:
                 continue
-            query = "SELECT described, contract FROM cells WHERE cell = ? AND described IS NOT NULL"
+            query = (
+                "SELECT described, contract FROM cases WHERE case_id = ? AND described IS NOT NULL"
+            )
             if (known := self._db.execute(query, (other.fingerprint,)).fetchone()) is not None:
                 was = EnvStatement(*map(json.loads, known))
-                changes |= dict.fromkeys(env_changes(cell.env, was, now))
+                changes |= dict.fromkeys(env_changes(case.env, was, now))
         self._accept_or_raise(
-            cell.place, list(changes), "the environment is not that of the results in"
+            case.place, list(changes), "the environment is not that of the results in"
         )
 
     def note_policy(self, name: str, metadata: dict[str, Any]) -> None:
@@ -309,7 +312,7 @@ class Store(AbstractContextManager["Store"]):
         """
         row = self._db.execute("SELECT metadata FROM policies WHERE name = ?", (name,)).fetchone()
         known = None if row is None else json.loads(row[0])
-        swept = any(cell.step is not None for cell in self.cells if cell.policy.name == name)
+        swept = any(case.step is not None for case in self.cases if case.policy.name == name)
         if known is not None:
             if (what := changed(known, metadata, swept=swept)) in ("policy", "checkpoint"):
                 raise ConfigError(
@@ -334,18 +337,18 @@ class Store(AbstractContextManager["Store"]):
             self._require_resumable(db, config)
             stop = _rule(config)
             with db:
-                for cell in self.cells:
-                    identity = (cell.policy.name, cell.step, cell.suite.name, cell.env)
-                    extent = (cell.planned, canonical(cell.suite.seeds), stop)
+                for case in self.cases:
+                    identity = (case.policy.name, case.step, case.suite.name, case.env)
+                    extent = (case.planned, canonical(case.suite.seeds), stop)
                     row = (
-                        cell.fingerprint,
+                        case.fingerprint,
                         *identity,
-                        canonical(cell.settings),
+                        canonical(case.settings),
                         *extent,
-                        canonical(cell.program),
+                        canonical(case.program),
                     )
                     db.execute(
-                        "INSERT INTO cells (cell, policy, step, suite, env, settings, planned, "
+                        "INSERT INTO cases (case_id, policy, step, suite, env, settings, planned, "
                         "seeds, stop, program)"
                         " VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?)"
                         " ON CONFLICT DO UPDATE SET planned = ?, seeds = ?, stop = ?",
@@ -371,7 +374,7 @@ class Store(AbstractContextManager["Store"]):
             )
         if not runs or (not episodes and causes == {"user"}):
             with db:
-                for table in ("attempts", "cells", "policies", "workers", "runs"):
+                for table in ("attempts", "cases", "policies", "workers", "runs"):
                     db.execute(f"DELETE FROM {table}")  # noqa: S608 - of a plan that could not begin
             return
         if not config.resume:
@@ -379,18 +382,20 @@ class Store(AbstractContextManager["Store"]):
                 f"{self._out} already has results ({episodes} episodes): resume them (--resume), "
                 f"or choose another out folder"
             )
-        if found := [f"- {text}" for cell in self.cells for text in _differences(db, cell)]:
+        if found := [f"- {text}" for case in self.cases for text in _differences(db, case)]:
             odd = "\n".join(found)
             raise ConfigError(
                 f"{self._out} has results of other settings:\n{odd}\n"
                 f"take the old settings, or choose another out folder"
             )
         lacking, programs = self._other_plan(db, config), dict[Change, None]()
-        for cell in self.cells:
-            query = "SELECT program FROM cells WHERE env = ? AND program IS NOT NULL AND cell = ?"
-            if (row := db.execute(query, (cell.env, cell.fingerprint)).fetchone()) is not None:
+        for case in self.cases:
+            query = (
+                "SELECT program FROM cases WHERE env = ? AND program IS NOT NULL AND case_id = ?"
+            )
+            if (row := db.execute(query, (case.env, case.fingerprint)).fetchone()) is not None:
                 programs |= dict.fromkeys(
-                    program_changes(f"env {cell.env}", json.loads(row[0]), cell.program)
+                    program_changes(f"env {case.env}", json.loads(row[0]), case.program)
                 )
         self._accept_or_raise(
             "plan",
@@ -405,18 +410,18 @@ class Store(AbstractContextManager["Store"]):
         )
 
     def _other_plan(self, db: sqlite3.Connection, config: EvalConfig) -> list[Change]:
-        """Return the cells and episodes of the results that this plan lacks, and other rules of
+        """Return the cases and episodes of the results that this plan lacks, and other rules of
         early stopping.
 
         A plan may grow, also by steps of a policy, which `--watch` adds one after the other. A
         trainer evaluates versions of policies one after the other into one folder, each with its
-        plan, so cells of other policies are not missing.
+        plan, so cases of other policies are not missing.
         """
-        trained = all(cell.policy.pushed_weights for cell in self.cells)
-        policies = {cell.policy.name for cell in self.cells}
-        mine = {(cell.policy.name, cell.suite.name, cell.env) for cell in self.cells}
+        trained = all(case.policy.pushed_weights for case in self.cases)
+        policies = {case.policy.name for case in self.cases}
+        mine = {(case.policy.name, case.suite.name, case.env) for case in self.cases}
         rows = db.execute(
-            "SELECT DISTINCT policy, suite, env FROM cells WHERE cell IN (SELECT cell FROM "
+            "SELECT DISTINCT policy, suite, env FROM cases WHERE case_id IN (SELECT case_id FROM "
             "episodes)"
         )
         gone = [
@@ -426,61 +431,61 @@ class Store(AbstractContextManager["Store"]):
         ]
         changes = [Change("plan", name, "in it", None) for name in gone]
         rule = _rule(config)
-        for cell in self.cells:
-            query = "SELECT planned, seeds, stop FROM cells WHERE cell = ?"
-            if (row := db.execute(query, (cell.fingerprint,)).fetchone()) is not None:
-                changes += _plan_changes(cell, rule, *row)
+        for case in self.cases:
+            query = "SELECT planned, seeds, stop FROM cases WHERE case_id = ?"
+            if (row := db.execute(query, (case.fingerprint,)).fetchone()) is not None:
+                changes += _plan_changes(case, rule, *row)
         return changes
 
 
 def _rule(config: EvalConfig) -> str | None:
-    """Return the rule of early stopping as the table of cells has it."""
+    """Return the rule of early stopping as the table of cases has it."""
     return config.stop.model_dump_json() if config.stop else None
 
 
 def _plan_changes(
-    cell: EvalCase, rule: str | None, planned: int, seeds_json: str, stop: str | None
+    case: EvalCase, rule: str | None, planned: int, seeds_json: str, stop: str | None
 ) -> list[Change]:
-    """Return what the plan of a cell leaves out of the results, or another rule of early stopping
+    """Return what the plan of a case leaves out of the results, or another rule of early stopping
     than `stop`.
 
     Otherwise an evaluation could end where its rate looks good.
     """
     seeds = json.loads(seeds_json)
     episodes = planned // len(seeds)
-    name = " ".join(filter(None, cell.name))
+    name = " ".join(filter(None, case.name))
     changes = []
-    if cell.suite.episodes < episodes:
-        changes.append(Change("plan", f"{name}: episodes", str(episodes), str(cell.suite.episodes)))
-    if len(cell.suite.seeds) < len(seeds):
-        changes.append(Change("plan", f"{name}: seeds", str(seeds), str(cell.suite.seeds)))
+    if case.suite.episodes < episodes:
+        changes.append(Change("plan", f"{name}: episodes", str(episodes), str(case.suite.episodes)))
+    if len(case.suite.seeds) < len(seeds):
+        changes.append(Change("plan", f"{name}: seeds", str(seeds), str(case.suite.seeds)))
     if stop != rule:
         changes.append(Change("plan", f"{name}: early stopping", str(stop), str(rule)))
     return changes
 
 
-def _differences(db: sqlite3.Connection, cell: EvalCase) -> list[str]:
-    """Return the settings of `cell` that differ from those in the results, a sentence each; none
-    for a new cell.
+def _differences(db: sqlite3.Connection, case: EvalCase) -> list[str]:
+    """Return the settings of `case` that differ from those in the results, a sentence each; none
+    for a new case.
 
     The first seeds must be the same: else episode 3 would be two episodes.
     """
     row = db.execute(
-        "SELECT settings, seeds FROM cells"
+        "SELECT settings, seeds FROM cases"
         " WHERE policy = ? AND step IS ? AND suite = ? AND env = ?",
-        (cell.policy.name, cell.step, cell.suite.name, cell.env),
+        (case.policy.name, case.step, case.suite.name, case.env),
     ).fetchone()
     if row is None:
         return []
     stored, seeds = map(json.loads, row)
     differing = [
         (name, stored.get(name), value)
-        for name, value in cell.settings.items()
+        for name, value in case.settings.items()
         if stored.get(name) != value
     ]
-    if any(old != new for old, new in zip(seeds, cell.suite.seeds, strict=False)):
-        differing.append(("seeds", seeds, cell.suite.seeds))
-    where = " ".join(filter(None, cell.name))
+    if any(old != new for old, new in zip(seeds, case.suite.seeds, strict=False)):
+        differing.append(("seeds", seeds, case.suite.seeds))
+    where = " ".join(filter(None, case.name))
     return [
         f"{where}: {name}: the results have {old!r}, now it is {new!r}"
         for name, old, new in differing

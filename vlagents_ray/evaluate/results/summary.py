@@ -15,7 +15,7 @@ from vlagents_ray.evaluate.artifacts.storage import whole
 from vlagents_ray.evaluate.episode.records import EpisodeResult
 from vlagents_ray.evaluate.results.comparison import gap_to_synchronous
 from vlagents_ray.evaluate.results.reader import (
-    CellResults,
+    CaseResults,
     Results,
     by_timing,
     have_common_rate,
@@ -30,7 +30,7 @@ Stated = Literal["checkpoint", "weights", "revision"]  # of an episode's result
 
 @dataclass(frozen=True, slots=True)
 class Group:
-    """Aggregates over the episodes of one cell, or of several.
+    """Aggregates over the episodes of one case, or of several.
 
     Rates count an error of the policy as a failure. Episodes that failed by infrastructure are in
     no rate.
@@ -40,7 +40,7 @@ class Group:
     suite: str
     env: str  # or "total"
     planned: int
-    stopped: int  # cells that stopped early
+    stopped: int  # cases that stopped early
     success_once: Rate
     success_at_end: Rate
     policy_errors: int  # episodes that an error of the policy ended; not successes
@@ -89,7 +89,7 @@ class Summary:
     """
 
     results: Results
-    cells: tuple[Group, ...]
+    cases: tuple[Group, ...]
     totals: tuple[Group, ...]  # one for each policy id, in the order of `results.contenders`
     wall_seconds: float  # of all runs together, the start of the workers included
     rollout_seconds: float  # from the first reset to the last step, of all runs together
@@ -107,26 +107,26 @@ class Summary:
     @property
     def total(self) -> Group:
         """All episodes together."""
-        return group_of((TOTAL, "", TOTAL), self.results.cells)
+        return group_of((TOTAL, "", TOTAL), self.results.cases)
 
     def parts(self, contender: str) -> dict[str, Group]:
         """Return the totals of a policy id, by the clock of their episodes (`by_timing`)."""
         return {
-            timing: group_of((contender, "", TOTAL), cells)
-            for timing, cells in by_timing(self.results.of(contender)).items()
+            timing: group_of((contender, "", TOTAL), cases)
+            for timing, cases in by_timing(self.results.of(contender)).items()
         }
 
     @property
     def best(self) -> list[str]:
-        """The policy ids, the best first, by the mean success rate of their cells with one clock.
+        """The policy ids, the best first, by the mean success rate of their cases with one clock.
 
         The clock is the first of `by_timing`: that of the episodes that waited for the policy, if
         there are any.
         """
         rates: dict[str, list[float]] = {name: [] for name in self.results.contenders}
-        timings = list(by_timing(self.results.cells).values())
-        for cell in timings[0] if timings else []:
-            rates[cell.contender].append(rate_of([cell], "success_once").rate or 0.0)
+        timings = list(by_timing(self.results.cases).values())
+        for case in timings[0] if timings else []:
+            rates[case.contender].append(rate_of([case], "success_once").rate or 0.0)
         means = {
             name: sum(values) / len(values) if values else 0.0 for name, values in rates.items()
         }
@@ -168,27 +168,27 @@ class Summary:
 
     @property
     def _counted(self) -> list[EpisodeResult]:
-        return [result for cell in self.results.cells for result in cell.counted]
+        return [result for case in self.results.cases for result in case.counted]
 
     def to_json(self) -> dict[str, Any]:
         """Return the content of summary.json."""
-        cells = [
+        cases = [
             group.to_json()
-            | {what: stated(cell, what) for what in get_args(Stated)}
-            | {"pushed_weights": pushed_of(cell)}
-            | {"settings": cell.settings, "env": cell.env}
-            | {"described": cell.described, "contract": cell.contract, "code": cell.code}
-            | {"program": cell.program}
+            | {what: stated(case, what) for what in get_args(Stated)}
+            | {"pushed_weights": pushed_of(case)}
+            | {"settings": case.settings, "env": case.env}
+            | {"described": case.described, "contract": case.contract, "code": case.code}
+            | {"program": case.program}
             | {
-                "stopped_at": cell.stopped_at,
-                "gap_to_synchronous": gap_to_synchronous(self.results, cell),
+                "stopped_at": case.stopped_at,
+                "gap_to_synchronous": gap_to_synchronous(self.results, case),
             }
-            for group, cell in zip(self.cells, self.results.cells, strict=True)
+            for group, case in zip(self.cases, self.results.cases, strict=True)
         ]
         last = self.results.runs[-1]
         return {
             "state": self.state,
-            "cells": cells,
+            "cases": cases,
             "totals": [group.to_json() for group in self.totals],
             "wall_seconds": self.wall_seconds,
             "rollout_seconds": self.rollout_seconds,
@@ -208,41 +208,41 @@ def summarize(results: Results) -> Summary:
     """Aggregate results, those of earlier runs included."""
     wall_s = rollout_s = 0.0
     for run in results.runs:
-        played = [one for cell in results.cells for one in cell.episodes if one.run == run.run]
+        played = [one for case in results.cases for one in case.episodes if one.run == run.run]
         last = max((one.finished for one in played), default=run.started)
         # A killed one ended with its last episode.
         wall_s += (last if run.ended is None else run.ended) - run.started
         rollout_s += last - min((one.finished - one.result.seconds for one in played), default=last)
     return Summary(
         results,
-        tuple(group_of((cell.contender, cell.suite, cell.env), [cell]) for cell in results.cells),
+        tuple(group_of((case.contender, case.suite, case.env), [case]) for case in results.cases),
         tuple(group_of((name, "", TOTAL), results.of(name)) for name in results.contenders),
         wall_s,
         rollout_s,
     )
 
 
-def stated(cell: CellResults, what: Stated) -> str | None:
+def stated(case: CaseResults, what: Stated) -> str | None:
     """Return the checkpoint, the digest of the weights, or the weights' commit on the hub; None
     if none was stated.
     """
-    found: list[str | None] = [getattr(one, what) for one in cell.counted]
+    found: list[str | None] = [getattr(one, what) for one in case.counted]
     return next((one for one in found if one is not None), None)
 
 
-def pushed_of(cell: CellResults) -> str | None:
-    """Return the pushed weights of a cell's episodes, in words; None if only the checkpoint's
+def pushed_of(case: CaseResults) -> str | None:
+    """Return the pushed weights of a case's episodes, in words; None if only the checkpoint's
     weights acted.
 
-    The rate of a cell of several versions describes none of them.
+    The rate of a case of several versions describes none of them.
     """
     named = {
         one.policy_version: one.policy_fingerprint
-        for one in cell.counted
+        for one in case.counted
         if one.policy_version is not None
     }
     numbers = {
-        one.first_policy_version for one in cell.counted if one.first_policy_version is not None
+        one.first_policy_version for one in case.counted if one.first_policy_version is not None
     } | named.keys()
     if not any(numbers):
         return None
@@ -266,18 +266,18 @@ def errors_of_policies(results: Results) -> list[tuple[tuple[str, str, str], int
     number of episodes.
     """
     found: dict[tuple[str, str, str], list[str]] = {}
-    for cell in results.cells:
-        for one in cell.counted:
+    for case in results.cases:
+        for one in case.counted:
             if one.status == "policy_error":
                 error = one.error or ""
-                found.setdefault((cell.contender, cell.task, cause_of(error)), []).append(error)
+                found.setdefault((case.contender, case.task, cause_of(error)), []).append(error)
     return [((policy, task, errors[0]), len(errors)) for (policy, task, _), errors in found.items()]
 
 
-def failing_cells(results: Results) -> list[CellResults]:
-    """Return the cells in which an error of the policy ended every episode."""
-    outcomes = [(cell, {one.status for one in cell.counted}) for cell in results.cells]
-    return [cell for cell, statuses in outcomes if statuses == {"policy_error"}]
+def failing_cases(results: Results) -> list[CaseResults]:
+    """Return the cases in which an error of the policy ended every episode."""
+    outcomes = [(case, {one.status for one in case.counted}) for case in results.cases]
+    return [case for case, statuses in outcomes if statuses == {"policy_error"}]
 
 
 def write_summary(summary: Summary) -> Path:
@@ -287,23 +287,23 @@ def write_summary(summary: Summary) -> Path:
     return path
 
 
-def group_of(name: tuple[str, str, str], cells: Sequence[CellResults]) -> Group:
-    """Aggregate these cells under the name (policy id, suite, env)."""
-    finished: list[EpisodeResult] = [result for cell in cells for result in cell.counted]
-    has_means = bool(finished) and have_common_rate(cells)
+def group_of(name: tuple[str, str, str], cases: Sequence[CaseResults]) -> Group:
+    """Aggregate these cases under the name (policy id, suite, env)."""
+    finished: list[EpisodeResult] = [result for case in cases for result in case.counted]
+    has_means = bool(finished) and have_common_rate(cases)
     return Group(
         *name,
-        planned=sum(cell.planned for cell in cells),
-        stopped=sum(cell.stopped_at is not None for cell in cells),
-        success_once=rate_of(cells, "success_once"),
-        success_at_end=rate_of(cells, "success_at_end"),
+        planned=sum(case.planned for case in cases),
+        stopped=sum(case.stopped_at is not None for case in cases),
+        success_once=rate_of(cases, "success_once"),
+        success_at_end=rate_of(cases, "success_at_end"),
         policy_errors=sum(one.status == "policy_error" for one in finished),
         infra_failures=sum(
             one.result.status == "infra_failed" and not one.beyond
-            for cell in cells
-            for one in cell.episodes
+            for case in cases
+            for one in case.episodes
         ),
-        retries=sum(attempt.retried for cell in cells for attempt in cell.attempts),
+        retries=sum(attempt.retried for case in cases for attempt in case.attempts),
         steps=sum(one.steps for one in finished),
         mean_steps=float(np.mean([one.steps for one in finished])) if has_means else None,
         mean_return=float(np.mean([one.episode_return for one in finished])) if has_means else None,

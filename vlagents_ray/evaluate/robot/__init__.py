@@ -16,7 +16,7 @@ from vlagents_ray.evaluate.robot.operator import (
 from vlagents_ray.evaluate.robot.run import (
     TrialsInterrupted,
     evaluate_on_robot,
-    planned_cells,
+    plan_robot_cases,
     unblind,
 )
 from vlagents_ray.evaluate.robot.trial import Trial, schedule
@@ -30,7 +30,7 @@ __all__ = [
     "Verdict",
     "VisibleTrial",
     "evaluate_on_robot",
-    "planned_cells",
+    "plan_robot_cases",
     "schedule",
     "unblind",
 ]

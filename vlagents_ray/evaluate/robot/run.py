@@ -28,7 +28,7 @@ from vlagents_ray.errors import ConfigError, ContractMismatch, VLAgentsError, fr
 from vlagents_ray.evaluate.artifacts.storage import driver_code, save_diffs, storing, versions
 from vlagents_ray.evaluate.episode.failures import Failure, explain
 from vlagents_ray.evaluate.episode.records import EnvInfo, EpisodeResult
-from vlagents_ray.evaluate.plan.cases import EvalCase, cells
+from vlagents_ray.evaluate.plan.cases import EvalCase, plan_cases
 from vlagents_ray.evaluate.plan.config import EvalConfig, canonical
 from vlagents_ray.evaluate.plan.jobs import EpisodeKey
 from vlagents_ray.evaluate.results.changes import changed
@@ -85,7 +85,7 @@ class LoggedTrial:
 class TrialLog(contextlib.AbstractContextManager["TrialLog"]):
     """The log in one folder, open for one evaluation at a time."""
 
-    def __init__(self, config: EvalConfig, cells: Sequence[EvalCase]) -> None:
+    def __init__(self, config: EvalConfig, cases: Sequence[EvalCase]) -> None:
         """Open or begin the log in `config.out`.
 
         Raises:
@@ -114,7 +114,7 @@ class TrialLog(contextlib.AbstractContextManager["TrialLog"]):
                 self._hidden = files.enter_context(_JsonLines(config.out / HIDDEN, mode=0o600))
             self._log.lock()
             plan = canonical(
-                [[cell.fingerprint, *cell.name, cell.planned, cell.suite.seeds] for cell in cells]
+                [[case.fingerprint, *case.name, case.planned, case.suite.seeds] for case in cases]
             )
             self._read(config, hmac.digest(self.key, plan.encode(), hashlib.sha256).hex())
             self._files = files.pop_all()
@@ -290,7 +290,7 @@ def evaluate_on_robot(
     A trial's policy is drawn (`schedule`). Until the last verdict only the hidden file in the
     folder names it (`TrialLog`), and no output or log does; results.db, summary.json and
     report.html are written at the end, as for a simulation. With `config.stop`, a task ends once
-    all its cells have stopped, since trials of the remaining ones would reveal their policy.
+    all its cases have stopped, since trials of the remaining ones would reveal their policy.
 
     Args:
         config: The policies, with their URLs, and the plan, with `robot`.
@@ -310,7 +310,7 @@ def evaluate_on_robot(
         TrialsInterrupted: The operator ended the evaluation, or Ctrl-C did.
         VLAgentsError: A policy cannot be reached, or fails, before the first trial.
     """
-    planned = planned_cells(config)
+    planned = plan_robot_cases(config)
     if config.record != "none":
         for module in ("av", "pyarrow"):
             require(module)
@@ -348,14 +348,14 @@ def unblind(out: Path, key: str | None = None) -> Summary:
         ConfigError: The folder has no trials, or they are of another key.
     """
     config = logged_plan(out, key).model_copy(update={"out": out, "resume": True})
-    planned = planned_cells(config)
+    planned = plan_robot_cases(config)
     with TrialLog(config, planned) as log:
         log.note_unblinded()
     return _write_results(config, planned, log, "interrupted")
 
 
-def planned_cells(config: EvalConfig) -> list[EvalCase]:
-    """Return the cells of a plan on a robot.
+def plan_robot_cases(config: EvalConfig) -> list[EvalCase]:
+    """Return the cases of a plan on a robot.
 
     Raises:
         ConfigError: The plan has no robot, or settings without meaning on one.
@@ -371,7 +371,7 @@ def planned_cells(config: EvalConfig) -> list[EvalCase]:
         raise ConfigError(
             f"track: got {config.track} with a robot, want none: rates tell policies before the end"
         )
-    return cells(config)
+    return plan_cases(config)
 
 
 @dataclasses.dataclass(slots=True)
@@ -385,15 +385,15 @@ class _RemainingTrials:
     _log: TrialLog
     _trials: Sequence[Trial]
     _message: str = ""  # for the operator, about the last trial
-    # By task and cell.
+    # By task and case.
     _stopping: dict[tuple[str, str], dict[str, Stopping]] = dataclasses.field(default_factory=dict)
 
     def __post_init__(self) -> None:
         for trial in self._trials:
-            cell = trial.job.cell
+            case = trial.job.case
             if (stop := self._config.stop) is not None:
                 found = self._stopping.setdefault(trial.task, {})
-                found.setdefault(cell.fingerprint, Stopping(stop, cell.suite.seeds, cell.planned))
+                found.setdefault(case.fingerprint, Stopping(stop, case.suite.seeds, case.planned))
         for number, logged in self._log.finished.items():
             trial = self._trials[number - 1]
             self._count(trial, result_of(trial, logged))
@@ -407,21 +407,21 @@ class _RemainingTrials:
         if not left:
             return
         obs = self._robot.observe()
-        policies = {trial.job.cell.contender: trial.job.cell for trial in left}
+        policies = {trial.job.case.contender: trial.job.case for trial in left}
         # An order that reveals nothing.
-        for _, cell in sorted(policies.items(), key=lambda one: one[0]):
+        for _, case in sorted(policies.items(), key=lambda one: one[0]):
             try:
-                rehearse(cell, self._robot, self._factory, self._operator, obs)
+                rehearse(case, self._robot, self._factory, self._operator, obs)
             except ContractMismatch as error:
                 raise ContractMismatch(
                     "a policy of this plan does not fit the robot. It is not named here, as the "
                     "trials are blind; "
-                    f"`vlagents-ray robot URL --robot {cell.on_robot[0].arm}` compares one policy "
+                    f"`vlagents-ray robot URL --robot {case.on_robot[0].arm}` compares one policy "
                     "with the robot, "
                     f"before any motion.\n{error}"
                 ) from None
             except VLAgentsError as error:
-                raise from_code(error.code, f"policy {cell.contender!r}: {error}") from error
+                raise from_code(error.code, f"policy {case.contender!r}: {error}") from error
         for trial in left:
             while not self._is_over(trial) and trial.number not in self._log.finished:
                 self._play(trial)
@@ -496,14 +496,14 @@ class _RemainingTrials:
 
     def _count(self, trial: Trial, result: EpisodeResult) -> None:
         if self._config.stop is not None:
-            self._stopping[trial.task][trial.job.cell.fingerprint].add(result)
+            self._stopping[trial.task][trial.job.case.fingerprint].add(result)
 
     def _is_over(self, trial: Trial) -> bool:
         stopping = self._stopping.get(trial.task)
         return stopping is not None and all(one.at is not None for one in stopping.values())
 
     def _visible(self, trial: Trial) -> VisibleTrial:
-        (robot, task), earlier = trial.job.cell.on_robot, self._log.of(trial.number)
+        (robot, task), earlier = trial.job.case.on_robot, self._log.of(trial.number)
         return VisibleTrial(
             number=trial.number,
             total=len(self._trials),
@@ -522,14 +522,14 @@ class _RemainingTrials:
         """Raise `ConfigError` if the policy has changed, without naming the policy or its
         trials.
         """
-        cell = trial.job.cell
+        case = trial.job.case
         now = {name: getattr(played.result, name) for name in ("checkpoint", "weights")}
         for number, logged in self._log.finished.items():
-            other = self._trials[number - 1].job.cell
-            if other.policy.name != cell.policy.name:
+            other = self._trials[number - 1].job.case
+            if other.policy.name != case.policy.name:
                 continue
-            what = changed(logged.hidden["metadata"], played.metadata, swept=cell.step is not None)
-            if what is None and other.contender == cell.contender:
+            what = changed(logged.hidden["metadata"], played.metadata, swept=case.step is not None)
+            if what is None and other.contender == case.contender:
                 before = logged.hidden["result"]
                 what = next(
                     (
@@ -583,7 +583,7 @@ def _write_results(
     with Store(config.model_copy(update={"resume": True})) as store, storing(config.out):
         store.begin_run(config, versions(), log.started)
         save_diffs(config.out, driver_code().values())
-        for place in {cell.place: cell for cell in planned}.values():
+        for place in {case.place: case for case in planned}.values():
             store.note_env(place.place, EnvInfo({"robot": place.on_robot[0].arm}, {}))
         for logged in log.attempts:
             trial = trials[logged.trial - 1]
@@ -596,6 +596,6 @@ def _write_results(
                 )
                 continue
             if logged.hidden["metadata"]:
-                store.note_policy(trial.job.cell.policy.name, logged.hidden["metadata"])
+                store.note_policy(trial.job.case.policy.name, logged.hidden["metadata"])
             store.record(result_of(trial, logged), logged.attempt, finished=logged.at)
         return conclude(config, store, state)

@@ -48,7 +48,7 @@ _WAIT_S = 1.0  # deadline of a tick in the modes that wait for an answer
 
 @dataclass(frozen=True, slots=True)
 class Trial:
-    """A trial, with its policy, `job.cell.policy`, which the operator must not see."""
+    """A trial, with its policy, `job.case.policy`, which the operator must not see."""
 
     number: int  # from 1, in the order in which they are played
     scene: int  # from 1; each policy plays each scene of a task once
@@ -57,7 +57,7 @@ class Trial:
     @property
     def task(self) -> tuple[str, str]:
         """(suite, env)."""
-        return self.job.cell.suite.name, self.job.cell.env
+        return self.job.case.suite.name, self.job.case.env
 
     @property
     def place(self) -> str:
@@ -65,7 +65,7 @@ class Trial:
         return plain("-".join((*filter(None, self.task), f"scene{self.scene}")))
 
 
-def schedule(cells: Iterable[EvalCase], key: bytes) -> list[Trial]:
+def schedule(cases: Iterable[EvalCase], key: bytes) -> list[Trial]:
     """Draw the order of all trials: task by task, scene by scene, and in each scene every policy
     once.
 
@@ -78,15 +78,15 @@ def schedule(cells: Iterable[EvalCase], key: bytes) -> list[Trial]:
     environments, by HMAC-SHA256.
 
     Args:
-        cells: The cells of the plan, all on a robot.
+        cases: The cases of the plan, all on a robot.
         key: The plan's key, which reveals the policy of each trial.
 
     Returns:
         The trials in the order in which they are played.
     """
     tasks: dict[tuple[str, str], dict[str, EvalCase]] = {}
-    for cell in cells:
-        tasks.setdefault((cell.suite.name, cell.env), {})[cell.contender] = cell
+    for case in cases:
+        tasks.setdefault((case.suite.name, case.env), {})[case.contender] = case
     trials: list[Trial] = []
     rows_used: Counter[int] = Counter()
     for task, contenders in tasks.items():
@@ -97,8 +97,8 @@ def schedule(cells: Iterable[EvalCase], key: bytes) -> list[Trial]:
             zip(scenes, orders, strict=True), start=1
         ):
             for name in order:
-                cell = contenders[name]
-                job = Job(EpisodeKey(cell.env, episode, seed + episode, cell.fingerprint), cell)
+                case = contenders[name]
+                job = Job(EpisodeKey(case.env, episode, seed + episode, case.fingerprint), case)
                 trials.append(Trial(len(trials) + 1, number, job))
     return trials
 
@@ -230,8 +230,8 @@ def play(
     Returns:
         The trial; with the status "policy_error" if the policy failed.
     """
-    cell = trial.job.cell
-    settings, task = cell.on_robot
+    case = trial.job.case
+    settings, task = case.on_robot
     deadline_s = _deadline_s(settings)
     stats = robot.stats = EpisodeStats(trial.job.key, instructions=[task.instruction])
     hangs_s = max(0.2, 5 / settings.hz) + deadline_s
@@ -247,7 +247,7 @@ def play(
 
     with contextlib.ExitStack() as stack:
         stack.callback(setattr, robot, "stats", None)
-        agent, player = stack.enter_context(_player(cell, factory, stats, robot, operator))
+        agent, player = stack.enter_context(_player(case, factory, stats, robot, operator))
         recorder = (
             None if recording is None else stack.enter_context(Recorder(recording, settings.hz))
         )
@@ -259,7 +259,7 @@ def play(
                 hz=settings.hz,
                 seconds=task.max_steps / settings.hz,
                 instruction=task.instruction,
-                reset_options={**cell.policy_options, "env": cell.env, "seed": trial.job.key.seed},
+                reset_options={**case.policy_options, "env": case.env, "seed": trial.job.key.seed},
                 watchdog=watchdog,
                 restart="manual",
                 recorder=recorder,
@@ -295,7 +295,7 @@ def play(
 
 
 def rehearse(
-    cell: EvalCase, robot: WatchedRobot, factory: AgentFactory, operator: Operator, obs: Obs
+    case: EvalCase, robot: WatchedRobot, factory: AgentFactory, operator: Operator, obs: Obs
 ) -> None:
     """Run a policy once, without moving the robot.
 
@@ -303,25 +303,25 @@ def rehearse(
     trial. Work done on the first call, such as compilation, does not slow the first trial, which
     would reveal which policy is running.
     """
-    settings, task = cell.on_robot
-    unused = EpisodeStats(EpisodeKey(cell.env, 0, 0, cell.fingerprint))
-    with _player(cell, factory, unused, robot, operator) as (agent, player):
+    settings, task = case.on_robot
+    unused = EpisodeStats(EpisodeKey(case.env, 0, 0, case.fingerprint))
+    with _player(case, factory, unused, robot, operator) as (agent, player):
         player.initialize()
         limits = None if settings.limits is None else MotionLimits.read(settings.limits)
         fit = fit_of(agent, robot, limits, accept=settings.accept_misfit)
         fit.require(obs, None)
         if fit.trained.action is not None:
             with contextlib.suppress(InvalidAction):
-                agent.reset(obs, task.instruction, **cell.policy_options)
+                agent.reset(obs, task.instruction, **case.policy_options)
                 fit.require(None, agent.act(obs).rows())
         with contextlib.suppress(InvalidAction):  # in a trial it is a failure of the policy
-            player.reset(obs, task.instruction, **cell.policy_options)
+            player.reset(obs, task.instruction, **case.policy_options)
             player.act(obs)
 
 
 @contextlib.contextmanager
 def _player(
-    cell: EvalCase,
+    case: EvalCase,
     factory: AgentFactory,
     stats: EpisodeStats,
     robot: WatchedRobot,
@@ -330,8 +330,8 @@ def _player(
     """Yield a policy's agent and its player with the plan's settings; both are closed at the
     end.
     """
-    settings, _ = cell.on_robot
-    agent = factory(cell.policy)
+    settings, _ = case.on_robot
+    agent = factory(case.policy)
     with contextlib.ExitStack() as unplayed:
         unplayed.callback(agent.close)
         agent.initialize()
@@ -342,7 +342,7 @@ def _player(
             operator,
             PlayerSettings(
                 mode=settings.mode,
-                execute=cell.policy.execute,
+                execute=case.policy.execute,
                 deadline_s=_deadline_s(settings),
                 max_age_s=settings.max_age_s,
                 safe=settings.safe,

@@ -13,7 +13,7 @@ from typing import Any
 from vlagents_ray.errors import ConfigError, PolicyFailed, from_code
 from vlagents_ray.evaluate.episode.episode import Phase
 from vlagents_ray.evaluate.episode.failures import Failure
-from vlagents_ray.evaluate.plan.cases import EvalCase, cells
+from vlagents_ray.evaluate.plan.cases import EvalCase, plan_cases
 from vlagents_ray.evaluate.plan.config import EvalConfig, WorkerConfig
 from vlagents_ray.evaluate.plan.jobs import Job, JobQueue
 from vlagents_ray.evaluate.workers.rollout import Heartbeat, Report
@@ -39,11 +39,11 @@ def chosen_workers(config: EvalConfig) -> int:
         ConfigError: `config.workers` is 0, and something needs Ray.
     """
     planned, urls = (
-        cells(config),
+        plan_cases(config),
         [url for one in config.policies for url in (one.url, one.source) if url],
     )
     needs = [f"{url} is inside a Ray cluster" for url in urls if url.startswith("serve://")]
-    packages = {name for cell in planned for name in cell.worker.runtime_env} - {VARIABLES}
+    packages = {name for case in planned for name in case.worker.runtime_env} - {VARIABLES}
     needs += [f"a worker's runtime_env has {name!r}" for name in sorted(packages)]
     if config.workers == 0 and needs:
         raise ConfigError(
@@ -52,7 +52,7 @@ def chosen_workers(config: EvalConfig) -> int:
         )
     if config.workers is not None:
         return config.workers
-    limits = [(cell.planned, cell.suite.env_options.get("max_steps")) for cell in planned]
+    limits = [(case.planned, case.suite.env_options.get("max_steps")) for case in planned]
     steps = sum(
         episodes * (limit if isinstance(limit, int) else _STEPS) for episodes, limit in limits
     )
@@ -60,7 +60,7 @@ def chosen_workers(config: EvalConfig) -> int:
     return int(
         bool(needs)
         or in_cluster
-        or any(cell.worker.gpus for cell in planned)
+        or any(case.worker.gpus for case in planned)
         or steps > SHORT_STEPS
     )
 
@@ -74,7 +74,7 @@ class WorkerHandle:
     actor: Any
     starting: Any  # ObjectRef of `ready()`; None once the worker runs
     started_at: float  # time of its start
-    jobs: tuple[Job, ...] = ()  # the jobs that it plays, all of one cell
+    jobs: tuple[Job, ...] = ()  # the jobs that it plays, all of one case
     running: Any = None  # ObjectRef of `run(jobs)`
     env_place: str | None = None  # the place of its environment
     query: Any = None  # ObjectRef of `progress()`
@@ -113,8 +113,8 @@ class Workers(contextlib.AbstractContextManager["Workers"]):
         """Return whether one more worker may start; ends an idle one if there is no room."""
 
     @abstractmethod
-    def start(self, cell: EvalCase) -> None:
-        """Start one more worker that can play `cell`."""
+    def start(self, case: EvalCase) -> None:
+        """Start one more worker that can play `case`."""
 
     @abstractmethod
     def dispatch(self, worker: WorkerHandle, jobs: tuple[Job, ...]) -> None:
@@ -136,14 +136,14 @@ def dispatch(
     called with the jobs.
     """
     for worker in pool.idle():
-        working = Counter(one.jobs[0].cell.place for one in pool._workers if one.jobs)
+        working = Counter(one.jobs[0].case.place for one in pool._workers if one.jobs)
         if jobs := queue.take(worker.kind, worker.env_place, working):
             begin(jobs)
             pool.dispatch(worker, jobs)
     while (
-        cell := queue.needs_worker(pool.kinds(), pool.kinds(occupied=False))
+        case := queue.needs_worker(pool.kinds(), pool.kinds(occupied=False))
     ) is not None and pool.free_slot():
-        pool.start(cell)
+        pool.start(case)
 
 
 def phase_limits_s(config: EvalConfig) -> dict[Phase, float]:

@@ -63,31 +63,31 @@ def most_gpus(config: EvalConfig) -> float:
     return max(worker.gpus for worker in _kinds(config))
 
 
-def runtime_env(cell: EvalCase) -> dict[str, Any]:
+def runtime_env(case: EvalCase) -> dict[str, Any]:
     """Return Ray's runtime environment of a worker: its thread settings, and no GPUs if it requests
     none.
 
     No secret may be in it: Ray writes runtime environments to logs that every user of a machine can
     read.
     """
-    given: dict[str, Any] = dict(cell.worker.runtime_env)
+    given: dict[str, Any] = dict(case.worker.runtime_env)
     # Or it is in the worker.
-    hides_gpus = not cell.worker.gpus and bool(cell.policy.url or cell.policy.source)
-    variables = dict.fromkeys(THREAD_VARIABLES, str(cell.worker.threads))
+    hides_gpus = not case.worker.gpus and bool(case.policy.url or case.policy.source)
+    variables = dict.fromkeys(THREAD_VARIABLES, str(case.worker.threads))
     if hides_gpus:  # Ray does not hide GPUs from an actor that requests none
         variables[GPUS] = ""
     return given | {"env_vars": variables | given.get("env_vars", {})}
 
 
-def unused_gpus(cell: EvalCase, where: WorkerInfo) -> str | None:
-    """Return a warning that the workers of `cell` render in software in a cluster with GPUs;
+def unused_gpus(case: EvalCase, where: WorkerInfo) -> str | None:
+    """Return a warning that the workers of `case` render in software in a cluster with GPUs;
     None if they do not.
     """
-    gpus = 0 if cell.worker.gpus else ray.cluster_resources().get("GPU", 0)
+    gpus = 0 if case.worker.gpus else ray.cluster_resources().get("GPU", 0)
     if not gpus:
         return None
     return (
-        f"{cell.env} draws on {where.renderer}, as its workers have no GPU; the cluster has "
+        f"{case.env} draws on {where.renderer}, as its workers have no GPU; the cluster has "
         f"{gpus:g}: {SHARE}, "
         f"see docs/cluster/scaling.md"
     )

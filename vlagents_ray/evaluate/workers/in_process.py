@@ -57,10 +57,10 @@ class InProcessWorkers(Workers):
             self._workers.remove(worker)
         return not self._workers
 
-    def start(self, cell: EvalCase) -> None:
-        self._variables.enter_context(variables(cell.worker.runtime_env.get(VARIABLES) or {}))  # type: ignore[arg-type]
+    def start(self, case: EvalCase) -> None:
+        self._variables.enter_context(variables(case.worker.runtime_env.get(VARIABLES) or {}))  # type: ignore[arg-type]
         self._workers.append(
-            WorkerHandle(cell.worker, cell.kind, actor=None, starting=self, started_at=0.0)
+            WorkerHandle(case.worker, case.kind, actor=None, starting=self, started_at=0.0)
         )
 
     def dispatch(self, worker: WorkerHandle, jobs: tuple[Job, ...]) -> None:
@@ -75,7 +75,7 @@ class InProcessWorkers(Workers):
             with raised_at_once(), _exits_raised(), _hangs_reported(self._rollout, self._config):
                 reports = self._rollout.run(jobs)
             if reports[0].env is not None:
-                worker.env_place = jobs[0].cell.place
+                worker.env_place = jobs[0].case.place
             if any(one.failure is not None and one.failure.cause == "worker" for one in reports):
                 self.close()
                 worker.env_place = None

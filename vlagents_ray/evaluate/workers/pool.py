@@ -101,16 +101,16 @@ class WorkerPool(Workers):
         self._leaving.append((idle[0].actor, monotonic()))
         return True
 
-    def start(self, cell: EvalCase) -> None:
+    def start(self, case: EvalCase) -> None:
         node = self._placement.node(
-            cell.policy.url, Counter(worker.node for worker in self._workers)
+            case.policy.url, Counter(worker.node for worker in self._workers)
         )
         options = {
-            "num_cpus": cell.worker.cpus,
-            "num_gpus": cell.worker.gpus,
+            "num_cpus": case.worker.cpus,
+            "num_gpus": case.worker.gpus,
             "max_restarts": 0,
             "scheduling_strategy": strategy(node),
-            "runtime_env": runtime_env(cell),
+            "runtime_env": runtime_env(case),
         }
         actor = self._actor_class.options(**options).remote(
             self._config, self._agent_factory, self._recorders
@@ -118,12 +118,12 @@ class WorkerPool(Workers):
         starting, now = actor.ready.remote(self._credentials), monotonic()
         self._workers.append(
             WorkerHandle(
-                cell.worker, cell.kind, actor, starting=starting, started_at=now, node=node
+                case.worker, case.kind, actor, starting=starting, started_at=now, node=node
             )
         )
 
     def dispatch(self, worker: WorkerHandle, jobs: tuple[Job, ...]) -> None:
-        phase: Phase = "env reset" if worker.env_place == jobs[0].cell.place else "make"
+        phase: Phase = "env reset" if worker.env_place == jobs[0].case.place else "make"
         worker.jobs = jobs
         worker.heartbeat, worker.heartbeat_at = Heartbeat(phase, 0.0, 0), monotonic()
         worker.queried_at, worker.query = monotonic(), None
@@ -189,7 +189,7 @@ class WorkerPool(Workers):
                 reason = f"the worker on {worker.process['host']} {what}: {error}"
                 reports = [Report(failure=Failure("worker", EnvFailed.code, reason))] * len(jobs)
             if reports[0].env is not None:
-                worker.env_place = jobs[0].cell.place
+                worker.env_place = jobs[0].case.place
             broken = [
                 one.failure
                 for one in reports

@@ -144,7 +144,7 @@ class Rollout:
         )
 
     def run(self, jobs: tuple[Job, ...]) -> list[Report]:
-        """Play the episodes of one cell, in parallel if there are several; return a report for
+        """Play the episodes of one case, in parallel if there are several; return a report for
         each.
         """
         self._thread = threading.get_ident()
@@ -169,23 +169,23 @@ class Rollout:
         self._drop_env()
 
     def _played(self, jobs: tuple[Job, ...], found: dict[str, Any]) -> list[Report]:
-        cell = jobs[0].cell
-        if self._agent is None or self._policy != cell.policy.name:
-            self._agent = self._connect(cell.policy)
+        case = jobs[0].case
+        if self._agent is None or self._policy != case.policy.name:
+            self._agent = self._connect(case.policy)
             found["policy"] = self._described or _metadata(self._agent)
-        if self._env is None or self._place != cell.place:
-            self._env = self._make_env(cell)
+        if self._env is None or self._place != case.place:
+            self._env = self._make_env(case)
             # The driver may have another numpy, which cannot read this one's pickles.
             found["env"] = EnvInfo(
                 plain_values(self._env.describe()),
                 self._env.contract.to_json(),
-                code_of(env_class(cell.env).__module__),
-                env_program(cell, loaded_code),
+                code_of(env_class(case.env).__module__),
+                env_program(case, loaded_code),
                 socket.gethostname(),
             )
         agent, env = self._agent, self._env
         if found:
-            require_match(agent.contract, env.contract, f"{cell.policy.name!r} in {cell.env!r}: ")
+            require_match(agent.contract, env.contract, f"{case.policy.name!r} in {case.env!r}: ")
             if (renderer := env.renderer()) is not None:
                 require_own(renderer)
             name, where = (
@@ -193,7 +193,7 @@ class Rollout:
                 (socket.gethostname(), this_node(), os.getpid()),
             )
             found["worker"] = WorkerInfo(
-                *where, cell.policy.name, episode.transport_of(agent), name
+                *where, case.policy.name, episode.transport_of(agent), name
             )
         with contextlib.ExitStack() as stack:
             made = (self._recorders(self._config, env.contract.control_hz) for _ in jobs)
@@ -204,14 +204,14 @@ class Rollout:
                 agent,
                 self._sessions_of(agent, env, len(jobs)),
                 [job.key for job in jobs],
-                execute=cell.policy.execute,
-                clock=cell.suite.clock,
-                reset_options=cell.suite.reset_options,
-                policy_options=cell.policy_options,
+                execute=case.policy.execute,
+                clock=case.suite.clock,
+                reset_options=case.suite.reset_options,
+                policy_options=case.policy_options,
                 observers=recordings,
                 watch=self._set_phase,
                 images=wanted == "all"
-                or (wanted == "failures" and self._renders_at_once(agent, env, cell.policy)),
+                or (wanted == "failures" and self._renders_at_once(agent, env, case.policy)),
             )
             reports = []
             for job, outcome, recording in zip(jobs, outcomes, recordings, strict=True):
@@ -232,7 +232,7 @@ class Rollout:
         self, env: BatchEnv, job: Job, result: EpisodeResult, recording: EpisodeRecorder
     ) -> Artifacts:
         """Return the artifacts of an episode; if images are missing, play it again."""
-        options = episode.options_of_reset(env, job.key.episode, job.cell.suite.reset_options)
+        options = episode.options_of_reset(env, job.key.episode, job.case.suite.reset_options)
         kept = recording.finish(
             result,
             lambda played, record: played.play_again(
@@ -293,21 +293,21 @@ class Rollout:
         self._policy = policy.name
         return agent
 
-    def _make_env(self, cell: EvalCase) -> BatchEnv:
+    def _make_env(self, case: EvalCase) -> BatchEnv:
         self._set_phase("make", 0)
         self._drop_env()  # first, so that a worker never holds two simulators
         try:
-            with env_side(f"{cell.env!r}: make"):
-                options, number = cell.suite.env_options, cell.suite.num_envs
+            with env_side(f"{case.env!r}: make"):
+                options, number = case.suite.env_options, case.suite.num_envs
                 if number == 1:  # even if the suite has a simulator for many
-                    env: BatchEnv = SequentialBatch([make_env(cell.env, **options)])
+                    env: BatchEnv = SequentialBatch([make_env(case.env, **options)])
                 else:
-                    env = make_batch(cell.env, number, **options)
+                    env = make_batch(case.env, number, **options)
         except EnvFailed as error:
-            if (reason := env_class(cell.env).missing()) is None:
+            if (reason := env_class(case.env).missing()) is None:
                 raise
-            raise MissingDependency(f"env {cell.env!r} cannot run here: {reason}") from error
-        self._place = cell.place
+            raise MissingDependency(f"env {case.env!r} cannot run here: {reason}") from error
+        self._place = case.place
         self._repeatable, self._surplus = True, 0
         return env
 

@@ -203,7 +203,7 @@ def _evaluation(words: list[str]) -> EvalConfig:
     start.
     """
     from vlagents_ray.cli.policies import resolve_policies
-    from vlagents_ray.evaluate.plan.cases import cells
+    from vlagents_ray.evaluate.plan.cases import plan_cases
 
     given = _parsed("eval", evaluate_command, words)
     _refuse(given, _FOUND_OUT, "address", "end_at")
@@ -213,5 +213,5 @@ def _evaluation(words: list[str]) -> EvalConfig:
         "watch",
     )
     config = config_from_options(EvalOptions(**given))
-    cells(resolve_policies(config, ask=False)[0])
+    plan_cases(resolve_policies(config, ask=False)[0])
     return config

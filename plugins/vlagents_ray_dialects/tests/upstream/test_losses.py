@@ -247,5 +247,5 @@ def test_an_upstream_that_is_killed_and_restarted_fails_no_episode(
         killer.join()
         replicas.close()
     assert len(servers) == 3
-    [cell] = results.cells
-    assert [(one.result.status, one.attempts) for one in cell.episodes] == [("done", 1)] * 20
+    [case] = results.cases
+    assert [(one.result.status, one.attempts) for one in case.episodes] == [("done", 1)] * 20

@@ -43,8 +43,8 @@ def played(summary: Summary) -> dict[str, Any]:
             one.result.policy_version,
             one.result.policy_fingerprint,
         )
-        for cell in summary.results.cells
-        for one in cell.episodes
+        for case in summary.results.cases
+        for one in case.episodes
     }
 
 

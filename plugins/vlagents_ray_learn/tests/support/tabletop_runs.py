@@ -46,7 +46,7 @@ def ended(run: subprocess.Popen[str], folder: Path) -> str:
 def table(out: Path) -> dict[str, tuple[str | None, list[tuple[int, float]]]]:
     """The weights, and seed and return of each episode, by contender."""
     results, found = Results.load(out), {}
-    for cell in results.cells:
-        episodes = sorted((one.result.key.seed, one.result.episode_return) for one in cell.episodes)
-        found[cell.contender] = pushed_of(cell), episodes
+    for case in results.cases:
+        episodes = sorted((one.result.key.seed, one.result.episode_return) for one in case.episodes)
+        found[case.contender] = pushed_of(case), episodes
     return {name: found[name] for name in results.contenders}

@@ -1,5 +1,5 @@
 "use strict";
-// The part of the live page about an evaluation or a training: cells that fill up, learning curves, failures.
+// The part of the live page about an evaluation or a training: cases that fill up, learning curves, failures.
 // live.js calls showEvaluation; everything here is in its document under "evaluation".
 
 const POLICIES = 12; // most columns of the table, the newest ones
@@ -42,7 +42,7 @@ function showEvaluation(said, now) {
   if (byId("evaluation-state").textContent !== state) byId("evaluation-state").textContent = state; // it is read aloud
   byId("evaluation-state").className = ["killed", "stopped"].includes(said.state) ? "bad" : "";
   byId("retries").textContent = said.retries ? `Attempts that infrastructure failed, and that were repeated: ${said.retries}` : "";
-  showCells(said);
+  showCases(said);
   showCurves(said.curves);
   showFailures(said);
 }
@@ -55,37 +55,37 @@ function timeLeft(said, now) {
   return `, about ${(minutes / 60).toFixed(1)} h left`;
 }
 
-// ---- cells
+// ---- cases
 
-function showCells(said) {
+function showCases(said) {
   const shown = said.contenders.slice(-POLICIES);
   const older = said.contenders.length - shown.length;
   byId("older").textContent = older ? `${older} earlier ones are in the learning curve alone.` : "";
-  byId("interval").textContent = said.cells.some((cell) => cell.sequence)
-    ? "Upper bar: success, with a confidence sequence where a cell may stop early, else Wilson's interval of 95\u00a0%. Lower bar: episodes done."
+  byId("interval").textContent = said.cases.some((result) => result.sequence)
+    ? "Upper bar: success, with a confidence sequence where a case may stop early, else Wilson's interval of 95\u00a0%. Lower bar: episodes done."
     : "Upper bar: success, with Wilson's interval of 95\u00a0%. Lower bar: episodes done.";
-  const cells = new Map(said.cells.map((cell) => [`${cell.task}\n${cell.policy}`, cell]));
-  byId("cell-policies").replaceChildren(element("th", { scope: "col" }, "Task"), ...shown.map((name) => element("th", { scope: "col" }, name)));
-  byId("cells").replaceChildren(...said.tasks.map((task) =>
-    element("tr", {}, element("th", { scope: "row" }, task), ...shown.map((policy) => cellOf(cells.get(`${task}\n${policy}`))))));
+  const results = new Map(said.cases.map((result) => [`${result.task}\n${result.policy}`, result]));
+  byId("case-policies").replaceChildren(element("th", { scope: "col" }, "Task"), ...shown.map((name) => element("th", { scope: "col" }, name)));
+  byId("cases").replaceChildren(...said.tasks.map((task) =>
+    element("tr", {}, element("th", { scope: "row" }, task), ...shown.map((policy) => cellOf(results.get(`${task}\n${policy}`))))));
 }
 
-function cellOf(cell) {
-  if (!cell) return element("td", { className: "cell" }, "–");
-  const known = cell.rate !== null;
-  const counts = `${cell.done} of ${cell.planned} episodes${cell.stopped ? ", certain enough" : ""}`;
-  return element("td", { className: "cell" }, element("b", {}, known ? percent(cell.rate) : "–"),
-    element("span", { className: "note" }, known ? ` ${interval(cell)}` : ""), intervalBar(known ? cell : null),
-    element("progress", { max: cell.planned || 1, value: cell.planned ? cell.done : 1, ariaLabel: counts }),
+function cellOf(result) {
+  if (!result) return element("td", { className: "case" }, "–");
+  const known = result.rate !== null;
+  const counts = `${result.done} of ${result.planned} episodes${result.stopped ? ", certain enough" : ""}`;
+  return element("td", { className: "case" }, element("b", {}, known ? percent(result.rate) : "–"),
+    element("span", { className: "note" }, known ? ` ${interval(result)}` : ""), intervalBar(known ? result : null),
+    element("progress", { max: result.planned || 1, value: result.planned ? result.done : 1, ariaLabel: counts }),
     element("span", { className: "note", ariaHidden: "true" }, counts));
 }
 
-function intervalBar(cell) {
+function intervalBar(result) {
   const svg = svgNode("svg", { viewBox: "0 0 100 10", preserveAspectRatio: "none", "aria-hidden": "true", class: "interval" });
   svg.append(svgNode("rect", { x: 0, y: 4, width: 100, height: 2, class: "axis" }));
-  if (cell) {
-    svg.append(svgNode("rect", { x: 100 * cell.low, y: 2, width: Math.max(0.5, 100 * (cell.high - cell.low)), height: 6, class: "range" }));
-    svg.append(svgNode("path", { d: `M${100 * cell.rate} 0V10`, class: "rate" }));
+  if (result) {
+    svg.append(svgNode("rect", { x: 100 * result.low, y: 2, width: Math.max(0.5, 100 * (result.high - result.low)), height: 6, class: "range" }));
+    svg.append(svgNode("path", { d: `M${100 * result.rate} 0V10`, class: "rate" }));
   }
   return svg;
 }
