@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from vlagents_ray.naming import distinct, plain, without_doubles
+from vlagents_ray.naming import distinct, plain, without_duplicate_keys
 
 
 def test_a_name_is_numbered_only_where_it_would_be_anothers() -> None:
@@ -31,6 +31,6 @@ def test_no_two_names_become_the_same_in_whatever_order_they_come(names: list[st
 def test_the_second_of_a_key_is_found_among_many() -> None:
     # In quadratic time, it would take an hour.
     pairs = [(str(number), number) for number in range(200_000)]
-    assert len(without_doubles(pairs)) == 200_000
+    assert len(without_duplicate_keys(pairs)) == 200_000
     with pytest.raises(ValueError, match="the key '199999' stands twice"):
-        without_doubles([*pairs, pairs[-1]])
+        without_duplicate_keys([*pairs, pairs[-1]])

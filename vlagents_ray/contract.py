@@ -1,10 +1,9 @@
 """The contracts of policies and of robots or environments, and their comparison.
 
-Both sides state a `Contract`: the inputs and the actions that a policy needs and returns, and those
+Both sides have a `Contract`: the inputs and the actions that a policy needs and returns, and those
 that a robot or an env provides and accepts. `require_match` compares them before the first step and
-lists every difference with its cure. `None` means "not stated", and a field that is not stated is
-not compared. Images are always upright RGB; the env of a simulator that renders upside down rotates
-them.
+lists every difference with its cure. A field that is None is not compared. Images are always
+upright RGB; the env of a simulator that renders upside down rotates them.
 """
 
 from __future__ import annotations
@@ -14,20 +13,22 @@ import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields
 from itertools import combinations
-from typing import Any, Literal, TypeGuard, get_args
+from typing import Any, Literal, TypeGuard, TypeVar, get_args
 
 import numpy as np
 
 from vlagents_ray.errors import ConfigError, ContractMismatch, MalformedMessage
-from vlagents_ray.naming import says_its_fields
+from vlagents_ray.naming import explain_unknown_fields
 
-_MOST_PARTS = 12  # of the env's state, whose combinations are tried
-_SHOWN = 3  # combinations in a message
+# The combinations of the env's state parts are tried for a message if it has no more parts than
+# this.
+_MAX_STATE_PARTS = 12
+_SHOWN_COMBINATIONS = 3  # the number of combinations that a message lists
 
 Rotation = Literal["none", "axis_angle", "euler_xyz", "quat_xyzw", "quat_wxyz", "rot6d"]
 
 
-@says_its_fields()
+@explain_unknown_fields()
 @dataclass(frozen=True, slots=True)
 class CameraSpec:
     """The size of a camera's upright RGB images in pixels; None accepts any."""
@@ -36,7 +37,7 @@ class CameraSpec:
     width: int | None = None
 
 
-@says_its_fields()
+@explain_unknown_fields()
 @dataclass(frozen=True, slots=True)
 class StateSpec:
     """The size and unit of one part of the proprioception, (dim,) float32."""
@@ -45,7 +46,7 @@ class StateSpec:
     unit: str | None = None  # e.g. "rad", "m", "m+quat_wxyz"
 
 
-@says_its_fields("; the rows of a chunk are Contract(chunk=…)")
+@explain_unknown_fields("; the rows of a chunk are Contract(chunk=…)")
 @dataclass(frozen=True, slots=True)
 class ActionSpec:
     """The meaning of the numbers in an action, (dim,) float32, or in each row of a chunk of
@@ -61,9 +62,10 @@ class ActionSpec:
     gripper_closed: float | None = None  # the value that closes it
     low: float | None = None  # lower bound of every number
     high: float | None = None  # upper bound of every number
-    # Names of several arms in the row's order: the command of each, then its gripper.
+    # Names of several arms, in the order of their commands in a row; each command is followed by
+    # that of the arm's gripper.
     arms: tuple[str, ...] | None = None
-    # Of the joints in the row's order, with or without grippers.
+    # Names of the joints in the order of a row, with or without the grippers.
     names: tuple[str, ...] | None = None
 
     @property
@@ -94,8 +96,7 @@ class ActionSpec:
         if dim % arms:
             raise ConfigError(
                 f"action.arms: expected a number of values that {arms} arms {self.arms} share "
-                f"equally, got {dim}; "
-                "correct `arms` or `dim` of the contract"
+                f"equally, got {dim}; correct `arms` or `dim` of the contract"
             )
         width = dim // arms
         return [(arm + 1) * width - 1 for arm in range(arms)]
@@ -116,7 +117,7 @@ class ActionSpec:
         return [column for column in range(dim) if column not in grippers]
 
 
-@says_its_fields()
+@explain_unknown_fields()
 @dataclass(frozen=True, slots=True)
 class Contract:
     """The inputs and actions of a policy, or of a robot or env, to be compared with the other
@@ -141,12 +142,13 @@ class Contract:
         """Return the contract as plain JSON values, which processes with another version of
         numpy can read.
         """
-        stated = asdict(self)
+        values = asdict(self)
         if self.behaviour is None:
-            del stated["behaviour"]  # only policies for learners state it
+            del values["behaviour"]  # only the contracts of policies for learners have it
         if self.action.names is None:
-            del stated["action"]["names"]
-        plain: dict[str, Any] = json.loads(json.dumps(stated, default=np.generic.item))
+            del values["action"]["names"]
+
+        plain: dict[str, Any] = json.loads(json.dumps(values, default=np.generic.item))
         return plain
 
     @classmethod
@@ -159,28 +161,37 @@ class Contract:
         Raises:
             MalformedMessage: The document has an unknown key or a value of a wrong type.
         """
-        top = closed(cls, data, "contract")
-        for name, spec in (("cameras", CameraSpec), ("state", StateSpec)):
-            if top.get(name) is not None:
-                if not isinstance(top[name], dict):
-                    raise MalformedMessage(
-                        f"contract.{name}: got {type(top[name]).__name__}, want an object"
-                    )
-                top[name] = {
-                    str(k): spec(**closed(spec, v, f"contract.{name}.{k}"))
-                    for k, v in top[name].items()
-                }
-        if "action" in top:
-            action = closed(ActionSpec, top["action"], "contract.action")
-            lists = {
-                name: _names(action.get(name), f"contract.action.{name}")
-                for name in ("arms", "names")
-            }
-            top["action"] = ActionSpec(**{**action, **lists})
-        return cls(**{**top, "behaviour": _names(top.get("behaviour"), "contract.behaviour")})
+        values = closed(cls, data, "contract")
+        values["cameras"] = _specs(CameraSpec, values.get("cameras"), "contract.cameras")
+        values["state"] = _specs(StateSpec, values.get("state"), "contract.state")
+        values["behaviour"] = _names(values.get("behaviour"), "contract.behaviour")
+
+        if "action" in values:
+            action = closed(ActionSpec, values["action"], "contract.action")
+            action["arms"] = _names(action.get("arms"), "contract.action.arms")
+            action["names"] = _names(action.get("names"), "contract.action.names")
+            values["action"] = ActionSpec(**action)
+        return cls(**values)
+
+
+_Spec = TypeVar("_Spec", CameraSpec, StateSpec)
+
+
+def _specs(spec: type[_Spec], data: object, where: str) -> dict[str, _Spec] | None:
+    """Read the specifications of cameras or state parts by name; None stays None."""
+    if data is None:
+        return None
+    if not isinstance(data, dict):
+        raise MalformedMessage(f"{where}: got {type(data).__name__}, want an object")
+
+    specs = {}
+    for name, values in data.items():
+        specs[str(name)] = spec(**closed(spec, values, f"{where}.{name}"))
+    return specs
 
 
 def _names(value: object, where: str) -> tuple[str, ...] | None:
+    """Read a list of names; None stays None."""
     if isinstance(value, (list, tuple)) and all(isinstance(name, str) for name in value):
         return tuple(value)
     if value is not None:
@@ -192,74 +203,82 @@ def differences(policy: Contract, env: Contract) -> list[str]:
     """List the differences between the contracts of a policy and an env, one sentence each with
     its cure.
     """
-    found, given = [], env.cameras or {}
-    for name, need in ((policy.cameras or {}) if env.cameras is not None else {}).items():
-        if (have := given.get(name)) is None:
-            found.append(
-                f"camera {name!r}: the policy needs it, the env gives {sorted(given)}; "
-                f"add or rename a camera of the env"
-            )
-        elif _differ(need.height, have.height) or _differ(need.width, have.width):
-            found.append(
-                f"camera {name!r}: the policy needs {need.height}x{need.width} pixels (height x "
-                "width), "
-                f"the env gives {have.height}x{have.width}; set the env's camera size"
-            )
-    found += _state_differences(policy, env)
+    sentences = [*_camera_differences(policy, env), *_state_differences(policy, env)]
+
     if policy.gripper and env.gripper is False:
-        found.append(
+        sentences.append(
             "gripper: the policy needs Obs.gripper, which the env does not provide; fill it, 1 = "
             "open"
         )
     if policy.instruction and env.instruction is False:
-        found.append(
+        sentences.append(
             "instruction: the policy needs one, the env has none; set it in the env's options"
         )
-    found += _action_differences(policy.action, env.action)
+
+    sentences += _action_differences(policy.action, env.action)
     if _differ(policy.control_hz, env.control_hz):
-        found.append(
+        sentences.append(
             f"control_hz: the policy was made for {policy.control_hz} Hz, the env runs at "
-            f"{env.control_hz} Hz; "
-            f"set the env's control rate"
+            f"{env.control_hz} Hz; set the env's control rate"
         )
     if _differ(policy.chunk, env.chunk):
-        found.append(
+        sentences.append(
             f"chunk: the policy returns {policy.chunk} rows, the env takes {env.chunk}; set the "
             "policy's chunk length"
         )
-    return found
+    return sentences
 
 
-def _differ(a: object, b: object) -> bool:
-    """Return whether both values are stated and differ."""
-    return a is not None and b is not None and a != b
+def _differ(policy_value: object, env_value: object) -> bool:
+    """Return whether neither value is None, and they differ."""
+    return policy_value is not None and env_value is not None and policy_value != env_value
+
+
+def _camera_differences(policy: Contract, env: Contract) -> Iterator[str]:
+    if env.cameras is None:
+        return
+
+    for name, needed in (policy.cameras or {}).items():
+        provided = env.cameras.get(name)
+        if provided is None:
+            yield (
+                f"camera {name!r}: the policy needs it, the env gives {sorted(env.cameras)}; "
+                "add or rename a camera of the env"
+            )
+        elif _differ(needed.height, provided.height) or _differ(needed.width, provided.width):
+            yield (
+                f"camera {name!r}: the policy needs {needed.height}x{needed.width} pixels (height "
+                f"x width), the env gives {provided.height}x{provided.width}; set the env's camera "
+                "size"
+            )
 
 
 def _state_differences(policy: Contract, env: Contract) -> Iterator[str]:
     if env.state is None:
         return
-    # The part may be several of the env's, concatenated.
-    alone = len(policy.state or {}) == 1 and not policy.gripper
-    for name, need in (policy.state or {}).items():
-        have = env.state.get(name)
-        cure = _parts_cure(need.dim, env) if alone else ""
-        if have is None:
+
+    # If the policy needs a single part, that may be several of the env's, concatenated.
+    has_single_part = len(policy.state or {}) == 1 and not policy.gripper
+    for name, needed in (policy.state or {}).items():
+        provided = env.state.get(name)
+        cure = _parts_cure(needed.dim, env) if has_single_part else ""
+        if provided is None:
             yield (
                 f"state {name!r}: the policy needs it, the env gives {sorted(env.state)}; "
                 f"{cure or 'add or rename a state of the env'}"
             )
             continue
-        if _differ(need.dim, have.dim):
+
+        if _differ(needed.dim, provided.dim):
             cure = cure or "is this another task's or robot's policy?"
             yield (
-                f"state {name!r}: the policy needs {need.dim} numbers, the env gives "
-                f"{have.dim}; "
-                f"{cure}"
+                f"state {name!r}: the policy needs {needed.dim} numbers, the env gives "
+                f"{provided.dim}; {cure}"
             )
-        if _differ(need.unit, have.unit):
+        if _differ(needed.unit, provided.unit):
             yield (
-                f"state {name!r}: the policy needs {need.unit!r}, the env gives {have.unit!r}; "
-                "convert it"
+                f"state {name!r}: the policy needs {needed.unit!r}, the env gives "
+                f"{provided.unit!r}; convert it"
             )
 
 
@@ -267,39 +286,44 @@ def _parts_cure(dim: int | None, env: Contract) -> str:
     """Name parts of the env's state whose sizes add up to `dim`, as a cure; "" if there are
     none.
     """
-    widths = {name: spec.dim for name, spec in sorted((env.state or {}).items()) if spec.dim}
+    dims = {name: spec.dim for name, spec in sorted((env.state or {}).items()) if spec.dim}
     if env.gripper:
-        widths["gripper"] = 1
-    if dim is None or len(widths) > _MOST_PARTS:
+        dims["gripper"] = 1
+    if dim is None or len(dims) > _MAX_STATE_PARTS:
         return ""
-    found = [
-        parts
-        for size in range(len(widths), 0, -1)
-        for parts in combinations(widths, size)
-        if sum(widths[part] for part in parts) == dim
-    ]
-    if not found:
+
+    matches: list[tuple[str, ...]] = []
+    for size in range(len(dims), 0, -1):
+        for names in combinations(dims, size):
+            if sum(dims[name] for name in names) == dim:
+                matches.append(names)
+    if not matches:
         return ""
-    shown = " or ".join(f"[{', '.join(parts)}]" for parts in found[:_SHOWN])
+
+    listed = " or ".join(f"[{', '.join(names)}]" for names in matches[:_SHOWN_COMBINATIONS])
+    if len(matches) > _SHOWN_COMBINATIONS:
+        listed += " or others"
+    verb = "has" if len(matches) == 1 else "have"
     return (
         "if it was trained on several parts, set the policy's `state` to them in their order: "
-        f"{shown}"
-        f"{' or others' if len(found) > _SHOWN else ''} {'has' if len(found) == 1 else 'have'} "
-        f"{dim} numbers here"
+        f"{listed} {verb} {dim} numbers here"
     )
 
 
 def _action_differences(policy: ActionSpec, env: ActionSpec) -> Iterator[str]:
     for name, cure in _ACTION_CURES.items():
-        gives, takes = getattr(policy, name), getattr(env, name)
-        if _differ(gives, takes):
-            yield f"action.{name}: the policy gives {gives!r}, the env takes {takes!r}; {cure}"
+        returned, accepted = getattr(policy, name), getattr(env, name)
+        if _differ(returned, accepted):
+            yield (
+                f"action.{name}: the policy gives {returned!r}, the env takes {accepted!r}; {cure}"
+            )
+
     for number, ours, theirs in reordered(policy.names or (), env.names or ()):
         yield (
-            f"action.names: number {number} is {ours!r} of the policy and {theirs!r} of the "
-            "env; "
+            f"action.names: number {number} is {ours!r} of the policy and {theirs!r} of the env; "
             "use one order"
         )
+
     if policy.low is not None and env.low is not None and policy.low < env.low:
         yield (
             f"action.low: the policy goes down to {policy.low}, the env takes {env.low}; scale "
@@ -313,16 +337,27 @@ def _action_differences(policy: ActionSpec, env: ActionSpec) -> Iterator[str]:
 
 
 def reordered(ours: Sequence[str], theirs: Sequence[str]) -> list[tuple[int, str, str]]:
-    """Return where two lists have the joints that both name in another order: (number, ours,
-    theirs).
+    """Return where two lists have their common joints in different orders.
 
-    LeRobot's suffix ".pos" does not count.
+    LeRobot's suffix ".pos" of a name is ignored.
+
+    Args:
+        ours: The names of the joints in one order.
+        theirs: The names of the joints in the other order.
+
+    Returns:
+        For each difference the index in `ours`, the name there, and the name in `theirs`.
     """
-    mine, others = ([name.removesuffix(".pos") for name in names] for names in (ours, theirs))
-    pairs = zip(
-        (one for one in mine if one in others), (one for one in others if one in mine), strict=False
-    )
-    return [(mine.index(one), one, other) for one, other in pairs if one != other]
+    our_names = [name.removesuffix(".pos") for name in ours]
+    their_names = [name.removesuffix(".pos") for name in theirs]
+    our_common = [name for name in our_names if name in their_names]
+    their_common = [name for name in their_names if name in our_names]
+
+    differences = []
+    for our_name, their_name in zip(our_common, their_common, strict=False):
+        if our_name != their_name:
+            differences.append((our_names.index(our_name), our_name, their_name))
+    return differences
 
 
 _ACTION_CURES = {
@@ -341,10 +376,12 @@ def require_match(policy: Contract | None, env: Contract | None, where: str = ""
     """Raise `ContractMismatch` with every difference of a policy and an env; `where` names both
     in an evaluation.
     """
-    if policy is not None and env is not None and (found := differences(policy, env)):
-        raise ContractMismatch(
-            f"{where}policy and env do not fit:\n" + "\n".join(f"- {line}" for line in found)
-        )
+    if policy is None or env is None:
+        return
+    sentences = differences(policy, env)
+    if sentences:
+        listed = "\n".join(f"- {sentence}" for sentence in sentences)
+        raise ContractMismatch(f"{where}policy and env do not fit:\n{listed}")
 
 
 def closed(
@@ -353,19 +390,32 @@ def closed(
     where: str,
     error: type[MalformedMessage | ConfigError] = MalformedMessage,
 ) -> dict[str, Any]:
-    """Return the entries of `data`; raise `error` unless it is a mapping with only fields of the
-    dataclass `cls`.
+    """Return the entries of `data`, which may only have fields of a dataclass.
 
     Fields that are numbers, texts or booleans are checked; the caller reads all others.
+
+    Args:
+        cls: The dataclass.
+        data: The decoded JSON or YAML document.
+        where: The path of `data` in the whole document, for messages.
+        error: The class of the error.
+
+    Raises:
+        MalformedMessage: `data` is not a mapping, has another key, or has a value of a wrong type;
+            it is of the class `error`.
     """
     if not isinstance(data, Mapping):
         raise error(f"{where}: got {type(data).__name__}, want an object")
-    known = {one.name: str(one.type) for one in fields(cls)}
-    if unknown := sorted(str(key) for key in data if key not in known):
-        raise error(f"{where}: unknown keys {unknown}, want some of {sorted(known)}")
+
+    type_names = {field.name: str(field.type) for field in fields(cls)}
+    unknown = sorted(str(key) for key in data if key not in type_names)
+    if unknown:
+        raise error(f"{where}: unknown keys {unknown}, want some of {sorted(type_names)}")
+
     for name, value in data.items():
-        if not _FITS.get(known[name], lambda _: True)(value):
-            raise error(f"{where}.{name}: got {repr(value)[:80]}, want {known[name]}")
+        is_of_type = _TYPE_CHECKS.get(type_names[name])
+        if is_of_type is not None and not is_of_type(value):
+            raise error(f"{where}.{name}: got {repr(value)[:80]}, want {type_names[name]}")
     return dict(data)
 
 
@@ -373,7 +423,8 @@ def _number(value: object) -> TypeGuard[float]:
     return type(value) in (int, float)
 
 
-_FITS: dict[str, Callable[[Any], bool]] = {  # by the type of a field
+# The check of a value, by the name of its field's type.
+_TYPE_CHECKS: dict[str, Callable[[Any], bool]] = {
     "str": lambda value: isinstance(value, str),
     "str | None": lambda value: value is None or isinstance(value, str),
     "int": lambda value: type(value) is int,

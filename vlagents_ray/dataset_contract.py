@@ -110,11 +110,10 @@ class DatasetContract:
                 raise ValueError(f"its state has no angles at {odd}")
         except (MalformedMessage, AttributeError, KeyError, TypeError, ValueError) as error:
             raise ConfigError(
-                f"the contract of the dataset in the checkpoint cannot be read "
+                "the contract of the dataset in the checkpoint cannot be read "
                 f"({type(error).__name__}: {error}); was the dataset written by a newer "
-                "vlagents-ray, or merged of "
-                "datasets with different contracts? Update this one, or export the results of "
-                "`vlagents-ray merge`"
+                "vlagents-ray, or merged of datasets with different contracts? Update this one, or "
+                "export the results of `vlagents-ray merge`"
             ) from error
         return found
 
@@ -175,8 +174,7 @@ def state_parts(
     ):
         raise ConfigError(
             f"observation.state: got {width} numbers, want them divided into {parts} of the "
-            "policy, of which the sizes "
-            f"are {dims}; name the parts in their order: {option}"
+            f"policy, of which the sizes are {dims}; name the parts in their order: {option}"
         )
     return [(part, dim or 0) for part, dim in dims.items()]
 

@@ -27,47 +27,50 @@ from collections.abc import Iterable
 from itertools import islice
 from typing import ClassVar, Literal
 
-_SHOWN_ITEMS = 8  # of a list or dict in an error
+_SHOWN_ITEMS = 8  # the maximum number of items of a list or dict that an error shows
+_SHOWN_LEVELS = 3  # the maximum depth of lists and dicts that an error shows
 
 
-def shown(value: object, most: int = 80) -> str:
-    """Return a short text, at most `most` characters, of a value from the network, for an error.
+def shown(value: object, max_characters: int = 80) -> str:
+    """Return a text of at most `max_characters` of a value from the network, for an error.
 
     Its time and memory do not depend on the size of the value, whereas `repr` or `str` would write
     all of it first.
     """
-    text = _shown(value, most, 3)
-    return text if len(text) <= most else f"{text[: most - 1]}…"
+    text = _shown(value, max_characters, _SHOWN_LEVELS)
+    return text if len(text) <= max_characters else f"{text[: max_characters - 1]}…"
 
 
-def _shown(value: object, most: int, levels: int) -> str:
+def _shown(value: object, max_characters: int, levels: int) -> str:
     if isinstance(value, str | bytes | bytearray):
-        return repr(value[:most]) + ("…" if len(value) > most else "")
-    if (
-        value is None
-        or isinstance(value, bool | float)
-        or (isinstance(value, int) and value.bit_length() <= 128)
-    ):
+        return repr(value[:max_characters]) + ("…" if len(value) > max_characters else "")
+
+    is_short_number = isinstance(value, bool | float) or (
+        isinstance(value, int) and value.bit_length() <= 128
+    )
+    if value is None or is_short_number:
         return repr(value)
+
     if not isinstance(value, dict | list | tuple | set | frozenset):
         shape = getattr(value, "shape", None)
-        return f"{type(value).__name__}{'' if shape is None else f' of shape {shape}'}"
-    parts = []
+        return type(value).__name__ + ("" if shape is None else f" of shape {shape}")
+
+    items = []
     for item in islice(value, _SHOWN_ITEMS if levels else 0):
-        key = f"{_shown(item, most, 0)}: " if isinstance(value, dict) else ""
-        parts.append(
-            key + _shown(value[item] if isinstance(value, dict) else item, most, levels - 1)
-        )
-    if len(value) > len(parts):
-        parts.append("…")
-    left, right = (
-        ("[", "]")
-        if isinstance(value, list)
-        else ("(", ")")
-        if isinstance(value, tuple)
-        else ("{", "}")
-    )
-    return f"{left}{', '.join(parts)}{right}"
+        if isinstance(value, dict):
+            key = _shown(item, max_characters, 0)
+            items.append(f"{key}: {_shown(value[item], max_characters, levels - 1)}")
+        else:
+            items.append(_shown(item, max_characters, levels - 1))
+    if len(value) > len(items):
+        items.append("…")
+
+    text = ", ".join(items)
+    if isinstance(value, list):
+        return f"[{text}]"
+    if isinstance(value, tuple):
+        return f"({text})"
+    return f"{{{text}}}"
 
 
 def printable(text: str) -> str:
@@ -79,14 +82,14 @@ def printable(text: str) -> str:
     """
     if text.isprintable():
         return text
-    lines = text.splitlines()
-    shown_lines = ["".join(_printable_character(character) for character in line) for line in lines]
-    indented = [line if line.startswith((" ", "\t")) else f"  {line}" for line in shown_lines[1:]]
-    return "\n".join([*shown_lines[:1], *indented])
+    first_line, *further_lines = map(_printable_line, text.splitlines())
+    indented = [line if line.startswith((" ", "\t")) else f"  {line}" for line in further_lines]
+    return "\n".join([first_line, *indented])
 
 
-def _printable_character(character: str) -> str:
-    return character if character.isprintable() or character == "\t" else "�"
+def _printable_line(line: str) -> str:
+    characters = (char if char.isprintable() or char == "\t" else "�" for char in line)
+    return "".join(characters)
 
 
 class VLAgentsError(Exception):

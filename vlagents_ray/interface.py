@@ -40,42 +40,45 @@ GOAL_IMAGE = "goal_image"  # (H, W, 3) uint8 RGB, for goal-conditioned policies
 DEPTH = "depth"  # {camera: (H, W) float32, metres; or uint16, millimetres}
 # In an observation: the number of samples of its action distribution to return, N.
 SAMPLES = "samples"
-# In the Act: {"mean", "std": shaped as the action; "samples": (N, *action)} float32, and for each
-# name of WANT the act's value for every sample, with N as the first dimension.
+# In the Act: {"mean", "std": shaped as the action; "samples": (N, *action)} float32. For each name
+# of WANT, it also has the value for every sample, with N as the first dimension.
 DISTRIBUTION = "distribution"
-# In an observation: names of values in `Contract.behaviour` that the Act returns beside the action.
+# In an observation: names of `Contract.behaviour` whose values the Act returns with the action.
 WANT = "want"
 # In the Act: {name: number, or one for each row or token}, e.g. the action's "logprob", nats.
 BEHAVIOUR = "behaviour"
-# In an observation: the time at which its first sensor was read, s since 1970 (`time.time`)
+# In an observation: the time at which its first sensor was read, s since 1970 (`time.time`).
 CAPTURED = "captured_at"
 # In an observation: the time after which `RemoteAgent` abandons the request, ms.
 DEADLINE = "deadline_ms"
-# Real-time chunking (Black, Galliker & Levine 2025, https://arxiv.org/abs/2506.07339), in an
-# observation: when the answer arrives, DELAY rows of LEFTOVER have been executed; the new chunk
-# begins with them, and continues the rest.
-LEFTOVER = "leftover_actions"  # (H', D) float32: the current plan from this observation's tick on
-# int: expected ticks until the answer arrives, at most the rows of LEFTOVER; 0: also unknown.
+# The next two are in an observation for real-time chunking (Black, Galliker & Levine 2025,
+# https://arxiv.org/abs/2506.07339). When the answer arrives, DELAY rows of LEFTOVER have been
+# executed; the new chunk begins with them, and continues the other rows of LEFTOVER.
+LEFTOVER = "leftover_actions"  # (H', D) float32: the current plan, from this observation's tick on
+# int: the expected number of ticks until the answer arrives, at most the rows of LEFTOVER. It is 0
+# if the number is unknown.
 DELAY = "delay_ticks"
-# In the Act of a policy that was trained to be given rows: how many of LEFTOVER its chunk begins
-# with. If more have been executed when it arrives, it continues from a pose that the robot has
-# left, and is dropped.
-GIVEN = "given_rows"  # int
-# In an observation, (N, D): actions not of the policy, executed since the last request.
+# In the Act of a policy that was trained to continue given rows, an int: the number of rows of
+# LEFTOVER with which its chunk begins. If more rows have been executed when the chunk arrives, it
+# continues from a pose that the robot has left, and is dropped.
+GIVEN = "given_rows"
+# In an observation, (N, D): the actions executed since the last request that the policy did not
+# choose.
 EXECUTED = "executed_actions"
 # In the Act of a served policy: its weights, {"version": int, "fingerprint": str}. Version 0 is the
 # loaded checkpoint.
 POLICY = "policy"
-# In the Act of a chunk player:
+# The next keys are in the Act of a chunk player.
 SAFE = "safe"  # str: the reason why this is the safe action; absent if the action is the policy's
 CAUSE = "safe_cause"  # str: the kind of that reason, see `vlagents_ray.chunking.fallback.Cause`
 INTERVENTION = "intervention"  # True for an operator's action, else absent
 WANTED = "policy_action"  # (D,) float32: the policy's action at an operator's; absent if unknown
 AGE = "age_ticks"  # int: ticks since the observation from which the action was computed
 PLANNED = "planned"  # (H, D) float32: the chunk of the action
-CHUNK, ROW = "chunk", "row"  # int: its number in the episode, and the row of the action
-AGE_MS = "age_ms"  # float: the same in ms, from its capture until the player returned the action
-# float: seconds since the oldest unanswered request, retries included; 0.0 if there is none.
+CHUNK, ROW = "chunk", "row"  # int: the chunk's number in the episode, and the row of the action
+# float: the age of the observation in ms, from its capture until the player returned the action.
+AGE_MS = "age_ms"
+# float: seconds since the oldest unanswered request was sent first; 0.0 if there is none.
 SILENT = "silent_s"
 OF_THE_LOOP = (SAFE, CAUSE, INTERVENTION, WANTED, AGE, PLANNED, CHUNK, ROW, AGE_MS, SILENT)
 """The names of `Act.info` that only a chunk player on the robot writes, and that a control loop
@@ -96,7 +99,7 @@ class Obs:
     cameras: dict[str, np.ndarray] = field(default_factory=dict)  # (H, W, 3) uint8 RGB, upright
     gripper: float | None = None  # in [0, 1], 1 = open
     state: dict[str, np.ndarray] = field(default_factory=dict)  # (D,) float32
-    # None, bool, int, float, str, bytes, array, list, dict.
+    # The values are None, bool, int, float, str, bytes, arrays, or lists and dicts of these.
     info: dict[str, Any] = field(default_factory=dict)
     # The server's result of `Agent.prepare`, or None.
     prepared: Any = field(default=None, repr=False, compare=False)
@@ -109,7 +112,7 @@ class Act:
     # (D,), or (H, D) for a chunk, float32, in the units of the contract's action.
     action: np.ndarray
     done: bool = False  # the policy considers its task finished
-    # As in `Obs.info`; `timing`: see `RemoteAgent.act`.
+    # The values have the types of `Obs.info`; `RemoteAgent.act` describes `timing`.
     info: dict[str, Any] = field(default_factory=dict)
 
     def rows(self) -> np.ndarray:
@@ -186,20 +189,20 @@ class Agent:
         try:
             return cls(cls.Config(**config))  # type: ignore[call-arg]
         except (TypeError, ValueError) as error:
-            message = (
-                wrong_settings(error, cls.Config, "--set")
-                if isinstance(error, ValueError)
-                else error
-            )
+            if isinstance(error, ValueError):
+                message = wrong_settings(error, cls.Config, "--set")
+            else:
+                message = str(error)
             raise ConfigError(f"policy {cls.__name__}: {message}") from error
 
     def shared_objects(self) -> list[Any]:
         """Return the objects that `shared` names; an agent that wraps another one adds that
         agent's objects.
         """
-        trainable = () if self.trainable is None else (self.trainable.partition(".")[0],)
-        names = dict.fromkeys((*self.shared, *trainable))
-        return [getattr(self, name, None) for name in names]
+        names = list(self.shared)
+        if self.trainable is not None:
+            names.append(self.trainable.partition(".")[0])
+        return [getattr(self, name, None) for name in dict.fromkeys(names)]
 
     def parameters(self) -> dict[str, Any]:
         """Return references to the values that a learner trains, by name.
@@ -212,7 +215,7 @@ class Agent:
         """
         return named_values(self._trainable())
 
-    def load_parameters(self, named: Mapping[str, Any]) -> None:
+    def load_parameters(self, values: Mapping[str, Any]) -> None:
         """Act with these values from now on; a server calls this between two batches.
 
         The default replaces the values in `trainable` by reference, and copies those on a GPU to
@@ -220,20 +223,19 @@ class Agent:
         values from its parameters overrides this, computes them again, and calls the default.
 
         Args:
-            named: A value for each name of `parameters`, of the same shape, type and device. They
+            values: A value for each name of `parameters`, of the same shape, type and device. They
                 have been checked, and do not change later; the agent must not change them either.
 
         Raises:
             NotTrainable: The agent has none, i.e. `trainable` is None.
         """
-        set_values(self._trainable(), named)
+        set_values(self._trainable(), values)
 
     def _trainable(self) -> Any:
         if self.trainable is None:
             raise NotTrainable(
                 f"{type(self).__name__}: names no parameters to train; set `trainable` to the name "
-                "of the attribute "
-                f"with its torch module or its dicts of arrays"
+                "of the attribute with its torch module or its dicts of arrays"
             )
         try:
             return attrgetter(self.trainable)(self)
@@ -350,9 +352,9 @@ class Agent:
             fails the whole batch.
         """
         acts: list[Act | Exception] = []
-        for session, one in zip(sessions, obs, strict=True):
+        for session, session_obs in zip(sessions, obs, strict=True):
             try:
-                acts.append(session.act(one))
+                acts.append(session.act(session_obs))
             except Exception as error:  # noqa: BLE001 - returned to the session whose request failed
                 acts.append(error)
         return acts
@@ -401,7 +403,7 @@ def copied(obs: Obs) -> Obs:
     return Obs(
         {name: np.array(image) for name, image in obs.cameras.items()},
         obs.gripper,
-        {name: np.array(part) for name, part in obs.state.items()},
+        {name: np.array(values) for name, values in obs.state.items()},
         _copied(obs.info),
     )
 
@@ -411,5 +413,7 @@ def _copied(value: Any) -> Any:
     if isinstance(value, np.ndarray):
         return np.array(value)
     if isinstance(value, dict):
-        return {key: _copied(one) for key, one in value.items()}
-    return [_copied(one) for one in value] if isinstance(value, list) else value
+        return {key: _copied(item) for key, item in value.items()}
+    if isinstance(value, list):
+        return [_copied(item) for item in value]
+    return value

@@ -26,57 +26,66 @@ def distinct(names: Iterable[str], simplify: Callable[[str], str] = plain) -> di
     "left/wrist" becomes "left_wrist"; beside a "left_wrist", which keeps its name, it becomes
     "left_wrist_2".
     """
-    wanted = sorted(set(names), key=lambda name: (simplify(name) != name, name))
-    found: dict[str, str] = {}
-    for name in wanted:
-        own, number = simplify(name), 1
-        while own in found.values():
+    # Names that simplification does not change come first, and so keep their names.
+    in_order = sorted(set(names), key=lambda name: (simplify(name) != name, name))
+
+    simplified: dict[str, str] = {}
+    for name in in_order:
+        candidate, number = simplify(name), 1
+        while candidate in simplified.values():
             number += 1
-            own = f"{simplify(name)}_{number}"
-        found[name] = own
-    return found
+            candidate = f"{simplify(name)}_{number}"
+        simplified[name] = candidate
+    return simplified
 
 
-def did_you_mean(got: str, known: Iterable[str]) -> str:
+def did_you_mean(name: str, known: Iterable[str]) -> str:
     """Suggest a known name as the end of a message, "; did you mean 'scripted'?"; "" if none is
-    similar to `got`.
+    similar to `name`.
     """
-    by_lower = {name.lower(): name for name in known}
-    close = difflib.get_close_matches(got.lower(), by_lower, n=1)
+    by_lower = {known_name.lower(): known_name for known_name in known}
+    close = difflib.get_close_matches(name.lower(), by_lower, n=1)
     return f"; did you mean {by_lower[close[0]]!r}?" if close else ""
 
 
-def without_doubles(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+def without_duplicate_keys(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     """Return a JSON object; raise `ValueError` if a key occurs twice, since either value could
     be meant.
     """
-    found = dict(pairs)
-    if len(found) < len(pairs):
-        # In linear time, as the keys are a stranger's.
-        [(twice, _)] = Counter(key for key, _ in pairs).most_common(1)
-        raise ValueError(f"the key {twice[:80]!r} stands twice in one object")
-    return found
+    values = dict(pairs)
+    if len(values) < len(pairs):
+        # The search takes linear time, since a stranger may have chosen the keys.
+        [(repeated_key, _)] = Counter(key for key, _ in pairs).most_common(1)
+        raise ValueError(f"the key {repeated_key[:80]!r} stands twice in one object")
+    return values
 
 
-def says_its_fields(hint: str = "") -> Callable[[type[T]], type[T]]:
-    """Decorate a dataclass to list its fields in the error for an unknown one; `hint` says where
-    other settings are.
+def explain_unknown_fields(hint: str = "") -> Callable[[type[T]], type[T]]:
+    """Return a decorator of dataclasses: the error for an unknown field lists the known ones.
+
+    Args:
+        hint: The end of that message if no known field is similar, such as where other settings
+            are.
     """
 
     def decorate(cls: type[T]) -> type[T]:
-        made = cls.__init__
+        """Replace the constructor of `cls`."""
+        original_init = cls.__init__
 
-        @functools.wraps(made)
+        @functools.wraps(original_init)
         def init(self: T, *args: Any, **kwargs: Any) -> None:
+            """Call the original constructor, and explain unknown fields."""
             try:
-                made(self, *args, **kwargs)
+                original_init(self, *args, **kwargs)
             except TypeError as error:
                 fields: list[str] = list(cls.__dataclass_fields__)  # type: ignore[attr-defined]
-                if not (unknown := [name for name in kwargs if name not in fields]):
+                unknown = [name for name in kwargs if name not in fields]
+                if not unknown:
                     raise
-                meant = "".join(did_you_mean(name, fields) for name in unknown)
+
+                suggestions = "".join(did_you_mean(name, fields) for name in unknown)
                 raise TypeError(
-                    f"{cls.__name__}: got {unknown}, want some of {fields}{meant or hint}"
+                    f"{cls.__name__}: got {unknown}, want some of {fields}{suggestions or hint}"
                 ) from error
 
         cls.__init__ = init  # type: ignore[method-assign, assignment]

@@ -231,8 +231,7 @@ def _install(package: str, extra: str | None = None, distribution: str = CORE) -
     if simulators:
         return (
             f"run `vlagents-ray env make {simulators[0].requirements[0]}` and give the "
-            "evaluation's "
-            f"workers that environment's Python, `runtime_env: {{py_executable: ...}}`"
+            "evaluation's workers that environment's Python, `runtime_env: {py_executable: ...}`"
         )
     needed = _BROUGHT.get(package, package)
     families = [entry for entry in policies if entry.requirements and needed in entry.needs]
@@ -244,8 +243,7 @@ def _install(package: str, extra: str | None = None, distribution: str = CORE) -
         )
         return (
             f"run `vlagents-ray env make {'NAME' if several else environments[0]}` and name the "
-            "environment in "
-            f"the deployment's `environment`{family}"
+            f"environment in the deployment's `environment`{family}"
         )
     return _ELSEWHERE.get(package, f"install the package that provides {package!r}")
 
@@ -366,8 +364,7 @@ def _load(points: tuple[EntryPoint, ...]) -> RegistryEntry:
     if not isinstance(entry, RegistryEntry):
         raise ConfigError(
             f"{expected}, got {point.value}, a {type(entry).__name__}; write ENTRY = "
-            "RegistryEntry('module:Class') "
-            f"in a module that imports nothing large, and name that"
+            "RegistryEntry('module:Class') in a module that imports nothing large, and name that"
         )
     return replace(entry, distribution=distributions[0])
 
@@ -471,8 +468,7 @@ def _importable_target(kind: str, name: str, unknown: type[ConfigError]) -> str:
         if distribution is not None:
             raise unknown(
                 f"{_SINGULAR[kind]} {_shown(kind, name)!r} is in {distribution}, which is not "
-                "installed: "
-                f"{pip_install(distribution=distribution)}"
+                f"installed: {pip_install(distribution=distribution)}"
             )
         known = names(kind)
         raise unknown(
@@ -528,9 +524,8 @@ def load_target(name: str, unknown: type[ConfigError] = ConfigError) -> Any:
         if error.name and (module == error.name or module.startswith(error.name + ".")):
             raise unknown(
                 f"{name!r}: no module {error.name!r} is installed, or lies in the working "
-                f"directory {Path.cwd()}; "
-                f"go to its folder, add that to PYTHONPATH, or install it"
-                f"{did_you_mean(error.name, (file.stem for file in Path.cwd().glob('*.py')))}"
+                f"directory {Path.cwd()}; go to its folder, add that to PYTHONPATH, or install "
+                f"it{did_you_mean(error.name, (file.stem for file in Path.cwd().glob('*.py')))}"
             ) from error
         raise MissingDependency(f"{name!r} needs {error.name!r}, which is not installed") from error
     found = getattr(loaded, attribute, None)

@@ -71,8 +71,8 @@ def require_wireable(value: object, where: str) -> None:
     else:
         raise ContractViolation(
             f"{where}: got {type(value).__module__}.{type(value).__qualname__}, which a message "
-            "cannot carry; "
-            f"want None, bool, int, float, str, bytes, numpy arrays, lists and dicts of them"
+            "cannot carry; want None, bool, int, float, str, bytes, numpy arrays, lists and dicts "
+            "of them"
         )
 
 
@@ -240,9 +240,8 @@ def _check_threads(suite: _AgentSuite, first: list[Act]) -> None:
     ended = threading.Event()
     cure = suite.cure = (
         "a server calls `prepare` on several threads, also while others are reset and acted on: "
-        "change nothing in it "
-        "that sessions share, such as a tokenizer's padding; compute tokens in `reset`, or hold a "
-        "lock"
+        "change nothing in it that sessions share, such as a tokenizer's padding; compute tokens "
+        "in `reset`, or hold a lock"
     )
 
     def prepare(number: int) -> None:

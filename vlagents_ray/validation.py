@@ -63,8 +63,7 @@ def check_observation(obs: Obs, contract: Contract | None) -> None:
         if unknown := sorted(set(wanted) - set(offered)):
             raise NotOffered(
                 f"info[{WANT!r}]: got {unknown}, want some of {sorted(offered)}, the `behaviour` "
-                "of the policy's "
-                f"contract; take a policy that returns it, or leave it out"
+                "of the policy's contract; take a policy that returns it, or leave it out"
             )
     if contract is not None and (contract.cameras or contract.state or contract.gripper):
         _check_needs(obs, contract)

@@ -44,9 +44,9 @@ class Doubled(Gain):
     def shared_objects(self) -> list[Any]:
         return [*super().shared_objects(), self.twice]
 
-    def load_parameters(self, named: Mapping[str, Any]) -> None:
-        np.copyto(self.tree["layer"]["gain"], named["layer/gain"])
-        np.copyto(self.twice, 2 * named["layer/gain"])
+    def load_parameters(self, values: Mapping[str, Any]) -> None:
+        np.copyto(self.tree["layer"]["gain"], values["layer/gain"])
+        np.copyto(self.twice, 2 * values["layer/gain"])
 
     def act(self, obs: Obs) -> Act:
         return Act(np.append(self.twice / 2, self.rng.random()))
@@ -59,8 +59,8 @@ class DyingInAPush(Gain):
         super().initialize()
         trainable.accepted = lambda *_, **__: os._exit(9)
 
-    def load_parameters(self, named: Mapping[str, Any]) -> None:
-        super().load_parameters(named)
+    def load_parameters(self, values: Mapping[str, Any]) -> None:
+        super().load_parameters(values)
 
 
 class Counting(Doubled):

@@ -21,8 +21,7 @@ Outcome = Literal["success", "failure"]
 PAUSED = "paused by an operator"
 COMMAND_S = 0.02
 """The longest time, s, for which a stop waits for the end of a command: a tick at 50 Hz. A command
-takes less than a
-millisecond, and a stop must not wait for one that hangs.
+takes less than a millisecond, and a stop must not wait for one that hangs.
 """
 
 

@@ -61,8 +61,8 @@ OLD = Held("old", "what was planned is older than max_age_s")
 STALE = Held(
     "stale",
     "the observation is older than max_age_s, or of a clock that is ahead: look for a camera that "
-    "hangs, for robot and "
-    "sensors with different clocks, or for an info['captured_at'] that is not time.time()",
+    "hangs, for robot and sensors with different clocks, or for an info['captured_at'] that is not "
+    "time.time()",
 )
 STOPPED = Held("waiting", "the robot was stopped since the observation that was answered last")
 RELEASED = Held(
@@ -116,10 +116,8 @@ class SafeAction:
             if spec.relative is None and safe != "hold":
                 raise ConfigError(
                     f"safe: got {safe!r}, and the policy's contract does not say whether its "
-                    "actions are relative or "
-                    "absolute; state it (ActionSpec.delta), or give safe='hold', which is right "
-                    "for absolute ones "
-                    "alone, or an action of your own"
+                    "actions are relative or absolute; state it (ActionSpec.delta), or give "
+                    "safe='hold', which is right for absolute ones alone, or an action of your own"
                 )
             self._make: Safe = stopping(spec)
             if safe not in ("auto", self._make):

@@ -136,23 +136,21 @@ class PlayerSettings:
 
     mode: Mode = "open_loop"
     """With "open_loop", execute `execute` rows, then send a request and wait for the answer. With
-    "ensemble", send one
-    at each tick, and average the actions of all chunks with the weights exp(-m * i), oldest first
-    (ACT's temporal ensembling). With "async", send requests in the background, one at a time, with
-    the newest observation.
+    "ensemble", send one at each tick, and average the actions of all chunks with the weights exp(-m
+    * i), oldest first (ACT's temporal ensembling). With "async", send requests in the background,
+    one at a time, with the newest observation.
     """
     # Rows between two requests: of a chunk (default: all), or in "async" ticks (default: 1)
     execute: int | None = None
     merge: str | Merge = "newest"
     """The combination of several chunks' rows for one tick, in "async": "newest", "average",
-    "weighted_average",
-    "conservative", "ensemble", or a function (see `vlagents_ray.chunking.buffer`).
+    "weighted_average", "conservative", "ensemble", or a function (see
+    `vlagents_ray.chunking.buffer`).
     """
     ensemble_m: float = ENSEMBLE_M  # the m of the weights
     real_time_chunking: bool = False
     """Whether each request contains the rest of the plan and the measured delay (`LEFTOVER`,
-    `DELAY` in
-    `vlagents_ray.interface`), for policies that use them; in "async" only.
+    `DELAY` in `vlagents_ray.interface`), for policies that use them; in "async" only.
     """
     deadline_s: float | None = None  # time limit of `act`; 0 by default in "async", else none
     timeout_s: float | None = None  # time limit of a request; by default the agent's
@@ -160,8 +158,8 @@ class PlayerSettings:
     horizon: int | None = None
     max_age_s: float | None = None
     """The largest age of the observation of an executed action. The age counts from
-    `info["captured_at"]`, that of the
-    sensor read first, or else from the call of `act` (see `CaptureClock`).
+    `info["captured_at"]`, that of the sensor read first, or else from the call of `act` (see
+    `CaptureClock`).
     """
     safe: Safe = "auto"  # the action in place of a missing one (see `SafeAction`)
     # The columns of the action that are grippers (see `SafeAction`)

@@ -124,8 +124,7 @@ class Connection:
             if metadata.get("protocol") != PROTOCOL_VERSION:
                 raise ConfigError(
                     f"{self.url}: speaks protocol {metadata.get('protocol')}, this client "
-                    f"{PROTOCOL_VERSION}; "
-                    f"upgrade the older of the two"
+                    f"{PROTOCOL_VERSION}; upgrade the older of the two"
                 )
             contract = metadata.get("contract")
             self.contract = None if contract is None else Contract.from_json(contract)

@@ -75,8 +75,7 @@ class Credentials:
         except OSError as error:  # ssl.SSLError is a subclass
             raise ConfigError(
                 f"TLS: ca={self.ca!r}: expected a file with the certificate of the CA that signed "
-                "the server's, in "
-                f"PEM (it begins with -----BEGIN CERTIFICATE-----), got {error}"
+                f"the server's, in PEM (it begins with -----BEGIN CERTIFICATE-----), got {error}"
             ) from error
         try:
             if self.certificate is not None:
@@ -84,8 +83,7 @@ class Credentials:
         except OSError as error:
             raise ConfigError(
                 f"TLS: certificate={self.certificate!r}: expected this client's certificate and "
-                "its private key, two "
-                f"PEM files that belong together, got {error}"
+                f"its private key, two PEM files that belong together, got {error}"
             ) from error
         return context
 
@@ -127,13 +125,11 @@ def tls_failure(url: str, error: ssl.SSLError) -> VLAgentsError:
     if isinstance(error, ssl.SSLCertVerificationError):
         cure = (
             "if the server's certificate is signed by a CA of your own, give the file of the CA's "
-            "certificate, not of "
-            "the server's, as ca=, or in SSL_CERT_FILE"
+            "certificate, not of the server's, as ca=, or in SSL_CERT_FILE"
         )
         if error.verify_code in _OTHER_NAMES:
             cure = (
-                "write the URL with a name that the certificate has, or make a certificate "
-                "with "
+                "write the URL with a name that the certificate has, or make a certificate with "
                 "this name"
             )
         return ConfigError(
@@ -142,9 +138,8 @@ def tls_failure(url: str, error: ssl.SSLError) -> VLAgentsError:
     if "CERTIFICATE" in (error.reason or "") or "UNKNOWN_CA" in (error.reason or ""):
         return ConfigError(
             f"{url}: the server refuses this client's certificate, or that it has none "
-            f"({error.reason}); "
-            "give certificate=(certificate file, key file), signed by the CA that the server "
-            "trusts"
+            f"({error.reason}); give certificate=(certificate file, key file), signed by the CA "
+            "that the server trusts"
         )
     if error.reason in ("WRONG_VERSION_NUMBER", "RECORD_LAYER_FAILURE", "UNSUPPORTED_PROTOCOL"):
         plain = url.replace("https://", "http://", 1).replace("wss://", "ws://", 1)

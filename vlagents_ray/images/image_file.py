@@ -238,13 +238,11 @@ def _check_size(
     if height * width > max_pixels:
         raise MessageTooLarge(
             f"image: declares {height}x{width} pixels, the limit is {max_pixels}; send a smaller "
-            "one, or raise "
-            f"`limits.pixels`"
+            "one, or raise `limits.pixels`"
         )
     most = 2 * pixel_bytes * height * width + _MOST_METADATA
     if file_bytes > most:
         raise MessageTooLarge(
             f"image: a file of {file_bytes} bytes for {height}x{width} pixels, the limit is "
-            f"{most}; encode it again "
-            f"without metadata"
+            f"{most}; encode it again without metadata"
         )

@@ -74,8 +74,8 @@ class Wrapper(Agent):
     def parameters(self) -> dict[str, Any]:
         return self.agent.parameters()
 
-    def load_parameters(self, named: Mapping[str, Any]) -> None:
-        self.agent.load_parameters(named)
+    def load_parameters(self, values: Mapping[str, Any]) -> None:
+        self.agent.load_parameters(values)
 
     def initialize(self) -> None:
         self.agent.initialize()

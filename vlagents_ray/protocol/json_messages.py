@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from vlagents_ray.errors import MalformedMessage, VLAgentsError, shown
-from vlagents_ray.naming import without_doubles
+from vlagents_ray.naming import without_duplicate_keys
 from vlagents_ray.protocol.frame_layout import parse_json
 from vlagents_ray.protocol.frames import check_request, describe_error
 from vlagents_ray.protocol.messages import Budget, Op, Reply, Request
@@ -44,15 +44,14 @@ def request_from_parts(
     The `budget` is charged before anything is decoded.
     """
     budget.begin(op)
-    document = parse_json(text, "obs:", without_doubles, budget=budget)
+    document = parse_json(text, "obs:", without_duplicate_keys, budget=budget)
     if not isinstance(document, dict):
         raise MalformedMessage(f"obs: got {type(document).__name__}, want an object")
     unknown = document.keys() - _KEYS
     if "cameras" in unknown:
         raise MalformedMessage(
             "obs: got 'cameras' in the JSON document; send multipart/form-data, in it the document "
-            "as part 'obs' and "
-            "each image as a file 'cameras.<name>', JPEG or PNG"
+            "as part 'obs' and each image as a file 'cameras.<name>', JPEG or PNG"
         )
     if unknown:
         raise MalformedMessage(

@@ -153,7 +153,7 @@ class LocalAddress:
     # that names it: a frame or, with COMPACT, the arrays of the acts that follow the message's
     # header (see `vlagents_ray.protocol.shm_layout`). A reply follows its header, or is in a memory
     # file that is sent with it.
-    # Number of the memory file, flags, number of bytes in it.
+    # REQUEST packs the number of the memory file, flags, and the number of bytes in it.
     REQUEST: ClassVar[struct.Struct] = struct.Struct("<IIQ")
     # Bit n: memory file n is free again; flags.
     REPLY: ClassVar[struct.Struct] = struct.Struct("<QHxx")
@@ -328,8 +328,8 @@ class Budget:
         if self._left < 0:
             raise MessageTooLarge(
                 f"request: its images and bytes take more than {self.limits.decoded_bytes} bytes, "
-                "decoded, each as "
-                f"often as it is named; send fewer or smaller ones, or raise `limits.decoded_bytes`"
+                "decoded, each as often as it is named; send fewer or smaller ones, or raise "
+                "`limits.decoded_bytes`"
             )
 
     def hold(self, size: int) -> None:
@@ -350,8 +350,8 @@ class Budget:
         if self._seconds_left < 0:
             raise MessageTooLarge(
                 f"request: decoding its images takes {-self._seconds_left:.3g} s longer than it "
-                "may; send fewer or "
-                f"smaller ones, or raise `limits.decoded_bytes`, to which the time is in proportion"
+                "may; send fewer or smaller ones, or raise `limits.decoded_bytes`, to which the "
+                "time is in proportion"
             )
         yield
 

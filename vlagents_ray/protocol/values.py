@@ -264,8 +264,7 @@ def as_camera(name: str, image: Any, limits: MessageLimits) -> np.ndarray:
     if image.shape[0] * image.shape[1] > limits.pixels:
         raise MessageTooLarge(
             f"camera {name!r}: got {image.shape[:2]} pixels, the limit is {limits.pixels}; send it "
-            "smaller, or raise "
-            f"`limits.pixels`"
+            "smaller, or raise `limits.pixels`"
         )
     return image
 
@@ -313,8 +312,7 @@ def require_obs(obs: Any) -> None:
         if not hasattr(image, "dtype"):
             raise InvalidObservation(
                 f"camera {name!r}: expected (H, W, 3) uint8 RGB, got {described(image)}; leave out "
-                "a camera that has "
-                f"no picture, and convert others: np.asarray(image, np.uint8)"
+                "a camera that has no picture, and convert others: np.asarray(image, np.uint8)"
             )
     for name, part in obs.state.items():
         if not hasattr(part, "dtype") or part.dtype.kind not in "fiub":

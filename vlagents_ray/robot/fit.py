@@ -111,8 +111,7 @@ class Trained:
         found = [
             (
                 f"joints: number {number} is {ours!r} of the arm and {theirs!r} of its limits; use "
-                "one "
-                "order"
+                "one order"
             )
             for number, ours, theirs in reordered(names, stated)
         ]
@@ -128,8 +127,7 @@ class Trained:
                 for i in np.flatnonzero(sign * (trained - limit) > 0):
                     found.append(
                         f"action{_name(int(i), names)}: was trained to {trained[i]:.4g}, the arm's "
-                        "limit is "
-                        f"{limit[i]:.4g}; are they of another arm, or in another order?"
+                        f"limit is {limit[i]:.4g}; are they of another arm, or in another order?"
                     )
         return found
 
@@ -239,8 +237,7 @@ def _outside(
         return [
             (
                 f"{what}: got {rows.shape[1]} numbers, was trained with {len(low)}; is this "
-                "another "
-                "arm's checkpoint?"
+                "another arm's checkpoint?"
             )
         ]
     room, found = _ROOM * (high - low) + 1e-3, []

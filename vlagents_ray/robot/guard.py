@@ -272,9 +272,8 @@ class Guard:
             if way > allowed[i] + 2 * _ROUNDING * max(abs(begin), abs(end)):
                 raise InvalidAction(
                     f"action[{i}]: got {end:g} as the first action, {way:g} from the pose "
-                    f"{begin:g}, want "
-                    f"{allowed[i]:.3g} at most; is it another arm's or in another order or unit? "
-                    "Else raise `first`",
+                    f"{begin:g}, want {allowed[i]:.3g} at most; is it another arm's or in another "
+                    "order or unit? Else raise `first`",
                     cause="max_step",
                 )
 
@@ -346,8 +345,7 @@ class Guard:
         if moved:
             raise ConfigError(
                 f"rest: expected null for the grippers, numbers {moved}, as the way to rest keeps "
-                "what they hold; got "
-                f"{limits.rest}"
+                f"what they hold; got {limits.rest}"
             )
         if not self._deltas:
             return
@@ -360,8 +358,8 @@ class Guard:
         if without_effect:
             raise ConfigError(
                 f"limits: got {', '.join(without_effect)} for relative actions, which cannot be "
-                "compared with a place; "
-                "remove them, or use a file with velocity, acceleration and jerk alone"
+                "compared with a place; remove them, or use a file with velocity, acceleration and "
+                "jerk alone"
             )
 
     def _softness(self) -> float:

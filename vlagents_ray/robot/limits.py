@@ -17,7 +17,7 @@ import numpy as np
 from vlagents_ray.contract import ActionSpec
 from vlagents_ray.dataset_contract import INFO, DatasetContract
 from vlagents_ray.errors import ConfigError
-from vlagents_ray.naming import did_you_mean, without_doubles
+from vlagents_ray.naming import did_you_mean, without_duplicate_keys
 from vlagents_ray.registry import require
 from vlagents_ray.yaml_text import load_yaml
 
@@ -51,8 +51,7 @@ class MotionLimits:
     """
     rest: tuple[float | None, ...] | None = None
     """The pose to which the arm goes slowly at the end of a run; a number that is None, as that of
-    a gripper must be,
-    stays as it was commanded."""
+    a gripper must be, stays as it was commanded."""
     joints: tuple[str, ...] = ()  # the names of the action's numbers, in order
     unit: str = "rad"  # "rad" or "deg", of the joints
     # m, of the tip in the base frame of the URDF.
@@ -127,8 +126,7 @@ class MotionLimits:
         ) as error:
             raise ConfigError(
                 f"limits {path}: {type(error).__name__}: {error}; want a .yaml or .json file of "
-                "limits, a .urdf, or a "
-                f"LeRobotDataset v3.0; see docs/control_loop.md"
+                "limits, a .urdf, or a LeRobotDataset v3.0; see docs/control_loop.md"
             ) from error
 
     @classmethod
@@ -145,15 +143,14 @@ class MotionLimits:
         if bounds_workspace != (tip is not None) or (tip is not None and urdf is None):
             raise ConfigError(
                 "tip, urdf and workspace: expected `tip` and `urdf` with `workspace_low` or "
-                "`workspace_high`, as each "
-                "has no effect without the others; add what is missing, or remove the rest"
+                "`workspace_high`, as each has no effect without the others; add what is missing, "
+                "or remove the rest"
             )
         if urdf is None:
             if "unit" in document:
                 raise ConfigError(
                     "unit: expected `urdf` with it, whose numbers it converts; got none, and "
-                    "limits are in the units "
-                    "of the actions; remove `unit`"
+                    "limits are in the units of the actions; remove `unit`"
                 )
             return limits
         return limits.stricter(
@@ -385,5 +382,5 @@ def _value(key: str, value: Any) -> Any:
 def _document(path: Path) -> Any:
     text = path.read_text(encoding="utf-8")
     if path.suffix == ".json":
-        return json.loads(text, object_pairs_hook=without_doubles)
+        return json.loads(text, object_pairs_hook=without_duplicate_keys)
     return load_yaml(text, extra="limits")

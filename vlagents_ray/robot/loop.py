@@ -165,8 +165,7 @@ def import_class(option: str, name: str, methods: Sequence[str] = ()) -> Any:
     except (ImportError, ValueError) as error:
         raise ConfigError(
             f"{option} {name}: {error}; go to the folder of its module ({os.getcwd()} is this "
-            "one), add that to "
-            f"PYTHONPATH, or install it"
+            "one), add that to PYTHONPATH, or install it"
         ) from error
     except Exception as error:  # whatever the module raises, a syntax error among them
         raise ConfigError(
@@ -236,8 +235,7 @@ def opened(make: Callable[[], Robot]) -> Iterator[Robot]:
         logger.info("robot: could not be made", exc_info=True)
         raise ConfigError(
             f"robot: could not be made: {type(error).__name__}: {error}; check its arguments "
-            "(--robot-set), its cables "
-            f"and its power, or correct its class"
+            "(--robot-set), its cables and its power, or correct its class"
         ) from error
     with contextlib.ExitStack() as stack:
         if isinstance(robot, contextlib.AbstractContextManager):
@@ -289,10 +287,9 @@ class LoopReport:
             cause = "waiting"
         return (
             f"the policy hardly drove the robot: {self.safe_ticks} of {ticks} ticks had no action "
-            "of it, most often: "
-            f"{self.reasons.get(cause, cause)}. If answers come too late, use a lower rate (hz), a "
-            "policy with longer "
-            "chunks, or let a tick wait for its answer (deadline_s, --deadline-ms)"
+            f"of it, most often: {self.reasons.get(cause, cause)}. If answers come too late, use a "
+            "lower rate (hz), a policy with longer chunks, or let a tick wait for its answer "
+            "(deadline_s, --deadline-ms)"
         )
 
     @property
@@ -303,8 +300,7 @@ class LoopReport:
             return None
         return (
             f"apply takes {self.apply_p50_ms:.3g} ms of a tick of {tick_ms:.3g} ms: send the "
-            "command and return, do "
-            "not wait until the arm is there"
+            "command and return, do not wait until the arm is there"
         )
 
     def log_warnings(self) -> None:

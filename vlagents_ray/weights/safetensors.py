@@ -19,7 +19,7 @@ from typing import Any, BinaryIO
 import numpy as np
 
 from vlagents_ray.errors import InvalidWeights, MalformedMessage, shown
-from vlagents_ray.naming import without_doubles
+from vlagents_ray.naming import without_duplicate_keys
 
 # Longest message with weights: a header (about 40,000 values), or a part of their bytes.
 MESSAGE_BYTES = 2**22
@@ -105,12 +105,11 @@ def read_header(data: bytes) -> dict[str, ValueSpec]:
     if announced != len(data) - _LENGTH.size or len(data) > MESSAGE_BYTES:
         raise MalformedMessage(
             f"safetensors: got {len(data)} bytes that announce a header of {announced}, want 8 "
-            "bytes with the length "
-            f"of the header, and the header, at most {MESSAGE_BYTES} together"
+            f"bytes with the length of the header, and the header, at most {MESSAGE_BYTES} together"
         )
     try:
         document = json.loads(
-            data[_LENGTH.size :], parse_int=_whole, object_pairs_hook=without_doubles
+            data[_LENGTH.size :], parse_int=_whole, object_pairs_hook=without_duplicate_keys
         )
     except (ValueError, RecursionError) as error:
         raise MalformedMessage(f"safetensors: the header is no JSON document ({error})") from error
@@ -126,8 +125,7 @@ def read_header(data: bytes) -> dict[str, ValueSpec]:
         if begin != at or end - begin != spec.size:
             raise MalformedMessage(
                 f"safetensors: {name!r}: got bytes {begin} to {end}, want {at} to {at + spec.size} "
-                f"for {code} of shape "
-                f"{list(shape)}"
+                f"for {code} of shape {list(shape)}"
             )
         specs[name], at = spec, end
     return specs

@@ -214,8 +214,8 @@ def _count(counters: bytes, counter: int) -> memoryview | None:
 def _warn_of_counts(reason: str) -> None:
     logger.warning(
         "torch's counts of readers cannot be set (%s): memory that was pushed to replicas on the "
-        "same GPU may stay "
-        "allocated; if it grows, use another version of torch, or other GPUs for the replicas",
+        "same GPU may stay allocated; if it grows, use another version of torch, or other GPUs for "
+        "the replicas",
         reason,
     )
 

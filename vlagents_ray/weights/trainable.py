@@ -2,8 +2,8 @@
 torch modules.
 
 The name of a value in a torch module is that in its `state_dict`; in nested dicts it is the keys,
-joined with "/", and then that in a module.
-Torch and JAX are never imported here: their objects exist only if they have been imported.
+joined with "/", and then that in a module. Torch and JAX are never imported here: their objects
+exist only if they have been imported.
 """
 
 from __future__ import annotations
@@ -235,8 +235,7 @@ def _leaves(tree: Any, path: str = "") -> Iterator[tuple[str, Any, Any]]:
         at = f" at {path.rstrip('/')!r}" if path else ""
         raise NotTrainable(
             f"trainable{at}: got {type(tree).__name__}, want a torch module, or dicts and lists of "
-            "arrays "
-            f"and modules; or define parameters() and load_parameters()"
+            "arrays and modules; or define parameters() and load_parameters()"
         )
     for key, value in tree.items() if isinstance(tree, dict) else enumerate(tree):
         if is_array(value) or _is_module(value):
@@ -469,8 +468,7 @@ def completed(
     if not allow_same and all(_is_equal(value, held[name]) for name, value in new.items()):
         raise UnchangedWeights(
             f"weights: all {len(new)} values equal those that the policy holds; push what the "
-            "optimizer changes, "
-            f"or allow it with allow_same=True"
+            "optimizer changes, or allow it with allow_same=True"
         )
     missing = {name: value for name, value in held.items() if name not in new}
     all_values = {**new, **(mapped(own_copy, missing) if in_place else missing)}

@@ -5,12 +5,11 @@ A deployment file states a mapping as a preset's name (`presets`), as an object,
 that names a preset and overrides some of its fields:
 
     {"cameras": {"front": "observation/image", "wrist": {"key": "images/wrist", "layout": "chw"}},
-     "state": {"joints": {"key": "state", "stop": 6}, "pose": ["position", "rotation"]},
-     "gripper": {"key": "state", "index": 6, "open": 0.04, "closed": 0.0},
-     "instruction": "prompt|task_id", "instructions": {"0": "turn on the radio"},
-     "info": {"unnorm_key": "unnorm_key"},
-     "action": {"arm": {"stop": 6}, "hand": {"start": 6}},
-     "action_gripper": {"index": 6, "open": -1, "closed": 1}}
+     "state": {"joints": {"key": "state", "stop": 6}, "pose": ["position", "rotation"]}, "gripper":
+     {"key": "state", "index": 6, "open": 0.04, "closed": 0.0}, "instruction": "prompt|task_id",
+     "instructions": {"0": "turn on the radio"}, "info": {"unnorm_key": "unnorm_key"}, "action":
+     {"arm": {"stop": 6}, "hand": {"start": 6}}, "action_gripper": {"index": 6, "open": -1,
+     "closed": 1}}
 
 The client's keys are paths: `images/wrist` is either that key itself or `wrist` within `images`.
 `states|state` is the first of the two that exists. A name and a key that end with `*` match all
@@ -262,8 +261,7 @@ def read_image(key: str, value: Any, layout: str, limits: MessageLimits) -> np.n
             if value.size and not (value.min() >= 0 and value.max() <= 1):  # also true for NaN
                 raise InvalidObservation(
                     f"camera {key!r}: got {value.dtype} from {value.min():g} to {value.max():g}, "
-                    "want uint8, or floats "
-                    f"in [0, 1]; scale it"
+                    "want uint8, or floats in [0, 1]; scale it"
                 )
             value = (255 * value).astype(np.uint8)
         if layout == "rgba" and value.ndim == 3 and value.shape[2] == 4:
@@ -521,8 +519,7 @@ class KeyMapping:
         found = [
             (
                 f"{kind} {name!r}: the policy needs it, the mapping gives {sorted(given)}; add it "
-                "to "
-                f"mapping.{field_}"
+                f"to mapping.{field_}"
             )
             for kind, field_, needs, given in (
                 ("camera", "cameras", contract.cameras or {}, self.cameras),
@@ -587,8 +584,7 @@ class KeyMapping:
         if known and not obs.cameras and not obs.state and obs.gripper is None:
             raise InvalidObservation(
                 f"observation: got {keys(flat)}, of which the mapping reads nothing; it looks for "
-                f"{known}: "
-                f"choose the preset of this client, or change the mapping"
+                f"{known}: choose the preset of this client, or change the mapping"
             )
         for kind, wanted, found, is_one in (
             ("cameras", images, obs.cameras, may_be_camera),
@@ -597,8 +593,8 @@ class KeyMapping:
             if wanted and not found and (lost := self._unread(flat, is_one)):
                 raise InvalidObservation(
                     f"observation: got {lost}, which the mapping does not read, and nothing at "
-                    f"{wanted}; add them to "
-                    f"mapping.{kind}, or to mapping.info if the policy does without"
+                    f"{wanted}; add them to mapping.{kind}, or to mapping.info if the policy does "
+                    "without"
                 )
 
     def _opening(
@@ -625,8 +621,7 @@ class KeyMapping:
                 return None
             raise InvalidObservation(
                 f"{gripper.key!r}: got {reading:g} for the gripper, want {gripper.closed:g} "
-                "(closed) to "
-                f"{gripper.open:g} (open); scale it, or change mapping.gripper"
+                f"(closed) to {gripper.open:g} (open); scale it, or change mapping.gripper"
             )
         return min(1.0, max(0.0, opening))
 
@@ -635,6 +630,5 @@ class KeyMapping:
 def _log_unread(dialect: str, unread: tuple[str, ...], read: tuple[str, ...]) -> None:
     logger.warning(
         f"{dialect}: a client sends the cameras {list(unread)}, which the policy does not get: the "
-        "mapping reads "
-        f"{list(read)}; if the policy takes them, add them to mapping.cameras"
+        f"mapping reads {list(read)}; if the policy takes them, add them to mapping.cameras"
     )

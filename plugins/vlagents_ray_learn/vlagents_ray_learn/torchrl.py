@@ -190,8 +190,8 @@ class TorchRLPolicy(Agent):
         lazy = any(map(torch.nn.parameter.is_lazy, self.policy.parameters()))
         return {} if lazy else named_values(self.policy)
 
-    def load_parameters(self, named: Mapping[str, Any]) -> None:
-        set_values(self.policy, named)
+    def load_parameters(self, values: Mapping[str, Any]) -> None:
+        set_values(self.policy, values)
 
     def reset(self, obs: Obs, instruction: str | None, **kwargs: Any) -> dict[str, Any]:
         self._instruction = instruction or ""

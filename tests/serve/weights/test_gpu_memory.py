@@ -64,8 +64,8 @@ class OnGpu(Agent):
 class OwnLoading(OnGpu):
     """Loads parameters by itself."""
 
-    def load_parameters(self, named: Any) -> None:
-        super().load_parameters(named)
+    def load_parameters(self, values: Any) -> None:
+        super().load_parameters(values)
 
 
 class Robot:

@@ -287,10 +287,10 @@ def test_weights_that_cannot_be_loaded_fail_the_act_and_others_act_again(
     serving: Callable[..., Engine],
 ) -> None:
     class Fragile(Gain):
-        def load_parameters(self, named: Mapping[str, Any]) -> None:
-            if named["layer/gain"][0] == 1:
+        def load_parameters(self, values: Mapping[str, Any]) -> None:
+            if values["layer/gain"][0] == 1:
                 raise MemoryError
-            super().load_parameters(named)
+            super().load_parameters(values)
 
     served = Served(serving(Fragile()))
     served.reset("a")

@@ -174,8 +174,7 @@ class HttpTransport:
                 self.close()
                 raise MessageTooLarge(
                     f"{self._url.geturl()}: got an answer of more than {DEFAULT_LIMITS.body_bytes} "
-                    "bytes, want that of "
-                    f"a policy server"
+                    "bytes, want that of a policy server"
                 )
             return answer.status, answer.headers.get("content-type", ""), content
         except TimeoutError as error:

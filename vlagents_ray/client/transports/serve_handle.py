@@ -89,8 +89,7 @@ class HandleTransport:
         if not ray.is_initialized():
             raise ConfigError(
                 f"serve://{self._app}: this process is in no Ray cluster; call ray.init() "
-                "(`vlagents-ray eval` does, "
-                f"with --address), or use http://"
+                "(`vlagents-ray eval` does, with --address), or use http://"
             )
         deadline = time.monotonic() + timeout_s
         attempt_s, report = (
@@ -286,8 +285,7 @@ class PlasmaTransport(UnixTransport):
         if (node := this_node()) is None:
             raise ConfigError(
                 f"serve://{self._app}: transport 'plasma' needs a process on a node of the "
-                "cluster; "
-                f"a Ray client (ray://) is none: use http://"
+                "cluster; a Ray client (ray://) is none: use http://"
             )
         address = read_address(PlasmaAddress, metadata.get("plasma"))
         if address is None:
@@ -298,8 +296,8 @@ class PlasmaTransport(UnixTransport):
         if address.node != node:
             raise ConfigError(
                 f"serve://{self._app}: transport 'plasma' needs the replica on this node "
-                f"({node[:8]}), the chosen one "
-                f"is on {address.node[:8]}; use transport 'handle', or 'auto'"
+                f"({node[:8]}), the chosen one is on {address.node[:8]}; use transport 'handle', "
+                "or 'auto'"
             )
         self._handle = handle
         self._server = address.socket

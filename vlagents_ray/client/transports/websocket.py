@@ -332,8 +332,7 @@ class WebSocketTransport:
         if (size := sum(map(len, pieces))) > STREAM_BYTES:
             raise MessageTooLarge(
                 f"{self._url}: got {size} bytes, the limit of a WebSocket message is "
-                f"{STREAM_BYTES}; "
-                f"send JPEG, or use transport='http'"
+                f"{STREAM_BYTES}; send JPEG, or use transport='http'"
             )
         connection = self._stream(left_s(deadline))
         try:

@@ -25,7 +25,7 @@ from pathlib import Path
 from typing import Any
 
 from vlagents_ray.errors import ConfigError, shown
-from vlagents_ray.naming import did_you_mean, without_doubles
+from vlagents_ray.naming import did_you_mean, without_duplicate_keys
 from vlagents_ray.protocol.messages import RANKS, RankName
 
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
@@ -99,7 +99,7 @@ def parse_keys(text: str, where: str = "keys") -> list[Key]:
     Raises `ConfigError` if it is invalid or two keys share a name.
     """
     try:
-        document = json.loads(text, object_pairs_hook=without_doubles)
+        document = json.loads(text, object_pairs_hook=without_duplicate_keys)
         entries = document["keys"]
     except (ValueError, TypeError, KeyError, RecursionError) as error:
         raise ConfigError(

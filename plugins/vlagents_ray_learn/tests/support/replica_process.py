@@ -47,9 +47,9 @@ class Served(Agent):
     def initialize(self) -> None:
         self.model = model(self.device)
 
-    def load_parameters(self, named: Any) -> None:
+    def load_parameters(self, values: Any) -> None:
         for name, value in self.parameters().items():
-            value.copy_(named[name])
+            value.copy_(values[name])
 
     def act(self, obs: Obs) -> Act:
         raise NotImplementedError
