@@ -80,3 +80,35 @@ def test_one_address_does_not_take_all_connections(page: Any) -> None:
         with socket.create_connection(("127.0.0.1", port), 30) as viewer:
             viewer.sendall(HALF_A_HEADER + b"\r\n")
             assert viewer.recv(100).startswith(b"HTTP/1.1")
+
+
+@PAGES
+def test_connections_that_are_closed_at_once_delay_no_other(page: Any) -> None:
+    """While the loop is busy, they wait in the kernel: one more is not sent a second time, after
+    one second.
+    """
+    with page() as port:
+        for _ in range(3):
+            for _ in range(200):
+                socket.create_connection(("127.0.0.1", port), 5).close()
+            begun = time.monotonic()
+            with socket.create_connection(("127.0.0.1", port), 5) as client:
+                client.sendall(b"GET /nothing HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n")
+                assert client.recv(100).startswith(b"HTTP/1.1 4")
+            assert time.monotonic() - begun < 0.9
+
+
+def test_a_listener_of_pages_queues_many_connections_and_accepts_only_those_that_are_open() -> None:
+    with page_protocol.PageListener.bound("127.0.0.1", 0) as listener:
+        listener.listen(page_protocol.BACKLOG)
+        listener.setblocking(False)
+        for _ in range(page_protocol._ENDED_AT_ONCE + 50):
+            socket.create_connection(listener.getsockname(), 0.9).close()
+        with socket.create_connection(listener.getsockname(), 0.9) as client:
+            with pytest.raises(BlockingIOError):
+                listener.accept()
+            accepted, address = listener.accept()
+            with accepted:
+                assert address == client.getsockname()
+            with pytest.raises(BlockingIOError):
+                listener.accept()

@@ -30,3 +30,7 @@ class TokenBucket:
             return (number - self._tokens) / self.rate
         self._tokens -= number
         return 0.0
+
+    def give_back(self, number: int = 1) -> None:
+        """Return tokens that were taken for nothing."""
+        self._tokens += number

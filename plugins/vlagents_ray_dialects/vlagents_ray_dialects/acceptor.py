@@ -8,6 +8,7 @@ import threading
 import time
 from collections.abc import Callable
 
+from vlagents_ray.serve.endpoints.connection import BACKLOG, accept_open
 from vlagents_ray.serve.token_bucket import TokenBucket
 from vlagents_ray_dialects.client_reader import shut_down
 
@@ -20,8 +21,9 @@ _END_S = 3.0
 
 
 class Acceptor:
-    """Accepts connections until it is closed; those above the rate wait in the listener's
-    backlog.
+    """Accepts connections until it is closed; those above the rate wait in the listener's backlog.
+
+    Connections that their clients have ended are closed, and do not count.
     """
 
     def __init__(
@@ -42,7 +44,7 @@ class Acceptor:
         self._name, self._listener = name, listener
         self._add, self._check_clients = add, check_clients
         self._closing = threading.Event()
-        listener.listen()
+        listener.listen(BACKLOG)
         listener.settimeout(TICK_S)
         self._thread = threading.Thread(target=self._run, name=name, daemon=True)
         self._thread.start()
@@ -70,13 +72,18 @@ class Acceptor:
                     time.sleep(wait_s)
                     continue
                 try:
-                    connection, _ = self._listener.accept()
+                    connection = accept_open(self._listener)
                 except TimeoutError:
+                    accepting.give_back()
                     continue
                 except OSError as error:
+                    accepting.give_back()
                     if not self._closing.is_set():
                         logger.warning("%s: cannot accept a client: %s", self._name, error)
                         # Other connections must end first if descriptors are exhausted.
                         time.sleep(0.1)
                     continue
-                self._add(connection)
+                if connection is None:
+                    accepting.give_back()
+                else:
+                    self._add(connection)

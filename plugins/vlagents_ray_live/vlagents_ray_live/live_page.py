@@ -32,7 +32,6 @@ from contextlib import contextmanager, suppress
 from functools import cache
 from importlib.resources import files as package_files
 from pathlib import Path
-from socket import AF_INET, AF_INET6, create_server
 from typing import Any
 
 import uvicorn
@@ -51,7 +50,7 @@ from vlagents_ray.errors import (
     Overloaded,
     VLAgentsError,
 )
-from vlagents_ray.page_protocol import BACKLOG, PageProtocol
+from vlagents_ray.page_protocol import BACKLOG, PageListener, PageProtocol
 from vlagents_ray.protocol.json_messages import problem
 from vlagents_ray.serve.access.api_keys import (
     Caller,
@@ -270,7 +269,7 @@ def page_server(
     host, port = address
     require_watch_keys(host, keys)
     try:
-        listening = create_server((host, port), family=AF_INET6 if ":" in host else AF_INET)
+        listening = PageListener.bound(host, port)
     except OSError as error:
         raise ConfigError(
             f"live page: cannot listen on {host}:{port} ({error.strerror}); choose another port"

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import resource
 import socket
+import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from typing import Any, cast
@@ -13,7 +14,8 @@ import pytest
 
 from vlagents_ray.protocol.messages import MessageLimits
 from vlagents_ray.serve.access.api_keys import NoKey
-from vlagents_ray.serve.endpoints.connection import PolledServer
+from vlagents_ray.serve.endpoints.connection import _ENDED_AT_ONCE, BACKLOG, PolledServer
+from vlagents_ray.serve.token_bucket import TokenBucket
 
 
 class Endpoint(PolledServer[Any]):
@@ -86,3 +88,21 @@ def test_whom_the_endpoint_cannot_take_is_turned_away_and_the_next_let_in(
     with endpoint.connect():
         endpoint.accept()
     assert len(endpoint.clients) == 1
+
+
+def test_connections_that_their_clients_have_ended_neither_count_nor_delay_the_next(
+    endpoint: Endpoint,
+) -> None:
+    """They also fit into the backlog: the kernel would discard the next client's SYN, which is
+    sent again after one second.
+    """
+    endpoint._listener.listen(BACKLOG)
+    endpoint._accepting = TokenBucket(1e-3, time.monotonic())  # one connection in 1,000 s
+    for _ in range(300):
+        endpoint.connect().close()
+    begun = time.monotonic()
+    with endpoint.connect() as client:
+        assert time.monotonic() - begun < 0.9
+        for _ in range(300 // _ENDED_AT_ONCE + 1):
+            endpoint.accept()
+        assert [each.getpeername() for each in endpoint.clients] == [client.getsockname()]

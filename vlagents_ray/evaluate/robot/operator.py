@@ -6,7 +6,6 @@ import asyncio
 import json
 import secrets
 import select
-import socket
 import sys
 import threading
 import time
@@ -31,7 +30,7 @@ from vlagents_ray.evaluate.artifacts.storage import whole
 from vlagents_ray.images.jpeg_png import decode, encode_jpeg
 from vlagents_ray.interface import Obs
 from vlagents_ray.naming import distinct
-from vlagents_ray.page_protocol import BACKLOG, PageProtocol
+from vlagents_ray.page_protocol import BACKLOG, PageListener, PageProtocol
 
 Outcome = Literal["success", "failure", "partial", "repeat"]
 SCENES = "scenes"
@@ -307,7 +306,7 @@ class PageOperator(Operator):
         """The page's address within the context."""
 
     def __enter__(self) -> Self:
-        listening = socket.create_server(("127.0.0.1", self._port))
+        listening = PageListener.bound("127.0.0.1", self._port)
         token = secrets.token_urlsafe(24)
         self.url = f"http://127.0.0.1:{listening.getsockname()[1]}/{token}/"
         routes = [

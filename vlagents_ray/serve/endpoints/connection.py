@@ -39,7 +39,11 @@ from vlagents_ray.serve.token_bucket import TokenBucket
 
 logger = logging.getLogger(__name__)
 
-BACKLOG = 128
+# Maximum number of connections that wait to be accepted. Above it the kernel discards a client's
+# SYN, which the client repeats after one second, and refuses a local client.
+BACKLOG = 1024
+# Maximum number of ended connections that are closed at once; each takes about 0.01 ms.
+_ENDED_AT_ONCE = 64
 MOST_UNANSWERED = 256  # unanswered messages of a client; further ones stay unread in its connection
 POLICY_VIOLATION, INTERNAL_ERROR, _SERVICE_RESTART = 1008, 1011, 1012  # WebSocket close codes
 # Maximum number of connections that a server accepts in a second; each takes some time of the
@@ -339,7 +343,9 @@ class PolledServer(ABC, Generic[C]):
         """Accept one client; errors (an aborted connection, EMFILE) never stop the listener, which
         is readable.
 
-        Clients above the rate of `_ACCEPTED_PER_S` wait in the listener's backlog.
+        Clients above the rate of `_ACCEPTED_PER_S` wait in the listener's backlog. Connections that
+        their clients have ended do not count: those of one client would fill the backlog, and
+        delay the connections of others by seconds.
         """
         if (wait_s := self._accepting.take(time.monotonic())) > 0:
             poller = self.engine.queue.poller
@@ -347,14 +353,18 @@ class PolledServer(ABC, Generic[C]):
             poller.call_later(wait_s, self._listen_again)
             return
         try:
-            connection, _ = self._listener.accept()
+            connection = accept_open(self._listener)
         except OSError as error:
+            self._accepting.give_back()
             logger.warning("a client was not let in: %s", error)
             if error.errno in (errno.EMFILE, errno.ENFILE):
                 self._spare.close()
                 with contextlib.suppress(OSError):
                     self._listener.accept()[0].close()
                 self._spare = _descriptor()
+            return
+        if connection is None:
+            self._accepting.give_back()
             return
         try:
             connection.setblocking(False)
@@ -407,6 +417,24 @@ def time_in_socket_s(control: AncillaryData) -> float:
             waited: float = time.time() - (seconds + nanoseconds * 1e-9)
             return waited if waited > LEAST_WAIT_S else 0.0
     return 0.0
+
+
+def accept_open(listener: socket.socket) -> socket.socket | None:
+    """Accept the next connection that its client has not ended yet, and close those before it.
+
+    Returns:
+        The connection; None if `_ENDED_AT_ONCE` connections had ended.
+
+    Raises:
+        OSError: No connection is waiting (`BlockingIOError`, or `TimeoutError` of a listener with a
+            time limit), or it cannot be accepted.
+    """
+    for _ in range(_ENDED_AT_ONCE):
+        connection, _address = listener.accept()
+        if not _has_hung_up(connection):
+            return connection
+        connection.close()
+    return None
 
 
 def has_unread(connection: socket.socket) -> bool:
