@@ -53,7 +53,7 @@ CHECK_PROCESSES ?= 4
 # Marked so: what wants more than Python, takes long, or wants the machine for itself (pyproject.toml, tests/support/needs.py).
 NOT_QUICK := ray or server or hosts or sim or vulkan or torch or gpu or browser or node or compiler or alone or slow or integration
 # Environments of model families and simulators, in $(VENV)-NAME: NAME.txt in requirements/ of a plug-in, or of tests/. What is
-# tested in each is in the folders families/NAME of tests/ and of the plug-ins' tests. Those whose code is on no package
+# tested in each is in the folders families/NAME of the plug-ins' tests. Those whose code is on no package
 # index want its source, too: OPENPI_SRC, OPENVLA_SRC,
 # OPENVLA_OFT_SRC, OCTO_SRC, DIFFUSION_POLICY_SRC, VJEPA2_SRC, GR00T_SRC.
 # ros is a ROS 2 of its own; it wants Python 3.11.
@@ -62,7 +62,7 @@ NOT_QUICK := ray or server or hosts or sim or vulkan or torch or gpu or browser 
 # robocasa is only tested where it is named: 1.3 GB, and a minute.
 FAMILIES ?= libero libero_pro lerobot hf rcs ros torchrl
 REQUIREMENTS := $(wildcard plugins/*/*/requirements)
-TESTS_OF = $(foreach family,$(1),$(wildcard tests/families/$(family) plugins/*/tests/families/$(family)))
+TESTS_OF = $(foreach family,$(1),$(wildcard plugins/*/tests/families/$(family)))
 TESTED_IN_libero := libero robosuite
 TESTED_IN_hf := pi0 arro vjepa2_ac
 TESTED_IN_lerobot06 := lerobot gr00t

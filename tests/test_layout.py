@@ -134,3 +134,57 @@ def test_a_plugins_readme_names_pages_that_exist(name: str) -> None:
     readme = (ROOT / "plugins" / name / "README.md").read_text()
     pages = re.findall(r"`(docs/[\w/]+\.md)", readme)
     assert [page for page in pages if not (ROOT / page).exists()] == []
+
+
+# Files and folders of tests/ that import plug-ins, with the reason. All others need the core alone.
+ABOVE_PLUGINS = {
+    "benchmarks": "benchmarks measure plug-ins as well",
+    "cluster/test_scaling.py": "it runs several drivers with the processes of the tuner",
+    "client/test_hostile_server.py": "one server is slow to clients of the core and of dialects",
+    "client/test_wrong_address.py": "a learner's client is told the same as a robot's",
+    "evaluate/report/test_families.py": "results of one run and merged ones have the same rates",
+    "evaluate/test_program.py": "resumed and merged results have the same rule",
+    "golden": "golden files have the messages of all protocols",
+    "integration": "whole servers, with what is installed beside them",
+    "policies/adapters/test_pushed_adapters.py": "weights that a learner pushes",
+    "policies/test_reference_dagger.py": "programs of examples/reference use plug-ins",
+    "policies/test_reference_training.py": "programs of examples/reference use plug-ins",
+    "policies/test_reference_weights.py": "it verifies bundles",
+    "serve/endpoints/test_weights.py": "weights that a learner pushes",
+    "serve/python_env/test_child_process.py": "weights that a learner pushes",
+    "serve/test_flood.py": "one harness attacks the ports of all protocols",
+    "serve/test_fuzz_before_keys.py": "one harness attacks the ports of all protocols",
+    "serve/test_overload.py": "one harness attacks the ports of all protocols",
+    "serve/test_page_headers.py": "a rule of all pages that are served",
+    "support": "helpers that tests here and of plug-ins share",
+    "test_docs.py": "pages of the workspace describe plug-ins",
+    "test_page_protocol.py": "a rule of all pages that are served",
+}
+
+
+def _imports_plugin(path: Path) -> bool:
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.ImportFrom):
+            modules = [node.module or ""]
+        elif isinstance(node, ast.Import):
+            modules = [alias.name for alias in node.names]
+        else:
+            continue
+        if any(module.partition(".")[0] in PLUGINS for module in modules):
+            return True
+    return False
+
+
+def test_tests_of_the_core_import_no_plugin_but_those_of_the_workspace() -> None:
+    tests = ROOT / "tests"
+    importing = {
+        str(path.relative_to(tests)) for path in tests.rglob("*.py") if _imports_plugin(path)
+    }
+    excepted = {
+        path: exception
+        for path in importing
+        for exception in ABOVE_PLUGINS
+        if path == exception or path.startswith(f"{exception}/")
+    }
+    assert sorted(importing - excepted.keys()) == [], "move it to the tests of that plug-in"
+    assert sorted(ABOVE_PLUGINS.keys() - set(excepted.values())) == [], "imports none any more"

@@ -13,6 +13,7 @@ import yaml
 from hypothesis import given
 from hypothesis import strategies as st
 from typer.testing import CliRunner
+from wrong_yaml import WRONG
 
 import vlagents_ray
 from vlagents_ray import ConfigError
@@ -22,7 +23,6 @@ from vlagents_ray.robot.limits import MotionLimits
 from vlagents_ray.serve.access.key_store import read_keys
 from vlagents_ray.serve.launch.deployment_file import read_deployment
 from vlagents_ray.yaml_text import load_yaml
-from vlagents_ray_robot.ros.robot import read_settings
 
 TEXTS = st.text(st.characters(codec="ascii", exclude_categories=("C",)), max_size=6)
 VALUES = st.recursive(
@@ -82,17 +82,8 @@ READERS = {
     "run": ("x.yaml", lambda file: read_run_file(file, "file of runs", "`policies`")),
     "limits": ("x.yaml", MotionLimits.read),
     "limits as JSON": ("x.json", MotionLimits.read),
-    "topics": ("x.yaml", read_settings),
     "keys": ("x.json", read_keys),
     "setting": ("x.txt", lambda file: parse_settings([f"a={file.read_text()}"], "--set")),
-}
-WRONG = {
-    "a key twice": (b'{"keys": [], "keys": []}', "twice"),
-    "not closed": (b"{a: [1, 2", ""),
-    "a tab": (b"a:\n\t- 1\n\tb: 2", ""),
-    "not UTF-8": (b"\xff\xfe\x00a", ""),
-    "an object of Python": (b"{a: !!python/object/apply:os.getcwd []}", ""),
-    "nested deeply": (b"[" * 5000, ""),
 }
 
 

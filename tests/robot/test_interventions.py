@@ -21,7 +21,6 @@ from vlagents_ray.chunking.player import ChunkPlayer, PlayerSettings
 from vlagents_ray.robot import Guard, Watchdog, run_loop
 from vlagents_ray.robot.record import Recorder
 from vlagents_ray.robot.simulated import SimulatedRobot
-from vlagents_ray_learn.open_loop.recorded_dataset import Names, RecordedDataset
 
 HZ = 50.0
 MAX_STEP = 0.05
@@ -267,6 +266,3 @@ def test_a_recorded_frame_is_the_policys_or_an_operators_or_a_safe_one(
     assert operators == [pytest.approx([0.1, 0.1])] * 10
     assert report.interventions == 10
     assert sum(safe for _, safe, _ in pairs) >= 20
-    [session] = RecordedDataset(tmp_path).sessions()
-    steps = list(RecordedDataset(tmp_path).steps(session.episodes[0], Names(), None))
-    assert sum(step.intervention for step in steps) == 10, "those that training imitates"

@@ -27,9 +27,8 @@ import pytest
 from vlagents_ray.registry import entries, find_entry
 
 ROOT = Path(__file__).parents[2]
-FOLDERS = (
-    "tests/families",
-    *(str(path.relative_to(ROOT)) for path in sorted(ROOT.glob("plugins/*/tests/families"))),
+FOLDERS = tuple(
+    str(path.relative_to(ROOT)) for path in sorted(ROOT.glob("plugins/*/tests/families"))
 )
 PAGES = ROOT / "docs" / "policies"
 PYTHON = "3.11"  # of this project's own environment

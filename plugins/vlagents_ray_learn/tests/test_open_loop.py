@@ -318,3 +318,15 @@ def test_datasets_of_other_actions_are_not_mixed(tmp_path: Path) -> None:
     (tmp_path / "two").rmdir()
     with pytest.raises(ConfigError, match="one by one"):
         open_datasets(tmp_path)
+
+
+def test_the_frames_of_an_operator_are_marked_for_training(tmp_path: Path) -> None:
+    operators = [False, True, True, False]
+    still, action = Obs(state={"joints": np.zeros(2, np.float32)}), np.ones(2, np.float32)
+    with Recorder(tmp_path, 10, interventions=True) as recorder, recorder.episode("stack"):
+        for tick, intervention in enumerate(operators):
+            recorder.add(still, action, tick=tick, intervention=intervention)
+    dataset = RecordedDataset(tmp_path)
+    [session] = dataset.sessions()
+    steps = dataset.steps(session.episodes[0], Names(), None)
+    assert [step.intervention for step in steps] == operators

@@ -22,6 +22,7 @@ from vlagents_ray.evaluate import EvalConfig, Results
 from vlagents_ray.evaluate.artifacts.storage import require_below
 from vlagents_ray.evaluate.episode.records import EpisodeResult
 from vlagents_ray.evaluate.plan.jobs import plan
+from vlagents_ray.evaluate.replay import find
 from vlagents_ray.evaluate.report.page import write_report
 from vlagents_ray.evaluate.results.combination import combined
 from vlagents_ray.evaluate.results.store import Store
@@ -319,3 +320,29 @@ def test_other_weights_under_the_same_name_are_not_merged(
         for one in case.episodes
     }
     assert found == {"x"}
+
+
+def test_an_episode_is_replayed_after_a_merge_that_renamed_its_suite(
+    config: Config, tmp_path: Path
+) -> None:
+    renamed = config(out=tmp_path / "b", seed=100, episodes=1)
+    suite = renamed.suites[0].model_copy(update={"name": "b"})
+    play(renamed.model_copy(update={"suites": [suite]}))
+    play(config(out=tmp_path / "a", episodes=1))
+    results = merge(tmp_path / "all", [tmp_path / "a", tmp_path / "b"]).results
+    for number, episode in enumerate(results.cases[0].episodes):
+        recorded = find(results, str(episode.result.key))
+        replayed = play(recorded.config(tmp_path / f"again{number}"), left_out=[])
+        played = [one.result.key for one in replayed.cases[0].episodes]
+        assert episode.result.key in played
+
+
+def test_a_folder_with_a_column_of_another_program_is_refused_and_nothing_is_written(
+    config: Config, tmp_path: Path
+) -> None:
+    folder = play(config(episodes=1)).out
+    with closing(sqlite3.connect(folder / "results.db")) as db, db:
+        db.execute("ALTER TABLE episodes ADD COLUMN theirs")
+    with pytest.raises(ConfigError, match=r"got the unknown columns .*theirs"):
+        merge(tmp_path / "merged", [folder])
+    assert not (tmp_path / "merged").exists()

@@ -22,7 +22,6 @@ from vlagents_ray.evaluate.plan.cases import plan_cases
 from vlagents_ray.evaluate.plan.jobs import plan
 from vlagents_ray.evaluate.results import database
 from vlagents_ray.evaluate.results.store import Store
-from vlagents_ray_results.merge import merge
 
 Config = Callable[..., EvalConfig]
 COUNT = """
@@ -158,7 +157,7 @@ FOREIGN = 'x") VALUES (1); DROP TABLE episodes; --'
     + [("episodes", " AS (1)")],  # generated
 )
 def test_a_column_of_somebody_else_is_refused_by_all_that_open_the_file(
-    config: Config, tmp_path: Path, table: str, kind: str
+    config: Config, table: str, kind: str
 ) -> None:
     begun(config()).close()
     name = '"' + FOREIGN.replace('"', '""') + '"'
@@ -167,7 +166,6 @@ def test_a_column_of_somebody_else_is_refused_by_all_that_open_the_file(
         before = list(db.iterdump())
     opened: list[Callable[[], object]] = [
         lambda: Results.load(config().out),
-        lambda: merge(tmp_path / "merged", [config().out]),
         lambda: Store(config(resume=True)),
     ]
     for read in opened:
@@ -175,7 +173,6 @@ def test_a_column_of_somebody_else_is_refused_by_all_that_open_the_file(
             ConfigError, match=r"got the unknown columns .*DROP TABLE.* read it with the version"
         ):
             read()
-    assert not (tmp_path / "merged").exists()
     with closing(sqlite3.connect(config().out / "results.db")) as db:
         assert list(db.iterdump()) == before
 

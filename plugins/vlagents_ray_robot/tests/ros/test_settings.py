@@ -9,6 +9,7 @@ from typing import Any
 
 import pytest
 import yaml
+from wrong_yaml import WRONG
 
 import vlagents_ray.cli.robot as robot_command
 from vlagents_ray.errors import ConfigError
@@ -161,8 +162,14 @@ def test_a_wrong_setting_is_an_error_that_names_it_and_the_cure(
     assert str(error.value).startswith("arm.yaml")
 
 
-def test_a_file_that_cannot_be_read_is_an_error(tmp_path: Path) -> None:
-    (tmp_path / "broken.yaml").write_text("a: [")
-    for name in ("broken.yaml", "missing.yaml"):
-        with pytest.raises(ConfigError, match=name):
-            read_settings(tmp_path / name)
+@pytest.mark.parametrize("mistake", WRONG)
+def test_a_file_that_cannot_be_read_is_an_error_that_names_it(mistake: str, tmp_path: Path) -> None:
+    text, word = WRONG[mistake]
+    (tmp_path / "broken.yaml").write_bytes(text)
+    with pytest.raises(ConfigError, match=rf"(?s)broken\.yaml.*{word}"):
+        read_settings(tmp_path / "broken.yaml")
+
+
+def test_a_missing_file_is_an_error_that_names_it(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"missing\.yaml"):
+        read_settings(tmp_path / "missing.yaml")

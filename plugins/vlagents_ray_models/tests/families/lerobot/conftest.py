@@ -42,7 +42,6 @@ if importlib.util.find_spec("ray") is None:
     of_ray = (
         "test_async_client.py",
         "test_commands.py",
-        "test_datasets.py",
         "test_hilserl.py",
         "test_training.py",
     )

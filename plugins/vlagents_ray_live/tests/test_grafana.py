@@ -19,7 +19,7 @@ from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.replica import metrics
 from vlagents_ray_live import recording
 
-ROOT = Path(__file__).parents[2]
+ROOT = Path(__file__).parents[3]
 DASHBOARD = json.loads((ROOT / "cluster/grafana/policy_server.json").read_text())
 TAGS = ("application", "deployment", "replica", "policy")
 SUFFIXES = {"Counter": ("_total",), "Gauge": ("",), "Histogram": ("_bucket", "_sum", "_count")}
