@@ -270,7 +270,7 @@ class World:
                 self.stop()
         else:
             do = fault.partition(" ")[0]
-            self.commands.came(
+            self.commands.receive(
                 Act(self.joints, info={COMMAND: {"id": str(self.clock.now), "do": do}})
             )
             if do != "restart":

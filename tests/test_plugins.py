@@ -19,7 +19,7 @@ from vlagents_ray.errors import ConfigError, UnknownEnv, UnknownPolicy
 from vlagents_ray.evaluate.trackers import tracker_class
 from vlagents_ray.registry import entries, find_entry, names, not_installed, plugin_distributions
 from vlagents_ray.robot.leaders import leader_named
-from vlagents_ray.robot.loop import robot_named
+from vlagents_ray.robot.loop import robot_factory
 
 Install = Callable[..., None]
 
@@ -282,12 +282,12 @@ def lab(install: Install, tmp_path: Path) -> None:
 
 @pytest.mark.usefixtures("lab")
 def test_a_robot_of_a_plugin_is_made_by_its_name_with_the_text_after_the_colon() -> None:
-    assert vars(robot_named("--robot", "arm:left")()) == {"name": "left"}
+    assert vars(robot_factory("--robot", "arm:left")()) == {"name": "left"}
     with pytest.raises(
         ConfigError,
         match="--robot lamp:left: lacks observe, apply, stop; want a class with observe",
     ):
-        robot_named("--robot", "lamp:left")
+        robot_factory("--robot", "lamp:left")
 
 
 @pytest.mark.usefixtures("lab")
@@ -325,7 +325,7 @@ def test_a_robot_a_leader_and_a_subcommand_that_are_not_installed_name_their_dis
         ConfigError,
         match="robot 'crane' is in vlagents-ray-cranes, which is not installed: pip inst",
     ):
-        robot_named("--robot", "crane:4")
+        robot_factory("--robot", "crane:4")
     with pytest.raises(
         ConfigError, match="leader 'wheel' is in vlagents-ray-cranes, which is not installed"
     ):

@@ -70,7 +70,7 @@ class Arm:
 
     def settle(self) -> None:
         """Wait until the policy has answered what it was asked."""
-        wait_for(lambda: self.player._asker is None or not self.player._asker.busy, every_s=0.001)
+        wait_for(lambda: self.player._caller is None or not self.player._caller.busy, every_s=0.001)
 
 
 def row(value: float) -> np.ndarray:

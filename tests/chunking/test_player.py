@@ -89,7 +89,7 @@ def playing() -> Iterator[Callable[..., tuple[Counting, ChunkPlayer]]]:
 def let(agent: Counting, player: ChunkPlayer) -> None:
     """One answer, and wait until the player could take it."""
     agent.gate.release()
-    wait_for(lambda: player._asker is not None and not player._asker.busy, every_s=0.001)
+    wait_for(lambda: player._caller is not None and not player._caller.busy, every_s=0.001)
 
 
 Playing = Callable[..., tuple[Counting, ChunkPlayer]]
@@ -554,8 +554,8 @@ def test_a_reply_that_was_lost_replays_nothing() -> None:
     for t in range(30):
         served.lose_reply |= t == 10
         act = player.act(obs(t))
-        assert player._asker is not None
-        wait_for(lambda: not player._asker.busy, every_s=0.001)
+        assert player._caller is not None
+        wait_for(lambda: not player._caller.busy, every_s=0.001)
         resumed |= "resumed" in act.info
         done.append((t, round(float(act.action[0]), 4), act.info["age_ticks"]))
     player.close()
@@ -583,11 +583,11 @@ def test_real_time_chunking_over_the_wire_joins_chunks_without_a_jump(real_time:
     player = ChunkPlayer(served.agent(), PlayerSettings(mode="async", real_time_chunking=real_time))
     player.reset(Obs())
     actions, chunks = [], set()
-    asker = player._asker
-    assert asker is not None
+    caller = player._caller
+    assert caller is not None
     for tick in range(60):
         if tick % 10 == 9:  # no answer takes longer, however busy the machine is
-            wait_for(lambda: not asker.busy, every_s=0.001)
+            wait_for(lambda: not caller.busy, every_s=0.001)
         act = player.act(Obs())
         assert "safe" not in act.info
         actions.append(float(act.action[0]))

@@ -20,22 +20,22 @@ def told(do: str, **more: str) -> Act:
 def test_commands_are_obeyed_and_answered_once_an_answer_has_come() -> None:
     inbox, control = CommandInbox(), RobotControl()
     for act in (told("pause"), told("stop", by="lab"), told("success")):
-        assert inbox.asking(Obs()).info == {}
-        inbox.came(act)
+        assert inbox.with_outcomes(Obs()).info == {}
+        inbox.receive(act)
         assert act.info == {"other": 1}
-    assert [command.do for command in inbox.obey(control)] == ["pause", "stop", "success"]
+    assert [command.do for command in inbox.apply(control)] == ["pause", "stop", "success"]
     assert (control.stops, control.reason) == (
         ["the live page by lab"],
         "paused from the live page",
     )
     assert control.over
     answers = {f"id of {do}": "" for do in ("pause", "stop", "success")}
-    assert inbox.asking(Obs(info={"a": 1})).info == {"a": 1, COMMANDED: answers}
-    inbox.came(PolicyFailed("lost"))
+    assert inbox.with_outcomes(Obs(info={"a": 1})).info == {"a": 1, COMMANDED: answers}
+    inbox.receive(PolicyFailed("lost"))
     # again, as the first may not have arrived.
-    assert inbox.asking(Obs()).info == {COMMANDED: answers}
-    inbox.came(Act(np.zeros(2, np.float32)))
-    assert inbox.asking(Obs()).info == {}
+    assert inbox.with_outcomes(Obs()).info == {COMMANDED: answers}
+    inbox.receive(Act(np.zeros(2, np.float32)))
+    assert inbox.with_outcomes(Obs()).info == {}
 
 
 @pytest.mark.parametrize("do", ["resume", "instruct", "restart", "take over", "move", "dance"])
@@ -43,34 +43,34 @@ def test_a_command_that_could_start_a_motion_does_not_exist(do: str) -> None:
     inbox, control = CommandInbox(), RobotControl()
     control.pause("by the operator")
     control.stop("by the operator")
-    inbox.came(told(do, text="fold the cloth"))
-    assert inbox.obey(control) == []
+    inbox.receive(told(do, text="fold the cloth"))
+    assert inbox.apply(control) == []
     assert (control.stopped, control.reason, control.over) == (True, "by the operator", False)
-    assert "no such command" in inbox.asking(Obs()).info[COMMANDED][f"id of {do}"]
+    assert "no such command" in inbox.with_outcomes(Obs()).info[COMMANDED][f"id of {do}"]
 
 
 def test_what_is_not_allowed_is_refused_and_what_has_another_form_left_out() -> None:
     inbox, control = CommandInbox(allow=["stop"]), RobotControl()
     for act in (told("pause"), told("stop")):
-        inbox.came(act)
-    inbox.obey(control)
+        inbox.receive(act)
+    inbox.apply(control)
     assert (control.stopped, control.reason) == (True, None)
-    assert "not allowed" in inbox.asking(Obs()).info[COMMANDED]["id of pause"]
+    assert "not allowed" in inbox.with_outcomes(Obs()).info[COMMANDED]["id of pause"]
     with pytest.raises(ConfigError, match="dance"):
         CommandInbox(allow=["dance"])
     for stated in (None, "stop", {"do": "stop"}, {"id": 1, "do": "stop"}):
         inbox = CommandInbox()
-        inbox.came(Act(np.zeros(2, np.float32), info={COMMAND: stated}))
-        assert inbox.obey(RobotControl()) == []
-        assert inbox.asking(Obs()).info == {}
+        inbox.receive(Act(np.zeros(2, np.float32), info={COMMAND: stated}))
+        assert inbox.apply(RobotControl()) == []
+        assert inbox.with_outcomes(Obs()).info == {}
 
 
 def test_the_name_of_a_key_forges_no_line_of_the_robots_log(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
     inbox = CommandInbox()
-    inbox.came(told("stop", by="lab\n2026-11-28 INFO robot: restarted by \x1b[2Janna"))
-    inbox.obey(RobotControl())
+    inbox.receive(told("stop", by="lab\n2026-11-28 INFO robot: restarted by \x1b[2Janna"))
+    inbox.apply(RobotControl())
     [record] = caplog.records
     first, *further = record.getMessage().split("\n")
     assert "\x1b" not in record.getMessage()

@@ -108,15 +108,15 @@ def drive(
     with ChunkPlayer(delayed, PlayerSettings(mode="async"), check=check) as player:
         see = lambda: Obs(state={"joints": np.array([position], np.float32)})  # noqa: E731
         player.reset(see(), "go")
-        asker = player._asker
-        assert asker is not None
+        caller = player._caller
+        assert caller is not None
         for tick in range(60 + 2 * stall):
             if tick == due:
                 delayed.gate.release()
-                wait_for(lambda: not asker.busy, every_s=0.001)
+                wait_for(lambda: not caller.busy, every_s=0.001)
                 due, fresh = None, tick if delayed.asked == 6 else fresh
             act = player.act(see())
-            if due is None and not asker.idle:
+            if due is None and not caller.idle:
                 assert delayed.called.acquire(timeout=60)
                 due = tick + (stall if delayed.asked == 6 else ANSWER)
                 if delayed.asked == 6:

@@ -101,10 +101,10 @@ def poses(inner: Reaching, agent: Agent, ticks_late: int, **settings: Any) -> np
             robot.stop()
             player.interrupt()
         robot.apply(player.act(obs).action)
-        asker = player._asker
-        if asker is not None and not asker.idle and tick % ticks_late == 0:
+        caller = player._caller
+        if caller is not None and not caller.idle and tick % ticks_late == 0:
             inner.gate.release()
-            wait_for(lambda asker=asker: not asker.busy, every_s=0.001)
+            wait_for(lambda caller=caller: not caller.busy, every_s=0.001)
     inner.gate.release(100)
     player.close()
     return np.stack(found)

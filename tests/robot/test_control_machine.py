@@ -120,7 +120,7 @@ class Machine(RuleBasedStateMachine):
                     act.info[COMMAND] = machine.from_afar.pop(0)
                     machine.paused |= act.info[COMMAND]["do"] == "pause"
                     machine.commanded_stop |= act.info[COMMAND]["do"] == "stop"
-                machine.inbox.came(act)
+                machine.inbox.receive(act)
                 return act
 
         class Leader:

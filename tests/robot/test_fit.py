@@ -102,7 +102,7 @@ def test_an_accepted_misfit_is_logged(caplog: pytest.LogCaptureFixture) -> None:
 
 def test_the_first_chunk_is_drawn_beside_the_training_and_the_limits() -> None:
     chunk = np.array([[0.0, 0.1, 1.0], [0.3, 0.2, 0.9]])
-    header, *lines = TRAINED.drawn(
+    header, *lines = TRAINED.draw(
         chunk, MotionLimits(low=(-1.5, -2.5, 0.0), high=(1.5, 1.0, 1.0)), NAMES
     )
     assert header.split()[-3:] == ["chunk", "training", "limits"]
@@ -118,7 +118,7 @@ def test_the_first_chunk_is_drawn_beside_the_training_and_the_limits() -> None:
 
 
 def test_a_chunk_is_drawn_without_training_and_limits() -> None:
-    assert ["#" in line for line in Trained().drawn(np.zeros((2, 2)), None)[1:]] == [True, True]
+    assert ["#" in line for line in Trained().draw(np.zeros((2, 2)), None)[1:]] == [True, True]
 
 
 def test_joints_in_another_order_than_that_of_the_limits_are_found_by_name() -> None:

@@ -87,7 +87,7 @@ def test_a_correction_of_a_second_is_recorded_from_its_first_tick_with_both_acti
 
     def answered() -> bool:
         """Let the policy answer within a tick, as no time passes between ticks."""
-        wait_for(lambda: player._asker is None or not player._asker.busy, every_s=0.001)
+        wait_for(lambda: player._caller is None or not player._caller.busy, every_s=0.001)
         return False
 
     with (

@@ -93,7 +93,7 @@ def executed(
 
         player.reset(observed())
         for _ in range(ticks):
-            while chunk is not None and player._asker is not None and player._asker.busy:
+            while chunk is not None and player._caller is not None and player._caller.busy:
                 time.sleep(0)
             act = player.act(observed())
             refused += act.info.get("safe_cause") in ("dynamics", "max_step", "limits")

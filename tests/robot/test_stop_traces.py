@@ -104,7 +104,7 @@ class Run:
     inbox: CommandInbox = field(default_factory=CommandInbox)
 
     def command(self, do: str) -> None:
-        self.inbox.came(Act(np.zeros(2, np.float32), info={COMMAND: {"id": do, "do": do}}))
+        self.inbox.receive(Act(np.zeros(2, np.float32), info={COMMAND: {"id": do, "do": do}}))
 
 
 def on_a_thread(call: Callable[[], object]) -> None:

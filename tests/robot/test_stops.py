@@ -49,7 +49,7 @@ class Commanding(Agent):
         act = Act(np.zeros(2, np.float32))
         if do := self._told.get(self._asked):
             act.info[COMMAND] = {"id": do, "do": do, "text": "fold"}
-        self._inbox.came(act)
+        self._inbox.receive(act)
         return act
 
 

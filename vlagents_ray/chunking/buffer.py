@@ -51,9 +51,8 @@ MERGES: Mapping[str, Merge] = {
 }
 ENSEMBLE = "ensemble"
 ENSEMBLE_M = 0.01
-"""The m of the weights exp(-m * i), i = 0 for the oldest: Zhao et al. 2023 (ACT,
-https://arxiv.org/abs/2304.13705), and
-`temporal_agg` in their code.
+"""The m of the weights exp(-m * i), i = 0 for the oldest, as in Zhao et al. 2023 (ACT,
+https://arxiv.org/abs/2304.13705) and under `temporal_agg` in their code.
 """
 
 
@@ -84,7 +83,7 @@ class Step(NamedTuple):
     def played(self, action: np.ndarray, tick: int, silent_s: float) -> Act:
         """Return `action` in place of the planned one for a tick, with the info of its chunk."""
         chunk = self.chunk
-        about = {
+        chunk_info = {
             AGE: tick - chunk.tick,
             AGE_MS: (time.monotonic() - chunk.seen_at) * 1e3,
             CHUNK: chunk.number,
@@ -93,7 +92,7 @@ class Step(NamedTuple):
             SILENT: silent_s,
         }
         done = chunk.done and self.row == len(chunk.rows) - 1
-        return Act(action.copy(), done, {**chunk.info, **about})
+        return Act(action.copy(), done, {**chunk.info, **chunk_info})
 
 
 class ChunkBuffer:
@@ -121,7 +120,7 @@ class ChunkBuffer:
             raise ConfigError(
                 f"merge: got {merge!r}, want one of {sorted([*MERGES, ENSEMBLE])} or a function"
             )
-        self.executed = 0  # number of executed actions of this plan
+        self.executed = 0  # the number of executed actions of this plan
         self._merge = MERGES.get(merge) if isinstance(merge, str) else merge  # None: the ensemble
         self._newest = merge == "newest"
         self._m = ensemble_m
@@ -135,6 +134,7 @@ class ChunkBuffer:
         """
         while self._chunks and self._chunks[0].end <= self.executed:
             self._chunks.popleft()
+
         if self.outruns(chunk.step, chunk.info):
             return False
         if chunk.end == self.executed and self.next is None:
@@ -168,7 +168,8 @@ class ChunkBuffer:
         """Return `next` and count it as executed; raises `PolicyFailed` if no chunk reaches that
         far.
         """
-        if (step := self.next) is None:
+        step = self.next
+        if step is None:
             raise PolicyFailed(f"chunk: no row is left for step {self.executed} of the plan")
         self.advance()
         return step
@@ -183,20 +184,28 @@ class ChunkBuffer:
     def leftover(self) -> np.ndarray | None:
         """Return the remaining actions, (H', D); None if there are none."""
         rows: list[np.ndarray] = []
-        while (step := self._at(self.executed + len(rows))) is not None:
+        step = self._at(self.executed)
+        while step is not None:
             rows.append(step.action)
+            step = self._at(self.executed + len(rows))
         return np.stack(rows) if rows else None
 
     def continuation(self, delay: int) -> dict[str, Any]:
         """Return the `Obs.info` of a request with real-time chunking, whose answer is expected
         in `delay` ticks.
         """
-        rest = self.leftover()
-        return {} if rest is None else {LEFTOVER: rest, DELAY: min(delay, len(rest))}
+        leftover = self.leftover()
+        if leftover is None:
+            return {}
+        return {LEFTOVER: leftover, DELAY: min(delay, len(leftover))}
 
     def outruns(self, step: int, info: Mapping[str, Any]) -> bool:
-        """Return whether more rows were executed since `step`, that of an answer, than it was
-        `GIVEN` in its `info`.
+        """Return whether more rows were executed since the observation of an answer than the policy
+        was given (`GIVEN`).
+
+        Args:
+            step: The number of executed actions at the observation.
+            info: The info of the answer.
         """
         return bool(self.executed - step > info.get(GIVEN, math.inf))
 
@@ -204,27 +213,24 @@ class ChunkBuffer:
         """Drop chunks with observations from before a time, s of `time.monotonic`; return
         whether there were any.
         """
-        count, kept = (
-            len(self._chunks),
-            deque(chunk for chunk in self._chunks if chunk.seen_at >= before),
-        )
-        self._chunks = kept
-        return len(kept) < count
+        count = len(self._chunks)
+        self._chunks = deque(chunk for chunk in self._chunks if chunk.seen_at >= before)
+        return len(self._chunks) < count
 
-    def _at(self, place: int) -> Step | None:
+    def _at(self, index: int) -> Step | None:
+        """Return the step with this index in the plan; None if no chunk has a row for it."""
         for newest in reversed(self._chunks):
-            if newest.step <= place < newest.end:
+            if newest.step <= index < newest.end:
                 break
         else:
             return None
-        row = place - newest.step
+
+        row = index - newest.step
         if self._newest:
             return Step(newest.rows[row], newest, row)
-        rows = [
-            chunk.rows[place - chunk.step]
-            for chunk in self._chunks
-            if chunk.step <= place < chunk.end
-        ]
+
+        chunks = (chunk for chunk in self._chunks if chunk.step <= index < chunk.end)
+        rows = [chunk.rows[index - chunk.step] for chunk in chunks]
         if len(rows) == 1:
             action = rows[0]
         elif self._merge is None:
@@ -235,11 +241,14 @@ class ChunkBuffer:
         return Step(action, newest, row)
 
 
-# answers: the first ones that continue a plan run passes and sizes of batches that compile only
-# then.
-_COLD = 2
-_RECENT = 10  # answers: at 10 ms to 1 s each, the estimate follows a slower network within seconds
-# Too short an estimate makes a jump, one too long only a later reaction: so not the median.
+# The number of answers that may include a cold start: the first ones that continue a plan may run
+# passes and sizes of batches that are not compiled yet.
+_COLD_ANSWERS = 2
+# The number of answers in the estimate. At 10 ms to 1 s each, it follows a slower network within
+# seconds.
+_RECENT_ANSWERS = 10
+# The estimate is not the median: if it is too short, the robot jumps; if it is too long, the robot
+# only reacts later.
 _QUANTILE = 0.9
 
 
@@ -253,11 +262,11 @@ class DelayEstimate:
 
     def __init__(self) -> None:
         self._answers = 0
-        self._recent: deque[int] = deque(maxlen=_RECENT)
+        self._recent: deque[int] = deque(maxlen=_RECENT_ANSWERS)
 
     def add(self, ticks: int) -> None:
         """Add the delay of an answer: the ticks from its observation to its arrival."""
-        if self._answers == _COLD:
+        if self._answers == _COLD_ANSWERS:
             self._recent.clear()
         self._answers += 1
         self._recent.append(ticks)
@@ -265,7 +274,9 @@ class DelayEstimate:
     @property
     def ticks(self) -> int:
         """The delay to expect; 0 before the first answer."""
-        return sorted(self._recent)[int(_QUANTILE * (len(self._recent) - 1))] if self._recent else 0
+        if not self._recent:
+            return 0
+        return sorted(self._recent)[int(_QUANTILE * (len(self._recent) - 1))]
 
 
 SKEW_S = 0.1  # the largest lead of the clock of a sensor's computer over this machine's clock, s
@@ -291,7 +302,8 @@ class CaptureClock:
         """Return the capture time; the current time if the observation has none; `-math.inf` for
         an impossible one.
         """
-        now, stamp = time.monotonic(), obs.info.get(CAPTURED)
+        now = time.monotonic()
+        stamp = obs.info.get(CAPTURED)
         if stamp is None:
             return now
         if not isinstance(stamp, (int, float)) or not math.isfinite(stamp):
@@ -300,7 +312,8 @@ class CaptureClock:
             )
         if stamp != self._stamp:
             age_s = time.time() - stamp
-            self._stamp, self._at = stamp, now - max(age_s, 0.0) if age_s >= -SKEW_S else -math.inf
+            self._stamp = stamp
+            self._at = now - max(age_s, 0.0) if age_s >= -SKEW_S else -math.inf
         return self._at
 
 

@@ -85,10 +85,10 @@ class RobotControl:
         # Sources whose silence stopped the robot and that are still silent.
         self._silent: set[str] = set()
         self._unseen = False  # whether the loop has yet to hold the robot for the last stop
-        self._auto = False
-        self._pause: str | None = None
-        self._pauses = 0
-        self._engaged = False  # at the last update
+        self._auto = False  # whether the end of a silence ends the stop that it caused
+        self._pause: str | None = None  # the reason of a pause
+        self._pauses = 0  # the number of pauses so far
+        self._engaged = False  # whether the leader was engaged at the last update
         self._outcome: Outcome | None = None
 
     def __deepcopy__(self, memo: dict[int, Any]) -> RobotControl:
@@ -224,22 +224,22 @@ class RobotControl:
         """Set the source of motion at the beginning of a tick; return whether the policy's plan
         must be discarded.
         """
-        pauses, engaged = self._pauses, False
+        pauses = self._pauses
+        engaged = False
         if self.leader is not None:
             try:
                 engaged = self.leader.engaged()
             except Exception as error:  # noqa: BLE001 - a broken device must not end the loop
-                self.pause(
-                    str(error)
-                    if isinstance(error, VLAgentsError)
-                    else f"the leader failed: {error!r}"
-                )
+                is_ours = isinstance(error, VLAgentsError)
+                self.pause(str(error) if is_ours else f"the leader failed: {error!r}")
+
         with self._lock:
             before = self._state
-            # No pause since the takeover.
+            # A takeover ends an earlier pause, but not one that began during this update.
             if engaged and not self._engaged and pauses == self._pauses:
                 self._pause = None
             self._engaged = engaged
+
             if self.stopped:
                 self._state = "stopped"
             elif engaged:
@@ -256,11 +256,10 @@ class RobotControl:
         with self._lock:
             if self._state == "stopped" or self.stopped or self._unseen or self._stopping:
                 silent = " and the ".join(sorted(self._silent))
-                silence = (
-                    f"no signal from the {silent}"
-                    if silent
-                    else "waiting for a restart (Watchdog.restart)"
-                )
+                if silent:
+                    silence = f"no signal from the {silent}"
+                else:
+                    silence = "waiting for a restart (Watchdog.restart)"
                 return Held("stopped", f"stopped: {self._stop or silence}")
             if self._state == "paused" or (self._pause is not None and self._state != "human"):
                 return Held("paused", self._pause or PAUSED)

@@ -51,12 +51,12 @@ class EaseIn:
         self._deltas, self._at_once = list(deltas), list(at_once)
         # A row of deltas is a motion, so that the ramp begins before it.
         self._is_motion = bool(self._deltas)
-        self._tick = -approach  # of the ramp
+        self._tick = -approach  # the tick of the ramp; negative during the approach
         self._speed = 0.0 if ramp else 1.0  # rows a tick
-        self._rise = 0.0  # of the speed, a tick
-        self._place = 0.0  # on the plan, in rows since the section's begin
-        self._rows = 0  # of the section
-        self._ticks = 0  # of the section that are left
+        self._rise = 0.0  # the increase of the speed a tick
+        self._position = 0.0  # the position on the plan, in rows since the beginning of the section
+        self._rows = 0  # the number of rows of the section
+        self._ticks = 0  # the number of ticks that are left of the section
 
     @property
     def arrived(self) -> bool:
@@ -89,7 +89,7 @@ class EaseIn:
             The command, (D,) float32, and 0 or 1.
         """
         self._tick += 1
-        if self._tick <= 0:
+        if self._tick <= 0:  # the approach
             share = 1.0 + self._tick / self._approach
             share *= share * share * (10.0 - 15.0 * share + 6.0 * share * share)
             command = self._between(action, share)
@@ -98,28 +98,31 @@ class EaseIn:
                 return command, 0
             self._from = action
             return command, 0 if self._is_motion else 1
+
         if not self._ticks:
             self._begin_section(known)
-        before, self._place = self._place, self._next_place()
-        row = int(self._place)
-        share = self._place - row
-        if row == int(before):
+        before, self._position = self._position, self._next_position()
+        row = int(self._position)
+        share = self._position - row
+        if row == int(before):  # before the next row
             command = self._between(action, share)
-            command[self._deltas] = (self._place - before) * action[self._deltas]
+            command[self._deltas] = (self._position - before) * action[self._deltas]
             return command, 0
+
         self._from = action
         if after is None or share == 0.0:
             self._ticks = self._ticks if after is not None else 0  # a shorter plan ends the section
             command = action.copy()
             command[self._deltas] = (row - before) * action[self._deltas]
             return command, 1
+
         command = self._between(after, share)
         command[self._deltas] = (row - before) * action[self._deltas] + share * after[self._deltas]
         return command, 1
 
     def _begin_section(self, known: int) -> None:
         """Begin the section of the ramp that ends at full speed, or else at the last known row."""
-        self._place = 0.0
+        self._position = 0.0
         first = math.ceil((1.0 - self._speed**2) * self._ramp / 2)
         for rows in range(max(1, first), known + 1):
             ticks = math.ceil(2 * rows / (1.0 + self._speed))
@@ -129,15 +132,16 @@ class EaseIn:
             ):
                 self._rows, self._ticks, self._rise = rows, ticks, rise
                 return
+
         self._rows, self._ticks = known, self._ticks_until_end(known)
         self._rise = self._rise_of(self._rows, self._ticks)
 
-    def _next_place(self) -> float:
-        """Return the place after this tick, at which the speed rises evenly."""
+    def _next_position(self) -> float:
+        """Return the position after this tick, during which the speed rises evenly."""
         self._ticks -= 1
-        place = self._place + self._speed + self._rise / 2
+        position = self._position + self._speed + self._rise / 2
         self._speed += self._rise
-        return float(self._rows) if self._ticks == 0 else place
+        return float(self._rows) if self._ticks == 0 else position
 
     def _ticks_until_end(self, rows: int) -> int:
         """Return the ticks until the last known row, with the largest speed that the next

@@ -25,7 +25,7 @@ from vlagents_ray.validation import check_action
 
 SafeName = Literal["auto", "hold", "zero"]
 Cause = Literal[
-    # The last answer has no rows left, and the next one is pending: not counted as `safe`.
+    # The last answer has no rows left, and the next one is pending; not counted as `safe`.
     "waiting",
     "late",  # the answer arrived too late for all its rows, or for those that it was given
     "old",  # the plan is older than max_age_s
@@ -119,18 +119,19 @@ class SafeAction:
                     "actions are relative or absolute; state it (ActionSpec.delta), or give "
                     "safe='hold', which is right for absolute ones alone, or an action of your own"
                 )
+
             self._make: Safe = stopping(spec)
             if safe not in ("auto", self._make):
-                moves = (
-                    "absolute ones take for a pose to go to"
-                    if safe == "zero"
-                    else "relative actions go on moving with"
-                )
+                if safe == "zero":
+                    consequence = "absolute ones take for a pose to go to"
+                else:
+                    consequence = "relative actions go on moving with"
                 raise ConfigError(
-                    f"safe: got {safe!r}, which {moves}; give safe={self._make!r}, or 'auto'"
+                    f"safe: got {safe!r}, which {consequence}; give safe={self._make!r}, or 'auto'"
                 )
         else:
             self._make = safe if callable(safe) else np.asarray(safe, np.float32)
+
         self._grippers = None if grippers is None else list(grippers)
         self._spec = spec
         if spec.dim is not None:
@@ -146,15 +147,18 @@ class SafeAction:
             return np.asarray(self._make(obs), np.float32)
         if isinstance(self._make, np.ndarray):
             return self._make.copy()
-        if last is None and self._make == "zero" and (first := self._first(obs)) is not None:
-            return first
+
         if last is None:
+            first = self._first(obs) if self._make == "zero" else None
+            if first is not None:
+                return first
             raise InvalidAction(
                 f"safe: got {self._make!r} before the first action, which there is nothing to make "
                 "from"
             )
         if self._make == "hold":
             return last.copy()
+
         action = np.zeros_like(last)
         grippers = self._gripper_columns(len(last))
         action[grippers] = last[grippers]
@@ -170,6 +174,7 @@ class SafeAction:
         spec = self._spec
         if spec.dim is None:
             return None
+
         action = np.zeros(spec.dim, np.float32)
         grippers = self._gripper_columns(spec.dim)
         if grippers:
@@ -255,11 +260,14 @@ class Motion:
         must not be sent.
         """
         self._ease = None
-        # By the last target; the robot may have been moved since, or never have arrived.
+
+        # Try to continue from the last target; but the robot may have been moved since, or never
+        # have arrived there.
         if self._state == "held":
             with contextlib.suppress(InvalidAction):
                 self._last, self._state = self._checked(action, self._last), "moving"
                 return self._last
+
         last = self._last if self._state == "moving" else self._standing(obs)
         self._last, self._state = self._checked(action, last), "moving"
         return self._last
@@ -281,19 +289,24 @@ class Motion:
         if plan.next is None:
             raise PolicyFailed(f"plan: expected a row for step {plan.executed}, got none")
         action = plan.next.action
+
         ease_in = getattr(self._check, "ease_in", None)
         if self._state != "moving" and ease_in is not None:
             start = self._last if self._state == "held" else self._standing(obs)
             ease = ease_in(start, action, plan=plan.leftover())
             if ease is not None:
                 self._ease, self._last, self._state = ease, start, "moving"
+
         ease = self._ease
         if ease is None or ease.over:
             return self.move(action, obs), 1
-        if ease.may_end:  # chunks too short for the full speed: as soon as the check accepts it
+        if ease.may_end:
+            # The chunks are too short to reach the full speed: use it as soon as the check accepts
+            # it.
             with contextlib.suppress(InvalidAction):
                 self._last, self._ease = self._checked(action, self._last), None
                 return self._last, 1
+
         command, rows = ease.step(action, plan.after, plan.known)
         self._last = self._checked(command, self._last)
         return self._last, rows
@@ -307,6 +320,7 @@ class Motion:
         self._ease = None
         if self._last is None:  # the first command was refused
             self._state = "stopped"
+
         last = self._standing(obs) if self._state == "stopped" else self._last
         try:
             action = self._checked(self._safe(obs, last), last)
@@ -318,6 +332,7 @@ class Motion:
                     "another one (safe=)"
                 ) from refused
             action = self._checked(last, last)
+
         self._state = "held" if self._state == "moving" else self._state
         self._last = action
         return action.copy(), why

@@ -59,7 +59,9 @@ from vlagents_ray.interface import (
 from vlagents_ray.validation import check_action
 
 _CLOSE_S = 2.0
-_IN_PLACE = 256  # largest number of recorded actions between two requests
+# The largest number of actions between two requests that are recorded as executed in place of the
+# policy's.
+_MAX_REPLACEMENTS = 256
 
 
 class AsyncCaller:
@@ -120,7 +122,9 @@ class AsyncCaller:
 
 
 class _Request(NamedTuple):
-    tick: int = -1
+    """The last request to the policy."""
+
+    tick: int = -1  # the tick of its observation
     # `ChunkBuffer.executed` at its observation: the position of the answer's first row.
     step: int = 0
     seen_at: float = 0.0  # s, of `time.monotonic`: the capture time of the observation
@@ -140,7 +144,8 @@ class PlayerSettings:
     * i), oldest first (ACT's temporal ensembling). With "async", send requests in the background,
     one at a time, with the newest observation.
     """
-    # Rows between two requests: of a chunk (default: all), or in "async" ticks (default: 1)
+    # The number of rows of a chunk between two requests (default: all), or in "async" the number of
+    # ticks (default: 1).
     execute: int | None = None
     merge: str | Merge = "newest"
     """The combination of several chunks' rows for one tick, in "async": "newest", "average",
@@ -154,7 +159,7 @@ class PlayerSettings:
     """
     deadline_s: float | None = None  # time limit of `act`; 0 by default in "async", else none
     timeout_s: float | None = None  # time limit of a request; by default the agent's
-    # Largest number of rows of a chunk to execute; a chunk with `done` is executed whole.
+    # The largest number of rows of a chunk to execute; a chunk with `done` is executed whole.
     horizon: int | None = None
     max_age_s: float | None = None
     """The largest age of the observation of an executed action. The age counts from
@@ -162,7 +167,7 @@ class PlayerSettings:
     `CaptureClock`).
     """
     safe: Safe = "auto"  # the action in place of a missing one (see `SafeAction`)
-    # The columns of the action that are grippers (see `SafeAction`)
+    # The columns of the action that are grippers (see `SafeAction`).
     grippers: Sequence[int] | None = None
 
     def __post_init__(self) -> None:
@@ -231,25 +236,25 @@ class ChunkPlayer(Agent):
         self.check = check
         self.control = RobotControl(override)
         self._agent = agent
-        self._plan = ChunkBuffer(
-            ENSEMBLE if settings.mode == "ensemble" else settings.merge, settings.ensemble_m
-        )
-        self._asker: AsyncCaller | None = None
+        merge = ENSEMBLE if settings.mode == "ensemble" else settings.merge
+        self._plan = ChunkBuffer(merge, settings.ensemble_m)
+        self._caller: AsyncCaller | None = None
         self._contract: Contract | None = None
         self._delay = DelayEstimate()
         self._begin()
 
     def _begin(self) -> None:
         self._plan.drop()
-        self._tick: int | None = None  # tick of the next `act`; None outside an episode
-        self._request = _Request()  # the last one
-        # Actions, (D,), executed in place of the policy's since the last request, and whether this
-        # tick has one.
-        self._in_place, self._noted = deque[np.ndarray](maxlen=_IN_PLACE), False
-        self._dropped = False  # whether its answer must not be executed
-        self._chunks = 0  # number of answers
+        self._tick: int | None = None  # the tick of the next `act`; None outside an episode
+        self._request = _Request()  # the last request
+        self._drops_answer = False  # whether the answer to it must not be executed
+        # The actions, (D,), that were executed in place of the policy's since the last request.
+        self._replacements = deque[np.ndarray](maxlen=_MAX_REPLACEMENTS)
+        self._is_replaced = False  # whether this tick has such an action
+        self._chunks = 0  # the number of answers
+        # When the oldest unanswered request was sent, s of `time.monotonic`; None if there is none.
         self._waiting_since: float | None = None
-        self._trouble = WAITING
+        self._reason = WAITING  # why the plan has no row, if it has none
         self._captured = CaptureClock()
         self._motion = Motion(self.check)
 
@@ -263,26 +268,27 @@ class ChunkPlayer(Agent):
 
     def initialize(self) -> None:
         """Initialize the policy; wait for a request in progress, if the policy was used before."""
-        if self._asker is not None:
-            self._asker.settle()
+        if self._caller is not None:
+            self._caller.settle()
         self._agent.initialize()
         self.statistics = self._agent.statistics
         self._choose_safe()
 
     def reset(self, obs: Obs, instruction: str | None = None, **kwargs: Any) -> dict[str, Any]:
         """Begin an episode, without a time limit; the plan and pending requests are dropped."""
-        if self._asker is not None:
-            self._asker.settle()
+        if self._caller is not None:
+            self._caller.settle()
         self._begin()
         obs = stamped(obs, {})
         self._captured(obs)  # before the reset of the policy, which may take long
         info = self._agent.reset(obs, instruction, **kwargs)
         self._choose_safe()
+
         if self.settings.deadline_s is not None:
-            self._note_asked(0, obs)
+            self._record_request(0, obs)
             self._take(self._agent.act(obs))
-            if self._asker is None:
-                self._asker = AsyncCaller(self._agent)
+            if self._caller is None:
+                self._caller = AsyncCaller(self._agent)
         self._tick = 0
         return info
 
@@ -295,9 +301,9 @@ class ChunkPlayer(Agent):
         or take over the robot.
         """
         self._begin_again(STOPPED)
-        if self._noted:  # its action was not executed
-            self._in_place.pop()
-            self._noted = False
+        if self._is_replaced:  # its action was not executed
+            self._replacements.pop()
+            self._is_replaced = False
         self._motion.stop()
         self._rebase_leader(None)
 
@@ -313,103 +319,113 @@ class ChunkPlayer(Agent):
         Raises:
             InvalidAction: The check refuses the action.
         """
-        if self._asker is not None:
-            self._asker.settle()
+        if self._caller is not None:
+            self._caller.settle()
         self._agent.observe(obs)
         if action is not None and self._tick is not None:
-            self._note_in_place(self._motion.move(action, obs))
+            self._record_replacement(self._motion.move(action, obs))
             self._plan.advance()
             self._tick += 1
 
     def act(self, obs: Obs) -> Act:
         """Return the action of this tick, (D,) float32."""
-        if (tick := self._tick) is None:
+        tick = self._tick
+        if tick is None:
             raise NotReset("act before reset; reset first")
         begun = time.monotonic()
         self._motion.tick()
-        self._noted = False
+        self._is_replaced = False
         if self.control.update():
             self._begin_again(RELEASED)
-        led = self.control.state == "human"
+        is_operated = self.control.state == "human"
+
         try:
-            self._ask(obs, tick, begun)
+            self._update_plan(obs, tick, begun)
         except Exception as error:
-            if not led:
+            if not is_operated:
                 raise
             # The operator continues, without a known action of the policy.
-            self._trouble = Held("failed", str(error))
+            self._reason = Held("failed", str(error))
         self._tick = tick + 1
-        act = self._led(obs) if led else self._chosen(obs, tick)
-        if led and SAFE not in act.info:  # the operator's action is executed in place of a row
-            self._note_in_place(act.action)
+
+        if not is_operated:
+            return self._policy_act(obs, tick)
+        act = self._operator_act(obs)
+        if SAFE not in act.info:  # the operator's action is executed in place of a row
+            self._record_replacement(act.action)
             self._plan.advance()
         return act
 
     def close(self) -> None:
         """Close the policy, at once or as soon as the request in progress is over."""
-        if self._asker is not None:
-            self._asker.close()
-            self._asker = None
+        if self._caller is not None:
+            self._caller.close()
+            self._caller = None
         else:
             self._agent.close()
         self._begin()
 
-    def _ask(self, obs: Obs, tick: int, begun: float) -> None:
+    def _update_plan(self, obs: Obs, tick: int, begun: float) -> None:
         """Take the policy's answer, send the next request if it is due, and wait as long as
         allowed and needed.
         """
-        asker = self._asker
-        if asker is None or self.settings.deadline_s is None:
-            if self._wants(tick, obs):
-                self._note_asked(tick, obs)
-                self._take(self._agent.act(stamped(obs, self._extras())))
-        else:  # no tick waits for an action that will not be executed
-            deadline = begun + (
-                self.settings.deadline_s if self.control.state == "autonomous" else 0.0
-            )
-            self._receive(asker.take(), tick)
-            if asker.idle and self._wants(tick, obs):
-                self._note_asked(tick, obs)
-                if self._waiting_since is None:
-                    self._waiting_since = time.monotonic()
-                asker.ask(stamped(copied(obs), self._extras()))
-            while not asker.idle and (left_s := deadline - time.monotonic()) > 0:
-                fresh = self.settings.mode != "async" and self._request.tick == tick
-                if not fresh and self._next() is not None:
-                    break
-                self._receive(asker.take(left_s), tick)
+        caller = self._caller
+        if caller is None or self.settings.deadline_s is None:
+            if self._is_request_due(tick, obs):
+                self._record_request(tick, obs)
+                self._take(self._agent.act(stamped(obs, self._request_info())))
+            return
+
+        self._receive(caller.take(), tick)
+        if caller.idle and self._is_request_due(tick, obs):
+            self._record_request(tick, obs)
+            if self._waiting_since is None:
+                self._waiting_since = time.monotonic()
+            caller.ask(stamped(copied(obs), self._request_info()))
+
+        # Wait only for an action that will be executed.
+        wait_s = self.settings.deadline_s if self.control.state == "autonomous" else 0.0
+        deadline = begun + wait_s
+        while not caller.idle:
+            left_s = deadline - time.monotonic()
+            if left_s <= 0:
+                break
+            is_of_this_tick = self.settings.mode != "async" and self._request.tick == tick
+            if not is_of_this_tick and self._next() is not None:
+                break
+            self._receive(caller.take(left_s), tick)
 
     def _choose_safe(self) -> None:
         """Choose the safe action; raises `ConfigError` if it does not fit the policy's actions."""
         self._contract = self._agent.contract
         spec = ActionSpec() if self._contract is None else self._contract.action
-        wanted = self.settings.deadline_s is not None or self.control.leader is not None
-        safe = SafeAction(self.settings.safe, spec, self.settings.grippers) if wanted else None
+        safe: SafeAction | None = None
+        if self.settings.deadline_s is not None or self.control.leader is not None:
+            safe = SafeAction(self.settings.safe, spec, self.settings.grippers)
         self._motion = Motion(self.check, self._contract, safe)
 
-    def _note_in_place(self, action: np.ndarray) -> None:
-        self._in_place.append(action)
-        self._noted = True
+    def _record_replacement(self, action: np.ndarray) -> None:
+        """Record an action that is executed in place of the policy's."""
+        self._replacements.append(action)
+        self._is_replaced = True
 
-    def _note_asked(self, tick: int, obs: Obs) -> None:
+    def _record_request(self, tick: int, obs: Obs) -> None:
+        """Record that a request with this tick's observation is being sent."""
         self._request = _Request(tick, self._plan.executed, self._captured(obs))
-        self._dropped = self._motion.keeps(self._plan)
+        self._drops_answer = self._motion.keeps(self._plan)
 
     def _is_old(self, seen_at: float) -> bool:
-        return (
-            self.settings.max_age_s is not None
-            and seen_at < time.monotonic() - self.settings.max_age_s
-        )
+        max_age_s = self.settings.max_age_s
+        return max_age_s is not None and seen_at < time.monotonic() - max_age_s
 
     def _next(self) -> Step | None:
         """Return the current action from chunks whose observations are recent enough."""
-        if self.settings.max_age_s is not None and self._plan.drop(
-            time.monotonic() - self.settings.max_age_s
-        ):
-            self._trouble = OLD
+        max_age_s = self.settings.max_age_s
+        if max_age_s is not None and self._plan.drop(time.monotonic() - max_age_s):
+            self._reason = OLD
         return self._plan.next
 
-    def _wants(self, tick: int, obs: Obs) -> bool:
+    def _is_request_due(self, tick: int, obs: Obs) -> bool:
         """Return whether a request with this tick's observation is due."""
         if self._is_old(self._captured(obs)):
             return False
@@ -418,54 +434,64 @@ class ChunkPlayer(Agent):
             return step is None
         if self.settings.mode == "open_loop":
             return self.settings.execute is not None and step.row >= self.settings.execute
-        # Also true for every answer with a single action.
-        last = step.chunk.end == self._plan.executed + 1
-        return last or tick - self._request.tick >= (self.settings.execute or 1)
+
+        # This also holds for every answer with a single action.
+        is_last_row = step.chunk.end == self._plan.executed + 1
+        return is_last_row or tick - self._request.tick >= (self.settings.execute or 1)
 
     def _receive(self, answer: Act | Exception | None, tick: int) -> None:
+        """Add the answer of the policy to the plan, if there is one; raise an error that another
+        request cannot cure.
+        """
         if answer is None:
             return
         if isinstance(answer, Act):
             try:
-                if not (self._dropped or self._motion.keeps(self._plan)):
+                if not (self._drops_answer or self._motion.keeps(self._plan)):
                     self._delay.add(tick - self._request.tick)
                     self._take(answer)
                 self._waiting_since = None
             except InvalidAction as error:
-                self._trouble = refused(error)
+                self._reason = refused(error)
             return
         if isinstance(answer, InvalidInput) or not isinstance(answer, VLAgentsError):
             raise answer
-        self._trouble = unanswered(answer)
+        self._reason = unanswered(answer)
 
     def _take(self, act: Act) -> None:
-        act = replace(
-            act, info={key: value for key, value in act.info.items() if key not in OF_THE_LOOP}
-        )
-        tick, step, seen_at = self._request
+        """Add the chunk of an answer to the plan."""
+        info = {key: value for key, value in act.info.items() if key not in OF_THE_LOOP}
         rows = Act(check_action(act.action, self._contract)).rows()
         if not act.done:  # the task is done with the last row of this chunk, not before
             rows = rows[: self.settings.horizon]
-        added = self._plan.add(Chunk(self._chunks, step, rows, act.done, act.info, tick, seen_at))
+
+        tick, step, seen_at = self._request
+        added = self._plan.add(Chunk(self._chunks, step, rows, act.done, info, tick, seen_at))
         self._chunks += 1
-        self._trouble = WAITING if added else LATE
+        self._reason = WAITING if added else LATE
 
-    def _extras(self) -> dict[str, Any]:
-        extras: dict[str, Any] = {EXECUTED: np.stack(self._in_place)} if self._in_place else {}
-        self._in_place.clear()
+    def _request_info(self) -> dict[str, Any]:
+        """Return the entries that the next request adds to the info of its observation."""
+        info: dict[str, Any] = {}
+        if self._replacements:
+            info[EXECUTED] = np.stack(self._replacements)
+            self._replacements.clear()
         if self.settings.timeout_s is not None:
-            extras[DEADLINE] = self.settings.timeout_s * 1e3
-        # The operator's actions replace those of the plan.
-        if self.settings.real_time_chunking and self.control.state != "human":
-            extras |= self._plan.continuation(self._delay.ticks)
-        return extras
+            info[DEADLINE] = self.settings.timeout_s * 1e3
 
-    def _led(self, obs: Obs) -> Act:
+        # While an operator acts, their actions replace those of the plan.
+        if self.settings.real_time_chunking and self.control.state != "human":
+            info |= self._plan.continuation(self._delay.ticks)
+        return info
+
+    def _operator_act(self, obs: Obs) -> Act:
         """Return the operator's action, or the safe one if the guard refuses it."""
         # A silent policy does not stop an operator.
         info: dict[str, Any] = {INTERVENTION: True, SILENT: 0.0}
-        if (planned := self._next()) is not None:
+        planned = self._next()
+        if planned is not None:
             info[WANTED] = planned.action.copy()
+
         try:
             try:
                 action = np.array(self.control.leader.action(obs), np.float32)  # type: ignore[union-attr]
@@ -473,9 +499,9 @@ class ChunkPlayer(Agent):
                 raise InvalidAction(f"leader: {error}", cause="leader") from error
             action = self._motion.move(action, obs)
         except InvalidAction as error:
-            action, held = self._motion.hold(obs, refused(error))
+            action, why = self._motion.hold(obs, refused(error))
             del info[INTERVENTION]  # the safe action is not the operator's
-            info |= {SAFE: held.reason, CAUSE: held.cause}
+            info |= {SAFE: why.reason, CAUSE: why.cause}
             self._rebase_leader(action)
         return Act(action.copy(), info=info)
 
@@ -485,15 +511,17 @@ class ChunkPlayer(Agent):
         if rebase is not None:
             rebase(last)
 
-    def _chosen(self, obs: Obs, tick: int) -> Act:
-        held = self.control.held
-        step = None if held is not None else self._next()
-        why = held or (STALE if self._is_old(self._captured(obs)) else self._trouble)
+    def _policy_act(self, obs: Obs, tick: int) -> Act:
+        """Return the policy's action, or the safe one if that is missing or refused."""
+        control_held = self.control.held
+        step = None if control_held is not None else self._next()
+        why = control_held or (STALE if self._is_old(self._captured(obs)) else self._reason)
+
         if step is not None:
             try:
                 action, rows = self._motion.follow(self._plan, obs)
             except InvalidAction as error:
-                self._plan.drop()  # the rest of the plan assumes the result of this action
+                self._plan.drop()  # the other rows assume the result of this action
                 why = refused(error)
                 if not self._motion.can_hold:
                     raise
@@ -503,7 +531,8 @@ class ChunkPlayer(Agent):
                     return replace(act, done=False)
                 self._plan.advance()
                 return act
-        if held is not None and self.control.running:  # the loop commands nothing
+
+        if control_held is not None and self.control.running:  # the loop commands nothing
             action = np.zeros(0, np.float32)
         else:
             try:
@@ -514,15 +543,15 @@ class ChunkPlayer(Agent):
                 if self._motion.begun or not self.control.running or not self._motion.can_hold:
                     raise
                 action = np.zeros(0, np.float32)
-            if held is not None:  # the policy's action will not be executed
-                self._note_in_place(action)
+            if control_held is not None:  # the policy's action will not be executed
+                self._record_replacement(action)
         return Act(action, info={SAFE: why.reason, CAUSE: why.cause, SILENT: self._silent_s()})
 
     def _begin_again(self, why: Held) -> None:
         """Drop the plan and the pending answer, and wait for the answer to a new observation."""
         self._plan.drop()
-        self._dropped = True
-        self._trouble = why
+        self._drops_answer = True
+        self._reason = why
 
     def _silent_s(self) -> float:
         return 0.0 if self._waiting_since is None else time.monotonic() - self._waiting_since

@@ -43,7 +43,7 @@ from vlagents_ray.robot.loop import (
     Robot,
     fit_of,
     opened,
-    robot_named,
+    robot_factory,
     robot_watchdog,
     run_loop,
 )
@@ -169,7 +169,9 @@ def _run(options: argparse.Namespace) -> LoopReport:
     deadline_s = 0.0 if options.mode == "async" else WAIT_S
     if options.deadline_ms is not None:
         deadline_s = options.deadline_ms / 1e3
-    make_robot = robot_named("--robot", options.robot, options.robot_set) if options.robot else None
+    make_robot = (
+        robot_factory("--robot", options.robot, options.robot_set) if options.robot else None
+    )
     open_leader = leader_named("--leader", options.leader) if options.leader else None
     ended: BaseException | None = None
     report = LoopReport(hz)
@@ -312,7 +314,7 @@ def _require_fit(
         obs = robot.observe()
         agent.reset(obs, options.instruction)
         rows = agent.act(obs).rows()
-        for line in fit.drawn(rows):
+        for line in fit.draw(rows):
             say(line)
             logger.info("%s", line)
         fit.require(obs, rows)

@@ -40,7 +40,8 @@ from vlagents_ray.tracing import TRACEPARENT, tracer
 if TYPE_CHECKING:
     from typing_extensions import Self
 
-# no replica has the session; `NotReset` if it could not be resumed in time
+# Errors after which no replica has the session; it is `NotReset` if the session could not be
+# resumed in time.
 _LOST = (NotReset, UnknownSession)
 # Errors after which another replica may answer; a running replica refuses a reset if it is full,
 # for instance.
@@ -50,18 +51,20 @@ _RETRYABLE = {
 }
 _FIRST_PAUSE_S = 0.02
 _LONGEST_PAUSE_S = 0.5
-# No attempt begins with less time left: a late request would be executed after its caller has given
-# up.
+# No attempt begins with less time left than the smaller of these, in s and as a share of the time
+# limit: a late request would be executed after its caller has given up.
 _RESERVE_S, _RESERVE_SHARE = 0.5, 0.25
 
 
 @dataclass(slots=True)
 class EpisodeState:
+    """The arguments with which an episode was begun, and what is needed to resume it."""
+
     obs: Obs  # the first observation
     instruction: str | None
     kwargs: dict[str, Any]
     contract: dict[str, Any] | None
-    # The last observations with an answer.
+    # The last observations that were answered.
     recent: deque[Obs] = field(default_factory=lambda: deque(maxlen=0))
     step: int | None = 0  # the server's count of acts; None if an answer may be lost
 
@@ -97,14 +100,13 @@ class ClientSession:
         """Return the request for an action; raises `NotReset` outside an episode."""
         if self.episode is None:
             raise NotReset("act before reset: this agent has no session, or lost it; reset first")
-        request_id = self._connection.request_id()
         return Request(
             "act",
             obs,
             session=self.id,
             rank=self._rank,
             step=self.episode.step,
-            request_id=request_id,
+            request_id=self._connection.request_id(),
         )
 
     def begun(self, reply: Reply) -> None:
@@ -149,38 +151,49 @@ def call_with_recovery(
     deadline = time.monotonic() + timeout_s
     last_attempt = deadline - min(_RESERVE_S, _RESERVE_SHARE * timeout_s)
     replies = connection.call(requests, timeout_s)
-    lost: set[int] = set()  # sessions whose state no replica has
+
+    lost: set[int] = set()  # indices of the sessions whose state no replica has
     pause_s = 0.0
-    while gone := [
-        i for i, reply in enumerate(replies) if isinstance(reply.error, _RETRYABLE[requests[i].op])
-    ]:
-        if time.monotonic() + pause_s >= last_attempt:
+    while True:
+        failed = [
+            i
+            for i, reply in enumerate(replies)
+            if isinstance(reply.error, _RETRYABLE[requests[i].op])
+        ]
+        if not failed or time.monotonic() + pause_s >= last_attempt:
             break
         time.sleep(pause_s)
         pause_s = min(_LONGEST_PAUSE_S, 2 * pause_s + _FIRST_PAUSE_S)
-        lost |= {i for i in gone if requests[i].op == "act" and sessions[i].is_lost(replies[i])}
-        if again := [i for i in gone if i in lost]:
-            resets = [sessions[i].begin_again(requests[i]) for i in again]
-            for i, reply in zip(
-                again, connection.call(resets, deadline - time.monotonic()), strict=True
-            ):
+
+        # Resume the lost sessions by a reset.
+        lost |= {i for i in failed if requests[i].op == "act" and sessions[i].is_lost(replies[i])}
+        to_resume = [i for i in failed if i in lost]
+        if to_resume:
+            resets = [sessions[i].begin_again(requests[i]) for i in to_resume]
+            reset_replies = connection.call(resets, deadline - time.monotonic())
+            for i, reply in zip(to_resume, reset_replies, strict=True):
                 if reply.error is None:
                     sessions[i].begun(reply)
                     requests[i].step = reply.step
                     lost.discard(i)
                 else:
                     replies[i] = reply
-        retry = [i for i in gone if i not in lost]
         if time.monotonic() >= last_attempt:
             break
-        if retry:
-            for i in retry:
+
+        # Send the requests of all other sessions again, those just resumed included.
+        to_send = [i for i in failed if i not in lost]
+        if to_send:
+            for i in to_send:
                 requests[i].request_id = connection.request_id()
-            answers = connection.call([requests[i] for i in retry], deadline - time.monotonic())
-            for i, reply in zip(retry, answers, strict=True):
+            new_replies = connection.call(
+                [requests[i] for i in to_send], deadline - time.monotonic()
+            )
+            for i, reply in zip(to_send, new_replies, strict=True):
                 replies[i] = reply
+
     for session, request, reply in zip(sessions, requests, replies, strict=True):
-        # these errors advise a reset, which is not needed here
+        # The messages of these errors advise a reset, which is not needed here.
         if isinstance(reply.error, _LOST) and request.op == "act":
             reply.error = DeadlineExceeded(
                 f"the session did not begin again within {timeout_s:g} s; the next act does"
@@ -251,9 +264,11 @@ class RemoteAgent(Agent):
         """
         if rank not in RANKS:
             raise ConfigError(f"rank: got {rank!r}, want one of {list(RANKS)}")
+
         choice = CodecChoice(codec)
         self.credentials = Credentials(api_key, ca, certificate)
         new_transport = partial(select_transport, url, transport, choice, self.credentials)
+
         connection = Connection(
             url,
             new_transport,
@@ -262,6 +277,7 @@ class RemoteAgent(Agent):
             connect_timeout_s or timeout_s,
             leaves_silent=resume,
         )
+
         self._connection = connection
         self._commands = commands
         self._rank: RankName = rank
@@ -273,10 +289,11 @@ class RemoteAgent(Agent):
         """Open `n` more sessions on this agent's connection, for `reset_batch` and `act_batch`;
         close each of them.
         """
-        made = [copy.copy(self) for _ in range(n)]
-        for agent in made:
-            agent._commands, agent._session = None, ClientSession(self._connection, self._rank)
-        return made
+        agents = [copy.copy(self) for _ in range(n)]
+        for agent in agents:
+            agent._commands = None
+            agent._session = ClientSession(self._connection, self._rank)
+        return agents
 
     @property
     def url(self) -> str:
@@ -300,9 +317,9 @@ class RemoteAgent(Agent):
     @property
     def codec(self) -> ImageCodec | None:
         """The codec of the cameras; None until it is chosen when the agent connects."""
-        return (
-            RAW if self.transport in ("shm", "plasma", "handle") else self._connection.codec.codec
-        )
+        if self.transport in ("shm", "plasma", "handle"):
+            return RAW
+        return self._connection.codec.codec
 
     @property
     def reconnects(self) -> int:
@@ -317,7 +334,7 @@ class RemoteAgent(Agent):
 
     @property
     def contract(self) -> Contract | None:
-        """The policy's side of the contract; None if it states none."""
+        """The policy's side of the contract; None if the policy has none."""
         self._connection.open()
         return self._connection.contract
 
@@ -326,7 +343,8 @@ class RemoteAgent(Agent):
         not.
         """
         self._connection.open()
-        self.statistics = ((self._connection.metadata or {}).get("weights") or {}).get("statistics")
+        weights = (self._connection.metadata or {}).get("weights") or {}
+        self.statistics = weights.get("statistics")
 
     def reset(
         self,
@@ -372,37 +390,40 @@ class RemoteAgent(Agent):
             The result of `reset` for each session, or its exception, which affects only that
             session.
         """
-        siblings = self._siblings(sessions)
-        for first in obs:
-            require_obs(first)
+        client_sessions = self._client_sessions(sessions)
+        for first_obs in obs:
+            require_obs(first_obs)
         self._connection.open()
-        stated = contract.to_json() if isinstance(contract, Contract) else contract
-        history = (self._connection.contract.history if self._connection.contract else None) or 1
-        options = (
-            [kwargs] * len(siblings)
-            if seeds is None
-            else [{**kwargs, "seed": seed} for seed in seeds]
-        )
-        episodes = [
-            EpisodeState(
-                copied(first) if self._resume else first,
-                text,
-                own,
-                stated,
-                deque(maxlen=history - 1),
-            )
-            for first, text, own in zip(obs, instructions, options, strict=True)
-        ]
-        for session in siblings:
+
+        contract_json = contract.to_json() if isinstance(contract, Contract) else contract
+        policy_contract = self._connection.contract
+        history = (policy_contract.history if policy_contract else None) or 1
+        if seeds is None:
+            options_of_sessions = [kwargs] * len(client_sessions)
+        else:
+            options_of_sessions = [{**kwargs, "seed": seed} for seed in seeds]
+
+        episodes = []
+        for first_obs, instruction, options in zip(
+            obs, instructions, options_of_sessions, strict=True
+        ):
+            episode_obs = copied(first_obs) if self._resume else first_obs
+            recent: deque[Obs] = deque(maxlen=history - 1)
+            episodes.append(EpisodeState(episode_obs, instruction, options, contract_json, recent))
+
+        for session in client_sessions:
             session.episode = None
         requests = [
-            session.reset(episode) for session, episode in zip(siblings, episodes, strict=True)
+            session.reset(episode)
+            for session, episode in zip(client_sessions, episodes, strict=True)
         ]
-        replies = self._call(siblings, requests, self._connection.timeout_s)
+        replies = self._call(client_sessions, requests, self._connection.timeout_s)
+
         infos: list[dict[str, Any] | Exception] = []
-        for session, episode, reply in zip(siblings, episodes, replies, strict=True):
+        for session, episode, reply in zip(client_sessions, episodes, replies, strict=True):
             if reply.error is None:
-                session.episode, session.resumed = episode, False
+                session.episode = episode
+                session.resumed = False
                 session.begun(reply)
                 self._connection.users.add(session)
             infos.append(reply.error or reply.info or {})
@@ -412,18 +433,16 @@ class RemoteAgent(Agent):
         """Return the next action, (D,) float32, or chunk of actions, (H, D).
 
         `act.info["timing"]` holds times in milliseconds by stage. The server measures from the last
-        byte of the
-        request: `decode_ms`, `queue_ms`, `inference_ms` (until the device has finished),
-            `encode_ms`, and `total_ms`,
-        which is their sum and the time between them. The client adds `round_trip_ms` and, as the
-        rest of it, `wire_ms`: its own coding, the network, and proxies. `batch_size` is a number of
-        requests, not a time.
+        byte of the request: `decode_ms`, `queue_ms`, `inference_ms` (until the device has
+        finished), `encode_ms`, and `total_ms`, which is their sum and the time between them. The
+        client adds `round_trip_ms` and, as the rest of it, `wire_ms`: its own coding, the network,
+        and proxies. `batch_size` is a number of requests, not a time.
         """
         commands = self._commands
         require_obs(obs)
-        [act] = self.act_batch([obs if commands is None else commands.asking(obs)], [self])
+        [act] = self.act_batch([obs if commands is None else commands.with_outcomes(obs)], [self])
         if commands is not None:
-            commands.came(act)
+            commands.receive(act)
         if isinstance(act, Exception):
             raise act
         return act
@@ -440,18 +459,25 @@ class RemoteAgent(Agent):
         own session.
         """
         begun = time.perf_counter()
-        siblings = self._siblings(sessions)
-        if len(obs) != len(siblings):
+        client_sessions = self._client_sessions(sessions)
+        if len(obs) != len(client_sessions):
             raise ConfigError(
-                f"act_batch: got {len(obs)} observations for {len(siblings)} sessions"
+                f"act_batch: got {len(obs)} observations for {len(client_sessions)} sessions"
             )
-        for one in obs:
-            require_obs(one)
-        requests = [session.act(one) for session, one in zip(siblings, obs, strict=True)]
-        replies = self._call(siblings, requests, min(self._connection.timeout_s, _deadline_s(obs)))
+        for session_obs in obs:
+            require_obs(session_obs)
+
+        requests = [
+            session.act(session_obs)
+            for session, session_obs in zip(client_sessions, obs, strict=True)
+        ]
+        timeout_s = min(self._connection.timeout_s, _deadline_s(obs))
+        replies = self._call(client_sessions, requests, timeout_s)
+
         round_trip_ms = (time.perf_counter() - begun) * 1e3
         return [
-            self._take(*each, round_trip_ms) for each in zip(siblings, obs, replies, strict=True)
+            self._read_reply(session, session_obs, reply, round_trip_ms)
+            for session, session_obs, reply in zip(client_sessions, obs, replies, strict=True)
         ]
 
     @property
@@ -464,20 +490,24 @@ class RemoteAgent(Agent):
         self._connection.end_session(self._session, self._session.id)
         self._session = ClientSession(self._connection, self._rank)
 
-    def _siblings(self, sessions: Sequence[Agent]) -> list[ClientSession]:
-        found: list[ClientSession] = []
+    def _client_sessions(self, sessions: Sequence[Agent]) -> list[ClientSession]:
+        """Return the sessions of these agents; raise `ConfigError` unless all share this
+        connection.
+        """
+        client_sessions: list[ClientSession] = []
         for agent in sessions:
             if not isinstance(agent, RemoteAgent) or agent._connection is not self._connection:
                 raise ConfigError(
                     "sessions: want agents made by sessions() of this one, which share its "
                     "connection"
                 )
-            found.append(agent._session)
-        return found
+            client_sessions.append(agent._session)
+        return client_sessions
 
     def _call(
         self, sessions: Sequence[ClientSession], requests: Sequence[Request], timeout_s: float
     ) -> list[Reply]:
+        """Return the replies to these requests, within a span if the process traces them."""
         call = (
             partial(call_with_recovery, self._connection, sessions)
             if self._resume
@@ -485,13 +515,18 @@ class RemoteAgent(Agent):
         )
         if self._tracer is None:
             return call(requests, timeout_s)
-        # Within a span, a child of the caller's if there is one and the parent of the server's.
+
+        # The span is a child of the caller's, if there is one, and the parent of the server's.
         trace: Any = require("opentelemetry.trace", extra="otel")
         context: Any = require("opentelemetry.trace.propagation.tracecontext", extra="otel")
-        about = {"server.url": self.url, "transport": self.transport, "requests": len(requests)}
         name = f"vlagents {requests[0].op}"
+        attributes = {
+            "server.url": self.url,
+            "transport": self.transport,
+            "requests": len(requests),
+        }
         with self._tracer.start_as_current_span(
-            name, kind=trace.SpanKind.CLIENT, attributes=about
+            name, kind=trace.SpanKind.CLIENT, attributes=attributes
         ) as span:
             carrier: dict[str, str] = {}
             context.TraceContextTextMapPropagator().inject(carrier)
@@ -499,24 +534,29 @@ class RemoteAgent(Agent):
                 if request.obs is not None:
                     info = {**request.obs.info, TRACEPARENT: carrier[TRACEPARENT]}
                     request.obs = replace(request.obs, info=info)
+
             replies = call(requests, timeout_s)
-            if failed := [reply.error for reply in replies if reply.error is not None]:
-                span.set_status(trace.StatusCode.ERROR, f"{failed[0].code}: {failed[0]}")
+            errors = [reply.error for reply in replies if reply.error is not None]
+            if errors:
+                span.set_status(trace.StatusCode.ERROR, f"{errors[0].code}: {errors[0]}")
             return replies
 
-    def _take(
+    def _read_reply(
         self, session: ClientSession, obs: Obs, reply: Reply, round_trip_ms: float
     ) -> Act | Exception:
+        """Update a session with the reply to its `act`, and return the action or the error."""
         episode = session.episode
         if reply.error is not None or reply.act is None or episode is None:
             if isinstance(reply.error, DeadlineExceeded) and episode is not None:
-                episode.step = None  # the policy may have acted on it
+                episode.step = None  # the policy may have acted on this observation
             elif isinstance(reply.error, (ConnectionLost, UnknownSession)) and not self._resume:
                 session.episode = None
             return reply.error or PolicyFailed("act: the server's reply holds no action")
+
         session.begun(reply)
         if episode.recent.maxlen:
             episode.recent.append(copied(obs))
+
         timing = reply.act.info["timing"] = reply.timing
         timing["round_trip_ms"] = round_trip_ms
         if "total_ms" in timing:
@@ -526,10 +566,10 @@ class RemoteAgent(Agent):
 
 def _deadline_s(obs: Sequence[Obs]) -> float:
     """Return the time, s, until the most urgent observation no longer needs an answer."""
-    stated_ms = [one.info[DEADLINE] for one in obs if DEADLINE in one.info]
-    for value in stated_ms:
-        if not isinstance(value, (int, float)) or not value > 0:
+    deadlines_ms = [session.info[DEADLINE] for session in obs if DEADLINE in session.info]
+    for deadline_ms in deadlines_ms:
+        if not isinstance(deadline_ms, (int, float)) or not deadline_ms > 0:
             raise InvalidObservation(
-                f"info[{DEADLINE!r}]: got {value!r}, want milliseconds above 0"
+                f"info[{DEADLINE!r}]: got {deadline_ms!r}, want milliseconds above 0"
             )
-    return min(stated_ms, default=math.inf) / 1e3
+    return min(deadlines_ms, default=math.inf) / 1e3

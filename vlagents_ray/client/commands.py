@@ -14,11 +14,12 @@ from vlagents_ray.errors import ConfigError, printable
 from vlagents_ray.interface import Act, Obs
 
 COMMAND = "command"  # the entry of `Act.info` with a command: {"id", "do", "by"}, str each
-# The entry of `Obs.info` with outcomes by id: why it was refused, or "" if executed.
+# The entry of `Obs.info` with the outcomes of commands, by id: the reason of the refusal, or "" if
+# the command was executed.
 COMMANDED = "commanded"
 COMMANDS = ("pause", "stop", "success", "failure")  # none of them can start a motion
 logger = logging.getLogger(__name__)
-_BY = 80  # characters of a name that are kept
+_NAME_CHARACTERS = 80  # the maximum length of a name from the network; longer ones are cut
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,48 +35,60 @@ class CommandInbox:
     """The commands for one session, from `RemoteAgent(url, commands=inbox)` to the state of the
     robot.
 
-    The agent's thread adds commands and collects outcomes; `obey` runs on the thread of the control
-    loop.
+    The agent's thread adds commands and collects outcomes; `apply` runs on the thread of the
+    control loop.
     """
 
     def __init__(self, allow: Collection[str] = COMMANDS) -> None:
-        """Create an inbox; commands that are not in `allow` are refused. Raises `ConfigError`
-        for an unknown one.
+        """Create an empty inbox.
+
+        Args:
+            allow: The names of the commands that may be executed; others are refused.
+
+        Raises:
+            ConfigError: `allow` has an unknown name.
         """
-        if unknown := sorted(set(allow) - set(COMMANDS)):
+        unknown = sorted(set(allow) - set(COMMANDS))
+        if unknown:
             raise ConfigError(f"allow: got {unknown}, want some of {list(COMMANDS)}")
-        self.control = RobotControl()  # that of the last run
+
+        self.control = RobotControl()  # the control of the last run
         self._allow = frozenset(allow)
         self._waiting: deque[Command] = deque()
-        self._answers: dict[str, str] = {}  # refusal by id of a command, empty if it was executed
-        self._sent: dict[str, str] = {}  # the outcomes in the last request
+        # Outcomes by the command's id: the reason of a refusal, or "" if it was executed.
+        self._outcomes: dict[str, str] = {}
+        self._sent_outcomes: dict[str, str] = {}  # the outcomes in the last request
 
-    def asking(self, obs: Obs) -> Obs:
+    def with_outcomes(self, obs: Obs) -> Obs:
         """Return the observation of a request with the outcomes of earlier commands added."""
-        answers = self._sent = dict(self._answers)
-        return replace(obs, info={**obs.info, COMMANDED: answers}) if answers else obs
+        outcomes = self._sent_outcomes = dict(self._outcomes)
+        return replace(obs, info={**obs.info, COMMANDED: outcomes}) if outcomes else obs
 
-    def came(self, act: Act | Exception) -> None:
-        """Remove the command from the answer to that request, and queue or refuse it; ignore an
+    def receive(self, act: Act | Exception) -> None:
+        """Remove the command from the answer to the last request, and queue or refuse it; ignore an
         invalid entry.
         """
         if isinstance(act, Exception):
             return
-        for told in self._sent:  # these have reached the server
-            self._answers.pop(told, None)
-        stated = act.info.pop(COMMAND, None)
-        if not isinstance(stated, dict) or not all(
-            isinstance(stated.get(name), str) for name in ("id", "do")
-        ):
+        for sent_id in self._sent_outcomes:  # these have reached the server
+            self._outcomes.pop(sent_id, None)
+
+        entry = act.info.pop(COMMAND, None)
+        if not isinstance(entry, dict):
             return
-        command = Command(stated["id"], stated["do"], printable(str(stated.get("by", ""))[:_BY]))
+        command_id, action = entry.get("id"), entry.get("do")
+        if not isinstance(command_id, str) or not isinstance(action, str):
+            return
+
+        sender = printable(str(entry.get("by", ""))[:_NAME_CHARACTERS])
+        command = Command(command_id, action, sender)
         if command.do in self._allow:
             self._waiting.append(command)
         elif command.do in COMMANDS:
-            self._answers[command.id] = f"{command.do}: not allowed here"
+            self._outcomes[command.id] = f"{command.do}: not allowed here"
         else:
-            self._answers[command.id] = (
-                f"{command.do[:_BY]!r}: no such command, want one of {list(COMMANDS)}"
+            self._outcomes[command.id] = (
+                f"{command.do[:_NAME_CHARACTERS]!r}: no such command, want one of {list(COMMANDS)}"
             )
 
     @property
@@ -83,11 +96,11 @@ class CommandInbox:
         """The commands that were received and not executed yet, oldest first."""
         return list(self._waiting)
 
-    def obey(self, control: RobotControl) -> list[Command]:
+    def apply(self, control: RobotControl) -> list[Command]:
         """Apply the commands received since the last call to the state of the robot, and return
         them.
         """
-        done = []
+        executed = []
         while self._waiting:
             command = self._waiting.popleft()
             by = f" by {command.by}" if command.by else ""
@@ -98,6 +111,6 @@ class CommandInbox:
                 logger.warning("stopped from the live page%s", by)
             else:
                 control.mark(command.do)
-            done.append(command)
-            self._answers[command.id] = ""
-        return done
+            executed.append(command)
+            self._outcomes[command.id] = ""
+        return executed

@@ -39,11 +39,12 @@ if TYPE_CHECKING:
 logger = logging.getLogger(__name__)
 
 _CLOSE_S = 2.0
-# The deadline sent to the server is shorter by the time of transport: this share of it, at most
-# this many s.
+# The deadline sent to the server is shorter by the time of transport: this share of the deadline,
+# but at most this many seconds.
 _TRANSPORT_SHARE, _TRANSPORT_S = 0.1, 0.2
 _LOOK_UP_S, _LOOK_UP_PAUSE_S = 10.0, 1.0  # s to find another replica, and between two attempts
-# S without any answer, over one or several calls, after which the next call uses another replica.
+# The time without any answer, s, over one or several calls, after which the next call uses another
+# replica.
 SILENT_S = 5.0
 
 
@@ -69,30 +70,41 @@ class Connection:
         The time limits are the defaults of a call and of `open`. With `leaves_silent` it switches
         to another replica when one no longer answers.
         """
-        self.url, self._new_transport, self._leaves_silent = url, new_transport, leaves_silent
-        # time.monotonic(); calls begun since then have no answer.
+        self.url = url
+        self.codec = codec
+        self.timeout_s = timeout_s
+        self._connect_timeout_s = connect_timeout_s
+        self._leaves_silent = leaves_silent
+        self._new_transport = new_transport
+        self.transport = new_transport()
+
+        # Both come from the server when a transport connects, and are None before.
+        self.metadata: dict[str, Any] | None = None
+        self.contract: Contract | None = None
+        self.users: set[object] = set()  # the owners of the sessions
+
+        # The beginning of the first of the calls without an answer, time.monotonic(); None if the
+        # last call had one.
         self._silent_since: float | None = None
         self._silent = False  # whether the silence has lasted for `SILENT_S`
         # The transport to the silent replica, kept until another one answers, since its sessions
         # may still be moved.
         self._old_transport: Transport | None = None
-        # To the next replica, while the current one still answers.
+        # The transport to the next replica, while the current one still answers.
         self._next: _NextTransport | None = None
         self._look_up_at = float("-inf")  # time.monotonic(), earliest time of the next look-up
-        self.transport = new_transport()
-        self.codec, self.timeout_s = codec, timeout_s
-        self.metadata: dict[str, Any] | None = None
-        self.contract: Contract | None = None
-        self.users: set[object] = set()  # owners of the sessions
-        self._connect_timeout_s = connect_timeout_s
-        self.reconnects = 0  # number of reconnections
-        self._must_reconnect = False  # connect again before the next request
-        # Whether the replica keeps the sessions when its connection is closed.
+
+        self.reconnects = 0  # the number of reconnections
+        self._must_reconnect = False  # whether to connect again before the next request
+        # Whether the replica requested a reconnection; it then keeps the sessions when its
+        # connection is closed.
         self._asked_to_move = False
+
         self._prefix = uuid.uuid4().hex[:16]
         self._requests = 0
 
     def request_id(self) -> str:
+        """Return a new id for a request."""
         self._requests += 1
         return f"{self._prefix}-{self._requests:x}"
 
@@ -110,11 +122,10 @@ class Connection:
             else:
                 self.transport.close()
             self.metadata, self._must_reconnect, self._asked_to_move = None, False, False
-        if self.metadata is not None:
-            return
-        self._connected(
-            self.transport.connect(self._connect_timeout_s if timeout_s is None else timeout_s)
-        )
+
+        if self.metadata is None:
+            limit_s = self._connect_timeout_s if timeout_s is None else timeout_s
+            self._connected(self.transport.connect(limit_s))
 
     def _connected(self, metadata: dict[str, Any]) -> None:
         """Store the metadata of the replica to which the transport has connected; close it if
@@ -132,13 +143,15 @@ class Connection:
         except VLAgentsError:
             self.transport.close()
             raise
-        # A tunnel to another machine also begins at a loopback address.
-        near = (
+
+        # The URL alone is not sufficient: a tunnel to another machine also begins at a loopback
+        # address.
+        is_near = (
             local is not None
             and local.boot_id == boot_id() != ""
             and is_loopback(urlsplit(self.url).hostname or "")
         )
-        self.codec.connected(near=near)
+        self.codec.connected(near=is_near)
         self._silent, self._silent_since = False, None  # even if the transport is unchanged
         self.metadata = metadata
 
@@ -148,16 +161,17 @@ class Connection:
         """
         if self._next is None or not self._next.ended:
             return
-        found, self._next = self._next, None
-        if found.metadata is None:
+        next_transport, self._next = self._next, None
+        if next_transport.metadata is None:
             self._look_up_at = time.monotonic() + _LOOK_UP_PAUSE_S
             return
+
         self._close_old_transport()
-        self._old_transport, self.transport = self.transport, found.transport
+        self._old_transport, self.transport = self.transport, next_transport.transport
         self._close_old_transport()
         self.reconnects += 1
         self._must_reconnect = self._asked_to_move = False
-        self._connected(found.metadata)
+        self._connected(next_transport.metadata)
 
     def _drop_next(self) -> None:
         if self._next is not None:
@@ -179,10 +193,12 @@ class Connection:
                         f"{self.url}: connected again, but too late for this call"
                     )
                     return [Reply(request.request_id, error=late) for request in requests]
+
             left_s = max(1e-3, timeout_s)
             server_deadline_ms = (left_s - min(_TRANSPORT_SHARE * left_s, _TRANSPORT_S)) * 1e3
             for request in requests:
                 request.deadline_ms = server_deadline_ms
+
             replies = self.transport.call(requests, left_s)
             self._silent_since = None
             if self._old_transport is not None:
@@ -195,6 +211,7 @@ class Connection:
                     self._silent and self._leaves_silent
                 )
             replies = [Reply(request.request_id, error=error) for request in requests]
+
         for reply in replies:
             if reply.act is not None:  # a server must not set keys of the control loop
                 for name in OF_THE_LOOP:
@@ -203,19 +220,23 @@ class Connection:
             reply.error or reply.draining for reply in replies
         ):
             return replies
-        return self._noted(requests, replies)
+        return self._after_error_or_drain(requests, replies)
 
-    def _noted(self, requests: Sequence[Request], replies: list[Reply]) -> list[Reply]:
+    def _after_error_or_drain(
+        self, requests: Sequence[Request], replies: list[Reply]
+    ) -> list[Reply]:
         """Record errors and whether to reconnect; return a reply for each request."""
         for reply in replies:
-            # The app existed: the server is stopping or restarting.
+            # The application existed, so the server is stopping or restarting.
             if isinstance(reply.error, UnknownApp):
                 reply.error = NoReplica(f"{self.url}: the application is gone ({reply.error})")
-        if len(replies) != len(requests):  # one reply for the whole frame
-            whole = replies[0].error or PolicyUnavailable(
+
+        if len(replies) != len(requests):  # one reply is for the whole frame
+            error = replies[0].error or PolicyUnavailable(
                 f"got {len(replies)} replies to {len(requests)} requests"
             )
-            replies = [Reply(request.request_id, error=whole) for request in requests]
+            replies = [Reply(request.request_id, error=error) for request in requests]
+
         if any(isinstance(reply.error, PolicyUnavailable) for reply in replies):
             self._must_reconnect, self._asked_to_move = True, False
         elif any(reply.draining for reply in replies):
@@ -228,20 +249,20 @@ class Connection:
         """End the session of `user`, if it was begun; with the last session, close the
         connection.
         """
-        begun = user in self.users
+        was_begun = user in self.users
         self.users.discard(user)
-        ended = self.transport.holds_sessions and not self.users  # by closing the connection
-        if (
-            begun
-            and self.metadata is not None
-            and (self._asked_to_move or not (ended or self._must_reconnect))
-        ):
+
+        # A `close` request is needed unless the session ends when the connection is closed.
+        ends_with_connection = self.transport.holds_sessions and not self.users
+        must_request = self._asked_to_move or not (ends_with_connection or self._must_reconnect)
+        if was_begun and self.metadata is not None and must_request:
             close = Request(
                 "close", session=session, request_id=self.request_id(), deadline_ms=_CLOSE_S * 1e3
             )
             with contextlib.suppress(VLAgentsError):  # harmless: the server drops idle sessions
-                # On the old connection, which holds the session.
+                # This is still the old connection, which holds the session.
                 self.transport.call([close], _CLOSE_S)
+
         if not self.users:
             self._drop_next()
             self._close_old_transport()

@@ -26,7 +26,8 @@ key.
 """
 WEBSOCKET_LOG.addFilter(lambda record: "authorization" not in str(record.args).lower())
 _Path = str | os.PathLike[str]
-_OTHER_NAMES = (62, 64)  # X509_V_ERR_HOSTNAME_MISMATCH, X509_V_ERR_IP_ADDRESS_MISMATCH
+# X509_V_ERR_HOSTNAME_MISMATCH and X509_V_ERR_IP_ADDRESS_MISMATCH: the certificate has other names.
+_NAME_MISMATCH_CODES = (62, 64)
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,7 +41,7 @@ class Credentials:
     certificate: tuple[_Path, _Path] | None = None
 
     def __post_init__(self) -> None:
-        """Take the key from the environment if none is given."""
+        """Take the key from the environment if none was passed, and check it."""
         key = os.environ.get(KEY_VARIABLE) if self.api_key is None else self.api_key
         if key is not None and not (key.isascii() and key.isprintable() and " " not in key):
             raise ConfigError(
@@ -70,6 +71,7 @@ class Credentials:
         """
         if urlsplit(url).scheme not in ("https", "wss"):
             return None
+
         try:
             context = ssl.create_default_context(cafile=self.ca)
         except OSError as error:  # ssl.SSLError is a subclass
@@ -77,6 +79,7 @@ class Credentials:
                 f"TLS: ca={self.ca!r}: expected a file with the certificate of the CA that signed "
                 f"the server's, in PEM (it begins with -----BEGIN CERTIFICATE-----), got {error}"
             ) from error
+
         try:
             if self.certificate is not None:
                 context.load_cert_chain(*self.certificate)
@@ -122,25 +125,29 @@ def tls_failure(url: str, error: ssl.SSLError) -> VLAgentsError:
         return ConnectionLost(
             f"{url}: the connection ended ({error}); does the server speak TLS at this port?"
         )
+
     if isinstance(error, ssl.SSLCertVerificationError):
-        cure = (
-            "if the server's certificate is signed by a CA of your own, give the file of the CA's "
-            "certificate, not of the server's, as ca=, or in SSL_CERT_FILE"
-        )
-        if error.verify_code in _OTHER_NAMES:
+        if error.verify_code in _NAME_MISMATCH_CODES:
             cure = (
                 "write the URL with a name that the certificate has, or make a certificate with "
                 "this name"
             )
+        else:
+            cure = (
+                "if the server's certificate is signed by a CA of your own, give the file of the "
+                "CA's certificate, not of the server's, as ca=, or in SSL_CERT_FILE"
+            )
         return ConfigError(
             f"{url}: the server's certificate is not to be trusted: {error.verify_message}; {cure}"
         )
+
     if "CERTIFICATE" in (error.reason or "") or "UNKNOWN_CA" in (error.reason or ""):
         return ConfigError(
             f"{url}: the server refuses this client's certificate, or that it has none "
             f"({error.reason}); give certificate=(certificate file, key file), signed by the CA "
             "that the server trusts"
         )
+
     if error.reason in ("WRONG_VERSION_NUMBER", "RECORD_LAYER_FAILURE", "UNSUPPORTED_PROTOCOL"):
         plain = url.replace("https://", "http://", 1).replace("wss://", "ws://", 1)
         return ConfigError(
@@ -162,7 +169,7 @@ def require_plain(url: SplitResult, timeout_s: float) -> None:
         with socket.create_connection((url.hostname, url.port or 80), timeout_s) as connection:
             context.wrap_socket(connection, server_hostname=url.hostname).close()
     except OSError as error:
-        # An alert is a sign of TLS.
+        # Only a server with TLS sends an alert.
         if not isinstance(error, ssl.SSLError) or "ALERT" not in (error.reason or ""):
             return
     port = url.netloc.rpartition("@")[2]

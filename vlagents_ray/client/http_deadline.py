@@ -48,8 +48,9 @@ class DeadlineSocket:
         self._socket.settimeout(None if math.isinf(left_s) else left_s)
 
     def sendall(self, data: Buffer) -> None:
-        """Send all of it. A TLS socket's own `sendall` would apply the time limit to each
-        record.
+        """Send all of the data within the time limit of the exchange.
+
+        A TLS socket's `sendall` would apply the limit to each record.
         """
         remaining = memoryview(data).cast("B")
         while remaining:

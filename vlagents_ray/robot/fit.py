@@ -19,13 +19,13 @@ from vlagents_ray.interface import Obs
 from vlagents_ray.robot.limits import MotionLimits
 
 logger = logging.getLogger(__name__)
-# Share of the trained range by which a number may leave it: other tables and mounts differ a
+# The share of the trained range by which a number may leave it: other tables and mounts differ a
 # little.
-_ROOM = 0.25
-# A robot in other units is outside by such factors: 180 / pi, 1000.
-_UNITS = {57.3: "degrees for radians", 1000.0: "millimetres for metres"}
-_WIDTH = 32  # characters of a drawn range
-_WANT = (
+_TOLERANCE = 0.25
+# The numbers of a robot in other units are outside of the range by such factors: 180 / pi, 1000.
+_UNIT_MISTAKES = {57.3: "degrees for radians", 1000.0: "millimetres for metres"}
+_WIDTH = 32  # the number of characters of a drawn range
+_ACCEPTED_FILES = (
     "LeRobot's meta/stats.json, openpi's norm_stats.json or GR00T's statistics.json, with min "
     "and max or q01 and q99"
 )
@@ -34,7 +34,7 @@ Span = tuple[np.ndarray, np.ndarray]  # lowest and highest of D numbers, (D,) ea
 
 @dataclass(frozen=True, slots=True)
 class Trained:
-    """The ranges of the numbers on which a checkpoint was trained; None if they are not stated."""
+    """The ranges of the numbers on which a checkpoint was trained; None if they are not known."""
 
     state: Span | None = None
     action: Span | None = None
@@ -51,45 +51,44 @@ class Trained:
             ConfigError: The file is missing, or is none of these.
         """
         try:
-            found: Any = json.loads(Path(path).read_text(encoding="utf-8"))
-            found = found.get("norm_stats", found)
-            if len(found) == 1 and {"state", "action"} <= set(next(iter(found.values()))):
-                [found] = found.values()
-            trained = cls.from_statistics(found)
+            statistics: Any = json.loads(Path(path).read_text(encoding="utf-8"))
+            statistics = statistics.get("norm_stats", statistics)
+            if len(statistics) == 1 and {"state", "action"} <= set(next(iter(statistics.values()))):
+                [statistics] = statistics.values()  # GR00T's have the robot as the only key
+            trained = cls.from_statistics(statistics)
         except (OSError, ValueError, TypeError, KeyError, AttributeError) as error:
             raise ConfigError(
-                f"statistics {path}: {type(error).__name__}: {error}; want {_WANT}"
+                f"statistics {path}: {type(error).__name__}: {error}; want {_ACCEPTED_FILES}"
             ) from error
         if trained.state is None and trained.action is None:
-            raise ConfigError(f"statistics {path}: got {sorted(found)}, want {_WANT}")
+            raise ConfigError(
+                f"statistics {path}: got {sorted(statistics)}, want {_ACCEPTED_FILES}"
+            )
         return trained
 
     @classmethod
-    def from_statistics(cls, stated: Mapping[str, Any]) -> Trained:
+    def from_statistics(cls, statistics: Mapping[str, Any]) -> Trained:
         """Return the ranges in statistics, such as those in a server's metadata
         (`Agent.statistics`).
         """
-        state, action = (
-            next((_range(stated[key]) for key in keys if key in stated), None)
-            for keys in (("observation.state", "state"), ("action", "actions"))
-        )
-        return cls(state, action, tuple(stated["parts"]) if "parts" in stated else None)
+        state = _first_range(statistics, ("observation.state", "state"))
+        action = _first_range(statistics, ("action", "actions"))
+        parts = tuple(statistics["parts"]) if "parts" in statistics else None
+        return cls(state, action, parts)
 
     def vector(self, obs: Obs, parts: Sequence[str]) -> np.ndarray | None:
         """Return the state in the order of the training, else of `parts`, (D,); None if it lacks
         one of them.
         """
-        have, wanted = dict(obs.state), parts if self.parts is None else self.parts
+        values = dict(obs.state)
         if obs.gripper is not None:
-            have |= {
-                "gripper": np.array([obs.gripper]),
-                "gripper_closed": np.array([1 - obs.gripper]),
-            }
-        return (
-            np.concatenate([have[part] for part in wanted])
-            if wanted and have.keys() >= set(wanted)
-            else None
-        )
+            values["gripper"] = np.array([obs.gripper])
+            values["gripper_closed"] = np.array([1 - obs.gripper])
+
+        names = parts if self.parts is None else self.parts
+        if not names or not values.keys() >= set(names):
+            return None
+        return np.concatenate([values[name] for name in names])
 
     def misfits(
         self,
@@ -98,8 +97,8 @@ class Trained:
         limits: MotionLimits | None,
         names: Sequence[str] = (),
     ) -> list[str]:
-        """List what does not fit before the first motion, a sentence with the number and a cure
-        each.
+        """List the numbers that do not fit before the first motion, one sentence each with its
+        cure.
 
         Args:
             state: The arm's present state in the order of the training, (D,).
@@ -107,64 +106,52 @@ class Trained:
             limits: The limits of the arm.
             names: The names of the numbers by the arm's driver; default: those of `limits`.
         """
-        stated = () if limits is None else limits.joints
-        found = [
-            (
+        joints = () if limits is None else limits.joints
+        sentences = []
+        for number, ours, theirs in reordered(names, joints):
+            sentences.append(
                 f"joints: number {number} is {ours!r} of the arm and {theirs!r} of its limits; use "
                 "one order"
             )
-            for number, ours, theirs in reordered(names, stated)
-        ]
-        names = [one.removesuffix(".pos") for one in names or stated]
+
+        names = [name.removesuffix(".pos") for name in names or joints]
         if self.state is not None and state is not None:
-            found += _outside("state", state[np.newaxis], *self.state, names)
+            sentences += _outside("state", state[np.newaxis], *self.state, names)
         if self.action is not None and chunk is not None:
-            found += _outside("first chunk", chunk, *self.action, names)
+            sentences += _outside("first chunk", chunk, *self.action, names)
+
         if limits is not None and self.action is not None:
-            for limit, trained, sign in zip(
-                limits.bounds(len(self.action[0])), self.action, (-1, 1), strict=True
-            ):
+            bounds = limits.bounds(len(self.action[0]))
+            for limit, trained, sign in zip(bounds, self.action, (-1, 1), strict=True):
                 for i in np.flatnonzero(sign * (trained - limit) > 0):
-                    found.append(
+                    sentences.append(
                         f"action{_name(int(i), names)}: was trained to {trained[i]:.4g}, the arm's "
                         f"limit is {limit[i]:.4g}; are they of another arm, or in another order?"
                     )
-        return found
+        return sentences
 
-    def drawn(
+    def draw(
         self, chunk: np.ndarray, limits: MotionLimits | None, names: Sequence[str] = ()
     ) -> list[str]:
         """Draw the first chunk, (H, D), beside the training's actions and the limits: a line for
         each number.
         """
         dim = chunk.shape[1]
-        trained = (
-            MotionLimits().bounds(dim)
-            if self.action is None or len(self.action[0]) != dim
-            else self.action
-        )
+        trained = self.action
+        if trained is None or len(trained[0]) != dim:
+            trained = MotionLimits().bounds(dim)  # infinite
         spans: list[Span] = [
             (limits or MotionLimits()).bounds(dim),
             trained,
             (chunk.min(0), chunk.max(0)),
         ]
+
         legend = "first chunk (#), training (-), limits (.)"
         lines = [f"{legend:<{_WIDTH + 22}}{'chunk':>20}{'training':>20}{'limits':>20}"]
         for i in range(dim):
-            of_number = [(float(low[i]), float(high[i])) for low, high in spans]
-            finite = [end for span in of_number for end in span if np.isfinite(end)] or [0.0]
-            least, most = min(finite), max(finite)
-            row = np.full(_WIDTH, " ")
-            for mark, span in zip(".-#", of_number, strict=True):
-                if np.isfinite(span).any():
-                    places = (
-                        (np.clip(span, least, most) - least)
-                        / max(most - least, 1e-9)
-                        * (_WIDTH - 1)
-                    )
-                    row[int(places[0]) : int(places[1]) + 1] = mark
-            said = "".join(f"{f'{a:.3g} … {b:.3g}':>20}" for a, b in reversed(of_number))
-            lines.append(f"{_name(i, names):<20}|{''.join(row)}|{said}")
+            ranges = [(float(low[i]), float(high[i])) for low, high in spans]
+            numbers = "".join(f"{f'{low:.3g} … {high:.3g}':>20}" for low, high in reversed(ranges))
+            lines.append(f"{_name(i, names):<20}|{_bars(ranges)}|{numbers}")
         return lines
 
 
@@ -175,9 +162,9 @@ class Fit:
     """
 
     trained: Trained
-    limits: MotionLimits | None = None  # of the arm
-    names: tuple[str, ...] = ()  # of the arm's joints, by its driver
-    parts: tuple[str, ...] = ()  # of the state, in order, if the training names none
+    limits: MotionLimits | None = None  # the limits of the arm
+    names: tuple[str, ...] = ()  # the names of the arm's joints, by its driver
+    parts: tuple[str, ...] = ()  # the parts of the state, in order, if the training names none
     accept: bool = False  # whether misfits are only logged
 
     @property
@@ -185,11 +172,11 @@ class Fit:
         """Whether there is anything to compare with."""
         return self.trained != Trained() or self.limits is not None
 
-    def drawn(self, rows: np.ndarray) -> list[str]:
+    def draw(self, rows: np.ndarray) -> list[str]:
         """Draw the first chunk, (H, D), beside the training's actions and the limits: a line for
         each number.
         """
-        return self.trained.drawn(rows, self.limits, self.names)
+        return self.trained.draw(rows, self.limits, self.names)
 
     def require(self, obs: Obs | None, rows: np.ndarray | None) -> None:
         """Compare an observation of the arm at rest and the policy's first chunk with the training
@@ -219,48 +206,85 @@ def require_fit(misfits: Sequence[str], *, accept: bool = False) -> None:
     logger.warning("accepted although %s", text)
 
 
-def _range(stated: Mapping[str, Any]) -> Span:
-    if stated and all(isinstance(one, Mapping) for one in stated.values()):  # groups
-        lows, highs = zip(*map(_range, stated.values()), strict=True)
+def _first_range(statistics: Mapping[str, Any], keys: Sequence[str]) -> Span | None:
+    """Return the range under the first of the keys that statistics have; None if they have none."""
+    for key in keys:
+        if key in statistics:
+            return _range(statistics[key])
+    return None
+
+
+def _range(statistics: Mapping[str, Any]) -> Span:
+    """Return the range of a vector's statistics, or of groups of them, which are joined."""
+    if statistics and all(isinstance(group, Mapping) for group in statistics.values()):
+        lows, highs = zip(*map(_range, statistics.values()), strict=True)
         return np.concatenate(lows), np.concatenate(highs)
-    low, high = ("min", "max") if "min" in stated else ("q01", "q99")
-    return np.ravel(np.asarray(stated[low], np.float64)), np.ravel(
-        np.asarray(stated[high], np.float64)
-    )
+
+    low_key, high_key = ("min", "max") if "min" in statistics else ("q01", "q99")
+    low = np.ravel(np.asarray(statistics[low_key], np.float64))
+    high = np.ravel(np.asarray(statistics[high_key], np.float64))
+    return low, high
+
+
+def _bars(ranges: Sequence[tuple[float, float]]) -> str:
+    """Draw the ranges of a number in limits, training and chunk over each other, with `_WIDTH`
+    characters.
+    """
+    ends = [end for low_high in ranges for end in low_high]
+    finite = [end for end in ends if np.isfinite(end)] or [0.0]
+    lowest, highest = min(finite), max(finite)
+
+    characters = np.full(_WIDTH, " ")
+    for mark, low_high in zip(".-#", ranges, strict=True):
+        if np.isfinite(low_high).any():
+            shares = (np.clip(low_high, lowest, highest) - lowest) / max(highest - lowest, 1e-9)
+            first, last = (shares * (_WIDTH - 1)).astype(int)
+            characters[first : last + 1] = mark
+    return "".join(characters)
 
 
 def _outside(
-    what: str, rows: np.ndarray, low: np.ndarray, high: np.ndarray, names: Sequence[str]
+    vector: str, rows: np.ndarray, low: np.ndarray, high: np.ndarray, names: Sequence[str]
 ) -> list[str]:
-    """List the numbers of rows, (H, D), that are outside of the trained range."""
+    """List the numbers of rows, (H, D), that are outside of the trained range.
+
+    Args:
+        vector: The name of the vector for messages: "state" or "first chunk".
+        rows: The rows.
+        low: The lowest numbers of the training, (D,).
+        high: The highest numbers of the training, (D,).
+        names: The names of the numbers, if they are known.
+    """
     if rows.shape[1] != len(low):
-        return [
-            (
-                f"{what}: got {rows.shape[1]} numbers, was trained with {len(low)}; is this "
-                "another arm's checkpoint?"
-            )
-        ]
-    room, found = _ROOM * (high - low) + 1e-3, []
-    least, most = rows.min(0), rows.max(0)
-    for i in np.flatnonzero((least < low - room) | (most > high + room)):
-        got = least[i] if least[i] < low[i] - room[i] else most[i]
-        ratio = abs(got) / max(abs(low[i]), abs(high[i]), 1e-9)
-        unit = next(
-            (f"; {said}?" for factor, said in _UNITS.items() if 0.2 * factor < ratio < 2 * factor),
-            "",
+        sentence = (
+            f"{vector}: got {rows.shape[1]} numbers, was trained with {len(low)}; is this another "
+            "arm's checkpoint?"
         )
-        fits = [
-            j for j in range(len(low)) if j != i and low[j] - room[j] <= got <= high[j] + room[j]
-        ]
-        order = (
-            f"; it would fit number {_name(fits[0], names)}: another order?"
-            if fits and not unit
-            else ""
+        return [sentence]
+
+    tolerance = _TOLERANCE * (high - low) + 1e-3
+    allowed_low, allowed_high = low - tolerance, high + tolerance
+    lowest, highest = rows.min(0), rows.max(0)
+    sentences = []
+    for i in np.flatnonzero((lowest < allowed_low) | (highest > allowed_high)):
+        number = lowest[i] if lowest[i] < allowed_low[i] else highest[i]
+
+        hint = ""
+        ratio = abs(number) / max(abs(low[i]), abs(high[i]), 1e-9)
+        for factor, mistake in _UNIT_MISTAKES.items():
+            if not hint and 0.2 * factor < ratio < 2 * factor:
+                hint = f"; {mistake}?"
+        fitting = np.flatnonzero((allowed_low <= number) & (number <= allowed_high))
+        if fitting.size and not hint:
+            hint = f"; it would fit number {_name(int(fitting[0]), names)}: another order?"
+
+        sentences.append(
+            f"{vector}{_name(int(i), names)}: got {number:.4g}, was trained from {low[i]:.4g} to "
+            f"{high[i]:.4g}{hint}"
         )
-        trained = f"was trained from {low[i]:.4g} to {high[i]:.4g}"
-        found.append(f"{what}{_name(int(i), names)}: got {got:.4g}, {trained}{unit or order}")
-    return found
+    return sentences
 
 
 def _name(i: int, names: Sequence[str]) -> str:
+    """Return the index of a number, with its name if that is known."""
     return f"[{i}] ({names[i]})" if i < len(names) else f"[{i}]"

@@ -74,17 +74,19 @@ class Guard:
         soft_start_s: float = SOFT_START_S,
     ) -> None:
         spec = contract.action if contract is not None else ActionSpec()
-        self.limits = limits = (
-            MotionLimits.read(limits, spec) if isinstance(limits, (str, Path)) else limits
-        )
+        if isinstance(limits, (str, Path)):
+            limits = MotionLimits.read(limits, spec)
+        self.limits = limits
         self.hz = hz
         self._spec = spec
         self._dim = spec.dim
-        own = limits or MotionLimits()
-        self._low = _bounds("low", np.maximum, spec.low, low, own.low)
-        self._high = _bounds("high", np.minimum, spec.high, high, own.high)
+
+        bounds = limits or MotionLimits()
+        self._low = _strictest("low", np.maximum, spec.low, low, bounds.low)
+        self._high = _strictest("high", np.minimum, spec.high, high, bounds.high)
         self._max_step = None if max_step is None else np.asarray(max_step, np.float64)
-        # With NaN any step would pass.
+
+        # This also rejects NaN, with which any step would pass.
         if self._max_step is not None and not (self._max_step >= 0).all():
             raise ConfigError(f"max_step: got {max_step}, want 0 or above, or None")
         if measure is not None and spec.relative:
@@ -97,16 +99,20 @@ class Guard:
                 f"limits: got hz={hz}, soft_start_s={soft_start_s}, want the control rate, and 0 s "
                 "or more"
             )
+
         self._measure = measure
         self._soft_ticks = soft_start_s * (hz or 0.0)
-        self._moved = 0  # ticks of motion
-        # low, high, max_step, velocity, acceleration, jerk; units and ticks.
+        self._moved = 0  # the number of ticks with motion
+
+        # For each of low, high, max_step, velocity, acceleration and jerk, the limit of each number
+        # of an action, in its units and ticks.
         self._columns: list[list[float]] = []
         self._grippers: list[int] = []
         self._deltas: list[int] = []
+
         self._then: list[float] | None = None  # the last accepted action; None at rest
-        self._speed: list[float] = []  # its change from the one before, units a tick
-        self._change: list[float] = []  # the change of that
+        self._speed: list[float] = []  # its change from the action before, units a tick
+        self._change: list[float] = []  # the change of the speed
         if self._dim is not None:
             self._limits_of(self._dim)
 
@@ -132,16 +138,16 @@ class Guard:
             return standing
         if self._measure is None:
             return last
+
         pose = np.array(self._measure(obs), np.float32)
-        wanted = self._dim if last is None else len(last)
-        if pose.ndim != 1 or wanted not in (None, len(pose)):
-            raise ConfigError(
-                f"measure: got {pose.shape}, want ({wanted or 'D'},), as an action is"
-            )
+        dim = self._dim if last is None else len(last)
+        if pose.ndim != 1 or dim not in (None, len(pose)):
+            raise ConfigError(f"measure: got {pose.shape}, want ({dim or 'D'},), as an action is")
         if not np.isfinite(pose).all():
             raise InvalidAction(
                 f"measure: got {pose.tolist()}, want finite numbers; the robot's sensors are broken"
             )
+
         if last is not None:
             self._limits_of(len(last))
             # A stop keeps the grasp, which the measured opening loosens.
@@ -165,15 +171,16 @@ class Guard:
         """
         action = np.asarray(action)
         if action.ndim != 1 or action.dtype.kind != "f" or self._dim not in (None, len(action)):
-            wanted = f"({self._dim if self._dim is not None else 'D'},) float32"
+            dim = "D" if self._dim is None else self._dim
             raise InvalidAction(
-                f"action: got {action.shape} {action.dtype}, want {wanted}, a single row"
+                f"action: got {action.shape} {action.dtype}, want ({dim},) float32, a single row"
             )
         now = action.tolist()  # plain floats: for so few numbers they are faster than numpy
         if not all(map(math.isfinite, now)):
             raise InvalidAction(
                 f"action: got {now}, want finite numbers; the policy's output is broken"
             )
+
         low, high, steps, *dynamic = self._limits_of(len(now))
         for i, number in enumerate(now):
             if not low[i] <= number <= high[i]:
@@ -184,6 +191,7 @@ class Guard:
                 )
         if self.limits is not None and self.limits.chain is not None:
             self._check_workspace(self.limits, self.limits.chain.tip(now))
+
         if last is not None and last.shape != action.shape:
             raise InvalidAction(
                 f"action: got {action.shape} after {np.shape(last)}, want as many numbers as before"
@@ -193,6 +201,7 @@ class Guard:
             self._then = None
             for i in self._deltas:
                 then[i] = 0.0
+
         for i, number in enumerate(now):
             if abs(number - then[i]) > steps[i] + 2 * _ROUNDING * max(abs(number), abs(then[i])):
                 raise InvalidAction(
@@ -232,29 +241,38 @@ class Guard:
         if self.limits is None or (start is None and not self._spec.relative):
             return None
         *_, velocity, acceleration, jerk = self._limits_of(len(goal))
-        start = goal if start is None else start  # of relative actions, whose grippers are unknown
+        if start is None:  # actions are relative, and the positions of the grippers are unknown
+            start = goal
         if start.shape != goal.shape:
             return None
         if not (far or self._spec.relative):
             self._check_first(self.limits, start, goal, velocity)
-        of_time = (self.limits.velocity, self.limits.acceleration, self.limits.jerk)
-        if all(limit is None for limit in of_time):
+        dynamic_limits = (self.limits.velocity, self.limits.acceleration, self.limits.jerk)
+        if all(limit is None for limit in dynamic_limits):
             return None
+
         at_once = [
             i for i in self._grippers if velocity[i] == acceleration[i] == jerk[i] == math.inf
         ]
-        ways = np.abs(goal.astype(np.float64) - start)
-        ways[self._deltas + at_once] = 0.0
+        distances = np.abs(goal.astype(np.float64) - start)
+        distances[self._deltas + at_once] = 0.0
         speeds = self._speeds(goal if plan is None else plan)
         ramp = approach = 0.0
-        for i, (way, speed) in enumerate(zip(ways.tolist(), speeds.tolist(), strict=True)):
+        for i, (distance, speed) in enumerate(
+            zip(distances.tolist(), speeds.tolist(), strict=True)
+        ):
             v, a, j = (self._softness() * limit[i] for limit in (velocity, acceleration, jerk))
             v_plan = v if v < math.inf else 2 * speed
             if i not in at_once:  # the policy's own acceleration needs the other half
                 ramp = max(ramp, 2 * v_plan / a, 2 * v_plan / j)
             # The peaks of the quintic over T ticks: 1.875 D / T, 5.7735 D / T^2, 60 D / T^3.
-            slow = (1.875 * way / v, math.sqrt(5.7735 * way / a), (60 * way / j) ** (1 / 3))
-            approach = max(approach, *(_SLOWLY * ticks for ticks in slow))
+            ticks_by_limit = (
+                1.875 * distance / v,
+                math.sqrt(5.7735 * distance / a),
+                (60 * distance / j) ** (1 / 3),
+            )
+            approach = max(approach, *(_SLOWLY * ticks for ticks in ticks_by_limit))
+
         ticks = math.ceil(approach) if self._deltas else max(1, math.ceil(approach))
         return EaseIn(start, ticks, 2 * math.ceil(ramp / 2), deltas=self._deltas, at_once=at_once)
 
@@ -267,11 +285,12 @@ class Guard:
             allowed = [limit * hz * _FIRST_S for limit in velocity]
         else:
             allowed = np.broadcast_to(np.asarray(limits.first, np.float64), dim).tolist()
+
         for i, (begin, end) in enumerate(zip(start.tolist(), goal.tolist(), strict=True)):
-            way = abs(end - begin)
-            if way > allowed[i] + 2 * _ROUNDING * max(abs(begin), abs(end)):
+            distance = abs(end - begin)
+            if distance > allowed[i] + 2 * _ROUNDING * max(abs(begin), abs(end)):
                 raise InvalidAction(
-                    f"action[{i}]: got {end:g} as the first action, {way:g} from the pose "
+                    f"action[{i}]: got {end:g} as the first action, {distance:g} from the pose "
                     f"{begin:g}, want {allowed[i]:.3g} at most; is it another arm's or in another "
                     "order or unit? Else raise `first`",
                     cause="max_step",
@@ -295,6 +314,7 @@ class Guard:
         for number, pose in enumerate(self.limits.rest):
             if pose is not None:
                 rest[number] = pose
+
         ease = self.ease_in(last, rest, far=True)
         yield last  # the way begins at rest
         while ease is not None and not ease.arrived:
@@ -305,52 +325,54 @@ class Guard:
         """Return the limits of each number of an action; raises `ConfigError` if they do not fit
         its meaning.
         """
-        if not self._columns or len(self._columns[0]) != dim:
-            limits, tick_s = self.limits or MotionLimits(), 1.0 / (self.hz or 1.0)
-            self._grippers = self._spec.gripper_columns(dim)
-            self._deltas = self._spec.delta_columns(dim)
-            try:
-                columns = [
-                    np.broadcast_to(-math.inf if self._low is None else self._low, dim).tolist(),
-                    np.broadcast_to(math.inf if self._high is None else self._high, dim).tolist(),
-                    _tolerant(math.inf if self._max_step is None else self._max_step, dim),
-                ]
-                for order, limit in enumerate(
-                    (limits.velocity, limits.acceleration, limits.jerk), 1
-                ):
-                    per_s = math.inf if limit is None else np.asarray(limit, np.float64)
-                    columns.append(_tolerant(per_s * tick_s**order, dim))
-                np.broadcast_to(0.0 if limits.first is None else limits.first, dim)
-            except ValueError as error:
-                raise ConfigError(
-                    f"limits: {error}; want one number, or {dim} as an action has"
-                ) from error
-            if any(low > high for low, high in zip(columns[0], columns[1], strict=True)):
-                raise ConfigError(
-                    f"low and high: expected low below high, got {columns[0]} and {columns[1]}"
-                )
-            self._check_places(limits, dim)
-            self._columns = columns
+        if self._columns and len(self._columns[0]) == dim:
+            return self._columns
+
+        limits = self.limits or MotionLimits()
+        tick_s = 1.0 / (self.hz or 1.0)
+        self._grippers = self._spec.gripper_columns(dim)
+        self._deltas = self._spec.delta_columns(dim)
+        try:
+            columns = [
+                np.broadcast_to(-math.inf if self._low is None else self._low, dim).tolist(),
+                np.broadcast_to(math.inf if self._high is None else self._high, dim).tolist(),
+                _tolerant(math.inf if self._max_step is None else self._max_step, dim),
+            ]
+            dynamic_limits = (limits.velocity, limits.acceleration, limits.jerk)
+            for order, limit in enumerate(dynamic_limits, 1):
+                per_s = math.inf if limit is None else np.asarray(limit, np.float64)
+                columns.append(_tolerant(per_s * tick_s**order, dim))
+            np.broadcast_to(0.0 if limits.first is None else limits.first, dim)
+        except ValueError as error:
+            raise ConfigError(
+                f"limits: {error}; want one number, or {dim} as an action has"
+            ) from error
+
+        low, high = columns[:2]
+        if any(low_i > high_i for low_i, high_i in zip(low, high, strict=True)):
+            raise ConfigError(f"low and high: expected low below high, got {low} and {high}")
+        self._check_positions(limits, dim)
+        self._columns = columns
         return self._columns
 
-    def _check_places(self, limits: MotionLimits, dim: int) -> None:
-        """Raise `ConfigError` if a limit of places has no effect, or would move a gripper."""
+    def _check_positions(self, limits: MotionLimits, dim: int) -> None:
+        """Raise `ConfigError` if a limit of positions has no effect, or would move a gripper."""
         if limits.rest is not None and len(limits.rest) != dim:
             raise ConfigError(
                 f"rest: expected {dim} numbers, as an action has, got {len(limits.rest)}"
             )
-        moved = (
-            [] if limits.rest is None else [i for i in self._grippers if limits.rest[i] is not None]
-        )
-        if moved:
+        rest = limits.rest or ()
+        moved_grippers = [i for i in self._grippers if rest and rest[i] is not None]
+        if moved_grippers:
             raise ConfigError(
-                f"rest: expected null for the grippers, numbers {moved}, as the way to rest keeps "
-                f"what they hold; got {limits.rest}"
+                f"rest: expected null for the grippers, numbers {moved_grippers}, as the way to "
+                f"rest keeps what they hold; got {limits.rest}"
             )
         if not self._deltas:
             return
-        places = ("first", "rest", "workspace_low", "workspace_high")
-        without_effect = [name for name in places if getattr(limits, name) is not None]
+
+        positions = ("first", "rest", "workspace_low", "workspace_high")
+        without_effect = [name for name in positions if getattr(limits, name) is not None]
         for name in ("low", "high"):
             bound = getattr(limits, name)
             if bound is not None and np.isfinite(np.broadcast_to(bound, dim)[self._deltas]).any():
@@ -364,20 +386,26 @@ class Guard:
 
     def _softness(self) -> float:
         """Return the share of the limits of speed, acceleration and jerk that applies now."""
-        return (
-            1.0 if self._moved >= self._soft_ticks else 0.5 + 0.5 * self._moved / self._soft_ticks
-        )
+        if self._moved >= self._soft_ticks:
+            return 1.0
+        return 0.5 + 0.5 * self._moved / self._soft_ticks
 
     def _check_dynamics(
         self, now: list[float], then: list[float], limits: Sequence[list[float]]
     ) -> None:
+        """Raise `InvalidAction` if the motion of this tick exceeds a limit of speed, acceleration
+        or jerk; else record it.
+        """
         zeros = [0.0] * len(now)
-        continues = then == self._then
-        speeds, changes = (self._speed, self._change) if continues else (zeros.copy(), zeros)
+        if then == self._then:  # the motion continues
+            speeds, changes = self._speed, self._change
+        else:
+            speeds, changes = zeros.copy(), zeros
         moved = [a - b for a, b in zip(now, then, strict=True)]
         for i in self._deltas:
             moved[i] = now[i]
             speeds[i] = then[i]
+
         share = self._softness()
         for i, (v, u, c, *limit) in enumerate(zip(moved, speeds, changes, *limits, strict=True)):
             # An action's rounding to float32 counts twice in a speed, and twice as often in each
@@ -396,52 +424,59 @@ class Guard:
         self._then, self._speed = now, moved
         self._moved += any(moved)
 
-    def _refusal(self, what: str, i: int, got: float, limit: float, order: int) -> InvalidAction:
+    def _refusal(
+        self, quantity: str, i: int, value: float, limit: float, order: int
+    ) -> InvalidAction:
+        """Return the error for a number whose difference of that order exceeds its limit."""
         per_s = (self.hz or 1.0) ** order
         soft = "" if self._moved >= self._soft_ticks else ", which the soft start lowers"
         return InvalidAction(
-            f"action[{i}]: got {what} {got * per_s:.4g}, want {limit * per_s:.3g} at most "
+            f"action[{i}]: got {quantity} {value * per_s:.4g}, want {limit * per_s:.3g} at most "
             f"(units/s^{order}{soft})",
             cause="max_step" if order == 1 else "dynamics",
         )
 
     def _check_workspace(self, limits: MotionLimits, tip: tuple[float, float, float]) -> None:
-        for bound, wrong, name in (
+        """Raise `InvalidAction` if the tip, m, would leave the workspace."""
+        for bound, sign, side in (
             (limits.workspace_low, 1, "below"),
             (limits.workspace_high, -1, "above"),
         ):
-            for axis, place, limit in zip("xyz", tip, bound or tip, strict=True):
-                if wrong * (limit - place) > 0:
+            for axis, position, limit in zip("xyz", tip, bound or tip, strict=True):
+                if sign * (limit - position) > 0:
                     raise InvalidAction(
-                        f"action: the tip would be at {axis} = {place:.3f} m, {name} the "
+                        f"action: the tip would be at {axis} = {position:.3f} m, {side} the "
                         f"workspace's {limit:g} m",
                         cause="limits",
                     )
 
 
-def measured_state(part: str | None) -> Callable[[Obs], np.ndarray] | None:
-    """Return a `measure` of a `Guard`: a part of the state, such as "joints"; None measures
-    nothing.
+def measured_state(name: str | None) -> Callable[[Obs], np.ndarray] | None:
+    """Return a `measure` of a `Guard`: the part of the state with that name, such as "joints";
+    None measures nothing.
     """
+    if name is None:
+        return None
 
-    def measured(obs: Obs) -> np.ndarray:
-        if part not in obs.state:
-            raise MissingState(str(part), obs.state)
-        return obs.state[part]
+    def measure(obs: Obs) -> np.ndarray:
+        """Return that part of the state, (D,)."""
+        if name not in obs.state:
+            raise MissingState(name, obs.state)
+        return obs.state[name]
 
-    return None if part is None else measured
+    return measure
 
 
-def _bounds(
-    name: str, stricter: np.ufunc, *given: float | np.ndarray | tuple[float, ...] | None
+def _strictest(
+    name: str, stricter: np.ufunc, *bounds: float | np.ndarray | tuple[float, ...] | None
 ) -> np.ndarray | None:
     """Return the strictest of the bounds as float32, the type of actions, so that a bound of 0.1
-    accepts 0.1.
+    accepts 0.1; None if all bounds are None.
     """
-    stated = [np.asarray(one, np.float32) for one in given if one is not None]
-    if any(np.isnan(one).any() for one in stated):
-        raise ConfigError(f"{name}: got {given}, want numbers")
-    return functools.reduce(stricter, stated) if stated else None
+    arrays = [np.asarray(bound, np.float32) for bound in bounds if bound is not None]
+    if any(np.isnan(array).any() for array in arrays):
+        raise ConfigError(f"{name}: got {bounds}, want numbers")
+    return functools.reduce(stricter, arrays) if arrays else None
 
 
 def _tolerant(limit: float | np.ndarray, dim: int) -> list[float]:

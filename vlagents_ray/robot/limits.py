@@ -28,7 +28,7 @@ MARGIN = 2.0
 i.e. at the quantiles.
 """
 _PER_RAD = {"rad": 1.0, "deg": 180 / math.pi}
-_ROOM = 0.1  # share of the demonstrated range by which an action may leave it
+_TOLERANCE = 0.1  # the share of the demonstrated range by which an action may leave it
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,39 +50,30 @@ class MotionLimits:
     `velocity`.
     """
     rest: tuple[float | None, ...] | None = None
-    """The pose to which the arm goes slowly at the end of a run; a number that is None, as that of
-    a gripper must be, stays as it was commanded."""
+    """The pose to which the arm goes slowly at the end of a run. A number that is None, as the
+    number of a gripper must be, stays as it was commanded.
+    """
     joints: tuple[str, ...] = ()  # the names of the action's numbers, in order
-    unit: str = "rad"  # "rad" or "deg", of the joints
-    # m, of the tip in the base frame of the URDF.
+    unit: str = "rad"  # the unit of the joints: "rad" or "deg"
+    # The bounds of the tip's position in the base frame of the URDF, m.
     workspace_low: tuple[float, float, float] | None = None
     workspace_high: tuple[float, float, float] | None = None
     chain: Chain | None = None  # from joints to the tip
 
     def __post_init__(self) -> None:
-        for name in (
-            "low",
-            "high",
-            "velocity",
-            "acceleration",
-            "jerk",
-            "first",
-            "workspace_low",
-            "workspace_high",
-        ):
-            numbers = _numbers(name, getattr(self, name))
-            if name in ("velocity", "acceleration", "jerk", "first") and (numbers < 0).any():
-                raise ConfigError(
-                    f"{name}: expected numbers of 0 or more, got {getattr(self, name)}"
-                )
-            if (
-                name.startswith("workspace")
-                and getattr(self, name) is not None
-                and numbers.shape != (3,)
-            ):
-                raise ConfigError(f"{name}: expected x, y and z in m, got {getattr(self, name)}")
-        poses = () if self.rest is None else [number for number in self.rest if number is not None]
-        if not np.isfinite(_numbers("rest", poses)).all():
+        for name in ("low", "high"):
+            _numbers(name, getattr(self, name))
+        for name in ("velocity", "acceleration", "jerk", "first"):
+            value = getattr(self, name)
+            if (_numbers(name, value) < 0).any():
+                raise ConfigError(f"{name}: expected numbers of 0 or more, got {value}")
+        for name in ("workspace_low", "workspace_high"):
+            value = getattr(self, name)
+            if _numbers(name, value).shape != (3,) and value is not None:
+                raise ConfigError(f"{name}: expected x, y and z in m, got {value}")
+
+        rest_numbers = [number for number in self.rest or () if number is not None]
+        if not np.isfinite(_numbers("rest", rest_numbers)).all():
             raise ConfigError(f"rest: expected finite numbers or null, got {self.rest}")
         if self.unit not in _PER_RAD:
             raise ConfigError(f"unit: got {self.unit!r}, want 'rad' or 'deg'")
@@ -133,11 +124,13 @@ class MotionLimits:
     def _of_document(cls, path: Path, document: Any) -> MotionLimits:
         urdf, tip = document.pop("urdf", None), document.pop("tip", None)
         known = {field.name for field in fields(cls)} - {"chain"} | {"urdf", "tip"}
-        if unknown := sorted(set(document) - known):
-            meant = "".join(did_you_mean(str(key), known) for key in unknown)
-            raise ConfigError(f"unknown keys {unknown}, want some of {sorted(known)}{meant}")
+        unknown = sorted(set(document) - known)
+        if unknown:
+            suggestions = "".join(did_you_mean(str(key), known) for key in unknown)
+            raise ConfigError(f"unknown keys {unknown}, want some of {sorted(known)}{suggestions}")
         if not isinstance(document.get("joints", []), list):
             raise ConfigError(f"joints: expected a list of names, got {document['joints']!r}")
+
         limits = cls(**{key: _value(key, value) for key, value in document.items()})
         bounds_workspace = limits.workspace_low is not None or limits.workspace_high is not None
         if bounds_workspace != (tip is not None) or (tip is not None and urdf is None):
@@ -146,6 +139,7 @@ class MotionLimits:
                 "`workspace_high`, as each has no effect without the others; add what is missing, "
                 "or remove the rest"
             )
+
         if urdf is None:
             if "unit" in document:
                 raise ConfigError(
@@ -153,35 +147,34 @@ class MotionLimits:
                     "limits are in the units of the actions; remove `unit`"
                 )
             return limits
-        return limits.stricter(
-            cls._of_urdf(path.parent / urdf, limits.joints, tip, _PER_RAD[limits.unit])
-        )
+        urdf_limits = cls._of_urdf(path.parent / urdf, limits.joints, tip, _PER_RAD[limits.unit])
+        return limits.stricter(urdf_limits)
 
     def bounds(self, dim: int) -> tuple[np.ndarray, np.ndarray]:
         """Return `low` and `high`, (dim,) each; infinite where none is set, and for another
         number of joints.
         """
-        ends, fitting = ((self.low, -np.inf), (self.high, np.inf)), ((), (dim,))
-        low, high = (
-            np.broadcast_to(one if one is not None and np.shape(one) in fitting else free, dim)
-            for one, free in ends
-        )
-        return low, high
+
+        def bound(limit: Numbers | None, unlimited: float) -> np.ndarray:
+            """Return a limit for each number of an action, (dim,)."""
+            is_set = limit is not None and np.shape(limit) in ((), (dim,))
+            return np.broadcast_to(np.asarray(limit if is_set else unlimited), dim)
+
+        return bound(self.low, -np.inf), bound(self.high, np.inf)
 
     def stricter(self, other: MotionLimits) -> MotionLimits:
         """Return these limits, each replaced by the other's where that is stricter."""
 
-        def least(name: str) -> Numbers | None:
-            a, b = getattr(self, name), getattr(other, name)
-            if a is None or b is None:
-                return b if a is None else a  # type: ignore[no-any-return]
-            return tuple(
-                (np.maximum if name == "low" else np.minimum)(*np.broadcast_arrays(a, b))
-                .ravel()
-                .tolist()
-            )
+        def stricter_of(name: str) -> Numbers | None:
+            """Return the stricter of both values of a field."""
+            ours, theirs = getattr(self, name), getattr(other, name)
+            if ours is None or theirs is None:
+                return theirs if ours is None else ours  # type: ignore[no-any-return]
+            choose = np.maximum if name == "low" else np.minimum
+            return tuple(choose(*np.broadcast_arrays(ours, theirs)).ravel().tolist())
 
-        bounds = {name: least(name) for name in ("low", "high", "velocity", "acceleration", "jerk")}
+        names = ("low", "high", "velocity", "acceleration", "jerk")
+        bounds = {name: stricter_of(name) for name in names}
         chain, joints = self.chain or other.chain, self.joints or other.joints
         return replace(self, chain=chain, joints=joints, **bounds)  # type: ignore[arg-type]
 
@@ -190,7 +183,9 @@ class MotionLimits:
         info = json.loads((folder / "meta/info.json").read_text())
         if INFO in info:
             action = DatasetContract.from_json(info[INFO]).contract.action
-        parquet, fps = require("pyarrow.parquet", extra="record"), float(info["fps"])
+
+        parquet = require("pyarrow.parquet", extra="record")
+        fps = float(info["fps"])
         episodes: dict[int, list[np.ndarray]] = {}
         for file in sorted(folder.glob("data/*/*.parquet")):
             table = parquet.read_table(file, columns=["action", "episode_index"])
@@ -201,13 +196,15 @@ class MotionLimits:
                 episodes.setdefault(int(number), []).append(rows[numbers == number])
         if not episodes:
             raise ConfigError("expected at least one frame in data/, got none")
-        whole = [np.concatenate(parts) for parts in episodes.values()]
-        actions = np.concatenate(whole)
-        room = _ROOM * np.ptp(actions, axis=0)
+
+        actions_of_episodes = [np.concatenate(chunks) for chunks in episodes.values()]
+        actions = np.concatenate(actions_of_episodes)
+        tolerance = _TOLERANCE * np.ptp(actions, axis=0)
         deltas = (action or ActionSpec()).delta_columns(actions.shape[1])
-        paths = [_path(episode, deltas) for episode in whole]
+        paths = [_path(episode, deltas) for episode in actions_of_episodes]
 
         def fastest(order: int) -> tuple[float, ...]:
+            """Return a limit of the paths' differences of that order, in units and seconds."""
             changes = [np.abs(np.diff(path, order, axis=0)) for path in paths if len(path) > order]
             if not changes:
                 return tuple([math.inf] * actions.shape[1])
@@ -219,7 +216,7 @@ class MotionLimits:
             # A gripper that hardly ever moves has the quantile 0, by which it could never be moved.
             return tuple(number if number > 0 else math.inf for number in limit.tolist())
 
-        low, high = actions.min(0) - room, actions.max(0) + room
+        low, high = actions.min(0) - tolerance, actions.max(0) + tolerance
         low[deltas], high[deltas] = -np.inf, np.inf  # the range of deltas is that of the speeds
         names = info["features"]["action"].get("names")
         return cls(
@@ -237,31 +234,38 @@ class MotionLimits:
     ) -> MotionLimits:
         robot = ET.parse(file).getroot()  # noqa: S314 - a file of this robot's owner
         elements = {
-            one.attrib["name"]: one for one in robot.iter("joint") if one.find("child") is not None
+            joint.attrib["name"]: joint
+            for joint in robot.iter("joint")
+            if joint.find("child") is not None
         }
         names = [*joints] or [
-            name for name, one in elements.items() if one.attrib["type"] != "fixed"
+            name for name, joint in elements.items() if joint.attrib["type"] != "fixed"
         ]
-        if unknown := sorted(set(names) - set(elements)):
+        unknown = sorted(set(names) - set(elements))
+        if unknown:
             raise ConfigError(
                 f"{file}: has no joints {unknown}, has {sorted(elements)}; name them in `joints`"
             )
 
-        def stated(name: str, key: str, default: float) -> float:
+        def limit_of(name: str, key: str, default: float) -> float:
+            """Return a limit of a joint in the units of the actions."""
             joint = elements[name]
-            limit, unit = joint.find("limit"), 1.0 if joint.attrib["type"] == "prismatic" else scale
-            bounded = limit is not None and (
-                key == "velocity" or joint.attrib["type"] != "continuous"
-            )
-            value = (
-                float(limit.attrib.get(key, default)) if limit is not None and bounded else default
-            )
-            return (value or default) * unit if key == "velocity" else value * unit
+            kind = joint.attrib["type"]
+            unit = 1.0 if kind == "prismatic" else scale
+
+            limit = joint.find("limit")
+            has_limit = limit is not None and (key == "velocity" or kind != "continuous")
+            value = default
+            if limit is not None and has_limit:
+                value = float(limit.attrib.get(key, default))
+            if key == "velocity":
+                value = value or default  # URDFs write 0 for an unknown speed
+            return value * unit
 
         return cls(
-            low=tuple(stated(name, "lower", -math.inf) for name in names),
-            high=tuple(stated(name, "upper", math.inf) for name in names),
-            velocity=tuple(stated(name, "velocity", math.inf) for name in names),
+            low=tuple(limit_of(name, "lower", -math.inf) for name in names),
+            high=tuple(limit_of(name, "upper", math.inf) for name in names),
+            velocity=tuple(limit_of(name, "velocity", math.inf) for name in names),
             joints=tuple(names),
             chain=None if tip is None else Chain(elements, tip, names, 1.0 / scale),
         )
@@ -278,32 +282,36 @@ class Chain:
         """Read the joints from the base to the link `tip`; `names` are those of an action's
         numbers, in order.
         """
-        parents = {one.find("child").attrib["link"]: (name, one) for name, one in joints.items()}
+        parents = {
+            joint.find("child").attrib["link"]: (name, joint) for name, joint in joints.items()
+        }
         if tip not in parents:
             raise ConfigError(f"tip: got {tip!r}, want one of the links {sorted(parents)}")
-        # From the tip to the base.
+
+        # The links from the tip to the base: rotation and offset of the joint, its axis, the index
+        # of its number in an action (-1 without one), and whether it slides.
         self._links: list[tuple[list[float], list[float], list[float], int, bool]] = []
         self._to_rad = to_rad
         while tip in parents:
-            name, one = parents[tip]
-            origin, axis, kind = one.find("origin"), one.find("axis"), one.attrib["type"]
+            name, joint = parents[tip]
+            origin, axis, kind = joint.find("origin"), joint.find("axis"), joint.attrib["type"]
             attributes = {} if origin is None else origin.attrib
             direction = np.array([1.0, 0.0, 0.0] if axis is None else _three(axis.attrib["xyz"]))
             direction /= np.linalg.norm(direction) or 1.0
             turn = _rotation(*_three(attributes.get("rpy", "0 0 0"))).ravel().tolist()
-            place = names.index(name) if name in names and kind != "fixed" else -1
+            index = names.index(name) if name in names and kind != "fixed" else -1
             offset = _three(attributes.get("xyz", "0 0 0"))
-            self._links.append((turn, offset, direction.tolist(), place, kind == "prismatic"))
-            tip = one.find("parent").attrib["link"]
+            self._links.append((turn, offset, direction.tolist(), index, kind == "prismatic"))
+            tip = joint.find("parent").attrib["link"]
 
     def tip(self, joints: Sequence[float]) -> tuple[float, float, float]:
         """Return the position of the tip in the base frame, m, at the numbers of an action."""
         x = y = z = 0.0
-        for turn, (ox, oy, oz), (ax, ay, az), place, slides in self._links:
-            if place >= 0 and slides:
-                x, y, z = x + joints[place] * ax, y + joints[place] * ay, z + joints[place] * az
-            elif place >= 0:  # Rodrigues' formula
-                angle = joints[place] * self._to_rad
+        for turn, (ox, oy, oz), (ax, ay, az), index, slides in self._links:
+            if index >= 0 and slides:
+                x, y, z = x + joints[index] * ax, y + joints[index] * ay, z + joints[index] * az
+            elif index >= 0:  # Rodrigues' formula
+                angle = joints[index] * self._to_rad
                 c, s = math.cos(angle), math.sin(angle)
                 along = (ax * x + ay * y + az * z) * (1.0 - c)
                 x, y, z = (
@@ -333,6 +341,7 @@ def _rotation(roll: float, pitch: float, yaw: float) -> np.ndarray:
 
 
 def _three(text: str) -> list[float]:
+    """Return the three numbers of an attribute."""
     x, y, z = map(float, text.split())
     return [x, y, z]
 
@@ -356,9 +365,10 @@ def _numbers(name: str, value: object) -> np.ndarray:
     """Return the number, or the numbers of a list, of a limit; none for None. Raises
     `ConfigError` for others.
     """
-    values = (
-        [] if value is None else value if isinstance(value, (tuple, list, np.ndarray)) else [value]
-    )
+    if value is None:
+        return np.array([], np.float64)
+
+    values = value if isinstance(value, (tuple, list, np.ndarray)) else [value]
     for number in values:
         if (
             isinstance(number, bool)
@@ -380,6 +390,7 @@ def _value(key: str, value: Any) -> Any:
 
 
 def _document(path: Path) -> Any:
+    """Return the content of a YAML or JSON file."""
     text = path.read_text(encoding="utf-8")
     if path.suffix == ".json":
         return json.loads(text, object_pairs_hook=without_duplicate_keys)

@@ -88,16 +88,13 @@ class Robot(Protocol):
 
 
 def contract_of(robot: Robot) -> Contract:
-    """Return what a robot states of itself, with the names of its joints; empty if it states
-    nothing.
+    """Return the contract of a robot with the names of its joints; an empty one if the robot has
+    none.
     """
-    stated, names = (
-        getattr(robot, "contract", None) or Contract(),
-        tuple(getattr(robot, "joint_names", ())),
-    )
-    return replace(
-        stated, action=replace(stated.action, names=stated.action.names or names or None)
-    )
+    contract = getattr(robot, "contract", None) or Contract()
+    joint_names = tuple(getattr(robot, "joint_names", ()))
+    names = contract.action.names or joint_names or None
+    return replace(contract, action=replace(contract.action, names=names))
 
 
 def fit_of(
@@ -124,14 +121,17 @@ def fit_of(
         ContractMismatch: The contracts differ.
     """
     require_match(agent.contract, contract_of(robot))
-    has_units = (
-        not getattr(robot, "simulated", False) or getattr(robot, "contract", None) is not None
-    )
+
     if trained is None:
+        is_simulated = getattr(robot, "simulated", False)
+        has_units = not is_simulated or getattr(robot, "contract", None) is not None
         trained = Trained.from_statistics(agent.statistics or {}) if has_units else Trained()
+
     contract = agent.contract or Contract()
-    parts = (*(contract.state or {}), *(["gripper"] if contract.gripper else []))
-    return Fit(trained, limits, tuple(getattr(robot, "joint_names", ())), parts, accept)
+    parts = list(contract.state or {})
+    if contract.gripper:
+        parts.append("gripper")
+    return Fit(trained, limits, tuple(getattr(robot, "joint_names", ())), tuple(parts), accept)
 
 
 def robot_watchdog(
@@ -171,11 +171,13 @@ def import_class(option: str, name: str, methods: Sequence[str] = ()) -> Any:
         raise ConfigError(
             f"{option} {name}: {type(error).__name__}: {error}; correct the module {module!r}"
         ) from error
-    if (found := getattr(imported, attribute, None)) is None:
+
+    cls = getattr(imported, attribute, None)
+    if cls is None:
         public = [known for known in vars(imported) if not known.startswith("_")]
-        guess = did_you_mean(attribute, public) or "; write the name of a class in it"
-        raise ConfigError(f"{option} {name}: module {module!r} has no {attribute!r}{guess}")
-    return _with_methods(f"{option} {name}", found, methods)
+        hint = did_you_mean(attribute, public) or "; write the name of a class in it"
+        raise ConfigError(f"{option} {name}: module {module!r} has no {attribute!r}{hint}")
+    return _with_methods(f"{option} {name}", cls, methods)
 
 
 def _with_methods(where: str, cls: Any, methods: Sequence[str]) -> Any:
@@ -188,14 +190,18 @@ def _with_methods(where: str, cls: Any, methods: Sequence[str]) -> Any:
     return cls
 
 
-def robot_named(option: str, name: str, settings: Iterable[str] = ()) -> Callable[..., Robot]:
-    """Return what makes a robot: "module:Class", or a registered name and its argument,
-    "mujoco:so101".
+def robot_factory(option: str, name: str, settings: Iterable[str] = ()) -> Callable[..., Robot]:
+    """Return a function that makes a robot.
 
-    The `settings` are further arguments as KEY=VALUE, of which the value is JSON or else text.
-    Raises `ConfigError`.
+    Args:
+        option: The option of the command line that names the robot, for messages.
+        name: "module:Class", or a registered name and its argument, "mujoco:so101".
+        settings: Further arguments of the robot as KEY=VALUE; a value that is not JSON is text.
+
+    Raises:
+        ConfigError: The name is unknown, its class is no robot, or a setting is wrong.
     """
-    given: dict[str, Any] = {}
+    arguments: dict[str, Any] = {}
     for text in settings:
         key, equals, value = text.partition("=")
         if not equals:
@@ -203,20 +209,20 @@ def robot_named(option: str, name: str, settings: Iterable[str] = ()) -> Callabl
                 f"{option}-set: got {text!r}, want KEY=VALUE, as in port=/dev/ttyACM0"
             )
         try:
-            given[key] = json.loads(value)
+            arguments[key] = json.loads(value)
         except json.JSONDecodeError:
-            given[key] = value
-    registered, _, argument = name.partition(":")
+            arguments[key] = value
+
+    registered_name, _, argument = name.partition(":")
     make: Callable[..., Robot]
-    if registered in names("robots") or registered in not_installed("robots"):
-        make = partial(
-            _with_methods(f"{option} {name}", registered_class("robots", registered), ROBOT),
-            argument,
-        )
+    if registered_name in names("robots") or registered_name in not_installed("robots"):
+        cls = registered_class("robots", registered_name)
+        make = partial(_with_methods(f"{option} {name}", cls, ROBOT), argument)
     else:
         make = import_class(option, name, ROBOT)
-    require_arguments(f"{option} {name}", make, given)
-    return partial(make, **given)
+
+    require_arguments(f"{option} {name}", make, arguments)
+    return partial(make, **arguments)
 
 
 @contextlib.contextmanager
@@ -237,6 +243,7 @@ def opened(make: Callable[[], Robot]) -> Iterator[Robot]:
             f"robot: could not be made: {type(error).__name__}: {error}; check its arguments "
             "(--robot-set), its cables and its power, or correct its class"
         ) from error
+
     with contextlib.ExitStack() as stack:
         if isinstance(robot, contextlib.AbstractContextManager):
             stack.enter_context(robot)
@@ -255,15 +262,16 @@ class LoopReport:
     jitter: dict[str, float] = field(default_factory=dict)  # see `vlagents_ray.robot.pacing.jitter`
     work_p50_ms: float = 0.0  # from the due time of a tick to its applied action
     work_p99_ms: float = 0.0
-    apply_p50_ms: float = 0.0  # of `robot.apply` alone
-    # Ticks with the safe action or without any, by cause.
+    apply_p50_ms: float = 0.0  # the time of `robot.apply` alone
+    # The number of ticks with the safe action or without any, by cause.
     safe: dict[Cause, int] = field(default_factory=dict)
     # The first reason of each cause, in words.
     reasons: dict[Cause, str] = field(default_factory=dict)
     waiting: int = 0  # ticks at which the robot held still, with all rows used up and no new answer
     barks: list[str] = field(default_factory=list)  # reasons of stops by the watchdog or a command
     interventions: int = 0  # ticks at which an operator moved the robot
-    # Ticks at which the robot was paused (see `vlagents_ray.chunking.control`); not among `safe`.
+    # The number of ticks at which the robot was paused (see `vlagents_ray.chunking.control`); they
+    # are not among `safe`.
     paused: int = 0
     done: bool = False  # the policy considered its task finished
     means: list[str] = field(default_factory=list)  # the measures taken against jitter
@@ -282,7 +290,8 @@ class LoopReport:
         ticks = int(self.jitter.get("ticks", 0))
         if 2 * self.safe_ticks <= ticks:
             return None
-        cause: Cause = max(self.safe, key=lambda one: self.safe[one], default="waiting")
+
+        cause: Cause = max(self.safe, key=lambda cause: self.safe[cause], default="waiting")
         if self.waiting >= self.safe.get(cause, 0):
             cause = "waiting"
         return (
@@ -309,15 +318,15 @@ class LoopReport:
             if warning is not None:
                 logger.warning("%s", warning)
 
-    def count(self, held: Held) -> None:
+    def count(self, why: Held) -> None:
         """Count a tick without an action of the policy."""
-        self.reasons.setdefault(held.cause, held.reason)
-        if held.cause == "paused":
+        self.reasons.setdefault(why.cause, why.reason)
+        if why.cause == "paused":
             self.paused += 1
-        elif held.cause == "waiting":
+        elif why.cause == "waiting":
             self.waiting += 1
         else:
-            self.safe[held.cause] = self.safe.get(held.cause, 0) + 1
+            self.safe[why.cause] = self.safe.get(why.cause, 0) + 1
 
 
 def run_loop(
@@ -343,12 +352,14 @@ def run_loop(
     over.
 
     With the rest pose of `Guard.limits`, the robot goes there slowly after a run that ended without
-    a stop, a pause, a mark or an exception; a mark may come from afar, from where a robot can only
-    be made to stop. A stop ends this motion as it ends any other. The schedule is
-    absolute, so there is no drift; a tick that is over before it could begin is skipped and counted
-    as missed. `robot.stop()` is called however the loop ends. If more than half of the ticks had no
-    action of the policy, `LoopReport.mostly_safe` is logged as a warning. Signals such as SIGTERM
-    end the loop if the caller turns them into an exception.
+    a stop, a pause, a mark or an exception. (A mark may come over a network, and nothing from there
+    may start a motion.) A stop ends this motion as it ends any other. `robot.stop()` is called
+    however the loop ends.
+
+    The schedule is absolute, so there is no drift; a tick that is over before it could begin is
+    skipped and counted as missed. If more than half of the ticks had no action of the policy,
+    `LoopReport.mostly_safe` is logged as a warning. Signals such as SIGTERM end the loop if the
+    caller turns them into an exception.
 
     Args:
         robot: The robot.
@@ -401,67 +412,92 @@ def run_loop(
         raise ConfigError(f"restart: got {restart!r}, want one of {list(get_args(Restart))}")
     if seconds is not None and not seconds > 0:
         raise ConfigError(f"seconds: got {seconds}, want above 0, or None")
-    # The shared state of this robot: the player's, else the watchdog's, else that of the commands.
-    control: RobotControl | None = agent.control
-    if control is None:
-        control = (
-            watchdog.control
-            if watchdog is not None
-            else commands.control
-            if commands is not None
-            else RobotControl()
-        )
-    if watchdog is not None:
-        watchdog.share(control)
-    if commands is not None and commands.control is not control:
-        control.adopt(commands.control)
-        commands.control = control
+
+    control = _shared_control(agent, watchdog, commands)
     if control.leader is not None and recorder is not None and not recorder.interventions:
         raise ConfigError(
             "recorder: got one without interventions for a player with override=; want Recorder(…, "
             "interventions=True)"
         )
+
     report = report or LoopReport(hz)
-    stops = len(control.stops)
+    earlier_stops = len(control.stops)
     agent.initialize()
-    own = agent.check if isinstance(agent.check, Guard) else None
-    if guard is not None and own is not None and own is not guard:
-        raise ConfigError(
-            "guard: got one besides the agent's own check=, want one of them; leave one out"
-        )
-    guard = guard or own or Guard(agent.contract)
-    if guard.hz not in (None, hz):
-        raise ConfigError(
-            f"guard: got limits for {guard.hz} Hz in a loop of {hz} Hz, want the same rate"
-        )
+    guard = _guard_of(agent, guard, hz)
     fit = fit or fit_of(agent, robot, guard.limits)
     run = _Run(
         robot, agent, control, guard, watchdog, recorder, commands, LoopView(viewer), report, fit
     )
+
     with contextlib.ExitStack() as stack:
         control.begin(auto=restart == "auto")
         try:
             obs = _observed(robot)
             fit.require(obs, None)
             agent.reset(obs, instruction, **(reset_options or {}))
+
             if recorder is not None:
                 stack.enter_context(recorder.episode(instruction or ""))
             stack.enter_context(run.view.episode(instruction or ""))
             report.means = stack.enter_context(undisturbed(real_time=real_time))
             if watchdog is not None:
                 stack.enter_context(watchdog)
+
             pacer = Pacer(hz)
             run.drive(pacer, seconds, until)
             run.go_to_rest(pacer)
+
             report.outcome = control.end()
             if report.outcome and recorder is not None and recorder.interventions:
                 recorder.label("success" if report.outcome == "success" else "failure")
         finally:
             control.running = False
-            report.barks = control.stops[stops:]
+            report.barks = control.stops[earlier_stops:]
             robot.stop()  # before the watchdog and the recorder end
     report.log_warnings()
     return report
+
+
+def _shared_control(
+    agent: Agent, watchdog: Watchdog | None, commands: CommandInbox | None
+) -> RobotControl:
+    """Return the control of a robot that agent, watchdog and commands share from now on: the
+    agent's, else the watchdog's, else the control of the commands.
+    """
+    control: RobotControl | None = agent.control
+    if control is None and watchdog is not None:
+        control = watchdog.control
+    if control is None and commands is not None:
+        control = commands.control
+    if control is None:
+        control = RobotControl()
+
+    if watchdog is not None:
+        watchdog.share(control)
+    if commands is not None and commands.control is not control:
+        control.adopt(commands.control)
+        commands.control = control
+    return control
+
+
+def _guard_of(agent: Agent, guard: Guard | None, hz: float) -> Guard:
+    """Return the guard of a run: the caller's, the agent's, or a new one of the agent's contract.
+
+    Raises:
+        ConfigError: There are two guards, or the guard has limits for another rate.
+    """
+    agent_guard = agent.check if isinstance(agent.check, Guard) else None
+    if guard is not None and agent_guard is not None and agent_guard is not guard:
+        raise ConfigError(
+            "guard: got one besides the agent's own check=, want one of them; leave one out"
+        )
+
+    guard = guard or agent_guard or Guard(agent.contract)
+    if guard.hz not in (None, hz):
+        raise ConfigError(
+            f"guard: got limits for {guard.hz} Hz in a loop of {hz} Hz, want the same rate"
+        )
+    return guard
 
 
 @dataclass(slots=True)
@@ -491,7 +527,7 @@ class _Run:
         ticks = None if seconds is None else max(1, round(seconds / pacer.period_s))
         try:
             while not (until() or self.report.done):
-                # Collects the cycles of failed requests, as automatic collection is off.
+                # Collect the cycles of failed requests, as automatic collection is off.
                 if time.monotonic() - collected > _COLLECT_S:
                     gc.collect()
                     collected = time.monotonic()
@@ -499,6 +535,7 @@ class _Run:
                 if ticks is not None and tick >= ticks:
                     pacer.forget(ticks)
                     break
+
                 obs = _observed(self.robot)
                 if self.agent.control is not self.control:  # else `act` has changed it
                     self.control.update()
@@ -509,15 +546,13 @@ class _Run:
                         "ChunkPlayer"
                     )
                 self.report.done = act.done
-                # Before this tick counts as a sign of life: it may be late.
+
+                # This comes before the sign of life of this tick, which may be late.
                 stop = self._held(act)
                 if self.control.over:
                     break
-                if self.watchdog is not None:
-                    self.watchdog.heard("loop")
-                    ago_s: Any = act.info.get(SILENT)
-                    known = isinstance(ago_s, int | float) and 0 <= ago_s < math.inf
-                    self.watchdog.heard("server", float(ago_s) if known else 0.0)
+                self._give_signs_of_life(act)
+
                 action = None
                 if stop is None:
                     action, stop = self._applied(obs, act)
@@ -526,18 +561,7 @@ class _Run:
                     self.view.add(obs, act, None, tick, pacer.since_tick_s(), stop.reason)
                 elif action is not None:
                     work_s.append(pacer.since_tick_s())
-                    led = INTERVENTION in act.info and SAFE not in act.info
-                    self.report.interventions += led
-                    if self.recorder is not None:
-                        wanted = act.info.get(WANTED)
-                        self.recorder.add(
-                            obs,
-                            action,
-                            tick=tick,
-                            safe=SAFE in act.info,
-                            intervention=led,
-                            wanted=wanted,
-                        )
+                    self._record(obs, act, action, tick)
                     self.view.add(obs, act, action, tick, work_s[-1])
         finally:
             self.report.jitter = jitter(pacer.late_s, pacer.missed, pacer.ticks)
@@ -546,26 +570,48 @@ class _Run:
                 self.report.work_p50_ms = float(np.median(work_s)) * 1e3
                 self.report.work_p99_ms = float(np.quantile(work_s, 0.99)) * 1e3
 
+    def _give_signs_of_life(self, act: Act) -> None:
+        """Report to the watchdog that the loop is alive, and when the server last was."""
+        if self.watchdog is None:
+            return
+        self.watchdog.heard("loop")
+        silent_s: Any = act.info.get(SILENT)
+        is_known = isinstance(silent_s, int | float) and 0 <= silent_s < math.inf
+        self.watchdog.heard("server", float(silent_s) if is_known else 0.0)
+
+    def _record(self, obs: Obs, act: Act, action: np.ndarray, tick: int) -> None:
+        """Count and record an action that was applied."""
+        is_intervention = INTERVENTION in act.info and SAFE not in act.info
+        self.report.interventions += is_intervention
+        if self.recorder is not None:
+            self.recorder.add(
+                obs,
+                action,
+                tick=tick,
+                safe=SAFE in act.info,
+                intervention=is_intervention,
+                wanted=act.info.get(WANTED),
+            )
+
     def go_to_rest(self, pacer: Pacer) -> None:
         """Move slowly to the guard's rest pose, unless the robot is held or the episode was
         marked.
         """
-        if (last := self.last) is None or self.standing:
+        last = self.last
+        if last is None or self.standing:
             return
         try:
             for command in self.guard.way_to_rest(last):
                 pacer.wait()
-                _observed(self.robot)  # so that the robot can tell that it must not move (`holds`)
+                _observed(self.robot)  # the robot may notice that it must not move (`holds`)
                 self.control.update()
-                if (
-                    self._held(Act(last)) is not None
-                    or self.control.state == "human"
-                    or self.control.over
-                ):
+                held = self._held(Act(last))
+                if held is not None or self.control.state == "human" or self.control.over:
                     break
+
                 if self.watchdog is not None:
                     self.watchdog.heard("loop")
-                    self.watchdog.heard("server")  # not needed for this motion
+                    self.watchdog.heard("server")  # this motion does not need the server
                 last = self.guard(command, last)
                 if self._command(last) is not None:
                     break
@@ -573,22 +619,26 @@ class _Run:
             logger.warning("the way to the rest pose ends here: %s", error)
 
     def _held(self, act: Act) -> Held | None:
-        """Obey new commands; return why this tick may command nothing, or None."""
+        """Apply new commands; return why this tick may command nothing, or None."""
         if self.commands is not None:
-            self.commands.obey(self.control)
-        held, why, safe = self.control.hold(), getattr(self.robot, "holds", None), _safe(act)
-        if held is None and why is not None:
-            return Held("robot", str(why))
+            self.commands.apply(self.control)
+
+        held = self.control.hold()
+        reason = getattr(self.robot, "holds", None)
+        if held is not None:
+            return held
+        if reason is not None:
+            return Held("robot", str(reason))
         # The cause of a safe action may have ended after the player's decision.
-        return (
-            safe
-            if held is None and safe is not None and safe.cause in ("stopped", "paused")
-            else held
-        )
+        safe = _safe(act)
+        if safe is not None and safe.cause in ("stopped", "paused"):
+            return safe
+        return None
 
     def _stop(self, why: Held) -> None:
+        """Keep the robot at rest for this tick."""
         if not self.standing:
-            # again, as the watchdog may have stopped it just before the last action.
+            # Stop it again, as the watchdog may have stopped it just before the last action.
             self.robot.stop()
         self.standing = True
         self.agent.interrupt()
@@ -603,14 +653,16 @@ class _Run:
         if safe is not None and self.standing:
             self.report.count(safe)
             return None, None
+
         if self.fit is not None and safe is None and not act.info.get(INTERVENTION):
             self.fit.require(None, act.info.get(PLANNED, action[np.newaxis]))
             self.fit = None
         if self.agent.check is not self.guard:  # else it was checked before `act` returned
-            action = self.guard(
-                action, self.guard.reference(obs, self.last) if self.standing else self.last
-            )
-        if (stop := self._command(action)) is not None:
+            last = self.guard.reference(obs, self.last) if self.standing else self.last
+            action = self.guard(action, last)
+
+        stop = self._command(action)
+        if stop is not None:
             return None, stop
         if safe is not None:
             self.report.count(safe)
@@ -636,10 +688,13 @@ def _safe(act: Act) -> Held | None:
     """Return why the action of an agent is the safe one; None if it is the policy's or an
     operator's.
     """
-    return Held(act.info.get(CAUSE, "other"), str(act.info[SAFE])) if SAFE in act.info else None
+    if SAFE not in act.info:
+        return None
+    return Held(act.info.get(CAUSE, "other"), str(act.info[SAFE]))
 
 
 def _observed(robot: Robot) -> Obs:
-    at = time.time()
+    """Return the robot's observation with its capture time."""
+    begun_at = time.time()
     obs = robot.observe()
-    return obs if CAPTURED in obs.info else replace(obs, info={CAPTURED: at, **obs.info})
+    return obs if CAPTURED in obs.info else replace(obs, info={CAPTURED: begun_at, **obs.info})

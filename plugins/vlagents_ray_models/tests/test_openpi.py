@@ -71,7 +71,7 @@ def test_a_robot_is_compared_by_the_numbers_that_are_known() -> None:
     joints[1] = 1.0
     [found] = trained.misfits(trained.vector(Obs(state=parts), []), None, None)
     assert found.startswith("state[1]: got 1, was trained from -2.5 to -0.5")
-    assert len(trained.drawn(np.full((2, 14), 1.0), None)) == 15
+    assert len(trained.draw(np.full((2, 14), 1.0), None)) == 15
 
 
 def test_nothing_is_stated_without_quantiles_or_the_number_of_actions() -> None:

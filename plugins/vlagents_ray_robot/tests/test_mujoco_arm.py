@@ -11,7 +11,7 @@ import pytest
 from arm_models import ARMS, model_file, simulated_arm
 
 from vlagents_ray.errors import ConfigError, InvalidAction
-from vlagents_ray.robot.loop import robot_named
+from vlagents_ray.robot.loop import robot_factory
 from vlagents_ray.validation import check_observation
 from vlagents_ray_robot.mujoco_arm import MujocoArm, SimulatedClock
 
@@ -58,7 +58,7 @@ def test_a_stop_ends_a_motion_and_forgets_commands() -> None:
 
 
 def test_a_name_gives_an_arm_with_its_settings() -> None:
-    make = robot_named(
+    make = robot_factory(
         "--robot", f"mujoco:{model_file('ur5e')}", ["like=ur5e", "cameras=[]", "speed=0.5"]
     )
     arm = make(clock=SimulatedClock())

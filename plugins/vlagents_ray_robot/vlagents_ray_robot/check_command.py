@@ -22,7 +22,7 @@ from functools import partial
 from vlagents_ray.cli.arguments import number, parse_all
 from vlagents_ray.client.agent import RemoteAgent
 from vlagents_ray.errors import VLAgentsError
-from vlagents_ray.robot.loop import opened, robot_named
+from vlagents_ray.robot.loop import opened, robot_factory
 from vlagents_ray_robot.check import Operator, RobotReport, examine
 from vlagents_ray_robot.mujoco_arm import SimulatedClock
 
@@ -61,7 +61,7 @@ def main(arguments: Sequence[str]) -> int:
 
 
 def _checked(options: argparse.Namespace, stack: contextlib.ExitStack) -> RobotReport:
-    make = robot_named("robot", options.robot, options.robot_set)
+    make = robot_factory("robot", options.robot, options.robot_set)
     if options.robot.startswith("mujoco:"):
         make = partial(make, clock=SimulatedClock())
     robot = stack.enter_context(opened(make))

@@ -69,18 +69,20 @@ class HttpTransport:
 
     def connect(self, timeout_s: float) -> dict[str, Any]:
         """Return the server's metadata once it answers; retries while it is not ready."""
-        begun, report = time.monotonic(), ConnectReport(self._url.geturl(), timeout_s)
-        unknown_since: float | None = None
+        url = self._url.geturl()
+        deadline = time.monotonic() + timeout_s
+        report = ConnectReport(url, timeout_s)
+        unknown_since: float | None = None  # time.monotonic() of the first answer without the app
         pause_s, attempt_s = 0.05, first_timeout_s(timeout_s)
+
         while True:
-            left_s = begun + timeout_s - time.monotonic()
+            left_s = deadline - time.monotonic()
             try:
                 return self._metadata(max(0.1, min(left_s, attempt_s)))
             except (PolicyUnavailable, DeadlineExceeded) as error:
-                # A hung replica: another session id selects another one.
+                # If the replica hangs, another session id selects another one.
                 if isinstance(error, DeadlineExceeded):
                     self._session, attempt_s = uuid.uuid4().hex, 2 * attempt_s
-                url = self._url.geturl()
                 if isinstance(error, ConnectionLost):
                     require_plain(self._url, attempt_s)
                 if pause_s > left_s:
@@ -94,15 +96,17 @@ class HttpTransport:
                 if time.monotonic() - unknown_since > _UNKNOWN_APP_S or pause_s > left_s:
                     raise
                 report.failed(error)
+
             time.sleep(pause_s)
             pause_s = min(0.3, pause_s * 1.5)
 
     def _metadata(self, timeout_s: float) -> dict[str, Any]:
         # The session id selects the replica by its hash, since WebSockets rely on the load
         # balancer's round robin for their distribution.
-        headers = {SESSION_HEADER: self._session} | (
-            {MACHINE_HEADER: self._machine} if self._machine else {}
-        )
+        headers = {SESSION_HEADER: self._session}
+        if self._machine:
+            headers[MACHINE_HEADER] = self._machine
+
         metadata = self.get("/v1/metadata", timeout_s, headers)
         if "protocol" not in metadata:
             raise ConfigError(
@@ -119,9 +123,7 @@ class HttpTransport:
         *,
         method: str = "GET",
     ) -> dict[str, Any]:
-        """Return the JSON document at a path of the server, or that which answers another
-        method, without a body.
-        """
+        """Return the JSON document with which the server answers a request without a body."""
         status, kind, body = self._exchange(method, path, None, headers or {}, timeout_s)
         if status != 200:
             raise refusal(status, kind, body)
@@ -143,13 +145,13 @@ class HttpTransport:
             "accept": CONTENT_TYPE,
         }
         frame = encode_requests(requests, self._codec.codec_for(requests[0].obs))
-        status, kind, body = self._exchange(
-            "POST", f"/v1/{requests[0].op}", frame, headers, timeout_s
-        )
+        path = f"/v1/{requests[0].op}"
+
+        status, kind, body = self._exchange("POST", path, frame, headers, timeout_s)
         if status == 200:
             return decode_replies(body)
-        refused = refusal(status, kind, body)
-        return [Reply(request.request_id, error=refused) for request in requests]
+        error = refusal(status, kind, body)
+        return [Reply(request.request_id, error=error) for request in requests]
 
     def close(self) -> None:
         """Close the connection; the next one may reach another replica."""
@@ -161,6 +163,7 @@ class HttpTransport:
     def _exchange(
         self, method: str, path: str, body: bytes | None, headers: dict[str, str], timeout_s: float
     ) -> tuple[int, str, bytes]:
+        """Send a request; return the status, content type and body of the answer."""
         begun = time.monotonic()
         connection, deadline_socket = self._open(timeout_s)
         deadline_socket.begin_exchange(timeout_s - (time.monotonic() - begun))
@@ -169,6 +172,7 @@ class HttpTransport:
                 method, self._url.path.rstrip("/") + path, body, headers | self._credentials.headers
             )
             answer = connection.getresponse()
+
             content = answer.read(DEFAULT_LIMITS.body_bytes + 1)
             if len(content) > DEFAULT_LIMITS.body_bytes:
                 self.close()
@@ -183,7 +187,7 @@ class HttpTransport:
                 f"{self._url.geturl()}: no answer within {timeout_s:g} s"
             ) from error
         except ssl.SSLError as error:
-            # with TLS 1.3, the server checks the client's certificate only now
+            # With TLS 1.3, the server checks the client's certificate only now.
             self.close()
             raise tls_failure(self._url.geturl(), error) from error
         except (OSError, http.client.HTTPException) as error:
@@ -195,14 +199,16 @@ class HttpTransport:
     def _open(self, timeout_s: float) -> tuple[http.client.HTTPConnection, DeadlineSocket]:
         if self._connection is not None and _closed_by_peer(self._connection[0].sock):
             self.close()
+
         if self._connection is None:
             host, port = self._url.hostname or "", self._url.port
             context = self._credentials.context(self._url.geturl())
-            connection = (
-                http.client.HTTPConnection(host, port, timeout=timeout_s)
-                if context is None
-                else http.client.HTTPSConnection(host, port, timeout=timeout_s, context=context)
-            )
+            if context is None:
+                connection = http.client.HTTPConnection(host, port, timeout=timeout_s)
+            else:
+                connection = http.client.HTTPSConnection(
+                    host, port, timeout=timeout_s, context=context
+                )
             try:
                 connection.connect()
             except ssl.SSLError as error:
@@ -250,8 +256,10 @@ def refusal(status: int, kind: str, body: bytes) -> VLAgentsError:
     """Return the error for an HTTP response of the server, or of a proxy in front of it, that is
     not a frame.
     """
-    if "json" in kind and isinstance(document := _json(body), dict):
+    document = _json(body) if "json" in kind else None
+    if isinstance(document, dict):
         return read_error(document)
+
     text = body[:200].decode(errors="replace").strip()
     if status == 413:
         return MessageTooLarge(

@@ -27,23 +27,22 @@ class AutoTransport:
     Inside the cluster: shared memory, else a plasma channel on the replica's node, else the Serve
     handle. Shared memory comes first because it is faster, without Ray's locks and framing; plasma
     reaches a replica on this node whose socket is in another network namespace. If the object store
-    has no room for a channel, the handle is used
-    instead: its frames are in the store for a moment, or on disk if the store has no room for them.
+    has no room for a channel, the handle is used instead: its frames are in the store for a moment,
+    or on disk if the store has no room for them.
     """
 
     def __init__(
         self, url: str, codec: CodecChoice, credentials: Credentials, *, only_shm: bool
     ) -> None:
-        self._credentials, self._url, self._codec, self._only_shm = (
-            credentials,
-            url,
-            codec,
-            only_shm,
-        )
+        self._url = url
+        self._codec = codec
+        self._credentials = credentials
+        self._only_shm = only_shm
         self._chosen: (
             ShmTransport | PlasmaTransport | HandleTransport | WebSocketTransport | None
         ) = None
-        self._handle: HandleTransport | None = None  # in addition to a channel to the same replica
+        # The Serve handle to the replica of a plasma channel, for frames too large for the channel.
+        self._handle: HandleTransport | None = None
 
     @property
     def name(self) -> str:
@@ -59,32 +58,32 @@ class AutoTransport:
         """Return the server's metadata, once it answers and the chosen transport is connected."""
         deadline = time.monotonic() + timeout_s
         parts = urlsplit(self._url)
-        handle = (
-            HandleTransport(parts.netloc, must_be_near=self._only_shm)
-            if parts.scheme == "serve"
-            else None
-        )
-        metadata_source = handle or HttpTransport(
-            self._url, self._codec, self._credentials, boot_id()
-        )
+        handle: HandleTransport | None = None
+        metadata_source: HandleTransport | HttpTransport
+        if parts.scheme == "serve":
+            handle = HandleTransport(parts.netloc, must_be_near=self._only_shm)
+            metadata_source = handle
+        else:
+            metadata_source = HttpTransport(self._url, self._codec, self._credentials, boot_id())
+
         try:
             metadata = metadata_source.connect(timeout_s)
             local = read_address(LocalAddress, metadata.get("local"))
         except BaseException:
             metadata_source.close()
             raise
+
+        # A client in the cluster needs a key for shared memory only; without one, it uses another
+        # transport.
+        needs_key = local is not None and local.keyed and not self._credentials.api_key
+        if handle is not None and not self._only_shm and needs_key:
+            local = None
+
         left_s = max(1.0, deadline - time.monotonic())
-        if (
-            handle is not None
-            and not self._only_shm
-            and local
-            and local.keyed
-            and not self._credentials.api_key
-        ):
-            local = None  # a client in the cluster only needs a key for this endpoint
         shm = self._shm(local, left_s)
         if shm is not None or handle is None:
             metadata_source.close()
+
         if shm is not None:
             self._chosen = shm
         elif handle is not None:
@@ -101,6 +100,7 @@ class AutoTransport:
         return metadata
 
     def call(self, requests: Sequence[Request], timeout_s: float) -> list[Reply]:
+        """Send requests as one frame by the chosen transport, and return their replies."""
         if self._chosen is None:
             raise NotReset("not connected; reset first")
         try:
@@ -108,6 +108,7 @@ class AutoTransport:
         except MessageTooLarge:  # too large for the channel; nothing was sent
             if self._handle is None:
                 raise
+
         self._chosen.close()
         self._chosen, self._handle = self._handle, None
         return self._chosen.call(requests, timeout_s)
@@ -130,7 +131,7 @@ class AutoTransport:
         try:
             transport.connect(timeout_s)
         except PolicyUnavailable:
-            # the server belongs to another user, or is in a container with its own network
+            # The server belongs to another user, or is in a container with its own network.
             if self._only_shm:
                 raise
             return None
@@ -141,16 +142,18 @@ def select_transport(
     url: str, transport: str, codec: CodecChoice, credentials: Credentials
 ) -> Transport:
     """Return the transport for a URL; raises `ConfigError` if the URL does not support it."""
-    inside = urlsplit(url).scheme == "serve"
+    is_in_cluster = urlsplit(url).scheme == "serve"
     if transport not in get_args(TransportName):
         raise ConfigError(
             f"transport: got {transport!r}, want one of {list(get_args(TransportName))}"
         )
-    if transport in (("http", "websocket") if inside else ("handle", "plasma")):
+    unsupported = ("http", "websocket") if is_in_cluster else ("handle", "plasma")
+    if transport in unsupported:
         raise ConfigError(
             f"transport {transport!r} does not reach {url!r}; 'handle' and 'plasma' go together "
             "with serve://APP"
         )
+
     credentials.use_at(url)
     if transport in ("handle", "plasma"):
         app = urlsplit(url).netloc
@@ -158,6 +161,6 @@ def select_transport(
     if transport in ("http", "websocket"):
         kind = HttpTransport if transport == "http" else WebSocketTransport
         return kind(url, codec, credentials)
-    if not inside:
+    if not is_in_cluster:
         http_url(url)  # raises for an invalid URL before anything is tried
     return AutoTransport(url, codec, credentials, only_shm=transport == "shm")

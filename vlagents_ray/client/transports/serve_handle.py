@@ -11,7 +11,7 @@ from __future__ import annotations
 import pickle
 import time
 import uuid
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any, ClassVar, Protocol
 
 from vlagents_ray.client.transports.base import ConnectReport, first_timeout_s
@@ -24,6 +24,7 @@ from vlagents_ray.errors import (
     VLAgentsError,
 )
 from vlagents_ray.images.codecs import RAW
+from vlagents_ray.protocol.frame_layout import Buffer
 from vlagents_ray.protocol.frames import decode_replies, encode_requests, request_parts
 from vlagents_ray.protocol.messages import (
     LocalAddress,
@@ -37,7 +38,7 @@ from vlagents_ray.ray_tools import private
 
 _PAUSE_S = 0.2  # s before requesting another replica in place of a lost one
 _QUERY_S = 10.0  # s between two queries for the replicas' nodes, which change over time
-# S to wait for the first query; an application without a replica does not answer.
+# The time to wait for the first query, s; an application without a replica does not answer.
 _FIRST_QUERY_S = 3.0
 _CHUNK = 2**20  # bytes; Ray copies longer buffers in other threads
 _WRITE_MS = 1000  # the channel is free when a frame is written; a longer wait is a fault
@@ -91,11 +92,10 @@ class HandleTransport:
                 f"serve://{self._app}: this process is in no Ray cluster; call ray.init() "
                 "(`vlagents-ray eval` does, with --address), or use http://"
             )
+
         deadline = time.monotonic() + timeout_s
-        attempt_s, report = (
-            first_timeout_s(timeout_s),
-            ConnectReport(f"serve://{self._app}", timeout_s),
-        )
+        attempt_s = first_timeout_s(timeout_s)
+        report = ConnectReport(f"serve://{self._app}", timeout_s)
         while True:
             try:
                 return self._attach(max(0.0, min(attempt_s, deadline - time.monotonic())))
@@ -105,7 +105,7 @@ class HandleTransport:
                 report.failed(error)
                 time.sleep(_PAUSE_S)
             except DeadlineExceeded as error:
-                # e.g. of a hung replica: the handle may choose another one
+                # The replica may hang; the handle may then choose another one.
                 if time.monotonic() >= deadline:
                     raise PolicyUnavailable(
                         f"serve://{self._app}: no replica within {timeout_s:g} s"
@@ -121,6 +121,7 @@ class HandleTransport:
         try:
             handle = serve.get_app_handle(self._app)
             attaching = handle.attach.remote(this_node() or "", boot_id(), self._must_be_near)
+            metadata: dict[str, Any]
             metadata, self._replica = attaching.result(timeout_s=timeout_s)
         except ray.exceptions.RayTaskError as error:
             raise PolicyUnavailable(f"serve://{self._app}: {error.cause}") from error
@@ -133,8 +134,7 @@ class HandleTransport:
             ) from error
         except ray.exceptions.RayError as error:
             raise ConnectionLost(f"serve://{self._app}: {error}") from error
-        found: dict[str, Any] = metadata
-        return found
+        return metadata
 
     def call(self, requests: Sequence[Request], timeout_s: float) -> list[Reply]:
         """Make one actor call; the frame is in plasma until the reply."""
@@ -160,12 +160,12 @@ class HandleTransport:
                 f"serve://{self._app}: no answer within {timeout_s:g} s"
             ) from error
         except ray.exceptions.RayTaskError as error:
-            # it is unknown whether the replica executed the request
+            # It is unknown whether the replica executed the request.
             raise ConnectionLost(
                 f"serve://{self._app}: the replica failed: {error.cause}; reset again"
             ) from error
         except ray.exceptions.RayError as error:
-            # the replica is gone, or its node with the frame or the answer
+            # The replica is gone, or its node with the frame or the answer.
             raise self._lost(error) from error
 
     def lease(self, length: int, timeout_s: float) -> tuple[bytes, int]:
@@ -191,6 +191,7 @@ class HandleTransport:
         return leased
 
     def close(self) -> None:
+        """Release the chosen replica."""
         self._replica = None
 
     def _lost(self, error: Exception) -> ConnectionLost:
@@ -218,7 +219,8 @@ class ReplicaNodes:
         from ray import serve
         from ray.serve.exceptions import RayServeException
 
-        now, wait_s = time.monotonic(), 0.0 if self._asked is not None else _FIRST_QUERY_S
+        now = time.monotonic()
+        wait_s = _FIRST_QUERY_S if self._asked is None else 0.0
         try:
             if self._answer is None and (self._asked is None or now - self._asked > _QUERY_S):
                 self._asked = now
@@ -243,7 +245,8 @@ def call_replica(replica: Any, method: Callable[..., Any], *args: Any, request_i
     return replica.handle_request.remote(header, *args)
 
 
-# Plasma: frames in mutable objects of the node, for a client on the node of its replica.
+# The plasma transport writes frames into mutable objects of the node's store. It is for a client on
+# the node of its replica.
 
 
 class PlasmaTransport(UnixTransport):
@@ -282,11 +285,13 @@ class PlasmaTransport(UnixTransport):
         """Connect like `connect`, but to the replica that `handle` chose and whose metadata is
         passed.
         """
-        if (node := this_node()) is None:
+        node = this_node()
+        if node is None:
             raise ConfigError(
                 f"serve://{self._app}: transport 'plasma' needs a process on a node of the "
                 "cluster; a Ray client (ray://) is none: use http://"
             )
+
         address = read_address(PlasmaAddress, metadata.get("plasma"))
         if address is None:
             raise ConfigError(
@@ -299,6 +304,7 @@ class PlasmaTransport(UnixTransport):
                 f"({node[:8]}), the chosen one is on {address.node[:8]}; use transport 'handle', "
                 "or 'auto'"
             )
+
         self._handle = handle
         self._server = address.socket
         self._open(timeout_s)
@@ -308,14 +314,9 @@ class PlasmaTransport(UnixTransport):
 
     def _write(self, requests: Sequence[Request], deadline: float) -> tuple[bytes, int | None]:
         written = self._writer.write(requests)
-        # Ray copies longer buffers with six threads, whose start takes longer than the copy: hence
-        # the chunks.
-        pieces = (
-            memoryview(part)[at : at + _CHUNK]
-            for part in (request_parts(requests, RAW) if written is None else written.parts())
-            for at in range(0, len(part), _CHUNK)
-        )
-        frame = private.channel_content(PlasmaAddress.TAG, pieces)
+        buffers = request_parts(requests, RAW) if written is None else written.parts()
+        frame = private.channel_content(PlasmaAddress.TAG, _chunks(buffers))
+
         if frame.total_bytes > self._capacity:
             import ray
 
@@ -325,9 +326,12 @@ class PlasmaTransport(UnixTransport):
             # The id is sufficient: the replica owns the object, and keeps it as long as it lives.
             self._channel = ray.ObjectRef(key)
             private.register_writer(self._channel)
-        if (reason := private.write_channel(self._channel, frame, _WRITE_MS)) is not None:
+
+        reason = private.write_channel(self._channel, frame, _WRITE_MS)
+        if reason is not None:
             raise OSError(f"the channel cannot be written ({reason})")
         self._unread = True
+
         flags = 0 if written is None else LocalAddress.COMPACT
         message: bytes = PlasmaAddress.REQUEST.pack(self._channel.binary(), flags)
         return (message if written is None else message + written.message), None
@@ -342,6 +346,15 @@ class PlasmaTransport(UnixTransport):
         """End the session; the replica takes the channel back."""
         super().close()
         self._channel, self._capacity, self._unread = None, 0, False
+
+
+def _chunks(buffers: Iterable[Buffer]) -> Iterator[memoryview]:
+    """Divide buffers into chunks: Ray copies longer ones with six threads, whose start takes longer
+    than the copy.
+    """
+    for buffer in buffers:
+        for start in range(0, len(buffer), _CHUNK):
+            yield memoryview(buffer)[start : start + _CHUNK]
 
 
 def this_node() -> str | None:

@@ -200,7 +200,8 @@ def _require_same_user(connection: socket.socket) -> None:
     """Raise `PermissionError` if the server belongs to another user: any user may reuse the name
     of an ended server.
     """
-    if (uid := peer_uid(connection)) != os.getuid():
+    uid = peer_uid(connection)
+    if uid != os.getuid():
         raise PermissionError(
             f"it belongs to the user with the number {uid}, want {os.getuid()}, this process's own"
         )
@@ -251,10 +252,11 @@ class ShmTransport(UnixTransport):
         )
 
     def _write(self, requests: Sequence[Request], deadline: float) -> tuple[bytes, int | None]:
-        if (written := self._writer.write(requests)) is not None:
+        written = self._writer.write(requests)
+        if written is not None:
             memory, descriptor = self._memory(written.size)
-            for at, array in written.arrays:
-                np.ndarray(array.shape, array.dtype, memory.map, at)[...] = array
+            for offset, array in written.arrays:
+                np.ndarray(array.shape, array.dtype, memory.map, offset)[...] = array
             message = (
                 LocalAddress.REQUEST.pack(memory.number, LocalAddress.COMPACT, written.size)
                 + written.message
@@ -263,10 +265,10 @@ class ShmTransport(UnixTransport):
             parts = request_parts(requests, RAW)
             length = sum(map(len, parts))
             memory, descriptor = self._memory(length)
-            at = 0
-            for part in parts:
-                memory.map[at : at + len(part)] = part
-                at += len(part)
+            offset = 0
+            for buffer in parts:
+                memory.map[offset : offset + len(buffer)] = buffer
+                offset += len(buffer)
             message = LocalAddress.REQUEST.pack(memory.number, 0, length)
         memory.busy = True
         self._written = memory, descriptor

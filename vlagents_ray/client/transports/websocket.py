@@ -70,7 +70,8 @@ _TRANSIENT = (404, 408, 500, 502, 503, 504)
 _PAUSE_S = 0.2
 _DIRECT_S = 1.0  # s to wait for a replica's own port: a firewall may drop the packets
 _READ_BYTES = 256 * 1024
-_MOST_PIECES = 64  # of a message that are sent without a copy; Linux takes at most 1,024 at once
+# The maximum number of pieces that are sent without a copy; Linux takes at most 1,024 at once.
+_MAX_PIECES = 64
 # A client's frames must have a mask, which keeps a web page from choosing the bytes that a proxy
 # sees (RFC 6455, 10.3). Here is neither page nor proxy, so this one changes nothing, which saves
 # two passes over each message.
@@ -166,6 +167,7 @@ class Stream:
         self._read_memory = memoryview(bytearray(_READ_BYTES))
         self._silent = False  # whether the server failed to read or answer the last message in time
         self._answers_fast = True  # whether the last answer was immediate
+
         self._socket = socket.create_connection((host, port), timeout_s)
         try:
             self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
@@ -173,10 +175,12 @@ class Stream:
             self._socket.setblocking(False)
             self._poller = select.poll()
             self._poller.register(self._socket, select.POLLIN)
+
             request = self._protocol.connect()
             request.headers.update(headers or {})
             self._protocol.send_request(request)
             self._flush(deadline)
+
             while self._protocol.state is State.CONNECTING:
                 wait(self._socket, select.POLLIN, deadline)
                 self._read(lambda data: self._protocol.receive_data(bytes(data)), deadline)
@@ -244,7 +248,8 @@ class Stream:
         """Raise `ConnectionClosed` or `OSError` if the connection is closed, or is being closed
         by the server.
         """
-        if (state := self._protocol.state) is State.CLOSED:
+        state = self._protocol.state
+        if state is State.CLOSED:
             raise self._protocol.close_exc
         if state is not State.OPEN:
             raise ConnectionResetError(
@@ -252,7 +257,8 @@ class Stream:
             )
 
     def _read(self, parse: Callable[[memoryview], None], deadline: float) -> None:
-        if count := self._socket.recv_into(self._read_memory):
+        count = self._socket.recv_into(self._read_memory)
+        if count:
             parse(self._read_memory[:count])
         else:
             self._protocol.receive_eof()
@@ -272,7 +278,7 @@ class Stream:
         size = sum(map(len, pieces))
         head = frame_head(size, _NO_MASK)
         pieces = [head, *pieces]
-        if len(pieces) > _MOST_PIECES:
+        if len(pieces) > _MAX_PIECES:
             pieces = [b"".join(pieces)]
         try:
             sent = self._socket.sendmsg(pieces)
@@ -328,12 +334,13 @@ class WebSocketTransport:
         """
         deadline = time.monotonic() + timeout_s
         pieces = request_parts(requests, self._codec.codec_for(requests[0].obs, STREAM_BYTES))
-        # The server would just close the connection.
-        if (size := sum(map(len, pieces))) > STREAM_BYTES:
+        size = sum(map(len, pieces))
+        if size > STREAM_BYTES:  # the server would just close the connection
             raise MessageTooLarge(
                 f"{self._url}: got {size} bytes, the limit of a WebSocket message is "
                 f"{STREAM_BYTES}; send JPEG, or use transport='http'"
             )
+
         connection = self._stream(left_s(deadline))
         try:
             connection.send_pieces(pieces, left_s(deadline))
@@ -385,21 +392,20 @@ class WebSocketTransport:
         """
         deadline = time.monotonic() + timeout_s
         attempt_s = first_timeout_s(timeout_s)
+
         while True:
+            limit_s = max(0.1, min(attempt_s, deadline - time.monotonic()))
             try:
-                return open_websocket(
-                    self._url,
-                    self._credentials,
-                    max(0.1, min(attempt_s, deadline - time.monotonic())),
-                )
+                return open_websocket(self._url, self._credentials, limit_s)
             except (PolicyUnavailable, UnknownApp) as error:
                 cause = error.__cause__
-                transient = (
+                is_transient = (
                     isinstance(cause, InvalidStatus) and cause.response.status_code in _TRANSIENT
                 )
-                silent = isinstance(cause, TimeoutError)
-                if not (transient or silent) or time.monotonic() + _PAUSE_S > deadline:
+                is_silent = isinstance(cause, TimeoutError)
+                if not (is_transient or is_silent) or time.monotonic() + _PAUSE_S > deadline:
                     raise
-                if silent:
+                if is_silent:
                     attempt_s *= 2
+
             time.sleep(_PAUSE_S)

@@ -54,7 +54,7 @@ from vlagents_ray.evaluate.robot.trial import (
 from vlagents_ray.evaluate.run import conclude
 from vlagents_ray.evaluate.workers.rollout import AgentFactory, agents
 from vlagents_ray.registry import require
-from vlagents_ray.robot.loop import Robot, opened, robot_named
+from vlagents_ray.robot.loop import Robot, opened, robot_factory
 
 LOG = "trials.jsonl"
 HIDDEN = "trials.hidden.jsonl"
@@ -318,7 +318,7 @@ def evaluate_on_robot(
     with contextlib.ExitStack() as stack:
         if robot is None:
             robot = stack.enter_context(
-                opened(robot_named("--robot", str(planned[0].on_robot[0].arm)))
+                opened(robot_factory("--robot", str(planned[0].on_robot[0].arm)))
             )
         log = stack.enter_context(TrialLog(config, planned))
         trials = schedule(planned, log.key)

@@ -176,10 +176,10 @@ class _OperatorStop(CommandInbox):
         super().__init__()
         self._operator = operator
 
-    def obey(self, control: RobotControl) -> list[Command]:
+    def apply(self, control: RobotControl) -> list[Command]:
         if self._operator.stops() and not control.stopped:
             control.stop(_STOPPED)
-        return super().obey(control)
+        return super().apply(control)
 
 
 class _CountingPlayer(ChunkPlayer):

@@ -7,7 +7,7 @@ from lerobot.robots.so_follower import so_follower
 from lerobot_robot_mirror import MOTORS
 
 from vlagents_ray.errors import ConfigError, InvalidAction
-from vlagents_ray.robot.loop import robot_named
+from vlagents_ray.robot.loop import robot_factory
 from vlagents_ray_robot import lerobot_robot
 from vlagents_ray_robot.check import examine
 from vlagents_ray_robot.mujoco_arm import SimulatedClock
@@ -74,7 +74,7 @@ class Person:
 
 
 def test_an_so101_is_driven_by_name_in_lerobots_order_and_units() -> None:
-    arm = robot_named("--robot", "lerobot:so101_follower", ["port=/dev/ttyACM0", "id=mine"])()
+    arm = robot_factory("--robot", "lerobot:so101_follower", ["port=/dev/ttyACM0", "id=mine"])()
     assert arm.joint_names == [
         "shoulder_pan",
         "shoulder_lift",
@@ -110,7 +110,7 @@ def test_an_so101_is_driven_by_name_in_lerobots_order_and_units() -> None:
 
 
 def test_a_robot_of_a_plugin_is_driven_by_name() -> None:
-    arm = robot_named("--robot", "lerobot:mirror")()
+    arm = robot_factory("--robot", "lerobot:mirror")()
     assert arm.joint_names == [name.removesuffix(".pos") for name in MOTORS]
     obs = arm.observe()
     assert {name: (spec.height, spec.width) for name, spec in arm.contract.cameras.items()} == {
@@ -136,4 +136,4 @@ def test_a_wrong_robot_or_setting_is_named_with_its_cure(
     name: str, settings: list[str], message: str
 ) -> None:
     with pytest.raises(ConfigError, match=message):
-        robot_named("--robot", f"lerobot:{name}", settings)()
+        robot_factory("--robot", f"lerobot:{name}", settings)()
