@@ -108,16 +108,20 @@ def own_clients(only: Sequence[str] = ()) -> tuple[list[OwnClient], dict[str, st
     return [one for one in wanted if one.transport in known], skipped
 
 
-def connect(url: str, transport: str, codec: str, rank: str | None = None) -> RemoteAgent:
+def connect(url: str, transport: str, codec: str, priority: str | None = None) -> RemoteAgent:
     """Make an agent that has not connected yet.
 
-    `codec` is "auto", "raw", "jpeg", or "jpeg QUALITY SUBSAMPLING". `rank` is "robot" or
-    "simulation", and has no effect if `RemoteAgent` has no ranks.
+    `codec` is "auto", "raw", "jpeg", or "jpeg QUALITY SUBSAMPLING". `priority` is "robot" or
+    "simulation", and has no effect if `RemoteAgent` has no priorities.
     """
     name, *details = codec.split()
     chosen = ImageCodec(name, int(details[0]), details[1]) if details else codec
-    ranked = {"rank": rank} if rank and "rank" in inspect.signature(RemoteAgent).parameters else {}
-    return RemoteAgent(url, transport=transport, codec=chosen, **ranked)  # type: ignore[arg-type]
+    options = (
+        {"priority": priority}
+        if priority and "priority" in inspect.signature(RemoteAgent).parameters
+        else {}
+    )
+    return RemoteAgent(url, transport=transport, codec=chosen, **options)  # type: ignore[arg-type]
 
 
 class BenchCaller:
@@ -150,9 +154,9 @@ class LoadGenerator:
 
     def __init__(self, url: str, transport: str, codec: str, robots: int, simulations: int) -> None:
         self._obs = observation()
-        ranks = [ROBOT] * robots + [SIMULATION] * simulations
-        self._agents = [connect(url, transport, codec, rank) for rank in ranks]
-        with ThreadPoolExecutor(len(ranks)) as pool:
+        priorities = [ROBOT] * robots + [SIMULATION] * simulations
+        self._agents = [connect(url, transport, codec, priority) for priority in priorities]
+        with ThreadPoolExecutor(len(priorities)) as pool:
             list(pool.map(lambda agent: agent.reset(self._obs, "measure"), self._agents))
         self._loop = ClosedLoop(
             [functools.partial(self._act, agent) for agent in self._agents], robots

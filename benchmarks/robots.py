@@ -46,7 +46,7 @@ def burst(url: str, robots: int, hz: float, seconds: float) -> list[RobotBurst]:
 def play(url: str, hz: float, seconds: float) -> RobotBurst:
     """Run one robot. Ticks that pass during an act are skipped."""
     obs, acts, resumed, failed = observation(64, 1), [], 0, []
-    with RemoteAgent(url, connect_timeout_s=_CONNECT_S, rank="robot") as agent:
+    with RemoteAgent(url, connect_timeout_s=_CONNECT_S, priority="robot") as agent:
         begun = time.time()
         try:
             agent.reset(obs, "let time pass")

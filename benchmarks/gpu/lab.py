@@ -24,11 +24,11 @@ from vlagents_ray.contract import Contract
 from vlagents_ray.errors import VLAgentsError
 from vlagents_ray.interface import Obs
 from vlagents_ray.policies.wrapper import build_agent
-from vlagents_ray.protocol.messages import Reply, Request
+from vlagents_ray.protocol.messages import PRIORITIES, Reply, Request
 from vlagents_ray.registry import require
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.models.checkpoints import Checkpoints
-from vlagents_ray.serve.requests import RANKS, PendingRequest
+from vlagents_ray.serve.requests import PendingRequest
 from vlagents_ray.testing import random_observation
 
 CAMERAS = {"base_0_rgb": "front", "left_wrist_0_rgb": "wrist", "right_wrist_0_rgb": "right_wrist"}
@@ -183,8 +183,8 @@ class Session:
     def ask(self, op: Any = "act", **given: Any) -> Reply:
         """Make a request and wait for its reply; raises its error."""
         replies: queue.SimpleQueue[Reply] = queue.SimpleQueue()
-        request = Request(op, self._view, rank="robot", **given)
-        self._engine.submit([PendingRequest(self._name, request, replies.put, RANKS["robot"])])
+        request = Request(op, self._view, priority="robot", **given)
+        self._engine.submit([PendingRequest(self._name, request, replies.put, PRIORITIES["robot"])])
         reply = replies.get(timeout=LATE_S)
         if reply.error is not None:
             raise reply.error

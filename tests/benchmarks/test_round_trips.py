@@ -86,7 +86,7 @@ def test_ways_have_names_of_their_own() -> None:
 
 def test_a_codec_is_written_in_words() -> None:
     assert (
-        connect("http://127.0.0.1:1", "websocket", "jpeg 90 420", rank="robot").transport
+        connect("http://127.0.0.1:1", "websocket", "jpeg 90 420", priority="robot").transport
         == "websocket"
     )
     with pytest.raises(ValueError, match="codec"):

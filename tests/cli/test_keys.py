@@ -69,7 +69,7 @@ def test_a_key_may_push_weights_if_it_is_made_for_that(tmp_path: Path) -> None:
     ("words", "text"),
     [
         (["new", "a b"], "letters"),
-        (["new", "arm", "--rank", "king"], "robot"),
+        (["new", "arm", "--priority", "king"], "robot"),
         (["new", "arm", "--scope", "root"], "weights"),
         (["new", "arm", "--rate", "-1"], "0.001"),
         (["revoke", "arm"], "keys new"),

@@ -266,7 +266,10 @@ COMMANDS: dict[str, tuple[list[str], list[str]]] = {
     ),
     "key: a folder": (["keys", "new", "x", "--keys", "."], ["expected a key file", "folder ."]),
     "key: scope": (["keys", "new", "x", "--scope", "wach"], ["'wach'", "did you mean 'watch'"]),
-    "key: rank": (["keys", "new", "x", "--rank", "simulaton"], ["did you mean 'simulation'"]),
+    "key: priority": (
+        ["keys", "new", "x", "--priority", "simulaton"],
+        ["did you mean 'simulation'"],
+    ),
     "key: revoke without a file": (["keys", "revoke", "x"], ["keys new"]),
     "key: revoke another": (
         ["keys", "revoke", "arm1", "--keys", "k.json"],

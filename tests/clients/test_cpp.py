@@ -384,7 +384,13 @@ def test_written_frames_mean_what_the_golden_ones_do(name: str, shared_driver: C
     assert isinstance(request, Request)
     written = of_request(request)
     assert written == {key: value for key, value in meaning.items() if key in written}
-    assert set(meaning) - set(written) <= {"session", "request_id", "rank", "step", "deadline_ms"}
+    assert set(meaning) - set(written) <= {
+        "session",
+        "request_id",
+        "priority",
+        "step",
+        "deadline_ms",
+    }
 
 
 @pytest.fixture(scope="module")

@@ -111,7 +111,7 @@ def episodes() -> Iterator[Trace]:
     yield from scenario(
         "several requests in a message",
         TOGETHER,
-        asks([reset(session=first), reset("place it", session=second, rank="simulation")]),
+        asks([reset(session=first), reset("place it", session=second, priority="simulation")]),
         asks(
             [
                 act(session=second),
@@ -251,7 +251,7 @@ def refusals() -> Iterator[Trace]:
     odd += [
         node(request_id="a b"),
         node(session=7),
-        node(rank="human"),
+        node(priority="human"),
         node(step="-1"),
         node(deadline_ms=0),
     ]
@@ -339,7 +339,7 @@ def of_http() -> Iterator[Trace]:
         ),
         asks(
             post("act", whole, x_step="7"),
-            post("act", whole, x_deadline_ms="1e6", x_rank="simulation"),
+            post("act", whole, x_deadline_ms="1e6", x_priority="simulation"),
         ),
         asks((http("POST", "/v1/close", session="s-1"),), post("act", whole)),
     )
@@ -367,7 +367,7 @@ def of_http() -> Iterator[Trace]:
         {"session": "a b"},
         {"x_request_id": "a b"},
         {"x_deadline_ms": "soon"},
-        {"x_rank": "human"},
+        {"x_priority": "human"},
     ]
     headers += [{"x_step": "-1"}, {"session": ""}, {"kind": "text/plain"}]
     frames = asks(

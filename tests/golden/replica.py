@@ -244,7 +244,7 @@ class Server:
         replicas, cls, port = self._replicas, dialect_class(name), free_port()
         context = GatewayContext(
             "app",
-            lambda _key, rank: replicas.agent(rank=rank or "robot"),
+            lambda _key, priority: replicas.agent(priority=priority or "robot"),
             LIMITS,
             8,
             30.0,

@@ -102,7 +102,7 @@ def test_sessions_of_two_adapters_act_in_one_batch_as_each_merged_alone(
 
 def played(server: Server, **options: Any) -> tuple[bytes, dict[str, Any]]:
     """The first action of an episode, and the weights that it states."""
-    with RemoteAgent(server.url, transport="http", rank="simulation") as agent:
+    with RemoteAgent(server.url, transport="http", priority="simulation") as agent:
         agent.reset(at(0), None, seed=0, **options)
         act = agent.act(at(1))
         return act.action.tobytes(), act.info["policy"]

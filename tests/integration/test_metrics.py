@@ -38,14 +38,14 @@ def scraped() -> dict[str, float]:
         assert one.tags["policy"] == "noop"
         assert one.tags["deployment"] == "Policy"
         assert one.tags["replica"]
-        found[one.key("op", "transport", "class", "code", "stage", "le")] = one.value
+        found[one.key("op", "transport", "priority", "code", "stage", "le")] = one.value
     return found
 
 
 def test_prometheus_reads_requests_batches_and_load(server: Server) -> None:
     with (
         RemoteAgent(server.url, transport="shm") as near,
-        RemoteAgent(f"serve://{APP}", transport="handle", rank="simulation") as inside,
+        RemoteAgent(f"serve://{APP}", transport="handle", priority="simulation") as inside,
     ):
         for agent in (near, inside):
             agent.reset(Obs())
@@ -56,21 +56,21 @@ def test_prometheus_reads_requests_batches_and_load(server: Server) -> None:
             urllib.request.urlopen(
                 urllib.request.Request(f"{server.url}/v1/act", b"{}", stranger), timeout=10
             )
-        ok = "vlagents_requests_total class={} code=ok op={} transport={}"
+        ok = "vlagents_requests_total code=ok op={1} priority={0} transport={2}"
         expected = {
             ok.format("robot", "reset", "shm"): 1,
             ok.format("robot", "act", "shm"): ACTS,
             ok.format("simulation", "act", "handle"): ACTS,
-            "vlagents_requests_total class=robot code=unknown_session op=act transport=http": 1,
-            "vlagents_latency_ms_count class=robot op=act transport=shm": ACTS,
-            "vlagents_latency_ms_count class=simulation op=act transport=handle": ACTS,
+            "vlagents_requests_total code=unknown_session op=act priority=robot transport=http": 1,
+            "vlagents_latency_ms_count op=act priority=robot transport=shm": ACTS,
+            "vlagents_latency_ms_count op=act priority=simulation transport=handle": ACTS,
             "vlagents_batch_size_count": 2 * ACTS,
             "vlagents_batch_size_bucket le=1.0": 2 * ACTS,
             "vlagents_padding_rows_total": 2 * ACTS,
             "vlagents_sessions transport=shm": 1,
             "vlagents_sessions transport=handle": 1,
-            "vlagents_queue_depth class=robot": 0,
-            "vlagents_queue_depth class=simulation": 0,
+            "vlagents_queue_depth priority=robot": 0,
+            "vlagents_queue_depth priority=simulation": 0,
             "vlagents_policy_version": 0,
         } | {f"vlagents_stage_ms_count stage={stage} transport=shm": ACTS for stage in STAGES}
         now: dict[str, float] = {}

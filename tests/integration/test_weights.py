@@ -44,7 +44,7 @@ def acts(server: Server, transport: str) -> tuple[int, float]:
 def acts_of(server: Server, app: str, transport: str) -> tuple[int, float]:
     """Version and first number of the first act of an episode."""
     url = f"serve://{app}" if transport in ("handle", "plasma") else server.url
-    with RemoteAgent(url, transport=transport, rank="simulation") as agent:
+    with RemoteAgent(url, transport=transport, priority="simulation") as agent:
         agent.reset(Obs(), None)
         act = agent.act(Obs())
         return act.info["policy"]["version"], float(act.action[0])

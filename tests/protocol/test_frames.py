@@ -353,14 +353,14 @@ def test_what_the_wire_cannot_carry_is_named_by_the_sender(value: object) -> Non
 @given(st.lists(observations, min_size=1, max_size=4))
 def test_requests_that_share_a_frame_come_back_in_order(seen: list[Obs]) -> None:
     sent = [
-        Request("act", obs, session=f"s{i}", rank="simulation", step=i, request_id=f"r{i}")
+        Request("act", obs, session=f"s{i}", priority="simulation", step=i, request_id=f"r{i}")
         for i, obs in enumerate(seen)
     ]
     got = read_requests(encode_requests(sent), Budget(DEFAULT_LIMITS))
     assert len(got) == len(sent)
     for i, (one, obs) in enumerate(zip(got, seen, strict=True)):
         assert isinstance(one, Request)
-        assert (one.session, one.rank, one.step, one.request_id) == (
+        assert (one.session, one.priority, one.step, one.request_id) == (
             f"s{i}",
             "simulation",
             i,
@@ -394,7 +394,7 @@ def test_replies_that_share_a_frame_come_back_in_order() -> None:
 @pytest.mark.parametrize(
     ("change", "error"),
     [
-        ({"rank": "king"}, MalformedMessage),
+        ({"priority": "king"}, MalformedMessage),
         ({"step": -1}, MalformedMessage),
         ({"step": True}, MalformedMessage),
         ({"session": "x" * 200}, MessageTooLarge),

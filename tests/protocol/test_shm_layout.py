@@ -59,7 +59,7 @@ def test_acts_come_back_as_they_were_also_when_their_layout_is_known(
             "act",
             obs,
             session=f"s{i}",
-            rank="simulation",
+            priority="simulation",
             step=step,
             request_id=f"r{i}",
             deadline_ms=5.0 + i,
@@ -74,7 +74,12 @@ def test_acts_come_back_as_they_were_also_when_their_layout_is_known(
         for i, (one, obs) in enumerate(
             zip(reader.read(memoryview(written.message), placed(written)), seen, strict=True)
         ):
-            assert (one.op, one.session, one.rank, one.step) == ("act", f"s{i}", "simulation", step)
+            assert (one.op, one.session, one.priority, one.step) == (
+                "act",
+                f"s{i}",
+                "simulation",
+                step,
+            )
             assert (one.request_id, one.deadline_ms) == (f"r{i}", 5.0 + i)
             assert one.obs.gripper == obs.gripper
             for mine, theirs in ((obs.cameras, one.obs.cameras), (obs.state, one.obs.state)):
@@ -102,13 +107,13 @@ def test_a_session_may_change_what_it_sees_even_within_a_message() -> None:
 @pytest.mark.parametrize(
     "change",
     [
-        {"rank": "simulation"},
+        {"priority": "simulation"},
         {"session": "other"},
         {"obs": Obs({"hand": np.zeros((4, 4, 3), np.uint8)})},
         {"obs": Obs({"front": np.zeros((4, 4, 3), np.uint8)}, state={"joints": np.zeros(7)})},
         {"obs": Obs()},
     ],
-    ids=["rank", "session", "name", "more", "less"],
+    ids=["priority", "session", "name", "more", "less"],
 )
 def test_what_is_not_like_the_last_act_has_a_layout_of_its_own(change: dict[str, Any]) -> None:
     writer, reader = ShmWriter(), ShmReader(MessageLimits())
@@ -116,7 +121,7 @@ def test_what_is_not_like_the_last_act_has_a_layout_of_its_own(change: dict[str,
         written = writer.write([request])
         assert len(written.message) > COUNT.size + ITEM.size
         [read] = reader.read(memoryview(written.message), placed(written))
-        assert (read.session, read.rank) == (request.session, request.rank)
+        assert (read.session, read.priority) == (request.session, request.priority)
         assert (list(read.obs.cameras), list(read.obs.state)) == (
             list(request.obs.cameras),
             list(request.obs.state),

@@ -61,7 +61,9 @@ def test_what_the_table_says_is_so(replica: KeyedReplica, cell: Cell) -> None:
     done = visitor.mark in replica.policy.done
     if cell.stated in ("acts", "as simulation"):
         assert (said in ("done", "200"), done) == (True, True), said
-        assert replica.ranks[visitor.mark] == ("ROBOT" if cell.stated == "acts" else "SIMULATION")
+        assert replica.priorities[visitor.mark] == (
+            "ROBOT" if cell.stated == "acts" else "SIMULATION"
+        )
         return
     assert not done, said
     if cell.stated != "nothing":

@@ -69,7 +69,7 @@ def test_its_episodes_are_those_of_a_replica(
     found = []
     for name, make in {
         "here": partial(LocalPolicy, args, {"length": 0.8}),
-        "there": partial(replica.agent, rank="simulation", resume=False),
+        "there": partial(replica.agent, priority="simulation", resume=False),
     }.items():
         plan = flat_config(
             envs=[LINE],

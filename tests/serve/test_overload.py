@@ -400,9 +400,9 @@ def test_a_png_that_changes_its_mind_about_its_size_is_refused() -> None:
 def test_robots_have_a_share_of_the_memory_for_themselves() -> None:
     whole = Admission(8 * DECODED)
 
-    def message(rank: str) -> tuple[MessageAdmission, VLAgentsError | None]:
+    def message(priority: str) -> tuple[MessageAdmission, VLAgentsError | None]:
         one = MessageAdmission(whole, DEFAULT_LIMITS, lambda _: True)
-        [answer] = read_requests(frame(reset(rank=rank)), one)
+        [answer] = read_requests(frame(reset(priority=priority)), one)
         return one, answer.error if isinstance(answer, Reply) else None
 
     simulations = [message("simulation") for _ in range(6)]
@@ -418,7 +418,7 @@ def test_robots_have_a_share_of_the_memory_for_themselves() -> None:
     assert isinstance(message("simulation")[1], Overloaded)  # what robots have taken is theirs
     # Into which it will never fit.
     small = MessageAdmission(Admission(DECODED), DEFAULT_LIMITS, lambda _: True)
-    [answer] = read_requests(frame(reset(rank="simulation")), small)
+    [answer] = read_requests(frame(reset(priority="simulation")), small)
     assert isinstance(answer, Reply)
     assert isinstance(answer.error, MessageTooLarge), "it is not told to wait"
     assert "limits.in_flight_bytes" in str(answer.error)
@@ -528,12 +528,12 @@ def act(file: bytes, name: str, **more: Any) -> bytes:
 
 
 @pytest.mark.parametrize(
-    ("rank", "threads"), [("simulation", "decode-others"), ("robot", "decode-robots")]
+    ("priority", "threads"), [("simulation", "decode-others"), ("robot", "decode-robots")]
 )
 def test_a_robot_is_answered_while_anothers_image_is_decoded_and_order_is_kept(
     endpoints: tuple[WebSocketServer, ShmServer],
     held_up: tuple[threading.Event, list[str]],
-    rank: str,
+    priority: str,
     threads: str,
 ) -> None:
     go_on, decoders = held_up
@@ -546,8 +546,8 @@ def test_a_robot_is_answered_while_anothers_image_is_decoded_and_order_is_kept(
         assert decode_replies(client.recv(10))[0].error is None
     small = Obs({"front": np.zeros((8, 8, 3), np.uint8)})
     assert local.call([Request("reset", small)], 10)[0].error is None
-    other.send(act(LARGE, "large", rank=rank), 10)
-    other.send(act(JPEG, "small", rank=rank), 10)
+    other.send(act(LARGE, "large", priority=priority), 10)
+    other.send(act(JPEG, "small", priority=priority), 10)
     wait_for(lambda: decoders != [])
     assert decoders[0].startswith(threads)
     for _ in range(3):

@@ -48,7 +48,7 @@ from vlagents_ray.protocol.messages import (
     LocalAddress,
     MessageLimits,
     PlasmaAddress,
-    RankName,
+    PriorityName,
     Request,
 )
 from vlagents_ray.registry import dialect_class
@@ -132,7 +132,7 @@ class Visitor:
             "expired": {"expires": 1.0},
             "revoked": {"revoked": True},
             "another application's": {"apps": ["another"]},
-            "simulation": {"rank": "simulation"},
+            "simulation": {"priority": "simulation"},
             "over its rate": {"rate": 1e-6},
             "over its sessions": {"sessions": 1},
         }
@@ -165,8 +165,8 @@ class KeyedReplica:
         self.at_gateway = self.known.another()  # of another process
         self.policy = Recorder()
         self.engine = Engine(self.policy, session_limit=5000)
-        self.ranks: dict[str, str] = {}
-        self._watch_ranks()
+        self.priorities: dict[str, str] = {}
+        self._watch_priorities()
         admit = partial(self.known.keys.check, app="app")
         self.own = WebSocketServer(self.engine, LIMITS, "127.0.0.1", None, admit)
         self.local = ShmServer(self.engine, LIMITS, admit)
@@ -208,7 +208,7 @@ class KeyedReplica:
         for each in (self.own, self.local, self.plasma):
             each.close()
 
-    def _watch_ranks(self) -> None:
+    def _watch_priorities(self) -> None:
         put = self.engine.queue.put
 
         def watched(*tickets: Any) -> None:
@@ -219,13 +219,13 @@ class KeyedReplica:
                     or (obs is not None and obs.info.get("mark"))
                     or ticket.session_id
                 )
-                self.ranks[str(mark)] = ticket.rank.name
+                self.priorities[str(mark)] = ticket.priority.name
             put(*tickets)
 
         self.engine.queue.put = watched  # type: ignore[method-assign]
 
-    def _agent(self, near: bool, key: str | None, rank: RankName | None) -> RemoteAgent:
-        agent = RemoteAgent("http://127.0.0.1:9", rank=rank or "robot")
+    def _agent(self, near: bool, key: str | None, priority: PriorityName | None) -> RemoteAgent:
+        agent = RemoteAgent("http://127.0.0.1:9", priority=priority or "robot")
         engines = SimpleNamespace(
             engines=[self.engine],
             dead=set(),
@@ -332,7 +332,9 @@ def over_http(method: str, path: str, **options: Any) -> Way:
         gone = f"{visitor.name}/robot-1" not in visitor.replica.engine.sessions
         if path == "/v1/close" and gone:
             visitor.replica.policy.done.append(visitor.mark)
-            visitor.replica.ranks[visitor.mark] = visitor.replica.ranks[f"{visitor.name}/robot-1"]
+            visitor.replica.priorities[visitor.mark] = visitor.replica.priorities[
+                f"{visitor.name}/robot-1"
+            ]
         return str(status)
 
     return attempt
@@ -575,7 +577,7 @@ class _Receiving:
     async def push_received(self, named: Any, options: Any) -> PushResult:
         for mark in named:
             self._replica.policy.done.append(mark)
-            self._replica.ranks[mark] = "ROBOT"
+            self._replica.priorities[mark] = "ROBOT"
         return PushResult(1, "", ("replica",))
 
     async def rest(self, rest: Any) -> None:

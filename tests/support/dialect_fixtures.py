@@ -14,7 +14,7 @@ from served_agents import Mirror, Witness
 from starlette.testclient import TestClient
 
 from vlagents_ray.client.agent import RemoteAgent
-from vlagents_ray.protocol.messages import MessageLimits, RankName
+from vlagents_ray.protocol.messages import MessageLimits, PriorityName
 from vlagents_ray.registry import dialect_class
 from vlagents_ray.serve.access.api_keys import NoKey
 from vlagents_ray.serve.dialects.base import GatewayContext, PortDialect
@@ -43,8 +43,8 @@ def open_dialect(replicas: Replicas) -> Iterator[OpenPort]:
     """Serve the clients of a dialect with a port of its own, by its name; returns the port."""
     dialects: list[PortDialect] = []
 
-    def connect(_key: str | None, rank: RankName | None) -> RemoteAgent:
-        return replicas.agent(rank=rank or "robot")
+    def connect(_key: str | None, priority: PriorityName | None) -> RemoteAgent:
+        return replicas.agent(priority=priority or "robot")
 
     def open_port(
         name: str,

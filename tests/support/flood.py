@@ -103,7 +103,7 @@ def key_of(way: str) -> str:
 
 def serve() -> None:
     """Say where it is, as JSON, and serve until the standard input ends."""
-    rated = [_key(key_of(way), rate=1, rank="simulation") for way in (*WAYS, *HTTP)]
+    rated = [_key(key_of(way), rate=1, priority="simulation") for way in (*WAYS, *HTTP)]
     keys = Keys.from_text(json.dumps({"keys": [_key("robot"), *rated]}))
     admit, limits = partial(keys.check, app="app"), MessageLimits()
     engine = Engine(_Policy())
@@ -212,7 +212,7 @@ def _no_replica(*_: object) -> RemoteAgent:
 
 def serve_gateways() -> None:
     """Serve the dialects with their own port, without a replica; print their ports as JSON."""
-    rated = [_key(key_of(way), rate=1, rank="simulation") for way in GATEWAYS]
+    rated = [_key(key_of(way), rate=1, priority="simulation") for way in GATEWAYS]
     keys = Keys.from_text(json.dumps({"keys": [_key("robot"), *rated]}))
     limits = MessageLimits()
     gr00t._MESSAGE_S = vlagents._FRAME_S = lerobot_dialect._UPLOAD_S = SLOW_S

@@ -118,7 +118,7 @@ def of_request(request: Request) -> dict[str, Any]:
             "kwargs",
             "contract",
             "session",
-            "rank",
+            "priority",
             "request_id",
             "deadline_ms",
         )
@@ -171,7 +171,7 @@ def _requests() -> list[Golden]:
         plain,
         request_id="a-1",
         session="robot-1",
-        rank="simulation",
+        priority="simulation",
         step=STEP,
         deadline_ms=1500.0,
     )
@@ -198,7 +198,7 @@ def _requests() -> list[Golden]:
     ]
     say = {
         "reset": ("a reset with raw pixels, a state and options", [reset]),
-        "act": ("an act with a step over 2**53, a deadline and the class of simulations", [act]),
+        "act": ("an act with a step over 2**53, a deadline and the priority of simulations", [act]),
         "act_shortest": ("an act without cameras or state", [Request("act", Obs())]),
         "close": ("a close", [Request("close", session="robot-1", request_id="c-1")]),
         "values": (

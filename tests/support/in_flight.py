@@ -7,17 +7,17 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 from vlagents_ray.protocol.frames import Decoded, decode_requests
-from vlagents_ray.protocol.messages import Reply, Request
+from vlagents_ray.protocol.messages import PRIORITIES, Reply, Request
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.engine.sender import Sender
-from vlagents_ray.serve.requests import RANKS, PendingRequest
+from vlagents_ray.serve.requests import PendingRequest
 
 Done = Callable[[Reply], Any]
 
 
 def pending(session_id: str, request: Request, done: Done, **fields: Any) -> PendingRequest:
-    """A request in flight with the class and the deadline that it states."""
-    one = PendingRequest(session_id, request, done, RANKS[request.rank], **fields)
+    """A request in flight with the priority and the deadline that it states."""
+    one = PendingRequest(session_id, request, done, PRIORITIES[request.priority], **fields)
     if request.deadline_ms is not None:
         one.deadline = one.arrived + request.deadline_ms / 1e3
     return one

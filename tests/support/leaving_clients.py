@@ -44,7 +44,7 @@ from vlagents_ray.client.transports.shm import ShmTransport
 from vlagents_ray.errors import ConnectionLost, VLAgentsError
 from vlagents_ray.interface import Act, Agent, Obs
 from vlagents_ray.protocol.frames import decode_replies, encode_requests
-from vlagents_ray.protocol.messages import MessageLimits, RankName, Reply, Request
+from vlagents_ray.protocol.messages import MessageLimits, PriorityName, Reply, Request
 from vlagents_ray.registry import dialect_class
 from vlagents_ray.serve.access.api_keys import NoKey
 from vlagents_ray.serve.config.dialects import DialectArgs
@@ -279,8 +279,8 @@ class StoppableServer:
         self.gateways[name] = dialect
         return port
 
-    def _agent(self, _key: str | None, rank: RankName | None) -> RemoteAgent:
-        agent = RemoteAgent("http://127.0.0.1:9", rank=rank or "robot")
+    def _agent(self, _key: str | None, priority: PriorityName | None) -> RemoteAgent:
+        agent = RemoteAgent("http://127.0.0.1:9", priority=priority or "robot")
         engines: Any = SimpleNamespace(
             engines=[self.engine],
             dead=set(),

@@ -45,7 +45,7 @@ def new(
         int | None,
         typer.Option(min=1, max=1_000_000, help="Sessions held at once, at each replica."),
     ] = None,
-    rank: Annotated[
+    priority: Annotated[
         str | None, typer.Option(help="'simulation': none of its requests goes before a robot's.")
     ] = None,
     scope: Annotated[
@@ -70,7 +70,7 @@ def new(
             "apps": tuple(app),
             "rate": rate,
             "sessions": sessions,
-            "rank": rank,
+            "priority": priority,
             "scopes": tuple(scope),
         }
         token = new_key(place, name, expires=expires, **allowed)
@@ -82,7 +82,7 @@ def new(
 def list_(file: File = None) -> None:
     """List the keys, and what each allows."""
     with errors():
-        listed = table("name", "for", "requests/s", "sessions", "class", "may also", "state")
+        listed = table("name", "for", "requests/s", "sessions", "priority", "may also", "state")
         for key in read_keys(_existing(file)):
             limits = (
                 "any" if value is None else f"{value:g}" for value in (key.rate, key.sessions)
@@ -93,7 +93,7 @@ def list_(file: File = None) -> None:
                 date = time.strftime("%Y-%m-%d %H:%M UTC", time.gmtime(key.expires))
                 over = key.expires <= time.time()
                 state = Text(f"expired {date}", "red") if over else Text(f"until {date}", "green")
-            listed.add_row(key.name, apps, *limits, key.rank or "any", scopes, state)
+            listed.add_row(key.name, apps, *limits, key.priority or "any", scopes, state)
         out.print(listed)
 
 

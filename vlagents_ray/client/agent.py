@@ -32,7 +32,7 @@ from vlagents_ray.errors import (
 )
 from vlagents_ray.images.codecs import RAW, ImageCodec
 from vlagents_ray.interface import DEADLINE, Act, Agent, Obs, copied
-from vlagents_ray.protocol.messages import RANKS, RankName, Reply, Request
+from vlagents_ray.protocol.messages import PRIORITIES, PriorityName, Reply, Request
 from vlagents_ray.protocol.values import require_obs
 from vlagents_ray.registry import require
 from vlagents_ray.tracing import TRACEPARENT, tracer
@@ -72,14 +72,14 @@ class EpisodeState:
 class ClientSession:
     """One session of a connection, and its requests."""
 
-    def __init__(self, connection: Connection, rank: RankName) -> None:
+    def __init__(self, connection: Connection, priority: PriorityName) -> None:
         self.id = uuid.uuid4().hex
         # None before the first reset and after the end of an episode.
         self.episode: EpisodeState | None = None
         self.step: int | None = None  # the server's count in its last reply, of any episode
         self.resumed = False  # whether the episode was resumed and no action has reported it yet
         self._connection = connection
-        self._rank: RankName = rank
+        self._priority: PriorityName = priority
 
     def reset(self, episode: EpisodeState) -> Request:
         """Return the request that begins `episode`, or resumes it at its current step."""
@@ -91,7 +91,7 @@ class ClientSession:
             episode.contract,
             history=list(episode.recent),
             session=self.id,
-            rank=self._rank,
+            priority=self._priority,
             step=self.step,
             request_id=self._connection.request_id(),
         )
@@ -104,7 +104,7 @@ class ClientSession:
             "act",
             obs,
             session=self.id,
-            rank=self._rank,
+            priority=self._priority,
             step=self.episode.step,
             request_id=self._connection.request_id(),
         )
@@ -223,7 +223,7 @@ class RemoteAgent(Agent):
         timeout_s: float = 30.0,
         connect_timeout_s: float | None = None,
         codec: ImageCodec | CodecName = "auto",
-        rank: RankName = "robot",
+        priority: PriorityName = "robot",
         resume: bool = True,
         api_key: str | None = None,
         ca: str | os.PathLike[str] | None = None,
@@ -247,7 +247,8 @@ class RemoteAgent(Agent):
                 little, and "exact" is PNG; to a server on this machine, both leave the pixels raw.
                 "raw", which is faster from 300 MB/s (2.4 Gbit/s) on, "lossless" (PNG), "jpeg" or an
                 `ImageCodec` force one.
-            rank: The class of the requests: a "robot" has priority over a "simulation".
+            priority: The priority of the requests: those of a "robot" are answered before those of
+                a "simulation".
             resume: If False, the loss of a session raises `ConnectionLost`, and the episode needs a
                 new `reset`.
             api_key: The API key, for a server that requires one; by default the value of
@@ -262,8 +263,8 @@ class RemoteAgent(Agent):
         Raises:
             ConfigError: The URL has none of these forms, or does not fit the transport.
         """
-        if rank not in RANKS:
-            raise ConfigError(f"rank: got {rank!r}, want one of {list(RANKS)}")
+        if priority not in PRIORITIES:
+            raise ConfigError(f"priority: got {priority!r}, want one of {list(PRIORITIES)}")
 
         choice = CodecChoice(codec)
         self.credentials = Credentials(api_key, ca, certificate)
@@ -280,9 +281,9 @@ class RemoteAgent(Agent):
 
         self._connection = connection
         self._commands = commands
-        self._rank: RankName = rank
+        self._priority: PriorityName = priority
         self._resume = resume
-        self._session = ClientSession(connection, rank)
+        self._session = ClientSession(connection, priority)
         self._tracer = tracer()
 
     def sessions(self, n: int) -> list[Self]:
@@ -292,7 +293,7 @@ class RemoteAgent(Agent):
         agents = [copy.copy(self) for _ in range(n)]
         for agent in agents:
             agent._commands = None
-            agent._session = ClientSession(self._connection, self._rank)
+            agent._session = ClientSession(self._connection, self._priority)
         return agents
 
     @property
@@ -488,7 +489,7 @@ class RemoteAgent(Agent):
     def close(self) -> None:
         """End the session. A later `reset` begins another one."""
         self._connection.end_session(self._session, self._session.id)
-        self._session = ClientSession(self._connection, self._rank)
+        self._session = ClientSession(self._connection, self._priority)
 
     def _client_sessions(self, sessions: Sequence[Agent]) -> list[ClientSession]:
         """Return the sessions of these agents; raise `ConfigError` unless all share this

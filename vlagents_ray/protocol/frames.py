@@ -30,7 +30,7 @@ from vlagents_ray.protocol.messages import (
     MOST_DEADLINE_MS,
     NAME_CHARACTERS,
     OPS,
-    RANKS,
+    PRIORITIES,
     Budget,
     MessageLimits,
     Op,
@@ -42,7 +42,12 @@ from vlagents_ray.protocol.values import ValueReader, ValueWriter, is_number, re
 
 CONTENT_TYPE = "application/x-vlagents-frame"
 # With defaults.
-_OPTIONAL: dict[str, Any] = {"request_id": "", "session": "", "rank": "robot", "deadline_ms": None}
+_OPTIONAL: dict[str, Any] = {
+    "request_id": "",
+    "session": "",
+    "priority": "robot",
+    "deadline_ms": None,
+}
 _WITH_OBS = ("reset", "act", "observe")
 _RESET_PARAMETERS = {"self", "obs", "instruction"}  # which no option of a reset may be named
 _OF_RESET = ("instruction", "kwargs", "contract", "history")
@@ -129,7 +134,7 @@ def decode_requests(data: Buffer, budget: Budget, ops: Sequence[Op] = OPS) -> De
     reader = ValueReader(blobs, budget)
     for place, node in enumerate(nodes):
         try:
-            budget.begin(node.get("op"), node.get("rank"))
+            budget.begin(node.get("op"), node.get("priority"))
             reader.begin()
             decoded.requests.append(_read_request(node, reader, ops))
         except VLAgentsError as error:
@@ -218,8 +223,10 @@ def check_request(request: Request, limits: MessageLimits) -> Request:
         raise MalformedMessage(
             f"kwargs: got {sorted(taken)}, which are parameters of `reset` itself; rename them"
         )
-    if not isinstance(request.rank, str) or request.rank not in RANKS:
-        raise MalformedMessage(f"rank: got {shown(request.rank)}, want one of {list(RANKS)}")
+    if not isinstance(request.priority, str) or request.priority not in PRIORITIES:
+        raise MalformedMessage(
+            f"priority: got {shown(request.priority)}, want one of {list(PRIORITIES)}"
+        )
     if request.deadline_ms is not None and not (
         is_number(request.deadline_ms) and 0 < request.deadline_ms < MOST_DEADLINE_MS
     ):

@@ -6,8 +6,9 @@ import contextlib
 import ipaddress
 import socket
 import struct
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import MISSING, dataclass, field, fields
+from enum import IntEnum
 from pathlib import Path
 from typing import Any, ClassVar, Literal, TypeVar
 
@@ -25,7 +26,7 @@ DEADLINE_HEADER = "x-deadline-ms"
 # header of a reply: the session's step. A request with it is refused if the session is at any other
 # step.
 STEP_HEADER = "x-step"
-RANK_HEADER = "x-rank"
+PRIORITY_HEADER = "x-priority"
 MOST_DEADLINE_MS = 1e9  # 11 days
 NAME_CHARACTERS = 128  # maximum length of a session's or a request's id
 STREAM_PATH = "/v1/stream/"  # path on a replica's own port, followed by an unguessable part
@@ -47,8 +48,20 @@ OPS: tuple[Op, ...] = ("reset", "act", "close")
 # Only a replica may send these, to the process that runs its policy; "export" and "adopt" contain
 # pickles.
 INNER_OPS: tuple[Op, ...] = (*OPS, "observe", "export", "adopt", "weights")
-RankName = Literal["robot", "simulation"]  # the class of a request; robots are scheduled first
-RANKS: tuple[RankName, ...] = ("robot", "simulation")
+PriorityName = Literal["robot", "simulation"]
+
+
+class Priority(IntEnum):
+    """Priorities of requests, the most urgent first: robots are answered before simulations."""
+
+    ROBOT = 0
+    SIMULATION = 1
+
+
+PRIORITIES: Mapping[PriorityName, Priority] = {
+    "robot": Priority.ROBOT,
+    "simulation": Priority.SIMULATION,
+}
 
 
 @dataclass(slots=True)
@@ -71,7 +84,7 @@ class Request:
     # Reset only: earlier observations of the session, oldest first.
     history: list[Obs] = field(default_factory=list)
     session: str = ""  # id of the sender's session; empty for the only session of its connection
-    rank: RankName = "robot"
+    priority: PriorityName = "robot"
     # for act and reset: the `step` of the last reply; an act is refused if the session is at
     # another step
     step: int | None = None
@@ -309,7 +322,7 @@ class Budget:
         """
         self.hold(_JSON_FACTOR * size)
 
-    def begin(self, op: object, rank: object = "robot") -> None:
+    def begin(self, op: object, priority: object = "robot") -> None:
         """Begin the next request of the message after its header is parsed; raise an error if it
         is refused.
         """

@@ -25,7 +25,7 @@ from vlagents_ray.errors import InvalidInput, MalformedMessage, MessageTooLarge
 from vlagents_ray.interface import POLICY, Act, Obs
 from vlagents_ray.protocol.frame_layout import Buffer
 from vlagents_ray.protocol.frames import check_request
-from vlagents_ray.protocol.messages import MessageLimits, RankName, Reply, Request, is_name
+from vlagents_ray.protocol.messages import MessageLimits, PriorityName, Reply, Request, is_name
 from vlagents_ray.protocol.values import require_array_name
 
 _ALIGN = 64
@@ -49,14 +49,14 @@ class Layout:
     """The constant part of a session's requests, with the offsets of their arrays."""
 
     session: str
-    rank: RankName
+    priority: PriorityName
     cameras: tuple[tuple[str, tuple[int, ...], int], ...]  # name, (H, W, 3) uint8, offset in bytes
     state: tuple[tuple[str, tuple[int, ...], int], ...]  # name, (D,) float32, offset in bytes
     size: int  # total size of the arrays, bytes
 
     @classmethod
     def of(
-        cls, session: str, rank: RankName, cameras: Sequence[Any], state: Sequence[Any]
+        cls, session: str, priority: PriorityName, cameras: Sequence[Any], state: Sequence[Any]
     ) -> Layout:
         """Compute the layout of arrays, given as pairs of name and shape: (H, W, 3) for cameras,
         (D,) for states.
@@ -67,7 +67,7 @@ class Layout:
             for name, shape in arrays:
                 group.append((name, tuple(shape), at))
                 at += -(-math.prod(shape) * width // _ALIGN) * _ALIGN
-        return cls(session, rank, tuple(placed[0]), tuple(placed[1]), at)
+        return cls(session, priority, tuple(placed[0]), tuple(placed[1]), at)
 
     def placed(self, request: Request, at: int) -> list[tuple[int, np.ndarray]] | None:
         """Return the offset of each array if the first one is at `at`; None if the request is no
@@ -76,7 +76,7 @@ class Layout:
         Comparing each array is faster than computing the request's `_key`.
         """
         obs = request.obs
-        if obs is None or not _is_plain(request, obs) or request.rank != self.rank:
+        if obs is None or not _is_plain(request, obs) or request.priority != self.priority:
             return None
         if len(obs.cameras) != len(self.cameras) or len(obs.state) != len(self.state):
             return None
@@ -230,7 +230,7 @@ class ShmReader:
                     "act",
                     obs,
                     session=layout.session,
-                    rank=layout.rank,
+                    priority=layout.priority,
                     step=None if step < 0 else step,
                     request_id=name_of_request,
                     deadline_ms=None if math.isnan(deadline_ms) else deadline_ms,
@@ -248,8 +248,8 @@ class ShmReader:
 
     def _layout(self, text: bytes) -> Layout:
         limits = self._limits
-        session, rank, cameras, state = json.loads(text)
-        check_request(Request("close", session=session, rank=rank), limits)
+        session, priority, cameras, state = json.loads(text)
+        check_request(Request("close", session=session, priority=priority), limits)
         if not isinstance(cameras, list) or not isinstance(state, list):
             raise MalformedMessage("local: cameras and state: want lists of names and shapes")
         if max(len(cameras), len(state)) > limits.cameras:
@@ -276,7 +276,7 @@ class ShmReader:
                 raise MessageTooLarge(
                     f"local: {name!r}: got {size} pixels or values, the limit is {most}"
                 )
-        return Layout.of(session, rank, cameras, state)
+        return Layout.of(session, priority, cameras, state)
 
 
 def _is_plain(request: Request, obs: Obs) -> bool:
@@ -305,7 +305,7 @@ def _key(request: Request) -> tuple[Any, ...] | None:
             return None
     return (
         request.session,
-        request.rank,
+        request.priority,
         tuple([(name, image.shape) for name, image in obs.cameras.items()]),
         tuple([(name, part.shape) for name, part in obs.state.items()]),
     )

@@ -13,13 +13,13 @@ from vlagents_ray.contract import Contract
 from vlagents_ray.errors import PolicyFailed
 from vlagents_ray.interface import Act, Agent, Obs
 from vlagents_ray.policies.base.program import Program
-from vlagents_ray.protocol.messages import Reply, Request
+from vlagents_ray.protocol.messages import Priority, Reply, Request
 from vlagents_ray.ray_tools.git_state import GitState
 from vlagents_ray.serve.config.deployment import ServerArgs
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.models.checkpoints import resolved
 from vlagents_ray.serve.python_env.child_agent import make_agent, version_of
-from vlagents_ray.serve.requests import PendingRequest, Rank
+from vlagents_ray.serve.requests import PendingRequest
 from vlagents_ray.serve.sessions import SessionFinder
 
 _LOOK_S = 0.1  # wait for a checkpoint that another thread loads
@@ -98,7 +98,7 @@ class LocalAgent(Agent):
         does.
         """
         [reply] = self._replies(
-            [self], [Request("reset", obs, instruction, kwargs, contract, rank="simulation")]
+            [self], [Request("reset", obs, instruction, kwargs, contract, priority="simulation")]
         )
         if reply.error is not None:
             raise reply.error
@@ -107,7 +107,7 @@ class LocalAgent(Agent):
     def act_batch(self, obs: Sequence[Obs], sessions: Sequence[Agent]) -> list[Act | Exception]:
         acts: list[Act | Exception] = []
         for reply in self._replies(
-            sessions, [Request("act", one, rank="simulation") for one in obs]
+            sessions, [Request("act", one, priority="simulation") for one in obs]
         ):
             if reply.act is not None:
                 reply.act.info["timing"] = reply.timing
@@ -119,14 +119,14 @@ class LocalAgent(Agent):
         return acts
 
     def close(self) -> None:
-        self._replies([self], [Request("close", rank="simulation")])
+        self._replies([self], [Request("close", priority="simulation")])
 
     def _replies(self, sessions: Sequence[Any], requests: Sequence[Request]) -> list[Reply]:
         """Return the reply to one request of each session."""
         answers: list[Future[Reply]] = [Future() for _ in requests]
         self.engine.submit(
             [
-                PendingRequest(session._session, request, answer.set_result, Rank.SIMULATION)
+                PendingRequest(session._session, request, answer.set_result, Priority.SIMULATION)
                 for session, request, answer in zip(sessions, requests, answers, strict=True)
             ]
         )

@@ -21,15 +21,14 @@ import logging
 import math
 import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, field
-from enum import IntEnum
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from vlagents_ray.errors import VLAgentsError
 from vlagents_ray.protocol.frames import Decoded, encode_replies
 from vlagents_ray.protocol.json_messages import reply_to_json
-from vlagents_ray.protocol.messages import DecodedFiles, Reply, Request
+from vlagents_ray.protocol.messages import DecodedFiles, Priority, Reply, Request
 from vlagents_ray.protocol.shm_layout import write_answers
 from vlagents_ray.serve.queue.preparation import Preparation
 
@@ -45,17 +44,6 @@ logger = logging.getLogger(__name__)
 # After the total as in `STAGES`.
 _TIMES = ("total_ms", "decode_ms", "queue_ms", "inference_ms", "encode_ms")
 _NOT_MEASURED = (0.0,) * 4  # stages of a request that failed
-
-
-class Rank(IntEnum):
-    """Classes of requests, the most urgent first."""
-
-    ROBOT = 0
-    SIMULATION = 1
-
-
-# By their names in the protocol.
-RANKS: Mapping[str, Rank] = {"robot": Rank.ROBOT, "simulation": Rank.SIMULATION}
 
 
 @dataclass(frozen=True, slots=True)
@@ -124,7 +112,7 @@ class PendingRequest:
     session_id: str  # the id in the engine
     request: Request
     done: Callable[[Reply], None]
-    rank: Rank = Rank.ROBOT
+    priority: Priority = Priority.ROBOT
     # s, of the engine's clock, by default this one.
     arrived: float = field(default_factory=time.perf_counter)
     deadline: float = math.inf  # time after which an answer is of no use, s, of the engine's clock
@@ -208,7 +196,7 @@ class IncomingMessage:
 
     Args:
         op: Operation of its only request, if that is known before decoding.
-        rank: Class of that request.
+        priority: Priority of that request.
     """
 
     __slots__ = (
@@ -225,10 +213,10 @@ class IncomingMessage:
     )
 
     def __init__(
-        self, stats: MetricsBuffer, transport: str, op: str = "unknown", rank: str = "robot"
+        self, stats: MetricsBuffer, transport: str, op: str = "unknown", priority: str = "robot"
     ) -> None:
         self._stats = stats
-        self._asked: list[tuple[str, str]] = [(op, rank)]
+        self._asked: list[tuple[str, str]] = [(op, priority)]
         self.transport = transport
         self.arrived = self._decoded = time.perf_counter()  # s
         self.replies: list[Reply] = []  # complete when `then` of `expect` is called
@@ -241,14 +229,14 @@ class IncomingMessage:
         self.arrived = self._decoded = time.perf_counter()
 
     def decoded(self, decoded: Decoded) -> None:
-        """Record that the requests are decoded, with their operations and classes."""
+        """Record that the requests are decoded, with their operations and priorities."""
         self._decoded = time.perf_counter()
-        self._asked = [(request.op, request.rank) for request in decoded.requests]
+        self._asked = [(request.op, request.priority) for request in decoded.requests]
         for place in sorted(decoded.refused):
             self._asked.insert(place, ("unknown", "robot"))
 
     def decoded_alike(self, requests: int = 1) -> None:
-        """Record that `requests` requests, all of the message's own `op` and `rank`, are
+        """Record that `requests` requests, all of the message's own `op` and `priority`, are
         decoded.
         """
         self._decoded = time.perf_counter()
@@ -328,8 +316,8 @@ class IncomingMessage:
         waits.
         """
         total_ms = (time.perf_counter() - self.arrived) * 1e3
-        for op, rank in self._asked:
-            self._stats.handled((op, self.transport, rank, code), (total_ms, *_NOT_MEASURED))
+        for op, priority in self._asked:
+            self._stats.handled((op, self.transport, priority, code), (total_ms, *_NOT_MEASURED))
 
     def _written(self, begun: float) -> None:
         ended = time.perf_counter()
@@ -344,15 +332,15 @@ class IncomingMessage:
         """
         if len(self.replies) != len(self._asked):  # the message was unreadable as a whole
             self._asked = self._asked[:1]
-        for (op, rank), reply in zip(self._asked, self.replies, strict=True):
+        for (op, priority), reply in zip(self._asked, self.replies, strict=True):
             if reply.error is None:
                 # Replies too large together are sent as errors, without times.
                 times = tuple([reply.timing.get(name, 0.0) for name in _TIMES])
-                self._stats.handled((op, self.transport, rank, "ok"), times)
+                self._stats.handled((op, self.transport, priority, "ok"), times)
             else:
                 total_ms = (time.perf_counter() - self.arrived) * 1e3
                 self._stats.handled(
-                    (op, self.transport, rank, reply.error.code), (total_ms, *_NOT_MEASURED)
+                    (op, self.transport, priority, reply.error.code), (total_ms, *_NOT_MEASURED)
                 )
 
 

@@ -7,7 +7,7 @@ import {
   ConnectionLost, DeadlineExceeded, InvalidInput, NotReset, OutcomeUnknown, Overloaded, PolicyUnavailable,
   TooManyRequests, UnknownSession, VLAgentsError,
 } from "./errors.js";
-import type { Act, Obs, Rank, Reply, Request } from "./frames.js";
+import type { Act, Obs, Priority, Reply, Request } from "./frames.js";
 import type { Json, Value } from "./values.js";
 
 export interface Options {
@@ -15,8 +15,8 @@ export interface Options {
   key?: string;
   /** The name of the session; by default a new one. */
   session?: string;
-  /** The class of the requests: robots, the default, go first. */
-  rank?: Rank;
+  /** The priority of the requests: robots, the default, go first. */
+  priority?: Priority;
   /** For how long a call may take, milliseconds. */
   timeoutMs?: number;
   /** `websocket`, the default, or `http` where proxies allow nothing else. */
@@ -51,7 +51,7 @@ const MOST_HISTORY = 256;
 export class RemoteAgent {
   readonly session: string;
   private readonly server: Server;
-  private readonly options: Required<Pick<Options, "rank" | "timeoutMs" | "transport" | "resume">> & Options;
+  private readonly options: Required<Pick<Options, "priority" | "timeoutMs" | "transport" | "resume">> & Options;
   private connection: Connection | undefined;
   private held: Connection | undefined; // the connection at which the session is
   private moving = false; // the replica asked for another connection
@@ -71,7 +71,7 @@ export class RemoteAgent {
       headers: key ? { authorization: `Bearer ${key}` } : {},
     };
     this.session = options.session ?? randomUUID();
-    this.options = { rank: "robot", timeoutMs: 30000, transport: "websocket", resume: true, ...options };
+    this.options = { priority: "robot", timeoutMs: 30000, transport: "websocket", resume: true, ...options };
   }
 
   /** The transport in use: `stream` is the replica's own port; undefined before the first call. */
@@ -191,7 +191,7 @@ export class RemoteAgent {
     const { session, options } = this;
     let reply: Reply;
     try {
-      reply = await connection.call({ ...request, session, rank: options.rank, deadline_ms: left }, left + GRACE_MS);
+      reply = await connection.call({ ...request, session, priority: options.priority, deadline_ms: left }, left + GRACE_MS);
     } catch (error) {
       if (isLate(error)) this.step = undefined; // the session may have taken the step
       throw error;

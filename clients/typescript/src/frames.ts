@@ -21,8 +21,8 @@ export interface Obs {
   info?: Record<string, Value>;
 }
 
-/** The class of a request: robots go first. */
-export type Rank = "robot" | "simulation";
+/** The priority of a request: robots go first. */
+export type Priority = "robot" | "simulation";
 
 export interface Request {
   op: "reset" | "act" | "close";
@@ -32,7 +32,7 @@ export interface Request {
   contract?: Json | undefined;
   history?: Obs[] | undefined;
   session?: string | undefined;
-  rank?: Rank | undefined;
+  priority?: Priority | undefined;
   step?: string | undefined;
   request_id?: string | undefined;
   deadline_ms?: number | undefined;

@@ -39,7 +39,7 @@ class VlagentsConfig(PreTrainedConfig):
     certificate: list[Path] = field(default_factory=list)
     transport: str = "auto"  # as of `RemoteAgent`
     codec: str = "auto"  # of images, as of `RemoteAgent`: "jpeg", "lossless", "raw", …
-    rank: str = "robot"  # "simulation": robots of the same server go first
+    priority: str = "robot"  # "simulation": robots of the same server go first
     # Move a robot although the training's statistics do not fit it; the log shows it.
     accept_misfit: bool = False
     timeout_s: float = 30.0  # for a request; after it the command ends with an error

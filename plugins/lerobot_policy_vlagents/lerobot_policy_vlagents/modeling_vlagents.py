@@ -196,7 +196,7 @@ class _Robot:
             timeout_s=config.timeout_s,
             connect_timeout_s=config.connect_timeout_s,
             codec=cast(Any, config.codec),
-            rank=cast(Any, config.rank),
+            priority=cast(Any, config.priority),
             api_key=config.api_key,
             ca=config.ca,
             certificate=certificate,
@@ -233,7 +233,7 @@ class _Robot:
         """Return the comparison of the policy's numbers with the robot's; an environment is not
         compared.
         """
-        statistics = agent.statistics if self.config.rank == "robot" else None
+        statistics = agent.statistics if self.config.priority == "robot" else None
         trained, parts = (
             Trained.from_statistics(statistics or {}),
             [*itertools.chain(*mapping.parts.values())],

@@ -98,7 +98,7 @@ def test_a_session_that_was_reset_without_an_instruction_begins_with_the_next_on
 
 def test_a_client_of_the_gateway_keeps_its_instruction_and_each_session_its_own() -> None:
     replicas = Replicas([Witness()])
-    sessions = GatewaySessions(lambda _key, _rank: replicas.agent(), Contract(instruction=True))
+    sessions = GatewaySessions(lambda _key, _priority: replicas.agent(), Contract(instruction=True))
     sessions.show(NoKey.OPEN, None)
     obs = Obs({"front": np.zeros((8, 8, 3), np.uint8)})
 

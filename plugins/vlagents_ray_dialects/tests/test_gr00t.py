@@ -565,7 +565,7 @@ def test_a_dialect_that_ends_answers_every_request(replicas: Replicas) -> None:
     config = GR00TDialect.Config(port=free_port())
     context = GatewayContext(
         "noop",
-        lambda _key, rank: replicas.agent(rank=rank or "robot", timeout_s=20.0),
+        lambda _key, priority: replicas.agent(priority=priority or "robot", timeout_s=20.0),
         MessageLimits(),
         8,
         30.0,

@@ -2,7 +2,7 @@
 
 The gateway enforces the permissions of the client's key, since not every transport to a replica
 contains a key: each observation (with the reset before it) counts towards the key's rate, each
-session towards its limit of sessions, and the key's class applies to all its requests.
+session towards its limit of sessions, and the key's priority applies to all its requests.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from vlagents_ray.client.agent import RemoteAgent
 from vlagents_ray.contract import Contract
 from vlagents_ray.errors import PolicyUnavailable
 from vlagents_ray.interface import Act, Obs
-from vlagents_ray.protocol.messages import RankName
+from vlagents_ray.protocol.messages import PriorityName
 from vlagents_ray.serve.access.api_keys import Caller, Identity
 from vlagents_ray.serve.dialects.base import Connect, GatewayContext, ImplicitEpisode, raise_first
 
@@ -38,7 +38,7 @@ class GatewaySessions:
         self._connect, self._contract = connect, contract
         self._caller: Identity | None = None
         self._key: str | None = None
-        self._rank: RankName | None = None
+        self._priority: PriorityName | None = None
         # Number of requests of the current message that were counted before it was read.
         self._counted = 0
         self._held = 0  # number of sessions that are counted for the key
@@ -104,10 +104,10 @@ class GatewaySessions:
 
     def show(self, caller: Identity, key: str | None) -> None:
         """Set the client and its API key; end the sessions of another client or class."""
-        rank = caller.rank if isinstance(caller, Caller) else None
-        if caller != self._caller or rank != self._rank:
+        priority = caller.priority if isinstance(caller, Caller) else None
+        if caller != self._caller or priority != self._priority:
             self.close()
-            self._caller, self._key, self._rank = caller, key, rank
+            self._caller, self._key, self._priority = caller, key, priority
             if isinstance(caller, Caller):
                 caller.note("let in by", "a gateway")
 
@@ -149,7 +149,7 @@ class GatewaySessions:
         # Counts sessions before they exist, and until they have ended.
         self._hold(max(number, self._held))
         if not self._agents:
-            self._agents = [self._connect(self._key, self._rank)]
+            self._agents = [self._connect(self._key, self._priority)]
         for agent in self._agents[number:]:
             agent.close()
         del self._agents[number:]

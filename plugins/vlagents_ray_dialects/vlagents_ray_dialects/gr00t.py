@@ -74,7 +74,7 @@ class GR00TConnection(GatewayClient):
         self._dialect, self._connection = dialect, connection
         # flat: whether the client's last keys were N1.5's
         self._mapping, self._flat = nested_mapping(dialect.mapping)
-        self._is_robot = dialect.config.rank == "robot"
+        self._is_robot = dialect.config.priority == "robot"
         self._share = share_of(connection)  # whose share of the bytes in flight its messages take
         self._reader = ClientReader(connection, dialect.of_strangers, robot=True)
         self._commands = TokenBucket(CONTROL_FRAMES_PER_S, time.monotonic(), CONTROL_FRAMES)
@@ -310,7 +310,7 @@ class GR00TConnection(GatewayClient):
             if isinstance(caller, Caller):
                 self._share = caller.name
                 self._is_robot = (
-                    self._dialect.config.rank == "robot" and caller.rank != "simulation"
+                    self._dialect.config.priority == "robot" and caller.priority != "simulation"
                 )
         if not self.is_client:
             self._dialect.admit(self)

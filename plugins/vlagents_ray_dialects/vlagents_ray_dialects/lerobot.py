@@ -319,7 +319,7 @@ class LeRobotDialect(PortDialect):
 
     def _observe(self, parts: Iterator[bytes], context: Any) -> None:
         with self._request(context) as client:
-            robot = self.config.rank == "robot"
+            robot = self.config.priority == "robot"
             admission = MessageAdmission(
                 self.context.admission,
                 self.context.limits,

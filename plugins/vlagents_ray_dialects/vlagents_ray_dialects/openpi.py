@@ -201,7 +201,7 @@ class RoboArenaDialect(MapDialect):
     config: RoboArenaDialectConfig
 
     def first(self) -> dict[str, Any]:
-        return self.config.model_dump(mode="json", exclude={"mapping", "rank", "bare"})
+        return self.config.model_dump(mode="json", exclude={"mapping", "priority", "bare"})
 
     def speaks(self, message: dict[str, Any]) -> bool:
         return "endpoint" in message

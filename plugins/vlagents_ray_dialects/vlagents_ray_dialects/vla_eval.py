@@ -31,7 +31,7 @@ from vlagents_ray.errors import (
     VLAgentsError,
     shown,
 )
-from vlagents_ray.protocol.messages import RankName
+from vlagents_ray.protocol.messages import PriorityName
 from vlagents_ray.serve.config.dialects import DialectConfig, MappingSetting
 from vlagents_ray.serve.dialects import base
 from vlagents_ray.serve.endpoints.http_messages import problem_response, public_problem
@@ -47,7 +47,7 @@ class VlaEvalDialectConfig(DialectConfig):
     """The settings of vla-eval's benchmarks."""
 
     mapping: MappingSetting = "vla-eval"
-    rank: RankName = "simulation"
+    priority: PriorityName = "simulation"
     execute: int | None = Field(
         default=None, ge=1, description="rows of each chunk that are executed; null: all"
     )

@@ -59,7 +59,7 @@ class VlagentsConnection:
         self._session = GatewaySessions(context.connect, context.contract)
         # The protocol has no key, and the deployment accepted that.
         self._session.show(NoKey.OPEN, None)
-        robot = dialect.config.rank == "robot"
+        robot = dialect.config.priority == "robot"
         self._share = share_of(connection)  # whose share of the bytes in flight its messages take
         self._reader = ClientReader(connection, context.admission, robot=robot)
         self._segments = SharedMemory(
@@ -191,7 +191,7 @@ class VlagentsConnection:
         return json_numpy.dumps(info)
 
     def _admission(self, text: str | bytes) -> MessageAdmission:
-        robot = self._dialect.config.rank == "robot"
+        robot = self._dialect.config.priority == "robot"
         return MessageAdmission(
             self._context.admission,
             self._context.limits,

@@ -34,8 +34,8 @@ def act(engine: Engine, session: str = "s") -> Act:
     """The first act of an episode of a simulation."""
     replies: queue.SimpleQueue[Reply] = queue.SimpleQueue()
     for request in (
-        Request("reset", Obs(), rank="simulation"),
-        Request("act", Obs(), rank="simulation"),
+        Request("reset", Obs(), priority="simulation"),
+        Request("act", Obs(), priority="simulation"),
     ):
         submit(engine, session, request, replies.put)
         reply = replies.get(timeout=30)

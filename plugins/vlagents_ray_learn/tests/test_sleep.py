@@ -39,7 +39,7 @@ def serving() -> Iterator[Callable[..., Engine]]:
         engines[-1].start()
         assert (
             answered(
-                engines[-1], "s", Request("reset", Obs(), rank="simulation", kwargs={"seed": 3})
+                engines[-1], "s", Request("reset", Obs(), priority="simulation", kwargs={"seed": 3})
             ).error
             is None
         )

@@ -136,7 +136,7 @@ def test_an_agent_of_this_process_has_the_results_of_a_served_one(
             agent.tree["gain"][:] = gain
             version = weights.push(agent.parameters())
             usual = plan_in(tmp_path / f"served {number}", num_envs=num_envs, workers=0)
-            evaluate(usual, agent_factory=partial(served.agent, rank="simulation"))
+            evaluate(usual, agent_factory=partial(served.agent, priority="simulation"))
             TrainingEvaluation(agent, plan_in(tmp_path / f"here {number}", num_envs=num_envs)).play(
                 version
             )

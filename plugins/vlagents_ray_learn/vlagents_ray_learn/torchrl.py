@@ -67,7 +67,7 @@ class ServedPolicy(nn.TensorDictModuleBase):  # type: ignore[misc]
         self.in_keys = [IMAGE, STATE, TEXT]
         self.out_keys = [vla.ACTION_CHUNK_KEY, "policy_version"]
         self._url = url
-        self._options = {"rank": "simulation", **options}
+        self._options = {"priority": "simulation", **options}
         self._sessions: list[RemoteAgent] = []
 
     def forward(self, batch: Any) -> Any:

@@ -24,10 +24,10 @@ from vlagents_ray.errors import InvalidInput, MessageTooLarge, Overloaded, Stora
 from vlagents_ray.images import jpeg_png
 from vlagents_ray.interface import Act, Obs
 from vlagents_ray.policies.noop import Noop
-from vlagents_ray.protocol.messages import DecodedFiles, Reply, Request
+from vlagents_ray.protocol.messages import PRIORITIES, DecodedFiles, Reply, Request
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.engine.observer import Observer, Observers
-from vlagents_ray.serve.requests import RANKS, PendingRequest
+from vlagents_ray.serve.requests import PendingRequest
 from vlagents_ray_live import live, live_view, ring, spans
 from vlagents_ray_live.live import LEASE_S, RATE, LiveObserver
 from vlagents_ray_live.live_view import ReplicaView
@@ -44,7 +44,9 @@ def observe(
     reply: Reply,
     files: DecodedFiles | None = None,
 ) -> None:
-    pending = PendingRequest(session, request, lambda _: None, RANKS[request.rank], kept={})
+    pending = PendingRequest(
+        session, request, lambda _: None, PRIORITIES[request.priority], kept={}
+    )
     pending.files = files or {}
     observer.on_request(pending)
     request.obs = None  # as the engine does once the policy has acted

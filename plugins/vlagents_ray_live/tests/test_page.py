@@ -22,7 +22,7 @@ from vlagents_ray.contract import ActionSpec, CameraSpec, Contract
 from vlagents_ray.errors import PolicyFailed
 from vlagents_ray.interface import Act, Agent
 from vlagents_ray.policies.noop import Noop
-from vlagents_ray.protocol.messages import RankName
+from vlagents_ray.protocol.messages import PriorityName
 from vlagents_ray.robot.loop import LoopReport, run_loop
 from vlagents_ray.robot.simulated import SimulatedRobot
 from vlagents_ray.serve.access import api_keys
@@ -63,14 +63,14 @@ def until(page: Page, expression: str, want: object) -> None:
 
 @contextmanager
 def acting(
-    server: LiveServer, number: int, rank: RankName = "robot", key: str | None = None
+    server: LiveServer, number: int, priority: PriorityName = "robot", key: str | None = None
 ) -> Iterator[None]:
     """So many robots or simulations that act until the end of the context."""
     over = threading.Event()
 
     def act(index: int) -> None:
         image = np.full((32, 48, 3), 10 * index, np.uint8)
-        with RemoteAgent(server.url, rank=rank, api_key=key) as agent:
+        with RemoteAgent(server.url, priority=priority, api_key=key) as agent:
             obs = Obs({"front": image}, 1.0, {"joints": np.zeros(7, np.float32)})
             agent.reset(obs, f"push cube {index}")
             while not over.wait(0.05):

@@ -54,7 +54,7 @@ class Answer(NamedTuple):
     number: int  # increases with every answer of the replica
     session: str
     op: str
-    rank: str
+    priority: str
     timing: Mapping[str, float]  # ms by stage; completed when the answer was sent
     error: str = ""  # error code; empty without an error
     detail: str = ""
@@ -242,7 +242,9 @@ class LiveObserver(Observer):
 
 def _answer(number: int, pending: PendingRequest, reply: Reply) -> Answer:
     request, act, error = pending.request, reply.act, reply.error
-    answer = Answer(number, pending.session_id, request.op, pending.rank.name.lower(), reply.timing)
+    answer = Answer(
+        number, pending.session_id, request.op, pending.priority.name.lower(), reply.timing
+    )
     if error is not None:
         return answer._replace(error=error.code, detail=str(error)[:TEXT])
     if act is None:

@@ -152,7 +152,8 @@ class ReplicaView:
             **self._state(),
             **_counted(answers),
             "waiting": {
-                rank.name.lower(): depth for rank, depth in engine.queue.depth_by_rank().items()
+                priority.name.lower(): depth
+                for priority, depth in engine.queue.depth_by_priority().items()
             },
             "sessions": list(sessions.values()),
             "sessions_held": len(engine.sessions),
@@ -203,7 +204,9 @@ def _session(session: Session[LoadedModel], last: live.Answer | None) -> dict[st
         "version": None if weights is None else weights.number,
         "pictures": {},
     }
-    return described if last is None else described | {"rank": last.rank, "last": _act(last)}
+    return (
+        described if last is None else described | {"priority": last.priority, "last": _act(last)}
+    )
 
 
 def _pictures(kept: live.KeptObservation, files: list[bytes]) -> dict[str, int]:

@@ -29,7 +29,7 @@ class _ServedRequest(NamedTuple):
 
     session: str
     op: str
-    rank: str
+    priority: str
     traceparent: str
     decoded_ns: int  # time at which the request was decoded, ns since 1970
     timing: Mapping[str, float]  # ms by stage; completed when the answer was sent
@@ -66,7 +66,7 @@ class RequestSpans(Observer):
         """Export the span of the answered request."""
         begun: tuple[str, int] | None = pending.kept.pop(self, None)
         if begun is not None:
-            about = pending.session_id, pending.request.op, pending.rank.name.lower()
+            about = pending.session_id, pending.request.op, pending.priority.name.lower()
             error = "" if reply.error is None else f"{reply.error.code}: {reply.error}"[:_TEXT]
             self._answered.append(
                 _ServedRequest(*about, *begun, reply.timing, error, time.time_ns())
@@ -83,7 +83,7 @@ class RequestSpans(Observer):
         about: dict[str, str | int] = {
             "replica": self._replica,
             "session": one.session,
-            "rank": one.rank,
+            "priority": one.priority,
         }
         if "batch_size" in timing:
             about["batch_size"] = int(timing["batch_size"])

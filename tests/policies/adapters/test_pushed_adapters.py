@@ -80,12 +80,14 @@ def at(seed: int) -> Obs:
 
 def reset(engine: Engine, name: str | None) -> None:
     kwargs = {"seed": 3} | ({} if name is None else {"adapter": name})
-    reply = answered(engine, str(name), Request("reset", at(0), None, kwargs, rank="simulation"))
+    reply = answered(
+        engine, str(name), Request("reset", at(0), None, kwargs, priority="simulation")
+    )
     assert reply.error is None, reply.error
 
 
 def act(engine: Engine, name: str | None) -> Act:
-    reply = answered(engine, str(name), Request("act", at(1), rank="simulation"))
+    reply = answered(engine, str(name), Request("act", at(1), priority="simulation"))
     assert reply.act is not None, reply.error
     return reply.act
 

@@ -339,12 +339,12 @@ def test_each_request_of_a_message_is_charged_to_the_key_once(
 
 
 def test_the_file_holds_hashes_for_its_owner_alone(file: Path) -> None:
-    token = new_key(file, "arm", rank="simulation", sessions=3)
+    token = new_key(file, "arm", priority="simulation", sessions=3)
     assert token not in file.read_text()
     assert stat.S_IMODE(file.stat().st_mode) == 0o600
     (key,) = read_keys(file)
     assert key.sha256 == hashlib.sha256(token.encode()).hexdigest()
-    assert (key.rank, key.sessions) == ("simulation", 3)
+    assert (key.priority, key.sessions) == ("simulation", 3)
     assert list(file.parent.iterdir()) == [file]
 
 
@@ -358,7 +358,7 @@ def test_the_file_holds_hashes_for_its_owner_alone(file: Path) -> None:
         ({"rate": 0}, "positive"),
         ({"rate": True}, "positive"),
         ({"sessions": 1.5}, "positive"),
-        ({"rank": "king"}, "robot"),
+        ({"priority": "king"}, "robot"),
         ({"apps": "pi0"}, "list"),
         ({"revoked": 1}, "true or false"),
         ({"ratee": 1}, "ratee"),

@@ -163,7 +163,7 @@ FIELDS = [
     "history",
     "request_id",
     "session",
-    "rank",
+    "priority",
     "step",
     "deadline_ms",
 ]
@@ -238,7 +238,11 @@ def test_what_a_decoder_returns_has_the_types_of_an_observation(op: Any) -> None
             for request in decoded.requests:
                 for obs in (*request.history, *([] if request.obs is None else [request.obs])):
                     require_types(obs)
-                assert (type(request.request_id), type(request.session), type(request.rank)) == (
+                assert (
+                    type(request.request_id),
+                    type(request.session),
+                    type(request.priority),
+                ) == (
                     str,
                     str,
                     str,

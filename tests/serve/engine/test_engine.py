@@ -198,13 +198,13 @@ class Held(Agent):
 
 
 @pytest.mark.parametrize(
-    ("rank", "computes", "beside"),
+    ("priority", "computes", "beside"),
     [("simulation", True, True), ("robot", False, True), ("robot", True, False)],
 )
 def test_replies_are_sent_beside_the_next_full_batch_unless_a_robot_would_wait(
     serving: Callable[..., Engine],
     monkeypatch: pytest.MonkeyPatch,
-    rank: Any,
+    priority: Any,
     computes: bool,
     beside: bool,
 ) -> None:
@@ -221,7 +221,7 @@ def test_replies_are_sent_beside_the_next_full_batch_unless_a_robot_would_wait(
         submit(
             engine,
             session,
-            Request("act", Obs(), rank=rank),
+            Request("act", Obs(), priority=priority),
             lambda _: threads.put(threading.current_thread().name),
         )
     while engine.queue.depth() != 1:

@@ -344,14 +344,14 @@ def test_the_child_drops_versions_that_nobody_acts_with_and_gives_others_to_new_
     weights = Publisher(served)
     for number in range(1, 5):
         weights.push(gains(number), pin=True)
-        reply = ask(served, "a", "reset", rank="simulation")
+        reply = ask(served, "a", "reset", priority="simulation")
         assert (info(reply)["gain"], info(ask(served, "a", "act"))["policy"]["version"]) == (
             number,
             number,
         )
     [held] = served.weights.held()
     np.testing.assert_equal(held.values, gains(4))
-    wait_for(lambda: info(ask(served, "a", "reset", rank="simulation"))["versions"] == 1)
+    wait_for(lambda: info(ask(served, "a", "reset", priority="simulation"))["versions"] == 1)
     served.close()
 
 
@@ -366,7 +366,7 @@ def test_handles_of_a_learners_gpu_are_opened_by_the_child(monkeypatch: pytest.M
         digest = served.weights.stage(1, handles, PushOptions())
         served.weights.commit(1, PushOptions())
     assert memory.handles == 0
-    reply = info(ask(served, "a", "reset", rank="simulation"))
+    reply = info(ask(served, "a", "reset", priority="simulation"))
     assert (reply["weight"], digest) == (3.0, served.weights.describe()["newest"]["fingerprint"])
     monkeypatch.setattr(memory, "uuid", "another")
     with (

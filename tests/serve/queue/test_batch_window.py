@@ -13,10 +13,10 @@ from dataclasses import dataclass, field
 import pytest
 from in_flight import pending
 
-from vlagents_ray.protocol.messages import Op, Request
+from vlagents_ray.protocol.messages import Op, Priority, Request
 from vlagents_ray.serve.queue.batch_window import BatchCost, BatchWindow
 from vlagents_ray.serve.queue.fair_queue import FairQueue
-from vlagents_ray.serve.requests import PendingRequest, Rank
+from vlagents_ray.serve.requests import PendingRequest
 
 SIZE = 16
 Delay = Callable[[], float]
@@ -28,10 +28,14 @@ def fixed(size: int) -> float:
 
 
 def ticket(
-    session: str, arrived: float, rank: Rank = Rank.SIMULATION, op: Op = "act", **fields: float
+    session: str,
+    arrived: float,
+    priority: Priority = Priority.SIMULATION,
+    op: Op = "act",
+    **fields: float,
 ) -> PendingRequest:
     one = pending(session, Request(op, **fields), lambda _: None, arrived=arrived)  # type: ignore[arg-type]
-    one.rank = rank
+    one.priority = priority
     return one
 
 
@@ -42,7 +46,7 @@ class World:
     delays: list[Delay]
     patience: float
     cost: Callable[[int], float] = fixed
-    ranks: dict[int, Rank] = field(default_factory=dict)
+    priorities: dict[int, Priority] = field(default_factory=dict)
     sizes: list[int] = field(default_factory=list)
     # How long, and how long the batch before took.
     waits: list[tuple[float, float]] = field(default_factory=list)
@@ -62,7 +66,7 @@ class World:
 
         def come() -> PendingRequest:
             at, _, number = heapq.heappop(coming)
-            one = ticket(str(number), at, self.ranks.get(number, Rank.SIMULATION))
+            one = ticket(str(number), at, self.priorities.get(number, Priority.SIMULATION))
             returning.record_arrival(one)
             waiting.add(one)
             return one
@@ -126,9 +130,9 @@ def robot(seed: int, least: float = 0.003, most: float = 0.012) -> Delay:
 @pytest.mark.parametrize("robots", [2, 4, 8])
 def test_robots_that_act_at_once_come_together(robots: int) -> None:
     world = {"delays": [robot(seed) for seed in range(robots)], "cost": large_model}
-    ranks = dict.fromkeys(range(robots), Rank.ROBOT)
-    assert World(**world, ranks=ranks, patience=0.0).run(200).mean() < 0.7 * robots
-    together = World(**world, ranks=ranks, patience=0.1).run(200)
+    priorities = dict.fromkeys(range(robots), Priority.ROBOT)
+    assert World(**world, priorities=priorities, patience=0.0).run(200).mean() < 0.7 * robots
+    together = World(**world, priorities=priorities, patience=0.1).run(200)
     assert together.mean() > 0.95 * robots
     assert all(wait < large_model(robots) / 2 for wait, _ in together.waits)
 
@@ -137,7 +141,7 @@ def test_robots_that_act_at_once_come_together(robots: int) -> None:
 def test_a_robot_with_a_rate_of_its_own_neither_waits_nor_is_waited_for(others: int) -> None:
     delays = [robot(0, 0.1, 0.3), robot(1, 0.2, 0.4), *[robot(2)] * others]
     world = World(
-        delays, patience=0.1, cost=large_model, ranks=dict.fromkeys(range(3), Rank.ROBOT)
+        delays, patience=0.1, cost=large_model, priorities=dict.fromkeys(range(3), Priority.ROBOT)
     ).run(300)
     assert world.waits == []
 
@@ -182,12 +186,12 @@ def answered_together(
 ) -> tuple[BatchWindow, FairQueue]:
     """Three batches of 100 ms, the last over at 2.0; in between all were back after `back_s`."""
     returning = BatchWindow(patience, SIZE, lambda name: name != "closed")
-    ranks = {name: Rank.ROBOT if name in robots else Rank.SIMULATION for name in names}
-    tickets = [ticket(name, 0.0, ranks[name]) for name in names]
+    priorities = {name: Priority.ROBOT if name in robots else Priority.SIMULATION for name in names}
+    tickets = [ticket(name, 0.0, priorities[name]) for name in names]
     for end in (0.0, 1.0, 2.0):  # the first shows that the policy is slow
         returning.record_start(tickets)
         returning.record_end(end, 0.1)
-        tickets = [ticket(name, end + back_s, ranks[name]) for name in names]
+        tickets = [ticket(name, end + back_s, priorities[name]) for name in names]
         if end < 2.0:
             for one in tickets:
                 returning.record_arrival(one)
@@ -213,29 +217,29 @@ def test_a_robot_ends_the_wait_and_prevents_it() -> None:
     returning, waiting = answered_together("a", "b")
     arrive(returning, waiting, ticket("a", 2.001))
     assert returning.wait_s(2.001, waiting) > 0
-    arrive(returning, waiting, robot := ticket("r", 2.002, Rank.ROBOT))
+    arrive(returning, waiting, robot := ticket("r", 2.002, Priority.ROBOT))
     assert returning.ends_wait(robot, waiting)
     assert returning.wait_s(2.002, waiting) == 0
 
 
 def test_robots_wait_for_robots_alone() -> None:
     returning, waiting = answered_together("a", "b", "s", robots="ab")
-    arrive(returning, waiting, ticket("a", 2.001, Rank.ROBOT))
+    arrive(returning, waiting, ticket("a", 2.001, Priority.ROBOT))
     assert returning.wait_s(2.001, waiting) == pytest.approx(0.05)
     arrive(returning, waiting, simulation := ticket("s", 2.002))
     assert not returning.ends_wait(simulation, waiting)
-    arrive(returning, waiting, b := ticket("b", 2.003, Rank.ROBOT))
+    arrive(returning, waiting, b := ticket("b", 2.003, Priority.ROBOT))
     assert returning.ends_wait(b, waiting)
     returning, waiting = answered_together("a", "s", robots="a")
-    arrive(returning, waiting, ticket("a", 2.001, Rank.ROBOT))
+    arrive(returning, waiting, ticket("a", 2.001, Priority.ROBOT))
     assert returning.wait_s(2.001, waiting) == 0
 
 
 def test_a_robot_that_came_for_the_first_time_ends_the_wait_of_robots() -> None:
     returning, waiting = answered_together("a", "b", "c", robots="abc")
-    arrive(returning, waiting, ticket("a", 2.001, Rank.ROBOT))
+    arrive(returning, waiting, ticket("a", 2.001, Priority.ROBOT))
     assert returning.wait_s(2.001, waiting) > 0
-    arrive(returning, waiting, new := ticket("r", 2.002, Rank.ROBOT))
+    arrive(returning, waiting, new := ticket("r", 2.002, Priority.ROBOT))
     assert returning.ends_wait(new, waiting)
 
 
@@ -244,7 +248,7 @@ def test_robots_do_not_wait_without_patience_or_for_longer_than_a_batch_saves() 
         returning, waiting = answered_together(
             "a", "b", patience=patience, robots="ab", back_s=back_s
         )
-        arrive(returning, waiting, ticket("a", 2 + back_s, Rank.ROBOT))
+        arrive(returning, waiting, ticket("a", 2 + back_s, Priority.ROBOT))
         assert returning.wait_s(2 + back_s, waiting) == 0
 
 

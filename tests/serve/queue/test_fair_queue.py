@@ -15,19 +15,19 @@ from in_flight import pending, send
 from in_memory_keys import ChangingKeys
 
 from vlagents_ray.errors import PolicyUnavailable
-from vlagents_ray.protocol.messages import Request
+from vlagents_ray.protocol.messages import Priority, Request
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.engine.sender import Sender
 from vlagents_ray.serve.queue.batch_queue import BatchQueue
 from vlagents_ray.serve.queue.fair_queue import PATIENCE_S, FairQueue
-from vlagents_ray.serve.requests import Origin, PendingRequest, Rank
+from vlagents_ray.serve.requests import Origin, PendingRequest
 
 
 def ticket(
-    session: str, *, owner: str = "", rank: Rank = Rank.SIMULATION, arrived: float = 0.0
+    session: str, *, owner: str = "", priority: Priority = Priority.SIMULATION, arrived: float = 0.0
 ) -> PendingRequest:
     return PendingRequest(
-        session, Request("act"), lambda _: None, rank, arrived, origin=Origin(connection=owner)
+        session, Request("act"), lambda _: None, priority, arrived, origin=Origin(connection=owner)
     )
 
 
@@ -119,15 +119,15 @@ def test_pipelined_requests_of_one_session_take_one_slot_of_a_batch() -> None:
 
 
 def test_simulations_get_the_slots_that_robots_leave() -> None:
-    waiting = filled(*(ticket(f"s{i}") for i in range(4)), ticket("r", rank=Rank.ROBOT))
+    waiting = filled(*(ticket(f"s{i}") for i in range(4)), ticket("r", priority=Priority.ROBOT))
     assert taken(waiting, 3) == ["r", "s0", "s1"]
 
 
 def test_robots_without_end_do_not_starve_simulations() -> None:
     waiting, served, now = filled(ticket("s0"), ticket("s1")), [], 0.0
     for _ in range(60):
-        waiting.add(ticket("r0", rank=Rank.ROBOT, arrived=now))
-        waiting.add(ticket("r1", rank=Rank.ROBOT, arrived=now))
+        waiting.add(ticket("r0", priority=Priority.ROBOT, arrived=now))
+        waiting.add(ticket("r1", priority=Priority.ROBOT, arrived=now))
         now += 0.05
         served.append(taken(waiting, 1, now))
         if now <= PATIENCE_S:
@@ -146,7 +146,7 @@ def test_every_ticket_is_taken_once_and_in_its_sessions_order(seed: int, size: i
     for _ in range(200):
         if choose.random() < 0.7:
             name = f"s{choose.randrange(6)}"
-            one = ticket(name, owner=f"o{int(name[1]) % 3}", rank=Rank(choose.randrange(2)))
+            one = ticket(name, owner=f"o{int(name[1]) % 3}", priority=Priority(choose.randrange(2)))
             put[name].append(one)
             waiting.add(one)
         else:
@@ -166,7 +166,7 @@ def test_every_ticket_is_taken_once_and_in_its_sessions_order(seed: int, size: i
 def test_a_simulation_that_is_over_does_not_take_the_turn_of_one_that_waits() -> None:
     waiting = filled(gone := ticket("gone"), ticket("waits"))
     for i in range(8):
-        waiting.add(ticket(f"robot{i}", rank=Rank.ROBOT, arrived=PATIENCE_S))
+        waiting.add(ticket(f"robot{i}", priority=Priority.ROBOT, arrived=PATIENCE_S))
     gone.over = True
     assert taken(waiting, 2, 2 * PATIENCE_S) == ["robot0", "robot1"]
     assert taken(waiting, 2, 2 * PATIENCE_S)[0] == "waits"

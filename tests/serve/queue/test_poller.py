@@ -16,10 +16,10 @@ from eval_fakes import wait_for
 from process_resources import descriptors, running_threads
 
 from vlagents_ray.interface import Act, Agent, Obs
-from vlagents_ray.protocol.messages import Reply, Request
+from vlagents_ray.protocol.messages import Priority, Reply, Request
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.queue.poller import Poller
-from vlagents_ray.serve.requests import PendingRequest, Rank
+from vlagents_ray.serve.requests import PendingRequest
 
 SLOW_S = 0.02  # a batch at least, so that the queue takes the policy for a slow one
 
@@ -62,11 +62,15 @@ class Slow:
         for name in NAMES:
             done: Future[Reply] = Future()
             self.engine.submit(
-                [PendingRequest(name, Request("reset", Obs()), done.set_result, Rank.SIMULATION)]
+                [
+                    PendingRequest(
+                        name, Request("reset", Obs()), done.set_result, Priority.SIMULATION
+                    )
+                ]
             )
             assert done.result(10).error is None
 
-    def put(self, *sessions: str, rank: Rank = Rank.SIMULATION) -> None:
+    def put(self, *sessions: str, priority: Priority = Priority.SIMULATION) -> None:
         """A request of each session, together."""
 
         def done(session: str) -> Callable[[Reply], None]:
@@ -78,7 +82,7 @@ class Slow:
 
         self.engine.submit(
             [
-                PendingRequest(s, Request("act", Obs(info={"name": s})), done(s), rank)
+                PendingRequest(s, Request("act", Obs(info={"name": s})), done(s), priority)
                 for s in sessions
             ]
         )
@@ -238,7 +242,7 @@ def test_a_robot_is_answered_before_the_next_batch(slow: Callable[..., Slow]) ->
     one.learn("a", "b")
     one.open.clear()
     one.busy.clear()
-    one.put("r", rank=Rank.ROBOT)
+    one.put("r", priority=Priority.ROBOT)
     assert one.busy.wait(5)
     one.put("c", "d")
     one.open.set()

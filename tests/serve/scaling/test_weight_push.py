@@ -62,7 +62,7 @@ class Replica(ThisReplica):
         """The version and the gain with which a simulation acts."""
         if reset:
             assert (
-                answered(self.engine, session, Request("reset", Obs(), rank="simulation")).error
+                answered(self.engine, session, Request("reset", Obs(), priority="simulation")).error
                 is None
             )
         act = answered(self.engine, session, Request("act", Obs())).act

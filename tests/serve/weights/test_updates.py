@@ -38,8 +38,8 @@ class Served:
         self.engine = engine
         self.learn = engine.weights
 
-    def reset(self, session: str, rank: Any = "simulation", **options: Any) -> Reply:
-        return self.ask(session, Request("reset", Obs(), kwargs=options, rank=rank))
+    def reset(self, session: str, priority: Any = "simulation", **options: Any) -> Reply:
+        return self.ask(session, Request("reset", Obs(), kwargs=options, priority=priority))
 
     def act(self, session: str) -> tuple[int, float]:
         """The version that acted, and the gain in its action."""

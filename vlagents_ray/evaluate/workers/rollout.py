@@ -52,7 +52,7 @@ from vlagents_ray.policies.base.checkpoint import used_checkpoints
 from vlagents_ray.policies.base.checkpoint_files import weights_of
 from vlagents_ray.policies.base.program import Program, code_of_class, files_named, loaded_code
 from vlagents_ray.protocol.json_messages import plain_values
-from vlagents_ray.protocol.messages import RankName
+from vlagents_ray.protocol.messages import PriorityName
 from vlagents_ray.ray_tools.git_state import code_of
 from vlagents_ray.registry import env_class
 
@@ -343,7 +343,7 @@ def own_logs() -> list[str]:
 
 
 def agents(
-    config: EvalConfig, own: OwnAgents = None, rank: RankName = "simulation"
+    config: EvalConfig, own: OwnAgents = None, priority: PriorityName = "simulation"
 ) -> AgentFactory:
     """Return the factory that a worker calls: `own`, that of a policy's name in it, or one of
     `RemoteAgent`s.
@@ -357,11 +357,14 @@ def agents(
                 f"policy {policy.name!r}: got no url, want that of its server, as "
                 "http://localhost:8000"
             )
-    return functools.partial(_agent, config, made, rank)
+    return functools.partial(_agent, config, made, priority)
 
 
 def _agent(
-    config: EvalConfig, own: Mapping[str, Callable[[], Agent]], rank: RankName, policy: PolicyConfig
+    config: EvalConfig,
+    own: Mapping[str, Callable[[], Agent]],
+    priority: PriorityName,
+    policy: PolicyConfig,
 ) -> Agent:
     if policy.name in own:
         return own[policy.name]()
@@ -371,7 +374,7 @@ def _agent(
         timeout_s=config.policy_timeout_s,
         connect_timeout_s=config.connect_timeout_s,
         codec=policy.codec,
-        rank=rank,
+        priority=priority,
         # An interrupted episode is played again, so that its result depends only on its key.
         resume=False,
     )

@@ -27,7 +27,7 @@ from pathlib import Path
 
 from vlagents_ray.client.credentials import KEY_VARIABLE
 from vlagents_ray.errors import ConfigError, Forbidden, TooManyRequests, Unauthorized, VLAgentsError
-from vlagents_ray.protocol.messages import RankName, is_loopback
+from vlagents_ray.protocol.messages import PriorityName, is_loopback
 from vlagents_ray.serve.access.audit import Audit
 from vlagents_ray.serve.access.key_store import Key, parse_keys, read_text
 from vlagents_ray.serve.token_bucket import TokenBucket
@@ -264,10 +264,10 @@ class Caller:
     app: str
 
     @property
-    def rank(self) -> RankName | None:
-        """The most urgent class of the caller's requests; None for any class."""
+    def priority(self) -> PriorityName | None:
+        """The highest priority of the caller's requests; None for any priority."""
         key = self._keys.key(self._digest)
-        return None if key is None else key.rank
+        return None if key is None else key.priority
 
     @property
     def sessions(self) -> int | None:

@@ -2,7 +2,8 @@
 keys themselves.
 
     {"keys": [{"name": "arm-1", "sha256": "9f86…", "apps": ["pi0"], "rate": 60, "sessions": 2,
-               "rank": "robot", "scopes": ["weights"], "expires": 1798675200, "revoked": false}]}
+               "priority": "robot", "scopes": ["weights"], "expires": 1798675200,
+               "revoked": false}]}
 
 All fields but `name` and `sha256` are optional. `rate` is in requests/s, `expires` in seconds since
 1970 (UTC).
@@ -26,7 +27,7 @@ from typing import Any
 
 from vlagents_ray.errors import ConfigError, shown
 from vlagents_ray.naming import did_you_mean, without_duplicate_keys
-from vlagents_ray.protocol.messages import RANKS, RankName
+from vlagents_ray.protocol.messages import PRIORITIES, PriorityName
 
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
 _SHA256 = re.compile(r"[0-9a-f]{64}")
@@ -45,8 +46,8 @@ class Key:
     apps: tuple[str, ...] = ()  # the applications that the key is for; empty for all
     rate: float | None = None  # maximum rate, requests/s
     sessions: int | None = None  # maximum number of sessions at once
-    # "simulation" for all requests of the key; otherwise each request states its class.
-    rank: RankName | None = None
+    # "simulation" for all requests of the key; otherwise each request states its priority.
+    priority: PriorityName | None = None
     scopes: tuple[str, ...] = ()  # some of `SCOPES`
     expires: float | None = None  # time of expiry, s since 1970
     revoked: bool = False
@@ -77,10 +78,11 @@ class Key:
                 raise ConfigError(
                     f"key {self.name!r}: {field}: got {value!r}, want a positive number"
                 )
-        if self.rank is not None and self.rank not in RANKS:
-            meant = did_you_mean(str(self.rank), RANKS)
+        if self.priority is not None and self.priority not in PRIORITIES:
+            meant = did_you_mean(str(self.priority), PRIORITIES)
             raise ConfigError(
-                f"key {self.name!r}: rank: got {self.rank!r}, want one of {list(RANKS)}{meant}"
+                f"key {self.name!r}: priority: got {self.priority!r}, want one of "
+                f"{list(PRIORITIES)}{meant}"
             )
         if unknown := sorted(map(str, set(self.scopes) - set(SCOPES))):
             meant = "".join(did_you_mean(scope, SCOPES) for scope in unknown)

@@ -18,7 +18,7 @@ from pydantic import BaseModel, Field, field_validator, model_validator
 from vlagents_ray.contract import Contract
 from vlagents_ray.errors import ConfigError, VLAgentsError
 from vlagents_ray.naming import did_you_mean
-from vlagents_ray.protocol.messages import RankName
+from vlagents_ray.protocol.messages import PriorityName
 from vlagents_ray.registry import dialect_class, names, require
 from vlagents_ray.serve.config.registered import RegisteredArgs
 from vlagents_ray.wire.mapping import KeyMapping
@@ -36,8 +36,8 @@ class DialectConfig(BaseModel, extra="forbid"):
         description="how the client's observations become ours: a preset's name, or an object, see "
         "vlagents_ray.wire.mapping; unset: the client uses our names",
     )
-    rank: RankName = Field(
-        default="robot", description="class of its requests: robots go before simulations"
+    priority: PriorityName = Field(
+        default="robot", description="priority of its requests: robots go before simulations"
     )
 
     @field_validator("mapping")

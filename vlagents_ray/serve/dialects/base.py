@@ -73,7 +73,7 @@ from vlagents_ray.protocol.messages import (
     Budget,
     MessageLimits,
     Op,
-    RankName,
+    PriorityName,
     Reply,
     Request,
 )
@@ -109,7 +109,7 @@ Check = Callable[[str | None], Identity]
 
 logger = logging.getLogger(__name__)
 
-Connect = Callable[[str | None, RankName | None], RemoteAgent]
+Connect = Callable[[str | None, PriorityName | None], RemoteAgent]
 """Connects to the application for one client, with its API key and the most urgent class that the
 key allows; None
 stands for no key, and for any class."""
@@ -259,7 +259,7 @@ class RouteDialect(Dialect):
         """Return a session of that sender, which begins without a reset by the client; by
         default its own session.
         """
-        return ImplicitSession(self.context.engine, sender, self.config.rank, name)
+        return ImplicitSession(self.context.engine, sender, self.config.priority, name)
 
     async def receive(
         self, socket: WebSocket, gate: Sender
@@ -276,12 +276,12 @@ class RouteDialect(Dialect):
             return None
         data = event.get("bytes")
         return data, gate.admission(
-            self.context.limits, 0 if data is None else len(data), self.config.rank
+            self.context.limits, 0 if data is None else len(data), self.config.priority
         )
 
     def arrived(self) -> IncomingMessage:
         """Create the `IncomingMessage` of an observation that has just arrived."""
-        return IncomingMessage(self.context.engine.stats, self.name, "act", self.config.rank)
+        return IncomingMessage(self.context.engine.stats, self.name, "act", self.config.priority)
 
 
 class PortDialect(Dialect):
@@ -427,9 +427,9 @@ class ImplicitSession:
     Its name is unique in the replica, or empty for the sender's own session.
     """
 
-    def __init__(self, engine: Engine, sender: Sender, rank: RankName, name: str) -> None:
+    def __init__(self, engine: Engine, sender: Sender, priority: PriorityName, name: str) -> None:
         self.episode = ImplicitEpisode()
-        self._engine, self._sender, self._rank, self._name = engine, sender, rank, name
+        self._engine, self._sender, self._priority, self._name = engine, sender, priority, name
 
     async def act(
         self, message: IncomingMessage, obs: Obs, instruction: str | None, request_id: str
@@ -448,7 +448,7 @@ class ImplicitSession:
         self, op: Op, obs: Obs | None, instruction: str | None, request_id: str
     ) -> Request:
         return Request(
-            op, obs, instruction, session=self._name, rank=self._rank, request_id=request_id
+            op, obs, instruction, session=self._name, priority=self._priority, request_id=request_id
         )
 
 
@@ -501,7 +501,7 @@ async def _reset(seen: Sequence[SessionObs], request_id: str) -> None:
     ]
     for session, _, _ in seen:
         session.episode.end()
-    resets = seen[0].session._sender.message("reset", seen[0].session._rank)
+    resets = seen[0].session._sender.message("reset", seen[0].session._priority)
     resets.decoded_alike(len(seen))
     replies = await _ask(resets, "reset", seen, openings, request_id)
     resets.written(lambda: None)
@@ -564,7 +564,9 @@ class HttpDialect(RouteDialect):
         """
         name = request_id(http)
         message = self.arrived()
-        admission = self.gate(counted=True).admission(self.context.limits, rank=self.config.rank)
+        admission = self.gate(counted=True).admission(
+            self.context.limits, priority=self.config.priority
+        )
         try:
             self.context.engine.require_ready()
             body = await read_body(http, admission)

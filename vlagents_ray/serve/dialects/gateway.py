@@ -13,7 +13,7 @@ from ray import serve
 from vlagents_ray.client.agent import RemoteAgent
 from vlagents_ray.contract import Contract
 from vlagents_ray.errors import PolicyUnavailable
-from vlagents_ray.protocol.messages import RankName
+from vlagents_ray.protocol.messages import PriorityName
 from vlagents_ray.registry import dialect_class
 from vlagents_ray.serve.access.api_keys import NoKey, require_access
 from vlagents_ray.serve.access.audit import write_audit
@@ -55,7 +55,7 @@ class Gateway:
             for name, one in wanted.items():
                 context = GatewayContext(
                     app=app,
-                    connect=partial(_connect, app, one.rank, keys is not None),
+                    connect=partial(_connect, app, one.priority, keys is not None),
                     limits=limits,
                     sessions=args.sessions.limit,
                     idle_s=args.sessions.idle_s,
@@ -98,7 +98,7 @@ def wait_for_policy(app: str) -> Contract | None:
 
 
 def _connect(
-    app: str, rank: RankName, keyed: bool, key: str | None, allowed: RankName | None
+    app: str, priority: PriorityName, keyed: bool, key: str | None, allowed: PriorityName | None
 ) -> RemoteAgent:
     # The gateway itself enforces the permissions of the key, in `GatewaySessions`, as not every
     # transport to a replica contains the key. Shared memory of a replica requires a key, which some
@@ -106,7 +106,7 @@ def _connect(
     return RemoteAgent(
         f"serve://{app}",
         transport="handle" if keyed and key is None else "auto",
-        rank=allowed or rank,
+        priority=allowed or priority,
         timeout_s=_ANSWER_S,
         connect_timeout_s=_ANSWER_S,
         api_key=key,

@@ -14,7 +14,7 @@ from vlagents_ray.errors import BY_CODE
 from vlagents_ray.protocol.frames import CONTENT_TYPE
 from vlagents_ray.protocol.messages import (
     DEADLINE_HEADER,
-    RANK_HEADER,
+    PRIORITY_HEADER,
     REQUEST_ID_HEADER,
     SESSION_HEADER,
     STEP_HEADER,
@@ -57,7 +57,7 @@ _PATHS = f"""\
     200 when the policy can act, 503 until then.
 """
 _HEADERS = f"""\
-`{RANK_HEADER}`
+`{PRIORITY_HEADER}`
     `robot` (the default, goes first) or `simulation`.
 `{DEADLINE_HEADER}`
     After which an answer is useless (504: with `deadline_exceeded` the request was not acted on and never will be, with
@@ -126,7 +126,7 @@ Choose a session id for each robot or environment and send it as <code>{SESSION_
 {_entries(_TIMING)}
 <h2>Metrics</h2>
 <p>Prometheus reads them at the metrics port of each Ray node, as <code>ray_vlagents_…</code>: requests by op,
-transport, class and outcome, latency, time by stage, batch sizes, queue depth, sessions by transport, utilisation.</p>
+transport, priority and outcome, latency, time by stage, batch sizes, queue depth, sessions by transport, utilisation.</p>
 <h2>Errors</h2><p><code>application/problem+json</code> with a stable <code>code</code>:</p>
 {_entries(errors)}
 <h2>This policy</h2><pre>{html.escape(json.dumps(metadata, indent=2))}</pre>

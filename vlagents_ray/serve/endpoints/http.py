@@ -134,7 +134,7 @@ class _HttpEndpoint:
                     self.engine, "http", session_id, caller=current_caller(), connected=False
                 )
                 admission = sender.admission(
-                    self.limits, rank=headers.get(messages.RANK_HEADER, "robot")
+                    self.limits, priority=headers.get(messages.PRIORITY_HEADER, "robot")
                 )
                 decoded = await http_messages.read_requests(
                     op, _timed(http, incoming), admission, name

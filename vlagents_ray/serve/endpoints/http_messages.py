@@ -39,7 +39,7 @@ from vlagents_ray.protocol.json_messages import (
 from vlagents_ray.protocol.messages import (
     DEADLINE_HEADER,
     MOST_DEADLINE_MS,
-    RANK_HEADER,
+    PRIORITY_HEADER,
     REQUEST_ID_HEADER,
     SESSION_HEADER,
     STEP_HEADER,
@@ -103,16 +103,16 @@ async def read_requests(
 def _read_headers(
     op: Op, requests: list[Request], headers: dict[str, str], name: str, limits: MessageLimits
 ) -> None:
-    """Check the requests, and add the deadline, step and class in the headers to them."""
+    """Check the requests, and add the deadline, step and priority in the headers to them."""
     stated = headers.get(REQUEST_ID_HEADER, "")
     if not is_name(stated):
         raise MalformedMessage(
             f"header {REQUEST_ID_HEADER}: got {stated[:40]!r}, want 1 to 128 visible ASCII "
             "characters"
         )
-    deadline, rank, step = (
+    deadline, priority, step = (
         headers.get(DEADLINE_HEADER),
-        headers.get(RANK_HEADER),
+        headers.get(PRIORITY_HEADER),
         headers.get(STEP_HEADER),
     )
     stated_by_headers: dict[str, Any] = {}
@@ -123,11 +123,11 @@ def _read_headers(
             stated_by_headers["deadline_ms"] = _positive(deadline)
         if step:
             stated_by_headers["step"] = _whole(step)
-        if rank:
-            stated_by_headers["rank"] = rank
+        if priority:
+            stated_by_headers["priority"] = priority
         request_id = request.request_id or ("" if place else name)
         requests[place] = replace(request, request_id=request_id, **stated_by_headers)
-        if rank:
+        if priority:
             check_request(requests[place], limits)
 
 

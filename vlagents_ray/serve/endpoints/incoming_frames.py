@@ -110,7 +110,7 @@ class IncomingFrames(asyncio.Protocol):
         robot, key = True, None
         if isinstance(caller, Caller):
             self._caller = caller
-            robot, key = caller.rank != "simulation", caller.name
+            robot, key = caller.priority != "simulation", caller.name
         if admission is not None:
             self._memory = ArrivingBytes(admission, key, robot, self._give_up)
 

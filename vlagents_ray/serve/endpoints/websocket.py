@@ -352,7 +352,7 @@ class WebSocketConnection(PolledConnection):
                 self._partial = admission
             if self._arriving is None:
                 caller = self.caller if isinstance(self.caller, Caller) else None
-                is_robot = caller is None or caller.rank != "simulation"
+                is_robot = caller is None or caller.priority != "simulation"
                 key = None if caller is None else caller.name
                 self._arriving = ArrivingBytes(self._engine.admission, key, is_robot, self._give_up)
             self._arriving.resize(self._received.size)

@@ -307,10 +307,10 @@ class MessageAdmission(Budget):
             raise NeedsDecodingThread
         super().parse(size)
 
-    def begin(self, op: object, rank: object = "robot") -> None:
+    def begin(self, op: object, priority: object = "robot") -> None:
         """Begin the next request, as in `Budget`; the first request is counted with its message."""
         self._refill()
-        if rank == "simulation":
+        if priority == "simulation":
             self._robot = False
         if self._admit is not None:
             self._index += 1

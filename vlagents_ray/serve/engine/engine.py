@@ -28,7 +28,7 @@ from vlagents_ray.errors import (
     VLAgentsError,
 )
 from vlagents_ray.interface import Act, Agent
-from vlagents_ray.protocol.messages import DEFAULT_LIMITS, Reply
+from vlagents_ray.protocol.messages import DEFAULT_LIMITS, Priority, Reply
 from vlagents_ray.serve.engine.admission import Admission
 from vlagents_ray.serve.engine.metrics_buffer import MetricsBuffer
 from vlagents_ray.serve.engine.observer import Observers
@@ -47,14 +47,7 @@ from vlagents_ray.serve.queue.batch_queue import BatchQueue, Taken
 from vlagents_ray.serve.queue.call_limits import CallLimits, PolicyCall, PolicyCalls
 from vlagents_ray.serve.queue.poller import Poller
 from vlagents_ray.serve.queue.preparation import Preparations
-from vlagents_ray.serve.requests import (
-    NOWHERE,
-    CheckpointChoice,
-    Opening,
-    Origin,
-    PendingRequest,
-    Rank,
-)
+from vlagents_ray.serve.requests import NOWHERE, CheckpointChoice, Opening, Origin, PendingRequest
 from vlagents_ray.serve.sessions import DrainList, Session, SessionFinder, SessionTable
 from vlagents_ray.serve.weights import Rest, WeightsVersion, WeightUpdates, follows
 
@@ -394,7 +387,7 @@ class Engine:
         elif request.op == "reset":
             choice, kwargs = self._source.split_options(request.kwargs)
             opening = Opening(
-                choice, kwargs, follows(kwargs, by_default=pending.rank is not Rank.ROBOT)
+                choice, kwargs, follows(kwargs, by_default=pending.priority is not Priority.ROBOT)
             )
             # Otherwise it is checked after loading.
             if (model := self.models.loaded(choice)) is not None:
@@ -802,7 +795,7 @@ class Engine:
             if reply.error is None:
                 reply.timing = timing(pending, call.began - prepared_s, call.ended)
                 reply.timing["batch_size"] = len(acting)
-            if defer and (robots or pending.rank is not Rank.ROBOT):
+            if defer and (robots or pending.priority is not Priority.ROBOT):
                 unsent.append((pending, reply))
             else:
                 pending.finish(reply)

@@ -19,7 +19,7 @@ STAGES = ("decode", "queue", "inference", "encode")
 SAMPLE = 100  # largest number of values in a sample
 
 Kind = tuple[str, str, str, str]
-"""Kind of a request: op, transport, class, and "ok" or the error's code."""
+"""Kind of a request: op, transport, priority, and "ok" or the error's code."""
 
 Times = tuple[float, ...]
 """Durations of a request, ms: in total, and in each of `STAGES`."""

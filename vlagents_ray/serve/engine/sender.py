@@ -11,16 +11,14 @@ from typing import TYPE_CHECKING, TypeVar
 
 from vlagents_ray.errors import DeadlineExceeded, OutcomeUnknown, TooManyRequests, VLAgentsError
 from vlagents_ray.protocol.frames import Decoded
-from vlagents_ray.protocol.messages import MessageLimits, Reply
+from vlagents_ray.protocol.messages import PRIORITIES, MessageLimits, Priority, Reply
 from vlagents_ray.serve.access.api_keys import Caller, Identity, NoKey
 from vlagents_ray.serve.engine.admission import REQUEST_BYTES, MessageAdmission
 from vlagents_ray.serve.requests import (
-    RANKS,
     Answered,
     IncomingMessage,
     Origin,
     PendingRequest,
-    Rank,
 )
 
 if TYPE_CHECKING:
@@ -94,17 +92,17 @@ class Sender:
             transport, owner, self.session_id, self._caller, self._prefix, opened=engine.clock()
         )
 
-    def message(self, op: str = "unknown", rank: str = "robot") -> IncomingMessage:
+    def message(self, op: str = "unknown", priority: str = "robot") -> IncomingMessage:
         """Return a message that has just arrived from the sender, see `IncomingMessage`."""
-        return IncomingMessage(self._engine.stats, self._origin.transport, op, rank)
+        return IncomingMessage(self._engine.stats, self._origin.transport, op, priority)
 
     def admission(
-        self, limits: MessageLimits, size: int = 0, rank: str = "robot"
+        self, limits: MessageLimits, size: int = 0, priority: str = "robot"
     ) -> MessageAdmission:
         """Return the admission of a message of `size` bytes, which charges its requests to the
         key; see `counted`.
         """
-        robot, caller, counted = rank != "simulation", self._caller, self._counted
+        robot, caller, counted = priority != "simulation", self._caller, self._counted
         keep = self._engine.observers.any
         if caller is None:
             return MessageAdmission(
@@ -194,8 +192,8 @@ class Sender:
             if admission is not None:
                 admission.grow(size)
             elif requests:
-                is_robot = requests[0].rank == "robot" and (
-                    self._caller is None or self._caller.rank != "simulation"
+                is_robot = requests[0].priority == "robot" and (
+                    self._caller is None or self._caller.priority != "simulation"
                 )
                 engine.admission.hold(size, is_robot, 0)
                 # Also released if the requests are dropped without an answer, as those of an ended
@@ -215,7 +213,7 @@ class Sender:
                 self._prefix + (request.session or self._session_id),
                 request,
                 partial(message.put, place),
-                RANKS[request.rank],
+                PRIORITIES[request.priority],
                 now,
                 origin=self._origin,
                 place=place,
@@ -244,7 +242,7 @@ class Sender:
     def _admitted(
         self, caller: Caller, requests: list[PendingRequest], counted: bool
     ) -> list[PendingRequest]:
-        """Return the requests that the caller's key allows, with its class; the others are finished
+        """Return the requests that the caller's key allows, with its priority; finish the others
         with their errors.
 
         The guard of the HTTP server has already counted the first request of a message.
@@ -254,7 +252,7 @@ class Sender:
             request = pending.request
             try:
                 if not self._count(caller, request.op, counted or self._paid):
-                    pending.rank = Rank.SIMULATION
+                    pending.priority = Priority.SIMULATION
             except VLAgentsError as error:
                 pending.fail(error)
                 continue
@@ -350,7 +348,7 @@ class Sender:
         is for simulations.
         """
         caller.admit(free=counted or op == "close")
-        return caller.rank != "simulation"
+        return caller.priority != "simulation"
 
     def _count_message(self, caller: Caller) -> bool:
         try:
@@ -359,7 +357,7 @@ class Sender:
             self._refused += 1
             raise
         self._refused = 0
-        return caller.rank != "simulation"
+        return caller.priority != "simulation"
 
 
 def settle(future: asyncio.Future[T], result: T) -> None:

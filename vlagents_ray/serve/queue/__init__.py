@@ -1,1 +1,1 @@
-"""The batch queue: fair scheduling with deadlines and request classes, on the policy's thread."""
+"""The batch queue: fair scheduling with deadlines and priorities, on the policy's thread."""

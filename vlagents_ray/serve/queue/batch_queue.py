@@ -21,10 +21,11 @@ from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 from vlagents_ray.errors import PolicyUnavailable
+from vlagents_ray.protocol.messages import Priority
 from vlagents_ray.serve.queue.batch_window import BatchWindow
 from vlagents_ray.serve.queue.fair_queue import FairQueue
 from vlagents_ray.serve.queue.poller import Poller
-from vlagents_ray.serve.requests import PendingRequest, Rank
+from vlagents_ray.serve.requests import PendingRequest
 
 _SPIN_S = 100e-6  # time for which the thread polls for the next request before it sleeps
 _DENSE_S = 500e-6  # interval between two requests below which the next one is expected as quickly
@@ -191,9 +192,9 @@ class BatchQueue:
         """Return the number of requests that wait for the next batch."""
         return self._waiting.size
 
-    def depth_by_rank(self) -> dict[Rank, int]:
-        """Return the number of requests that wait for the next batch, by class."""
-        return dict(zip(Rank, self._waiting.depth, strict=True))
+    def depth_by_priority(self) -> dict[Priority, int]:
+        """Return the number of requests that wait for the next batch, by priority."""
+        return dict(zip(Priority, self._waiting.depth, strict=True))
 
     def load_s(self) -> tuple[float, float]:
         """Return the total time for which the policy's thread has been idle, and all requests have

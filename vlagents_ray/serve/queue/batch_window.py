@@ -26,8 +26,9 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 
+from vlagents_ray.protocol.messages import Priority
 from vlagents_ray.serve.queue.fair_queue import FairQueue
-from vlagents_ray.serve.requests import PendingRequest, Rank
+from vlagents_ray.serve.requests import PendingRequest
 
 _KEPT = 0.95  # factor by which the weight of a batch decreases with each later batch
 _SPREAD = 0.01  # variance of the batch sizes below which the fixed cost cannot be estimated
@@ -40,17 +41,19 @@ SLOW_S = 0.002  # a shorter batch ends before a wait could pay off, or another t
 
 
 class _AnsweredBatch:
-    """The sessions of a batch by class, and the recent return time of each, s; None if it is
+    """The sessions of a batch by priority, and the recent return time of each, s; None if it is
     unknown.
 
     The return time of a session is the time from an answer to its next request.
     """
 
     def __init__(self, batch: Sequence[PendingRequest]) -> None:
-        self.returns: dict[Rank, dict[str, float | None]] = {rank: {} for rank in Rank}
+        self.returns: dict[Priority, dict[str, float | None]] = {
+            priority: {} for priority in Priority
+        }
         for pending in batch:
             if pending.request.op in ("act", "reset"):
-                self.returns[pending.rank][pending.session_id] = pending.return_s
+                self.returns[pending.priority][pending.session_id] = pending.return_s
         self.lone = batch[0].session_id if len(batch) == 1 else ""
         self.acts = len(batch) if all(pending.request.op == "act" for pending in batch) else 0
         self.ended = math.inf  # s
@@ -104,7 +107,7 @@ class BatchWindow:
         self.overlaps = False
         self._cost = BatchCost()
         self._missing: set[str] = set()
-        self._rank = Rank.SIMULATION  # of the missing sessions
+        self._priority = Priority.SIMULATION  # of the missing sessions
         self._bound = self._until = 0.0  # the longest wait, s, and its end
 
     def record_start(self, batch: Sequence[PendingRequest]) -> None:
@@ -132,7 +135,7 @@ class BatchWindow:
         difference.
         """
         for answered in (self._last, self._previous):
-            returns = answered.returns[pending.rank]
+            returns = answered.returns[pending.priority]
             if pending.session_id in returns:
                 usual = returns.pop(pending.session_id)
                 took = max(0.0, pending.arrived - answered.ended)
@@ -143,15 +146,15 @@ class BatchWindow:
         """Return how long the free policy may wait for further requests, s; every `put` then
         calls `ends_wait`.
         """
-        self._rank = Rank.ROBOT if waiting.depth[Rank.ROBOT] else Rank.SIMULATION
-        robots = self._rank is Rank.ROBOT
+        self._priority = Priority.ROBOT if waiting.depth[Priority.ROBOT] else Priority.SIMULATION
+        robots = self._priority is Priority.ROBOT
         patience = max(_ROBOTS, self._patience) if robots and self._patience else self._patience
         bound = self._bound = min(patience * self._duration, self._cost.fixed_s())
         if bound <= 0 or not self.slow or waiting.sessions >= self._size:
             return 0.0
         self._missing = {
             session_id
-            for session_id, return_s in self._last.returns[self._rank].items()
+            for session_id, return_s in self._last.returns[self._priority].items()
             if return_s is not None
             and abs(self._last.ended + return_s - now) <= bound
             and not (robots and return_s > bound)
@@ -173,8 +176,8 @@ class BatchWindow:
 
         The deadline may pass if the policy waits, and then takes as long as for the last batch.
         """
-        if pending.rank is Rank.ROBOT:
+        if pending.priority is Priority.ROBOT:
             at_once = pending.return_s is not None and pending.return_s <= self._bound
-            if self._rank is not Rank.ROBOT or not at_once:
+            if self._priority is not Priority.ROBOT or not at_once:
                 return True
         return pending.deadline < self._until + self._duration

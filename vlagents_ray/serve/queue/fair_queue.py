@@ -1,11 +1,11 @@
 """The order in which waiting requests enter batches; uses no threads and no clock but the requests'
 arrival times.
 
-Robots go before simulations. Within a class the *sources* take turns (round-robin): a connection
-that sends 512 observations at once gets one slot, then the next source gets one, and so on until
-the batch is full. So a client with many requests delays the others of its class by no more than one
-batch, and a client alone fills the batch. A session (one robot, one env) has at most one request in
-a batch, and its requests keep their order.
+Robots go before simulations. Among requests of the same priority the *sources* take turns
+(round-robin): a connection that sends 512 observations at once gets one slot, then the next source
+gets one, and so on until the batch is full. So a client with many requests delays the others of its
+priority by no more than one batch, and a client alone fills the batch. A session (one robot, one
+env) has at most one request in a batch, and its requests keep their order.
 
 Robots may use the whole throughput of the policy. Simulations then advance slowly: once the request
 of the next simulation has waited for longer than `PATIENCE_S`, it gets a slot in every second
@@ -16,7 +16,8 @@ from __future__ import annotations
 
 from collections import deque
 
-from vlagents_ray.serve.requests import PendingRequest, Rank
+from vlagents_ray.protocol.messages import Priority
+from vlagents_ray.serve.requests import PendingRequest
 
 # Time after which a simulation gets a slot although robots' requests keep arriving.
 PATIENCE_S = 1.0
@@ -25,8 +26,8 @@ PATIENCE_S = 1.0
 _SessionQueue = deque[PendingRequest]
 
 
-class _ClassQueue:
-    """The sources of one class in round-robin order, each with its waiting sessions."""
+class _SourceQueue:
+    """The sources of one priority in round-robin order, each with its waiting sessions."""
 
     __slots__ = ("queues", "sources")
 
@@ -66,13 +67,15 @@ class FairQueue:
     """
 
     def __init__(self) -> None:
-        self._rank_queues = [_ClassQueue() for _ in Rank]
+        self._queues_by_priority = [_SourceQueue() for _ in Priority]
         self._sessions: dict[str, _SessionQueue] = {}
         # The only waiting request, which is not in a session's queue.
         self._lone: PendingRequest | None = None
         self._yielded = False  # whether the last batch had a slot for an impatient simulation
-        self.depth = [0] * len(Rank)  # waiting requests by rank, including those that are over
-        self.size = 0  # waiting requests of all ranks
+        self.depth = [0] * len(
+            Priority
+        )  # waiting requests by priority, including those that are over
+        self.size = 0  # waiting requests of all priorities
 
     def __contains__(self, session_id: str) -> bool:
         self._enqueue_lone()
@@ -90,7 +93,7 @@ class FairQueue:
 
     def add(self, pending: PendingRequest) -> None:
         """Add a request behind the others of its session."""
-        self.depth[pending.rank] += 1
+        self.depth[pending.priority] += 1
         self.size += 1
         if self.size == 1:
             self._lone = pending
@@ -109,7 +112,7 @@ class FairQueue:
             queue.append(pending)
             return
         queue = self._sessions[pending.session_id] = deque((pending,))
-        self._rank_queues[pending.rank].add(queue)
+        self._queues_by_priority[pending.priority].add(queue)
 
     def take(self, size: int, now: float) -> tuple[list[PendingRequest], list[PendingRequest]]:
         """Take the next batch of at most `size` requests.
@@ -122,23 +125,23 @@ class FairQueue:
         if lone is not None and not (lone.over or lone.origin.ended) and now <= lone.deadline:
             self._lone = None
             lone.begun = True
-            self.depth[lone.rank] = self.size = 0
+            self.depth[lone.priority] = self.size = 0
             self._yielded = False
             return [lone], []
         self._enqueue_lone()
         batch: list[PendingRequest] = []
         expired: list[PendingRequest] = []
         again: list[_SessionQueue] = []
-        robots, simulations = self._rank_queues
+        robots, simulations = self._queues_by_priority
         yields = bool(robots.sources) and not self._yielded and simulations.impatient(now)
         if yields:
             self._pick(simulations.next(), now, batch, expired, again)
         self._yielded = bool(batch)  # not if all requests there are over or have expired
-        for rank_queue in self._rank_queues:
-            while rank_queue.sources and len(batch) < size:
-                self._pick(rank_queue.next(), now, batch, expired, again)
+        for priority_queue in self._queues_by_priority:
+            while priority_queue.sources and len(batch) < size:
+                self._pick(priority_queue.next(), now, batch, expired, again)
         for queue in again:
-            self._rank_queues[queue[0].rank].add(queue)
+            self._queues_by_priority[queue[0].priority].add(queue)
         return batch, expired
 
     def clear(self) -> list[PendingRequest]:
@@ -146,8 +149,8 @@ class FairQueue:
         self._enqueue_lone()
         left = [pending for queue in self._sessions.values() for pending in queue]
         self._sessions.clear()
-        self._rank_queues = [_ClassQueue() for _ in Rank]
-        self.depth = [0] * len(Rank)
+        self._queues_by_priority = [_SourceQueue() for _ in Priority]
+        self.depth = [0] * len(Priority)
         self.size = 0
         return left
 
@@ -165,7 +168,7 @@ class FairQueue:
         session_id = queue[0].session_id
         while queue:
             pending = queue.popleft()
-            self.depth[pending.rank] -= 1
+            self.depth[pending.priority] -= 1
             self.size -= 1
             # Otherwise it must run, to release the checkpoint that its session holds.
             if pending.loaded is None:

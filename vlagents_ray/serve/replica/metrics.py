@@ -2,7 +2,7 @@
 `ray_`.
 
 `Exporter` creates the series. All have the tags `application`, `deployment`, `replica` and
-`policy`. Transport is `shm`, `plasma`, `websocket`, `http` or `handle`, class is `robot` or
+`policy`. Transport is `shm`, `plasma`, `websocket`, `http` or `handle`, priority is `robot` or
 `simulation`, code is "ok", an error's code or "disconnected". Latencies are those of successful
 requests, stages those of successful acts. Counters are exact; a histogram takes a random sample of
 up to 100 values per second for each kind of request and for the batches.
@@ -68,7 +68,7 @@ class Exporter:
         make = partial(series, tags)
         self._engine = engine
         self._requests = make(
-            Counter, "requests", "Requests answered.", "op", "transport", "class", "code"
+            Counter, "requests", "Requests answered.", "op", "transport", "priority", "code"
         )
         self._latency = make(
             Histogram,
@@ -76,7 +76,7 @@ class Exporter:
             "Server time of a request.",
             "op",
             "transport",
-            "class",
+            "priority",
             boundaries=_MS,
         )
         self._stage = make(
@@ -88,7 +88,7 @@ class Exporter:
         self._padding = make(
             Counter, "padding_rows", "Rows that filled batches up to a fixed size."
         )
-        self._depth = make(Gauge, "queue_depth", "Requests that wait.", "class")
+        self._depth = make(Gauge, "queue_depth", "Requests that wait.", "priority")
         self._sessions = make(Gauge, "sessions", "Sessions that are held.", "transport")
         self._utilisation = make(Gauge, "utilisation", "Busy share of the policy's thread.")
         # Of a GPU in the replica's process, as for the next series; the kinds are allocated,
@@ -132,8 +132,8 @@ class Exporter:
     def export(self) -> None:
         """Export the stats since the last call."""
         self._export_collected(self._engine.stats.collect())
-        for rank, depth in self._engine.queue.depth_by_rank().items():
-            self._depth.set(depth, {"class": rank.name.lower()})
+        for priority, depth in self._engine.queue.depth_by_priority().items():
+            self._depth.set(depth, {"priority": priority.name.lower()})
         sessions = self._engine.sessions.by_transport()
         for transport in _TRANSPORTS:
             self._sessions.set(sessions.get(transport, 0), {"transport": transport})
@@ -150,8 +150,8 @@ class Exporter:
         self._unreadable.set(0.0 if self._keys is None else self._keys.unreadable_s)
 
     def _export_collected(self, collected: Collected) -> None:
-        for (op, transport, kind, code), sample in collected.requests.items():
-            what = {"op": op, "transport": transport, "class": kind}
+        for (op, transport, priority, code), sample in collected.requests.items():
+            what = {"op": op, "transport": transport, "priority": priority}
             self._requests.inc(sample.seen, {**what, "code": code})
             if code != "ok":
                 continue

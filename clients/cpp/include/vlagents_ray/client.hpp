@@ -26,7 +26,7 @@ struct Options {
   int jpeg_quality = 90;          // 1 to 100 of raw images, colours at full resolution; 0 sends raw pixels
   bool resume = true;             // begin the session again where its connection was lost
   std::size_t history = 16;       // observations that are kept for that, if the policy's contract wants no fewer; at most 256
-  std::string rank = "robot";     // or "simulation", which robots go before
+  std::string priority = "robot"; // or "simulation", which robots go before
   std::string session;            // 1 to 128 visible ASCII characters; "" makes a UUID
   Json contract;                  // what the robot gives and takes; the server compares it with the policy's
 };
@@ -200,7 +200,7 @@ class Client {
     if (left_s < 0.001) throw Error("deadline_exceeded", "no time was left to send the request");
     request.header["session"] = session_;
     request.header["request_id"] = request_id;
-    request.header["rank"] = options_.rank;
+    request.header["priority"] = options_.priority;
     request.header["deadline_ms"] = 900 * left_s;  // the server's own refusal arrives in time
     if (step_) request.header["step"] = *step_;
     const std::uint64_t before = connection_->received();

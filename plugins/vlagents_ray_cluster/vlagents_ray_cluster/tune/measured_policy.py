@@ -3,8 +3,8 @@
 `python -m vlagents_ray_cluster.tune.measured_policy` loads and measures one variant of a policy for
 `tuner`. It runs in the policy's own Python environment, and so needs the light install and
 pydantic. The first line of its input is `ProcessSettings`, as JSON. Each further line is a request,
-{"measure": SESSIONS, "seconds": S, "rank": RANK} or {"act": BATCH}, and is answered with a line of
-JSON. {"step": …} is a step of a long load, {"failed": …} an error.
+{"measure": SESSIONS, "seconds": S, "priority": PRIORITY} or {"act": BATCH}, and is answered with a
+line of JSON. {"step": …} is a step of a long load, {"failed": …} an error.
 """
 
 from __future__ import annotations
@@ -27,11 +27,18 @@ from vlagents_ray.errors import PolicyFailed
 from vlagents_ray.interface import Act, Agent, Obs
 from vlagents_ray.policies.wrapper import Wrapper, build_agent
 from vlagents_ray.protocol.frames import decode_requests, encode_requests
-from vlagents_ray.protocol.messages import DEFAULT_LIMITS, Budget, RankName, Reply, Request
+from vlagents_ray.protocol.messages import (
+    DEFAULT_LIMITS,
+    PRIORITIES,
+    Budget,
+    PriorityName,
+    Reply,
+    Request,
+)
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.models.agent_copies import AgentCopies
 from vlagents_ray.serve.python_env.child_start import die_with_parent, own_stdout
-from vlagents_ray.serve.requests import RANKS, PendingRequest
+from vlagents_ray.serve.requests import PendingRequest
 from vlagents_ray.testing import random_observation
 from vlagents_ray.validation import check_observation
 
@@ -123,7 +130,7 @@ class MeasuredPolicy:
 
         return act
 
-    def queued(self, size: int, seconds: float, rank: RankName) -> QueuedTurn:
+    def queued(self, size: int, seconds: float, priority: PriorityName) -> QueuedTurn:
         """Measure `size` sessions, each of which sends its next request as soon as the last one
         is answered.
         """
@@ -133,9 +140,9 @@ class MeasuredPolicy:
 
         def ask(i: int, op: Any, **given: Any) -> None:
             asked[i] = time.perf_counter()
-            request = Request(op, views[i], rank=rank, **given)
+            request = Request(op, views[i], priority=priority, **given)
             done = lambda reply: answers.put((i, reply))  # noqa: E731 - of this request
-            self.engine.submit([PendingRequest(f"bench-{i}", request, done, RANKS[rank])])
+            self.engine.submit([PendingRequest(f"bench-{i}", request, done, PRIORITIES[priority])])
 
         def answer() -> tuple[int, Reply, float]:
             i, reply = answers.get(timeout=_LATE_S)
@@ -315,7 +322,7 @@ def _serve(settings: ProcessSettings, answer: Callable[[Mapping[str, Any]], None
                     }
                 else:
                     forget_peak()
-                    turn = measured.queued(asked["measure"], asked["seconds"], asked["rank"])
+                    turn = measured.queued(asked["measure"], asked["seconds"], asked["priority"])
                     trips_ms = [round(trip, 4) for trip in turn.trips_ms]
                     said = {
                         "actions_per_s": turn.actions_per_s,

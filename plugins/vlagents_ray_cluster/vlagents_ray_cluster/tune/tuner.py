@@ -474,8 +474,10 @@ class Tuner:
         return [np.array(action, np.float64) for action in self._answer(process)["actions"]]
 
     def _turn(self, process: LineProcess, number: int) -> dict[str, Any]:
-        rank = "robot" if self._plan.goal.kind == "robots" else "simulation"
-        process.send(json.dumps({"measure": number, "seconds": self._plan.seconds, "rank": rank}))
+        priority = "robot" if self._plan.goal.kind == "robots" else "simulation"
+        process.send(
+            json.dumps({"measure": number, "seconds": self._plan.seconds, "priority": priority})
+        )
         return self._answer(process)
 
     def _answer(self, process: LineProcess) -> dict[str, Any]:

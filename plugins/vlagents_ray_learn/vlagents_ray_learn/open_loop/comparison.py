@@ -53,7 +53,7 @@ def candidate(source: str) -> Iterator[OpenSession]:
         A function that opens sessions, which share the policy's batches.
     """
     if "://" in source:
-        yield partial(RemoteAgent, source, rank="simulation", codec="exact")
+        yield partial(RemoteAgent, source, priority="simulation", codec="exact")
         return
     application = policy_application(source)
     with LocalPolicy(

@@ -250,11 +250,11 @@ class Card {
 
   update(said, files, ring) {
     this.missed = 0;
-    if (said.rank && said.rank !== this.rank) {
-      this.rank = said.rank;
-      this.name.replaceChildren(this.name.firstChild, `, ${said.rank}, ${said.transport}`);
-      this.numbers.open = said.rank === "robot";
-      byId(said.rank === "robot" ? "sessions" : "simulations").append(this.root);
+    if (said.priority && said.priority !== this.priority) {
+      this.priority = said.priority;
+      this.name.replaceChildren(this.name.firstChild, `, ${said.priority}, ${said.transport}`);
+      this.numbers.open = said.priority === "robot";
+      byId(said.priority === "robot" ? "sessions" : "simulations").append(this.root);
     }
     this.instruction.textContent = said.instruction ? `“${said.instruction}”` : "No instruction";
     this.filter();
@@ -266,7 +266,7 @@ class Card {
       this.series.set(part, rows);
       this.plot(`state: ${part}`, rows);
     }
-    this.operated.hidden = !mayOperate || this.rank !== "robot";
+    this.operated.hidden = !mayOperate || this.priority !== "robot";
     this.save.hidden = !ring;
     this.save.textContent = `Save last ${ring} s`;
     this.commands(said.commands);

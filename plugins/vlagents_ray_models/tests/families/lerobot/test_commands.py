@@ -97,7 +97,7 @@ def ended(server: Server, tmp_path_factory: pytest.TempPathFactory) -> dict[str,
             "--eval.n_episodes=4",
             f"--output_dir={folder / 'evaluated'}",
             f"--policy.instruction={INSTRUCTION}",
-            "--policy.rank=simulation",
+            "--policy.priority=simulation",
         ],
     }
     # Its lerobot-record takes no policy; a process for each environment would import LeRobot again.
@@ -337,7 +337,7 @@ def test_a_robot_outside_of_the_training_is_found_before_the_first_motion(
         with pytest.raises(ContractMismatch, match=said):
             act()
         act(accept_misfit=True)
-        act(rank="simulation")
+        act(priority="simulation")
 
 
 def test_joints_in_another_order_than_that_of_the_policy_are_found_by_name() -> None:

@@ -202,9 +202,11 @@ def test_in_a_child_process_it_acts_with_pushed_weights(folder: Path) -> None:
     try:
         Publisher(served).push(pushed)
         answered(
-            served, "a", Request("reset", seen(0), WORDS[0], kwargs={"seed": 0}, rank="simulation")
+            served,
+            "a",
+            Request("reset", seen(0), WORDS[0], kwargs={"seed": 0}, priority="simulation"),
         )
-        act = answered(served, "a", Request("act", seen(0), rank="simulation")).act
+        act = answered(served, "a", Request("act", seen(0), priority="simulation")).act
     finally:
         served.close()
     before = begun(policy, 0).act(seen(0)).action
