@@ -29,6 +29,7 @@ from vlagents_ray.errors import (
     PolicyFailed,
     PolicyUnavailable,
     UnknownSession,
+    VLAgentsError,
 )
 from vlagents_ray.images.codecs import RAW, ImageCodec
 from vlagents_ray.interface import DEADLINE, Act, Agent, Obs, copied
@@ -151,6 +152,7 @@ def call_with_recovery(
     deadline = time.monotonic() + timeout_s
     last_attempt = deadline - min(_RESERVE_S, _RESERVE_SHARE * timeout_s)
     replies = connection.call(requests, timeout_s)
+    first_errors = [reply.error for reply in replies]
 
     lost: set[int] = set()  # indices of the sessions whose state no replica has
     pause_s = 0.0
@@ -192,15 +194,31 @@ def call_with_recovery(
             for i, reply in zip(to_send, new_replies, strict=True):
                 replies[i] = reply
 
-    for session, request, reply in zip(sessions, requests, replies, strict=True):
+    for session, request, reply, first_error in zip(
+        sessions, requests, replies, first_errors, strict=True
+    ):
         # The messages of these errors advise a reset, which is not needed here.
         if isinstance(reply.error, _LOST) and request.op == "act":
             reply.error = DeadlineExceeded(
                 f"the session did not begin again within {timeout_s:g} s; the next act does"
             )
+        reply.error = _with_cause(reply.error, first_error)
         if session.resumed and reply.act is not None:
             reply.act.info["resumed"], session.resumed = True, False
     return replies
+
+
+def _with_cause(
+    error: VLAgentsError | None, first_error: VLAgentsError | None
+) -> VLAgentsError | None:
+    """Return the last error of a call with the loss of the connection that came before it: an
+    address that does not answer any more is no cause.
+    """
+    if error is first_error or not isinstance(first_error, ConnectionLost):
+        return error
+    if not isinstance(error, PolicyUnavailable | DeadlineExceeded):
+        return error
+    return type(error)(f"{error}; before that: {first_error}")
 
 
 class RemoteAgent(Agent):

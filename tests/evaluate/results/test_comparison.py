@@ -96,8 +96,16 @@ def test_no_shared_episode_and_unknown_contenders_are_no_comparison(tmp_path: Pa
     )
     with pytest.raises(ConfigError, match="share no finished episode"):
         compare(results, "a", "b")
-    with pytest.raises(ConfigError, match=r"got \['best'\], want two of the contenders"):
+    with pytest.raises(
+        ConfigError, match=r"expected two of the policies \['a', 'b'\], got \['best'\]$"
+    ):
         compare(results, "best", "b")
+
+
+def test_a_misspelt_policy_is_answered_with_the_nearest_name(tmp_path: Path) -> None:
+    results = combined([folder(tmp_path / "a", "all_rows"), folder(tmp_path / "b", "four_rows")])
+    with pytest.raises(ConfigError, match=r"got \['allrows'\]; did you mean 'all_rows'\?"):
+        compare(results, "allrows", "four_rows")
 
 
 def test_folders_are_read_as_one(tmp_path: Path) -> None:

@@ -11,7 +11,7 @@ import time
 from collections.abc import Sequence
 from typing import Any, Literal, Protocol, get_args
 
-from vlagents_ray.errors import InvalidInput
+from vlagents_ray.errors import ConnectionLost, DeadlineExceeded, InvalidInput
 from vlagents_ray.images.codecs import JPEG, LOSSLESS, RAW, ImageCodec
 from vlagents_ray.interface import Obs
 from vlagents_ray.protocol.messages import Reply, Request
@@ -26,6 +26,24 @@ _ANSWER_S = 2.0  # s, time limit for the first byte of the first replica
 _SILENT_S = 2.0  # s after which an unfinished attempt to connect is reported
 SPIN_S = 150e-6  # s to poll for an answer before sleeping
 FAST_S = 600e-6  # s; after an answer within this time, wake-up included, the next one is polled for
+
+
+def no_answer(address: str, timeout_s: float) -> DeadlineExceeded:
+    """Return the error of a request without an answer, with its likely causes."""
+    return DeadlineExceeded(
+        f"{address}: no answer within {timeout_s:g} s; the policy may need longer (raise "
+        "timeout_s) or hang in a call (the server's log then names the line)"
+    )
+
+
+def connection_lost(address: str, reason: object) -> ConnectionLost:
+    """Return the error of a connection that ended after a request was sent, with its likely
+    causes.
+    """
+    return ConnectionLost(
+        f"{address}: {reason}; if the server was not restarted, the policy may have ended its "
+        "process (os._exit, a crash in C code, exhausted memory): see the server's log"
+    )
 
 
 class Transport(Protocol):

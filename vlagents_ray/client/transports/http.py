@@ -21,7 +21,13 @@ from vlagents_ray.client.credentials import (
     tls_failure,
 )
 from vlagents_ray.client.http_deadline import DeadlineSocket
-from vlagents_ray.client.transports.base import CodecChoice, ConnectReport, first_timeout_s
+from vlagents_ray.client.transports.base import (
+    CodecChoice,
+    ConnectReport,
+    connection_lost,
+    first_timeout_s,
+    no_answer,
+)
 from vlagents_ray.errors import (
     ConfigError,
     ConnectionLost,
@@ -183,18 +189,15 @@ class HttpTransport:
             return answer.status, answer.headers.get("content-type", ""), content
         except TimeoutError as error:
             self.close()
-            raise DeadlineExceeded(
-                f"{self._url.geturl()}: no answer within {timeout_s:g} s"
-            ) from error
+            raise no_answer(self._url.geturl(), timeout_s) from error
         except ssl.SSLError as error:
             # With TLS 1.3, the server checks the client's certificate only now.
             self.close()
             raise tls_failure(self._url.geturl(), error) from error
         except (OSError, http.client.HTTPException) as error:
             self.close()
-            raise ConnectionLost(
-                f"{self._url.geturl()}: {type(error).__name__}: {error}"
-            ) from error
+            reason = f"{type(error).__name__}: {error}"
+            raise connection_lost(self._url.geturl(), reason) from error
 
     def _open(self, timeout_s: float) -> tuple[http.client.HTTPConnection, DeadlineSocket]:
         if self._connection is not None and _closed_by_peer(self._connection[0].sock):

@@ -14,7 +14,12 @@ import uuid
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any, ClassVar, Protocol
 
-from vlagents_ray.client.transports.base import ConnectReport, first_timeout_s
+from vlagents_ray.client.transports.base import (
+    ConnectReport,
+    connection_lost,
+    first_timeout_s,
+    no_answer,
+)
 from vlagents_ray.client.transports.shm import UnixTransport
 from vlagents_ray.errors import (
     ConfigError,
@@ -156,9 +161,7 @@ class HandleTransport:
             return decode_replies(ray.get(pending, timeout=timeout_s))
         except ray.exceptions.GetTimeoutError as error:
             ray.cancel(pending)
-            raise DeadlineExceeded(
-                f"serve://{self._app}: no answer within {timeout_s:g} s"
-            ) from error
+            raise no_answer(f"serve://{self._app}", timeout_s) from error
         except ray.exceptions.RayTaskError as error:
             # It is unknown whether the replica executed the request.
             raise ConnectionLost(
@@ -195,8 +198,8 @@ class HandleTransport:
         self._replica = None
 
     def _lost(self, error: Exception) -> ConnectionLost:
-        return ConnectionLost(
-            f"serve://{self._app}: the replica is gone ({type(error).__name__}); reset again"
+        return connection_lost(
+            f"serve://{self._app}", f"the replica is gone ({type(error).__name__}); reset again"
         )
 
 

@@ -21,8 +21,15 @@ from typing import ClassVar
 import numpy as np
 
 from vlagents_ray.client.credentials import ANONYMOUS, Credentials
-from vlagents_ray.client.transports.base import FAST_S, SPIN_S, await_answer, wait
-from vlagents_ray.errors import ConnectionLost, DeadlineExceeded, PolicyUnavailable
+from vlagents_ray.client.transports.base import (
+    FAST_S,
+    SPIN_S,
+    await_answer,
+    connection_lost,
+    no_answer,
+    wait,
+)
+from vlagents_ray.errors import PolicyUnavailable
 from vlagents_ray.images.codecs import RAW
 from vlagents_ray.protocol import shm_layout
 from vlagents_ray.protocol.frames import decode_replies, request_parts
@@ -80,10 +87,10 @@ class UnixTransport(ABC):
             self._send(connection, requests, deadline)
             return self._await(connection, requests, deadline)
         except TimeoutError as error:
-            raise DeadlineExceeded(f"{self.name}: no answer within {timeout_s:g} s") from error
+            raise no_answer(self.name, timeout_s) from error
         except OSError as error:
             self.close()
-            raise ConnectionLost(f"{self.name}: {error}; reset before the next act") from error
+            raise connection_lost(self.name, f"{error}; reset before the next act") from error
 
     def close(self) -> None:
         """End the connection, and with it its sessions."""

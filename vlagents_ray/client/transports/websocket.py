@@ -37,14 +37,14 @@ from vlagents_ray.client.transports.base import (
     SPIN_S,
     CodecChoice,
     await_answer,
+    connection_lost,
     first_timeout_s,
     left_s,
+    no_answer,
     wait,
 )
 from vlagents_ray.client.transports.http import HttpTransport, http_url, no_replica, refusal
 from vlagents_ray.errors import (
-    ConnectionLost,
-    DeadlineExceeded,
     MessageTooLarge,
     PolicyUnavailable,
     UnknownApp,
@@ -349,10 +349,10 @@ class WebSocketTransport:
                 if replies[0].answers(requests[0]):
                     return replies
         except TimeoutError as error:
-            raise DeadlineExceeded(f"{self._url}: no answer within {timeout_s:g} s") from error
+            raise no_answer(self._url, timeout_s) from error
         except (ConnectionClosed, OSError) as error:
             self.close()
-            raise ConnectionLost(f"{self._url}: {error}; reset before the next act") from error
+            raise connection_lost(self._url, f"{error}; reset before the next act") from error
 
     def close(self) -> None:
         """Close the connection, and with it its sessions."""

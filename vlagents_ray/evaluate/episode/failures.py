@@ -29,16 +29,10 @@ Cause = Literal["user", "policy", "worker", "operator"]
 # Ends of messages about the policy's server: the likely causes, and how to find the line of a
 # policy.
 _CURES: dict[type[errors.VLAgentsError], str] = {
-    errors.ConnectionLost: (
-        "; if its server was not restarted, the policy ended its own process (os._exit, a crash in "
-        "C code, or "
-        "exhausted memory): see the log of the server, or find the line in this process with "
-        "--workers 0"
-    ),
+    errors.ConnectionLost: ("; or find the line that ends it in this process with --workers 0"),
     errors.DeadlineExceeded: (
-        "; the policy may hang or be too slow: raise policy_timeout_s, or see where it hangs in "
-        "this process with "
-        "--workers 0"
+        "; in an evaluation, timeout_s is policy_timeout_s; or see where it hangs in this process "
+        "with --workers 0"
     ),
 }
 _USER = (

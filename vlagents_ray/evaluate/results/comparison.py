@@ -19,6 +19,7 @@ from vlagents_ray.evaluate.results.changes import (
 )
 from vlagents_ray.evaluate.results.reader import CaseResults, Results, by_timing, synchronous_twin
 from vlagents_ray.evaluate.results.statistics import Pairs, difference_interval, holm
+from vlagents_ray.naming import did_you_mean
 
 # The policy's settings among a case's, in which compared cases may differ. All others are the
 # env's.
@@ -220,7 +221,8 @@ def _shared(
     """Return the pairs of outcomes by suite and env, and the accepted changes between the two."""
     if unknown := sorted({a, b} - set(results.contenders)):
         raise ConfigError(
-            f"compare: got {unknown}, want two of the contenders {results.contenders}"
+            f"compare: expected two of the policies {results.contenders}, got {unknown}"
+            + did_you_mean(unknown[0], results.contenders)
         )
     others = {(case.suite, case.env): case for case in results.of(b)}
     found: dict[str, Strata] = {}

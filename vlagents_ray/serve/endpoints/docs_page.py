@@ -43,7 +43,9 @@ _PATHS = f"""\
 `POST /v1/reset`, `POST /v1/act`
     `multipart/form-data`: a JSON part `obs` (instruction, gripper, state, info; for reset also kwargs, contract) and a
     JPEG or PNG file `cameras.<name>` for each camera; or `application/json` without cameras; or one frame,
-    `{CONTENT_TYPE}`. The answer is JSON, or a frame if `Accept` asks for it.
+    `{CONTENT_TYPE}`. The answer is JSON, or a frame if `Accept` asks for it. Images are upright RGB. A server cannot
+    detect swapped colours: convert OpenCV's BGR with `image[..., ::-1]` before it is sent as an array (`cv2.imencode`
+    takes BGR as it is), and let `vlagents-ray robot check` compare the colours of a card.
 `POST /v1/close`
     Ends the session.
 `WS /v1/stream`

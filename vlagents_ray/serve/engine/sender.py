@@ -324,7 +324,10 @@ class Sender:
             after = f"no action within {pending.request.deadline_ms:g} ms"
             late: VLAgentsError = DeadlineExceeded(f"{after}: not acted on, and never will be")
             if pending.begun:
-                late = OutcomeUnknown(f"{after}, but the policy is at work on it")
+                late = OutcomeUnknown(
+                    f"{after}, but the policy is at work on it; it may need longer (allow more "
+                    "time) or hang in a call (the server's log then names the line)"
+                )
             # Ignored if the request has been answered.
             pending.done(Reply(pending.request.request_id, error=late))
 
