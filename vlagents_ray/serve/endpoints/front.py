@@ -21,11 +21,16 @@ from vlagents_ray.errors import MalformedMessage, shown
 from vlagents_ray.protocol.messages import STREAM_BYTES
 from vlagents_ray.serve.endpoints.http_messages import problem_response
 from vlagents_ray.serve.endpoints.incoming_frames import SCOPE_KEY, IncomingFrames
+from vlagents_ray.serve.token_bucket import TokenBucket
 
 _MESSAGE_TOO_BIG = 1009  # WebSocket close code
 # Maximum number of bytes that are discarded after a message that was too large.
 _DRAINED_BYTES = 8 * STREAM_BYTES
 _DRAINED_S = 5.0  # maximum time of discarding
+# Maximum rate of discarding, of all connections together: above it, a client waits. At full speed,
+# 32 connections take a quarter of a core.
+_DRAINED_BYTES_PER_S = 64 * 2**20
+_READ_BYTES = 2**18
 
 
 def middlewares() -> list[Middleware]:
@@ -43,6 +48,7 @@ class FrontMiddleware:
     def __init__(self, app: ASGIApp) -> None:
         self._app = app
         self._draining: set[asyncio.Task[None]] = set()
+        self._discarder = _Discarder()
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Serve one connection as specified by ASGI."""
@@ -90,20 +96,34 @@ class FrontMiddleware:
         if connection is None or connection.fileno() < 0:
             return
         duplicate = socket.socket(fileno=os.dup(connection.fileno()))
-        task = asyncio.get_running_loop().create_task(_discard(duplicate))
+        task = asyncio.get_running_loop().create_task(self._discarder.discard(duplicate))
         self._draining.add(task)  # the loop holds only weak references to tasks
         task.add_done_callback(self._draining.discard)
 
 
-async def _discard(connection: socket.socket) -> None:
-    loop, end, left = asyncio.get_running_loop(), time.monotonic() + _DRAINED_S, _DRAINED_BYTES
-    connection.setblocking(False)
-    buffer = bytearray(2**18)
-    await asyncio.sleep(0)  # by then uvicorn has stopped reading, and has sent the close code
-    with connection, contextlib.suppress(OSError, asyncio.TimeoutError):
-        connection.shutdown(socket.SHUT_WR)
-        while left > 0 and (wait_s := end - time.monotonic()) > 0:
-            count = await asyncio.wait_for(loop.sock_recv_into(connection, buffer), wait_s)
-            if not count:
-                return
-            left -= count
+class _Discarder:
+    """Discards the incoming bytes of connections, which share one rate."""
+
+    def __init__(self) -> None:
+        self._rate = TokenBucket(_DRAINED_BYTES_PER_S, time.monotonic(), capacity=_READ_BYTES)
+        self._turn = asyncio.Lock()  # a connection at a time waits for the rate, in order
+
+    async def discard(self, connection: socket.socket) -> None:
+        """Discard until the client has closed the connection, or a limit is reached; close it."""
+        loop, end, left = asyncio.get_running_loop(), time.monotonic() + _DRAINED_S, _DRAINED_BYTES
+        connection.setblocking(False)
+        buffer = bytearray(_READ_BYTES)
+        await asyncio.sleep(0)  # by then uvicorn has stopped reading, and has sent the close code
+        with connection, contextlib.suppress(OSError, asyncio.TimeoutError):
+            connection.shutdown(socket.SHUT_WR)
+            while left > 0 and (wait_s := end - time.monotonic()) > 0:
+                count = await asyncio.wait_for(loop.sock_recv_into(connection, buffer), wait_s)
+                if not count:
+                    return
+                left -= count
+                await self._wait_for_rate(count)
+
+    async def _wait_for_rate(self, count: int) -> None:
+        async with self._turn:
+            while (wait_s := self._rate.take(time.monotonic(), count)) > 0:
+                await asyncio.sleep(wait_s)
