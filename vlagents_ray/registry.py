@@ -77,6 +77,7 @@ POLICIES: dict[str, RegistryEntry] = {
     "reference": RegistryEntry(
         "vlagents_ray.policies.reference:Reference",
         "the reference policy: 4 million parameters, two cameras and words; trained on two cores",
+        needs=("torch",),
         wants="torch",
         weights=True,
     ),
@@ -245,6 +246,11 @@ def _install(package: str, extra: str | None = None, distribution: str = CORE) -
             f"run `vlagents-ray env make {'NAME' if several else environments[0]}` and name the "
             f"environment in the deployment's `environment`{family}"
         )
+    return install_alone(package)
+
+
+def install_alone(package: str) -> str:
+    """Return how to install a package for a policy that has neither an extra nor requirements."""
     return _ELSEWHERE.get(package, f"install the package that provides {package!r}")
 
 

@@ -156,6 +156,25 @@ def test_of_one_policy_all_is_said(shown: io.StringIO, monkeypatch: pytest.Monke
     assert "'opnpi' is not registered; did you mean 'openpi'" in shown.getvalue()
 
 
+def test_a_policy_is_described_as_its_entry_describes_it() -> None:
+    described = {row.name: row.what for row in listing.policies_and_wrappers()}
+    for name, entry in (entries("policies") | entries("wrappers")).items():
+        if entry.about:
+            assert described[name] == entry.about
+
+
+def test_the_reference_policy_is_not_ready_without_torch(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(
+        listing.importlib.util, "find_spec", lambda name: None if name == "torch" else object()
+    )
+    [reference] = [row for row in listing.policies_and_wrappers() if row.name == "reference"]
+    cure = "run `pip install torch` in the policy's environment"
+    assert reference.missing == f"not in this environment (torch): {cure}"
+    assert f"reference: {reference.missing}" in list(listing.installing([reference]))
+
+
 def test_an_environment_that_has_a_family_is_ready_for_it(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(
         listing.importlib.util, "find_spec", lambda name: None if name == "openpi" else object()

@@ -337,7 +337,7 @@ COMMANDS: dict[str, tuple[list[str], list[str]]] = {
     ),
     "replay: nothing there": (["replay", "nowhere"], ["nowhere", "results.db"]),
     "replay: no episode": (["replay", "done"], ["got no episode, want a key as ['tabletop#0@0:"]),
-    "replay: a dataset": (["replay", "dataset"], ["dataset", "results.db"]),
+    "replay: a dataset": (["replay", "dataset"], ["dataset", "vlagents-ray open-loop dataset"]),
     "open-loop: nothing there": (
         ["open-loop", "nowhere", "--policy", "noop"],
         ["nowhere", "LeRobotDataset"],

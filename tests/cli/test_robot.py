@@ -305,7 +305,8 @@ class Stopped(command.Watchdog):
         self.trip("a person is in the way")
 
 import vlagents_ray.robot.loop as loop
-command.RemoteAgent, loop.Watchdog, teleoperation.Keyboard = Still, Stopped, Seen
+command.RemoteAgent, loop.Watchdog = Still, Stopped
+teleoperation.open_keyboard = Seen.open_leader
 sys.exit(command.main(sys.argv[1:]))
 """
     options = ["http://gpu-box:8000", "--leader", "keyboard", "--step", "0.01"]

@@ -19,6 +19,7 @@ from vlagents_ray.errors import MissingDependency, VLAgentsError
 from vlagents_ray.registry import (
     env_class,
     find_entry,
+    install_alone,
     names,
     not_installed,
     pip_install,
@@ -66,10 +67,19 @@ def policies_and_wrappers() -> Iterator[Listed]:
             except VLAgentsError as error:
                 yield Listed(kind, name, "cannot be loaded", str(error), [])
                 continue
-            module = sys.modules[target_of(registered, name).partition(":")[0]]
-            what = summary_of(module)
-            yield Listed(kind, name, what, missing_packages(name), list(settings_of(cls)))
+            missing = missing_packages(name) if kind == "policy" else None
+            yield Listed(kind, name, _what(registered, name), missing, list(settings_of(cls)))
         yield from _in_other_plugins(kind, registered)
+
+
+def _what(registered: str, name: str) -> str:
+    """Return the description of a registered policy or wrapper, or its module's first sentence if
+    its entry has none.
+    """
+    entry = find_entry(registered, name)
+    if entry is not None and entry.about:
+        return entry.about
+    return summary_of(sys.modules[target_of(registered, name).partition(":")[0]])
 
 
 def environments() -> Iterator[Listed]:
@@ -107,13 +117,14 @@ def installing(listed: Sequence[Listed]) -> Iterator[str]:
         modules, sources, requirements = (
             _lacking(one.name) if one.kind != "environment" else ([], [], "")
         )
-        if modules or sources:
+        by_environment = bool(requirements) and bool(modules or sources)
+        if by_environment:
             wanted.setdefault(f"vlagents-ray env make {requirements}  # {{}}", []).append(one.name)
         if sources:
             wanted.setdefault(f"export {sources[0]}=FOLDER  # a checkout, for {{}}", []).append(
                 one.name
             )
-        if one.missing is not None and not (modules or sources):
+        if one.missing is not None and not by_environment:
             wanted.setdefault(
                 f"{{}}: {one.missing.replace('{', '{{').replace('}', '}}')}", []
             ).append(one.name)
@@ -147,6 +158,9 @@ def missing_packages(name: str, *, checkout: bool = True) -> str | None:
     modules, sources, requirements = _lacking(name)
     if not modules and not (sources and checkout):
         return None
+    if not requirements:
+        cure = "; ".join(install_alone(module) for module in modules)
+        return f"not in this environment ({', '.join(modules)}): {cure}"
     cures = [
         (
             f"`vlagents-ray env make {requirements}`, and that Python in `environment` of its "
@@ -161,17 +175,19 @@ def missing_packages(name: str, *, checkout: bool = True) -> str | None:
 
 def _lacking(name: str) -> tuple[list[str], list[str], str]:
     """Return the modules and checkout variables that a family lacks, and the name of its
-    requirements.
+    requirements, "" if it has none. A family that an extra installs is not looked at.
     """
     entry = find_entry("policies", name)
-    if entry is None or not entry.requirements:
+    if entry is None or entry.extra:
         return [], [], ""
     has_checkout = any(os.environ.get(variable) for variable in entry.checkouts)
     lacking = [
         module for module in entry.needs[has_checkout:] if importlib.util.find_spec(module) is None
     ]
     no_source = bool(entry.checkouts) and not has_checkout and entry.needs[0] in lacking
-    return lacking[no_source:], list(entry.checkouts) if no_source else [], entry.requirements[0]
+    sources = list(entry.checkouts) if no_source else []
+    requirements = entry.requirements[0] if entry.requirements else ""
+    return lacking[no_source:], sources, requirements
 
 
 def settings_of(cls: type) -> Iterator[str]:

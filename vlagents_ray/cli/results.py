@@ -134,6 +134,15 @@ def settings_of_export(
     return {field: getattr(read, field) for field in read.model_fields_set}
 
 
+def _require_no_dataset(folder: Path) -> None:
+    """Raise `ConfigError` if a folder holds LeRobotDatasets, which `open-loop` reads."""
+    if any(folder.glob("meta/info.json")) or any(folder.glob("*/meta/info.json")):
+        raise ConfigError(
+            f"{folder}: expected results of an evaluation, got a LeRobotDataset; run "
+            f"`vlagents-ray open-loop {folder} --policy NAME` to compare a policy with it"
+        )
+
+
 def replay_command(
     folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="Folder of results.")],
     episode: Annotated[
@@ -153,6 +162,7 @@ def replay_command(
         from vlagents_ray.evaluate import Results
         from vlagents_ray.evaluate.replay import actions_difference, compare, find
 
+        _require_no_dataset(folder)
         recorded = find(Results.load(folder), episode)
         other: dict[str, Any] | None = (
             None

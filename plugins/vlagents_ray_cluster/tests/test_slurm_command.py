@@ -107,6 +107,15 @@ def test_what_would_end_the_job_as_soon_as_it_began_is_refused_before(
     assert text in done.stderr
 
 
+def test_a_tracker_that_is_not_registered_is_refused_before_the_job_is_submitted(
+    tmp_path: Path,
+) -> None:
+    done = slurm(*EVAL, "--out", str(tmp_path / "out"), "--track", "wandbb")
+    assert done.exit_code == 2
+    assert "'wandbb' is not registered" in done.output
+    assert "'wandb'" in done.output
+
+
 def test_a_server_has_a_key_made_for_it_unless_it_has_some() -> None:
     made = arguments(*SERVE, "--set", "action_dim=3", "--time=60")
     assert made == ["serve", "--app=noop=/", "--key", "--", "noop", "--set", "action_dim=3"]

@@ -28,6 +28,7 @@ from vlagents_ray.policies.random import Random
 from vlagents_ray.robot.record import Recorder
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.local_agent import LocalAgent
+from vlagents_ray_learn.open_loop import comparison
 from vlagents_ray_learn.open_loop.command import parse_episodes
 from vlagents_ray_learn.open_loop.comparison import (
     OpenLoopPlan,
@@ -292,6 +293,21 @@ def test_wrong_options_are_told(words: list[str], said: str, tmp_path: Path) -> 
     done = CliRunner().invoke(app, ["open-loop", *given, "--out", str(tmp_path / "out")])
     assert done.exit_code == 2
     assert said in done.output
+
+
+@pytest.mark.parametrize("out", ["file", "file/below"])
+def test_a_file_in_place_of_the_folder_of_errors_is_refused_before_the_policy_is_loaded(
+    out: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    demonstrate(tmp_path / "data", 2)
+    (tmp_path / "file").write_text("kept")
+    loaded: list[str] = []
+    monkeypatch.setattr(comparison, "candidate", loaded.append)
+    options = ["--policy", "noop", "--out", str(tmp_path / out)]
+    done = CliRunner().invoke(app, ["open-loop", str(tmp_path / "data"), *options])
+    assert done.exit_code == 2
+    assert "expected a folder" in done.output
+    assert loaded == []
 
 
 def test_numbers_and_ranges() -> None:

@@ -11,7 +11,7 @@ LIVE = RegistryEntry(
 )
 
 EVALUATION_PAGE = RegistryEntry(
-    "vlagents_ray_live.evaluation_page:LiveEvaluationPage",
+    "vlagents_ray_live.live_evaluation_page:LiveEvaluationPage",
     "Shows an evaluation while it runs: `eval --live`, `report --live`.",
 )
 

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from vlagents_ray.contract import ActionSpec, CameraSpec, Contract, StateSpec
-from vlagents_ray.errors import ConfigError, InvalidAction
+from vlagents_ray.errors import ConfigError, InvalidAction, MissingDependency
 from vlagents_ray.interface import CAPTURED, Obs
 from vlagents_ray.naming import did_you_mean
 from vlagents_ray.registry import require
@@ -71,7 +71,14 @@ class LeRobotRobot:
     _goal: np.ndarray | None = None  # the last action, (D,)
 
     def __init__(self, kind: str, *, unit: str = "", **settings: Any) -> None:
-        package = require("lerobot.robots")
+        try:
+            package = require("lerobot.robots")
+        except MissingDependency as error:
+            raise MissingDependency(
+                f"lerobot:{kind}: LeRobot is not installed in this Python; run `pip install "
+                "lerobot`, or run `vlagents-ray env make lerobot` and then this command as "
+                "`.venv-lerobot/bin/vlagents-ray ...`"
+            ) from error
         for folder in (package, require("lerobot.cameras")):
             for module in pkgutil.iter_modules(folder.__path__):
                 with contextlib.suppress(ImportError):  # of a robot whose driver is not installed

@@ -18,7 +18,7 @@ from vlagents_ray.registry import require
 from vlagents_ray.robot.terminal import Terminal
 from vlagents_ray_robot import DISTRIBUTION
 
-__all__ = ["AxesDevice", "AxesLeader", "Keyboard", "SpaceMouse", "open_keyboard", "open_spacemouse"]
+__all__ = ["AxesDevice", "AxesLeader", "Keyboard", "SpaceMouse"]
 
 _FULLY_OPEN = 0.9  # below this opening, a gripper may hold something
 
@@ -47,6 +47,36 @@ class AxesDevice(ABC):
         joints.
         """
         return ""
+
+    def __enter__(self) -> AxesDevice:
+        return self
+
+    def __exit__(self, *exc: object) -> None:  # noqa: B027 - not every device is to be closed
+        """Close the device."""
+
+    @classmethod
+    @contextlib.contextmanager
+    def open_leader(
+        cls,
+        contract: Contract | None,
+        *,
+        step: float | None = None,
+        measure: Callable[[Obs], np.ndarray] | None = None,
+    ) -> Iterator[Leader]:
+        """Open the device as a leader.
+
+        Args:
+            contract: The contract of the policy or the environment.
+            step: The change of a number of the action at a tick with an axis at its end; None: by
+                the contract.
+            measure: Returns the robot's measured pose, (D,), in an observation; None: the state's
+                part `joints`.
+
+        Yields:
+            The leader, an `AxesLeader`.
+        """
+        with cls() as device:
+            yield AxesLeader(contract, device, step=step, measure=measure)
 
 
 class AxesLeader:
@@ -285,9 +315,6 @@ class SpaceMouse(AxesDevice):
         self._axes = np.zeros(6, np.float32)
         self._buttons: list[int] = []
 
-    def __enter__(self) -> SpaceMouse:
-        return self
-
     def __exit__(self, *exc: object) -> None:
         self._device.close()
 
@@ -317,47 +344,6 @@ class SpaceMouse(AxesDevice):
 # The devices by name, `--leader keyboard`; see `vlagents_ray.robot.leaders.OpenLeader`.
 
 
-@contextlib.contextmanager
-def open_keyboard(
-    contract: Contract | None,
-    *,
-    step: float | None = None,
-    measure: Callable[[Obs], np.ndarray] | None = None,
-) -> Iterator[Leader]:
-    """Open the keys of the terminal as a leader.
-
-    Args:
-        contract: The contract of the policy or the environment.
-        step: The change of a number of the action at a tick with an axis at its end; None: by the
-            contract.
-        measure: Returns the robot's measured pose, (D,), in an observation; None: the state's part
-            `joints`.
-
-    Yields:
-        The leader, an `AxesLeader`.
-    """
-    with Keyboard() as device:
-        yield AxesLeader(contract, device, step=step, measure=measure)
-
-
-@contextlib.contextmanager
-def open_spacemouse(
-    contract: Contract | None,
-    *,
-    step: float | None = None,
-    measure: Callable[[Obs], np.ndarray] | None = None,
-) -> Iterator[Leader]:
-    """Open a SpaceMouse as a leader.
-
-    Args:
-        contract: The contract of the policy or the environment.
-        step: The change of a number of the action at a tick with an axis at its end; None: by the
-            contract.
-        measure: Returns the robot's measured pose, (D,), in an observation; None: the state's part
-            `joints`.
-
-    Yields:
-        The leader, an `AxesLeader`.
-    """
-    with SpaceMouse() as device:
-        yield AxesLeader(contract, device, step=step, measure=measure)
+# The leaders "keyboard" and "spacemouse".
+open_keyboard = Keyboard.open_leader
+open_spacemouse = SpaceMouse.open_leader

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
+import io
 import json
 import logging
 import os
@@ -487,6 +488,18 @@ def test_a_replica_writes_the_audit_log_where_nobody_has_set_up_logging(
     audit.write_audit()
     Keys.from_file(_one_key(file)).audit.did("arm", "let in by", "http")
     assert capsys.readouterr().err.count("vlagents_ray.serve.audit: key arm: let in by http") == 1
+
+
+def test_the_audit_log_goes_on_where_stderr_was_replaced_and_closed(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(audit.logger, "propagate", False)
+    monkeypatch.setattr(audit.logger, "handlers", [])
+    monkeypatch.setattr(audit.logger, "level", logging.NOTSET)
+    with io.StringIO() as replaced, contextlib.redirect_stderr(replaced):
+        audit.write_audit()
+    audit.log_pressed("lab", "'pause'")
+    assert capsys.readouterr().err.endswith("key lab: pressed 'pause'\n")
 
 
 def _one_key(file: Path) -> Path:

@@ -124,6 +124,13 @@ def require_folder_of(file: Path) -> None:
         )
 
 
+def require_folder(folder: Path) -> None:
+    """Raise `ConfigError` if this is a file or lies below one, so that no folder can be made."""
+    blocking = next((path for path in (folder, *folder.parents) if path.exists()), None)
+    if blocking is not None and not blocking.is_dir():
+        raise ConfigError(f"{folder}: expected a folder, got the file {blocking}; choose another")
+
+
 @contextmanager
 def whole(path: Path) -> Iterator[Path]:
     """Yield a path for writing, which is renamed to `path` when the file is complete; make missing

@@ -15,6 +15,7 @@ from vlagents_ray.cli.evaluate import EvalOptions, config_from_options, evaluate
 from vlagents_ray.cli.options import finite
 from vlagents_ray.cli.serve import serve_command
 from vlagents_ray.errors import ConfigError
+from vlagents_ray.registry import registered_class
 from vlagents_ray_cluster.slurm.submission import Script, first_index, split, submit
 
 if TYPE_CHECKING:
@@ -74,6 +75,8 @@ def eval_(
             _evaluation([word.replace(_TASK, one) for word in words])
             for one in (index, f"{index}0")
         )
+        for tracker in config.track:
+            registered_class("trackers", tracker)  # raises an error for an unknown name
         if "array" in options and config.out == other.out:
             raise ConfigError(
                 f"--array: its tasks write to one folder; want {_TASK} in it, as in --out "

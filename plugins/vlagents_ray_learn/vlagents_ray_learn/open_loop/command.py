@@ -48,6 +48,7 @@ def open_loop_command(
     horizon are printed, and written as JSON.
     """
     with errors():
+        from vlagents_ray.evaluate.artifacts.storage import require_folder
         from vlagents_ray_learn.open_loop.comparison import (
             OpenLoopPlan,
             candidate,
@@ -64,6 +65,7 @@ def open_loop_command(
         plan = OpenLoopPlan(episodes, horizon, every, at_once, names)
         datasets = open_datasets(folder)
         into = out_dir or fresh(Path("runs/open_loop"))
+        require_folder(into)
         with candidate(policy) as open_session:
             result = compare(datasets, open_session, plan)
 
