@@ -4,6 +4,8 @@ installed.
 
 from __future__ import annotations
 
+import json
+import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -77,7 +79,7 @@ def test_a_plugins_entry_carries_what_a_built_in_one_does(install: Install) -> N
     assert "mine" in names("policies")
     assert "lab-policies" in plugin_distributions()
     [listed] = [row for row in policies_and_wrappers() if row.name == "mine"]
-    assert (listed.kind, listed.what, listed.missing) == ("policy", "A policy of a plug-in.", None)
+    assert (listed.kind, listed.what, listed.missing) == ("policy", "models of the lab", None)
 
 
 def test_a_built_in_name_is_not_replaced(install: Install) -> None:
@@ -343,3 +345,41 @@ def test_a_robot_a_leader_and_a_subcommand_that_are_not_installed_name_their_dis
     )
     monkeypatch.setattr(doctor, "published", lambda: published)
     assert doctor.plugins().detail.endswith("; not installed: vlagents-ray-cranes")
+
+
+# Prints the exit status and the output of each command that the plug-ins of this repository have,
+# where none of them is installed.
+WITHOUT_PLUGINS = """
+import contextlib, importlib.metadata, io, json
+
+importlib.metadata.entry_points = lambda **_: ()
+
+from typer.testing import CliRunner
+from vlagents_ray.cli.main import app
+from vlagents_ray.registry import published
+
+ended = {}
+for command in published()["commands"]:
+    with contextlib.redirect_stderr(io.StringIO()) as stderr:
+        done = CliRunner().invoke(app, [*command.split("."), "runs/x", "--out", "y"])
+    ended[command] = done.exit_code, done.output + stderr.getvalue()
+print(json.dumps(ended))
+"""
+
+
+def test_each_command_of_a_plugin_that_is_not_installed_names_its_distribution() -> None:
+    done = subprocess.run(
+        [sys.executable, "-c", WITHOUT_PLUGINS],
+        cwd=Path(registry.__file__).parents[1],
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    ended = json.loads(done.stdout.splitlines()[-1])
+    assert ended.keys() == registry.published()["commands"].keys()
+    for command, distribution in registry.published()["commands"].items():
+        status, output = ended[command]
+        assert status == 2
+        words = " ".join(output.split())
+        assert f"command {command.replace('.', ' ')!r} is in {distribution}" in words
+        assert f"pip install {distribution}" in words
