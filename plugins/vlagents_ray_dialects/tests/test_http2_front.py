@@ -45,6 +45,13 @@ def test_small_frames_are_counted_wherever_the_bytes_are_split(
     assert counted == sum(size < 4096 for size in sizes)
 
 
+def test_a_cancellation_counts_as_eight_small_frames_of_any_size() -> None:
+    cancellation = b"\0\0\x04\x03\0\0\0\0\x01" + b"\0\0\0\x08"
+    assert FrameCounter().count(cancellation * 3 + SETTINGS) == 3 * 8 + 1
+    long_cancellation = (5000).to_bytes(3, "big") + cancellation[3:9] + bytes(5000)
+    assert FrameCounter().count(long_cancellation) == 8
+
+
 @given(st.lists(st.binary(max_size=100), max_size=20))
 def test_any_bytes_are_counted_as_when_they_arrive_at_once(parts: list[bytes]) -> None:
     counter = FrameCounter()

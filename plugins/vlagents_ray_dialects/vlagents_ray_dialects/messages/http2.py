@@ -10,10 +10,16 @@ _SIZE_BYTES = 3  # of the payload, at the begin of a head
 # The cost of a frame with a larger payload is that of its bytes. Clients send messages in frames of
 # 16 KiB.
 _SMALL_BYTES = 4096
+_TYPE = 3  # index of the type of a frame in its head
+_CANCELLATION = 3  # RST_STREAM, the type of a frame that cancels a request
+# A robot cancels a request only after a time-out. For 30 bytes, a stranger who begins a request and
+# cancels it makes gRPC's server begin and end a call.
+_FRAMES_OF_A_CANCELLATION = 8
 
 
 class FrameCounter:
-    """Counts the small frames in the bytes that a client sends after its preface.
+    """Counts the small frames in the bytes that a client sends after its preface; a cancellation
+    counts as `_FRAMES_OF_A_CANCELLATION`.
 
     Control frames (PING, SETTINGS, WINDOW_UPDATE), begun and cancelled requests, and messages in
     tiny parts are all small frames: they cost their sender a few bytes each, and gRPC's library up
@@ -40,7 +46,10 @@ class FrameCounter:
             start = end
             if len(self._head) == _HEAD_BYTES:
                 self._payload_left = int.from_bytes(self._head[:_SIZE_BYTES], "big")
+                is_cancellation = self._head[_TYPE] == _CANCELLATION
                 self._head = b""
-                if self._payload_left < _SMALL_BYTES:
+                if is_cancellation:
+                    small_frames += _FRAMES_OF_A_CANCELLATION
+                elif self._payload_left < _SMALL_BYTES:
                     small_frames += 1
         return small_frames
