@@ -2,9 +2,9 @@
 
 The default policy takes 20 ms for a batch and 1 ms for each observation in it, without using the
 CPU: with 16 in a batch, 444 actions a second are the ideal. Any other policy is measured bare in
-    the same run. All transports take turns.
-A robot among simulations, which acts at random moments, is also measured. So are other policy
-servers, which compute the same policy, also in batches of at most 16 if they can.
+the same run. All transports take turns. A robot among simulations, which acts at random moments, is
+also measured. So are other policy servers, which compute the same policy, also in batches of at
+most 16 if they can.
 """
 
 from __future__ import annotations

@@ -63,8 +63,8 @@ def client_servers() -> Iterator[dict[str, str]]:
     """Yield the variables that the tests of a client read.
 
     VLAGENTS_TEST_URL: a server whose replica has a port of its own; VLAGENTS_TEST_PROXIED_URL: the
-        same policy without
-    that port; VLAGENTS_TEST_KEYED_URL: the same behind API keys, of which VLAGENTS_TEST_KEY is one.
+    same policy without that port; VLAGENTS_TEST_KEYED_URL: the same behind API keys, of which
+    VLAGENTS_TEST_KEY is one.
     """
     engine = Engine(Told())
     own = WebSocketServer(engine, DEFAULT_LIMITS, "127.0.0.1", None, NoKey.OPEN)

@@ -347,10 +347,10 @@ class PushT(Gymnasium):
     """PushT by its published protocol, "image" or "keypoints".
 
     Observation: `state["agent_pos"]`, (2,) in pixels of the field, 512 by 512. With "image" also
-        "front", (96, 96, 3)
-    by default; with "keypoints" `state["environment_state"]`, (16,), x and y of eight points of the
-    block, in pixels. In `info["sim_state"]`, (7,) float64, the simulator's state: x, y of the agent
-    and its velocity, pixels and pixels/s; x, y and angle of the block, pixels and rad.
+    "front", (96, 96, 3) by default; with "keypoints" `state["environment_state"]`, (16,), x and y
+    of eight points of the block, in pixels. In `info["sim_state"]`, (7,) float64, the simulator's
+    state: x, y of the agent and its velocity, pixels and pixels/s; x, y and angle of the block,
+    pixels and rad.
 
     Action: (2,) in [0, 512]: the target of the disc, in the same pixels.
     """

@@ -67,8 +67,8 @@ class SimulatorEnv(EvalEnv):
 
     Most constructors have the following options; None selects the default of the task or the
     protocol: `width` and `height` of each image, pixels; `instruction`, the task in words;
-        `max_steps`, the step limit; `ends_on_success`,
-    whether success ends the episode (if not, success at the end can also be measured).
+    `max_steps`, the step limit; `ends_on_success`, whether success ends the episode (if not,
+    success at the end can also be measured).
     """
 
     suite: ClassVar[str]

@@ -272,8 +272,7 @@ class Guide:
 
         The gain of the correction of a later row is at most `limit`, and at most the number of
         steps: with that, one step goes to the end. `lower` returns the smaller of two numbers, for
-            libraries whose `time` is not a plain
-        number.
+        libraries whose `time` is not a plain number.
         """
         spread = (1.0 - time) ** 2 + time**2
         gain = lower(spread / (time * (1.0 - time) + 1e-6), min(limit, float(steps)))

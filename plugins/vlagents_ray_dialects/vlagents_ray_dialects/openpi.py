@@ -3,8 +3,7 @@ sends first.
 
 RoboArena's clients use nearly the same protocol and also connect to the root. Both dialects may be
 on: RoboArena's requests name an `endpoint`, openpi's do not. The first message is then RoboArena's
-    configuration, which openpi's client
-takes for metadata.
+configuration, which openpi's client takes for metadata.
 
 An error is a text with a request id, after which the connection is closed (1011) except for 429;
 openpi's own server sends a traceback.

@@ -48,15 +48,13 @@ class Aloha(SimulatorEnv):
     """One environment of one of ALOHA's two tasks, "transfer_cube" or "insertion".
 
     Observation: cameras, by default "top", as in ACT's and LeRobot's data; `state`: "left/joints"
-        (6,) rad,
-    "left/gripper" (1,), "right/joints", "right/gripper", in the order of gym-aloha's `agent_pos`;
-    in `info["sim_state"]`, (7,) float64 or (14,), the poses of the cube, or of peg and socket, in
-    the world frame: position in m and quaternion w, x, y, z.
+    (6,) rad, "left/gripper" (1,), "right/joints", "right/gripper", in the order of gym-aloha's
+    `agent_pos`; in `info["sim_state"]`, (7,) float64 or (14,), the poses of the cube, or of peg and
+    socket, in the world frame: position in m and quaternion w, x, y, z.
 
     Action: (14,), for the left arm and then for the right: six joint angles, rad, and the gripper,
-        0 closed, 1 open.
-    They are not clipped to gym-aloha's action space, [-1, 1], which excludes even the arms' first
-    pose: neither ACT nor LeRobot clips them.
+    0 closed, 1 open. They are not clipped to gym-aloha's action space, [-1, 1], which excludes even
+    the arms' first pose: neither ACT nor LeRobot clips them.
     """
 
     suite, title, known = "aloha", "gym-aloha", tuple(_TASKS)

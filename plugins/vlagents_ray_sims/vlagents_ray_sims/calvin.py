@@ -176,13 +176,12 @@ class Calvin(SimulatorEnv):
     """One scene of CALVIN, "A" to "D", in which an episode is a chain of five tasks.
 
     Observation: cameras `static`, 200x200, and `gripper`, 84x84; in `state`, in the world frame,
-        `tcp_pos` (3,) m and
-    `tcp_orn` (3,) rad of the tool, x-y-z angles about fixed axes, `gripper_opening_width` (1,) m,
-    and `robot_joints` (7,) rad; `gripper` is the last command, 1 = open.
+    `tcp_pos` (3,) m and `tcp_orn` (3,) rad of the tool, x-y-z angles about fixed axes,
+    `gripper_opening_width` (1,) m, and `robot_joints` (7,) rad; `gripper` is the last command, 1 =
+    open.
 
     Action: (7,): the tool's target moves by 0.02 m per unit along the world's axes, and its angles
-        by 0.05 rad per
-    unit; the last is the gripper: 1 opens, -1 closes, and only its sign counts.
+    by 0.05 rad per unit; the last is the gripper: 1 opens, -1 closes, and only its sign counts.
 
     The reward is 1 in the step that solves a task. Its sum over an episode is the number of tasks
     solved in a row, whose mean is CALVIN's average length. The episode ends with the fifth task, or

@@ -244,8 +244,7 @@ class Libero(SimulatorEnv):
     """One environment of one LIBERO task, e.g. "libero_spatial/0".
 
     Observation: cameras "front" (LIBERO's agentview) and "wrist" (its eye in hand), turned as
-        policies
-    expect them, see `LiberoProtocol`. In `state` the inputs of policies for LIBERO:
+    policies expect them, see `LiberoProtocol`. In `state` the inputs of policies for LIBERO:
     `xyz_axis_angle` (6,), the end effector in the world frame, whose axes are those of the robot
     base, m and rad, the angle in [0, 2 pi] as robosuite's quaternion gives it; `gripper_qpos` (2,)
     m, of the fingers; and `joints` (7,) rad. In `info["sim_state"]`, for scripted experts only:
@@ -253,9 +252,8 @@ class Libero(SimulatorEnv):
     objects, (4,) xyzw; the predicates of the `goal`, and those of them that are `unmet`.
 
     Action: (7,) in [-1, 1]: the end effector's target moves by 0.05 m per unit along the base's
-        axes, and turns by 0.5
-    rad per unit about them, axis-angle; the last is the gripper: -1 opens, 1 closes, and only its
-    sign counts.
+    axes, and turns by 0.5 rad per unit about them, axis-angle; the last is the gripper: -1 opens, 1
+    closes, and only its sign counts.
 
     An episode is a pure function of its initial state, `options["init_state"]`. Without that option
     the seed selects the state; otherwise only the policy uses the seed.

@@ -40,13 +40,11 @@ class MetaWorld(SimulatorEnv):
     """One environment of one Meta-World task, e.g. "reach-v3".
 
     Observation: cameras, by default "corner2", turned upright; `state["xyz"]` (3,) m, the hand in
-        the world frame, and
-    `gripper`; in `info["sim_state"]`, (39,) float64, Meta-World's observation including the goal,
-    which its oracles need bit for bit.
+    the world frame, and `gripper`; in `info["sim_state"]`, (39,) float64, Meta-World's observation
+    including the goal, which its oracles need bit for bit.
 
     Action: (4,) in [-1, 1]: the hand's target moves by 0.01 m per unit, x, y, z in the world frame;
-        the last is the
-    gripper's effort: -1 opens, 1 closes.
+    the last is the gripper's effort: -1 opens, 1 closes.
 
     The seed draws the positions of the object and the goal, as Meta-World's own generator of tasks
     does. With `goals_seed` the initial states are the 50 that MT1 draws with that seed, in order.

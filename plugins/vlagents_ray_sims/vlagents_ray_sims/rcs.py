@@ -186,10 +186,9 @@ class Rcs(SimulatorEnv):
     registered.
 
     Observation: the scene's cameras; for each arm `joints` rad, `tquat` and `xyzrpy`, the tool's
-        pose in the frame that
-    all arms share; the gripper, 1 = open. `Arms` describes the names for several arms.
-    `info["objects"]` is {joint: (7,) float64}, the pose of each loose body in the world frame,
-    metres and quaternion wxyz: for scripted experts only.
+    pose in the frame that all arms share; the gripper, 1 = open. `Arms` describes the names for
+    several arms. `info["objects"]` is {joint: (7,) float64}, the pose of each loose body in the
+    world frame, metres and quaternion wxyz: for scripted experts only.
 
     Action: for each arm its command in `control_mode`, then its gripper, which closes at 0.5 and
     below.

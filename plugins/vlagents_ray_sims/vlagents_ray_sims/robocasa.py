@@ -133,16 +133,15 @@ class RoboCasa(RobosuiteEnv):
     base, in a kitchen.
 
     Observation: cameras by RoboCasa's names, upright; in `state`, by the names of its datasets,
-        `base_position` (3,) m
-    and `base_rotation` (4,) xyzw in the world frame, `end_effector_position_relative` (3,) m and
-    `end_effector_rotation_relative` (4,) xyzw of the hand in the base frame, `gripper_qpos` (2,) m
-    of the fingers.
+    `base_position` (3,) m and `base_rotation` (4,) xyzw in the world frame,
+    `end_effector_position_relative` (3,) m and `end_effector_rotation_relative` (4,) xyzw of the
+    hand in the base frame, `gripper_qpos` (2,) m of the fingers.
 
     Action: (12,) in [-1, 1]: the base's velocity forward and to the left (1 m/s per unit) and about
-        its axis (1.5 rad/s
-    per unit); the torso's height; the mode, at least 0.5 to move the base together with the hand;
-    the hand's target, which moves by 0.05 m per unit along the base's axes and turns by 0.5 rad per
-    unit about them, axis-angle; the gripper, which closes at 0.5 or more and opens below that.
+    its axis (1.5 rad/s per unit); the torso's height; the mode, at least 0.5 to move the base
+    together with the hand; the hand's target, which moves by 0.05 m per unit along the base's axes
+    and turns by 0.5 rad per unit about them, axis-angle; the gripper, which closes at 0.5 or more
+    and opens below that.
     """
 
     suite, title, known = "robocasa", "RoboCasa", tuple(HORIZONS)

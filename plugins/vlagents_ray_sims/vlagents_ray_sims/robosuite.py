@@ -220,16 +220,14 @@ class Robosuite(RobosuiteEnv):
     """One environment of one of robosuite's tasks, e.g. "Lift".
 
     Observation: cameras by robosuite's names, upright; in `state`, by robomimic's names, for each
-        arm
-    `robot0_eef_pos` (3,) m and `robot0_eef_quat` (4,) xyzw of the hand in the world frame,
+    arm `robot0_eef_pos` (3,) m and `robot0_eef_quat` (4,) xyzw of the hand in the world frame,
     `robot0_gripper_qpos` (2,) m of the fingers, and `robot0_joint_pos` (7,) rad. In
     `info["sim_state"]`, for scripted experts only: the positions and quaternions xyzw of objects,
     and `target_pos`, the target position of one of them.
 
     Action: (7,) in [-1, 1] for each arm: the hand's target moves by 0.05 m per unit along the
-        base's axes and turns by
-    0.5 rad per unit about them, axis-angle; the last is the gripper: -1 opens, 1 closes, and only
-    its sign counts.
+    base's axes and turns by 0.5 rad per unit about them, axis-angle; the last is the gripper: -1
+    opens, 1 closes, and only its sign counts.
     """
 
     suite = title = "robosuite"

@@ -57,9 +57,8 @@ class Simpler(SimulatorEnv):
     """One Bridge task with its WidowX 250 S, at 5 Hz.
 
     Observation: "3rd_view_camera", (480, 640, 3), the size that the policies of the paper received
-        and resized
-    themselves; `state`: the arm's `joints` (6,) rad, and `tquat` and `xyzrpy`, the pose of the
-    gripper's link in the robot's base frame; `gripper`. For scripted experts only,
+    and resized themselves; `state`: the arm's `joints` (6,) rad, and `tquat` and `xyzrpy`, the pose
+    of the gripper's link in the robot's base frame; `gripper`. For scripted experts only,
     `info["sim_state"]`, (13,) float32 in that frame: the positions in m of object, target, gripper
     and commanded gripper, and the object's yaw in rad.
 

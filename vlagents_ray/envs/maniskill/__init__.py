@@ -43,8 +43,7 @@ class ManiSkill(SimulatorEnv):
     """One environment of one ManiSkill task.
 
     Observation: the task's cameras; in `state` the arm's `joints` (without the fingers), `tquat`
-        and
-    `xyzrpy`, the pose of the tool centre point in the robot's base frame; `gripper`; and, for
+    and `xyzrpy`, the pose of the tool centre point in the robot's base frame; `gripper`; and, for
     scripted experts only, `info["sim_state"]`, (D,) float32, ManiSkill's flat state observation,
     which includes the positions of objects. Some goals, such as PickCube's, are hidden from
     cameras.

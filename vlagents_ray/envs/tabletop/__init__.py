@@ -50,15 +50,13 @@ class Tabletop(EvalEnv):
     pad".
 
     Tasks: `pick_place`, `slide` (never lift the puck), `stack`, `lift`, and `mixed`, the default,
-        which draws one of
-    them for each episode.
+    which draws one of them for each episode.
 
     Observation: cameras (height, width, 3), by default "front" alone, of "front" and "wrist";
-        `state["xyzrpy"]` (6,),
-    the fingertips' position in m and the gripper's constant orientation in rad, in the base frame
-    of the package's docstring; `gripper` in [0, 1], 1 = open, about 0.58 around a puck. With
-    `object_state`, also `state["puck"]` (3,), the position of the underside of the instruction's
-    puck, and `state["target"]` (3,), its target; m, in the base frame.
+    `state["xyzrpy"]` (6,), the fingertips' position in m and the gripper's constant orientation in
+    rad, in the base frame of the package's docstring; `gripper` in [0, 1], 1 = open, about 0.58
+    around a puck. With `object_state`, also `state["puck"]` (3,), the position of the underside of
+    the instruction's puck, and `state["target"]` (3,), its target; m, in the base frame.
 
     Action (4,): `dx, dy, dz` in units of 0.03 m per step along the base frame's axes, and the
     gripper, 1 = open, -1 = closed. Components outside [-1, 1] are clipped, as by a robot's

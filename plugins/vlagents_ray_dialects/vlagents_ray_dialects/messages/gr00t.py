@@ -2,10 +2,9 @@
 map.
 
 Sources: Isaac-GR00T's `gr00t/eval/service.py` (N1.5) and `gr00t/policy/server_client.py` (N1.6 and
-    newer). A
-request is `{"endpoint", "data"?, "api_token"?}`. An array is `{"__ndarray_class__": True, "as_npy":
-<.npy file>}` or, in newer clients, has the format of `msgpack_numpy`: `{b"nd": True, b"type",
-b"kind", b"shape", b"data"}`; the reply has the format of the request.
+newer). A request is `{"endpoint", "data"?, "api_token"?}`. An array is `{"__ndarray_class__": True,
+"as_npy": <.npy file>}` or, in newer clients, has the format of `msgpack_numpy`: `{b"nd": True,
+b"type", b"kind", b"shape", b"data"}`; the reply has the format of the request.
 """
 
 from __future__ import annotations

@@ -2,9 +2,8 @@
 chunks of actions.
 
 Sources: `async_inference/helpers.py` and `robot_client.py` of LeRobot 0.4.4, which are equivalent
-    in 0.6.1. A
-client pickles its data classes. They are read as data, see `pickles`, and the chunk is written as a
-pickle that refers to the client's own `TimedAction` and `torch.tensor`.
+in 0.6.1. A client pickles its data classes. They are read as data, see `pickles`, and the chunk is
+written as a pickle that refers to the client's own `TimedAction` and `torch.tensor`.
 """
 
 from __future__ import annotations

@@ -1,10 +1,9 @@
 """A small random GR00T, saved by NVIDIA's own code: `python tiny.py OUT_FOLDER [KIND]`.
 
 N1.6's network has the size that a file of the checkout says, so that a copy of the checkout with
-smaller numbers comes
-first: `checkout`. KIND is `relative` (joints relative to the state), `libero` (two robots, one of
-    them LIBERO's), or
-`history` (frames of two moments, and a transformer that attends to padding, as all of N1.7 do).
+smaller numbers comes first: `checkout`. KIND is `relative` (joints relative to the state), `libero`
+(two robots, one of them LIBERO's), or `history` (frames of two moments, and a transformer that
+attends to padding, as all of N1.7 do).
 """
 
 from __future__ import annotations

@@ -2,8 +2,7 @@
 [KIND]`.
 
 Kinds: openvla, remote (with the code beside the weights), oft, oft-diffusion, oft-film, oft-tokens.
-    They need
-$OPENVLA_SRC, the OFT ones $OPENVLA_OFT_SRC too.
+They need $OPENVLA_SRC, the OFT ones $OPENVLA_OFT_SRC too.
 """
 
 from __future__ import annotations
