@@ -62,8 +62,8 @@ class _Values(dict[str, Any]):
     A value that is set is also rounded into the tensors that the passes read.
     """
 
-    def __init__(self, place: int) -> None:
-        self.place = place  # its index in the tensors of all adapters
+    def __init__(self, index: int) -> None:
+        self.index = index  # in the tensors of all adapters
         self.pushed: set[str] = set()  # names whose values a learner has pushed
         self._targets: dict[str, tuple[Any, Any, float]] = {}
 
@@ -75,11 +75,16 @@ class _Values(dict[str, Any]):
         self[name] = value
 
     def __setitem__(self, name: str, value: Any) -> None:
-        if value is not self.get(name):
-            read, target, scale = self._targets[name]
-            target.copy_(value.reshape(target.shape) * scale)
-            (self.pushed.discard if value is read else self.pushed.add)(name)
-            super().__setitem__(name, value)
+        if value is self.get(name):
+            return
+
+        value_of_file, target, scale = self._targets[name]
+        target.copy_(value.reshape(target.shape) * scale)
+        if value is value_of_file:
+            self.pushed.discard(name)
+        else:
+            self.pushed.add(name)
+        super().__setitem__(name, value)
 
 
 class LoraAdapters:
@@ -89,20 +94,21 @@ class LoraAdapters:
         self.base = ""  # fingerprint of the base alone
         # Memory of the base that is on the host while the policy sleeps.
         self.moved: list[tuple[Any, Any]] = []
-        self._named: dict[str, LoraAdapter] = {}
+        self._by_name: dict[str, LoraAdapter] = {}  # the names are those of resets
         self._values = {"": _Values(0)}  # by fingerprint; those of the base are zeros
         self._device: Any = None
 
     @property
     def ids(self) -> dict[str, str]:
-        return {name: adapter.weights for name, adapter in self._named.items()}
+        """The digest of each adapter with its base, by its name in resets."""
+        return {name: adapter.weights for name, adapter in self._by_name.items()}
 
     @property
     def trainable(self) -> dict[str, dict[str, Any]]:
         """The values of each adapter by their names in its file, which act when they are
         replaced.
         """
-        return {name: self._values[adapter.fingerprint] for name, adapter in self._named.items()}
+        return {name: self._values[adapter.fingerprint] for name, adapter in self._by_name.items()}
 
     def load(
         self,
@@ -135,21 +141,25 @@ class LoraAdapters:
                 adapt(adapter.fingerprint, folder)
             except ConfigError as error:
                 raise ConfigError(f"adapter {name!r}: {error}") from error
-            self._named[name] = adapter
+            self._by_name[name] = adapter
+
+        count = len(self._values)
         modules = dict(network.named_modules())
-        for layer, found in layers.items():
+        for layer, changes in layers.items():
             weight = modules[layer].weight
-            (outputs, *inputs), rank = weight.shape, max(len(down) for down, _, _ in found.values())
-            downs = torch.zeros(
-                len(self._values), rank, *inputs, dtype=weight.dtype, device=weight.device
-            )
-            ups = torch.zeros(
-                len(self._values), outputs, rank, dtype=weight.dtype, device=weight.device
-            )
-            for fingerprint, (down, up, scale) in found.items():
+            outputs, *inputs = weight.shape
+            rank = max(len(down) for down, _, _ in changes.values())
+            like_weight = {"dtype": weight.dtype, "device": weight.device}
+            downs = torch.zeros(count, rank, *inputs, **like_weight)
+            ups = torch.zeros(count, outputs, rank, **like_weight)
+
+            for fingerprint, (down, up, scale) in changes.items():
                 values = self._values[fingerprint]
-                values.read(f"{_PREFIX}{layer}{_DOWN}", down, downs[values.place, : len(down)], 1.0)
-                values.read(f"{_PREFIX}{layer}{_UP}", up, ups[values.place, :, : len(down)], scale)
+                down_target = downs[values.index, : len(down)]
+                up_target = ups[values.index, :, : len(down)]
+                values.read(f"{_PREFIX}{layer}{_DOWN}", down, down_target, 1.0)
+                values.read(f"{_PREFIX}{layer}{_UP}", up, up_target, scale)
+
             modules[layer].register_forward_hook(partial(self._add, downs, ups))
             self._device = weight.device
 
@@ -159,11 +169,12 @@ class LoraAdapters:
         """
         if name is None:
             return LoraAdapter()
-        if not isinstance(name, str) or name not in self._named:
+        if not isinstance(name, str) or name not in self._by_name:
             raise UnknownCheckpoint(
-                f"{ADAPTER}: got {name!r}, want one of {sorted(self._named)}, or none, for the base"
+                f"{ADAPTER}: got {name!r}, want one of {sorted(self._by_name)}, or none, for the "
+                "base"
             )
-        return self._named[name]
+        return self._by_name[name]
 
     def example(self, number: int) -> str:
         """Return an adapter's fingerprint for example row `number`; successive rows have
@@ -188,30 +199,35 @@ class LoraAdapters:
         """
         if fingerprint and any(values.pushed for values in self._values.values()):
             return {}
-        stated = fingerprint or self.base
-        return {POLICY: {"version": 0, "fingerprint": stated}} if stated else {}
+
+        fingerprint = fingerprint or self.base
+        return {POLICY: {"version": 0, "fingerprint": fingerprint}} if fingerprint else {}
 
     @contextmanager
     def rows(self, fingerprints: Iterable[str]) -> Iterator[None]:
         """Apply an adapter to each row of the network's passes on this thread."""
-        places, chosen = [self._values[one].place for one in fingerprints], None
-        if any(places):
+        indices = [self._values[fingerprint].index for fingerprint in fingerprints]
+        chosen = None
+        if any(indices):
             import torch
 
-            chosen = torch.tensor(places).to(self._device, non_blocking=True)
-        before = _CHOSEN.set(chosen)
+            chosen = torch.tensor(indices).to(self._device, non_blocking=True)
+
+        token = _CHOSEN.set(chosen)
         try:
             yield
         finally:
-            _CHOSEN.reset(before)
+            _CHOSEN.reset(token)
 
     def _add(self, downs: Any, ups: Any, module: Any, inputs: tuple[Any, ...], output: Any) -> Any:
         """Return the output of a layer, with N entries, after adding the change of each row's
         adapter.
         """
-        chosen, [x] = _CHOSEN.get(), inputs
+        chosen = _CHOSEN.get()
         if chosen is None:
             return output
+
+        [x] = inputs
         if len(x) % len(chosen):
             raise PolicyFailed(
                 f"adapters: a layer got {len(x)} entries for {len(chosen)} rows, want as many for "
@@ -221,9 +237,8 @@ class LoraAdapters:
             entries = x.reshape(len(chosen), -1, x.shape[-1])
             change = (entries @ downs[chosen].mT) @ ups[chosen].mT
         else:
-            change = _convolved(
-                module, x, downs, ups, chosen.repeat_interleave(len(x) // len(chosen))
-            )
+            chosen_by_entry = chosen.repeat_interleave(len(x) // len(chosen))
+            change = _convolved(module, x, downs, ups, chosen_by_entry)
         return output + change.view(output.shape).to(output.dtype)
 
 
@@ -235,11 +250,16 @@ def _convolved(module: Any, x: Any, downs: Any, ups: Any, chosen: Any) -> Any:
     """
     from torch.nn.functional import conv2d
 
-    weight, entries = downs[chosen].flatten(0, 1), x.flatten(0, 1)[None]
-    seen = conv2d(
-        entries, weight, None, module.stride, module.padding, module.dilation, groups=len(x)
+    low_rank = conv2d(
+        x.flatten(0, 1)[None],
+        downs[chosen].flatten(0, 1),
+        None,
+        module.stride,
+        module.padding,
+        module.dilation,
+        groups=len(x),
     )
-    return ups[chosen] @ seen.view(len(x), downs.shape[1], -1)
+    return ups[chosen] @ low_rank.view(len(x), downs.shape[1], -1)
 
 
 CONFIG, WEIGHTS = "adapter_config.json", "adapter_model.safetensors"
@@ -252,32 +272,26 @@ _LISTED = 5
 # unset: they select other methods, or parts of the fine-tune that are not a low-rank change of a
 # linear layer.
 _KNOWN = {
-    *(
-        "auto_mapping",
-        "base_model_name_or_path",
-        "revision",
-        "peft_type",
-        "task_type",
-        "inference_mode",
-    ),
-    *(
-        "peft_version",
-        "r",
-        "lora_alpha",
-        "use_rslora",
-        "rank_pattern",
-        "lora_dropout",
-        "target_modules",
-    ),
-    *(
-        "exclude_modules",
-        "layers_to_transform",
-        "layers_pattern",
-        "megatron_core",
-        "runtime_config",
-        "eva_config",
-    ),
+    "auto_mapping",
+    "base_model_name_or_path",
+    "eva_config",
+    "exclude_modules",
+    "inference_mode",
+    "layers_pattern",
+    "layers_to_transform",
+    "lora_alpha",
+    "lora_dropout",
+    "megatron_core",
+    "peft_type",
+    "peft_version",
     "qalora_group_size",
+    "r",
+    "rank_pattern",
+    "revision",
+    "runtime_config",
+    "target_modules",
+    "task_type",
+    "use_rslora",
 }
 # Other values also change the weights of the base.
 _INITIAL = (True, False, None, "gaussian", "orthogonal", "eva")
@@ -287,13 +301,13 @@ def base_of(folder: Path) -> str | None:
     """Return the checkpoint that the adapter's training names as its base; None if it names
     none.
     """
-    named = _config(folder).get("base_model_name_or_path") or None
-    if named is not None and not isinstance(named, str):
+    base = _config(folder).get("base_model_name_or_path") or None
+    if base is not None and not isinstance(base, str):
         raise ConfigError(
-            f"{folder / CONFIG}: got {type(named).__name__} as base_model_name_or_path, want the "
+            f"{folder / CONFIG}: got {type(base).__name__} as base_model_name_or_path, want the "
             "name of a checkpoint"
         )
-    return named
+    return base
 
 
 def read_adapter(folder: Path, network: Any) -> dict[str, tuple[Any, Any, float]]:
@@ -320,6 +334,7 @@ def read_adapter(folder: Path, network: Any) -> dict[str, tuple[Any, Any, float]
         raise ConfigError(
             f"{folder / WEIGHTS}: is damaged, or of another format ({error}); copy it again"
         ) from error
+
     _require_complete(folder, saved, network)
     modules = dict(network.named_modules())
     names = [key.removeprefix(_PREFIX).removesuffix(_DOWN) for key in saved if key.endswith(_DOWN)]
@@ -328,31 +343,34 @@ def read_adapter(folder: Path, network: Any) -> dict[str, tuple[Any, Any, float]
 
 
 def _config(folder: Path) -> dict[str, Any]:
+    """Return the settings of an adapter; raises `ConfigError` if they are not those of a plain
+    LoRA.
+    """
     try:
         config = json.loads((folder / CONFIG).read_text(encoding="utf-8"))
     except (OSError, ValueError, RecursionError) as error:
         raise ConfigError(
             f"{folder / CONFIG}: cannot be read as JSON ({error}); copy it again"
         ) from error
+
     if not isinstance(config, dict) or config.get("peft_type") != "LORA":
-        got = config.get("peft_type") if isinstance(config, dict) else type(config).__name__
+        kind = config.get("peft_type") if isinstance(config, dict) else type(config).__name__
         raise ConfigError(
-            f"{folder / CONFIG}: got peft_type {got!r}, want 'LORA'; merge another kind into its "
-            "base "
-            f"(merge_and_unload) and serve that as a checkpoint of its own"
+            f"{folder / CONFIG}: got peft_type {kind!r}, want 'LORA'; merge another kind into its "
+            "base (merge_and_unload) and serve that as a checkpoint of its own"
         )
-    other = {
-        name: value
-        for name, value in config.items()
-        if name not in _KNOWN and value and value != "none"
-    }
+
+    unsupported = {}
+    for name, value in config.items():
+        if name not in _KNOWN and value and value != "none":
+            unsupported[name] = value
     if config.get("init_lora_weights") in _INITIAL:
-        other.pop("init_lora_weights", None)
-    if other:
+        unsupported.pop("init_lora_weights", None)
+    if unsupported:
         raise ConfigError(
-            f"{folder / CONFIG}: got {other}, want a plain LoRA of linear layers without these; "
-            "merge the fine-tune "
-            f"into its base (merge_and_unload) and serve that as a checkpoint of its own"
+            f"{folder / CONFIG}: got {unsupported}, want a plain LoRA of linear layers without "
+            "these; merge the fine-tune into its base (merge_and_unload) and serve that as a "
+            "checkpoint of its own"
         )
     return config
 
@@ -363,83 +381,106 @@ def _require_complete(folder: Path, saved: Mapping[str, Any], network: Any) -> N
 
     If the last layer of a language model has an adapter, PEFT also saves the whole layer.
     """
-    stems = {key.removesuffix(end) for key in saved for end in (_DOWN, _UP) if key.endswith(end)}
-    wanted = {stem + end for stem in stems for end in (_DOWN, _UP)}
-    faults = sorted({*wanted - set(saved), *(key for key in wanted if not key.startswith(_PREFIX))})
-    held = network.state_dict() if set(saved) - wanted else {}
-    for key in sorted(set(saved) - wanted):
-        value = held.get(key.removeprefix(_PREFIX).replace(_BASE, "."))
+    pairs: set[str] = set()  # the names of A and B of each layer that has at least one of them
+    for key in saved:
+        for suffix in (_DOWN, _UP):
+            if key.endswith(suffix):
+                layer = key.removesuffix(suffix)
+                pairs |= {layer + _DOWN, layer + _UP}
+    misnamed = {key for key in pairs if not key.startswith(_PREFIX)}
+    faults = sorted(pairs - set(saved) | misnamed)
+
+    unpaired = sorted(set(saved) - pairs)
+    base_values = network.state_dict() if unpaired else {}
+    for key in unpaired:
+        value = base_values.get(key.removeprefix(_PREFIX).replace(_BASE, "."))
         if (
             value is None
             or saved[key].shape != tuple(value.shape)
             or not converted(saved[key], value).equal(value)
         ):
             faults.append(key)
-    if faults or not wanted:
+
+    if faults or not pairs:
         raise ConfigError(
             f"{folder / WEIGHTS}: got {faults[:_LISTED] or 'no adapters'}, want pairs "
-            f"{_PREFIX}LAYER{_DOWN} and "
-            f"{_PREFIX}LAYER{_UP}, and no changes of the base; merge another kind of fine-tune "
-            f"into it (merge_and_unload)"
+            f"{_PREFIX}LAYER{_DOWN} and {_PREFIX}LAYER{_UP}, and no changes of the base; merge "
+            "another kind of fine-tune into it (merge_and_unload)"
         )
 
 
 def _require_adaptable(folder: Path, names: list[str], modules: Mapping[str, Any]) -> None:
-    from torch.nn import Conv2d, Linear
-
-    if unknown := sorted(name for name in names if name not in modules):
+    """Raise `ConfigError` unless all layers of an adapter are linear ones and plain convolutions
+    of the network.
+    """
+    unknown = sorted(name for name in names if name not in modules)
+    if unknown:
         raise ConfigError(
             f"{folder / WEIGHTS}: {len(unknown)} of its {len(names)} layers are not in the "
-            "network: "
-            f"{unknown[:_LISTED]}; want an adapter that was trained on this checkpoint, with this "
-            "version of its code"
+            f"network: {unknown[:_LISTED]}; want an adapter that was trained on this checkpoint, "
+            "with this version of its code"
         )
-    # no derived classes: some, as in torch's attention, are never called, and only their weights
-    # are used
-    other = {
-        name: type(module).__name__
-        for name, module in ((name, modules[name]) for name in sorted(names))
-        if type(module) is not Linear
-        and not (type(module) is Conv2d and module.groups == 1 and module.padding_mode == "zeros")
-    }
-    if other:
+
+    unsupported = {}
+    for name in sorted(names):
+        if not _is_adaptable(modules[name]):
+            unsupported[name] = type(modules[name]).__name__
+    if unsupported:
         raise ConfigError(
-            f"{folder / WEIGHTS}: got adapters of {dict(list(other.items())[:_LISTED])}, want "
-            "those of linear layers "
-            f"and plain convolutions; merge this one into its base (merge_and_unload)"
+            f"{folder / WEIGHTS}: got adapters of {dict(list(unsupported.items())[:_LISTED])}, "
+            "want those of linear layers and plain convolutions; merge this one into its base "
+            "(merge_and_unload)"
         )
+
+
+def _is_adaptable(module: Any) -> bool:
+    """Return whether a module is a linear layer or a plain convolution.
+
+    Derived classes do not count: some, as in torch's attention, are never called, and only their
+    weights are used.
+    """
+    from torch.nn import Conv2d, Linear
+
+    if type(module) is Linear:
+        return True
+    return type(module) is Conv2d and module.groups == 1 and module.padding_mode == "zeros"
 
 
 def _layer(
     folder: Path, name: str, saved: Mapping[str, Any], config: Mapping[str, Any], weight: Any
 ) -> tuple[Any, Any, float]:
+    """Return A, B and the scale of a layer as `read_adapter` does; `weight` is the layer's."""
     from torch import empty, float32
 
-    raw = [saved[f"{_PREFIX}{name}{end}"] for end in (_DOWN, _UP)]
-    if not all(one.dtype.kind in "fV" for one in raw):  # V: bfloat16, which numpy lacks
+    saved_down, saved_up = saved[f"{_PREFIX}{name}{_DOWN}"], saved[f"{_PREFIX}{name}{_UP}"]
+    kinds = {saved_down.dtype.kind, saved_up.dtype.kind}
+    if not kinds <= {"f", "V"}:  # V: bfloat16, which numpy lacks
         raise ConfigError(
-            f"{folder / WEIGHTS}: {name}: got A {raw[0].dtype} and B {raw[1].dtype}, want real "
-            "numbers; save the "
-            f"adapter without quantization"
+            f"{folder / WEIGHTS}: {name}: got A {saved_down.dtype} and B {saved_up.dtype}, want "
+            "real numbers; save the adapter without quantization"
         )
-    # scaled before rounding to the type of the weights
-    down, up = (converted(one, empty(0, dtype=float32)) for one in raw)
-    (outputs, *inputs), rank = weight.shape, down.shape[0] if down.ndim else 0
-    wanted = (rank, *inputs), (outputs, rank, *(1 for _ in inputs[1:]))
-    if (tuple(down.shape), tuple(up.shape)) != wanted or not rank:
+
+    # float32, since B is scaled before it is rounded to the type of the weights.
+    down = converted(saved_down, empty(0, dtype=float32))
+    up = converted(saved_up, empty(0, dtype=float32))
+    outputs, *inputs = weight.shape
+    rank = down.shape[0] if down.ndim else 0
+    down_shape = (rank, *inputs)
+    up_shape = (outputs, rank, *(1 for _ in inputs[1:]))
+    if (tuple(down.shape), tuple(up.shape)) != (down_shape, up_shape) or not rank:
         raise ConfigError(
             f"{folder / WEIGHTS}: {name}: got A {tuple(down.shape)} and B {tuple(up.shape)}, want "
-            "them for weights "
-            f"{tuple(weight.shape)}; want an adapter that was trained on this checkpoint"
+            f"them for weights {tuple(weight.shape)}; want an adapter that was trained on this "
+            "checkpoint"
         )
+
     alpha = config.get("lora_alpha")
     if isinstance(alpha, bool) or not isinstance(alpha, int | float) or not math.isfinite(alpha):
         raise ConfigError(f"{folder / CONFIG}: got lora_alpha {alpha!r}, want a number")
     scale = alpha / (math.sqrt(rank) if config.get("use_rslora") else rank)
-    if not all(one.to(weight.dtype).isfinite().all() for one in (down, up * scale)):
+    if not all(values.to(weight.dtype).isfinite().all() for values in (down, up * scale)):
         raise ConfigError(
             f"{folder / WEIGHTS}: {name}: got NaN or infinite values as {weight.dtype}, want "
-            "finite ones; take an "
-            f"earlier step of the training"
+            "finite ones; take an earlier step of the training"
         )
     return down, up, scale

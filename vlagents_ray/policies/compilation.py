@@ -12,6 +12,7 @@ which there is no program, as its rows have another shape, or as it is too large
 from __future__ import annotations
 
 import logging
+import math
 import os
 import threading
 import time
@@ -39,9 +40,10 @@ def keep_torch_programs() -> None:
     Torch writes its own choice, /tmp/torchinductor_USER, into that variable when it first needs it.
     """
     chosen = Path(os.environ.get(_TORCH, "")).name
-    if (not chosen or chosen.startswith("torchinductor_")) and (
-        folder := _folder("torch")
-    ) is not None:
+    if chosen and not chosen.startswith("torchinductor_"):
+        return
+    folder = _folder("torch")
+    if folder is not None:
         os.environ[_TORCH] = str(folder)
 
 
@@ -52,7 +54,10 @@ def keep_jax_programs(jax: Any, platform: str) -> None:
     if platform == "cpu":
         return
     chosen = getattr(jax.config, "jax_compilation_cache_dir", "an older JAX, without this setting")
-    if chosen is None and (folder := _folder("jax")) is not None:
+    if chosen is not None:
+        return
+    folder = _folder("jax")
+    if folder is not None:
         jax.config.update("jax_compilation_cache_dir", str(folder))
 
 
@@ -93,8 +98,7 @@ def quantize(policy: Any, kind: Quantization) -> None:
     except (RuntimeError, AttributeError, NotImplementedError, AssertionError) as error:
         raise ConfigError(
             f"quantization {kind!r}: torchao cannot use it here ({type(error).__name__}: {error}); "
-            "try the other one, "
-            f"or dtype: bfloat16"
+            "try the other one, or dtype: bfloat16"
         ) from error
 
 
@@ -162,18 +166,23 @@ class GraphMemory:
 
     def __init__(self, device: Any) -> None:
         torch = require("torch")
-        self._device, self.pool = device, torch.cuda.graph_pool_handle()
-        # torch's own stream for captures is on the device of the first capture of the process
+        self._device = device
+        self.pool = torch.cuda.graph_pool_handle()
+        # Torch's own stream for captures is on the device of the first capture of the process.
         self.stream = torch.cuda.Stream(device)
-        self._others = 0
-        self._others = self.taken()
+        self._bytes_before = self._reserved()
 
     def taken(self) -> int:
         """Return the bytes that the process has reserved on the device since the first graph."""
+        return self._reserved() - self._bytes_before
+
+    def _reserved(self) -> int:
         torch = require("torch")
-        with CAPTURES.pushes:  # not beside a capture of another thread, which that would end
-            torch.cuda.empty_cache()  # of memory that no tensor and no graph has
-            return int(torch.cuda.memory_reserved(self._device)) - self._others
+        # Emptying the cache would end a capture of another thread.
+        with CAPTURES.pushes:
+            # Only memory of tensors and graphs remains reserved.
+            torch.cuda.empty_cache()
+            return int(torch.cuda.memory_reserved(self._device))
 
 
 class CudaGraph:
@@ -197,27 +206,31 @@ class CudaGraph:
             inputs: Tensors from which each replay reads, and to which a call copies its own.
             memory: That of the policy's graphs; None: of this graph alone.
         """
-        torch, device = require("torch"), inputs[0].device
+        torch = require("torch")
+        device = inputs[0].device
         memory = memory or GraphMemory(device)
         self._function, self._inputs = function, inputs
+
         # The current stream is entered again, since `torch.cuda.graph` leaves its own if the
         # capture fails.
-        own, current = memory.stream, torch.cuda.current_stream(device)
+        stream, current = memory.stream, torch.cuda.current_stream(device)
         with torch.cuda.device(device), torch.cuda.stream(current):
-            own.wait_stream(current)
-            with torch.cuda.stream(own):
+            stream.wait_stream(current)
+            with torch.cuda.stream(stream):
                 for _ in range(_WARM_UP):
                     function(*inputs)
-            current.wait_stream(own)
+            current.wait_stream(stream)
+
             self._graph = torch.cuda.CUDAGraph()
-            with CAPTURES.capture(), warnings.catch_warnings(record=True) as said:
+            with CAPTURES.capture(), warnings.catch_warnings(record=True) as caught_warnings:
                 warnings.simplefilter("always")
                 # Other threads still prepare acts; their calls must not end the capture.
                 with torch.cuda.graph(
-                    self._graph, memory.pool, own, capture_error_mode="thread_local"
+                    self._graph, memory.pool, stream, capture_error_mode="thread_local"
                 ):
                     self._result = function(*inputs)
-        if any(_EMPTY in str(warning.message) for warning in said):
+
+        if any(_EMPTY in str(warning.message) for warning in caught_warnings):
             raise RuntimeError(
                 "the CUDA graph is empty: all work ran on another stream, or on another device"
             )
@@ -225,13 +238,14 @@ class CudaGraph:
     def __call__(self, *tensors: Any) -> Any:
         """Return the results of at most as many rows as were captured, in memory of their own."""
         rows = len(tensors[0])
-        for held, tensor in zip(self._inputs, tensors, strict=True):
-            held[:rows].copy_(tensor, non_blocking=True)
-            if rows < len(held):
-                held[rows:].copy_(tensor[-1:], non_blocking=True)
+        for graph_input, tensor in zip(self._inputs, tensors, strict=True):
+            graph_input[:rows].copy_(tensor, non_blocking=True)
+            if rows < len(graph_input):
+                graph_input[rows:].copy_(tensor[-1:], non_blocking=True)
+
         self._graph.replay()
         CudaGraph.replays += 1
-        results = tuple(one[:rows].clone() for one in _each(self._result))
+        results = tuple(result[:rows].clone() for result in _each(self._result))
         return results if isinstance(self._result, tuple) else results[0]
 
     def replay_ms(self) -> float:
@@ -264,7 +278,7 @@ _SHOWN = 300  # characters of a compiler's error in the log
 _FASTER = 0.97
 _REPLAYS = 5  # of each, of which the shortest counts
 
-# tiers: the eager core, and torch's program, both in graphs on a GPU.
+# Tiers: the eager core, and torch's program, both in graphs on a GPU.
 _GRAPH, _COMPILED = "CUDA graph", "torch.compile"
 
 
@@ -283,7 +297,7 @@ class Compilation:
         self.mode = mode
         self.sizes: list[int] = []  # batch sizes for which a core is compiled, ascending
         self.building: int | None = None  # the batch size whose programs are being made
-        # The tier that a core with parts now calls of them; None: it is open.
+        # The tier of the parts that a core calls now; None: outside of `parts`.
         self.tier_of_parts: str | None = None
         self.cores: list[Core] = []
         self.memories: dict[Any, GraphMemory] = {}  # by device
@@ -330,13 +344,17 @@ class Compilation:
         Raises:
             ConfigError: A program failed, and the mode is "require".
         """
-        began, self.building = time.monotonic(), size
+        began = time.monotonic()
+        self.building = size
         try:
-            forward()  # makes the programs
-            forward()  # compares them after all of them were made
+            forward()  # This makes the programs.
+            forward()  # This compares them, after all of them were made.
         finally:
             self.building = None
-        failures = [failure for core in self.cores for failure in core.settle(size)]
+
+        failures: list[str] = []
+        for core in self.cores:
+            failures += core.settle(size)
         if failures and self.mode == "require":
             raise ConfigError(
                 f"compile: require: {'; '.join(failures)}; with `compile: true` it would run "
@@ -344,9 +362,13 @@ class Compilation:
             )
         if failures:
             report_uncompiled(f"{size} rows: {'; '.join(failures)}")
-        if used := {core.name: tier for core in self.cores if (tier := core.tier(size))}:
+
+        tiers = {core.name: core.tier(size) for core in self.cores}
+        compiled = {name: tier for name, tier in tiers.items() if tier is not None}
+        if compiled:
             insort(self.sizes, size)
-            logger.info("compiled for %d rows in %.1f s: %s", size, time.monotonic() - began, used)
+            seconds = time.monotonic() - began
+            logger.info("compiled for %d rows in %.1f s: %s", size, seconds, compiled)
         self.graph_bytes = sum(memory.taken() for memory in self.memories.values())
 
     @contextmanager
@@ -386,41 +408,44 @@ class Core:
     ) -> None:
         self.name = name
         self._owner, self._function, self._rows, self._parts = owner, function, rows, parts
-        # By rows and tier, of which one is left once settled.
+        # Programs by rows and tier; only one tier is left after `settle`.
         self._programs: dict[int, dict[str, Any]] = {}
-        self._kinds: dict[int, list[Any]] = {}  # of the rows of arguments, for each program
+        # Shapes and types of the rows of arguments, for each program.
+        self._kinds: dict[int, list[Any]] = {}
         self._compiled: dict[int, Callable[..., Any]] = {}  # torch's programs, by rows
-        # Inputs of the graph with the most rows, of which others read the first rows.
-        self._held: list[Any] = []
-        self._failures: list[str] = []  # of the batch size whose programs are being made
+        # Inputs of the graph with the most rows; other graphs read their first rows.
+        self._graph_inputs: list[Any] = []
+        # Failures at the batch size whose programs are being made.
+        self._failures: list[str] = []
 
     def __call__(self, *tensors: Any) -> Any:
         rows, owner = len(tensors[0]), self._owner
         if not owner.mode or (self._parts and tensors[0].device.type != "cuda"):
             return self._function(*tensors)
+
+        # A core of which this one is a part is being made.
         if owner.tier_of_parts is not None:
-            compiled = owner.tier_of_parts == _COMPILED
-            return (
-                self._compiled[rows](*map(_of_one_kind, tensors))
-                if compiled
-                else self._function(*tensors)
-            )
+            if owner.tier_of_parts == _COMPILED:
+                return self._compiled[rows](*map(_of_one_kind, tensors))
+            return self._function(*tensors)
+
+        # The programs of a batch size are being made.
         if owner.building is not None:
-            own = rows == (self._rows or owner.building)
-            return (
-                self._compared(list(map(_of_one_kind, tensors)))
-                if own
-                else self._function(*tensors)
-            )
+            if rows == (self._rows or owner.building):
+                return self._compared(list(map(_of_one_kind, tensors)))
+            return self._function(*tensors)
+
         sizes = owner.sizes if self._rows is None else [self._rows]
         size = next((size for size in sizes if size >= rows and size in self._programs), None)
         if size is None or self._kinds[size] != _row_kinds(tensors):
             return self._function(*tensors)
+
         [program] = self._programs[size].values()
         if isinstance(program, CudaGraph):
             return program(*tensors)
         result = program(*(_padded(_of_one_kind(tensor), size) for tensor in tensors))
-        return tuple(one[:rows] for one in result) if isinstance(result, tuple) else result[:rows]
+        results = tuple(tensor[:rows] for tensor in _each(result))
+        return results if isinstance(result, tuple) else results[0]
 
     def tier(self, size: int) -> str | None:
         """Return the tier of the program of a batch size; None if it has none."""
@@ -432,18 +457,20 @@ class Core:
         """
         self._programs.clear()
         self._kinds.clear()
-        self._held.clear()
+        self._graph_inputs.clear()
 
     def settle(self, size: int) -> list[str]:
         """Keep the fastest program of a batch size; return the reasons for which others failed."""
-        size, failures, self._failures = self._rows or size, self._failures, []
+        size = self._rows or size
+        failures, self._failures = self._failures, []
         programs = self._programs.get(size, {})
-        # Both are graphs; they alternate, so that other work on the GPU slows both.
         if len(programs) > 1:
-            times = [
-                [program.replay_ms() for program in programs.values()] for _ in range(_REPLAYS)
-            ]
-            graph_ms, compiled_ms = map(min, zip(*times, strict=True))
+            # Both are graphs. They alternate, so that other work on the GPU slows both.
+            graph, compiled = programs.values()
+            graph_ms = compiled_ms = math.inf
+            for _ in range(_REPLAYS):
+                graph_ms = min(graph_ms, graph.replay_ms())
+                compiled_ms = min(compiled_ms, compiled.replay_ms())
             logger.info(
                 "%r, %d rows: %.3f ms eager, %.3f ms compiled",
                 self.name,
@@ -460,33 +487,41 @@ class Core:
         """Return the eager result, once the programs are made; keep those whose results are near
         it.
         """
-        wanted, size = self._function(*tensors), len(tensors[0])
-        tiers = list(self._programs.get(size, ()))
-        if missing := size not in self._programs:
+        eager_result, size = self._function(*tensors), len(tensors[0])
+        is_first = size not in self._programs
+        if is_first:
             self._programs[size], self._kinds[size] = {}, _row_kinds(tensors)
-            both = self._owner.mode != "graphs" and all(
-                _COMPILED in part._programs.get(size, ()) for part in self._parts
-            )
-            tiers = [_GRAPH] * (tensors[0].device.type == "cuda") + [_COMPILED] * both
+            tiers = self._tiers(size, tensors[0].device)
+        else:
+            tiers = list(self._programs[size])
+
         programs = self._programs[size]
         for tier in tiers:
             try:
-                program = self._made(tier, tensors) if missing else programs[tier]
-                error = _largest_error(program(*tensors), wanted)
-                limit = _LEAST if error <= _LEAST else self._limit(tensors, wanted)
+                program = self._made(tier, tensors) if is_first else programs[tier]
+                error = _largest_error(program(*tensors), eager_result)
+                limit = _LEAST if error <= _LEAST else self._limit(tensors, eager_result)
             except Exception as failure:  # noqa: BLE001 - compilers raise any error
-                said = f"{type(failure).__name__}: {' '.join(str(failure).split())[:_SHOWN]}"
+                reason = f"{type(failure).__name__}: {' '.join(str(failure).split())[:_SHOWN]}"
             else:
                 programs[tier] = program
                 if error <= limit:
                     continue
-                # Or it is not a number.
-                said = f"its results are off by {error:.2g}, want at most {limit:g}"
+                # The error is above the limit, or NaN.
+                reason = f"its results are off by {error:.2g}, want at most {limit:g}"
             programs.pop(tier, None)
-            self._failures.append(f"{self.name!r} by {tier}: {said}")
-        return wanted
+            self._failures.append(f"{self.name!r} by {tier}: {reason}")
+        return eager_result
 
-    def _limit(self, tensors: Sequence[Any], wanted: Any) -> float:
+    def _tiers(self, size: int, device: Any) -> list[str]:
+        """Return the tiers of which programs are made for a batch size."""
+        tiers = [_GRAPH] if device.type == "cuda" else []
+        parts_compiled = all(_COMPILED in part._programs.get(size, ()) for part in self._parts)
+        if self._owner.mode != "graphs" and parts_compiled:
+            tiers.append(_COMPILED)
+        return tiers
+
+    def _limit(self, tensors: Sequence[Any], eager_result: Any) -> float:
         """Return the largest error of a right program, as measured with the eager core on the same
         inputs.
 
@@ -498,15 +533,15 @@ class Core:
 
         rounding, rows = OtherRounding(), len(tensors[0])
         sizes = [size for size in (rows // 2, rows - rows // 2) if size]
+        inputs_of_halves = zip(*(tensor.split(sizes) for tensor in tensors), strict=True)
         with self._owner.parts(_GRAPH):
-            halves = [
-                _each(rounding.run(self._function, *half))
-                for half in zip(*(tensor.split(sizes) for tensor in tensors), strict=True)
-            ]
+            halves = [_each(rounding.run(self._function, *inputs)) for inputs in inputs_of_halves]
         results = tuple(map(require("torch").cat, zip(*halves, strict=True)))
+
         types = rounding.types | {_type(tensor) for tensor in tensors}
-        most = max(TOLERANCE.get(name, 0.0) for name in types) or TOLERANCE["float32"]
-        return min(most, max(_LEAST, _ROUNDINGS * _largest_error(results, _each(wanted))))
+        tolerance = max(TOLERANCE.get(name, 0.0) for name in types) or TOLERANCE["float32"]
+        measured = _ROUNDINGS * _largest_error(results, _each(eager_result))
+        return min(tolerance, max(_LEAST, measured))
 
     def _made(self, tier: str, tensors: Sequence[Any]) -> Any:
         """Return a tier's program for tensors of these shapes.
@@ -514,12 +549,8 @@ class Core:
         It is made with other values than those of a comparison: a CUDA graph that missed a part of
         the core returns the results of the values with which it was captured.
         """
-        function, owner, size, device = (
-            self._function,
-            self._owner,
-            len(tensors[0]),
-            tensors[0].device,
-        )
+        function, owner = self._function, self._owner
+        size, device = len(tensors[0]), tensors[0].device
         inputs = self._inputs(tensors)
         if tier == _COMPILED and not self._parts:
             function = self._compiled[size] = self._compiled.get(size) or self._program(inputs)
@@ -539,13 +570,14 @@ class Core:
         such.
         """
         size = len(tensors[0])
-        if (
-            not self._held
-            or len(self._held[0]) < size
-            or _row_kinds(self._held) != _row_kinds(tensors)
-        ):
-            self._held = [require("torch").zeros_like(tensor) for tensor in tensors]
-        return [held[:size].zero_() for held in self._held]
+        fits = (
+            bool(self._graph_inputs)
+            and len(self._graph_inputs[0]) >= size
+            and _row_kinds(self._graph_inputs) == _row_kinds(tensors)
+        )
+        if not fits:
+            self._graph_inputs = [require("torch").zeros_like(tensor) for tensor in tensors]
+        return [graph_input[:size].zero_() for graph_input in self._graph_inputs]
 
     def _program(self, tensors: Sequence[Any]) -> Callable[..., Any]:
         """Return torch's program for tensors of these shapes."""
@@ -554,7 +586,7 @@ class Core:
         def core(*tensors: Any) -> Any:
             return function(*tensors)
 
-        # torch counts the programs of each code object, and gives up after eight of them
+        # Torch counts the programs of each code object, and gives up after eight of them.
         core.__code__ = core.__code__.replace(
             co_name=f"{self.name}_{len(tensors[0])}".replace(" ", "_")
         )
@@ -575,12 +607,11 @@ def _of_one_kind(tensor: Any) -> Any:
 
 
 def _padded(tensor: Any, size: int) -> Any:
+    """Return the tensor with its last row again, up to `size` rows."""
     missing = size - len(tensor)
-    return (
-        require("torch").cat([tensor, tensor[-1:].expand(missing, *tensor.shape[1:])])
-        if missing
-        else tensor
-    )
+    if not missing:
+        return tensor
+    return require("torch").cat([tensor, tensor[-1:].expand(missing, *tensor.shape[1:])])
 
 
 def _row_kinds(tensors: Sequence[Any]) -> list[Any]:
@@ -588,20 +619,24 @@ def _row_kinds(tensors: Sequence[Any]) -> list[Any]:
 
 
 def _each(result: Any) -> Sequence[Any]:
+    """Return the tensors of a core's result, which is a tensor or a tuple of them."""
     return result if isinstance(result, tuple) else (result,)
 
 
-def _largest_error(got: Any, wanted: Any) -> float:
+def _largest_error(actual: Any, expected: Any) -> float:
     """Return the largest relative error of a row, by its Euclidean norm, among all tensors of
-    the results.
+    the results; NaN if one of them is NaN.
     """
     errors = []
-    for one, other in zip(_each(got), _each(wanted), strict=True):
-        off, size = (
-            part.float().reshape(len(part), -1).norm(dim=1) for part in (one - other, other)
-        )
-        errors.append((off / size.clamp(min=1e-12)).max())
-    return float(require("torch").stack(errors).max())  # which is NaN if any of them is
+    for actual_rows, expected_rows in zip(_each(actual), _each(expected), strict=True):
+        differences = _row_norms(actual_rows - expected_rows)
+        norms = _row_norms(expected_rows)
+        errors.append((differences / norms.clamp(min=1e-12)).max())
+    return float(require("torch").stack(errors).max())
+
+
+def _row_norms(tensor: Any) -> Any:
+    return tensor.float().reshape(len(tensor), -1).norm(dim=1)
 
 
 def _type(tensor: Any) -> str:

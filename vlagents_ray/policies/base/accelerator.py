@@ -47,26 +47,33 @@ _GPU_ERROR = re.compile(
 
 
 def torch_device(name: str = "auto") -> Any:
-    """Return the `torch.device` of a name; "auto" takes a CPU only where no GPU is meant; raises
-    `ConfigError`.
+    """Return the `torch.device` of a name.
+
+    Args:
+        name: A name of torch's, or "auto": a GPU, or a CPU only if this process was given no GPU
+            and torch finds none.
+
+    Raises:
+        ConfigError: There is no such device, or torch cannot use it.
     """
     share = _limit_jax()
     torch = require("torch")
-    given = name == "auto" and bool(_given_gpus())
+    needs_gpu = name == "auto" and bool(_given_gpus())
+    kind = name
     try:
-        device = torch.device(
-            ("cuda" if given or torch.cuda.is_available() else "cpu") if name == "auto" else name
-        )
+        if name == "auto":
+            kind = "cuda" if needs_gpu or torch.cuda.is_available() else "cpu"
+        device = torch.device(kind)
         torch.empty(0, device=device)
     except (RuntimeError, AssertionError) as error:
-        said = str(error).splitlines()[0]
-        if given:
-            raise _unusable(f"torch {torch.__version__}", said) from error
+        reason = str(error).splitlines()[0]
+        if needs_gpu:
+            raise _unusable(f"torch {torch.__version__}", reason) from error
         raise ConfigError(
-            f"device {name!r}: not here ({said}); use 'auto' or 'cpu', or give the replica a GPU "
-            "with "
-            f"resources: {{num_gpus: 1}}"
+            f"device {name!r}: not here ({reason}); use 'auto' or 'cpu', or give the replica a GPU "
+            "with resources: {num_gpus: 1}"
         ) from error
+
     described = {"kind": device.type, "device": str(device), "torch": torch.__version__}
     if device.type == "cuda":
         if share:
@@ -89,23 +96,23 @@ def _limit_jax() -> float:
     By itself JAX allocates three quarters of the memory at once.
     """
     os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
-    if share := os.environ.get(GPU_SHARE, ""):
+    share = os.environ.get(GPU_SHARE, "")
+    if share:
         os.environ.setdefault("XLA_PYTHON_CLIENT_MEM_FRACTION", share)
     return float(share or 0)
 
 
 def _given_gpus() -> str:
     """Return the GPUs that this process was given; empty if none was."""
-    named = os.environ.get(VISIBLE, "")
-    return "" if named in ("-1", "NoDevFiles") else named
+    visible = os.environ.get(VISIBLE, "")
+    return "" if visible in ("-1", "NoDevFiles") else visible
 
 
-def _unusable(library: str, said: str) -> ConfigError:
+def _unusable(library: str, reason: str) -> ConfigError:
     return ConfigError(
         f"device 'auto': this process was given GPU {_given_gpus()} ({VISIBLE}), which {library} "
-        f"cannot use: {said}; "
-        "install a build of it for the GPU and its driver, or set device: cpu with resources: "
-        f"{{num_gpus: 0}}"
+        f"cannot use: {reason}; install a build of it for the GPU and its driver, or set device: "
+        "cpu with resources: {num_gpus: 0}"
     )
 
 
@@ -116,11 +123,12 @@ def driver_version() -> str | None:
     with suppress(OSError):
         driver = re.search(r"Kernel Module\s+(?:for \S+\s+)?([\d.]+)", _DRIVER.read_text())
         return driver and driver[1]
-    with suppress(OSError, subprocess.SubprocessError, IndexError):  # WSL2 has no such file
-        command = ["nvidia-smi", "--query-gpu=driver_version", "--format=csv,noheader"]
-        return subprocess.run(  # noqa: S603
-            command, capture_output=True, text=True, timeout=10, check=True
-        ).stdout.split()[0]
+
+    # WSL2 has no such file.
+    command = ["nvidia-smi", "--query-gpu=driver_version", "--format=csv,noheader"]
+    with suppress(OSError, subprocess.SubprocessError, IndexError):
+        answer = subprocess.run(command, capture_output=True, text=True, timeout=10, check=True)  # noqa: S603
+        return answer.stdout.split()[0]
     return None
 
 
@@ -134,13 +142,17 @@ def torch_dtype(name: DType, device: Any, preferred: str = "bfloat16") -> Any:
 
 
 def jax_device(name: str = "auto") -> Any:
-    """Return the JAX device of a name; "auto" takes the first one, and a CPU only where no GPU is
-    meant.
-
-    Raises `ConfigError` for a missing device.
+    """Return the JAX device of a name.
 
     From then on, the programs that JAX compiles for a device that is no CPU are kept for the next
     start.
+
+    Args:
+        name: A platform of JAX, such as "gpu" or "gpu:1", or "auto": the first device, which is a
+            CPU only if this process was given no GPU.
+
+    Raises:
+        ConfigError: There is no such device, or JAX cannot use it.
     """
     _limit_jax()
     jax = require("jax")
@@ -154,9 +166,10 @@ def jax_device(name: str = "auto") -> Any:
             raise _unusable(f"jax {jax.__version__}", str(error).splitlines()[0]) from error
         raise ConfigError(
             f"device {name!r}: not here, JAX sees {jax.devices()}; use 'auto' or 'cpu', or install "
-            "the jaxlib of your "
-            f"accelerator and give the replica a GPU with resources: {{num_gpus: 1}}"
+            "the jaxlib of your accelerator and give the replica a GPU with resources: "
+            "{num_gpus: 1}"
         ) from error
+
     keep_jax_programs(jax, device.platform)
     report_device(
         {
@@ -178,19 +191,21 @@ def onnx_provider(name: str, matmul: Matmul) -> tuple[str, dict[str, str]]:
     runtime = require("onnxruntime")
     kind, _, index = name.partition(":")
     cuda = "CUDAExecutionProvider"
-    there = cuda in runtime.get_available_providers()
+    offers_cuda = cuda in runtime.get_available_providers()
     if name == "auto":
-        kind = "cuda" if (there and driver_version()) or _given_gpus() else "cpu"
+        kind = "cuda" if (offers_cuda and driver_version()) or _given_gpus() else "cpu"
+
     if kind == "cpu":
         report_device({"kind": "cpu", "device": "cpu", "onnxruntime": runtime.__version__})
         return "CPUExecutionProvider", {}
-    if kind != "cuda" or not there:
+
+    if kind != "cuda" or not offers_cuda:
         raise ConfigError(
             f"device {name!r}: this onnxruntime offers {runtime.get_available_providers()}; "
-            "replace it by "
-            f"`pip uninstall onnxruntime && pip install onnxruntime-gpu`, or set device: cpu with "
-            f"resources: {{num_gpus: 0}}"
+            "replace it by `pip uninstall onnxruntime && pip install onnxruntime-gpu`, or set "
+            "device: cpu with resources: {num_gpus: 0}"
         )
+
     device = {
         "kind": "cuda",
         "device": f"cuda:{index or 0}",
@@ -208,8 +223,8 @@ def set_matmul(precision: Matmul, device: dict[str, Any]) -> None:
     if device["kind"] == "cpu" or "onnxruntime" in device:
         return
     if "jax" in device:
-        named = {"high": "tensorfloat32", "highest": "float32"}[precision]
-        require("jax").config.update("jax_default_matmul_precision", named)
+        jax_precision = {"high": "tensorfloat32", "highest": "float32"}[precision]
+        require("jax").config.update("jax_default_matmul_precision", jax_precision)
     else:
         torch = require("torch")
         torch.set_float32_matmul_precision(precision)
@@ -281,27 +296,34 @@ def gpu_memory(devices: Iterable[Mapping[str, Any]]) -> dict[str, int]:
 
     The result is empty if there is none, as when the policy runs in a child process.
     """
-    found: Counter[str] = Counter()
+    memory: Counter[str] = Counter()
     torch, jax = sys.modules.get("torch"), sys.modules.get("jax")
     for device in devices:
         if device["kind"] == "cuda" and torch is not None and torch.cuda.is_initialized():
-            place, cuda = device.get("device", "cuda"), torch.cuda
-            reserved, (free, total) = cuda.memory_reserved(place), cuda.mem_get_info(place)
-            free = min(free, int(float(os.environ.get(GPU_SHARE) or 1) * total) - reserved)
-            found.update(
-                allocated=cuda.memory_allocated(place), reserved=reserved, free=max(0, free)
-            )
+            memory.update(_torch_memory(torch.cuda, device.get("device", "cuda")))
         elif device["kind"] == "gpu" and jax is not None:
-            stats = (
-                next(
-                    one for one in jax.local_devices() if str(one) == device["device"]
-                ).memory_stats()
-                or {}
-            )
-            used = stats.get("bytes_in_use", 0)
-            free = stats.get("bytes_limit", used) - used
-            found.update(allocated=used, reserved=stats.get("pool_bytes", used), free=free)
-    return dict(found)
+            memory.update(_jax_memory(jax, device["device"]))
+    return dict(memory)
+
+
+def _torch_memory(cuda: Any, device: str) -> dict[str, int]:
+    reserved = cuda.memory_reserved(device)
+    free, total = cuda.mem_get_info(device)
+    share = float(os.environ.get(GPU_SHARE) or 1)
+    free = min(free, int(share * total) - reserved)
+    return {
+        "allocated": cuda.memory_allocated(device),
+        "reserved": reserved,
+        "free": max(0, free),
+    }
+
+
+def _jax_memory(jax: Any, name: str) -> dict[str, int]:
+    device = next(device for device in jax.local_devices() if str(device) == name)
+    stats = device.memory_stats() or {}
+    used = stats.get("bytes_in_use", 0)
+    free = stats.get("bytes_limit", used) - used
+    return {"allocated": used, "reserved": stats.get("pool_bytes", used), "free": free}
 
 
 def gpu_timer(report: LoadingReport) -> Callable[[], AbstractContextManager[None]]:
@@ -312,16 +334,17 @@ def gpu_timer(report: LoadingReport) -> Callable[[], AbstractContextManager[None
     waits for the GPU.
     """
     cuda = require("torch").cuda if "torch" in sys.modules else None
-    device = next(
-        (one.get("device", "cuda") for one in report.devices if one["kind"] == "cuda"), None
-    )
-    if device is None or cuda is None or not cuda.is_initialized():
+    gpus = [device for device in report.devices if device["kind"] == "cuda"]
+    if not gpus or cuda is None or not cuda.is_initialized():
         return nullcontext
+
+    device = gpus[0].get("device", "cuda")
     begin, end = (cuda.Event(enable_timing=True) for _ in range(2))
     timed = False
 
     @contextmanager
     def timer() -> Iterator[None]:
+        """Record the begin and the end of a pass, after reporting the time of the previous one."""
         nonlocal timed
         if timed and end.query():
             report.on_gpu_ms(begin.elapsed_time(end))

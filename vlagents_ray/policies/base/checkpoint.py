@@ -42,10 +42,10 @@ def used_checkpoints() -> Iterator[list[Path]]:
     """Yield a list of the paths that `find_checkpoint` finds in this context; a path within
     another replaces it.
     """
-    found: list[Path] = []
-    token = _used.set(found)
+    paths: list[Path] = []
+    token = _used.set(paths)
     try:
-        yield found
+        yield paths
     finally:
         _used.reset(token)
 
@@ -64,21 +64,29 @@ def find_checkpoint(name: str, step: int | None = None, needs: Iterable[str] = (
     Raises:
         ConfigError: There is no such checkpoint, or a file is missing.
     """
-    names = [at_step(name, digits) for digits in (step, f"{step or 0:06d}")]
-    name = next((one for one in names if Path(one).expanduser().exists()), names[0])
+    candidates = [at_step(name, digits) for digits in (step, f"{step or 0:06d}")]
+    name = next(
+        (candidate for candidate in candidates if Path(candidate).expanduser().exists()),
+        candidates[0],
+    )
     path = Path(name).expanduser()
     if not path.exists():
         if name.startswith((".", "/", "~")) or name.partition("@")[0].count("/") != 1:
             raise ConfigError(f"checkpoint {name!r}: no such file or folder; have {_beside(path)}")
         path = _from_hub(name)
-    if path.is_dir() and (missing := [pattern for pattern in needs if not any(path.glob(pattern))]):
-        raise ConfigError(
-            f"checkpoint {path}: misses {missing}, has "
-            f"{sorted(p.name for p in path.iterdir())[:20]}; "
-            f"is it a checkpoint of this family, and whole?"
-        )
-    if (used := _used.get()) is not None and path not in used:
-        used[:] = [*(one for one in used if not _holds(one, path)), path]
+
+    if path.is_dir():
+        missing = [pattern for pattern in needs if not any(path.glob(pattern))]
+        if missing:
+            names = sorted(entry.name for entry in path.iterdir())
+            raise ConfigError(
+                f"checkpoint {path}: misses {missing}, has {names[:20]}; is it a checkpoint of "
+                "this family, and whole?"
+            )
+
+    used = _used.get()
+    if used is not None and path not in used:
+        used[:] = [*(outer for outer in used if not _holds(outer, path)), path]
     return path
 
 
@@ -88,9 +96,9 @@ def _holds(folder: Path, path: Path) -> bool:
     """
     if not folder.is_dir():
         return False
-    # A file in the hub's cache is a link to a place outside of its folder.
-    places = (path.resolve(), path.parent.resolve() / path.name)
-    return any(folder.resolve() in (place, *place.parents) for place in places)
+    # A file in the hub's cache is a link to a file outside of its folder.
+    resolved = (path.resolve(), path.parent.resolve() / path.name)
+    return any(folder.resolve() in (target, *target.parents) for target in resolved)
 
 
 def find_adapter(
@@ -115,30 +123,40 @@ def find_adapter(
         raise ConfigError(
             f"{folder}: got a file, want the folder with {', '.join(FILES)}, as PEFT saves it"
         )
+
     trained_on = base_of(folder)
     if trained_on is not None and _is_other(trained_on, checkpoint, base, digest_of_base):
         raise ConfigError(
             f"{folder}: was trained on {trained_on!r}, want an adapter of {checkpoint!r}, the "
-            "policy's checkpoint; "
-            "if these are the same weights, name it so as base_model_name_or_path in its "
-            "adapter_config.json"
+            "policy's checkpoint; if these are the same weights, name it so as "
+            "base_model_name_or_path in its adapter_config.json"
         )
-    own = digest([folder])
-    both = hashlib.sha256(f"{digest_of_base} {own}".encode()).hexdigest()
-    return LoraAdapter(
-        source, f"{own.partition(':')[0]}:{both}", both[:DIGITS], revision(folder)
-    ), folder
+
+    digest_of_adapter = digest([folder])
+    method = digest_of_adapter.partition(":")[0]
+    both = hashlib.sha256(f"{digest_of_base} {digest_of_adapter}".encode()).hexdigest()
+    adapter = LoraAdapter(
+        source=source,
+        weights=f"{method}:{both}",
+        fingerprint=both[:DIGITS],
+        revision=revision(folder),
+    )
+    return adapter, folder
 
 
 def _is_other(trained_on: str, checkpoint: str, base: Sequence[Path], digest_of_base: str) -> bool:
     """Return whether the base that an adapter names is known to differ from `checkpoint`, at the
     paths `base`.
     """
-    # Unlike Path's own methods, os.path raises neither for.
+    # Unlike the methods of Path, os.path raises neither for unknown users nor for folders that
+    # are not visible here.
     path = Path(os.path.expanduser(trained_on))
-    if os.path.exists(path):  # unknown users nor for folders that are not visible here
-        ours = {parent for one in base for parent in (one.resolve(), *one.resolve().parents)}
-        return path.resolve() not in ours and digest([path]) != digest_of_base
+    if os.path.exists(path):
+        folders_of_base: set[Path] = set()
+        for base_path in base:
+            folders_of_base |= {base_path.resolve(), *base_path.resolve().parents}
+        return path.resolve() not in folders_of_base and digest([path]) != digest_of_base
+
     names = [name.partition("@")[0] for name in (trained_on, checkpoint)]
     if all(_HUB_ID.fullmatch(name) for name in names) and not Path(checkpoint).exists():
         return names[0] != names[1]
@@ -149,34 +167,33 @@ def _is_other(trained_on: str, checkpoint: str, base: Sequence[Path], digest_of_
 
 
 def _beside(path: Path) -> str:
-    parent = next((p for p in path.parents if p.is_dir()), Path("/"))
-    names = sorted(p.name for p in parent.iterdir())
+    """Return what the nearest existing folder above a missing path contains, for a message."""
+    parent = next((folder for folder in path.parents if folder.is_dir()), Path("/"))
+    names = sorted(entry.name for entry in parent.iterdir())
     shown = ", ".join(names[:_LISTED]) + (" …" if len(names) > _LISTED else "")
     return f"in {parent}: {shown or 'nothing'}"
 
 
 def _from_hub(name: str) -> Path:
     hub = require("huggingface_hub")
-    repository, at, wanted = name.partition("@")
-    if at and not wanted:
+    repository, at, commit = name.partition("@")
+    if at and not commit:
         raise ConfigError(
             f"checkpoint {name!r}: got no revision after the @, want a commit, a tag or a branch"
         )
+
     try:
-        path = Path(hub.snapshot_download(repository, revision=wanted or None))
+        path = Path(hub.snapshot_download(repository, revision=commit or None))
     except Exception as error:  # of many classes: no such id, no access, no network, offline mode
         if type(error).__name__ == "RevisionNotFoundError":
             raise ConfigError(
-                f"checkpoint {name!r}: {repository} has no revision {wanted!r}, want one of its "
-                "commits, or of its "
-                f"branches and tags, which are {_revisions(hub, repository)}"
+                f"checkpoint {name!r}: {repository} has no revision {commit!r}, want one of its "
+                f"commits, or of its branches and tags, which are {_revisions(hub, repository)}"
             ) from error
         raise ConfigError(
             f"checkpoint {name!r}: neither a path here nor to be had from the hub "
-            f"({type(error).__name__}); "
-            "download it to a folder and name that, or check the id (org/name or "
-            "org/name@COMMIT), the network and "
-            f"your token"
+            f"({type(error).__name__}); download it to a folder and name that, or check the id "
+            "(org/name or org/name@COMMIT), the network and your token"
         ) from error
     log.info("checkpoint %s: commit %s", name, path.name)
     return path
@@ -185,7 +202,7 @@ def _from_hub(name: str) -> Path:
 def _revisions(hub: Any, repository: str) -> str:
     try:
         refs = hub.HfApi().list_repo_refs(repository)
-        names = [one.name for one in (*refs.branches, *refs.tags)]
+        names = [ref.name for ref in (*refs.branches, *refs.tags)]
     except Exception as error:  # noqa: BLE001 - the message is about another error
         return f"not known here ({type(error).__name__})"
     return ", ".join(names[:_LISTED]) + (", …" if len(names) > _LISTED else "")
@@ -201,8 +218,11 @@ class SavedTensors:
     def of(cls, path: Path) -> SavedTensors:
         """Open a .safetensors file, or a folder with one, or with several and their index."""
         files = [path] if path.is_file() else _safetensors(path)
-        opened = [require("safetensors").safe_open(str(file), framework="pt") for file in files]
-        return cls({key: partial(file.get_tensor, key) for file in opened for key in file.keys()})  # noqa: SIM118 - no mapping
+        readers: dict[str, Callable[[], Any]] = {}
+        for file in files:
+            opened = require("safetensors").safe_open(str(file), framework="pt")
+            readers |= {name: partial(opened.get_tensor, name) for name in opened.keys()}  # noqa: SIM118 - no mapping
+        return cls(readers)
 
     def __iter__(self) -> Iterator[str]:
         return iter(self._readers)
@@ -214,19 +234,21 @@ class SavedTensors:
 def _safetensors(folder: Path) -> list[Path]:
     for index in sorted(folder.glob(f"*{_INDEX}")):
         names = set(json.loads(index.read_text(encoding="utf-8"))["weight_map"].values())
-        if absent := sorted(name for name in names if not (folder / name).is_file()):
+        absent = sorted(name for name in names if not (folder / name).is_file())
+        if absent:
             raise ConfigError(
                 f"checkpoint {folder}: {index.name} names {absent}, which are missing; copy all of "
                 "it"
             )
         return [folder / name for name in sorted(names)]
-    found = sorted(folder.glob("*.safetensors"))
-    if len(found) != 1:
+
+    files = sorted(folder.glob("*.safetensors"))
+    if len(files) != 1:
         raise ConfigError(
-            f"checkpoint {folder}: got {[p.name for p in found]}, want one .safetensors file or an "
-            "index"
+            f"checkpoint {folder}: got {[file.name for file in files]}, want one .safetensors file "
+            "or an index"
         )
-    return found
+    return files
 
 
 def require_loaded(model: Any, saved: SavedTensors | Mapping[str, Any]) -> None:
@@ -239,27 +261,30 @@ def require_loaded(model: Any, saved: SavedTensors | Mapping[str, Any]) -> None:
     diagnose.
     """
     torch = require("torch")
-    names = set(saved)
+    saved_names = set(saved)
     state = model.state_dict(keep_vars=True)
+
+    # Parameters that share memory are tied.
     tied: dict[int, set[str]] = {}
     for name, tensor in state.items():
-        tied.setdefault(tensor.data_ptr() if tensor.numel() else id(tensor), set()).add(name)
+        address = tensor.data_ptr() if tensor.numel() else id(tensor)
+        tied.setdefault(address, set()).add(name)
+
     absent, different = [], []
     for name, tensor in state.items():
-        source = next(
-            (n for n in (name, *sorted(tied.get(tensor.data_ptr(), ()))) if n in names), None
-        )
+        names = (name, *sorted(tied.get(tensor.data_ptr(), ())))
+        source = next((candidate for candidate in names if candidate in saved_names), None)
         if source is None:
             absent.append(name)
         elif not _same(torch, tensor.detach(), saved[source]):
             different.append(name)
+
     if absent or different:
         raise ConfigError(
             f"the checkpoint does not fill the model: {len(absent)} parameters are not in it "
-            f"{absent[:_LISTED]}, "
-            f"{len(different)} are not what it holds {different[:_LISTED]}; it has {len(names)}, "
-            "the model "
-            f"{len(state)}: is it a checkpoint of this model and this version of its library?"
+            f"{absent[:_LISTED]}, {len(different)} are not what it holds {different[:_LISTED]}; "
+            f"it has {len(saved_names)}, the model {len(state)}: is it a checkpoint of this model "
+            "and this version of its library?"
         )
 
 
@@ -271,17 +296,17 @@ def from_pretrained(cls: Any, path: Path, **options: Any) -> Any:
     compares names, cannot check its models; but transformers reports the parameters without values.
     """
     try:
-        model, said = cls.from_pretrained(path, output_loading_info=True, **options)
+        model, loading_info = cls.from_pretrained(path, output_loading_info=True, **options)
     except (OSError, RuntimeError, ValueError) as error:
-        # raised for files that are incomplete or in another format
+        # The files are incomplete or in another format.
         raise ConfigError(
             f"checkpoint {path}: {cls.__name__} does not load: {str(error).strip()[:500]}"
         ) from error
-    lacks = {
-        key: sorted(map(str, said[key]))[:_LISTED]
-        for key in ("missing_keys", "mismatched_keys")
-        if said[key]
-    }
+
+    lacks = {}
+    for key in ("missing_keys", "mismatched_keys"):
+        if loading_info[key]:
+            lacks[key] = sorted(map(str, loading_info[key]))[:_LISTED]
     if lacks:
         raise ConfigError(
             f"checkpoint {path}: it does not fill {cls.__name__}: {lacks}; is it a checkpoint of "
@@ -290,13 +315,13 @@ def from_pretrained(cls: Any, path: Path, **options: Any) -> Any:
     return model
 
 
-def require_filled(params: Mapping[str, Any], wanted: Mapping[str, Any]) -> None:
+def require_filled(params: Mapping[str, Any], expected: Mapping[str, Any]) -> None:
     """Raise `ConfigError` unless the nested `params` are arrays with exactly the names and shapes
-    in `wanted`.
+    in `expected`.
 
     This check is for JAX, whose loaders return only values from the checkpoint.
     """
-    have, want = dict(_leaves(params)), dict(_leaves(wanted))
+    have, want = dict(_leaves(params)), dict(_leaves(expected))
     absent = sorted(name for name in want if not hasattr(have.get(name), "__array__"))
     unknown = sorted(set(have) - set(want))
     different = sorted(
@@ -305,11 +330,9 @@ def require_filled(params: Mapping[str, Any], wanted: Mapping[str, Any]) -> None
     if absent or unknown or different:
         raise ConfigError(
             f"the checkpoint does not fill the model: {len(absent)} parameters are not in it "
-            f"{absent[:_LISTED]}, "
-            f"{len(different)} have another shape {different[:_LISTED]}, {len(unknown)} are not "
-            "the model's "
-            f"{unknown[:_LISTED]}: is it a checkpoint of this model and this version of its "
-            "library?"
+            f"{absent[:_LISTED]}, {len(different)} have another shape {different[:_LISTED]}, "
+            f"{len(unknown)} are not the model's {unknown[:_LISTED]}: is it a checkpoint of this "
+            "model and this version of its library?"
         )
 
 
@@ -322,8 +345,10 @@ def _leaves(tree: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, An
 
 
 def _same(torch: Any, have: Any, want: Any) -> bool:
+    """Return whether two tensors have the same shape and equal elements, in a sample of them."""
     if have.shape != want.shape:
         return False
+
     step = max(1, have.numel() // _COMPARED)
     ours = have.reshape(-1)[::step].cpu()
     return bool(torch.equal(ours, want.reshape(-1)[::step].cpu().to(ours.dtype)))

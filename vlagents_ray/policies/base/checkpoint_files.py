@@ -54,15 +54,18 @@ def unfinished(path: Path) -> str | None:
     """
     try:
         entries = [path, *sorted(path.rglob("*"))] if path.is_dir() else [path]
-        if not (files := [entry for entry in entries if entry.is_file()]):
+        files = [entry for entry in entries if entry.is_file()]
+        if not files:
             return f"{path.name}: no file is there"
         if all(file.suffix in _TEXT for file in files):
             return f"{path.name}: holds no weights, only {[file.name for file in files]}"
+
         for entry in entries:
             if any(fnmatch.fnmatchcase(entry.name, pattern) for pattern in TEMPORARY):
                 return f"{entry.name}: its name is a temporary one"
         for file in files:
-            if (trouble := _trouble(file)) is not None:
+            trouble = _trouble(file)
+            if trouble is not None:
                 return f"{file.name}: {trouble}"
     except FileNotFoundError as error:
         return f"{error.filename}: went away while it was looked at"
@@ -70,11 +73,14 @@ def unfinished(path: Path) -> str | None:
 
 
 def _trouble(file: Path) -> str | None:
+    """Return the sign that a file is incomplete, by the check for its suffix; None if there is
+    none.
+    """
     check = next((check for suffix, check in _CHECKS.items() if file.name.endswith(suffix)), None)
     try:
         return None if check is None else check(file)
-    # truncated, or not in the format of its name
     except (ValueError, KeyError, TypeError, AttributeError) as error:
+        # The file is truncated, or not in the format of its name.
         return f"cannot be read ({error})"
 
 
@@ -84,18 +90,20 @@ def _safetensors(file: Path) -> str | None:
         length = int.from_bytes(opened.read(8), "little")
         if size < 8 + length:
             return f"has {size} bytes, its header alone has {8 + length}"
-        ends = [end for _, end in _places(opened.read(length))]
-    wanted = 8 + length + max(ends, default=0)
-    return None if size == wanted else f"has {size} bytes, its header says {wanted}"
+        ends = [end for _, end in _data_offsets(opened.read(length))]
+    expected_size = 8 + length + max(ends, default=0)
+    return None if size == expected_size else f"has {size} bytes, its header says {expected_size}"
 
 
-def _places(header: bytes) -> list[tuple[int, int]]:
+def _data_offsets(header: bytes) -> list[tuple[int, int]]:
     """Return start and end of each tensor's bytes after the header (JSON) of a .safetensors file.
 
     The file begins with 8 bytes, the length of the header.
     """
-    tensors = json.loads(header)
-    return [tuple(one["data_offsets"]) for name, one in tensors.items() if name != "__metadata__"]
+    entries = json.loads(header)
+    return [
+        tuple(entry["data_offsets"]) for name, entry in entries.items() if name != "__metadata__"
+    ]
 
 
 def _index(file: Path) -> str | None:
@@ -111,14 +119,12 @@ def _json(file: Path) -> str | None:
 
 def _zip(file: Path) -> str | None:
     with file.open("rb") as opened:
-        begins = opened.read(4)
-    if not begins:
+        first_bytes = opened.read(4)
+    if not first_bytes:
         return "is empty"
-    return (
-        "is a zip file without its end"
-        if begins == b"PK\x03\x04" and not zipfile.is_zipfile(file)
-        else None
-    )
+    if first_bytes == b"PK\x03\x04" and not zipfile.is_zipfile(file):
+        return "is a zip file without its end"
+    return None
 
 
 _CHECKS: dict[str, Callable[[Path], str | None]] = {
@@ -147,25 +153,28 @@ def digest(paths: Iterable[Path]) -> str:
     equal names.
 
     The digest covers the name and the size of each file, in a folder sorted by name, and part of
-    its
-    content: all of it up to 1 MiB; of a larger .safetensors file the header and 4 KiB in the middle
-        of each tensor; of
-    a zip file, as written by torch.save, the directory with the CRC-32 of each part; of any other
-    file 256 blocks of 4 KiB at equal distances. Different weights, statistics or settings therefore
-    have different digests, but a deliberate change of a few bytes may go unnoticed. Hidden files
-    and READMEs do not count.
+    its content:
+
+    - all of it up to 1 MiB;
+    - of a larger .safetensors file the header and 4 KiB in the middle of each tensor;
+    - of a zip file, as written by torch.save, the directory with the CRC-32 of each part;
+    - of any other file 256 blocks of 4 KiB at equal distances.
+
+    Different weights, statistics or settings therefore have different digests, but a deliberate
+    change of a few bytes may go unnoticed. Hidden files and READMEs do not count.
     """
-    found = hashlib.sha256()
+    sha256 = hashlib.sha256()
     for path in paths:
         for file in files_in(path):
             name = file.name if file == path else file.relative_to(path).as_posix()
-            with contextlib.suppress(OSError):  # unreadable or gone, so it was not loaded
+            # A file that cannot be read, or is gone, was not loaded.
+            with contextlib.suppress(OSError):
                 size = file.stat().st_size
-                found.update(json.dumps([name, size]).encode())
+                sha256.update(json.dumps([name, size]).encode())
                 with file.open("rb") as opened:
-                    for part in _parts(file, opened, size):
-                        found.update(part)
-    return f"{METHOD}:{found.hexdigest()}"
+                    for block in _sampled_blocks(file, opened, size):
+                        sha256.update(block)
+    return f"{METHOD}:{sha256.hexdigest()}"
 
 
 def revision(path: Path) -> str | None:
@@ -189,7 +198,7 @@ def _below(folder: Path, above: frozenset[str]) -> Iterator[Path]:
     folder's parents.
     """
     within = above | {os.path.realpath(folder)}
-    with contextlib.suppress(OSError):  # unreadable or gone
+    with contextlib.suppress(OSError):  # The folder cannot be read, or is gone.
         for entry in list(folder.iterdir()):
             if entry.name.startswith((".", "__pycache__")):
                 continue
@@ -200,20 +209,23 @@ def _below(folder: Path, above: frozenset[str]) -> Iterator[Path]:
                 yield from _below(entry, within)
 
 
-def _parts(file: Path, opened: BinaryIO, size: int) -> Iterator[bytes]:
+def _sampled_blocks(file: Path, opened: BinaryIO, size: int) -> Iterator[bytes]:
+    """Yield the bytes of a file of `size` bytes that its digest covers; see `digest`."""
     if size <= _WHOLE:
         yield opened.read()
-    elif file.suffix == ".safetensors" and (header := _header(opened)) is not None:
-        text, starts = header
+        return
+
+    header = _header(opened) if file.suffix == ".safetensors" else None
+    if header is not None:
+        text, blocks = header
         yield text
-        for start, length in starts:
+        for start, length in blocks:
             opened.seek(start)
             yield opened.read(length)
     elif zipfile.is_zipfile(file):
         with contextlib.suppress(zipfile.BadZipFile), zipfile.ZipFile(file) as archive:
-            yield json.dumps(
-                [[one.filename, one.file_size, one.CRC] for one in archive.infolist()]
-            ).encode()
+            directory = [[info.filename, info.file_size, info.CRC] for info in archive.infolist()]
+            yield json.dumps(directory).encode()
     else:
         for i in range(_BLOCKS):
             opened.seek((size - _BLOCK) * i // (_BLOCKS - 1))
@@ -226,14 +238,16 @@ def _header(opened: BinaryIO) -> tuple[bytes, list[tuple[int, int]]] | None:
 
     Returns None if the file has another format.
     """
-    if (length := int.from_bytes(opened.read(8), "little")) > _LONGEST_HEADER:
+    length = int.from_bytes(opened.read(8), "little")
+    if length > _LONGEST_HEADER:
         return None
+
     text = opened.read(length)
+    blocks = []
     try:
-        blocks = [
-            (max(begin, (begin + end - _BLOCK) // 2), min(_BLOCK, end - begin))
-            for begin, end in _places(text)
-        ]
+        for begin, end in _data_offsets(text):
+            middle = max(begin, (begin + end - _BLOCK) // 2)
+            blocks.append((8 + length + middle, min(_BLOCK, end - begin)))
     except (ValueError, KeyError, TypeError, AttributeError):
         return None
-    return text, [(8 + length + start, size) for start, size in blocks]
+    return text, blocks

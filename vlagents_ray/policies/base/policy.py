@@ -216,8 +216,8 @@ class ModelPolicy(Agent, abc.ABC):
         """Load the checkpoint; with `batch_sizes`, run each of them once, or compile the model's
         cores for it.
 
-        Without, one row and a full batch run on an accelerator, so that a missing kernel, or too
-        little memory, is not first found by a robot.
+        Without `batch_sizes`, one row and a full batch run on an accelerator, so that a missing
+        kernel, or too little memory, is an error before a robot acts.
         """
         with current_report() as self.report:
             self.model = self._load_with_adapters() if self.config.adapters else self.load()
@@ -241,20 +241,20 @@ class ModelPolicy(Agent, abc.ABC):
         self.report.pads = bool(sizes)
         if not sizes and self.report.accelerated:
             sizes = sorted({1, self.config.rows})
-        seeds, cores = itertools.count(), self.compilation.mode and self.compilation.cores
+        seeds = itertools.count()
+        cores = self.compilation.mode and self.compilation.cores
+        activity = "compiling" if self.config.compile else "running"
         for number, size in enumerate(reversed(sizes) if cores else sizes, 1):
-            report_progress(
-                f"{'compiling' if self.config.compile else 'running'} {size} rows ({number} of "
-                f"{len(sizes)})"
-            )
+            report_progress(f"{activity} {size} rows ({number} of {len(sizes)})")
             if cores:
                 self.compilation.add_size(size, partial(self._run_examples, size, seeds))
             elif self.config.batch_sizes and self.report.accelerated:
-                # Which also loads kernels, so its duration is not that of later ones.
+                # This pass also loads kernels: only the duration of the next one counts.
                 self._run_examples(size, seeds)
             self._run_examples(size, seeds)
+
         if sizes:
-            free_memory()  # which a full batch took, and usual ones do not need
+            free_memory()  # A full batch took it, and usual ones do not need it.
         for device in self.report.devices:
             if device["kind"] == "cuda" and cores:
                 device["graphs_mib"] = round(self.compilation.graph_bytes / 2**20, 1)
@@ -262,14 +262,18 @@ class ModelPolicy(Agent, abc.ABC):
 
     def _decide_on_compiling(self) -> None:
         """Set `compile` to what it means for the loaded model and its device."""
-        kind = next(
-            (device["kind"] for device in self.report.devices if device["kind"] != "cpu"), "cpu"
-        )
+        kinds = [device["kind"] for device in self.report.devices]
+        kind = next((kind for kind in kinds if kind != "cpu"), "cpu")
         mode = self.config.compile_on(kind)
         if self.config.compile == "auto":
             mode = mode if self.compilation.cores else False
-            why = (kind, len(self.compilation.cores), len(self.config.adapters))
-            logger.info("compile: auto: %s, on %r, with %d cores and %d adapters", mode, *why)
+            logger.info(
+                "compile: auto: %s, on %r, with %d cores and %d adapters",
+                mode,
+                kind,
+                len(self.compilation.cores),
+                len(self.config.adapters),
+            )
         elif mode == "graphs" and kind != "cuda":
             raise ConfigError(
                 f"compile: graphs: got a model on {kind!r}, want 'cuda'; leave it out"
@@ -312,40 +316,50 @@ class ModelPolicy(Agent, abc.ABC):
         """Return a chunk (H, D), or one action (D,), for each session, from one forward pass for
         all that need one.
         """
-        wanted = [
-            attempt(self._rows, one, session) for one, session in zip(obs, sessions, strict=True)
-        ]
-        rows = [row for own in wanted if not isinstance(own, Exception) for row in own]
-        found = iter(self._forward(rows))
-        return [
-            own
-            if isinstance(own, Exception)
-            else self._act(session, list(itertools.islice(found, len(own))))  # type: ignore[arg-type]
-            for own, session in zip(wanted, sessions, strict=True)
+        rows_by_session = [
+            attempt(self._rows, session_obs, session)
+            for session_obs, session in zip(obs, sessions, strict=True)
         ]
 
+        rows: list[Row] = []
+        for session_rows in rows_by_session:
+            if not isinstance(session_rows, Exception):
+                rows += session_rows
+        predictions = iter(self._forward(rows))
+
+        answers: list[Act | Exception] = []
+        for session_rows, session in zip(rows_by_session, sessions, strict=True):
+            if isinstance(session_rows, Exception):
+                answers.append(session_rows)
+                continue
+            session_predictions = list(itertools.islice(predictions, len(session_rows)))
+            answers.append(self._act(session, session_predictions))  # type: ignore[arg-type]
+        return answers
+
     def sleep(self) -> None:
+        """Free the captured graphs, and move the weights to the host if the policy has adapters."""
         self.compilation.drop_graphs()
         if self.config.adapters:  # the server moves the trainable values alone
             to_host([named_values(attrgetter(self.network or "")(self))], self.adapters.moved)
 
     def wake(self) -> None:
+        """Move the weights back to the device, and capture the graphs again."""
         from_host(self.adapters.moved)
         if self.compilation.mode and not self.compilation.sizes:
             self._warm_up()
 
     def close(self) -> None:
-        self.model, self.adapters, self.compilation = (
-            None,
-            LoraAdapters(),
-            Compilation(self.config.compile),
-        )
+        """Drop the model, its adapters and its compiled programs, which frees their memory."""
+        self.model = None
+        self.adapters = LoraAdapters()
+        self.compilation = Compilation(self.config.compile)
 
     def _trainable(self) -> Any:
-        if (kind := self.config.quantization) is not None:
+        quantization = self.config.quantization
+        if quantization is not None:
             raise NotTrainable(
-                f"quantization {kind!r}: weights of 8 bits cannot be replaced by a learner's; "
-                "leave it out"
+                f"quantization {quantization!r}: weights of 8 bits cannot be replaced by a "
+                "learner's; leave it out"
             )
         return self.adapters.trainable if self.config.adapters else super()._trainable()
 
@@ -400,17 +414,21 @@ class ModelPolicy(Agent, abc.ABC):
         then its samples.
         """
         episode = session._begun()
-        samples, want = wanted_samples(obs, self.config), wanted_behaviour(obs)
+        samples = wanted_samples(obs, self.config)
+        want = wanted_behaviour(obs)
         session.notice(obs)
-        if EXECUTED in obs.info:  # others than those of the plan
+
+        if EXECUTED in obs.info:  # The robot executed other actions than those of the plan.
             episode.plan.drop()
         rows_left = self.config.actions == "queue" and episode.plan.next is not None
         if rows_left and self.history == 1:
             return []
+
         episode.frames.append(session.perceive(obs) if obs.prepared is None else obs.prepared)
         if rows_left:
             return []
-        own = Row(
+
+        chunk_row = Row(
             frames=tuple(episode.frames),
             instruction=episode.instruction,
             rng=episode.rng,
@@ -423,45 +441,59 @@ class ModelPolicy(Agent, abc.ABC):
             adapter=self.adapters.require(episode.adapter),
         )
         if not samples:
-            return [own]
-        # One each, as they may be computed in several passes.
-        seeds = episode.draws.integers(2**63, size=samples)
-        return [own, *(drawn(own, np.random.default_rng(seed)) for seed in seeds)]
+            return [chunk_row]
 
-    def _act(self, session: ModelPolicy, found: list[Prediction | Exception]) -> Act | Exception:
+        # Each sample has a seed, since they may be computed in several passes.
+        seeds = episode.draws.integers(2**63, size=samples)
+        return [chunk_row, *(drawn(chunk_row, np.random.default_rng(seed)) for seed in seeds)]
+
+    def _act(
+        self, session: ModelPolicy, predictions: list[Prediction | Exception]
+    ) -> Act | Exception:
+        """Return a session's answer: from its predictions, the chunk and then its samples, or
+        from its plan if there are none.
+        """
         episode = session._begun()
         info = self.adapters.stated(episode.adapter)
-        if not found:
+        if not predictions:
             return Act(episode.plan.take().action, info=info)
-        if (error := next((p for p in found if isinstance(p, Exception)), None)) is not None:
-            return error
-        own, *samples = found
-        chunk = self._used(own.actions)  # type: ignore[union-attr]
-        info |= own.info  # type: ignore[union-attr]
-        if own.behaviour:  # type: ignore[union-attr]
-            info[BEHAVIOUR] = own.behaviour  # type: ignore[union-attr]
+
+        computed: list[Prediction] = []
+        for prediction in predictions:
+            if isinstance(prediction, Exception):
+                return prediction
+            computed.append(prediction)
+
+        chunk_prediction, *samples = computed
+        chunk = self._used(chunk_prediction.actions)
+        info |= chunk_prediction.info
+        if chunk_prediction.behaviour:
+            info[BEHAVIOUR] = chunk_prediction.behaviour
         if samples:
-            info[DISTRIBUTION] = self._distribution(own, samples)  # type: ignore[arg-type]
+            info[DISTRIBUTION] = self._distribution(chunk_prediction, samples)
         if self.config.actions == "chunk":
             return Act(chunk, info=info)
-        try:  # before the chunk is kept for later ticks
+
+        # Check the chunk before it is kept for later ticks.
+        try:
             check_action(chunk, self.contract)
-        except InvalidAction as broken:
-            return broken
+        except InvalidAction as error:
+            return error
         episode.plan.add(Chunk(0, episode.plan.executed, chunk))
         return Act(episode.plan.take().action, info=info)
 
     def _used(self, actions: np.ndarray) -> np.ndarray:
         return np.ascontiguousarray(actions[: self.config.execute], dtype=np.float32)
 
-    def _distribution(self, own: Prediction, samples: list[Prediction]) -> dict[str, Any]:
-        drawn = np.stack([self._used(sample.actions) for sample in samples])
-        mean = drawn.mean(0) if own.mean is None else self._used(own.mean)
-        std = drawn.std(0) if own.std is None else self._used(own.std)
+    def _distribution(self, prediction: Prediction, samples: list[Prediction]) -> dict[str, Any]:
+        """Return the samples with their mean and deviation, or those that the model states."""
+        chunks = np.stack([self._used(sample.actions) for sample in samples])
+        mean = chunks.mean(0) if prediction.mean is None else self._used(prediction.mean)
+        std = chunks.std(0) if prediction.std is None else self._used(prediction.std)
         return {
             "mean": mean,
             "std": std,
-            "samples": drawn,
+            "samples": chunks,
             **_stacked([sample.behaviour for sample in samples]),
         }
 
@@ -470,14 +502,17 @@ class ModelPolicy(Agent, abc.ABC):
         passes from then on.
         """
         while True:
-            before = [row.rng.bit_generator.state for row in rows]
+            states_before = [row.rng.bit_generator.state for row in rows]
             try:
                 return self._passes(rows)
             except Exception as error:
                 if not is_out_of_memory(error) or not self._lower_rows(len(rows), error):
                     raise
-            free_memory()  # after the handler, whose traceback refers to the tensors of the pass
-            for row, state in zip(rows, before, strict=True):  # the same noise again
+
+            # Only after the handler: its traceback refers to the tensors of the pass.
+            free_memory()
+            # The next try draws the same noise.
+            for row, state in zip(rows, states_before, strict=True):
                 row.rng.bit_generator.state = state
 
     def _lower_rows(self, rows: int, error: Exception) -> bool:
@@ -486,20 +521,25 @@ class ModelPolicy(Agent, abc.ABC):
         """
         self.report.on_out_of_memory()
         tried = min(self.most_rows, self._size(rows))
-        fits = [size for size in self.config.batch_sizes or (tried // 2,) if 0 < size <= tried // 2]
-        said = f"of at most {fits[-1]} rows from now on" if fits else "no smaller one is possible"
+        half = tried // 2
+        smaller_sizes = [size for size in self.config.batch_sizes or (half,) if 0 < size <= half]
+        if smaller_sizes:
+            self.report.most_rows = smaller_sizes[-1]
+            consequence = f"of at most {smaller_sizes[-1]} rows from now on"
+        else:
+            consequence = "no smaller one is possible"
+
         logger.error(
             "out of memory in a forward pass of %d rows: %s. Lower batch.max_size, max_rows or "
-            "batch_sizes, or free "
-            "memory of the device (%s)",
+            "batch_sizes, or free memory of the device (%s)",
             tried,
-            said,
+            consequence,
             error,
         )
-        self.report.most_rows = fits[-1] if fits else self.report.most_rows
-        return bool(fits)
+        return bool(smaller_sizes)
 
     def _size(self, rows: int) -> int:
+        """Return the number of rows to which a pass of `rows` rows is padded."""
         return next((size for size in self.config.batch_sizes or () if size >= rows), rows)
 
     def padded(self, items: list[T]) -> list[T]:
@@ -507,23 +547,28 @@ class ModelPolicy(Agent, abc.ABC):
         return items + items[-1:] * (self._size(len(items)) - len(items))
 
     def _passes(self, rows: list[Row]) -> list[Prediction | Exception]:
-        found: list[Prediction | Exception] = []
+        """Compute all rows, in as many forward passes as `_split` returns."""
+        predictions: list[Prediction | Exception] = []
         for size in self._split(len(rows)):
-            part = rows[len(found) : len(found) + size]
-            # copies, so that their noise is not the session's.
-            spare = self.padded(part)[len(part) :]
-            filled = [*part, *(copy.deepcopy(row, {id(row.frames): row.frames}) for row in spare)]
+            pass_rows = rows[len(predictions) : len(predictions) + size]
+            # The rows that fill the pass are copies, so that they draw no noise of the session.
+            fillers = self.padded(pass_rows)[len(pass_rows) :]
+            copies = [copy.deepcopy(row, {id(row.frames): row.frames}) for row in fillers]
+            padded_rows = [*pass_rows, *copies]
+
             began = time.perf_counter()
             with self.report.timer():
-                results = self.predict(filled)
-            shortest, took = self.report.pass_s, time.perf_counter() - began
-            shortest[len(filled)] = min(took, shortest.get(len(filled), took))
-            if len(results) != len(filled):
+                results = self.predict(padded_rows)
+            took = time.perf_counter() - began
+            if len(results) != len(padded_rows):
                 raise PolicyFailed(
-                    f"predict: got {len(filled)} rows, returned {len(results)} chunks"
+                    f"predict: got {len(padded_rows)} rows, returned {len(results)} chunks"
                 )
-            found += results[: len(part)]
-        return found
+
+            shortest = self.report.pass_s
+            shortest[len(padded_rows)] = min(took, shortest.get(len(padded_rows), took))
+            predictions += results[: len(pass_rows)]
+        return predictions
 
     def _split(self, rows: int) -> list[int]:
         """Return the numbers of rows of the passes for a batch: one, or several if it is too large
@@ -532,16 +577,16 @@ class ModelPolicy(Agent, abc.ABC):
         With `batch_sizes`, 9 rows may take longer as a pass of 16 than as one of 8 and one of 1. On
         a CPU, where the time of a pass depends on what else runs, only the number of passes counts.
         """
-        most = self.most_rows
-        whole, rest = divmod(rows, most)
-        pass_s = {
-            size: self.report.pass_s.get(size)
-            for size in self.config.batch_sizes or ()
-            if size <= most
-        }
-        if rest and self.report.accelerated and pass_s and None not in pass_s.values():
-            return [most] * whole + fastest_split(rest, tuple(pass_s.items()))
-        return [most] * whole + [rest] * bool(rest)
+        full_passes, remaining = divmod(rows, self.most_rows)
+        split = [self.most_rows] * full_passes
+        if not remaining:
+            return split
+
+        sizes = [size for size in self.config.batch_sizes or () if size <= self.most_rows]
+        pass_s = {size: self.report.pass_s.get(size) for size in sizes}
+        if self.report.accelerated and pass_s and None not in pass_s.values():
+            return split + fastest_split(remaining, tuple(pass_s.items()))
+        return [*split, remaining]
 
     def _run_examples(self, size: int, seeds: Iterator[int]) -> None:
         rows = [self._example(next(seeds)) for _ in range(size)]
@@ -549,10 +594,13 @@ class ModelPolicy(Agent, abc.ABC):
             if isinstance(prediction, Exception):
                 raise prediction
         if any("jax" in device for device in self.report.devices) and size <= self.most_rows:
-            # JAX compiles for each such pair.
-            for few in (few for few in self.config.batch_sizes or () if few < size):
-                # Its duration is another.
-                self.predict([*rows[:few], *(drawn(rows[0], row.rng) for row in rows[few:])])
+            # JAX compiles for each pair of a number of rows and a smaller number of observations.
+            for observations in self.config.batch_sizes or ():
+                if observations >= size:
+                    continue
+                samples = [drawn(rows[0], row.rng) for row in rows[observations:]]
+                # Not by `_forward`: the durations of these passes must not count.
+                self.predict([*rows[:observations], *samples])
 
     def observations_of(self, rows: Sequence[Row]) -> tuple[list[int], list[int]]:
         """Return the rows to encode, padded to one of `batch_sizes`, and for each row the place of
@@ -561,44 +609,49 @@ class ModelPolicy(Agent, abc.ABC):
         As many observations as rows are those of the rows: 0, 1, …, which needs no gathering.
         """
         firsts, owners = shared_frames(rows)
-        firsts, each = self.padded(firsts), list(range(len(rows)))
-        return (each, each) if len(firsts) == len(rows) else (firsts, owners)
+        firsts = self.padded(firsts)
+        if len(firsts) == len(rows):
+            every_row = list(range(len(rows)))
+            return every_row, every_row
+        return firsts, owners
 
     def _example(self, seed: int, instruction: str = "warm up") -> Row:
         """Return a row for the warm-up: random images, and a random state near zero, that fit
         the contract.
         """
-        rng, contract = np.random.default_rng(seed), self.contract or Contract()
-        lengths = {name: part.dim or 1 for name, part in (contract.state or {}).items()}
-        unstated = [name for name, part in (contract.state or {}).items() if part.dim is None]
-        if unstated and self.state_dim is not None:
-            lengths[unstated[0]] += self.state_dim - len(unstated) - bool(contract.gripper)
-        obs = Obs(
-            cameras={
-                name: rng.integers(0, 256, (one.height or 224, one.width or 224, 3), np.uint8)
-                for name, one in (contract.cameras or {}).items()
-            },
-            gripper=float(rng.random()),
-            state={
-                name: rng.uniform(-0.1, 0.1, length).astype(np.float32)
-                for name, length in lengths.items()
-            },
-        )
+        rng = np.random.default_rng(seed)
+        contract = self.contract or Contract()
+        state_specs = contract.state or {}
+        lengths = {name: spec.dim or 1 for name, spec in state_specs.items()}
+        open_lengths = [name for name, spec in state_specs.items() if spec.dim is None]
+        if open_lengths and self.state_dim is not None:
+            lengths[open_lengths[0]] += self.state_dim - len(open_lengths) - bool(contract.gripper)
+
+        images = {}
+        for name, camera in (contract.cameras or {}).items():
+            shape = (camera.height or 224, camera.width or 224, 3)
+            images[name] = rng.integers(0, 256, shape, np.uint8)
+        gripper = float(rng.random())
+        state = {}
+        for name, length in lengths.items():
+            state[name] = rng.uniform(-0.1, 0.1, length).astype(np.float32)
+        obs = Obs(cameras=images, gripper=gripper, state=state)
+
         session = copy.copy(self)
         session._begin(instruction, seed, self.adapters.example(seed))
-        seen = (session.perceive(obs),) * self.history
-        return Row(seen, instruction, rng, adapter=self.adapters.example(seed))
+        frames = (session.perceive(obs),) * self.history
+        return Row(frames, instruction, rng, adapter=self.adapters.example(seed))
 
 
-def _stacked(stated: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+def _stacked(mappings: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """Return one mapping for several of the same names: arrays get a first dimension, mappings
     are mapped alike.
     """
-    columns = {name: [one[name] for one in stated] for name in stated[0]}
-    return {
-        name: _stacked(values) if isinstance(values[0], Mapping) else np.stack(values)
-        for name, values in columns.items()
-    }
+    stacked: dict[str, Any] = {}
+    for name, first in mappings[0].items():
+        values = [mapping[name] for mapping in mappings]
+        stacked[name] = _stacked(values) if isinstance(first, Mapping) else np.stack(values)
+    return stacked
 
 
 @lru_cache(maxsize=256)
@@ -610,11 +663,15 @@ def fastest_split(rows: int, pass_s: tuple[tuple[int, float], ...]) -> list[int]
         pass_s: The sizes of passes, to which smaller ones are padded, and how long each takes, s;
             ascending by size.
     """
+    # The shortest time for 0, 1, … rows, and the passes that take it.
     best: list[tuple[float, list[int]]] = [(0.0, [])]
     for count in range(1, rows + 1):
-        splits = ((size, took, *best[max(0, count - size)]) for size, took in pass_s)
-        best.append(
-            min((took + others, [*sizes, min(size, count)]) for size, took, others, sizes in splits)
-        )
-    one_s = next(took for size, took in pass_s if size >= rows)
-    return best[rows][1] if best[rows][0] < _FASTER * one_s else [rows]
+        splits = []
+        for size, took in pass_s:
+            earlier_s, earlier_passes = best[max(0, count - size)]
+            splits.append((took + earlier_s, [*earlier_passes, min(size, count)]))
+        best.append(min(splits))
+
+    shortest_s, passes = best[rows]
+    single_pass_s = next(took for size, took in pass_s if size >= rows)
+    return passes if shortest_s < _FASTER * single_pass_s else [rows]

@@ -55,28 +55,31 @@ def code_of_class(target: str) -> Program:
     top = module.partition(".")[0]
     if not top.isidentifier() or top == _PACKAGE:
         return {}
-    found: Program = {}
-    waiting, seen = [module], set()
+
+    digests: Program = {}
+    waiting, visited = [module], set()
     while waiting:
-        if (name := waiting.pop()) in seen:
+        name = waiting.pop()
+        if name in visited:
             continue
-        seen.add(name)
+        visited.add(name)
         if "." in name:
-            waiting.append(name.rpartition(".")[0])  # a package is executed before its modules
+            waiting.append(name.rpartition(".")[0])  # A package is executed before its modules.
+
         file = _file(name)
         if file is None or not _is_own(file):
             continue
         content = file.read_bytes()
-        inside = name if file.stem == "__init__" else name.rpartition(".")[0]
-        folder = Path(*inside.split(".")) if inside else Path()
-        found[(folder / file.name).as_posix()] = f"sha256:{hashlib.sha256(content).hexdigest()}"
+        package = name if file.stem == "__init__" else name.rpartition(".")[0]
+        folder = Path(*package.split(".")) if package else Path()
+        digests[(folder / file.name).as_posix()] = f"sha256:{hashlib.sha256(content).hexdigest()}"
         if file.suffix == ".py":
-            waiting += _imports(content, inside)
-    if not found and top != "__main__":
-        found = {
-            name: f"version {version(name)}" for name in sorted(set(_distributions().get(top, ())))
-        }
-    return found
+            waiting += _imports(content, package)
+
+    if digests or top == "__main__":
+        return digests
+    distributions = sorted(set(_distributions().get(top, ())))
+    return {name: f"version {version(name)}" for name in distributions}
 
 
 # Takes half a second, since it reads the list of files of each installed package, and runs for each
@@ -101,17 +104,18 @@ def files_named(settings: Mapping[str, Any], *, folders: bool = True) -> Program
             does.
     """
     step = settings.get("checkpoint_step")
-    found: Program = {}
+    digests: Program = {}
     for name, text in _texts(settings):
-        if (path := _existing(at_step(text, step) if isinstance(step, int) else text)) is None:
+        path = _existing(at_step(text, step) if isinstance(step, int) else text)
+        if path is None:
             continue
         if path.is_file():
-            found[f"{name}: {path}"] = digest([path])
+            digests[f"{name}: {path}"] = digest([path])
         elif folders and not Path.cwd().resolve().is_relative_to(path.resolve()):
             files = files_in(path)
             listed = files if len(files) <= _LISTED else [path]
-            found |= {f"{name}: {file}": digest([file]) for file in listed}
-    return found
+            digests |= {f"{name}: {file}": digest([file]) for file in listed}
+    return digests
 
 
 def digest_of(files: Program) -> str:
@@ -125,9 +129,9 @@ def with_defaults(cls: type[Any], settings: Mapping[str, Any]) -> dict[str, Any]
     fields = getattr(getattr(cls, "Config", None), "model_fields", {})
     defaults = {name: field.default for name, field in fields.items()}
     parameters = inspect.signature(cls.__init__).parameters.values()
-    defaults |= {
-        one.name: one.default for one in parameters if one.default is not inspect.Parameter.empty
-    }
+    for parameter in parameters:
+        if parameter.default is not inspect.Parameter.empty:
+            defaults[parameter.name] = parameter.default
     return {**defaults, **settings}
 
 
@@ -139,24 +143,28 @@ def _file(name: str) -> Path | None:
         path = getattr(sys.modules[name], "__file__", None)
         return None if path is None else Path(path)
     spec = _spec(name)
-    return (
-        None if spec is None or not spec.has_location or spec.origin is None else Path(spec.origin)
-    )
+    if spec is None or not spec.has_location or spec.origin is None:
+        return None
+    return Path(spec.origin)
 
 
 def _spec(name: str) -> ModuleSpec | None:
+    """Return the spec of a module without importing its packages; None for a module in an
+    installed package, or a missing one.
+    """
     parent, _, _ = name.rpartition(".")
     if not parent:
         try:
-            return find_spec(name)  # imports nothing, since the name has no parent
-        except (ImportError, ValueError):  # a module without a spec
+            return find_spec(name)  # It imports nothing, since the name has no parent.
+        except (ImportError, ValueError):  # The module has no spec.
             return None
-    above = _spec(parent)
-    if above is None or above.submodule_search_locations is None:
+
+    package = _spec(parent)
+    if package is None or package.submodule_search_locations is None:
         return None
-    if above.has_location and above.origin is not None and not _is_own(Path(above.origin)):
+    if package.has_location and package.origin is not None and not _is_own(Path(package.origin)):
         return None
-    return PathFinder.find_spec(name, list(above.submodule_search_locations))
+    return PathFinder.find_spec(name, list(package.submodule_search_locations))
 
 
 def _is_own(file: Path) -> bool:
@@ -164,10 +172,10 @@ def _is_own(file: Path) -> bool:
     library.
     """
     path = file.resolve()
-    here = Path(__file__).resolve().parents[2]
-    return not _SITES & set(path.parts) and not any(
-        path.is_relative_to(one) for one in (*_LIBRARIES, here)
-    )
+    if _SITES & set(path.parts):
+        return False
+    this_package = Path(__file__).resolve().parents[2]
+    return not any(path.is_relative_to(folder) for folder in (*_LIBRARIES, this_package))
 
 
 def _imports(source: bytes, package: str) -> Iterator[str]:
@@ -182,12 +190,17 @@ def _imports(source: bytes, package: str) -> Iterator[str]:
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names)
         elif isinstance(node, ast.ImportFrom):
-            parts = (
-                package.split(".")[: len(package.split(".")) - node.level + 1] if node.level else []
-            )
-            if base := ".".join([*parts, *([node.module] if node.module else [])]):
-                yield base
-                yield from (f"{base}.{alias.name}" for alias in node.names if alias.name != "*")
+            names = []
+            if node.level:  # The import is relative to the package.
+                parents = package.split(".")
+                names += parents[: len(parents) - node.level + 1]
+            if node.module:
+                names.append(node.module)
+            base = ".".join(names)
+            if not base:
+                continue
+            yield base
+            yield from (f"{base}.{alias.name}" for alias in node.names if alias.name != "*")
 
 
 def _texts(value: Any, name: str = "") -> Iterator[tuple[str, str]]:
@@ -208,5 +221,5 @@ def _existing(text: str) -> Path | None:
         path = Path(text).expanduser()
         return path if path.exists() else None
     except (OSError, RuntimeError):
-        # a name too long for the file system, or `~` of an unknown user
+        # The name is too long for the file system, or is `~` of an unknown user.
         return None
