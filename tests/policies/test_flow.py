@@ -42,7 +42,7 @@ def row(seed: int, *want: str) -> Row:
 def followed(rows: list[Row], level: float = LEVEL) -> tuple[Any, RandomSteps | None]:
     """The actions of rows, and their random steps."""
     actions = torch.from_numpy(np.stack([one.noise(HORIZON, DIM) for one in rows]))
-    random = RandomSteps.of(rows, SHAPE, level, torch.from_numpy)
+    random = RandomSteps.for_rows(rows, SHAPE, level, torch.from_numpy)
     actions = follow(velocity, actions, STEPS, *([] if random is None else [random.change]))
     return actions, random
 
@@ -50,7 +50,7 @@ def followed(rows: list[Row], level: float = LEVEL) -> tuple[Any, RandomSteps | 
 def stated(*rows: Row, execute: int | None = None, dim: int = DIM) -> dict[int, dict[str, Any]]:
     _, random = followed(list(rows))
     assert random is not None
-    return random.stated(execute, dim)
+    return random.outputs(execute, dim)
 
 
 @pytest.mark.parametrize("level", [0.0, 0.5, 1.0])
@@ -96,7 +96,7 @@ def test_a_chain_begins_with_the_noise_and_ends_with_the_actions() -> None:
     rows = [row(0, "replay")]
     actions, random = followed(rows)
     assert random is not None
-    chain = random.stated(None, DIM)[0]["replay"]["chain"]
+    chain = random.outputs(None, DIM)[0]["replay"]["chain"]
     assert chain.shape == (STEPS + 1, HORIZON, DIM)
     np.testing.assert_array_equal(chain[0], row(0).noise(HORIZON, DIM))
     np.testing.assert_array_equal(chain[-1], actions[0])

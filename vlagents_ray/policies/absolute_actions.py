@@ -31,8 +31,7 @@ class AbsoluteActionsConfig(BaseModel, extra="forbid"):
     state: list[str] = Field(
         min_length=1,
         description="parts of the proprioception to which actions are relative: in turn a number "
-        "for each relative "
-        "column of an action",
+        "for each relative column of an action",
     )
     absolute: list[int] = Field(
         default=[],
@@ -70,9 +69,8 @@ class AbsoluteActions(Wrapper):
         if isinstance(agent, ModelPolicy) and agent.config.actions != "chunk":
             raise ConfigError(
                 f"absolute_actions: got a policy with actions: {agent.config.actions}, whose rows "
-                "belong to chunks of "
-                "earlier states; want actions: chunk, and let the chunk player or the evaluation "
-                "execute them"
+                "belong to chunks of earlier states; want actions: chunk, and let the chunk player "
+                "or the evaluation execute them"
             )
 
     @property
@@ -100,30 +98,37 @@ class AbsoluteActions(Wrapper):
         inner = self.agent.contract
         if inner is None:
             return
+
         action = inner.action
-        got = {
-            "absolute actions": action.delta is False,
-            f"actions in the space {action.space!r}": "velocity" in (action.space or ""),
-            f"rotations as {action.rotation!r}": action.rotation not in (None, "none"),
-        }
-        if wrong := [what for what, is_so in got.items() if is_so]:
+        faults = []
+        if action.delta is False:
+            faults.append("absolute actions")
+        if "velocity" in (action.space or ""):
+            faults.append(f"actions in the space {action.space!r}")
+        if action.rotation not in (None, "none"):
+            faults.append(f"rotations as {action.rotation!r}")
+        if faults:
             raise ConfigError(
-                f"absolute_actions: the policy has {' and '.join(wrong)}, want relative ones that "
-                "add up with its "
-                f"state, such as joints; leave the wrapper out"
+                f"absolute_actions: the policy has {' and '.join(faults)}, want relative ones that "
+                "add up with its state, such as joints; leave the wrapper out"
             )
 
     def change_batch(
         self, obs: Sequence[Obs], sessions: Sequence[Wrapper]
     ) -> list[Obs | Exception]:
-        return [attempt(self._with_relative_plan, one) for one in obs]
+        """Make the leftover plan of each observation relative to its state."""
+        return [attempt(self._with_relative_plan, session_obs) for session_obs in obs]
 
     def act_batch(self, obs: Sequence[Obs], sessions: Sequence[Agent]) -> list[Act | Exception]:
+        """Return the inner agent's actions with the states of the observations added."""
         acts = super().act_batch(obs, sessions)
-        return [
-            act if isinstance(act, Exception) else attempt(self._absolute, one, act)
-            for one, act in zip(obs, acts, strict=True)
-        ]
+        absolute: list[Act | Exception] = []
+        for session_obs, act in zip(obs, acts, strict=True):
+            if isinstance(act, Exception):
+                absolute.append(act)
+            else:
+                absolute.append(attempt(self._absolute, session_obs, act))
+        return absolute
 
     def _with_relative_plan(self, obs: Obs) -> Obs:
         if obs.info.get(LEFTOVER) is None:
@@ -132,22 +137,27 @@ class AbsoluteActions(Wrapper):
         return replace(obs, info={**obs.info, LEFTOVER: plan - self._origin(obs, plan.shape[-1])})
 
     def _absolute(self, obs: Obs, act: Act) -> Act:
-        origin, info = self._origin(obs, act.action.shape[-1]), act.info
+        origin = self._origin(obs, act.action.shape[-1])
+        info = act.info
         if DISTRIBUTION in info:
-            drawn = info[DISTRIBUTION]
-            moved = {name: drawn[name] + origin for name in ("mean", "samples") if name in drawn}
-            info = {**info, DISTRIBUTION: {**drawn, **moved}}
+            distribution = dict(info[DISTRIBUTION])
+            for name in ("mean", "samples"):
+                if name in distribution:
+                    distribution[name] = distribution[name] + origin
+            info = {**info, DISTRIBUTION: distribution}
         return Act(act.action + origin, act.done, info)
 
     def _origin(self, obs: Obs, dim: int) -> np.ndarray:
         """Return the pose to which actions are relative, (dim,) float32; zeros in absolute
         columns.
         """
-        if outside := [column for column in self.config.absolute if not -dim <= column < dim]:
+        outside = [column for column in self.config.absolute if not -dim <= column < dim]
+        if outside:
             raise InvalidAction(
                 f"absolute_actions: got the absolute columns {outside} of actions with {dim} "
                 "numbers"
             )
+
         relative = np.ones(dim, bool)
         relative[self.config.absolute] = False
         origin = np.zeros(dim, np.float32)

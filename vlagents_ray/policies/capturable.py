@@ -43,11 +43,15 @@ class Capturable(TorchFunctionMode):  # type: ignore[misc]
     ) -> Any:
         if func not in _COPIES:
             return func(*args, **(kwargs or {}))
-        place, self._calls = self._calls, self._calls + 1
-        if place < len(self._copied) and (copied := self._copied[place]) is not None:
+
+        number = self._calls
+        self._calls += 1
+        copied = self._copied[number] if number < len(self._copied) else None
+        if copied is not None:
             return copied.clone()
+
         result = func(*args, **(kwargs or {}))
-        if place == len(self._copied):
-            own = any(isinstance(one, torch.Tensor) and one.is_cuda for one in args)
-            self._copied.append(result if result.is_cuda and not own else None)
+        if number == len(self._copied):
+            from_gpu = any(isinstance(arg, torch.Tensor) and arg.is_cuda for arg in args)
+            self._copied.append(result if result.is_cuda and not from_gpu else None)
         return result

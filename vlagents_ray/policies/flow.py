@@ -119,10 +119,10 @@ def chain_entropy(steps: int, noise_level: float) -> float:
     """Return the entropy of one number of a chain, given the noise, nats: it depends on the
     noise level alone.
     """
-    return sum(
-        math.log(step_std(step, steps, noise_level)) + 0.5 * (1.0 + _LOG_2_PI)
-        for step in range(steps)
-    )
+    entropy = 0.0
+    for step in range(steps):
+        entropy += math.log(step_std(step, steps, noise_level)) + 0.5 * (1.0 + _LOG_2_PI)
+    return entropy
 
 
 class RandomSteps:
@@ -158,7 +158,7 @@ class RandomSteps:
         self._means: list[Any] = []  # of those after each step
 
     @classmethod
-    def of(
+    def for_rows(
         cls,
         rows: Sequence[Row],
         shape: tuple[int, int, int],
@@ -168,11 +168,9 @@ class RandomSteps:
         """Return the random steps of a batch; None if there are none, in which case nothing is
         drawn.
         """
-        return (
-            cls(rows, shape, noise_level, convert)
-            if noise_level and any(row.want for row in rows)
-            else None
-        )
+        if not noise_level or not any(row.want for row in rows):
+            return None
+        return cls(rows, shape, noise_level, convert)
 
     def change(self, velocity: Any, actions: Any, time: float) -> Any:
         """Return the velocity (B, H, D) of the next step, which moves the requested rows to
@@ -187,22 +185,30 @@ class RandomSteps:
         self._means.append(mean)
         return velocity.index_copy(0, self._index, change.to(velocity.dtype))
 
-    def stated(self, execute: int | None, dim: int | None) -> dict[int, dict[str, Any]]:
-        """Return the outputs requested of rows, by their places, after the last step; None: all
-        rows, all numbers.
+    def outputs(self, execute: int | None, dim: int | None) -> dict[int, dict[str, Any]]:
+        """Return the outputs that rows request, by the index of the row, after the last step.
+
+        Args:
+            execute: How many rows of a chunk are used; None: all.
+            dim: How many numbers of an action are the robot's; None: all.
         """
         stds = [step_std(step, self._steps, self._level) for step in range(self._steps)]
         total = sum(map(normal_logprob, self._chain[1:], self._means, stds))
-        # One copy, for which it waits.
-        *chains, logprobs = fetch(require("torch").stack([*self._chain, total]))
-        logprob = logprobs[:, :execute, :dim]
-        entropy = chain_entropy(self._steps, self._level) * logprob[0].size
-        found: dict[int, dict[str, Any]] = {}
-        for place, (i, want) in enumerate(self._wants.items()):
-            replay = {"chain": np.stack([one[place] for one in chains]), "noise_level": self._level}
-            said = {"logprob": logprob[place], "entropy": entropy, "replay": replay}
-            found[i] = {name: said[name] for name in want}
-        return found
+        # A single copy from the device, for which this thread waits.
+        *chain, all_logprobs = fetch(require("torch").stack([*self._chain, total]))
+        logprobs = all_logprobs[:, :execute, :dim]
+        entropy = chain_entropy(self._steps, self._level) * logprobs[0].size
+
+        outputs: dict[int, dict[str, Any]] = {}
+        for index, (row, want) in enumerate(self._wants.items()):
+            row_chain = np.stack([actions[index] for actions in chain])
+            available = {
+                "logprob": logprobs[index],
+                "entropy": entropy,
+                "replay": {"chain": row_chain, "noise_level": self._level},
+            }
+            outputs[row] = {name: available[name] for name in want}
+        return outputs
 
 
 @dataclass(frozen=True, slots=True)
@@ -216,44 +222,47 @@ class Guide:
     weight: Any  # (B, H, 1) in [0, 1]: how closely a later row follows
 
     @classmethod
-    def of(cls, rows: Sequence[Row], horizon: int, dim: int) -> Guide | None:
+    def for_rows(cls, rows: Sequence[Row], horizon: int, dim: int) -> Guide | None:
         """Return the guide of the rows' `delay` and `leftover`, in the model's units; None if no
         row has any.
         """
         if all(row.leftover is None for row in rows):
             return None
+
         plan = np.zeros((len(rows), horizon, dim), np.float32)
         frozen = np.zeros((len(rows), horizon, 1), np.float32)
         weight = np.zeros((len(rows), horizon, 1), np.float32)
         for i, row in enumerate(rows):
-            if row.leftover is not None:
-                left = row.leftover[:horizon]
-                delay = min(max(row.delay, 0), len(left))
-                plan[i, : len(left), : left.shape[1]] = left
-                frozen[i, :delay] = 1.0
-                # the paper's soft mask, from about 1 after the frozen rows down to 0 where the plan
-                # ends
-                behind = np.arange(delay, horizon, dtype=np.float32)
-                share = np.clip((len(left) - behind) / (len(left) - delay + 1), 0.0, 1.0)
-                weight[i, delay:, 0] = share * np.expm1(share) / np.expm1(1.0)
+            if row.leftover is None:
+                continue
+            leftover = row.leftover[:horizon]
+            delay = min(max(row.delay, 0), len(leftover))
+            plan[i, : len(leftover), : leftover.shape[1]] = leftover
+            frozen[i, :delay] = 1.0
+
+            # The paper's soft mask: from about 1 after the frozen rows down to 0 where the plan
+            # ends.
+            later_rows = np.arange(delay, horizon, dtype=np.float32)
+            share = np.clip((len(leftover) - later_rows) / (len(leftover) - delay + 1), 0.0, 1.0)
+            weight[i, delay:, 0] = share * np.expm1(share) / np.expm1(1.0)
         return cls(plan, frozen, weight)
 
     def to(self, convert: Callable[[np.ndarray], Any]) -> Guide:
         """Convert the arrays to another library, or move them to another device."""
         return Guide(convert(self.plan), convert(self.frozen), convert(self.weight))
 
-    def given(self, noise: Any) -> Any:
+    def insert_frozen(self, noise: Any) -> Any:
         """Return noise (B, H, D) with the frozen rows of the plan in it, for a policy that was
         trained with prefixes.
 
-        Such a policy reads these rows as actions, at flow time 0 (`FlowPasses.sample`'s `given`),
+        Such a policy reads these rows as actions, at flow time 0 (`FlowPasses.sample`'s `frozen`),
         and continues them without any correction (training-time action conditioning,
         https://arxiv.org/abs/2512.05964).
         """
         return self.frozen * self.plan + (1.0 - self.frozen) * noise
 
     def keep(self, velocity: Any, actions: Any, time: float) -> Any:
-        """Return the velocity (B, H, D) that leaves given rows as they are."""
+        """Return the velocity (B, H, D) that leaves the frozen rows as they are."""
         return (1.0 - self.frozen) * velocity
 
     def steer(
@@ -305,8 +314,8 @@ class FlowPasses(abc.ABC):
     def encode(
         self, tokens: Any, mask: Any, cameras: Any, state: Any, *images: Any
     ) -> tuple[Any, Any]:
-        """Return keys and values, or all else that `velocity` reads of inputs, and which tokens (P,
-        L) are there.
+        """Return keys and values, or all else that `velocity` reads of inputs, and the mask (P, L)
+        of the tokens that are there.
 
         Args:
             tokens: Of the instruction, (P, T) int64.
@@ -317,9 +326,15 @@ class FlowPasses(abc.ABC):
         """
 
     @abc.abstractmethod
-    def velocity(self, encoded: Any, seen: Any, state: Any, actions: Any, times: Any) -> Any:
-        """Return the velocity (B, H, D) of noisy actions (B, H, D) at times (B,), or (B, H) with
-        `by_row`.
+    def velocity(self, encoded: Any, present: Any, state: Any, actions: Any, times: Any) -> Any:
+        """Return the velocity (B, H, D) of noisy actions (B, H, D).
+
+        Args:
+            encoded: The first result of `encode`, for B rows.
+            present: The second one, the mask (B, L) of its tokens.
+            state: (B, S).
+            actions: (B, H, D).
+            times: The flow times (B,), or (B, H) with `by_row`.
         """
 
     def chunks(
@@ -334,8 +349,8 @@ class FlowPasses(abc.ABC):
         dim: int | None,
         convert: Callable[[np.ndarray], Any],
     ) -> tuple[np.ndarray, dict[int, dict[str, Any]]]:
-        """Return actions (B, H, D) in the model's units, and the outputs requested of rows, by
-        their places.
+        """Return actions (B, H, D) in the model's units, and the outputs that rows request, by the
+        index of the row.
 
         Args:
             rows: Those of the batch, with plans in the model's units.
@@ -348,21 +363,31 @@ class FlowPasses(abc.ABC):
             dim: How many of the numbers are the robot's; None: all.
             convert: Makes a tensor of an array, on the model's device.
         """
-        start, changes, (_, horizon, width) = convert(noise), list[Change](), noise.shape
-        if (guide := Guide.of(rows, horizon, width)) is not None:
+        _, horizon, width = noise.shape
+        start = convert(noise)
+        changes: list[Change] = []
+
+        guide = Guide.for_rows(rows, horizon, width)
+        if guide is not None:
+            converted = guide.to(convert)
             changes.append(
-                partial(guide.to(convert).steer, noise=start, steps=steps, limit=config.guidance)
+                partial(converted.steer, noise=start, steps=steps, limit=config.guidance)
             )
-        random = RandomSteps.of(rows, (steps, horizon, width), config.noise_level, convert)
+        random = RandomSteps.for_rows(rows, (steps, horizon, width), config.noise_level, convert)
         if random is not None:
             changes.append(random.change)
-        adapters: Sequence[str] = (
-            [row.adapter for row in rows] if any(row.adapter for row in rows) else ()
-        )
+
+        fingerprints = [row.adapter for row in rows]
         flow = self.sample(
-            *inputs, noise=start, owners=owners, steps=steps, changes=changes, fingerprints=adapters
+            *inputs,
+            noise=start,
+            owners=owners,
+            steps=steps,
+            changes=changes,
+            fingerprints=fingerprints if any(fingerprints) else (),
         )
-        return fetch(flow), {} if random is None else random.stated(config.execute, dim)
+        outputs = {} if random is None else random.outputs(config.execute, dim)
+        return fetch(flow), outputs
 
     def sample(
         self,
@@ -377,7 +402,7 @@ class FlowPasses(abc.ABC):
         steps: int,
         changes: Sequence[Change] = (),
         fingerprints: Sequence[str] = (),
-        given: Any = None,
+        frozen: Any = None,
         states: Any = None,
         state_masks: Any = None,
     ) -> Any:
@@ -394,38 +419,49 @@ class FlowPasses(abc.ABC):
             steps: Of the flow.
             changes: See `follow`.
             fingerprints: The adapter of each row, see `Row.adapter`; empty: none has one.
-            given: With `by_row`, which rows of the chunks are actions already, at time 0: (B, H,
+            frozen: With `by_row`, which rows of the chunks are actions already, at time 0: (B, H,
                 1), 1.0 or 0.0.
             states: Of a memory, from LeRobot's π0.5 after 0.6.1, and None, as models with a memory
                 are refused.
             state_masks: As `states`.
         """
         torch = require("torch")
-        firsts = [list(owners).index(place) for place in range(len(mask))] if fingerprints else []
+        observations = len(mask)
+        # The adapter of an observation is that of the first of its rows.
+        encoding_adapters: list[str] = []
+        if fingerprints:
+            first_rows = [list(owners).index(owner) for owner in range(observations)]
+            encoding_adapters = [fingerprints[row] for row in first_rows]
         if state is None:
             state = mask[:, :0].float()
-        with self.adapters.rows([fingerprints[i] for i in firsts]):
-            encoded, seen = self._encode(
+        with self.adapters.rows(encoding_adapters):
+            encoded, present = self._encode(
                 tokens, mask, torch.stack(list(cameras), 1), state, *self.encode_images(images)
             )
-        if list(owners) != list(range(len(mask))):
-            index = torch.tensor(owners).to(mask.device, non_blocking=True)
-            encoded, seen, state = encoded[index], seen[index], state[index]
 
-        if not changes and steps not in self._flows:
-            whole = partial(self._flow, steps, (), None)
-            self._flows[steps] = self._compilation.core("flow", whole, parts=[self._velocity])
-        flow = partial(self._flow, steps, changes, given) if changes else self._flows[steps]
+        if list(owners) != list(range(observations)):
+            index = torch.tensor(owners).to(mask.device, non_blocking=True)
+            encoded, present, state = encoded[index], present[index], state[index]
+
+        changed = partial(self._flow, steps, changes, frozen)
+        flow = changed if changes else self._whole_flow(steps)
         with self.adapters.rows(fingerprints):
-            return flow(encoded, seen, state, noise)
+            return flow(encoded, present, state, noise)
+
+    def _whole_flow(self, steps: int) -> Callable[..., Any]:
+        """Return the flow of all steps without changes, which is one core."""
+        if steps not in self._flows:
+            function = partial(self._flow, steps, (), None)
+            self._flows[steps] = self._compilation.core("flow", function, parts=[self._velocity])
+        return self._flows[steps]
 
     def _flow(
         self,
         steps: int,
         changes: Sequence[Change],
-        given: Any,
+        frozen: Any,
         encoded: Any,
-        seen: Any,
+        present: Any,
         state: Any,
         noise: Any,
     ) -> Any:
@@ -435,9 +471,10 @@ class FlowPasses(abc.ABC):
         float32 = require("torch").float32
 
         def velocity(actions: Any, time: float) -> Any:
+            """Return the velocity at one time, which is 0 for frozen rows."""
             times = actions.new_full(actions.shape[: 2 if self.by_row else 1], time, dtype=float32)
-            if given is not None:
-                times = times * (1.0 - given[..., 0])
-            return self._velocity(encoded, seen, state, actions, times)
+            if frozen is not None:
+                times = times * (1.0 - frozen[..., 0])
+            return self._velocity(encoded, present, state, actions, times)
 
         return follow(velocity, noise, steps, *changes)

@@ -71,7 +71,8 @@ def loading_report(
 @contextmanager
 def current_report() -> Iterator[LoadingReport]:
     """Yield the report of this context, or a new one if no server has opened one."""
-    if (report := _report.get()) is not None:
+    report = _report.get()
+    if report is not None:
         yield report
         return
     with loading_report(lambda _: None) as report:
@@ -81,21 +82,24 @@ def current_report() -> Iterator[LoadingReport]:
 def report_progress(step: str) -> None:
     """Log and report a step of a long start, such as "compiling for 4 rows (3 of 5)"."""
     logger.info("%s", step)
-    if (report := _report.get()) is not None:
+    report = _report.get()
+    if report is not None:
         report.on_progress(step)
 
 
 def report_device(device: dict[str, Any]) -> None:
     """Log and report a device on which a policy computes."""
     logger.info("device: %s", device)
-    if (report := _report.get()) is not None and device not in report.devices:
+    report = _report.get()
+    if report is not None and device not in report.devices:
         report.devices.append(device)
 
 
-def report_uncompiled(what: str) -> None:
+def report_uncompiled(part: str) -> None:
     """Log and report a part that runs uncompiled although its policy's settings require
     compilation.
     """
-    logger.warning("not compiled: %s", what)
-    if (report := _report.get()) is not None:
-        report.uncompiled.append(what)
+    logger.warning("not compiled: %s", part)
+    report = _report.get()
+    if report is not None:
+        report.uncompiled.append(part)

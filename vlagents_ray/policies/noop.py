@@ -40,6 +40,7 @@ class Noop(Agent):
 
     @property
     def contract(self) -> Contract:
+        """Actions of the configured size; the policy needs no observation."""
         return Contract(
             action=ActionSpec(dim=self.config.action_dim, delta=self.config.delta),
             chunk=self.config.chunk,

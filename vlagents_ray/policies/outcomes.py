@@ -16,14 +16,14 @@ def attempt(function: Callable[..., Any], *args: Any) -> Any:
         return error
 
 
-def of_good(rows: Sequence[Any], compute: Callable[[list[Any]], Iterable[Any]]) -> list[Any]:
+def compute_valid(rows: Sequence[Any], compute: Callable[[list[Any]], Iterable[Any]]) -> list[Any]:
     """Compute the rows that are no exceptions in one call, if there are any; return their
-    results among the others.
+    results among the exceptions, in the order of the rows.
     """
-    found = list(rows)
-    good = [place for place, row in enumerate(rows) if not isinstance(row, Exception)]
-    for place, result in zip(
-        good, compute([rows[place] for place in good]) if good else (), strict=True
-    ):
-        found[place] = result
-    return found
+    valid = [index for index, row in enumerate(rows) if not isinstance(row, Exception)]
+    results = list(rows)
+    if valid:
+        computed = compute([rows[index] for index in valid])
+        for index, result in zip(valid, computed, strict=True):
+            results[index] = result
+    return results

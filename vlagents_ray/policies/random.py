@@ -51,6 +51,7 @@ class Random(Agent):
 
     @property
     def contract(self) -> Contract:
+        """Actions of the configured size and bounds; the policy needs no observation."""
         config = self.config
         return Contract(
             action=ActionSpec(dim=config.action_dim, low=config.low, high=config.high),
@@ -59,18 +60,22 @@ class Random(Agent):
 
     def reset(self, obs: Obs, instruction: str | None, **kwargs: Any) -> dict[str, Any]:
         """Begin the episode of `kwargs["seed"]` (an int, 0 if not given)."""
-        # numpy accepts no negative seed; each int64 has a distinct number modulo 2**64
-        seed = [self.config.seed, int(kwargs.get("seed") or 0) % 2**64]
-        self._rng, self._draws = np.random.default_rng(seed), np.random.default_rng([*seed, 1])
+        # Numpy accepts no negative seed; each int64 has a distinct number modulo 2**64.
+        seeds = [self.config.seed, int(kwargs.get("seed") or 0) % 2**64]
+        self._rng = np.random.default_rng(seeds)
+        self._draws = np.random.default_rng([*seeds, 1])
         return {}
 
     def act(self, obs: Obs) -> Act:
+        """Draw a chunk, (D,) or (chunk, D); with `info["samples"]` also samples of it."""
         if self._rng is None or self._draws is None:
             raise NotReset("random: act before reset; call reset(obs, instruction, seed=...) first")
         low, high, chunk = self.config.low, self.config.high, self.config.chunk
         shape = (self.config.action_dim,) if chunk == 1 else (chunk, self.config.action_dim)
         act = Act(self._rng.uniform(low, high, shape).astype(np.float32))
-        if samples := int(obs.info.get(SAMPLES) or 0):
+
+        samples = int(obs.info.get(SAMPLES) or 0)
+        if samples:
             act.info[DISTRIBUTION] = {
                 "mean": np.full(shape, (low + high) / 2, np.float32),
                 "std": np.full(shape, (high - low) / math.sqrt(12), np.float32),

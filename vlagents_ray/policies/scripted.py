@@ -43,7 +43,7 @@ class Scripted(Agent):
 
     def reset(self, obs: Obs, instruction: str | None, **kwargs: Any) -> dict[str, Any]:
         """Begin an episode of the env `kwargs["env"]`, or of the config's `task`."""
-        self._expert = None  # the previous episode's expert must not act if this fails
+        self._expert = None  # The previous episode's expert must not act if this fails.
         env = kwargs.get("env") or self.config.task
         if not isinstance(env, str):
             raise InvalidInput(
@@ -56,6 +56,7 @@ class Scripted(Agent):
         return {"expert": type(expert).__name__}
 
     def act(self, obs: Obs) -> Act:
+        """Return the action of the session's expert, (D,)."""
         if self._expert is None:
             raise NotReset(
                 "scripted: act before reset; call reset(obs, instruction, env=...) first"

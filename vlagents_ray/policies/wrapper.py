@@ -10,7 +10,7 @@ from typing import Any
 from vlagents_ray.contract import Contract
 from vlagents_ray.errors import ConfigError, UnknownPolicy
 from vlagents_ray.interface import Act, Agent, Obs
-from vlagents_ray.policies.outcomes import of_good
+from vlagents_ray.policies.outcomes import compute_valid
 from vlagents_ray.registry import find_entry, policy_class, wrapper_class
 from vlagents_ray.settings import wrong_settings
 
@@ -85,6 +85,7 @@ class Wrapper(Agent):
         return self.agent.reset(self.begin(obs, instruction), instruction, **kwargs)
 
     def observe(self, obs: Obs) -> None:
+        """Pass the changed observation to the inner agent."""
         [changed] = self.change_batch([obs], [self])
         if isinstance(changed, Exception):
             raise changed
@@ -95,9 +96,15 @@ class Wrapper(Agent):
         exception.
         """
         changed = self.change_batch(obs, sessions)  # type: ignore[arg-type]
-        good = [i for i, one in enumerate(changed) if not isinstance(one, Exception)]
-        inner = [sessions[i].agent for i in good]  # type: ignore[attr-defined]
-        return of_good(changed, lambda observations: self.agent.act_batch(observations, inner))
+        inner_sessions = []
+        for session_obs, session in zip(changed, sessions, strict=True):
+            if not isinstance(session_obs, Exception):
+                inner_sessions.append(session.agent)  # type: ignore[attr-defined]
+
+        def act(observations: list[Obs]) -> list[Act | Exception]:
+            return self.agent.act_batch(observations, inner_sessions)
+
+        return compute_valid(changed, act)
 
     def sleep(self) -> None:
         self.agent.sleep()
@@ -123,41 +130,50 @@ def build_agent(
     Wrappers are names, or {name: settings}; the first is the outermost one, which receives the
     robot's observations and is returned.
     """
-    if not issubclass(kind := policy_class(policy), Agent):
+    cls = policy_class(policy)
+    if not issubclass(cls, Agent):
         raise UnknownPolicy(
             f"policy {policy!r}: is no Agent; derive the class from vlagents_ray.Agent"
         )
-    if kind.act is Agent.act and kind.act_batch is Agent.act_batch:
+    if cls.act is Agent.act and cls.act_batch is Agent.act_batch:
         raise ConfigError(
-            f"policy {policy!r}: expected a class that defines act or act_batch, got "
-            f"{kind.__name__}"
+            f"policy {policy!r}: expected a class that defines act or act_batch, got {cls.__name__}"
         )
+
     try:
-        agent: Agent = kind.from_config(config)
+        agent: Agent = cls.from_config(config)
     except ConfigError as error:
-        raise ConfigError(f"{error}{_example_of(policy, kind, config)}") from error
+        raise ConfigError(f"{error}{_example_of(policy, cls, config)}") from error
+
     for entry in reversed(wrappers):
-        named = {entry: {}} if isinstance(entry, str) else dict(entry)
-        if len(named) != 1:
-            raise ConfigError(
-                f"wrappers: got {sorted(named)} in one entry, want one name each, with its settings"
-            )
-        [(name, settings)] = named.items()
-        cls = wrapper_class(name)
-        if not issubclass(cls, Wrapper):
-            raise ConfigError(
-                f"wrappers: {name!r} is {cls.__name__}, want a subclass of "
-                f"{Wrapper.__module__}.Wrapper"
-            )
-        agent = cls.around(agent, settings or {})
+        agent = _wrapped(agent, entry)
     return agent
 
 
-def _example_of(policy: str, kind: type[Agent], config: Mapping[str, Any]) -> str:
+def _wrapped(agent: Agent, entry: str | Mapping[str, Mapping[str, Any]]) -> Wrapper:
+    """Return an agent within the wrapper of one entry: a name, or {name: settings}."""
+    settings_by_name = {entry: {}} if isinstance(entry, str) else dict(entry)
+    if len(settings_by_name) != 1:
+        raise ConfigError(
+            f"wrappers: got {sorted(settings_by_name)} in one entry, want one name each, with its "
+            "settings"
+        )
+
+    [(name, settings)] = settings_by_name.items()
+    cls = wrapper_class(name)
+    if not issubclass(cls, Wrapper):
+        raise ConfigError(
+            f"wrappers: {name!r} is {cls.__name__}, want a subclass of {Wrapper.__module__}.Wrapper"
+        )
+    wrapper: Wrapper = cls.around(agent, settings or {})
+    return wrapper
+
+
+def _example_of(policy: str, cls: type[Agent], config: Mapping[str, Any]) -> str:
     """Return the end of a message that names a file and a page with the settings that `config`
     lacks, if any.
     """
-    fields = getattr(kind.Config, "model_fields", {})
+    fields = getattr(cls.Config, "model_fields", {})
     missing = any(field.is_required() and name not in config for name, field in fields.items())
     entry = find_entry("policies", policy)
     if not missing or entry is None:

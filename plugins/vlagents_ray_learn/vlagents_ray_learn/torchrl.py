@@ -32,7 +32,7 @@ from vlagents_ray.contract import ActionSpec, Contract
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.interface import BEHAVIOUR, POLICY, WANT, Act, Agent, Obs
 from vlagents_ray.policies.base.model_inputs import camera_images, state_vector
-from vlagents_ray.policies.outcomes import attempt, of_good
+from vlagents_ray.policies.outcomes import attempt, compute_valid
 from vlagents_ray.registry import named_class, require
 from vlagents_ray.serve.ports import free_port
 from vlagents_ray.weights.trainable import named_values, set_values
@@ -203,7 +203,7 @@ class TorchRLPolicy(Agent):
             attempt(_row, received, session)
             for received, session in zip(obs, sessions, strict=True)
         ]
-        return of_good(rows, self._acts)
+        return compute_valid(rows, self._acts)
 
     def _acts(self, rows: list[tuple[Any, np.random.Generator | None]]) -> Iterable[Act]:
         """Compute one batch; each row has an input, and the generator of its draw, or None for

@@ -35,7 +35,7 @@ from vlagents_ray.policies.base.model_inputs import (
     state_vector,
 )
 from vlagents_ray.policies.compilation import Compilation
-from vlagents_ray.policies.outcomes import attempt, of_good
+from vlagents_ray.policies.outcomes import attempt, compute_valid
 from vlagents_ray.registry import require
 from vlagents_ray_models.model_code import remote_code, use_source
 
@@ -281,7 +281,7 @@ class Gr00tNetwork:
                 ) from error
         if not flash:
             use_torch_attention(model)
-        saved = SavedTensors.of(folder)
+        saved = SavedTensors.open(folder)
         model = _converted(model.eval().requires_grad_(False), saved, device, dtype)
         require_loaded(model, saved)
         embodiment.require_fits(model.config)
@@ -632,7 +632,7 @@ class Gr00t(ModelPolicy):
         def compute(good: list[tuple[np.random.Generator, dict[str, Any]]]) -> list[Prediction]:
             return [Prediction(chunk) for chunk in self.loaded().chunks(*zip(*good, strict=True))]
 
-        return of_good([attempt(self._inputs, row) for row in rows], compute)
+        return compute_valid([attempt(self._inputs, row) for row in rows], compute)
 
     def _inputs(self, row: Row) -> tuple[np.random.Generator, dict[str, Any]]:
         """Return the random generator and the model's inputs of a row."""

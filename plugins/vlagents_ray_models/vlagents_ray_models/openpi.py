@@ -440,7 +440,7 @@ class JaxFlow(OpenPiModel):
         """Compute actions (B, H, action_dim) float32; a batch without plans runs the same
         program without guidance.
         """
-        jax, guide = require("jax"), Guide.of(batch.rows, *batch.noise.shape[1:])
+        jax, guide = require("jax"), Guide.for_rows(batch.rows, *batch.noise.shape[1:])
         if guide is None:
             none = np.zeros((*batch.noise.shape[:2], 1), np.float32)
             guide = Guide(np.zeros_like(batch.noise), none, none)
@@ -589,7 +589,7 @@ def load_torch(
     except (ValueError, RuntimeError) as error:
         raise ConfigError(f"checkpoint {file}: {str(error)[:600]}") from error
     network.paligemma_with_expert.to_bfloat16_for_selected_params(chosen)
-    require_loaded(network, SavedTensors.of(file))
+    require_loaded(network, SavedTensors.open(file))
     return TorchFlow(network.eval().requires_grad_(False).to(device), device, settings, compilation)
 
 

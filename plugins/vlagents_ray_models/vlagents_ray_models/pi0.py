@@ -399,11 +399,11 @@ class Pi0HfPasses(FlowPasses):
         ).past_key_values
         return stack_of(layers_of(cache)), mask
 
-    def velocity(self, encoded: Any, seen: Any, state: Any, actions: Any, times: Any) -> Any:
+    def velocity(self, encoded: Any, present: Any, state: Any, actions: Any, times: Any) -> Any:
         cache = cache_of(encoded.unbind(1))  # of this step alone: later ones must not attend to it
         noise = actions.to(state.dtype)
         output = self.model(
-            state=state, noise=noise, timestep=times, attention_mask=seen, past_key_values=cache
+            state=state, noise=noise, timestep=times, attention_mask=present, past_key_values=cache
         )
         return output.logits.float()
 

@@ -29,22 +29,22 @@ class Pi0Passes(FlowPasses):
         self, tokens: Any, mask: Any, cameras: Any, state: Any, *images: Any
     ) -> tuple[Any, Any]:
         """Return keys and values, and which tokens are there; the state is not read."""
-        embedded, seen, causal = self.model.embed_prefix(
+        embedded, present, causal = self.model.embed_prefix(
             list(images), list(cameras.unbind(1)), tokens, mask
         )
         _, cache = self.model.paligemma_with_expert.forward(
-            attention_mask=self._mask_4d(self.module.make_att_2d_masks(seen, causal)),
-            position_ids=seen.cumsum(1) - 1,
+            attention_mask=self._mask_4d(self.module.make_att_2d_masks(present, causal)),
+            position_ids=present.cumsum(1) - 1,
             inputs_embeds=[embedded, None],
             use_cache=True,
         )
-        return stack_of(layers_of(cache)), seen.long()
+        return stack_of(layers_of(cache)), present.long()
 
-    def velocity(self, encoded: Any, seen: Any, state: Any, actions: Any, times: Any) -> Any:
+    def velocity(self, encoded: Any, present: Any, state: Any, actions: Any, times: Any) -> Any:
         cache = cache_of(encoded.unbind(1))  # of this step alone
         stated = {"state": state} if self._stated else {}
         return self.model.denoise_step(
-            prefix_pad_masks=seen.bool(),
+            prefix_pad_masks=present.bool(),
             past_key_values=cache,
             x_t=actions,
             timestep=times,

@@ -35,7 +35,7 @@ from vlagents_ray.policies.base.model_inputs import (
     state_vector,
 )
 from vlagents_ray.policies.compilation import Compilation
-from vlagents_ray.policies.outcomes import of_good
+from vlagents_ray.policies.outcomes import compute_valid
 from vlagents_ray.registry import require
 from vlagents_ray_models.model_code import use_source
 
@@ -581,7 +581,7 @@ class VJepa2Ac(ModelPolicy):
             f"info[{GOAL_IMAGE!r}]: got none since the reset, want an image of the goal, (H, W, 3) "
             "uint8"
         )
-        return of_good([row if _GOAL in row.memory else no_goal for row in rows], self._plans)
+        return compute_valid([row if _GOAL in row.memory else no_goal for row in rows], self._plans)
 
     def _plans(self, rows: Sequence[Row]) -> list[Prediction]:
         torch = require("torch")

@@ -24,7 +24,7 @@ def row(leftover: np.ndarray | None = None, delay: int = 0) -> Row:
 def flow(*rows: Row, steps: int = STEPS, limit: float = 5.0) -> np.ndarray:
     """(B, H, D) actions, as a policy makes them."""
     noise = np.random.default_rng(0).standard_normal((len(rows), HORIZON, DIM)).astype(np.float32)
-    guide = Guide.of(rows, HORIZON, DIM)
+    guide = Guide.for_rows(rows, HORIZON, DIM)
     actions = noise
     for step in range(steps):
         time = 1.0 - step / steps
@@ -40,7 +40,7 @@ def plan(length: int = 6) -> np.ndarray:
 
 
 def test_without_a_plan_there_is_nothing_to_follow() -> None:
-    assert Guide.of([row(), row()], HORIZON, DIM) is None
+    assert Guide.for_rows([row(), row()], HORIZON, DIM) is None
 
 
 @pytest.mark.parametrize("delay", [1, 3, 6])
@@ -103,7 +103,7 @@ def prefixed(*rows: Row) -> np.ndarray:
 
     passes = Prefixed(torch.nn.Identity(), Compilation(False))
     passes.by_row = True
-    guide = Guide.of(rows, HORIZON, DIM)
+    guide = Guide.for_rows(rows, HORIZON, DIM)
     assert guide is not None
     guide = guide.to(torch.from_numpy)
     noise = torch.from_numpy(np.stack([one.noise(HORIZON, DIM) for one in rows]))
@@ -113,11 +113,11 @@ def prefixed(*rows: Row) -> np.ndarray:
         [there[:, 0]],
         torch.zeros(len(rows), 1, dtype=torch.long),
         there,
-        noise=guide.given(noise),
+        noise=guide.insert_frozen(noise),
         owners=range(len(rows)),
         steps=STEPS,
         changes=[guide.keep],
-        given=guide.frozen,
+        frozen=guide.frozen,
     )
     return np.asarray(found)
 

@@ -215,7 +215,7 @@ class SavedTensors:
         self._readers = readers
 
     @classmethod
-    def of(cls, path: Path) -> SavedTensors:
+    def open(cls, path: Path) -> SavedTensors:
         """Open a .safetensors file, or a folder with one, or with several and their index."""
         files = [path] if path.is_file() else _safetensors(path)
         readers: dict[str, Callable[[], Any]] = {}

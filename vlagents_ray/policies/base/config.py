@@ -18,8 +18,7 @@ NoiseLevel = Annotated[
     Field(
         ge=0,
         description="randomness of the flow's steps in acts whose log-probability a learner "
-        "requests, usually "
-        "0.5; 0: none is offered",
+        "requests, usually 0.5; 0: none is offered",
     ),
 ]
 
@@ -51,31 +50,25 @@ class ModelConfig(BaseModel, extra="forbid"):
     matmul: Matmul = Field(
         default="high",
         description="products of float32 matrices on a GPU: 'high' in TF32, which keeps 10 bits of "
-        "their inputs; "
-        "'highest' in float32, several times slower; of the whole process, in which the last "
-        "policy to load decides",
+        "their inputs; 'highest' in float32, several times slower; of the whole process, in which "
+        "the last policy to load decides",
     )
     quantization: Quantization | None = Field(
         default=None,
         description="keep the weights of linear layers in 8 bits (torchao): a quarter to a half of "
-        "their memory, and "
-        "other actions, so compare them before use",
+        "their memory, and other actions, so compare them before use",
     )
     adapters: dict[str, str] = Field(
         default={},
         description="LoRA adapters by name, PEFT's folders or hub ids, that sessions may act with "
-        "over the checkpoint; "
-        "usually set by the `checkpoints` of a deployment",
+        "over the checkpoint; usually set by the `checkpoints` of a deployment",
     )
     compile: CompileMode = Field(
         default="auto",
         description="'graphs': CUDA graphs of the forward pass for each of `batch_sizes`; true: on "
-        "a GPU also of "
-        "what torch.compile makes of it, if that is faster, and on a CPU that alone; what fails, "
-        "or computes something "
-        "else, runs without; 'require': true, with an error then; 'auto': 'graphs' on a GPU, false "
-        "on a CPU, with "
-        "adapters, or if the family has none",
+        "a GPU also of what torch.compile makes of it, if that is faster, and on a CPU that alone; "
+        "what fails, or computes something else, runs without; 'require': true, with an error "
+        "then; 'auto': 'graphs' on a GPU, false on a CPU, with adapters, or if the family has none",
     )
     seed: int = Field(default=0, ge=0, description="mixed with the seed of each episode")
 
@@ -86,17 +79,15 @@ class ModelConfig(BaseModel, extra="forbid"):
     state: list[str] | None = Field(
         default=None,
         description="parts of the proprioception that make up the model's state vector, in its "
-        "order; "
-        "'gripper' stands for `Obs.gripper`, 'gripper_closed' for 1 minus that; unset: the "
+        "order; 'gripper' stands for `Obs.gripper`, 'gripper_closed' for 1 minus that; unset: the "
         "family's convention",
     )
 
     actions: Literal["chunk", "queue", "ensemble"] = Field(
         default="chunk",
         description="an `act` returns: a whole chunk; the next row of one that is kept here, where "
-        "the model is asked "
-        "every `execute` acts; or one row, the model being asked at each act and the chunks "
-        "averaged",
+        "the model is asked every `execute` acts; or one row, the model being asked at each act "
+        "and the chunks averaged",
     )
     execute: int | None = Field(
         default=None, ge=1, description="rows of each chunk that are used; unset: all"
@@ -115,9 +106,8 @@ class ModelConfig(BaseModel, extra="forbid"):
     batch_sizes: list[int] | None = Field(
         default=None,
         description="the only numbers of rows to run, ascending; each is run, or compiled, when "
-        "the model is loaded, "
-        "smaller batches are padded; unset: if the model is compiled those of the deployment's "
-        "`batch`, else any",
+        "the model is loaded, smaller batches are padded; unset: if the model is compiled those "
+        "of the deployment's `batch`, else any",
     )
 
     @model_validator(mode="after")
@@ -125,8 +115,7 @@ class ModelConfig(BaseModel, extra="forbid"):
         if (STEP in self.checkpoint) != (self.checkpoint_step is not None):
             raise ValueError(
                 f"checkpoint {self.checkpoint!r} and checkpoint_step {self.checkpoint_step}: give "
-                "both the place "
-                f"{STEP} and the step that belongs there, or neither"
+                f"both the place {STEP} and the step that belongs there, or neither"
             )
         return self
 
@@ -141,15 +130,17 @@ class ModelConfig(BaseModel, extra="forbid"):
 
     @model_validator(mode="after")
     def _adapters_are_added_to_eager_whole_layers(self) -> Self:
-        for name, value in (
-            ("compile", self.compile not in (False, "auto")),
-            ("quantization", self.quantization),
-        ):
-            if self.adapters and value:
+        if not self.adapters:
+            return self
+        is_set = {
+            "compile": self.compile not in (False, "auto"),
+            "quantization": self.quantization is not None,
+        }
+        for name, value in is_set.items():
+            if value:
                 raise ValueError(
                     f"adapters and {name}: got both, want one of them; merge an adapter into its "
-                    "base to have "
-                    f"{name} for it"
+                    f"base to have {name} for it"
                 )
         return self
 
@@ -171,12 +162,11 @@ class ModelConfig(BaseModel, extra="forbid"):
 
     def with_sizes(self, sizes: Sequence[int]) -> Self:
         """Return the settings with these `batch_sizes`, unless they name others."""
-        return (
-            self
-            if self.batch_sizes is not None
-            else self.model_copy(update={"batch_sizes": list(sizes)})
-        )
+        if self.batch_sizes is not None:
+            return self
+        return self.model_copy(update={"batch_sizes": list(sizes)})
 
     @property
     def rows(self) -> int:
+        """The largest number of rows in one forward pass."""
         return self.batch_sizes[-1] if self.batch_sizes else self.max_rows

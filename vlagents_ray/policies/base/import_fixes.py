@@ -18,6 +18,7 @@ import importlib.util
 import logging
 import sys
 from collections.abc import Callable, Sequence
+from functools import partial
 from importlib.machinery import ModuleSpec, PathFinder
 from pathlib import Path
 from types import ModuleType
@@ -31,10 +32,9 @@ _operators: list[Any] = []  # operators live as long as the object that defined 
 
 def install() -> None:
     """Fix later imports of torchvision and of LeRobot's `video_utils`; imports nothing itself."""
-    if not any(
-        isinstance(finder, _Finder) or type(finder).__name__ == _Finder.__name__
-        for finder in sys.meta_path
-    ):
+    # By name, since an environment also has a copy of this file.
+    names = {type(finder).__name__ for finder in sys.meta_path}
+    if _Finder.__name__ not in names:
         sys.meta_path.insert(0, _Finder())
 
 
@@ -44,11 +44,17 @@ class _Finder:
     def find_spec(
         self, name: str, path: Sequence[str] | None = None, target: ModuleType | None = None
     ) -> ModuleSpec | None:
+        """Return the spec of a module of `_FIXES`, whose loader applies the fix; None for any
+        other.
+        """
         fix = _FIXES.get(name)
-        spec = PathFinder.find_spec(name, path, target) if fix is not None else None
-        if fix is not None and spec is not None and spec.loader is not None:
+        if fix is None:
+            return None
+
+        spec = PathFinder.find_spec(name, path, target)
+        if spec is not None and spec.loader is not None:
             execute = spec.loader.exec_module
-            spec.loader.exec_module = lambda module: fix(execute, module)  # type: ignore[method-assign]
+            spec.loader.exec_module = partial(fix, execute)  # type: ignore[method-assign]
         return spec
 
 
@@ -64,9 +70,13 @@ def _torchvision(execute: Execute, module: ModuleType) -> None:
             raise
     else:
         return
-    for name in [name for name in sys.modules if name.startswith("torchvision.")]:
+
+    # Remove what the failed import left behind.
+    submodules = [name for name in sys.modules if name.startswith("torchvision.")]
+    for name in submodules:
         del sys.modules[name]
         vars(module).pop(name.removeprefix("torchvision."), None)
+
     library = torch.library.Library("torchvision", "FRAGMENT")
     for operator in ("nms", "qnms"):
         library.define(f"{operator}(Tensor dets, Tensor scores, float iou_threshold) -> Tensor")
@@ -85,12 +95,16 @@ def _video_utils(execute: Execute, module: Any) -> None:
                 "torchcodec does not load (%s); videos are read with PyAV",
                 str(error).partition("\n")[0],
             )
-            module.get_safe_default_codec = lambda: "pyav"
+            module.get_safe_default_codec = _pyav
     else:
         # LeRobot's own function warns at every import.
-        module.get_safe_default_codec = lambda: "pyav"
+        module.get_safe_default_codec = _pyav
     if not hasattr(importlib.import_module("torchvision.io"), "VideoReader"):
         module.decode_video_frames_torchvision = decode_frames
+
+
+def _pyav() -> str:
+    return "pyav"
 
 
 _FIXES: dict[str, Callable[[Execute, ModuleType], None]] = {
@@ -116,28 +130,29 @@ def decode_frames(
         ValueError: LeRobot's `FrameTimestampError`: a frame is `tolerance_s` or more away.
     """
     av, np, torch = (importlib.import_module(name) for name in ("av", "numpy", "torch"))
+
     frames: list[Any] = []
     with av.open(str(video_path)) as container:
         stream = container.streams.video[0]
         first = max(0.0, min(timestamps) - tolerance_s)
-        # To the key frame at or before that time.
+        # Decoding begins at the key frame at or before that time.
         container.seek(int(first / stream.time_base), stream=stream)
         for frame in container.decode(stream):
             frames.append(frame)
             if frame.time >= max(timestamps) - tolerance_s:
                 break
-    nearest: list[Any] = [
-        min(frames, key=lambda frame: abs(frame.time - wanted), default=None)
-        for wanted in timestamps
-    ]
-    off = [
-        wanted
-        for frame, wanted in zip(nearest, timestamps, strict=True)
-        if frame is None or abs(frame.time - wanted) >= tolerance_s
-    ]
-    if off:
+
+    nearest: list[Any] = []
+    too_far: list[float] = []
+    for timestamp in timestamps:
+        frame = min(frames, key=lambda frame: abs(frame.time - timestamp), default=None)
+        nearest.append(frame)
+        if frame is None or abs(frame.time - timestamp) >= tolerance_s:
+            too_far.append(timestamp)
+    if too_far:
         raise importlib.import_module("lerobot.datasets.video_utils").FrameTimestampError(
-            f"{video_path}: has no frame within {tolerance_s} s of {off} s"
+            f"{video_path}: has no frame within {tolerance_s} s of {too_far} s"
         )
+
     pixels = np.stack([frame.to_ndarray(format="rgb24") for frame in nearest])
     return torch.from_numpy(pixels).permute(0, 3, 1, 2).float() / 255

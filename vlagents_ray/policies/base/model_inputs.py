@@ -39,11 +39,11 @@ class Row:
     leftover: np.ndarray | None = None
     delay: int = 0  # DELAY: the number of first rows of the chunk that are the leftover's
     info: Mapping[str, Any] = field(default_factory=dict)  # the observation's info
-    # the session's memory, for families that store more than frames
+    # The session's memory, for families that store more than frames.
     memory: dict[str, Any] = field(default_factory=dict)
     want: tuple[str, ...] = ()  # requested outputs of the chunk, from the contract's `behaviour`
-    # whether to draw from the distribution, for samples and requested outputs; if not, the
-    # likeliest chunk
+    # Whether the chunk is drawn from the distribution, as samples and requested outputs need it;
+    # otherwise it is the likeliest one.
     sample: bool = False
     # Fingerprint of the session's adapter, see `ModelPolicy.adapters`; empty: no adapter.
     adapter: str = ""
@@ -69,13 +69,13 @@ def shared_frames(rows: Sequence[Row]) -> tuple[list[int], list[int]]:
         The indices of rows with distinct observations, and for each row the index of its
         observations among them.
     """
-    places: dict[int, int] = {}
+    owners: dict[int, int] = {}
     firsts: list[int] = []
     for i, row in enumerate(rows):
-        if id(row.frames) not in places:
-            places[id(row.frames)] = len(firsts)
+        if id(row.frames) not in owners:
+            owners[id(row.frames)] = len(firsts)
             firsts.append(i)
-    return firsts, [places[id(row.frames)] for row in rows]
+    return firsts, [owners[id(row.frames)] for row in rows]
 
 
 def choose_cameras(
@@ -89,10 +89,10 @@ def choose_cameras(
     """
     mapping = usual if chosen is None else chosen
     if set(mapping) != set(known):
+        example = ", ".join(f"{name}: …" for name in known)
         raise ConfigError(
             f"cameras: got {sorted(mapping)}, want {sorted(known)}, the checkpoint's own names, "
-            "each with the name of "
-            f"one of yours, as in cameras: {{{', '.join(f'{name}: …' for name in known)}}}"
+            f"each with the name of one of yours, as in cameras: {{{example}}}"
         )
     return {name: mapping[name] for name in known}
 
@@ -115,26 +115,25 @@ def state_vector(obs: Obs, parts: Sequence[str], dim: int | None = None) -> np.n
     Raises:
         MissingState, InvalidObservation: A part is missing, or the length is wrong.
     """
-    found = []
-    for part in parts:
-        if part in (GRIPPER, CLOSED):
+    values = []
+    for name in parts:
+        if name in (GRIPPER, CLOSED):
             if obs.gripper is None:
                 raise InvalidObservation(
                     "gripper: got none, want a number in [0, 1] where 1 = open"
                 )
-            found.append(
-                np.array([obs.gripper if part == GRIPPER else 1.0 - obs.gripper], np.float32)
-            )
-        elif part in obs.state:
-            found.append(np.asarray(obs.state[part], np.float32))
+            gripper = obs.gripper if name == GRIPPER else 1.0 - obs.gripper
+            values.append(np.array([gripper], np.float32))
+        elif name in obs.state:
+            values.append(np.asarray(obs.state[name], np.float32))
         else:
-            raise MissingState(part, have=obs.state)
-    vector = np.concatenate(found) if found else np.zeros(0, np.float32)
+            raise MissingState(name, have=obs.state)
+
+    vector = np.concatenate(values) if values else np.zeros(0, np.float32)
     if dim is not None and vector.shape != (dim,):
         raise InvalidObservation(
             f"state: got {len(vector)} numbers from {list(parts)}, want {dim}, as the checkpoint "
-            "was trained; "
-            f"set the policy's `state` to the parts that it was trained with"
+            "was trained; set the policy's `state` to the parts that it was trained with"
         )
     return vector
 
@@ -148,24 +147,25 @@ def state_specs(parts: Sequence[str], dim: int | None = None) -> dict[str, State
     """Return the states of a contract: the parts, and the length of a part that is the whole
     vector.
     """
-    own = [part for part in parts if part not in (GRIPPER, CLOSED)]
-    return {
-        part: StateSpec(dim=dim if list(parts) == own and len(own) == 1 else None) for part in own
-    }
+    names = [name for name in parts if name not in (GRIPPER, CLOSED)]
+    is_whole_vector = list(parts) == names and len(names) == 1
+    return {name: StateSpec(dim=dim if is_whole_vector else None) for name in names}
 
 
 def wanted_samples(obs: Obs, config: ModelConfig) -> int:
-    if (samples := count_in(obs, SAMPLES)) > config.max_samples:
+    """Return the number of samples that an observation requests; raises `InvalidObservation` if
+    the policy does not offer so many.
+    """
+    samples = count_in(obs, SAMPLES)
+    if samples > config.max_samples:
         raise InvalidObservation(
             f"info[{SAMPLES!r}]: got {samples}, want at most {config.max_samples}; ask for fewer, "
-            "or set the policy's "
-            f"`max_samples`"
+            "or set the policy's `max_samples`"
         )
     if samples and config.actions != "chunk":
         raise InvalidObservation(
             f"info[{SAMPLES!r}]: got {samples} with actions: {config.actions}, want none; samples "
-            "are of whole chunks, "
-            f"so set the policy's `actions` to 'chunk'"
+            "are of whole chunks, so set the policy's `actions` to 'chunk'"
         )
     return samples
 
@@ -177,29 +177,31 @@ def wanted_behaviour(obs: Obs) -> tuple[str, ...]:
     if obs.info.get(LEFTOVER) is not None:
         raise InvalidObservation(
             f"info[{WANT!r}]: got it with {LEFTOVER!r}, want one of them; a chunk that continues a "
-            "plan is not drawn "
-            f"from the policy's distribution"
+            "plan is not drawn from the policy's distribution"
         )
     return tuple(obs.info[WANT])
 
 
 def leftover_plan(obs: Obs, contract: Contract | None) -> np.ndarray:
     """Return a copy of the plan to continue, (H, D) float32, from an observation with a plan."""
-    given = obs.info[LEFTOVER]
+    leftover = obs.info[LEFTOVER]
     dim = None if contract is None else contract.action.dim
     try:
-        left = np.array(given, np.float32)
+        plan = np.array(leftover, np.float32)
     except (TypeError, ValueError):
-        left = np.zeros(0, np.float32)  # not numbers: refused below
-    if left.ndim != 2 or dim not in (None, left.shape[1]) or not np.isfinite(left).all():
-        got = given.shape if isinstance(given, np.ndarray) else type(given).__name__
+        plan = np.zeros(0, np.float32)  # Values that are no numbers are rejected below.
+    if plan.ndim != 2 or dim not in (None, plan.shape[1]) or not np.isfinite(plan).all():
+        kind = leftover.shape if isinstance(leftover, np.ndarray) else type(leftover).__name__
         raise InvalidObservation(
-            f"info[{LEFTOVER!r}]: got {got}, want (H, {dim or 'D'}) finite float32"
+            f"info[{LEFTOVER!r}]: got {kind}, want (H, {dim or 'D'}) finite float32"
         )
-    return left
+    return plan
 
 
 def count_in(obs: Obs, name: str) -> int:
+    """Return a number in an observation's info, by default 0; raises `InvalidObservation` if it
+    is no int from 0.
+    """
     value = obs.info.get(name) or 0
     if not isinstance(value, int | np.integer) or value < 0:
         raise InvalidObservation(f"info[{name!r}]: got {value!r}, want an int from 0")
@@ -232,5 +234,5 @@ def keeping_tokens(tokenize: Callable[[str], T]) -> Callable[[str], T]:
     """Return `tokenize` with a cache of its results for recent instructions, except for very
     long ones.
     """
-    kept = lru_cache(maxsize=KEPT)(tokenize)
-    return lambda text: kept(text) if len(text) <= KEPT_CHARACTERS else tokenize(text)
+    cached = lru_cache(maxsize=KEPT)(tokenize)
+    return lambda text: cached(text) if len(text) <= KEPT_CHARACTERS else tokenize(text)

@@ -52,9 +52,9 @@ class Staging:
         stream.
         """
         tensor = require("torch").from_numpy(array)
-        return (tensor if self._stream is None else tensor.pin_memory()).to(
-            self.device, non_blocking=True
-        )
+        if self._stream is not None:
+            tensor = tensor.pin_memory()
+        return tensor.to(self.device, non_blocking=True)
 
     def stage(self, arrays: Mapping[str, np.ndarray]) -> StagedRow:
         """Begin to copy the arrays of one row to the device; several threads may call it.
@@ -66,7 +66,7 @@ class Staging:
         try:
             self._copy(row)
         except RuntimeError as error:
-            # Otherwise `stack` copies it, where a policy frees memory.
+            # If memory is exhausted, `stack` copies the row, where a policy frees memory.
             if not is_out_of_memory(error):
                 raise
         return row
@@ -90,36 +90,45 @@ class Staging:
                 raise ValueError(
                     f"stack: got rows of {layout} and {row.layout}, want the same arrays in each"
                 )
-            if row.block is None:  # of an earlier batch, or of a session that another replica began
+            # The row is of an earlier batch, or of a session that another replica began.
+            if row.block is None:
                 self._copy(row)
-        blocks, memory = [row.block for row in rows], None
+
         if self._stream is not None:
             current = torch.cuda.current_stream(self.device)
             for row in rows:
                 current.wait_event(row.copied)
-                row.block.record_stream(current)  # its memory is the other stream's
-        elif self.device.type == "cpu":  # where fresh memory costs more than the copies
-            if (
-                self._batch is None
-                or self._batch.shape[1] != len(blocks[0])
-                or len(self._batch) < len(blocks)
-            ):
-                with torch.inference_mode(False):  # so that any later batch may be written
-                    self._batch = torch.empty(len(blocks), len(blocks[0]), dtype=torch.uint8)
-            memory = self._batch[: len(blocks)]
-        batch = torch.stack(blocks, out=memory)
-        for row in () if keep else rows:
-            row.block = row.copied = None
-        starts = zip(_starts(rows[0]), rows[0].items(), strict=False)
-        parts = {
-            name: (batch[:, start : start + array.nbytes], array) for start, (name, array) in starts
-        }
-        return {
-            name: part.view(getattr(torch, array.dtype.name)).view(len(rows), *array.shape)
-            for name, (part, array) in parts.items()
-        }
+                row.block.record_stream(current)  # The other stream allocated its memory.
+        blocks = [row.block for row in rows]
+        batch = torch.stack(blocks, out=self._memory(len(blocks), len(blocks[0])))
+
+        if not keep:
+            for row in rows:
+                row.block = row.copied = None
+
+        tensors = {}
+        for start, (name, array) in zip(_starts(rows[0]), rows[0].items(), strict=False):
+            columns = batch[:, start : start + array.nbytes]
+            typed = columns.view(getattr(torch, array.dtype.name))
+            tensors[name] = typed.view(len(rows), *array.shape)
+        return tensors
+
+    def _memory(self, rows: int, size: int) -> Any:
+        """Return the memory of a batch of `rows` blocks of `size` bytes on a CPU, where fresh
+        memory costs more than the copies; None on other devices.
+        """
+        if self.device.type != "cpu":
+            return None
+
+        torch = require("torch")
+        if self._batch is None or self._batch.shape[1] != size or len(self._batch) < rows:
+            # Not an inference tensor, so that any later batch may be written to it.
+            with torch.inference_mode(False):
+                self._batch = torch.empty(rows, size, dtype=torch.uint8)
+        return self._batch[:rows]
 
     def _copy(self, row: StagedRow) -> None:
+        """Copy the arrays of a row into one block on the device."""
         torch, starts = require("torch"), _starts(row)
         host = torch.empty(starts[-1], dtype=torch.uint8, pin_memory=self._stream is not None)
         for start, array in zip(starts, row.values(), strict=False):

@@ -38,7 +38,8 @@ def expert_class(env_name: str) -> type[Expert]:
     """Return the expert for an env, e.g. "tabletop/slide"; raises `ContractMismatch` if there is
     none.
     """
-    if (target := EXPERTS.get(env_name) or EXPERTS.get(env_suite(env_name))) is None:
+    target = EXPERTS.get(env_name) or EXPERTS.get(env_suite(env_name))
+    if target is None:
         raise ContractMismatch(
             f"no scripted expert for env {env_name!r}: there are experts for {sorted(EXPERTS)}; "
             "choose one of these envs, set `expert` to one of examples/experts/README.md, such as "
@@ -55,8 +56,8 @@ def sim_vector(
     """
     state = obs.info.get("sim_state")
     if not isinstance(state, np.ndarray) or state.shape != (size,):
-        got = f"shape {state.shape}" if isinstance(state, np.ndarray) else type(state).__name__
+        kind = f"shape {state.shape}" if isinstance(state, np.ndarray) else type(state).__name__
         raise InvalidObservation(
-            f"info['sim_state']: got {got}, want ({size},), as the env {env_name} gives it; {cure}"
+            f"info['sim_state']: got {kind}, want ({size},), as the env {env_name} gives it; {cure}"
         )
     return state

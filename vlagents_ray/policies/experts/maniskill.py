@@ -41,28 +41,30 @@ class PushCube(_CubeExpert):
     _PLACED_M = 0.03  # distance of the cube from the target's centre; success needs 0.1
 
     def act(self, obs: Obs) -> Act:
-        # qpos 9, qvel 9, tool pose 7, goal 3, cube pose 7
+        """Return the next action of the push, (7,)."""
+        # The state: qpos 9, qvel 9, tool pose 7, goal 3, cube pose 7.
         state = self._state(obs)
         tool, goal, cube = state[18:21], state[25:28], state[28:31]
         over = np.array([cube[0] - self._BEHIND_M, cube[1], self._OVER_M])
         low = np.array([cube[0] - self._BEHIND_M, cube[1], self._LOW_M])
+
         if self._phase == "over" and np.linalg.norm(tool[:2] - over[:2]) < 0.02:
             self._phase = "down"
         if self._phase == "down" and tool[2] < self._LOW_M + 0.015:
             self._phase = "push"
         if self._phase == "push" and np.linalg.norm(cube[:2] - goal[:2]) < self._PLACED_M:
             self._phase = "hold"
+
         if self._phase == "over":
             return self._hand.move(tool, over, _CLOSED)
         if self._phase == "down":
             return self._hand.move(tool, low, _CLOSED)
         if self._phase == "push":
-            # near the end of its reach the arm lags behind, so the cube must slide the last
-            # centimetres
+            # Near the end of its reach the arm lags behind, so the cube must slide the last
+            # centimetres.
             speed = 0.8 if goal[0] > self._FAR_M else 0.5
-            return self._hand.move(
-                tool, np.array([goal[0], goal[1], self._LOW_M]), _CLOSED, limit=speed
-            )
+            target = np.array([goal[0], goal[1], self._LOW_M])
+            return self._hand.move(tool, target, _CLOSED, limit=speed)
         return self._hand.move(tool, tool, _CLOSED)
 
 
@@ -75,10 +77,12 @@ class PickCube(_CubeExpert):
     _GIVE_UP_STEPS = 8  # without contact on both fingers; then it tries again from above
 
     def act(self, obs: Obs) -> Act:
-        # qpos 9, qvel 9, grasped 1, tool pose 7, goal 3, cube pose 7, tool to cube 3, cube to goal
-        # 3
+        """Return the next action of the pick, (7,)."""
+        # The state: qpos 9, qvel 9, grasped 1, tool pose 7, goal 3, cube pose 7, tool to cube 3,
+        # cube to goal 3.
         state = self._state(obs)
         grasped, tool, goal, cube = state[18] > 0.5, state[19:22], state[26:29], state[29:32]
+
         if self._phase == "over" and np.linalg.norm(tool[:2] - cube[:2]) < 0.01:
             self._phase = "down"
         if self._phase == "down" and np.linalg.norm(tool - cube) < 0.012:
@@ -89,13 +93,14 @@ class PickCube(_CubeExpert):
                 self._phase = "carry"
             elif self._closing > self._GIVE_UP_STEPS:
                 self._phase = "over"
+
         if self._phase == "over":
             return self._hand.move(tool, cube + np.array([0.0, 0.0, self._OVER_M]), _OPEN)
         if self._phase == "down":
             return self._hand.move(tool, cube, _OPEN, limit=0.5)
         if self._phase == "grasp":
             return self._hand.move(tool, tool, _CLOSED)
-        # the cube, not the tool, must reach the target; shorter steps let the arm settle
+        # The cube, not the tool, must reach the target; shorter steps let the arm settle.
         return self._hand.move(tool, tool + 0.8 * (goal - cube), _CLOSED, limit=0.6)
 
 

@@ -62,11 +62,13 @@ class TabletopExpert:
         self._waited = 0
 
     def reset(self, obs: Obs, instruction: str) -> None:
+        """Plan an episode from its first image."""
         self._plan = plan(_image(obs), instruction)
         self._instruction = instruction
         self._waited = 0
 
     def act(self, obs: Obs) -> Act:
+        """Return the next action along the plan, (4,); `done` after its last waypoint."""
         if not self._plan:
             raise NotReset(
                 f"{self._env_name}: act before reset; call reset(obs, instruction) first"
@@ -75,6 +77,7 @@ class TabletopExpert:
             raise MissingState("xyzrpy", have=obs.state)
         if obs.gripper is None:
             raise InvalidObservation("gripper: got none, want a number in [0, 1] where 1 = open")
+
         position, opening = obs.state["xyzrpy"][:3].astype(np.float64), obs.gripper
         done = False
         if self._has_arrived(position) and self._waited >= self._plan[0].wait:
@@ -84,8 +87,10 @@ class TabletopExpert:
                 self._waited = 0
         if self._has_arrived(position):
             self._waited += 1
+
         offset = (np.array(self._plan[0].xyz) - position) / _METRES_PER_UNIT
-        offset /= max(1.0, float(np.abs(offset).max()))  # slower, to stay on the straight line
+        # Scaled as a whole, to stay on the straight line.
+        offset /= max(1.0, float(np.abs(offset).max()))
         return Act(np.append(offset, self._plan[0].grip).astype(np.float32), done=done)
 
     def _after(
@@ -106,8 +111,8 @@ class TabletopExpert:
 def plan(image: np.ndarray, instruction: str) -> list[Waypoint]:
     """Plan waypoints that fulfil an instruction in the scene of an image, (H, W, 3) uint8."""
     kind, puck, target = _parse(instruction)
-    seen = _SeenObject(image)
-    x, y = seen.puck(puck)
+    objects = _ColouredObjects(image)
+    x, y = objects.puck(puck)
     grasp = [
         Waypoint((x, y, _TRAVEL_Z), _OPEN),
         Waypoint((x, y, _GRASP_Z), _OPEN),
@@ -115,7 +120,8 @@ def plan(image: np.ndarray, instruction: str) -> list[Waypoint]:
     ]
     if kind == "lift":
         return [*grasp, Waypoint((x, y, 0.13), _CLOSED, wait=1)]
-    to_x, to_y = seen.puck(target) if kind == "stack" else seen.pad(target)
+
+    to_x, to_y = objects.puck(target) if kind == "stack" else objects.pad(target)
     low = _GRASP_Z + (_PUCK_HEIGHT + 0.003 if kind == "stack" else 0.0)
     carry = [Waypoint((x, y, _TRAVEL_Z), _CLOSED), Waypoint((to_x, to_y, _TRAVEL_Z), _CLOSED)]
     return [
@@ -134,12 +140,12 @@ def _parse(instruction: str) -> tuple[str, str, str]:
             return kind, match[1], match[match.re.groups]
     raise InvalidObservation(
         f"tabletop expert: got instruction {instruction!r}, want one like 'put the red puck on the "
-        "blue pad', "
-        f"'slide ... onto ...', 'stack ...' or 'lift ...', with colours of {sorted(_HUES)}"
+        f"blue pad', 'slide ... onto ...', 'stack ...' or 'lift ...', with colours of "
+        f"{sorted(_HUES)}"
     )
 
 
-class _SeenObject:
+class _ColouredObjects:
     """The coloured objects in an image, in metres on the table."""
 
     def __init__(self, image: np.ndarray) -> None:
@@ -171,9 +177,18 @@ class _SeenObject:
     def _find(
         self, colour: str, kind: str, saturation: tuple[float, float], reach: float, z: float
     ) -> tuple[float, float]:
-        off = np.abs((self._hue - _HUES[colour] + 180) % 360 - 180)
+        """Return the position of an object, (x, y) m, by its colour.
+
+        Args:
+            colour: One of `_HUES`.
+            kind: "puck" or "pad", for errors.
+            saturation: The bounds of its pixels' saturation.
+            reach: The largest distance of its pixels from its centre, m.
+            z: The height of its pixels' centre, m.
+        """
+        hue_difference = np.abs((self._hue - _HUES[colour] + 180) % 360 - 180)
         fits = (
-            (off < _HUE_TOLERANCE)
+            (hue_difference < _HUE_TOLERANCE)
             & (self._saturation > saturation[0])
             & (self._saturation <= saturation[1])
         )
@@ -181,9 +196,10 @@ class _SeenObject:
             raise InvalidObservation(
                 f"tabletop expert: sees no {colour} {kind}; is this image the tabletop's 'front'?"
             )
+
         u, v = self._u[fits], self._v[fits]
-        # the blurred edge of a puck looks like a pad: the median ignores these few pixels, the mean
-        # is more precise
+        # The blurred edge of a puck looks like a pad. The median ignores these few pixels; the mean
+        # is more precise.
         near = np.hypot(u - np.median(u), v - np.median(v)) < reach * self._scale
         x = (float(u[near].mean()) - self._centre[0]) / self._scale
         y = ((self._centre[1] - float(v[near].mean())) / self._scale - z * _DEEP) / _UP

@@ -49,6 +49,7 @@ class Embodiment(BaseModel, extra="forbid", frozen=True):
 
 
 def words_of(instruction: str) -> list[str]:
+    """Return the words of an instruction in lower case, without punctuation."""
     return re.findall(r"[\w-]+", instruction.lower())
 
 
@@ -65,17 +66,19 @@ class Checkpoint(BaseModel, extra="forbid", frozen=True):
         Raises:
             InvalidObservation: It has a word that the training did not have, or too many.
         """
-        said = words_of(instruction)
-        if unknown := [word for word in said if word not in self.words]:
+        words = words_of(instruction)
+        unknown = [word for word in words if word not in self.words]
+        if unknown:
             raise InvalidObservation(
                 f"instruction: got {unknown[0]!r} in {instruction!r}, want words of {self.words}"
             )
-        if not 0 < len(said) <= self.sizes.longest:
+        if not 0 < len(words) <= self.sizes.longest:
             raise InvalidObservation(
-                f"instruction: got {len(said)} words, want 1 to {self.sizes.longest}"
+                f"instruction: got {len(words)} words, want 1 to {self.sizes.longest}"
             )
+
         tokens = np.zeros(self.sizes.longest, np.int64)
-        tokens[: len(said)] = [self.words.index(word) + 1 for word in said]
+        tokens[: len(words)] = [self.words.index(word) + 1 for word in words]
         return tokens
 
 

@@ -55,6 +55,9 @@ class _Eye(nn.Module):
         self.keys = nn.Sequential(nn.LayerNorm(width), nn.Linear(width, 2 * sizes.looks * width))
 
     def forward(self, images: Tensor) -> tuple[Tensor, ...]:
+        """Return keys and values of each look, in turn, (P, tokens, width), for images (P, 3, S,
+        S).
+        """
         tokens = self.patches(self.cut(images).transpose(1, 2)) + self.places
         tokens = tokens + self.mix(tokens)
         return self.keys(tokens).split(tokens.shape[-1], -1)  # type: ignore[no-any-return]
@@ -73,19 +76,20 @@ class _Look(nn.Module):
         self.mix = _mlp(sizes.width)
 
     def forward(
-        self, queries: Tensor, seen: Sequence[tuple[Tensor, Tensor]], grid: Tensor
+        self, queries: Tensor, cameras: Sequence[tuple[Tensor, Tensor]], grid: Tensor
     ) -> Tensor:
-        found = []
-        for asked, (keys, values) in zip(self.ask(queries).chunk(len(seen), -1), seen, strict=True):
-            cosines = (
-                asked
-                @ keys.transpose(1, 2)
-                * _inverse_norms(asked)
-                * _inverse_norms(keys).transpose(1, 2)
-            )
+        """Return the queries (P, queries, width) after a look at the keys and values of each
+        camera; `grid` has the positions of their tokens.
+        """
+        answers = []
+        camera_queries = self.ask(queries).chunk(len(cameras), -1)
+        for camera_query, (keys, values) in zip(camera_queries, cameras, strict=True):
+            products = camera_query @ keys.transpose(1, 2)
+            cosines = products * _inverse_norms(camera_query) * _inverse_norms(keys).transpose(1, 2)
             scores = (_SHARPNESS * cosines).softmax(-1)
-            found += [scores @ values, scores @ grid.to(scores.dtype)]
-        queries = queries + self.answer(torch.cat(found, -1))
+            answers += [scores @ values, scores @ grid.to(scores.dtype)]
+
+        queries = queries + self.answer(torch.cat(answers, -1))
         queries = queries + self.among(queries.transpose(1, 2)).transpose(1, 2)
         return queries + self.mix(queries)
 
@@ -131,9 +135,9 @@ class ReferenceNetwork(nn.Module):
         self.why = nn.Linear(2 * sizes.head, sizes.head)
         self.blocks = nn.ModuleList(_Block(sizes.head) for _ in range(sizes.blocks))
         self.result = nn.Linear(sizes.head, sizes.horizon * sizes.action)
-        side = torch.linspace(-1, 1, sizes.side // sizes.stride)
-        # (tokens, 2): x, y.
-        self.register_buffer("grid", torch.cartesian_prod(side, side).flip(-1), persistent=False)
+        steps = torch.linspace(-1, 1, sizes.side // sizes.stride)
+        positions = torch.cartesian_prod(steps, steps).flip(-1)  # (tokens, 2): x, y
+        self.register_buffer("grid", positions, persistent=False)
 
     def encode(self, tokens: Tensor, state: Tensor, *images: Tensor) -> Tensor:
         """Return the context (P, 2 * head) of words (P, L) int64, states (P, S) and images (P,
@@ -142,20 +146,21 @@ class ReferenceNetwork(nn.Module):
         words = self.words(tokens) + self.order
         keys, values = self.read(words).chunk(2, -1)
         scores = self.queries @ keys.transpose(1, 2) / math.sqrt(self.sizes.width)
-        queries = (
-            self.queries + scores.masked_fill(tokens[:, None] == 0, -math.inf).softmax(-1) @ values
-        )
+        attention = scores.masked_fill(tokens[:, None] == 0, -math.inf).softmax(-1)
+        queries = self.queries + attention @ values
         queries = queries + self.understand(queries) + self.feel(state)[:, None]
-        seen = [eye(image) for eye, image in zip(self.eyes, images, strict=True)]
+
+        encoded = [eye(image) for eye, image in zip(self.eyes, images, strict=True)]
         for number, look in enumerate(self.looks):
-            queries = look(queries, [one[2 * number : 2 * number + 2] for one in seen], self.grid)
+            cameras = [camera[2 * number : 2 * number + 2] for camera in encoded]
+            queries = look(queries, cameras, self.grid)
         return silu(self.context(torch.cat([queries.flatten(1), state], -1)))
 
     def velocity(self, context: Tensor, actions: Tensor, times: Tensor) -> Tensor:
         """Return the velocity, noise minus actions, of noisy actions (B, H, D) at times (B,), 1
         being noise.
         """
-        # Not a buffer, which a network of bfloat16 would round: the largest rate by several rad.
+        # Not a buffer: a network of bfloat16 would round it, the largest rate by several rad.
         angles = times[:, None].float() * torch.logspace(0, 3, _TIMES, device=times.device)
         when = torch.cat([angles.sin(), angles.cos()], -1).to(context.dtype)
         condition = silu(self.why(context) + self.when(when))
@@ -192,12 +197,11 @@ def read_network(sizes: NetworkSizes, folder: Path) -> ReferenceNetwork:
     try:
         with (folder / WEIGHTS).open("rb") as file:
             values = read_values(file)
-        network.load_state_dict(
-            {name: torch.from_numpy(value.copy()) for name, value in values.items()}
-        )
+        tensors = {name: torch.from_numpy(value.copy()) for name, value in values.items()}
+        network.load_state_dict(tensors)
     except (VLAgentsError, RuntimeError) as error:
-        said = " ".join(str(error).split())[:300]
+        reason = " ".join(str(error).split())[:300]
         raise ConfigError(
-            f"{folder / WEIGHTS}: cannot be read: {said}; copy the checkpoint again"
+            f"{folder / WEIGHTS}: cannot be read: {reason}; copy the checkpoint again"
         ) from error
     return network

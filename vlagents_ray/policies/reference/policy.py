@@ -46,7 +46,7 @@ class ReferencePasses(FlowPasses):
     ) -> tuple[Any, Any]:
         return self.model.encode(tokens, state, *images), tokens
 
-    def velocity(self, encoded: Any, seen: Any, state: Any, actions: Any, times: Any) -> Any:
+    def velocity(self, encoded: Any, present: Any, state: Any, actions: Any, times: Any) -> Any:
         return self.model.velocity(encoded, actions.to(encoded.dtype), times).float()
 
 
@@ -88,10 +88,14 @@ class Reference(ModelPolicy):
 
     @property
     def contract(self) -> Contract:
+        """The cameras, the state and the actions of the robot, once the checkpoint is loaded."""
         if self.model is None:
             return Contract(instruction=True, history=1)
-        model, behaviour = self.model, self.offered(OFFERED if self.config.noise_level else ())
-        action, horizon = ActionSpec(**model.robot.action), model.checkpoint.sizes.horizon
+
+        model = self.model
+        behaviour = self.offered(OFFERED if self.config.noise_level else ())
+        action = ActionSpec(**model.robot.action)
+        horizon = model.checkpoint.sizes.horizon
         return self.stated(model.cameras, self.state, horizon, action=action, behaviour=behaviour)
 
     @property
@@ -108,18 +112,20 @@ class Reference(ModelPolicy):
         return self.config.actions == "chunk"
 
     def load(self) -> LoadedReference:
+        """Read the checkpoint, choose its embodiment, and move the network to the device."""
         folder = find_checkpoint(
             self.config.checkpoint, self.config.checkpoint_step, needs=[CONFIG, WEIGHTS]
         )
         checkpoint = read_checkpoint(folder)
-        known, name = checkpoint.embodiments, self.config.embodiment
-        if name is None and len(known) == 1:
-            [name] = known
-        if name is None or name not in known:
+        embodiments, name = checkpoint.embodiments, self.config.embodiment
+        if name is None and len(embodiments) == 1:
+            [name] = embodiments
+        if name is None or name not in embodiments:
             raise ConfigError(
-                f"embodiment: got {name!r}, want one of {sorted(known)}, those of {folder}"
+                f"embodiment: got {name!r}, want one of {sorted(embodiments)}, those of {folder}"
             )
-        robot = known[name]
+        robot = embodiments[name]
+
         device = torch_device(self.config.device)
         from vlagents_ray.policies.reference.network import read_network  # imports torch
 
@@ -142,28 +148,32 @@ class Reference(ModelPolicy):
     def perceive(self, obs: Obs) -> StagedRow:
         """Return the network's inputs for one row."""
         model = self.loaded()
-        sizes, found = model.checkpoint.sizes, model_inputs.camera_images(obs, model.cameras)
-        images = np.stack(
-            [model_inputs.resize_with_pad(found[name], sizes.side, sizes.side) for name in CAMERAS]
-        )
-        state = normalised(
-            model.robot, model_inputs.state_vector(obs, self.state, self.state_dim), sizes.state
-        )
+        sizes = model.checkpoint.sizes
+        images = model_inputs.camera_images(obs, model.cameras)
+        resized = [
+            model_inputs.resize_with_pad(images[name], sizes.side, sizes.side) for name in CAMERAS
+        ]
+        state = model_inputs.state_vector(obs, self.state, self.state_dim)
         staged: StagedRow = model.staging.stage(
-            {"tokens": self._begun().prompt, "images": images, "state": state}
+            {
+                "tokens": self._begun().prompt,
+                "images": np.stack(resized),
+                "state": normalised(model.robot, state, sizes.state),
+            }
         )
         return staged
 
     def predict(self, rows: Sequence[Row]) -> list[Prediction]:
-        model, torch, (firsts, owners) = self.loaded(), require("torch"), shared_frames(rows)
+        """Compute one chunk for each row; samples of a session share its encoded observation."""
+        model, torch = self.loaded(), require("torch")
+        firsts, owners = shared_frames(rows)
         sizes = model.checkpoint.sizes
         with torch.inference_mode():
             inputs = self._inputs([rows[i] for i in firsts])
             tokens = inputs["tokens"]
-            cameras = [torch.ones(len(tokens), dtype=torch.bool, device=tokens.device)] * len(
-                CAMERAS
-            )
-            flows, stated = model.passes.chunks(
+            present = torch.ones(len(tokens), dtype=torch.bool, device=tokens.device)
+            cameras = [present] * len(CAMERAS)
+            flows, outputs = model.passes.chunks(
                 rows,
                 [inputs["images"].unbind(1), cameras, tokens, tokens != 0, inputs["state"]],
                 owners,
@@ -173,7 +183,7 @@ class Reference(ModelPolicy):
                 dim=sizes.action,
                 convert=model.staging.upload,
             )
-        return [Prediction(flow, behaviour=stated.get(i, {})) for i, flow in enumerate(flows)]
+        return [Prediction(flow, behaviour=outputs.get(i, {})) for i, flow in enumerate(flows)]
 
     def _inputs(self, rows: Sequence[Row]) -> dict[str, Any]:
         """Stack the last frames of rows, in the type of the network."""

@@ -17,7 +17,7 @@ from typing_extensions import Self
 from vlagents_ray.contract import Contract
 from vlagents_ray.errors import ConfigError, ContractMismatch, NotReset, VLAgentsError
 from vlagents_ray.interface import Act, Agent, Obs
-from vlagents_ray.policies.outcomes import attempt, of_good
+from vlagents_ray.policies.outcomes import attempt, compute_valid
 from vlagents_ray.serve.config.dialects import read_mapping
 from vlagents_ray.wire.mapping import KeyMapping
 from vlagents_ray_dialects.messages.outgoing import Outgoing
@@ -238,7 +238,9 @@ class Upstream(Agent):
 
             return [attempt(act, answer) for answer in answers]
 
-        return of_good([attempt(converted, *each) for each in zip(obs, sessions, strict=True)], ask)
+        return compute_valid(
+            [attempt(converted, *each) for each in zip(obs, sessions, strict=True)], ask
+        )
 
     def close(self) -> None:
         for connections in (self._lanes, self._sessions):

@@ -66,7 +66,7 @@ def load(folder: Path, config: LeRobotConfig, device: Any) -> Any:
     settings.pretrained_path = folder
     as_saved = _prepare(settings, config, device)
     try:
-        saved = SavedTensors.of(folder / WEIGHTS)
+        saved = SavedTensors.open(folder / WEIGHTS)
         policy = factory.get_policy_class(settings.type).from_pretrained(
             str(folder), config=settings
         )

@@ -239,30 +239,33 @@ class Flow(Kind):
     def draw(self, batch: dict[str, Any], rows: Sequence[Row], leftovers: Sequence[Any]) -> Any:
         shape = (self.horizon, int(self.config.max_action_dim))
         convert = self.staging.upload
-        # before that of the steps, which only some rows draw
+        # This noise is drawn before that of the steps, which only some rows draw.
         noise = convert(np.stack([row.noise(*shape) for row in rows]))
-        self.random = RandomSteps.of(rows, (self.flow_steps, *shape), self.noise_level, convert)
+        self.random = RandomSteps.for_rows(
+            rows, (self.flow_steps, *shape), self.noise_level, convert
+        )
         changes: list[Change] = []
-        given, self.given = None, {}
+        frozen = None
+        given_rows: dict[int, int] = {}
         if any(left is not None for left in leftovers):
             plans = [None if left is None else self._encoded(left) for left in leftovers]
-            prefixes = (
-                Guide.of(list(map(self._prefixed, rows, plans)), *shape) if self.longest else None
-            )
+            prefixes = None
+            if self.longest:
+                prefixes = Guide.for_rows(list(map(self._prefixed, rows, plans)), *shape)
             if prefixes is not None:
-                self.given = {
-                    i: int(prefixes.frozen[i].sum())
-                    for i, plan in enumerate(plans)
-                    if plan is not None
-                }
+                for i, plan in enumerate(plans):
+                    if plan is not None:
+                        given_rows[i] = int(prefixes.frozen[i].sum())
                 prefixes = prefixes.to(convert)
-                noise, given = prefixes.given(noise), prefixes.frozen
+                noise = prefixes.insert_frozen(noise)
+                frozen = prefixes.frozen
                 changes.append(prefixes.keep)
             else:
                 delays = [row.delay for row in rows]
                 changes.append(guided(self.policy.rtc_processor, plans, delays, shape, convert))
         if self.random is not None:
             changes.append(self.random.change)
+        self.given = given_rows
         return self.policy.predict_action_chunk(
             batch,
             noise=noise,
@@ -270,7 +273,7 @@ class Flow(Kind):
             fingerprints=[row.adapter for row in rows],
             steps=self.flow_steps,
             changes=changes,
-            given=given,
+            frozen=frozen,
         )
 
     def _shared(self, rows: Sequence[Row]) -> tuple[list[int], list[int]]:
@@ -369,12 +372,12 @@ class SmolVLAPasses(FlowPasses):
     def encode(
         self, tokens: Any, mask: Any, cameras: Any, state: Any, *patches: Any
     ) -> tuple[Any, Any]:
-        embedded, seen, causal = self.model.embed_prefix(
+        embedded, present, causal = self.model.embed_prefix(
             patches, cameras.unbind(1), tokens, mask, state=state
         )
         _, cache = self.model.vlm_with_expert.forward(
-            attention_mask=self.module.make_att_2d_masks(seen, causal),
-            position_ids=seen.cumsum(1) - 1,
+            attention_mask=self.module.make_att_2d_masks(present, causal),
+            position_ids=present.cumsum(1) - 1,
             inputs_embeds=[embedded, None],
             use_cache=True,
             **({"fill_kv_cache": True} if self._by_name else {}),
@@ -383,9 +386,9 @@ class SmolVLAPasses(FlowPasses):
             layers = [(layer["key_states"], layer["value_states"]) for layer in cache.values()]
         else:
             layers = layers_of(cache)
-        return stack_of(layers), seen.long()
+        return stack_of(layers), present.long()
 
-    def velocity(self, encoded: Any, seen: Any, state: Any, actions: Any, times: Any) -> Any:
+    def velocity(self, encoded: Any, present: Any, state: Any, actions: Any, times: Any) -> Any:
         layers = encoded.unbind(1)
         if self._by_name:
             cache = {
@@ -395,7 +398,7 @@ class SmolVLAPasses(FlowPasses):
         else:
             cache = cache_of(layers)
         return self.model.denoise_step(
-            prefix_pad_masks=seen.bool(), past_key_values=cache, x_t=actions, timestep=times
+            prefix_pad_masks=present.bool(), past_key_values=cache, x_t=actions, timestep=times
         )
 
     def _embed(self, patches: Any) -> Any:

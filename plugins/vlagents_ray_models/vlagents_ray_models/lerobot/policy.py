@@ -237,10 +237,10 @@ class LeRobot(ModelPolicy):
                 if places := _of(adapter, rows):
                     chunks[places] = own.actions(drawn[places])
             dim = settings.action_feature.shape[0]
-            stated = {} if kind.random is None else kind.random.stated(self.config.execute, dim)
+            outputs = {} if kind.random is None else kind.random.outputs(self.config.execute, dim)
         given = [{GIVEN: kind.given[i]} if i in kind.given else {} for i in range(len(rows))]
         return [
-            Prediction(chunk, behaviour=stated.get(i, {}), info=given[i])
+            Prediction(chunk, behaviour=outputs.get(i, {}), info=given[i])
             for i, chunk in enumerate(chunks)
         ]
 

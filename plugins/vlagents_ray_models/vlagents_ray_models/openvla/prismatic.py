@@ -38,7 +38,7 @@ from vlagents_ray.policies.base.accelerator import (
 from vlagents_ray.policies.base.checkpoint import SavedTensors, find_checkpoint, require_loaded
 from vlagents_ray.policies.base.model_inputs import keeping_tokens
 from vlagents_ray.policies.base.staging import StagedRow, Staging
-from vlagents_ray.policies.outcomes import attempt, of_good
+from vlagents_ray.policies.outcomes import attempt, compute_valid
 from vlagents_ray.registry import require
 
 # Of each dimension: 1st and 99th percentile, or minimum and maximum.
@@ -266,7 +266,7 @@ def load_prismatic(config: PrismaticConfig, bounds: Bounds = "q99") -> Prismatic
     network = model_class.from_pretrained(
         path, torch_dtype=dtype, attn_implementation=config.attention, low_cpu_mem_usage=True
     )
-    require_loaded(network, SavedTensors.of(path))
+    require_loaded(network, SavedTensors.open(path))
     return Prismatic(
         path=path,
         network=network.to(device).eval().requires_grad_(False),
@@ -534,7 +534,7 @@ class PrismaticPolicy(ModelPolicy):
                 row, self._statistics(row.adapter).scale(key), self._model_input(row, key)
             )
 
-        return of_good([attempt(prepare, row) for row in rows], self._compute)
+        return compute_valid([attempt(prepare, row) for row in rows], self._compute)
 
     def _example(self, seed: int, instruction: str = "warm up") -> Row:
         """Return a row of any dataset; sessions may select theirs later."""
