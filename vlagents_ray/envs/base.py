@@ -24,9 +24,9 @@ if TYPE_CHECKING:
     from typing_extensions import Self
 
 Options = Mapping[str, Any]
-Metric = Literal[
-    "success_once", "success_at_end"
-]  # the success of an episode: after any of its steps, or after the last
+# The success of an episode: after any of its steps, or after the last one.
+Metric = Literal["success_once", "success_at_end"]
+# Observations, rewards, terminated, truncated and infos of one step of several environments.
 Steps = tuple[list[Obs], list[float], list[bool], list[bool], list[dict[str, Any]]]
 
 
@@ -318,15 +318,16 @@ fields.
 
 def require_cameras(env: str, names: Collection[str], have: Collection[str]) -> None:
     """Raise `ConfigError` unless an env has the cameras of these names."""
-    if unknown := sorted(set(names) - set(have)):
+    unknown = sorted(set(names) - set(have))
+    if unknown:
         raise ConfigError(f"{env} has no camera {unknown}: want some of {sorted(have)}")
 
 
-def require_known(suite: str, task: str | None, known: Sequence[str], others: str = "") -> None:
-    """Raise `UnknownEnv` unless a task is known; `others` are further allowed tasks, in words."""
+def require_known(suite: str, task: str | None, known: Sequence[str], also: str = "") -> None:
+    """Raise `UnknownEnv` unless a task is known; `also` describes further allowed tasks."""
     if task not in known:
-        meant = did_you_mean(str(task), known)
-        raise UnknownEnv(f"{suite} has no task {task!r}: want one of {list(known)}{others}{meant}")
+        hint = did_you_mean(str(task), known)
+        raise UnknownEnv(f"{suite} has no task {task!r}: want one of {list(known)}{also}{hint}")
 
 
 def one_row(act: Act, contract: Contract) -> np.ndarray:
@@ -353,11 +354,14 @@ def make_batch(name: str, num_envs: int, **options: Any) -> BatchEnv:
     if num_envs < 1:
         raise ConfigError(f"env {name!r}: num_envs is {num_envs}, want at least 1")
     cls, arguments = env_arguments(name, options)
-    if (together := cls.batched(num_envs, **arguments)) is not None:
-        return together
-    with ExitStack() as made:
-        envs = [made.enter_context(cls(**arguments)) for _ in range(num_envs)]
-        made.pop_all()
+    batch = cls.batched(num_envs, **arguments)
+    if batch is not None:
+        return batch
+
+    # Close those that were made if a later one fails.
+    with ExitStack() as closing:
+        envs = [closing.enter_context(cls(**arguments)) for _ in range(num_envs)]
+        closing.pop_all()
         return SequentialBatch(envs)
 
 
@@ -368,9 +372,9 @@ class SequentialBatch(BatchEnv):
     """Environments that are stepped one after another, while one call of the policy serves all of
     them.
 
-    If the step of one of several environments raises an exception, such as `InvalidAction` for a
-    refused action, it stands as `ERROR` in its info, and the others are stepped: an episode does
-    not depend on those beside it.
+    If the step of one of several environments raises an exception, such as `InvalidAction`, its
+    info contains the exception as `ERROR`, and the others are stepped: an episode does not depend
+    on those in other environments.
     """
 
     restarts = True
@@ -380,13 +384,10 @@ class SequentialBatch(BatchEnv):
         self.several_tasks = envs[0].several_tasks
         self._envs = list(envs)
         self._playing = 0  # the number of environments, from the first, that have an episode
-        self._seen: list[Obs] = []  # the last observation of each environment
-        first = self._envs[0]
-        self.num_envs, self.max_steps, self.init_states = (
-            len(self._envs),
-            first.max_steps,
-            first.init_states,
-        )
+        self._last_obs: list[Obs] = []  # the last observation of each environment
+        self.num_envs = len(self._envs)
+        self.max_steps = self._envs[0].max_steps
+        self.init_states = self._envs[0].init_states
 
     @property
     def contract(self) -> Contract:
@@ -399,39 +400,51 @@ class SequentialBatch(BatchEnv):
     def reset(
         self, *, seeds: Sequence[int], options: Sequence[Options | None] | None = None
     ) -> list[Obs]:
+        """Begin the episodes one after another; see `BatchEnv.reset`."""
         self._playing = episodes_of(seeds, self.num_envs)
-        given = zip(self._envs, seeds, options or [None] * self._playing, strict=False)
-        self._seen = self._stacked([_begun(*each) for each in given], range(self._playing))
-        return self._seen
+        if not options:
+            options = [None] * self._playing
+        observations = []
+        for env, seed, env_options in zip(self._envs, seeds, options, strict=False):
+            observations.append(_first_obs(env, seed, env_options))
+        self._last_obs = self._stacked(observations, range(self._playing))
+        return self._last_obs
 
     def restart(self, index: int, *, seed: int, options: Options | None = None) -> Obs:
-        self._seen[index] = _begun(self._envs[index], seed, options)
-        return self._seen[index]
+        self._last_obs[index] = _first_obs(self._envs[index], seed, options)
+        return self._last_obs[index]
 
     def step(self, acts: Sequence[Act | None]) -> Steps:
-        if (n := len(acts)) != self._playing:
+        """Step the environments one after another; see `BatchEnv.step`."""
+        count = len(acts)
+        if count != self._playing:
             raise ConfigError(
-                f"step: got {n} actions, want {self._playing}, one for each episode or None"
+                f"step: got {count} actions, want {self._playing}, one for each episode or None"
             )
         moving = {i: act for i, act in enumerate(acts) if act is not None}
-        if n > 1:  # a single environment checks its action itself
+        if count > 1:  # A single environment checks its action itself.
             for act in moving.values():
                 one_row(act, self.contract)
+
         moved = set(moving)
-        seen, rewards, terminated, truncated = list(self._seen), [0.0] * n, [False] * n, [False] * n
-        infos: list[dict[str, Any]] = [{}] * n
+        observations = list(self._last_obs)
+        rewards, terminated, truncated = [0.0] * count, [False] * count, [False] * count
+        infos: list[dict[str, Any]] = [{}] * count
         for i, act in moving.items():
             try:
-                seen[i], rewards[i], terminated[i], truncated[i], infos[i] = self._step_one(i, act)
+                result = self._step_env(i, act)
             except (Exception, SystemExit) as error:
-                if n == 1:
+                if count == 1:
                     raise
                 infos[i] = {ERROR: error}
                 moved.discard(i)
-        self._seen = self._stacked(seen, moved)
-        return self._seen, rewards, terminated, truncated, infos
+            else:
+                observations[i], rewards[i], terminated[i], truncated[i], infos[i] = result
 
-    def _step_one(self, index: int, act: Act) -> tuple[Any, ...]:
+        self._last_obs = self._stacked(observations, moved)
+        return self._last_obs, rewards, terminated, truncated, infos
+
+    def _step_env(self, index: int, act: Act) -> tuple[Any, ...]:
         env = self._envs[index]
         env.looked_at = self.looked_at
         answer: Any = env.step(act)
@@ -444,37 +457,44 @@ class SequentialBatch(BatchEnv):
         return self._envs[0].renderer()
 
     def describe(self) -> dict[str, Any]:
-        return self._envs[0].describe() | (
-            {} if self.num_envs == 1 else {"num_envs": self.num_envs}
-        )
+        facts = self._envs[0].describe()
+        return facts if self.num_envs == 1 else {**facts, "num_envs": self.num_envs}
 
     def close(self) -> None:
+        """Close all environments, also if one of them raises an exception."""
         with ExitStack() as closing:
             for env in self._envs:
                 closing.callback(env.close)
 
-    def _stacked(self, seen: list[Obs], moved: Collection[int]) -> list[Obs]:
+    def _stacked(self, observations: list[Obs], moved: Collection[int]) -> list[Obs]:
         """Return the observations with the images of each camera as rows of one array, if images
         are used.
 
         An idle environment may have left its images out when it last moved; images of one that
         moved then take their place.
         """
-        if len(seen) == 1 or not moved or not self.looked_at:
-            return seen
-        if not (shown := seen[min(moved)].cameras):
-            return seen
-        cameras = [
-            obs.cameras if i in moved else {**shown, **obs.cameras} for i, obs in enumerate(seen)
-        ]
-        images = {name: np.stack([one[name] for one in cameras]) for name in cameras[0]}
-        return [
-            replace(obs, cameras={name: rows[i] for name, rows in images.items()})
-            for i, obs in enumerate(seen)
-        ]
+        if len(observations) == 1 or not moved or not self.looked_at:
+            return observations
+        substitutes = observations[min(moved)].cameras
+        if not substitutes:
+            return observations
+
+        cameras = []
+        for i, obs in enumerate(observations):
+            cameras.append(obs.cameras if i in moved else {**substitutes, **obs.cameras})
+        images = {}
+        for name in cameras[0]:
+            images[name] = np.stack([env_images[name] for env_images in cameras])
+
+        stacked = []
+        for i, obs in enumerate(observations):
+            rows = {name: array[i] for name, array in images.items()}
+            stacked.append(replace(obs, cameras=rows))
+        return stacked
 
 
-def _begun(env: EvalEnv, seed: int, options: Options | None) -> Obs:
+def _first_obs(env: EvalEnv, seed: int, options: Options | None) -> Obs:
+    """Begin an episode, and return its first observation."""
     answer: Any = env.reset(seed=seed, options=options)
     if not isinstance(answer, tuple) or len(answer) != 2:
         raise EnvFailed(f"env reset: got {kind_of(answer)}, want (Obs, info); see EvalEnv.reset")

@@ -32,7 +32,7 @@ from typing import Any, Literal
 import vlagents_ray
 from vlagents_ray.errors import ConfigError
 
-_MOST = 64  # devices
+_MOST_DEVICES = 64
 _EXTENSIONS = 0x3055
 _DEVICE = 0x322C  # attribute of a display: its device
 _CUDA_DEVICE = 0x323A
@@ -66,38 +66,44 @@ class _Functions:
         self.library.eglGetProcAddress.restype = ctypes.c_void_p
         self.library.eglGetProcAddress.argtypes = [ctypes.c_char_p]
         self.library.eglGetCurrentDisplay.restype = ctypes.c_void_p
-        pointers, whole = ctypes.POINTER(ctypes.c_void_p), ctypes.POINTER(ctypes.c_int)
+        # The results and arguments of each function.
+        pointers, integers = ctypes.POINTER(ctypes.c_void_p), ctypes.POINTER(ctypes.c_int)
         self._query = self._extension(
-            "eglQueryDevicesEXT", ctypes.c_uint, ctypes.c_int, pointers, whole
+            "eglQueryDevicesEXT", ctypes.c_uint, ctypes.c_int, pointers, integers
         )
         self._text = self._extension(
             "eglQueryDeviceStringEXT", ctypes.c_char_p, ctypes.c_void_p, ctypes.c_int
         )
-        asking = (ctypes.c_uint, ctypes.c_void_p, ctypes.c_int, ctypes.POINTER(_Value))
-        self._attribute = self._extension("eglQueryDeviceAttribEXT", *asking)
-        self.display_attribute = self._extension("eglQueryDisplayAttribEXT", *asking)
+        signature = (ctypes.c_uint, ctypes.c_void_p, ctypes.c_int, ctypes.POINTER(_Value))
+        self._attribute = self._extension("eglQueryDeviceAttribEXT", *signature)
+        self.display_attribute = self._extension("eglQueryDisplayAttribEXT", *signature)
         self.gl_string = self._extension("glGetString", ctypes.c_char_p, ctypes.c_uint)
 
     def devices(self) -> list[tuple[int | None, EglDevice]]:
-        handles, number = (ctypes.c_void_p * _MOST)(), ctypes.c_int()
-        if not self._query(_MOST, handles, ctypes.byref(number)):
+        """List all devices in EGL's order, each with its handle."""
+        handles, number = (ctypes.c_void_p * _MOST_DEVICES)(), ctypes.c_int()
+        if not self._query(_MOST_DEVICES, handles, ctypes.byref(number)):
             return []
-        found = []
+
+        listed = []
         for i, handle in enumerate(handles[: number.value]):
             extensions = (self._text(handle, _EXTENSIONS) or b"").decode().split()
-            cuda = (
-                self.value(self._attribute, handle, _CUDA_DEVICE) if _CUDA in extensions else None
-            )
-            found.append((handle, EglDevice(i, _SOFTWARE in extensions, cuda)))
-        return found
+            cuda = None
+            if _CUDA in extensions:
+                cuda = self.value(self._attribute, handle, _CUDA_DEVICE)
+            listed.append((handle, EglDevice(i, _SOFTWARE in extensions, cuda)))
+        return listed
 
-    def value(self, ask: Callable[..., int], of: int | None, what: int) -> int | None:
-        """Return the value of an attribute; None if it has no value."""
-        found = _Value(-1)
-        return found.value if ask(of, what, ctypes.byref(found)) and found.value >= 0 else None
+    def value(self, query: Callable[..., int], handle: int | None, attribute: int) -> int | None:
+        """Return the value of an attribute of a device or a display; None if it has no value."""
+        value = _Value(-1)
+        if not query(handle, attribute, ctypes.byref(value)) or value.value < 0:
+            return None
+        return value.value
 
     def _extension(self, name: str, result: Any, *arguments: Any) -> Any:
-        if not (address := self.library.eglGetProcAddress(name.encode())):
+        address = self.library.eglGetProcAddress(name.encode())
+        if not address:
             raise AttributeError(name)
         return ctypes.CFUNCTYPE(result, *arguments)(address)
 
@@ -126,8 +132,8 @@ _CURE_HIDDEN = (
 _CURE_OWN = (
     "install the NVIDIA driver's graphics part on that node (libnvidia-gl; in a container "
     "NVIDIA_DRIVER_CAPABILITIES=all), or leave worker.gpus at 0 to render in software; if it is "
-    "intended, set "
-    f"render_backend in env_options (ManiSkill) or {EGL_DEVICE} in worker.runtime_env.env_vars"
+    f"intended, set render_backend in env_options (ManiSkill) or {EGL_DEVICE} in "
+    "worker.runtime_env.env_vars"
 )
 
 
@@ -154,12 +160,9 @@ def fitting(devices: Sequence[EglDevice], *, gpu: bool) -> EglDevice | None:
     None if there is none.
     """
     if gpu:
-        return min(
-            (one for one in devices if one.cuda is not None),
-            key=lambda one: one.cuda or 0,
-            default=None,
-        )
-    return next((one for one in devices if one.software), None)
+        gpus = [device for device in devices if device.cuda is not None]
+        return min(gpus, key=lambda device: device.cuda or 0, default=None)
+    return next((device for device in devices if device.software), None)
 
 
 def prepare_rendering() -> None:
@@ -178,33 +181,39 @@ def choose_devices() -> None:
     """Set the variables that select the devices, before libraries are loaded; variables set by
     the user are kept.
     """
-    if (gpu := has_gpu()) is None:
+    gpu = has_gpu()
+    if gpu is None:
         return
-    if EGL_DEVICE not in os.environ and (device := fitting(devices(), gpu=gpu)) is not None:
-        os.environ[EGL_DEVICE] = str(device.number)
-    if (
-        not gpu
-        and not any(os.environ.get(name) for name in VULKAN_DRIVERS)
-        and (driver := _lavapipe()) is not None
-    ):
-        os.environ[VULKAN_DRIVERS[0]] = str(driver)
+
+    if EGL_DEVICE not in os.environ:
+        device = fitting(devices(), gpu=gpu)
+        if device is not None:
+            os.environ[EGL_DEVICE] = str(device.number)
+
+    if not gpu and not any(os.environ.get(name) for name in VULKAN_DRIVERS):
+        driver = _lavapipe()
+        if driver is not None:
+            os.environ[VULKAN_DRIVERS[0]] = str(driver)
 
 
 def opengl_renderer() -> Renderer | None:
     """Return the renderer of this thread's OpenGL context; None if there is none, or if it is
     not EGL's.
     """
-    if (functions := _functions()) is None or not (
-        display := functions.library.eglGetCurrentDisplay()
-    ):
+    functions = _functions()
+    if functions is None:
         return None
+    display = functions.library.eglGetCurrentDisplay()
+    if not display:
+        return None
+
     handle = functions.value(functions.display_attribute, display, _DEVICE)
     device = next((device for pointer, device in functions.devices() if pointer == handle), None)
     name = functions.gl_string(_GL_RENDERER)
     if device is None or name is None:
         return None
-    named = os.environ.get(EGL_DEVICE) == str(device.number)
-    return Renderer(name.decode(errors="replace"), device.software, device.cuda, named)
+    asked_for = os.environ.get(EGL_DEVICE) == str(device.number)
+    return Renderer(name.decode(errors="replace"), device.software, device.cuda, asked_for)
 
 
 def vulkan_renderer(name: str, cuda: int | None, *, asked_for: bool = False) -> Renderer:
@@ -212,8 +221,8 @@ def vulkan_renderer(name: str, cuda: int | None, *, asked_for: bool = False) -> 
     options named it.
     """
     files = filter(None, map(os.environ.get, VULKAN_DRIVERS))
-    named = has_gpu() is False and any(_SAPIENS_OWN not in file for file in files)
-    return Renderer(name, name.startswith(_SOFTWARE_VULKAN), cuda, asked_for or named)
+    driver_set = has_gpu() is False and any(_SAPIENS_OWN not in file for file in files)
+    return Renderer(name, name.startswith(_SOFTWARE_VULKAN), cuda, asked_for or driver_set)
 
 
 def require_own(renderer: Renderer) -> None:
@@ -221,12 +230,12 @@ def require_own(renderer: Renderer) -> None:
     none is assigned.
     """
     gpu = has_gpu()
-    if (
-        gpu is None
-        or renderer.asked_for
-        or (renderer.cuda is not None if gpu else renderer.software)
-    ):
+    if gpu is None or renderer.asked_for:
         return
+    is_right = renderer.cuda is not None if gpu else renderer.software
+    if is_right:
+        return
+
     if gpu:
         raise ConfigError(
             f"the worker was given the GPU {os.environ[GPUS]}, but its env renders on "
@@ -234,16 +243,17 @@ def require_own(renderer: Renderer) -> None:
         )
     raise ConfigError(
         f"the worker was given no GPU (worker.gpus: 0), but its env renders on {renderer.name!r}, "
-        "which a policy may "
-        f"be using; {_CURE_HIDDEN}"
+        f"which a policy may be using; {_CURE_HIDDEN}"
     )
 
 
 def _lavapipe() -> Path | None:
-    return next(
-        (path for folder in _ICD_FOLDERS for path in sorted(Path(folder).glob("lvp_icd*.json"))),
-        None,
-    )
+    """Return the description of Mesa's software driver for Vulkan; None if it is not installed."""
+    for folder in _ICD_FOLDERS:
+        files = sorted(Path(folder).glob("lvp_icd*.json"))
+        if files:
+            return files[0]
+    return None
 
 
 def _has_egl() -> bool:
@@ -261,21 +271,17 @@ TIMEOUT_S = 60.0  # a software driver compiles its shaders in 3 to 10 s
 
 VULKAN_CURE = (
     "install a Vulkan driver: Mesa 25 renders in software (Debian 12: apt-get install -t "
-    "bookworm-backports "
-    "mesa-vulkan-drivers, its own 22.3 is too old; elsewhere: mesa-vulkan-drivers); for an "
-    "unpacked one set "
-    "VK_ICD_FILENAMES to its lvp_icd.json"
+    "bookworm-backports mesa-vulkan-drivers, its own 22.3 is too old; elsewhere: "
+    "mesa-vulkan-drivers); for an unpacked one set VK_ICD_FILENAMES to its lvp_icd.json"
 )
 VULKAN_CURE_NVIDIA = (
     "an NVIDIA driver is here but no Vulkan device: install the driver's graphics part "
-    "(libnvidia-gl), or start the "
-    "container with NVIDIA_DRIVER_CAPABILITIES=all"
+    "(libnvidia-gl), or start the container with NVIDIA_DRIVER_CAPABILITIES=all"
 )
 EGL_CURE = (
     "install EGL: apt-get install libegl1 libgl1-mesa-dri renders in software; on NVIDIA the "
-    "driver's graphics part "
-    "(libnvidia-gl), in a container NVIDIA_DRIVER_CAPABILITIES=all; MUJOCO_GL must be set before "
-    "mujoco is imported"
+    "driver's graphics part (libnvidia-gl), in a container NVIDIA_DRIVER_CAPABILITIES=all; "
+    "MUJOCO_GL must be set before mujoco is imported"
 )
 
 _BOX_XML = """
@@ -338,16 +344,17 @@ def usable_devices(summary: str) -> list[tuple[str, int | None]]:
     Each has a name, such as "llvmpipe (LLVM 15.0.6, 256 bits)", and its number among the CUDA
     devices of this process; None if CUDA does not know it.
     """
-    found = []
+    usable = []
     for block in summary.split("GPU:")[1:]:
         name, *lines = block.splitlines()
-        facts = {
-            key.strip(): value.strip() for key, _, value in (line.partition(":") for line in lines)
-        }
+        facts = {}
+        for line in lines:
+            key, _, value = line.partition(":")
+            facts[key.strip()] = value.strip()
         if facts.get("Supported") == "1":
             cuda = int(facts.get("cudaId", "-1"))
-            found.append((name.strip(), cuda if cuda >= 0 else None))
-    return found
+            usable.append((name.strip(), cuda if cuda >= 0 else None))
+    return usable
 
 
 def _probed(
@@ -357,13 +364,14 @@ def _probed(
     if importlib.util.find_spec(module) is None:
         error, cure = f"{module} is not installed", f"pip install 'vlagents-ray[{extra}]'"
         return RenderProbe(ok=False, seconds=0.0, error=error, cure=cure)
+
     root = str(Path(vlagents_ray.__file__).parents[1])
     path = os.pathsep.join(filter(None, [root, os.environ.get("PYTHONPATH")]))
     started = time.monotonic()
     try:
         child = subprocess.run(  # noqa: S603 - our own interpreter and module, no outside input
             [sys.executable, "-c", f"from {__name__} import _main; _main({api!r})"],
-            # Which SAPIEN does not read.
+            # SAPIEN does not read MUJOCO_GL.
             env={**os.environ, "PYTHONPATH": path, "MUJOCO_GL": "egl"},
             stdin=subprocess.DEVNULL,
             capture_output=True,
@@ -375,16 +383,16 @@ def _probed(
     except subprocess.TimeoutExpired:
         error = f"no frame within {timeout_s:g} s"
         return RenderProbe(ok=False, seconds=time.monotonic() - started, error=error, cure=cure)
+
     seconds = time.monotonic() - started
     if child.returncode == 0:
         answer = json.loads(child.stdout.splitlines()[-1])
-        devices = tuple(EglDevice(**one) for one in answer["devices"])
+        devices = tuple(EglDevice(**device) for device in answer["devices"])
         return RenderProbe(ok=True, seconds=seconds, device=answer["device"], devices=devices)
-    errors = [line for line in child.stderr.splitlines() if line.strip()]
-    ended = f"the child ended with {child.returncode}"
-    return RenderProbe(
-        ok=False, seconds=seconds, error=errors[-1].strip() if errors else ended, cure=cure
-    )
+
+    errors = [line.strip() for line in child.stderr.splitlines() if line.strip()]
+    error = errors[-1] if errors else f"the child ended with {child.returncode}"
+    return RenderProbe(ok=False, seconds=seconds, error=error, cure=cure)
 
 
 def _render_vulkan() -> str | None:
@@ -405,8 +413,8 @@ def _render_vulkan() -> str | None:
     scene.update_render()
     camera.take_picture()
     _require_contrast(np.asarray(camera.get_picture("Color"))[..., :3])
-    found = vulkan_device(on_gpu=device.is_cuda())
-    return None if found is None else found[0]
+    name_and_cuda = vulkan_device(on_gpu=device.is_cuda())
+    return None if name_and_cuda is None else name_and_cuda[0]
 
 
 def _render_egl() -> str | None:
@@ -433,5 +441,5 @@ def _require_contrast(image: object) -> None:
 
 def _main(api: str) -> None:
     device = _render_vulkan() if api == "vulkan" else _render_egl()
-    listed = [asdict(one) for one in devices()] if api == "egl" else []
+    listed = [asdict(device) for device in devices()] if api == "egl" else []
     sys.stdout.write("\n" + json.dumps({"device": device, "devices": listed}) + "\n")

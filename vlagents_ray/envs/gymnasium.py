@@ -157,41 +157,41 @@ class Gymnasium(EvalEnv):
         """
         if task is None:
             raise UnknownEnv("gymnasium: got no id, want one, as in 'gymnasium/Pendulum-v1'")
+
         prepare_rendering()
         defaults = known(task)
         self._id, self._name = task, f"gymnasium/{task}"
         self._module = module if module is not None else defaults.module
         self._kwargs = {**defaults.kwargs, **(kwargs or {})}
         self._protocol = defaults.protocol
+        self._instruction = instruction if instruction is not None else defaults.instruction
         self._success, self._unit_actions, self._remake = success, unit_actions, remake
+        self._size = (height, width)
         self._ready = False
         self._steps = 0
         self._env = self._make(max_steps)
+
         try:
-            self._instruction = instruction if instruction is not None else defaults.instruction
-            spec = self._env.spec
-            limit = max_steps or (spec.max_episode_steps if spec is not None else None)
-            if limit is None or limit < 1:
-                raise ConfigError(
-                    f"{self._name}: its step limit is {limit}; set `max_steps` to 1 or more"
-                )
-            self.max_steps = int(limit)
-            self._action_space, self._size = str(self._env.action_space), (height, width)
+            self.max_steps = self._step_limit(max_steps)
+            self._action_space = str(self._env.action_space)
             self._low, self._high, self._dtype = bounds(self._env.action_space)
             if unit_actions and not np.isfinite([self._low, self._high]).all():
                 raise ConfigError(
                     f"{self._name}: unit_actions needs finite bounds, got {self._env.action_space}"
                 )
-            seen_cameras, seen_state = parts(self._env.observation_space, self._env.render_mode)
-            cameras = cameras if cameras is not None else defaults.cameras
-            self._cameras = _picks(cameras if cameras is not None else seen_cameras)
-            self._state = _picks(state if state is not None else seen_state)
+
+            space_cameras, space_state = parts(self._env.observation_space, self._env.render_mode)
+            if cameras is None:
+                cameras = defaults.cameras
+            self._cameras = _picks(cameras if cameras is not None else space_cameras)
+            self._state = _picks(state if state is not None else space_state)
             self._gripper = Pick.parse(gripper) if gripper is not None else None
             self._closed, self._open = gripper_range
             if self._closed == self._open:
                 raise ConfigError(
                     f"{self._name}: gripper_range is {gripper_range}, want two different numbers"
                 )
+
             first, _ = self._call("reset", seed=0)
             self._contract = self._contract_of(
                 self._observe(first), control_hz or defaults.control_hz
@@ -199,6 +199,16 @@ class Gymnasium(EvalEnv):
         except BaseException:
             self.close()
             raise
+
+    def _step_limit(self, max_steps: int | None) -> int:
+        """Return `max_steps`, or by default the limit that the id was registered with."""
+        spec = self._env.spec
+        limit = max_steps or (spec.max_episode_steps if spec is not None else None)
+        if limit is None or limit < 1:
+            raise ConfigError(
+                f"{self._name}: its step limit is {limit}; set `max_steps` to 1 or more"
+            )
+        return int(limit)
 
     @classmethod
     def missing(cls) -> str | None:
@@ -213,7 +223,11 @@ class Gymnasium(EvalEnv):
         return self._instruction
 
     def describe(self) -> dict[str, Any]:
-        played = {"max_steps": self.max_steps, "control_hz": self._contract.control_hz}
+        """Return the id, the versions, and the settings with their deviations from the
+        protocol.
+        """
+        settings = {"max_steps": self.max_steps, "control_hz": self._contract.control_hz}
+        protocol = settings if self._protocol is None else self._protocol.describe(**settings)
         return {
             "id": self._id,
             "gymnasium": require("gymnasium").__version__,
@@ -221,16 +235,20 @@ class Gymnasium(EvalEnv):
             "action_space": self._action_space,
             "unit_actions": self._unit_actions,
             "success": self._success or f"info: {' or '.join(SUCCESS_KEYS)}",
-            "protocol": self._protocol.describe(**played) if self._protocol is not None else played,
+            "protocol": protocol,
         }
 
     def reset(
         self, *, seed: int, options: Mapping[str, Any] | None = None
     ) -> tuple[Obs, dict[str, Any]]:
+        """Begin the episode of `seed`, 0 or more; `options` are those of the environment's own
+        reset.
+        """
         if seed < 0:
             raise ConfigError(f"{self._name}: seed is {seed}, want 0 or more")
         if self._env is None:
             raise NotReset(f"{self._name}: is closed; make it again")
+
         if self._remake:
             self._call("close")
             self._env = self._make(self.max_steps)
@@ -239,55 +257,58 @@ class Gymnasium(EvalEnv):
         return self._observe(nested), plain(info)
 
     def step(self, act: Act) -> tuple[Obs, float, bool, bool, dict[str, Any]]:
+        """Execute an action, (D,), clipped to the action space; see `EvalEnv.step`."""
         if not self._ready:
             raise NotReset(f"{self._name}: step before reset; call reset(seed=...) first")
+
         action = one_row(act, self._contract).astype(np.float64)
         if self._unit_actions:
             action = self._low + (action + 1) / 2 * (self._high - self._low)
         action = np.clip(action, self._low, self._high).astype(self._dtype)
         nested, reward, terminated, truncated, info = self._call("step", action)
         self._steps += 1
-        if self._success == "terminated":
-            success = bool(terminated)
-        elif self._success is not None:
-            success = bool(Pick.parse(self._success).value(info))
-        else:
-            success = any(bool(info.get(key, False)) for key in SUCCESS_KEYS)
-        stopped = bool(truncated) or self._steps >= self.max_steps
+
+        success = self._is_success(terminated, info)
+        is_truncated = bool(truncated) or self._steps >= self.max_steps
         # Unused images are also rendered: rendering changes the state of some envs (the target of
         # the Fetch tasks).
-        return (
-            self._observe(nested),
-            float(reward),
-            bool(terminated),
-            stopped,
-            {**plain(info), "success": success},
-        )
+        obs = self._observe(nested)
+        info = {**plain(info), "success": success}
+        return obs, float(reward), bool(terminated), is_truncated, info
+
+    def _is_success(self, terminated: Any, info: Mapping[str, Any]) -> bool:
+        if self._success == "terminated":
+            return bool(terminated)
+        if self._success is not None:
+            return bool(Pick.parse(self._success).value(info))
+        return any(bool(info.get(key, False)) for key in SUCCESS_KEYS)
 
     def close(self) -> None:
+        """Close the environment; safe to call twice."""
         self._ready = False
         if self._env is not None:
             env, self._env = self._env, None
             env.close()
 
     def _make(self, max_steps: int | None) -> Any:
-        # pygame, the renderer of several environments, otherwise prints a greeting on import
+        # Pygame, the renderer of several environments, otherwise prints a greeting on import.
         os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")
         gymnasium = require("gymnasium")
-        namespace = (
-            "" if self._id in gymnasium.registry else self._id.rpartition("/")[0].partition(":")[0]
-        )
-        if module := self._module or namespace:
+        module = self._module
+        if not module and self._id not in gymnasium.registry:
+            module = self._id.rpartition("/")[0].partition(":")[0]  # the id's namespace
+        if module:
             require(module)
+
         arguments = {"render_mode": "rgb_array", "disable_env_checker": True, **self._kwargs}
         try:
             return gymnasium.make(self._id, max_episode_steps=max_steps, **arguments)
         except gymnasium.error.DependencyNotInstalled as error:
             raise MissingDependency(f"{self._name}: {error}") from error
         except gymnasium.error.UnregisteredEnv as error:
-            meant = did_you_mean(self._id.rpartition("/")[2], gymnasium.registry)
+            hint = did_you_mean(self._id.rpartition("/")[2], gymnasium.registry)
             raise UnknownEnv(
-                f"{self._name}: {error}; gymnasium/MODULE:ID imports what registers it{meant}"
+                f"{self._name}: {error}; gymnasium/MODULE:ID imports what registers it{hint}"
             ) from error
         except gymnasium.error.Error as error:
             raise ConfigError(f"{self._name}: {error}") from error
@@ -307,27 +328,24 @@ class Gymnasium(EvalEnv):
             ) from error
 
     def _observe(self, nested: Any) -> Obs:
-        cameras = {
-            name: as_image(
-                self._call("render") if pick.text == RENDER else pick.value(nested),
-                name,
-                self._size,
-            )
-            for name, pick in self._cameras.items()
-        }
+        cameras = {}
+        for name, pick in self._cameras.items():
+            image = self._call("render") if pick.text == RENDER else pick.value(nested)
+            cameras[name] = as_image(image, name, self._size)
+
         gripper = None
         if self._gripper is not None:
             share = (self._gripper.number(nested) - self._closed) / (self._open - self._closed)
             gripper = min(max(share, 0.0), 1.0)
-        return Obs(
-            cameras, gripper, {name: pick.vector(nested) for name, pick in self._state.items()}
-        )
+
+        state = {name: pick.vector(nested) for name, pick in self._state.items()}
+        return Obs(cameras, gripper, state)
 
     def _contract_of(self, obs: Obs, control_hz: float | None) -> Contract:
         low, high = (-1.0, 1.0) if self._unit_actions else (uniform(self._low), uniform(self._high))
         return Contract(
             cameras={name: CameraSpec(*image.shape[:2]) for name, image in obs.cameras.items()},
-            state={name: StateSpec(len(part)) for name, part in obs.state.items()},
+            state={name: StateSpec(len(vector)) for name, vector in obs.state.items()},
             gripper=obs.gripper is not None,
             instruction=bool(self._instruction),
             action=ActionSpec(dim=len(self._low), low=low, high=high),
@@ -396,48 +414,52 @@ class Pick:
 
     text: str
     keys: tuple[str, ...]
-    part: slice
+    range: slice
 
     @classmethod
     def parse(cls, text: str) -> Pick:
         """Parse a path: `"images/top"`, `"agent_pos"`, `"robot/qpos[0:7]"`, `"[2:]"`; `""` is
         the whole observation.
         """
-        if (match := _PATH.fullmatch(text)) is None:
+        match = _PATH.fullmatch(text)
+        if match is None:
             raise ConfigError(
                 f"path {text!r}: want keys joined by '/', then perhaps a range, as in "
                 "'robot/qpos[0:7]'"
             )
+
+        keys = tuple(key for key in match["keys"].split("/") if key)
         start, stop = (int(match[name]) if match[name] else None for name in ("start", "stop"))
-        return cls(text, tuple(key for key in match["keys"].split("/") if key), slice(start, stop))
+        return cls(text, keys, slice(start, stop))
 
     def value(self, nested: Any) -> Any:
         """Return the value under the keys, without the range; raises `ConfigError` if there is
         none.
         """
         for key in self.keys:
-            if not isinstance(nested, Mapping) or key not in nested:
-                have = (
-                    sorted(map(str, nested))
-                    if isinstance(nested, Mapping)
-                    else type(nested).__name__
-                )
+            if not isinstance(nested, Mapping):
+                kind = type(nested).__name__
+                raise ConfigError(f"path {self.text!r}: there is no {key!r} in {kind}")
+            if key not in nested:
+                have = sorted(map(str, nested))
                 raise ConfigError(f"path {self.text!r}: there is no {key!r} in {have}")
             nested = nested[key]
         return nested
 
     def vector(self, nested: Any) -> np.ndarray:
+        """Return the range of the value, (D,) float32; raises `ConfigError` if it is no vector."""
         array = np.array(self.value(nested), dtype=np.float32)
         if array.ndim > 1:
             raise ConfigError(f"path {self.text!r}: got shape {array.shape}, want (D,)")
-        found: np.ndarray = np.atleast_1d(array)[self.part]
-        if found.size == 0:
+        numbers: np.ndarray = np.atleast_1d(array)[self.range]
+        if numbers.size == 0:
             raise ConfigError(
                 f"path {self.text!r}: the range is empty, the value has {array.size} numbers"
             )
-        return found
+        return numbers
 
     def number(self, nested: Any) -> float:
+        """Return the range of the value as a number; raises `ConfigError` if it has several."""
         vector = self.vector(nested)
         if vector.size != 1:
             raise ConfigError(
@@ -461,9 +483,8 @@ def as_image(
     if (height, width) == image.shape[:2]:
         return np.array(image, order="C")
     pil = require("PIL.Image")
-    return np.array(
-        pil.fromarray(np.ascontiguousarray(image)).resize((width, height), pil.Resampling.BILINEAR)
-    )
+    picture = pil.fromarray(np.ascontiguousarray(image))
+    return np.array(picture.resize((width, height), pil.Resampling.BILINEAR))
 
 
 def plain(value: Any) -> Any:
@@ -489,7 +510,7 @@ def bounds(space: Any) -> tuple[np.ndarray, np.ndarray, np.dtype[Any]]:
     if type(space).__name__ != "Box" or len(space.shape) != 1:
         raise ConfigError(
             f"action space: got {space}, want Box (D,): policies give continuous vectors; "
-            f"wrap the environment, and register it so wrapped"
+            "wrap the environment, and register it so wrapped"
         )
     return space.low.astype(np.float64), space.high.astype(np.float64), space.dtype
 
@@ -507,12 +528,13 @@ def parts(space: Any, render_mode: str | None) -> tuple[dict[str, str], dict[str
     state: dict[str, str] = {}
     pending = [("", space)]
     while pending:
-        path, one = pending.pop(0)
-        if isinstance(one, Mapping):  # gymnasium.spaces.Dict is a Mapping
-            pending += [(f"{path}/{key}" if path else str(key), sub) for key, sub in one.items()]
-        elif one.dtype == np.uint8 and len(one.shape) == 3 and one.shape[2] == 3:
+        path, subspace = pending.pop(0)
+        if isinstance(subspace, Mapping):  # gymnasium.spaces.Dict is a Mapping
+            for key, value in subspace.items():
+                pending.append((f"{path}/{key}" if path else str(key), value))
+        elif subspace.dtype == np.uint8 and len(subspace.shape) == 3 and subspace.shape[2] == 3:
             cameras[path or "front"] = path
-        elif type(one).__name__ == "Box" and len(one.shape) == 1:
+        elif type(subspace).__name__ == "Box" and len(subspace.shape) == 1:
             state[path or "state"] = path
     if not cameras and render_mode == "rgb_array":
         cameras["front"] = RENDER

@@ -40,15 +40,15 @@ class BenchmarkProtocol:
     ends_on_success: bool
     episodes: int | None = None  # episodes per task in published tables; None if they differ
 
-    def describe(self, **played: Any) -> dict[str, Any]:
-        """Return the protocol as plain values; `deviations` lists the fields of `played` that
+    def describe(self, **settings: Any) -> dict[str, Any]:
+        """Return the protocol as plain values; `deviations` lists the fields of `settings` that
         differ from it.
         """
-        deviations = [
-            f"{name}: {value}, the protocol says {getattr(self, name)}"
-            for name, value in played.items()
-            if value != getattr(self, name)
-        ]
+        deviations = []
+        for name, value in settings.items():
+            expected = getattr(self, name)
+            if value != expected:
+                deviations.append(f"{name}: {value}, the protocol says {expected}")
         return asdict(self) | {"deviations": deviations}
 
 
@@ -105,7 +105,8 @@ class SimulatorEnv(EvalEnv):
 
     @classmethod
     def require_task(cls, task: str | None) -> None:
-        if task is not None and (known := cls.tasks()):  # the constructor has a default
+        known = cls.tasks()
+        if task is not None and known:  # The constructor has a default.
             require_known(cls.suite, task, known)
 
     @classmethod
@@ -113,18 +114,18 @@ class SimulatorEnv(EvalEnv):
         """Return why the simulator cannot run here; the first call in a process renders one
         frame in a child.
         """
-        if lacks := without(cls.packages, cls.cure):
-            return lacks
+        missing = without(cls.packages, cls.cure)
+        if missing is not None:
+            return missing
         try:
             cls._require_assets()
         except EnvFailed as error:
             return str(error)
+
         probe = egl_probe()
-        return (
-            None
-            if probe.ok
-            else f"{cls.title} cannot render without a display ({probe.error}); {probe.cure}"
-        )
+        if probe.ok:
+            return None
+        return f"{cls.title} cannot render without a display ({probe.error}); {probe.cure}"
 
     def reset(self, *, seed: int, options: Options | None = None) -> tuple[Obs, dict[str, Any]]:
         """Begin the episode of `seed`, taken modulo 2^32.
@@ -133,24 +134,32 @@ class SimulatorEnv(EvalEnv):
         or in one that the seed selects. There are no other options.
         """
         self._alive()
-        given, count = options or {}, self.init_states
-        if unknown := sorted(set(given) - ({"init_state"} if count is not None else set())):
-            want = "none" if count is None else "init_state or none"
-            raise ConfigError(f"{self._name}: unknown reset options {unknown}, want {want}")
-        state = given.get("init_state", seed % (count or 1))
-        if type(state) is not int or not 0 <= state < (count or 1):
-            raise ConfigError(
-                f"{self._name}: init_state is {state!r}, want 0 to {(count or 1) - 1}"
-            )
+        options = options or {}
+        has_states = self.init_states is not None
+        unknown = sorted(set(options) - ({"init_state"} if has_states else set()))
+        if unknown:
+            allowed = "init_state or none" if has_states else "none"
+            raise ConfigError(f"{self._name}: unknown reset options {unknown}, want {allowed}")
+
+        count = self.init_states or 1
+        state = options.get("init_state", seed % count)
+        if type(state) is not int or not 0 <= state < count:
+            raise ConfigError(f"{self._name}: init_state is {state!r}, want 0 to {count - 1}")
+
         with failing(self._name, "reset"):
-            obs, info = self._begin(seed % 2**32, state)
+            obs, begin_info = self._begin(seed % 2**32, state)
         self._steps = 0
-        return obs, {"success": False} | ({} if count is None else {"init_state": state}) | info
+        info: dict[str, Any] = {"success": False}
+        if has_states:
+            info["init_state"] = state
+        return obs, info | begin_info
 
     def step(self, act: Act) -> tuple[Obs, float, bool, bool, dict[str, Any]]:
+        """Execute an action, (D,); see `EvalEnv.step`."""
         self._alive()
         if self._steps is None:
             raise NotReset(f"{self._name}: step before reset; call reset(seed=...) first")
+
         action = one_row(act, self._contract)
         with failing(self._name, "step"):
             obs, reward, ended, info = self._advance(action)
@@ -158,6 +167,7 @@ class SimulatorEnv(EvalEnv):
         return obs, reward, ended, self._steps >= self.max_steps, info
 
     def describe(self) -> dict[str, Any]:
+        """Return the suite, the task, the versions, the render backend and the protocol."""
         facts: dict[str, Any] = {
             "simulator": self.suite,
             "task": self._name.partition("/")[2],
@@ -236,19 +246,19 @@ class MujocoCameras:
         """
         require_cameras(env, cameras, camera_names(model))
         self._cameras, self._upside_down = list(cameras), upside_down
+        height, width = size
         buffer = model.vis.global_
-        buffer.offheight, buffer.offwidth = (
-            max(buffer.offheight, size[0]),
-            max(buffer.offwidth, size[1]),
-        )
+        buffer.offheight = max(buffer.offheight, height)
+        buffer.offwidth = max(buffer.offwidth, width)
+
         mujoco = require("mujoco")
         if not shadows:
             model.vis.quality.offsamples = 0
-        self._renderer: Any = mujoco.Renderer(model, *size)
-        for effect in (
-            () if shadows else (mujoco.mjtRndFlag.mjRND_SHADOW, mujoco.mjtRndFlag.mjRND_REFLECTION)
-        ):
-            self._renderer.scene.flags[effect] = 0
+        self._renderer: Any = mujoco.Renderer(model, height, width)
+        if not shadows:
+            flags = self._renderer.scene.flags
+            flags[mujoco.mjtRndFlag.mjRND_SHADOW] = 0
+            flags[mujoco.mjtRndFlag.mjRND_REFLECTION] = 0
 
     def render(self, data: Any) -> dict[str, np.ndarray]:
         """Render a `mujoco.MjData`: the images by camera, (H, W, 3) uint8."""
@@ -256,12 +266,13 @@ class MujocoCameras:
         for camera in self._cameras:
             self._renderer.update_scene(data, camera=camera)
             image: np.ndarray = self._renderer.render()
-            images[camera] = (
-                np.ascontiguousarray(image[::-1, ::-1]) if camera in self._upside_down else image
-            )
+            if camera in self._upside_down:
+                image = np.ascontiguousarray(image[::-1, ::-1])
+            images[camera] = image
         return images
 
     def close(self) -> None:
+        """Free the renderer."""
         self._renderer.close()
 
 
@@ -273,6 +284,7 @@ def require_sizes(env: str, **sizes: int | None) -> None:
 
 
 def camera_names(model: Any) -> list[str]:
+    """List the cameras of a `mujoco.MjModel`."""
     return [model.camera(i).name for i in range(model.ncam)]
 
 
