@@ -93,7 +93,7 @@ def state(scene: world.TabletopWorld) -> list[float]:
     """Return x, y, z of the fingertips and the gap, m; the number of the held puck, or -1; x, y,
     z of each puck, m.
     """
-    held = next((i for i, puck in enumerate(scene.pucks) if puck is scene.held), -1)
+    held = next((i for i, puck in enumerate(scene.pucks) if puck is scene.held_puck), -1)
     pucks = [place for puck in scene.pucks for place in (puck.x, puck.y, puck.z)]
     return [
         held if i == 4 else _rounded(one)

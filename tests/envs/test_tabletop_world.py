@@ -41,7 +41,7 @@ def test_closing_around_a_puck_holds_it_and_it_follows() -> None:
     red = Puck("red", 0.05, 0.02)
     scene = world(red)
     grasp(scene, red)
-    assert scene.held is red
+    assert scene.held_puck is red
     go(scene, -0.1, 0.1, 0.12, CLOSED)
     assert (red.x, red.y) == pytest.approx((-0.1, 0.1), abs=1e-3)
     assert red.z == pytest.approx(0.115, abs=1e-3)
@@ -69,7 +69,7 @@ def test_what_stands_on_the_held_puck_is_carried_with_it() -> None:
     scene.x, scene.y, scene.z = 0.0, 0.0, 0.005
     for _ in range(3):
         scene.step(0, 0, 0, CLOSED)
-    assert scene.held is below
+    assert scene.held_puck is below
     go(scene, 0.1, 0.05, 0.05, CLOSED)
     assert (above.x, above.y) == pytest.approx((below.x, below.y), abs=1e-6)
     assert above.z == pytest.approx(below.z + PUCK_HEIGHT)
@@ -138,7 +138,7 @@ def test_a_puck_still_held_over_its_pad_does_not_count() -> None:
     red = Puck("red", 0.2, 0.0)
     scene = world(red)
     grasp(scene, red)
-    assert scene.held is red
+    assert scene.held_puck is red
     assert not Goal("pick_place", "red", "blue").reached(scene)
 
 

@@ -93,8 +93,8 @@ class ManiSkill(SimulatorEnv):
                 (PlugCharger, PushT) depend on the previous episode; it saves about 15 ms per reset.
         """
         super().__init__(task)
-        self.max_steps, self._own_limit = step_limits(self._name, task, max_steps)
-        self._given_instruction = instruction
+        self.max_steps, self._task_limit = step_limits(self._name, task, max_steps)
+        self._chosen_instruction = instruction
         self._reconfigure = reconfigure
         self._env = _simulator(
             task,
@@ -112,11 +112,11 @@ class ManiSkill(SimulatorEnv):
 
     @property
     def instruction(self) -> str:
-        return (
-            self._alive().instructions()[0]
-            if self._given_instruction is None
-            else self._given_instruction
-        )
+        """The instruction of the constructor, or the task's."""
+        if self._chosen_instruction is not None:
+            return self._chosen_instruction
+        instructions: list[str] = self._alive().instructions()
+        return instructions[0]
 
     def reset(self, *, seed: int, options: Options | None = None) -> tuple[Obs, dict[str, Any]]:
         """Begin the episode of `seed`, taken modulo 2^32; `options` are passed to ManiSkill's
@@ -131,42 +131,44 @@ class ManiSkill(SimulatorEnv):
 
     @classmethod
     def missing(cls) -> str | None:
-        if missing := without(
-            ("mani_skill", "sapien", "gymnasium", "torch"), "pip install 'vlagents-ray[maniskill]'"
-        ):
+        """Return why ManiSkill cannot run here, with the cure; None if it can.
+
+        The first call in a process renders one frame in a child.
+        """
+        modules = ("mani_skill", "sapien", "gymnasium", "torch")
+        missing = without(modules, "pip install 'vlagents-ray[maniskill]'")
+        if missing is not None:
             return missing
+
         probe = render_probe()
-        return (
-            None
-            if probe.ok
-            else f"ManiSkill finds no Vulkan device to render on ({probe.error}); {probe.cure}"
-        )
+        if probe.ok:
+            return None
+        return f"ManiSkill finds no Vulkan device to render on ({probe.error}); {probe.cure}"
 
     @classmethod
     def batched(cls, num_envs: int, **options: Any) -> BatchEnv | None:
         """Make all environments in one simulator, if it runs on a GPU."""
-        return (
-            ManiSkillBatch(num_envs=num_envs, **options)
-            if options.get("sim_backend") in ON_GPU
-            else None
-        )
+        if options.get("sim_backend") not in ON_GPU:
+            return None
+        return ManiSkillBatch(num_envs=num_envs, **options)
 
     def renderer(self) -> Renderer | None:
-        found: Renderer | None = self._alive().renderer()
-        return found
+        renderer: Renderer | None = self._alive().renderer()
+        return renderer
 
     def describe(self) -> dict[str, Any]:
-        return _described(self._alive(), self._reconfigure, self.max_steps, self._own_limit)
+        return _described(self._alive(), self._reconfigure, self.max_steps, self._task_limit)
 
     def _begin(self, seed: int, state: int) -> tuple[Obs, dict[str, Any]]:
-        now = self._env.reset(
-            [seed], {**self._options, **({"reconfigure": True} if self._reconfigure else {})}
-        )
-        return now.obs[0], {"success": now.success[0]}
+        options = dict(self._options)
+        if self._reconfigure:
+            options["reconfigure"] = True
+        moment = self._env.reset([seed], options)
+        return moment.obs[0], {"success": moment.success[0]}
 
     def _advance(self, action: np.ndarray) -> tuple[Obs, float, bool, dict[str, Any]]:
-        now = self._env.step(action[np.newaxis], look=self.looked_at)
-        return now.obs[0], now.rewards[0], False, {"success": now.success[0]}
+        moment = self._env.step(action[np.newaxis], look=self.looked_at)
+        return moment.obs[0], moment.rewards[0], False, {"success": moment.success[0]}
 
 
 class ManiSkillBatch(BatchEnv):
@@ -197,7 +199,7 @@ class ManiSkillBatch(BatchEnv):
                 "physx_cuda"
             )
         self.num_envs = num_envs
-        self.max_steps, self._own_limit = step_limits(f"maniskill/{task}", task, max_steps)
+        self.max_steps, self._task_limit = step_limits(f"maniskill/{task}", task, max_steps)
         self._task, self._instruction, self._reconfigure = task, instruction, reconfigure
         self._playing = self._steps = 0
         self._simulator = _simulator(task, num_envs=num_envs, sim_backend=sim_backend, **options)
@@ -209,12 +211,10 @@ class ManiSkillBatch(BatchEnv):
 
     @property
     def instructions(self) -> list[str]:
-        own = (
-            self._simulator.instructions()
-            if self._instruction is None
-            else [self._instruction] * self.num_envs
-        )
-        return own[: self._playing]
+        """The instruction of the constructor, or those of the tasks."""
+        if self._instruction is not None:
+            return [self._instruction] * self._playing
+        return self._simulator.instructions()[: self._playing]
 
     def reset(
         self, *, seeds: Sequence[int], options: Sequence[Options | None] | None = None
@@ -223,17 +223,20 @@ class ManiSkillBatch(BatchEnv):
         ManiSkill's own reset.
         """
         self._playing, self._steps = episodes_of(seeds, self.num_envs), 0
-        spare = self.num_envs - self._playing
-        every = [*seeds, *[seeds[-1]] * spare]
-        given: list[Options] = [
-            *(option or {} for option in options or [{}] * self._playing),
-            *[{}] * spare,
-        ]
+        if not options:
+            options = [None] * self._playing
+
+        # Idle environments begin an episode as well, whose results are not used.
+        idle = self.num_envs - self._playing
+        all_seeds = [*seeds, *[seeds[-1]] * idle]
+        all_options: list[Options] = [env_options or {} for env_options in options]
+        all_options += [{}] * idle
         if self._reconfigure:
-            self._simulator.reset(every, {"reconfigure": True})
-        return self._simulator.reset_each(every, given).obs[: self._playing]
+            self._simulator.reset(all_seeds, {"reconfigure": True})
+        return self._simulator.reset_each(all_seeds, all_options).obs[: self._playing]
 
     def step(self, acts: Sequence[Act | None]) -> Steps:
+        """Execute an action in each episode, by one step of the simulator."""
         if not self._playing:
             raise NotReset(
                 f"maniskill/{self._task}: step before reset; call reset(seeds=...) first"
@@ -242,18 +245,20 @@ class ManiSkillBatch(BatchEnv):
         for i, act in enumerate(acts):
             if act is not None:
                 actions[i] = one_row(act, self._contract)
-        now = self._simulator.step(actions, look=self.looked_at)
+
+        moment = self._simulator.step(actions, look=self.looked_at)
         self._steps += 1
-        n = self._playing
-        over = self._steps >= self.max_steps
-        infos = [{"success": success} for success in now.success[:n]]
-        return now.obs[:n], now.rewards[:n], [False] * n, [over] * n, infos
+        count = self._playing
+        is_truncated = self._steps >= self.max_steps
+        infos = [{"success": success} for success in moment.success[:count]]
+        terminated, truncated = [False] * count, [is_truncated] * count
+        return moment.obs[:count], moment.rewards[:count], terminated, truncated, infos
 
     def renderer(self) -> Renderer | None:
         return self._simulator.renderer()
 
     def describe(self) -> dict[str, Any]:
-        return _described(self._simulator, self._reconfigure, self.max_steps, self._own_limit)
+        return _described(self._simulator, self._reconfigure, self.max_steps, self._task_limit)
 
     def close(self) -> None:
         self._playing = 0
@@ -265,18 +270,21 @@ def _simulator(
 ) -> Simulator:
     name = f"maniskill/{task}"
     require_sizes(name, width=width, height=height)
-    sensors = {"width": width, "height": height} | ({"shader_pack": shader} if shader else {})
+    sensors: dict[str, Any] = {"width": width, "height": height}
+    if shader:
+        sensors["shader_pack"] = shader
     return Simulator(name, task, obs_mode="rgb+state", sensors=sensors, **options)
 
 
 def _described(
-    simulator: Simulator, reconfigure: bool, max_steps: int, own_limit: int | None
+    simulator: Simulator, reconfigure: bool, max_steps: int, task_limit: int | None
 ) -> dict[str, Any]:
+    """Return the facts of `describe`, with the deviations from the protocol."""
     deviations = []
     if not reconfigure:
         deviations.append("reconfigure is False: scenes are kept from episode to episode")
-    if max_steps != own_limit:
-        deviations.append(f"max_steps is {max_steps}, the task's own is {own_limit}")
+    if max_steps != task_limit:
+        deviations.append(f"max_steps is {max_steps}, the task's own is {task_limit}")
     return simulator.describe() | {
         "reconfigure": reconfigure,
         "protocol": {**PROTOCOL, "deviations": deviations},

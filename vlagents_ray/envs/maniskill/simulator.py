@@ -56,12 +56,17 @@ def instruction_for(task: str) -> str:
     return " ".join(words).lower()
 
 
-def step_limits(env: str, task: str, wanted: int | None) -> tuple[int, int | None]:
-    """Return the step limit, `wanted` or else the task's own, and the latter; prepares the process
-    for ManiSkill.
+def step_limits(env: str, task: str, max_steps: int | None) -> tuple[int, int | None]:
+    """Return the step limit to use, and the task's own; prepares the process for ManiSkill.
 
-    Raises `UnknownEnv` for an unknown task, and `ConfigError`, which names `env`, if there is no
-    limit of 1 or more.
+    Args:
+        env: The env's name, for errors.
+        task: ManiSkill's id.
+        max_steps: The limit to use; None: the task's own.
+
+    Raises:
+        UnknownEnv: There is no such task.
+        ConfigError: There is no limit of 1 or more.
     """
     prepare_rendering()
     require("sapien")
@@ -73,19 +78,21 @@ def step_limits(env: str, task: str, wanted: int | None) -> tuple[int, int | Non
             f"maniskill has no task {task!r}: want one of {sorted(INSTRUCTIONS)}, or another of "
             "its ids"
         )
-    own: int | None = registered[task].max_episode_steps
-    if (limit := own if wanted is None else wanted) is None:
+
+    task_limit: int | None = registered[task].max_episode_steps
+    limit = task_limit if max_steps is None else max_steps
+    if limit is None:
         raise ConfigError(f"{env} has no step limit of its own; set max_steps")
     require_sizes(env, max_steps=limit)
-    return limit, own
+    return limit, task_limit
 
 
-def chosen_backend(wanted: str) -> str:
+def chosen_backend(render_backend: str) -> str:
     """Resolve the render backend: "auto" is the GPU if SAPIEN can render and torch can wait
     there, else the CPU.
     """
-    if wanted != "auto":
-        return wanted
+    if render_backend != "auto":
+        return render_backend
     try:
         require("sapien").Device("cuda")
     except RuntimeError:  # raised by SAPIEN if there is no device
@@ -105,23 +112,23 @@ def make_bare(
         ConfigError: The robot lacks the control mode.
         EnvFailed: The environment cannot be made for another reason.
     """
-    given = {name: value for name, value in options.items() if value is not None}
-    given |= {"sim_backend": sim_backend, "render_backend": render_backend}
+    arguments = {name: value for name, value in options.items() if value is not None}
+    arguments |= {"sim_backend": sim_backend, "render_backend": render_backend}
     gymnasium = require("gymnasium")
     with _no_prompts(task), failing(f"maniskill/{task}", "make"), warnings.catch_warnings():
-        # the digital twin of the cubes makes a tensor from a list of arrays: 24 rows, once
+        # The digital twin of the cubes makes a tensor from a list of arrays: 24 rows, once.
         warnings.filterwarnings("ignore", "Creating a tensor from a list of numpy", UserWarning)
         _keep_renderer(sim_backend, render_backend)
+
+        mode = control_mode or DEFAULT_CONTROL_MODE
         try:
-            return gymnasium.make(
-                task, control_mode=control_mode or DEFAULT_CONTROL_MODE, **given
-            ).unwrapped
+            return gymnasium.make(task, control_mode=mode, **arguments).unwrapped
         except AssertionError as error:
             if "not in supported modes" not in str(error):
                 raise
             if control_mode is not None:
                 raise ConfigError(f"maniskill/{task}: control_mode {error}") from error
-        return gymnasium.make(task, **given).unwrapped
+        return gymnasium.make(task, **arguments).unwrapped
 
 
 @contextlib.contextmanager
@@ -135,13 +142,11 @@ def _no_prompts(task: str) -> Iterator[None]:
         with contextlib.redirect_stdout(output):
             yield
     except SystemExit as error:
-        lacks = next(
-            (line for line in output.getvalue().splitlines() if "found" in line),
-            "it did not say which",
-        )
-        robot = re.match(r"Robot (\S+) ", lacks)
+        lines = [line for line in output.getvalue().splitlines() if "found" in line]
+        prompt = lines[0] if lines else "it did not say which"
+        robot = re.match(r"Robot (\S+) ", prompt)
         raise EnvFailed(
-            f"maniskill/{task}: assets are missing ({lacks.partition(' Would you')[0]}); download "
+            f"maniskill/{task}: assets are missing ({prompt.partition(' Would you')[0]}); download "
             "them with: "
             f"python -m mani_skill.utils.download_asset {robot[1] if robot else task}"
         ) from error
@@ -215,14 +220,13 @@ class ManiSkillRobot:
 
     def __init__(self, agent: Any) -> None:
         names = [joint.name for joint in agent.robot.active_joints]
-        self._arm = np.array(
-            [names.index(name) for name in getattr(agent, "arm_joint_names", names)]
-        )
+        arm_joints = getattr(agent, "arm_joint_names", names)
+        finger_joints = getattr(agent, "gripper_joint_names", ())
+        self._arm = np.array([names.index(name) for name in arm_joints])
+        self._fingers = np.array([names.index(name) for name in finger_joints], dtype=int)
         self._finger_m = _FINGER_M.get(agent.uid)
         self.has_gripper = self._finger_m is not None
-        self._fingers = np.array(
-            [names.index(name) for name in getattr(agent, "gripper_joint_names", ())], dtype=int
-        )
+
         self.state = {"joints": StateSpec(len(self._arm), "rad")}
         if _tool(agent) is not None:
             self.state |= {"tquat": StateSpec(7, "m+quat_xyzw"), "xyzrpy": StateSpec(6, "m+rad")}
@@ -238,13 +242,16 @@ class ManiSkillRobot:
             tools = _tool(agent).pose.raw_pose.cpu().numpy()
             for state, base, tool in zip(states, bases, tools, strict=True):
                 state["tquat"], state["xyzrpy"] = tool_in_base(base, tool)
+
         return [(state, self._opening(qpos)) for state, qpos in zip(states, rows, strict=True)]
 
     def _opening(self, qpos: np.ndarray) -> float | None:
         if self._finger_m is None:
             return None
-        closed, opened = self._finger_m
-        return min(max((float(qpos[self._fingers].mean()) - closed) / (opened - closed), 0.0), 1.0)
+
+        closed_m, open_m = self._finger_m
+        position_m = float(qpos[self._fingers].mean())
+        return min(max((position_m - closed_m) / (open_m - closed_m), 0.0), 1.0)
 
 
 def _tool(agent: Any) -> Any:
@@ -254,6 +261,9 @@ def _tool(agent: Any) -> Any:
 
 
 def action_spec(control_mode: str, space: Any, *, has_gripper: bool) -> ActionSpec:
+    """Return the actions of a control mode, as far as they are known, with the bounds of its
+    space.
+    """
     normalized = bool((space.low == -1.0).all() and (space.high == 1.0).all())
     return ActionSpec(
         dim=int(space.shape[0]),
@@ -278,25 +288,24 @@ def tool_in_base(base: np.ndarray, tool: np.ndarray) -> tuple[np.ndarray, np.nda
     """
     bw, bx, by, bz = (float(v) for v in base[3:])
     tw, tx, ty, tz = (float(v) for v in tool[3:])
-    # conj(base) * tool
+
+    # The rotation: conj(base) * tool.
     w = bw * tw + bx * tx + by * ty + bz * tz
     x = bw * tx - bx * tw - by * tz + bz * ty
     y = bw * ty + bx * tz - by * tw - bz * tx
     z = bw * tz - bx * ty + by * tx - bz * tw
     if w < 0.0:
         w, x, y, z = -w, -x, -y, -z
+
+    # The offset turned by conj(base): v + 2 u x (u x v - bw v) with u the base's vector part.
     px, py, pz = (float(t - b) for t, b in zip(tool[:3], base[:3], strict=True))
-    # the offset turned by conj(base): v + 2 u x (u x v - bw v) with u the base's vector part
-    cx, cy, cz = (
-        by * pz - bz * py - bw * px,
-        bz * px - bx * pz - bw * py,
-        bx * py - by * px - bw * pz,
-    )
-    px, py, pz = (
-        px + 2 * (by * cz - bz * cy),
-        py + 2 * (bz * cx - bx * cz),
-        pz + 2 * (bx * cy - by * cx),
-    )
+    cx = by * pz - bz * py - bw * px
+    cy = bz * px - bx * pz - bw * py
+    cz = bx * py - by * px - bw * pz
+    px += 2 * (by * cz - bz * cy)
+    py += 2 * (bz * cx - bx * cz)
+    pz += 2 * (bx * cy - by * cx)
+
     # Sine and cosine of the roll, times the cosine of the pitch.
     rolls = 2 * (w * x + y * z), 1 - 2 * (x * x + y * y)
     pitch = math.asin(min(max(2 * (w * y - z * x), -1.0), 1.0))
@@ -305,7 +314,9 @@ def tool_in_base(base: np.ndarray, tool: np.ndarray) -> tuple[np.ndarray, np.nda
         roll, yaw = 0.0, math.copysign(2.0, -pitch) * math.atan2(x, w)
         yaw = math.remainder(yaw, 2 * math.pi)
     else:
-        roll, yaw = math.atan2(*rolls), math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+        roll = math.atan2(*rolls)
+        yaw = math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+
     tquat = np.array([px, py, pz, x, y, z, w], dtype=np.float32)
     return tquat, np.array([px, py, pz, roll, pitch, yaw], dtype=np.float32)
 
@@ -352,23 +363,24 @@ class Simulator:
             sensor_configs=dict(sensors),
         )
         try:
-            if not hasattr(self.env.agent, "robot"):  # no robot, or several
+            if not hasattr(self.env.agent, "robot"):  # The task has no robot, or several.
                 raise ConfigError(f"{self.name}: want a task with exactly one robot")
             if "success" not in self.env.get_info():
                 raise ConfigError(
                     f"{self.name} does not say what success is: there is nothing to evaluate"
                 )
-            seen = self.env.single_observation_space["sensor_data"]
-            sizes = {
-                name: textures["rgb"].shape[:2]
-                for name, textures in seen.items()
-                if "rgb" in textures.spaces
-            }
+
+            sizes = {}
+            sensor_spaces = self.env.single_observation_space["sensor_data"]
+            for camera, textures in sensor_spaces.items():
+                if "rgb" in textures.spaces:
+                    sizes[camera] = textures["rgb"].shape[:2]
             require_cameras(self.name, cameras or (), sizes)
-            chosen = sizes if cameras is None else cameras
-            self.cameras = {
-                name: CameraSpec(height=sizes[name][0], width=sizes[name][1]) for name in chosen
-            }
+            self.cameras = {}
+            for camera in sizes if cameras is None else cameras:
+                height, width = sizes[camera]
+                self.cameras[camera] = CameraSpec(height=height, width=width)
+
             self._robot = ManiSkillRobot(self.env.agent)
         except BaseException:
             self.close()
@@ -379,24 +391,24 @@ class Simulator:
         mode has them.
         """
         env, has_gripper = self.alive(), self._robot.has_gripper
+        if action is None:
+            action = action_spec(env.control_mode, env.single_action_space, has_gripper=has_gripper)
         return Contract(
             cameras=self.cameras,
             state=self._robot.state,
             gripper=has_gripper,
             instruction=True,
-            action=action
-            or action_spec(env.control_mode, env.single_action_space, has_gripper=has_gripper),
+            action=action,
             control_hz=float(env.control_freq),
         )
 
     def instructions(self) -> list[str]:
+        """Return the instruction of each environment: ManiSkill's, or ours for the task."""
         env = self.alive()
-        own = getattr(env, "get_language_instruction", None)
-        return (
-            [str(text) for text in own()]
-            if own is not None
-            else [instruction_for(self._task)] * env.num_envs
-        )
+        get_instructions = getattr(env, "get_language_instruction", None)
+        if get_instructions is None:
+            return [instruction_for(self._task)] * env.num_envs
+        return [str(text) for text in get_instructions()]
 
     def reset(self, seeds: Sequence[int], options: Mapping[str, Any]) -> Moment:
         """Begin an episode in each environment; seeds are taken modulo 2^32."""
@@ -417,11 +429,12 @@ class Simulator:
         """
         env = self.alive()
         with failing(self.name, "reset"):
-            with self._observing("none"):  # render nothing before all episodes have begun
-                for i, (seed, option) in enumerate(zip(seeds, options, strict=True)):
-                    only = require("torch").tensor([i], device=env.device)
+            with self._observing("none"):  # Nothing is rendered before all episodes have begun.
+                for i, (seed, env_options) in enumerate(zip(seeds, options, strict=True)):
+                    index = require("torch").tensor([i], device=env.device)
                     env.reset(
-                        seed=[seed % 2**32] * env.num_envs, options={**option, "env_idx": only}
+                        seed=[seed % 2**32] * env.num_envs,
+                        options={**env_options, "env_idx": index},
                     )
             info = env.get_info()
             return self.moment(env.get_obs(info), info)
@@ -431,39 +444,48 @@ class Simulator:
         nothing.
         """
         env = self.alive()
-        with (
-            failing(self.name, "step"),
-            contextlib.nullcontext() if look else self._observing("state_dict"),
-        ):
-            # a copy, since torch shares the memory, and warns of read-only arrays, such as Ray's
+        observing = contextlib.nullcontext() if look else self._observing("state_dict")
+        with failing(self.name, "step"), observing:
+            # A copy, since torch shares the memory, and warns of read-only arrays, such as Ray's.
             raw, rewards, _, _, info = env.step(actions.copy())
-            return replace(
-                self.moment(raw, info), rewards=rewards.cpu().numpy().astype(float).tolist()
-            )
+            moment = self.moment(raw, info)
+            return replace(moment, rewards=rewards.cpu().numpy().astype(float).tolist())
 
     def moment(self, raw: Mapping[str, Any], info: Mapping[str, Any]) -> Moment:
         """Convert ManiSkill's observation and info. The images of a camera share one array, (N,
         H, W, 3).
         """
         env = self.alive()
+        images = {}
         rendered = raw.get("sensor_data")
-        shown = {} if rendered is None else {name: rendered[name]["rgb"] for name in self.cameras}
-        images = {name: np.ascontiguousarray(image.cpu().numpy()) for name, image in shown.items()}
-        states = raw["state"].cpu().numpy() if "state" in raw else None
-        seen = []
+        if rendered is not None:
+            for name in self.cameras:
+                images[name] = np.ascontiguousarray(rendered[name]["rgb"].cpu().numpy())
+        sim_states = raw["state"].cpu().numpy() if "state" in raw else None
+
+        observations = []
         for i, (state, gripper) in enumerate(self._robot.read(env.agent)):
-            extra = {} if states is None else {"sim_state": states[i]}
-            seen.append(
-                Obs({name: rows[i] for name, rows in images.items()}, gripper, state, extra)
-            )
-        return Moment(seen, [bool(value) for value in info["success"]], [0.0] * len(seen))
+            env_images = {name: rows[i] for name, rows in images.items()}
+            obs_info = {} if sim_states is None else {"sim_state": sim_states[i]}
+            observations.append(Obs(env_images, gripper, state, obs_info))
+        success = [bool(value) for value in info["success"]]
+        return Moment(observations, success, [0.0] * len(observations))
 
     def renderer(self) -> Renderer | None:
-        found = vulkan_device(on_gpu=self.alive().backend.render_device.is_cuda())
-        return None if found is None else vulkan_renderer(*found, asked_for=self._asked_for)
+        """Return the device on which SAPIEN renders; None if there is none."""
+        device = vulkan_device(on_gpu=self.alive().backend.render_device.is_cuda())
+        if device is None:
+            return None
+        name, cuda = device
+        return vulkan_renderer(name, cuda, asked_for=self._asked_for)
 
     def describe(self) -> dict[str, Any]:
+        """Return the versions, the robot, the modes and backends, and the shaders."""
         env = self.alive()
+        renderer = self.renderer()
+        shaders = {}
+        for name in self.cameras:
+            shaders[name] = env.scene.sensors[name].config.shader_config.shader_pack
         return {
             "simulator": "maniskill",
             "task": self._task,
@@ -475,20 +497,19 @@ class Simulator:
             "reward_mode": env.reward_mode,
             "sim_backend": env.backend.sim_backend,
             "render_backend": env.backend.render_backend,
-            "render_device": None if (renderer := self.renderer()) is None else renderer.name,
-            "shaders": {
-                name: env.scene.sensors[name].config.shader_config.shader_pack
-                for name in self.cameras
-            },
+            "render_device": None if renderer is None else renderer.name,
+            "shaders": shaders,
             "num_envs": env.num_envs,
         }
 
     def alive(self) -> Any:
+        """Return ManiSkill's environment; raises `EnvFailed` after `close`."""
         if self.env is None:
             raise EnvFailed(f"{self.name} is closed; make a new one")
         return self.env
 
     def close(self) -> None:
+        """Free the simulator; safe to call twice."""
         env, self.env = self.env, None
         if env is not None:
             env.close()
@@ -499,8 +520,8 @@ class Simulator:
         original mode.
         """
         env = self.alive()
-        own, env._obs_mode = env._obs_mode, mode
+        original_mode, env._obs_mode = env._obs_mode, mode
         try:
             yield
         finally:
-            env._obs_mode = own
+            env._obs_mode = original_mode

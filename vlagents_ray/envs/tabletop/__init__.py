@@ -100,32 +100,35 @@ class Tabletop(EvalEnv):
         """
         self.require_task(task)
         self._task = task or MIXED
-        self._tasks = [one for one in _TASKS if self._task in (MIXED, one)]
-        fewest = 2 if self._task in (MIXED, "stack") else 1
-        ranges: dict[str, tuple[float, int, int | None]] = {
-            "width": (width, 32, None),
-            "height": (height, 32, None),
-            "max_steps": (max_steps, 1, None),
-            "pucks": (pucks, fewest, PUCKS),
-            "disturbance": (disturbance, 0, 1),
-        }
-        for name, (value, least, most) in ranges.items():
-            if value < least or (most is not None and value > most):
-                wanted = (
-                    f"at least {least}" if most is None else f"{least} to {most} in {self._task!r}"
-                )
-                raise ConfigError(f"tabletop: {name} is {value}, want {wanted}")
+        self._tasks = [name for name in _TASKS if self._task in (MIXED, name)]
+        fewest_pucks = 2 if self._task in (MIXED, "stack") else 1
+        self._require_in_range("width", width, 32)
+        self._require_in_range("height", height, 32)
+        self._require_in_range("max_steps", max_steps, 1)
+        self._require_in_range("pucks", pucks, fewest_pucks, PUCKS)
+        self._require_in_range("disturbance", disturbance, 0, 1)
         require_cameras("tabletop", cameras, _RENDERERS)
+
         self.max_steps, self._disturbance = max_steps, disturbance
         self._pucks, self._object_state = pucks, object_state
         self._contract = self.known_contract(
             {"width": width, "height": height, "cameras": cameras, "object_state": object_state}
         )
         self._renderers = {name: _RENDERERS[name](width, height) for name in cameras}
+
+        # The state of the episode.
         self._draws = np.random.default_rng()
         self._world: TabletopWorld | None = None
         self._goal: Goal | None = None
         self._steps = 0
+
+    def _require_in_range(
+        self, option: str, value: float, low: int, high: int | None = None
+    ) -> None:
+        if value >= low and (high is None or value <= high):
+            return
+        allowed = f"at least {low}" if high is None else f"{low} to {high} in {self._task!r}"
+        raise ConfigError(f"tabletop: {option} is {value}, want {allowed}")
 
     @classmethod
     def require_task(cls, task: str | None) -> None:
@@ -133,24 +136,25 @@ class Tabletop(EvalEnv):
 
     @classmethod
     def known_contract(cls, arguments: Mapping[str, Any]) -> Contract:
-        objects = {"puck": StateSpec(3, "m"), "target": StateSpec(3, "m")}
+        """Return the contract of the environment with these arguments of the constructor."""
+        camera = CameraSpec(arguments["height"], arguments["width"])
+        state = {"xyzrpy": StateSpec(6, "m+rad")}
+        if arguments.get("object_state"):
+            state |= {"puck": StateSpec(3, "m"), "target": StateSpec(3, "m")}
+        action = replace(
+            DELTA_POSE,
+            dim=4,
+            space="ee_position",
+            rotation="none",
+            gripper_open=1.0,
+            gripper_closed=-1.0,
+        )
         return Contract(
-            cameras={
-                name: CameraSpec(arguments["height"], arguments["width"])
-                for name in arguments.get("cameras", ("front",))
-            },
-            state={"xyzrpy": StateSpec(6, "m+rad")}
-            | (objects if arguments.get("object_state") else {}),
+            cameras=dict.fromkeys(arguments.get("cameras", ("front",)), camera),
+            state=state,
             gripper=True,
             instruction=True,
-            action=replace(
-                DELTA_POSE,
-                dim=4,
-                space="ee_position",
-                rotation="none",
-                gripper_open=1.0,
-                gripper_closed=-1.0,
-            ),
+            action=action,
             control_hz=10.0,
         )
 
@@ -165,6 +169,7 @@ class Tabletop(EvalEnv):
         return self._goal.instruction
 
     def describe(self) -> dict[str, Any]:
+        """Return the version of the scenes and the physics, the task, and the camera."""
         return {
             "version": _VERSION,
             "task": self._task,
@@ -182,32 +187,39 @@ class Tabletop(EvalEnv):
         `info["instructions"]` lists the instructions of the episode's task that are possible in
         this scene.
         """
-        if unknown := sorted(set(options or {}) - {"instruction"}):
+        unknown = sorted(set(options or {}) - {"instruction"})
+        if unknown:
             raise ConfigError(
                 f"tabletop: unknown reset options {unknown}, want none or 'instruction'"
             )
-        rng = np.random.default_rng(seed % 2**64)  # numpy accepts no negative seed
+
+        rng = np.random.default_rng(seed % 2**64)  # Numpy accepts no negative seed.
         task = self._tasks[rng.integers(len(_TASKS)) if self._task == MIXED else 0]
         world, goal = draw_episode(task, rng, self._pucks)
         if options:
             goal = self._chosen(world, options["instruction"])
+
         self._world, self._goal, self._steps, self._draws = world, goal, 0, rng
         for renderer in self._renderers.values():
             renderer.begin(world.pads)
-        info = {"instructions": [g.instruction for g in goals(world, goal.task)], "success": False}
+        instructions = [possible.instruction for possible in goals(world, goal.task)]
+        info = {"instructions": instructions, "success": False}
         return self._observe(world, goal), info
 
     def step(self, act: Act) -> tuple[Obs, float, bool, bool, dict[str, Any]]:
+        """Execute an action, (4,); see `EvalEnv.step`."""
         world, goal = self._world, self._goal
         if world is None or goal is None:
             raise NotReset("tabletop: step before reset; call reset(seed=...) first")
+
         action = one_row(act, self._contract)
         if self._disturbance and self._draws.random() < _DISTURBED:
             action = action + np.append(self._draws.normal(0.0, self._disturbance, 3), 0.0)
         dx, dy, dz, grip = np.clip(action, -1.0, 1.0).tolist()
         world.step(dx * STEP_LIMIT, dy * STEP_LIMIT, dz * STEP_LIMIT, (grip + 1) / 2)
         self._steps += 1
-        success = goal.reached(world)
+
+        success = goal.is_reached(world)
         obs = self._observe(world, goal, look=self.looked_at)
         return obs, float(success), False, self._steps >= self.max_steps, {"success": success}
 
@@ -219,16 +231,20 @@ class Tabletop(EvalEnv):
         if self._object_state:
             puck = world.puck(goal.puck)
             state["puck"] = np.array((puck.x, puck.y, puck.z), np.float32)
-            state["target"] = np.array(goal.place(world), np.float32)
-        cameras = (
-            {name: renderer.draw(world) for name, renderer in self._renderers.items()}
-            if look
-            else {}
-        )
+            state["target"] = np.array(goal.target_position(world), np.float32)
+
+        cameras = {}
+        if look:
+            cameras = {name: renderer.draw(world) for name, renderer in self._renderers.items()}
         return Obs(cameras=cameras, gripper=world.opening, state=state)
 
     def _chosen(self, world: TabletopWorld, instruction: object) -> Goal:
-        possible = {goal.instruction: goal for task in self._tasks for goal in goals(world, task)}
+        """Return the goal of an instruction in this scene; raises `ConfigError` if it is not
+        possible.
+        """
+        possible: dict[str, Goal] = {}
+        for task in self._tasks:
+            possible |= {goal.instruction: goal for goal in goals(world, task)}
         if instruction not in possible:
             raise ConfigError(
                 f"tabletop: got instruction {instruction!r}, want one of this scene's: "

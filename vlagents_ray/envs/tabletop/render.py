@@ -62,6 +62,7 @@ class TabletopRenderer:
         self._still_key: tuple[tuple[float, float, float], ...] = ()
 
     def begin(self, pads: list[Pad]) -> None:
+        """Draw the pads of an episode, which never move."""
         self._floor_picture = self._background.copy()
         for pad in pads:
             self._blend(self._floor_picture, self._pads[pad.colour], pad.x, pad.y, 0.0)
@@ -69,17 +70,21 @@ class TabletopRenderer:
 
     def draw(self, world: TabletopWorld) -> np.ndarray:
         """Return the image, (H, W, 3) uint8 RGB, as a new array."""
-        resting = [p for p in world.pucks if p is not world.held]
-        if (key := tuple([(p.x, p.y, p.z) for p in resting])) != self._still_key:
+        resting = [puck for puck in world.pucks if puck is not world.held_puck]
+        key = tuple((puck.x, puck.y, puck.z) for puck in resting)
+        if key != self._still_key:
             self._still, self._still_key = self._floor_picture.copy(), key
-            # Near ones over far ones, upper over lower.
-            for puck in sorted(resting, key=lambda p: (p.z, -p.y)):
+            # Near pucks hide far ones, and upper pucks lower ones.
+            for puck in sorted(resting, key=lambda puck: (puck.z, -puck.y)):
                 self._draw_puck_at(self._still, puck)
+
         image = self._still.copy()
         self._shade(image, self._gripper_shadow, world.x, world.y, world.z + _FINGER_LENGTH)
-        if world.held is not None:
-            self._draw_puck_at(image, world.held)
-        if (gap := round(world.gap * self._scale)) not in self._grippers:
+        if world.held_puck is not None:
+            self._draw_puck_at(image, world.held_puck)
+
+        gap = round(world.gap * self._scale)  # px
+        if gap not in self._grippers:
             self._grippers[gap] = self._draw_gripper(float(gap))
         self._blend(image, self._grippers[gap], world.x, world.y, world.z)
         return image
@@ -105,6 +110,8 @@ class TabletopRenderer:
         canvas = Canvas(0, width, 0, height)
         cu, cv = self._centre
         canvas.paint(_FLOOR, np.ones_like(canvas.u))
+
+        # The table with its shadow and its front edge.
         half_u, half_v = _TABLE_HALF[0] * s, _TABLE_HALF[1] * s * self._up
         drop = _TABLE_THICKNESS * s * self._deep
         canvas.paint(
@@ -112,20 +119,20 @@ class TabletopRenderer:
             0.8 * canvas.glow(cu + 0.03 * s, cv + 0.05 * s, half_u * 1.3, half_v * 1.5),
         )
         canvas.paint(_TABLE_EDGE, canvas.box(cu, cv + drop, half_u, half_v, 0.02 * s))
-        light = (
-            1.03
-            - 0.09 * np.hypot((canvas.u - cu) / half_u + 0.5, (canvas.v - cv) / half_v + 0.6) / 2
-        )
+        distance = np.hypot((canvas.u - cu) / half_u + 0.5, (canvas.v - cv) / half_v + 0.6)
+        light = 1.03 - 0.09 * distance / 2
         grain = np.random.default_rng(0).normal(0, 0.006, light.shape)
         canvas.paint(
             np.asarray(_TABLE) * (light + grain)[..., None],
             canvas.box(cu, cv, half_u, half_v, 0.02 * s),
         )
+
+        # A line around the reach of the fingertips.
         reach_u, reach_v = REACH[0][1] * s, REACH[1][1] * s * self._up
-        line = canvas.box(cu, cv, reach_u, reach_v, 0.015 * s) - canvas.box(
-            cu, cv, reach_u - 1, reach_v - 1, 0.015 * s
-        )
-        canvas.paint((200, 198, 194), 0.7 * line)
+        outer = canvas.box(cu, cv, reach_u, reach_v, 0.015 * s)
+        inner = canvas.box(cu, cv, reach_u - 1, reach_v - 1, 0.015 * s)
+        canvas.paint((200, 198, 194), 0.7 * (outer - inner))
+
         picture = np.zeros((height, width, 3), np.uint8)
         canvas.sprite().blend(picture, 0, 0)
         return picture
@@ -146,7 +153,7 @@ class TabletopRenderer:
         ry, h = r * self._up, PUCK_HEIGHT * self._scale * self._deep
         canvas = Canvas(r, r, h + ry, ry)
         base = np.asarray(colour, np.float32)
-        side = np.maximum.reduce(
+        cylinder = np.maximum.reduce(
             [
                 canvas.ellipse(0, 0, r, ry),
                 canvas.ellipse(0, -h, r, ry),
@@ -154,7 +161,7 @@ class TabletopRenderer:
             ]
         )
         light = 0.72 - 0.28 * canvas.u / r  # from the left
-        canvas.paint(base * np.clip(light, 0.4, 1.0)[..., None], side)
+        canvas.paint(base * np.clip(light, 0.4, 1.0)[..., None], cylinder)
         canvas.paint(np.minimum(base * 1.08, 255), canvas.ellipse(0, -h, r, ry))
         canvas.paint(base * 0.94, canvas.ellipse(0, -h, r * 0.78, ry * 0.78))
         canvas.paint(
@@ -177,8 +184,9 @@ class TabletopRenderer:
         half, tall = 0.052 * s, 0.016 * s  # of the palm
         front, above = 0.022 * s * self._deep, -length - 0.022 * s * self._deep
         canvas = Canvas(half + finger, half + finger, length + front + 2 * tall + 0.03 * s, finger)
-        for side in (-1.0, 1.0):
-            u = side * (gap + finger)
+
+        for sign in (-1.0, 1.0):
+            u = sign * (gap + finger)
             canvas.paint(
                 np.asarray(_FINGER) * 0.72,
                 canvas.box(u, -length / 2, finger, length / 2 + finger / 2, finger / 2),
@@ -187,12 +195,14 @@ class TabletopRenderer:
                 _FINGER,
                 canvas.box(u - finger * 0.25, -length / 2, finger * 0.6, length / 2, finger / 2),
             )
+
         canvas.paint(
             _PALM_FRONT,
             canvas.box(0, above + front / 2, half, tall * self._up + front / 2, 0.008 * s),
         )
         canvas.paint(_PALM, canvas.box(0, above, half, tall * self._up, 0.008 * s))
         canvas.paint((48, 49, 51), 0.6 * canvas.glow(0, above, 0.03 * s, 0.024 * s))
+
         wrist = 0.02 * s
         rise = 0.02 * s * self._deep
         column = np.maximum(
@@ -217,14 +227,13 @@ class WristRenderer(TabletopRenderer):
         self._rows, self._columns = np.arange(height) - height // 2, np.arange(width) - width // 2
 
     def draw(self, world: TabletopWorld) -> np.ndarray:
+        """Return the image around the fingertips, (H, W, 3) uint8 RGB, as a new array."""
         image = super().draw(world)
         u, v = self._pixel(world.x, world.y, world.z)
-        rows, columns = (
-            (self._rows + v).clip(0, len(image) - 1),
-            (self._columns + u).clip(0, image.shape[1] - 1),
-        )
-        cut: np.ndarray = image[rows[:, None], columns]
-        return cut
+        rows = (self._rows + v).clip(0, len(image) - 1)
+        columns = (self._columns + u).clip(0, image.shape[1] - 1)
+        section: np.ndarray = image[rows[:, None], columns]
+        return section
 
 
 FloatArray = np.ndarray  # (h, w) float32 throughout, in pixels or as a coverage in [0, 1]
@@ -269,12 +278,10 @@ class Canvas:
         self._left, self._top = -int(np.ceil(left)) - 1, -int(np.ceil(up)) - 1
         width = int(np.ceil(right)) + 2 - self._left
         height = int(np.ceil(down)) + 2 - self._top
-        self.u: FloatArray = (np.arange(width, dtype=np.float32) + (self._left + 0.5))[
-            None, :
-        ].repeat(height, 0)
-        self.v: FloatArray = (np.arange(height, dtype=np.float32) + (self._top + 0.5))[
-            :, None
-        ].repeat(width, 1)
+        columns = np.arange(width, dtype=np.float32) + (self._left + 0.5)
+        rows = np.arange(height, dtype=np.float32) + (self._top + 0.5)
+        self.u: FloatArray = columns[None, :].repeat(height, 0)
+        self.v: FloatArray = rows[:, None].repeat(width, 1)
         self._rgb = np.zeros((height, width, 3), np.float32)  # premultiplied
         self._alpha = np.zeros((height, width, 1), np.float32)
 
@@ -287,6 +294,7 @@ class Canvas:
         self._alpha = self._alpha * (1 - amount) + amount
 
     def sprite(self) -> Sprite:
+        """Return the painted picture."""
         alpha = np.rint(self._alpha * 256)
         paint = np.minimum(np.rint(np.clip(self._rgb, 0, 255) * 256), alpha * 255)
         return Sprite(
@@ -294,12 +302,14 @@ class Canvas:
         )
 
     def ellipse(self, u: float, v: float, radius_u: float, radius_v: float) -> FloatArray:
+        """Return the coverage of an ellipse around (u, v)."""
         distance = np.hypot((self.u - u) / radius_u, (self.v - v) / radius_v) - 1
         return np.clip(0.5 - distance * min(radius_u, radius_v), 0, 1)
 
     def box(
         self, u: float, v: float, half_u: float, half_v: float, corner: float = 0.0
     ) -> FloatArray:
+        """Return the coverage of a rectangle around (u, v) with rounded corners."""
         across = np.abs(self.u - u) - (half_u - corner)
         down = np.abs(self.v - v) - (half_v - corner)
         outside = np.hypot(np.maximum(across, 0), np.maximum(down, 0))

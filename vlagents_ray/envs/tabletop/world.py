@@ -55,7 +55,7 @@ class TabletopWorld:
         self.pucks, self.pads = pucks, pads
         self.x, self.y, self.z = HOME  # m, midway between the fingertips
         self.gap = GAP_OPEN  # m
-        self.held: Puck | None = None
+        self.held_puck: Puck | None = None
 
     @property
     def opening(self) -> float:
@@ -63,10 +63,12 @@ class TabletopWorld:
         return self.gap / GAP_OPEN
 
     def puck(self, colour: str) -> Puck:
-        return next(p for p in self.pucks if p.colour == colour)
+        """Return the puck of a colour."""
+        return next(puck for puck in self.pucks if puck.colour == colour)
 
     def pad(self, colour: str) -> Pad:
-        return next(p for p in self.pads if p.colour == colour)
+        """Return the pad of a colour."""
+        return next(pad for pad in self.pads if pad.colour == colour)
 
     def step(self, dx: float, dy: float, dz: float, opening: float) -> None:
         """Move the fingertips by (dx, dy, dz) m and the fingers towards `opening` in [0, 1]."""
@@ -74,8 +76,8 @@ class TabletopWorld:
             self._travel(dx / _SUBSTEPS, dy / _SUBSTEPS)
             self._raise(dz / _SUBSTEPS)
             self._grip(opening)
-            for puck in sorted(self.pucks, key=lambda p: p.z):
-                if puck is not self.held and puck.z > 0.0:
+            for puck in sorted(self.pucks, key=lambda puck: puck.z):
+                if puck is not self.held_puck and puck.z > 0.0:
                     puck.z = max(puck.z - _FALL, self._support(puck))
                 puck.lifted = puck.lifted or puck.z > _LIFTED
 
@@ -86,53 +88,57 @@ class TabletopWorld:
             puck.x += dx
             puck.y += dy
         self.x, self.y = x, y
-        lowest = self.z if self.held is None else min(self.z, self.held.z)
-        if any(lowest < puck.z + PUCK_HEIGHT for puck in self.pucks if puck is not self.held):
+        lowest = self.z if self.held_puck is None else min(self.z, self.held_puck.z)
+        if any(lowest < puck.z + PUCK_HEIGHT for puck in self.pucks if puck is not self.held_puck):
             self._push()
 
     def _push(self) -> None:
+        """Move the pucks that the fingers touch, and those that these touch."""
         reach, offset = PUCK_RADIUS + FINGER_RADIUS, self.gap + FINGER_RADIUS
         for puck in self.pucks:
-            if puck is self.held or puck.z + PUCK_HEIGHT <= self.z + _EPSILON:
+            if puck is self.held_puck or puck.z + PUCK_HEIGHT <= self.z + _EPSILON:
                 continue
             if self._between_fingers(puck):
                 slack = max(self.gap - PUCK_RADIUS, 0.0)
                 puck.x = _clip(puck.x, (self.x - slack, self.x + slack))
                 continue
             for _ in range(_CONTACT_PASSES):
-                # both fingers push at once: in sequence they would push a centred puck aside
-                pushes = [
-                    _overlap(puck, self.x + side * offset, self.y, reach) for side in (-1.0, 1.0)
-                ]
-                puck.x += sum(push[0] for push in pushes if push)
-                puck.y += sum(push[1] for push in pushes if push)
-                if not any(pushes):
+                # Both fingers push at once: in sequence they would push a centred puck aside.
+                finger_xs = (self.x - offset, self.x + offset)
+                overlaps = [_overlap(puck, finger_x, self.y, reach) for finger_x in finger_xs]
+                pushes = [overlap for overlap in overlaps if overlap is not None]
+                puck.x += sum(dx for dx, _ in pushes)
+                puck.y += sum(dy for _, dy in pushes)
+                if not pushes:
                     break
-        for _ in range(len(self.pucks)):  # a pushed puck pushes the next
+
+        for _ in range(len(self.pucks)):  # A pushed puck pushes the next one.
             if not self._separate():
                 break
 
     def _separate(self) -> bool:
+        """Move overlapping pucks apart, once for each pair; return whether any moved."""
         moved = False
         for i, a in enumerate(self.pucks):
             for b in self.pucks[i + 1 :]:
                 if abs(a.z - b.z) >= PUCK_HEIGHT - _EPSILON:
                     continue
-                still, loose = (b, a) if b is self.held else (a, b)
-                if push := _overlap(loose, still.x, still.y, 2 * PUCK_RADIUS):
+                still, loose = (b, a) if b is self.held_puck else (a, b)
+                push = _overlap(loose, still.x, still.y, 2 * PUCK_RADIUS)
+                if push is not None:
                     loose.x += push[0]
                     loose.y += push[1]
                     moved = True
         for puck in self.pucks:
-            if puck is not self.held:
+            if puck is not self.held_puck:
                 puck.x = _clip(puck.x, (PUCK_RADIUS - _TABLE[0], _TABLE[0] - PUCK_RADIUS))
                 puck.y = _clip(puck.y, (PUCK_RADIUS - _TABLE[1], _TABLE[1] - PUCK_RADIUS))
         return moved
 
     def _raise(self, dz: float) -> None:
         z = _clip(self.z + dz, REACH[2])
-        if self.held is not None:
-            z = max(z, self.z + self._support(self.held) - self.held.z)
+        if self.held_puck is not None:
+            z = max(z, self.z + self._support(self.held_puck) - self.held_puck.z)
         elif dz < 0:
             for puck in self.pucks:
                 top = puck.z + PUCK_HEIGHT
@@ -145,9 +151,9 @@ class TabletopWorld:
     def _grip(self, opening: float) -> None:
         change = _clip(opening - self.opening, (-_OPENING_RATE, _OPENING_RATE))
         gap = _clip(self.gap + change * GAP_OPEN, (0.0, GAP_OPEN))
-        if self.held is not None:
+        if self.held_puck is not None:
             if gap > PUCK_RADIUS + _EPSILON:
-                self.held = None
+                self.held_puck = None
                 self.gap = gap
             return
         if change < 0:
@@ -157,7 +163,7 @@ class TabletopWorld:
                 slack = max(gap - PUCK_RADIUS, 0.0)
                 puck.x = _clip(puck.x, (self.x - slack, self.x + slack))
                 if gap <= PUCK_RADIUS:
-                    gap, self.held = PUCK_RADIUS, puck
+                    gap, self.held_puck = PUCK_RADIUS, puck
                     break
         self.gap = gap
 
@@ -177,13 +183,17 @@ class TabletopWorld:
         return height
 
     def _carried(self) -> list[Puck]:
-        if self.held is None:
+        """List the held puck and those that are stacked on it."""
+        if self.held_puck is None:
             return []
-        carried = [self.held]
-        for puck in sorted(self.pucks, key=lambda p: p.z):
-            below = [one for one in carried if abs(puck.z - one.z - PUCK_HEIGHT) < _EPSILON]
-            if any(_distance(puck, one) < PUCK_RADIUS for one in below):
-                carried.append(puck)
+
+        carried = [self.held_puck]
+        for puck in sorted(self.pucks, key=lambda puck: puck.z):
+            for lower in carried:
+                is_on_top = abs(puck.z - lower.z - PUCK_HEIGHT) < _EPSILON
+                if is_on_top and _distance(puck, lower) < PUCK_RADIUS:
+                    carried.append(puck)
+                    break
         return carried
 
     def _between_fingers(self, puck: Puck) -> bool:
@@ -196,9 +206,8 @@ class TabletopWorld:
     def _finger_over(self, puck: Puck) -> bool:
         reach = PUCK_RADIUS + FINGER_RADIUS - _EPSILON
         offset = self.gap + FINGER_RADIUS
-        return any(
-            math.hypot(self.x + s * offset - puck.x, self.y - puck.y) < reach for s in (-1.0, 1.0)
-        )
+        finger_xs = (self.x - offset, self.x + offset)
+        return any(math.hypot(x - puck.x, self.y - puck.y) < reach for x in finger_xs)
 
 
 def _overlap(puck: Puck, x: float, y: float, distance: float) -> tuple[float, float] | None:
@@ -206,12 +215,13 @@ def _overlap(puck: Puck, x: float, y: float, distance: float) -> tuple[float, fl
     enough away.
     """
     dx, dy = puck.x - x, puck.y - y
-    if (have := math.hypot(dx, dy)) >= distance - _EPSILON:
+    current = math.hypot(dx, dy)
+    if current >= distance - _EPSILON:
         return None
-    if have < _EPSILON:
+    if current < _EPSILON:
         # At the centre any direction is valid, as long as it is always the same.
         return 0.0, -distance
-    return dx * (distance / have - 1), dy * (distance / have - 1)
+    return dx * (distance / current - 1), dy * (distance / current - 1)
 
 
 def _distance(a: Puck, b: Puck) -> float:
@@ -251,22 +261,23 @@ class Goal:
 
     @property
     def instruction(self) -> str:
+        """The goal in words."""
         return TEMPLATES[self.task].format(puck=self.puck, target=self.target)
 
-    def reached(self, world: TabletopWorld) -> bool:
+    def is_reached(self, world: TabletopWorld) -> bool:
         """Return whether the puck is at the instruction's target and released."""
         puck = world.puck(self.puck)
         if self.target is None:
-            return puck is world.held and puck.z >= _LIFT_HEIGHT
-        if puck is world.held:
+            return puck is world.held_puck and puck.z >= _LIFT_HEIGHT
+        if puck is world.held_puck:
             return False
-        x, y, z = self.place(world)
+        x, y, z = self.target_position(world)
         if self.task == "stack":
             return math.hypot(puck.x - x, puck.y - y) < PUCK_RADIUS and abs(puck.z - z) < 1e-3
         at_pad = abs(puck.x - x) <= _AT_PAD and abs(puck.y - y) <= _AT_PAD and puck.z < 1e-3
         return at_pad and not (self.task == "slide" and puck.lifted)
 
-    def place(self, world: TabletopWorld) -> tuple[float, float, float]:
+    def target_position(self, world: TabletopWorld) -> tuple[float, float, float]:
         """Return the target of the centre of the puck's underside: x, y, z in m, in the base
         frame.
         """
@@ -282,11 +293,17 @@ class Goal:
 
 def goals(world: TabletopWorld, task: Task) -> list[Goal]:
     """List the goals of a task that are possible in this scene, in a fixed order."""
-    pucks, pads = [p.colour for p in world.pucks], [p.colour for p in world.pads]
+    pucks = [puck.colour for puck in world.pucks]
     if task == "lift":
         return [Goal(task, puck) for puck in pucks]
-    targets = pucks if task == "stack" else pads
-    return [Goal(task, a, b) for a in pucks for b in targets if task != "stack" or a != b]
+
+    targets = pucks if task == "stack" else [pad.colour for pad in world.pads]
+    possible = []
+    for puck in pucks:
+        for target in targets:
+            if task != "stack" or puck != target:
+                possible.append(Goal(task, puck, target))
+    return possible
 
 
 def draw_episode(
@@ -297,43 +314,63 @@ def draw_episode(
     """
     while True:
         world = _draw_scene(rng, pucks)
-        wanted = [goal for goal in goals(world, task) if task != "slide" or _is_clear(world, goal)]
-        if wanted:
-            return world, wanted[rng.integers(len(wanted))]
+        possible = goals(world, task)
+        if task == "slide":
+            possible = [goal for goal in possible if _is_clear(world, goal)]
+        if possible:
+            return world, possible[rng.integers(len(possible))]
 
 
 def _draw_scene(rng: np.random.Generator, count: int) -> TabletopWorld:
+    """Draw the positions and colours of three pads and `count` pucks."""
     while True:
-        # x, y, and the clearance from objects of the same kind.
-        places: list[tuple[float, float, float]] = []
-        for _ in range(200):
-            if len(places) == _PADS + count:
-                break
-            clearance = _PAD_CLEARANCE if len(places) < _PADS else _CLEARANCE
-            x, y = rng.uniform(-1, 1, 2) * _AREA
-            if all(math.hypot(x - p[0], y - p[1]) >= min(clearance, p[2]) for p in places):
-                places.append((float(x), float(y), clearance))
-        if len(places) < _PADS + count:
-            continue  # no free place is left: draw again
+        positions = _draw_positions(rng, _PADS + count)
+        if positions is None:
+            continue
+
         pad_colours = rng.permutation(COLOURS)[:_PADS]
         puck_colours = rng.permutation(COLOURS)[:count]
-        pads = [Pad(str(c), x, y) for c, (x, y, _) in zip(pad_colours, places[:_PADS], strict=True)]
-        pucks = [
-            Puck(str(c), x, y) for c, (x, y, _) in zip(puck_colours, places[_PADS:], strict=True)
-        ]
+        pads, pucks = [], []
+        for colour, (x, y) in zip(pad_colours, positions[:_PADS], strict=True):
+            pads.append(Pad(str(colour), x, y))
+        for colour, (x, y) in zip(puck_colours, positions[_PADS:], strict=True):
+            pucks.append(Puck(str(colour), x, y))
         return TabletopWorld(pucks, pads)
 
 
+def _draw_positions(rng: np.random.Generator, count: int) -> list[tuple[float, float]] | None:
+    """Draw the positions of pads and then pucks, m; None if there is no room for one of them."""
+    # x, y, and the clearance from objects of the same kind.
+    drawn: list[tuple[float, float, float]] = []
+    for _ in range(200):
+        if len(drawn) == count:
+            break
+        clearance = _PAD_CLEARANCE if len(drawn) < _PADS else _CLEARANCE
+        x, y = rng.uniform(-1, 1, 2) * _AREA
+        is_free = True
+        for other_x, other_y, other_clearance in drawn:
+            distance = math.hypot(x - other_x, y - other_y)
+            is_free = is_free and distance >= min(clearance, other_clearance)
+        if is_free:
+            drawn.append((float(x), float(y), clearance))
+
+    if len(drawn) < count:
+        return None
+    return [(x, y) for x, y, _ in drawn]
+
+
 def _is_clear(world: TabletopWorld, goal: Goal) -> bool:
+    """Return whether no other puck is on the way of a slide."""
     start, end = world.puck(goal.puck), world.pad(goal.target or "")
     dx, dy = end.x - start.x, end.y - start.y
     length = math.hypot(dx, dy)
     for other in world.pucks:
         if other is start:
             continue
-        along = min(
-            max(((other.x - start.x) * dx + (other.y - start.y) * dy) / length**2, 0.0), 1.0
-        )
-        if math.hypot(start.x + along * dx - other.x, start.y + along * dy - other.y) < _CORRIDOR:
+        # The nearest point of the way to the other puck, as a share of the way.
+        share = ((other.x - start.x) * dx + (other.y - start.y) * dy) / length**2
+        share = _clip(share, (0.0, 1.0))
+        x, y = start.x + share * dx, start.y + share * dy
+        if math.hypot(x - other.x, y - other.y) < _CORRIDOR:
             return False
     return True

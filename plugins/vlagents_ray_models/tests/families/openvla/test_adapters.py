@@ -96,6 +96,7 @@ def test_each_row_of_one_pass_acts_as_its_adapter_merged_alone(
     acts = policy.act_batch(
         [seen(seed, **{SAMPLES: 2 * seed}) for seed in range(len(CHOSEN))], sessions
     )
+    fingerprints: dict[str | None, str] = {}
     for seed, (name, act) in enumerate(zip(CHOSEN, acts, strict=True)):
         wanted = session(alone[name], seed).act(seen(seed, **{SAMPLES: 2 * seed}))
         assert isinstance(act, Act)
@@ -105,11 +106,15 @@ def test_each_row_of_one_pass_acts_as_its_adapter_merged_alone(
             np.testing.assert_allclose(stated["mean"], other["mean"], atol=ATOL)
             np.testing.assert_allclose(stated["std"], other["std"], atol=ATOL)
             assert np.array_equal(stated["samples"], other["samples"])
-        assert (POLICY in act.info) == (name is not None)
+        fingerprint = policy.adapters.named(name).fingerprint or policy.adapters.base
+        assert act.info[POLICY] == {"version": 0, "fingerprint": fingerprint}
+        assert fingerprint
+        fingerprints[name] = fingerprint
         if name is not None:
             assert not np.array_equal(
                 wanted.action, session(alone[None], seed).act(seen(seed)).action
             )
+    assert len(set(fingerprints.values())) == len(alone), "the base and each adapter differ"
 
 
 def test_a_learner_pushes_the_layers_alone_that_its_adapters_change(
