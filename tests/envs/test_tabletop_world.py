@@ -56,8 +56,8 @@ def test_a_puck_released_over_another_stands_on_it_and_falls_when_that_is_taken_
     go(scene, 0.15, 0.0, 0.1, CLOSED)
     go(scene, 0.15, 0.0, 0.1, OPEN)
     assert red.z == pytest.approx(PUCK_HEIGHT)
-    assert Goal("stack", "red", "blue").reached(scene)
-    assert not Goal("stack", "blue", "red").reached(scene)
+    assert Goal("stack", "red", "blue").is_reached(scene)
+    assert not Goal("stack", "blue", "red").is_reached(scene)
     blue.x = -0.2
     scene.step(0, 0, 0, OPEN)
     assert red.z == 0.0
@@ -118,7 +118,7 @@ def test_only_the_named_puck_on_the_named_pad_counts() -> None:
         [Pad("blue", 0.2, 0.0), Pad("red", -0.2, 0.0)],
     )
     reached = {
-        (puck, pad): Goal("pick_place", puck, pad).reached(scene)
+        (puck, pad): Goal("pick_place", puck, pad).is_reached(scene)
         for puck in ("red", "green")
         for pad in ("blue", "red")
     }
@@ -128,10 +128,10 @@ def test_only_the_named_puck_on_the_named_pad_counts() -> None:
 def test_a_slide_does_not_count_once_the_puck_was_lifted() -> None:
     red = Puck("red", 0.2, 0.0)
     scene = world(red)
-    assert Goal("slide", "red", "blue").reached(scene)
+    assert Goal("slide", "red", "blue").is_reached(scene)
     red.lifted = True
-    assert not Goal("slide", "red", "blue").reached(scene)
-    assert Goal("pick_place", "red", "blue").reached(scene)
+    assert not Goal("slide", "red", "blue").is_reached(scene)
+    assert Goal("pick_place", "red", "blue").is_reached(scene)
 
 
 def test_a_puck_still_held_over_its_pad_does_not_count() -> None:
@@ -139,14 +139,14 @@ def test_a_puck_still_held_over_its_pad_does_not_count() -> None:
     scene = world(red)
     grasp(scene, red)
     assert scene.held_puck is red
-    assert not Goal("pick_place", "red", "blue").reached(scene)
+    assert not Goal("pick_place", "red", "blue").is_reached(scene)
 
 
 def test_lift_counts_while_the_puck_is_held_high() -> None:
     red, blue = Puck("red", 0.0, 0.0), Puck("blue", 0.15, 0.0)
     scene = world(red, blue)
     grasp(scene, red)
-    assert not Goal("lift", "red").reached(scene)
+    assert not Goal("lift", "red").is_reached(scene)
     go(scene, 0.0, 0.0, 0.12, CLOSED)
-    assert Goal("lift", "red").reached(scene)
-    assert not Goal("lift", "blue").reached(scene)
+    assert Goal("lift", "red").is_reached(scene)
+    assert not Goal("lift", "blue").is_reached(scene)
