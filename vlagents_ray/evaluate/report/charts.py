@@ -17,8 +17,9 @@ from vlagents_ray.evaluate.results.statistics import Rate
 NONE, MINUS = "\u2013", "\u2212"
 _COLOURS = 6
 _DASHES = (None, "7 3", "2 3", "9 3 2 3", "12 4", "4 4")
-_GLYPH, _EDGE = 96, 6  # width of a glyph, and margin of a dot beyond the ends of its axis
-_LIMITS = (0.05, 0.1, 0.2, 0.4, 0.6, 1.0)  # of the axes of differences
+_GLYPH = 96  # the width of a glyph
+_EDGE = 6  # the margin beyond the ends of a glyph's axis, so that a dot at an end is whole
+_LIMITS = (0.05, 0.1, 0.2, 0.4, 0.6, 1.0)  # the largest differences of the axes
 
 
 def percent(rate: Rate) -> str:
@@ -43,7 +44,7 @@ def bounds(values: tuple[float, float] | None) -> str:
 
 
 def interval_name(rate: Rate) -> str:
-    """Return the kind of that interval: a confidence sequence if cases could stop early, else
+    """Return the kind of the rate's interval: a confidence sequence if cases could stop early, else
     Wilson's.
     """
     if rate.error_rate is None:
@@ -63,7 +64,11 @@ def p_value(p: float) -> str:
     """Return a p-value with its significant digits; never 0."""
     if p < 1e-4:
         return "< 0.0001"
-    return f"{p:.4f}" if p < 0.01 else f"{p:.3f}" if p < 0.1 else f"{p:.2f}"
+    if p < 0.01:
+        return f"{p:.4f}"
+    if p < 0.1:
+        return f"{p:.3f}"
+    return f"{p:.2f}"
 
 
 def number(value: float | None, digits: int = 1) -> str:
@@ -113,7 +118,7 @@ class Series:
 
     name: str
     points: Sequence[tuple[float, Rate]]
-    level: bool = False  # one rate, whatever x is
+    level: bool = False  # whether it is one rate, which does not depend on x
 
 
 @dataclass(frozen=True, slots=True)
@@ -172,54 +177,58 @@ def rate_chart(series: Sequence[Series], x_label: str, title: str) -> RateChart:
     """Return the lines of `series`, in their order, on a common axis from the least x to the
     largest.
     """
-    most = max((x for one in series for x, _ in one.points), default=0.0)
-    least = min((x for one in series for x, _ in one.points), default=0.0)
-    left, right = (least - 1, most + 1) if least == most else (least, most)
+    all_x: list[float] = []
+    for line in series:
+        all_x += [x for x, _ in line.points]
+    left, right = min(all_x, default=0.0), max(all_x, default=0.0)
+    if left == right:
+        left, right = left - 1, right + 1
 
     def x_of(x: float) -> float:
         return PLOT.left + (PLOT.right - PLOT.left) * (x - left) / (right - left)
 
-    lines = []
-    for index, one in enumerate(series):
-        known = [(x, rate) for x, rate in one.points if rate.rate is not None]
-        bounds = [(rate.rate or 0.0, *rate.interval) for _, rate in known]
-        rates, lows, highs = (
-            [(x_of(x), PLOT.y(shares[i])) for (x, _), shares in zip(known, bounds, strict=True)]
-            for i in range(3)
-        )
-        dots = [
-            (
-                x_of(x),
-                PLOT.y(rate.rate or 0.0),
-                f"{one.name}, {short(x)}: {percent(rate)} % ({interval(rate)})",
-            )
-            for x, rate in known
-            if not one.level
-        ]
-        style = Style(one.name, f"c{index % _COLOURS}", _DASHES[index % len(_DASHES)])
-        band = f"{_path([*lows, *reversed(highs)])}Z"
-        lines.append(Curve(style, _path(rates) if known else None, band if known else None, dots))
-    return RateChart(
-        title, x_label, [(x_of(tick), short(tick)) for tick in ticks(left, right)], lines
-    )
+    curves = []
+    for index, line in enumerate(series):
+        style = Style(line.name, f"c{index % _COLOURS}", _DASHES[index % len(_DASHES)])
+        rates, lows, highs, dots = [], [], [], []
+        for x, rate in line.points:
+            if rate.rate is None:
+                continue
+            low, high = rate.interval
+            rates.append((x_of(x), PLOT.y(rate.rate)))
+            lows.append((x_of(x), PLOT.y(low)))
+            highs.append((x_of(x), PLOT.y(high)))
+            if not line.level:
+                text = f"{line.name}, {short(x)}: {percent(rate)} % ({interval(rate)})"
+                dots.append((x_of(x), PLOT.y(rate.rate), text))
+
+        path = band = None
+        if rates:
+            path = _path(rates)
+            band = f"{_path([*lows, *reversed(highs)])}Z"
+        curves.append(Curve(style, path, band, dots))
+
+    x_ticks = [(x_of(tick), short(tick)) for tick in ticks(left, right)]
+    return RateChart(title, x_label, x_ticks, curves)
 
 
 def bar_chart(rows: Mapping[str, Mapping[str, float]], title: str) -> BarChart:
-    """Return a bar for each of `rows`, at least one."""
-    names = dict.fromkeys(part for parts in rows.values() for part in parts)
+    """Return a bar for each of `rows`, at least one; a row has its values by the names of its
+    segments.
+    """
+    names: dict[str, None] = {}  # of all segments
+    for values in rows.values():
+        names |= dict.fromkeys(values)
     styles = {name: Style(name, f"c{index % _COLOURS}") for index, name in enumerate(names)}
-    longest = max(sum(parts.values()) for parts in rows.values())
-    bars = [
-        (
-            name,
-            sum(parts.values()),
-            [
-                (styles[part], value, 100 * value / longest if longest else 0.0)
-                for part, value in parts.items()
-            ],
-        )
-        for name, parts in rows.items()
-    ]
+
+    longest = max(sum(values.values()) for values in rows.values())
+    bars = []
+    for row_name, values in rows.items():
+        segments = []
+        for name, value in values.items():
+            width = 100 * value / longest if longest else 0.0
+            segments.append((styles[name], value, width))
+        bars.append((row_name, sum(values.values()), segments))
     return BarChart(title, list(styles.values()), bars)
 
 
@@ -228,18 +237,19 @@ def interval_glyph(rate: Rate) -> Glyph:
     axis = f"M{_EDGE} 8H{_GLYPH - _EDGE}"
     if rate.rate is None:
         return Glyph(axis, None, None)
-    low, dot, high = (
-        _EDGE + (_GLYPH - 2 * _EDGE) * value
-        for value in (rate.interval[0], rate.rate, rate.interval[1])
-    )
-    return Glyph(axis, f"M{low:.1f} 8H{high:.1f}", dot)
+
+    def x_of(share: float) -> float:
+        return _EDGE + (_GLYPH - 2 * _EDGE) * share
+
+    low, high = rate.interval
+    return Glyph(axis, f"M{x_of(low):.1f} 8H{x_of(high):.1f}", x_of(rate.rate))
 
 
 def difference_limit(intervals: Iterable[tuple[float, float]]) -> float:
     """Return the largest difference on the common axis of these intervals, which is symmetric
     around 0.
     """
-    largest = max((abs(bound) for interval in intervals for bound in interval), default=1.0)
+    largest = max((max(abs(low), abs(high)) for low, high in intervals), default=1.0)
     return next(limit for limit in _LIMITS if limit >= largest)
 
 
@@ -250,33 +260,35 @@ def difference_glyph(
     mark at 0.
     """
     middle = _GLYPH / 2
-    left, dot, right = (
-        middle + (middle - _EDGE) * value / limit
-        for value in (interval[0], difference, interval[1])
-    )
+
+    def x_of(value: float) -> float:
+        return middle + (middle - _EDGE) * value / limit
+
+    low, high = interval
     axis = f"M{_EDGE} 8H{_GLYPH - _EDGE}M{middle:.1f} 2V14"
-    return Glyph(axis, f"M{left:.1f} 8H{right:.1f}", dot, decided)
+    return Glyph(axis, f"M{x_of(low):.1f} 8H{x_of(high):.1f}", x_of(difference), decided)
 
 
 def difference_labels(limit: float) -> tuple[str, str, str]:
-    """Return the labels of that axis at its left end, its middle and its right end, in
-    percentage points.
+    """Return the labels of the axis from -`limit` to `limit` at its left end, its middle and its
+    right end, in percentage points.
     """
     return f"{MINUS}{100 * limit:g}", "0", f"+{100 * limit:g}"
 
 
-def ticks(low: float, high: float, most: int = 6) -> list[float]:
-    """Return round numbers within [low, high], at most `most` or one more, at equal distances."""
+def ticks(low: float, high: float, intervals: int = 6) -> list[float]:
+    """Return round numbers within [low, high] at equal distances, which divide it into at most
+    so many `intervals`.
+    """
     if high <= low:
         return [low]
-    rough = (high - low) / most
-    magnitude = 10 ** math.floor(math.log10(rough))
-    distance = next(
-        factor * magnitude
-        for factor in (1, 2, 2.5, 5, 10)
-        if factor * magnitude >= rough * (1 - 1e-9)
-    )
-    first, last = math.ceil(low / distance - 1e-9), math.floor(high / distance + 1e-9)
+    shortest = (high - low) / intervals
+    magnitude = 10 ** math.floor(math.log10(shortest))
+    # The tolerances keep the ticks at the ends in spite of floating point.
+    distances = (factor * magnitude for factor in (1, 2, 2.5, 5, 10))
+    distance = next(value for value in distances if value >= shortest * (1 - 1e-9))
+    first = math.ceil(low / distance - 1e-9)
+    last = math.floor(high / distance + 1e-9)
     return [distance * step for step in range(first, last + 1)]
 
 

@@ -19,7 +19,7 @@ from vlagents_ray.evaluate.results.summary import errors_of_policies
 from vlagents_ray.images.jpeg_png import data_url, encode_jpeg
 from vlagents_ray.registry import require
 
-BUDGET = 24 * 2**20  # bytes of videos that one page carries
+BUDGET = 24 * 2**20  # bytes of the videos in one page
 POSTER = 224  # the most pixels of a poster's side
 SMALL = 128  # a video whose sides have fewer pixels is enlarged without blurring
 MOST_UNSOLVED, MOST_SOLVED = 24, 12  # videos
@@ -34,7 +34,7 @@ _OUTCOMES = {
     "infra_failed": "lost",
 }
 
-Found = tuple[CaseResults, Episode]
+CaseEpisode = tuple[CaseResults, Episode]  # an episode with its case
 
 
 @dataclass(frozen=True, slots=True)
@@ -106,26 +106,33 @@ class Gallery:
         # Paths that are symbolic links out of their folder of results: not shown.
         self.outside: set[str] = set()
 
-    def cards(self, found: Sequence[Found], most: int) -> list[Card]:
-        """Return at most `most` of these episodes with a video, from tasks and policies in
+    def cards(self, episodes: Sequence[CaseEpisode], limit: int) -> list[Card]:
+        """Return at most `limit` of these episodes with a video, from tasks and policies in
         turns.
         """
-        by_case: dict[str, list[Found]] = {}
-        for case, one in found:
-            if one.videos:
-                by_case.setdefault(case.case_id, []).append((case, one))
-        drawn: list[Card] = []
-        for case, one in filter(None, itertools.chain(*itertools.zip_longest(*by_case.values()))):
-            label = f"{case.task}, episode {one.result.key.episode}, {case.contender}"
-            if len(drawn) < most and (player := self.player(one.videos[0], label)) is not None:
-                drawn.append((case, one, player))
-        return drawn
+        by_case: dict[str, list[CaseEpisode]] = {}
+        for case, episode in episodes:
+            if episode.videos:
+                by_case.setdefault(case.case_id, []).append((case, episode))
+        rounds = itertools.zip_longest(*by_case.values())  # one episode of each case, or None
+
+        cards: list[Card] = []
+        for case, episode in filter(None, itertools.chain.from_iterable(rounds)):
+            if len(cards) == limit:
+                break
+            label = f"{case.task}, episode {episode.result.key.episode}, {case.contender}"
+            player = self.player(episode.videos[0], label)
+            if player is not None:
+                cards.append((case, episode, player))
+        return cards
 
     def player(self, video: str, label: str) -> Player | None:
         """Return a player for `video`, a path of an episode; None if the file is missing."""
-        if (path := self._file(video)) is None:
+        path = self._file(video)
+        if path is None:
             return None
-        size, frame = path.stat().st_size, last_frame(path)
+
+        size = path.stat().st_size
         if size <= self._budget:
             self._budget -= size
             self.inlined += 1
@@ -133,19 +140,21 @@ class Gallery:
         else:
             self.linked += 1
             source = self.link(video)
-        still = None if frame is None else poster(frame)
-        style = "small" if frame is not None and max(frame.shape[:2]) < SMALL else None
-        tall = None if frame is None else frame.shape[0] / frame.shape[1]
-        return Player(label, source, still, style, tall)
+
+        frame = last_frame(path)
+        if frame is None:
+            return Player(label, source, still=None, style=None, tall=None)
+        height, width = frame.shape[:2]
+        style = "small" if max(height, width) < SMALL else None
+        return Player(label, source, poster(frame), style, height / width)
 
     def link(self, video: str) -> str | None:
         """Return the page's link to the file; None without one."""
         path = self._file(video)
-        return (
-            None
-            if path is None
-            else quote(Path(os.path.relpath(path, self._page.parent.resolve())).as_posix())
-        )
+        if path is None:
+            return None
+        relative = os.path.relpath(path, self._page.parent.resolve())
+        return quote(Path(relative).as_posix())
 
     def _file(self, video: str) -> Path | None:
         try:
@@ -160,54 +169,64 @@ def episodes(results: Results, gallery: Gallery) -> Episodes | None:
     """Return all episodes, or None without any."""
     order = {name: index for index, name in enumerate(results.contenders)}
     cases = sorted(results.cases, key=lambda case: order[case.contender])
-    if not (found := [(case, one) for case in cases for one in case.episodes]):
+    played: list[CaseEpisode] = []
+    for case in cases:
+        played += [(case, episode) for episode in case.episodes]
+    if not played:
         return None
-    solved = [(case, one) for case, one in found if one.counts and one.result.success_once]
+
+    solved = [
+        (case, episode)
+        for case, episode in played
+        if episode.counts and episode.result.success_once
+    ]
     cards = gallery.cards(solved, MOST_SOLVED)
-    rows = []
-    for case, one in found[:MOST_LISTED]:
-        kind = outcome(one.result)
-        words = f"({_OUTCOMES[kind]})" if one.beyond else _OUTCOMES[kind]
-        style = {"success": "good", "failure": None}.get(kind, "bad")
-        links = [(number, gallery.link(video)) for number, video in enumerate(one.videos, 1)]
-        rows.append(
-            EpisodeRow(
-                case,
-                one,
-                words,
-                style,
-                [(number, link) for number, link in links if link is not None],
-            )
-        )
-    return Episodes(rows, len(found) - len(rows), all(one.counts for _, one in found), cards)
+    rows = [_row(case, episode, gallery) for case, episode in played[:MOST_LISTED]]
+    all_count = all(episode.counts for _, episode in played)
+    return Episodes(rows, len(played) - len(rows), all_count, cards)
+
+
+def _row(case: CaseResults, episode: Episode, gallery: Gallery) -> EpisodeRow:
+    kind = outcome(episode.result)
+    words = f"({_OUTCOMES[kind]})" if episode.beyond else _OUTCOMES[kind]
+    style = {"success": "good", "failure": None}.get(kind, "bad")
+    links = []
+    for number, video in enumerate(episode.videos, 1):
+        link = gallery.link(video)
+        if link is not None:
+            links.append((number, link))
+    return EpisodeRow(case, episode, words, style, links)
 
 
 def failures(results: Results, gallery: Gallery) -> Failures | None:
     """Return the episodes that were not solved; None if there are none."""
-    found = [
-        (case, one)
-        for case in results.cases
-        for one in case.episodes
-        if one.counts and not one.result.success_once
-    ]
-    if not found:
+    unsolved: list[CaseEpisode] = []
+    for case in results.cases:
+        for episode in case.episodes:
+            if episode.counts and not episode.result.success_once:
+                unsolved.append((case, episode))
+    if not unsolved:
         return None
-    cards = gallery.cards(found, MOST_UNSOLVED)
-    return Failures(len(found), cards, gallery.inlined, gallery.linked, len(gallery.outside))
+    cards = gallery.cards(unsolved, MOST_UNSOLVED)
+    return Failures(len(unsolved), cards, gallery.inlined, gallery.linked, len(gallery.outside))
 
 
 def errors(results: Results) -> Errors | None:
     """Return the errors with their logs; None without any."""
-    broken = errors_of_policies(results)
-    attempts = [(case, attempt) for case in results.cases for attempt in case.attempts]
-    if not broken and not attempts:
+    of_policies = errors_of_policies(results)
+    attempts: list[tuple[CaseResults, Attempt]] = []
+    for case in results.cases:
+        attempts += [(case, attempt) for attempt in case.attempts]
+    if not of_policies and not attempts:
         return None
+
+    most_frequent_first = sorted(of_policies, key=lambda error: -error[1])
     return Errors(
-        sorted(broken, key=lambda one: -one[1])[:MOST_ERRORS],
+        most_frequent_first[:MOST_ERRORS],
         attempts[:MOST_LOGS],
-        len(attempts),
-        sum(attempt.retried for _, attempt in attempts),
-        sum(one.result.status == "infra_failed" for case in results.cases for one in case.episodes),
+        failed=len(attempts),
+        repeated=sum(attempt.retried for _, attempt in attempts),
+        lost=sum(episode.result.status == "infra_failed" for episode in results.episodes),
     )
 
 

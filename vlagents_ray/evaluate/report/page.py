@@ -8,10 +8,11 @@ written into the page.
 
 from __future__ import annotations
 
+import itertools
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import cache, partial
+from functools import cache
 from importlib.resources import files
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -21,6 +22,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
 from vlagents_ray.evaluate.artifacts.storage import storing, whole
+from vlagents_ray.evaluate.episode.records import EpisodeResult
 from vlagents_ray.evaluate.plan.config import EvalConfig
 from vlagents_ray.evaluate.report import charts
 from vlagents_ray.evaluate.report.charts import (
@@ -34,6 +36,7 @@ from vlagents_ray.evaluate.report.charts import (
 from vlagents_ray.evaluate.report.episodes import AT_ONCE, Gallery, episodes, errors, failures
 from vlagents_ray.evaluate.report.success import (
     Comparisons,
+    Difference,
     compare_all,
     learning_curves,
     success_table,
@@ -79,24 +82,32 @@ class Section(NamedTuple):
 def write_report(
     results: Results, path: Path, *, inline: bool = False, accept_changes: bool = False
 ) -> Path:
-    """Write the report of one folder, or of several (`combined`), to the HTML file `path`, whole or
-    not at all.
+    """Write the report of one folder, or of several (`combined`), to an HTML file, whole or not at
+    all.
 
-    With `inline`, videos are in the page, up to `episodes.BUDGET` bytes; others are links, relative
-    to `path`. Missing folders are made. With `accept_changes`, policies are compared although
-    something changed between them (`compare`), and the page shows these changes. Returns `path`.
+    Args:
+        results: The results.
+        path: The file. Missing folders are made.
+        inline: Whether the page contains the videos, up to `episodes.BUDGET` bytes; others are
+            links, relative to `path`.
+        accept_changes: Compare policies although something changed between them (`compare`); the
+            page shows these changes.
+
+    Returns:
+        `path`.
     """
-    text = report(
-        summarize(results), Gallery(results, path, inline=inline), accept_changes=accept_changes
-    )
-    with storing(path.parent), whole(path) as part:
-        part.write_text(text, encoding="utf-8")
+    gallery = Gallery(results, path, inline=inline)
+    text = report(summarize(results), gallery, accept_changes=accept_changes)
+    with storing(path.parent), whole(path) as temporary:
+        temporary.write_text(text, encoding="utf-8")
     return path
 
 
 def report(summary: Summary, gallery: Gallery, *, accept_changes: bool = False) -> str:
+    """Return the page as HTML."""
     results, total = summary.results, summary.total
     compared = compare_all(summary, accept_changes=accept_changes)
+
     figures = [
         _answer(summary, compared) or _solved(summary),
         Figure(number(total.episodes, 0), "episodes", f"of {number(total.planned, 0)} planned"),
@@ -120,17 +131,15 @@ def report(summary: Summary, gallery: Gallery, *, accept_changes: bool = False) 
         Section("Configuration", "configuration", configuration(results)),
         Section("To repeat", "repeat", repeat(results)),
     ]
-    return (
-        _templates()
-        .get_template("page.html.j2")
-        .render(
-            summary=summary,
-            policies=list(dict.fromkeys(case.policy for case in results.cases)),
-            tasks=len({(case.suite, case.env) for case in results.cases}),
-            run=results.runs[-1],
-            figures=figures,
-            sections=[one for one in sections if one.view],
-        )
+
+    template = _templates().get_template("page.html.j2")
+    return template.render(
+        summary=summary,
+        policies=list(dict.fromkeys(case.policy for case in results.cases)),
+        tasks=len({(case.suite, case.env) for case in results.cases}),
+        run=results.runs[-1],
+        figures=figures,
+        sections=[section for section in sections if section.view],
     )
 
 
@@ -142,13 +151,14 @@ def _answer(summary: Summary, compared: Comparisons | None) -> Figure | None:
     allow for cases that may stop early.
     """
     may_stop = any(group.success_once.error_rate is not None for group in summary.cases)
-    differences = (
-        []
-        if compared is None
-        else [row for part in compared.parts for row in (*part.shown, *part.folded)]
-    )
-    if may_stop or len(differences) != 1:
+    if compared is None or may_stop:
         return None
+    differences: list[Difference] = []
+    for part in compared.parts:
+        differences += part.shown + part.folded
+    if len(differences) != 1:
+        return None
+
     [difference] = differences
     verdict = "" if difference.decided else ", not told apart"
     low, high = (charts.points(bound) for bound in difference.interval)
@@ -165,23 +175,23 @@ def _solved(summary: Summary) -> Figure:
     It is a rate, if the cases have a common one, of synchronous episodes if there are any.
     """
     best = summary.best[0]
-    timing, part = next(iter(summary.parts(best).items()))
+    timing, group = next(iter(summary.parts(best).items()))
     name = "solved" if len(summary.results.contenders) == 1 else f"solved by the best, {best}"
     if len(by_timing(summary.results.cases)) > 1:
         name += f", {timing}"
-    once = part.success_once
+
+    once = group.success_once
     if once.pooled:
-        return Figure(
-            f"{percent(once)} %", name, f"{charts.interval_name(once)} {interval(once)} %"
-        )
+        note = f"{charts.interval_name(once)} {interval(once)} %"
+        return Figure(f"{percent(once)} %", name, note)
+
     cases = by_timing(summary.results.of(best))[timing]
-    rates = [rate for case in cases if (rate := rate_of([case], "success_once")).rate is not None]
-    low, high = (percent(pick(rates, key=lambda rate: rate.rate or 0.0)) for pick in (min, max))
-    return Figure(
-        f"{low} to {high} %",
-        name,
-        f"{quantity(len(cases), 'task')} that stopped apart: no rate in common",
+    rates = [rate_of([case], "success_once") for case in cases]
+    known = sorted(
+        (rate for rate in rates if rate.rate is not None), key=lambda rate: rate.rate or 0.0
     )
+    note = f"{quantity(len(cases), 'task')} that stopped apart: no rate in common"
+    return Figure(f"{percent(known[0])} to {percent(known[-1])} %", name, note)
 
 
 @cache
@@ -195,34 +205,41 @@ def _templates() -> Environment:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    formats = (
-        "bounds",
-        "difference_limit",
-        "duration",
-        "interval",
-        "interval_name",
-        "moment",
-        "number",
-        "p_value",
-        "percent",
-        "points",
-        "quantity",
-    )
-    env.filters.update({name: getattr(charts, name) for name in formats})
     env.filters.update(
+        bounds=charts.bounds,
+        difference_limit=charts.difference_limit,
+        duration=charts.duration,
+        interval=charts.interval,
         interval_glyph=charts.interval_glyph,
+        interval_name=charts.interval_name,
+        json=_json,
+        moment=charts.moment,
+        number=charts.number,
+        p_value=charts.p_value,
+        percent=charts.percent,
+        points=charts.points,
         px=charts.px,
-        json=partial(json.dumps, ensure_ascii=False),
+        quantity=charts.quantity,
     )
     env.globals.update(
-        difference_glyph=charts.difference_glyph, difference_labels=charts.difference_labels
+        AT_ONCE=AT_ONCE,
+        MINUS=charts.MINUS,
+        NONE=charts.NONE,
+        PLOT=charts.PLOT,
+        difference_glyph=charts.difference_glyph,
+        difference_labels=charts.difference_labels,
     )
-    env.globals.update(PLOT=charts.PLOT, AT_ONCE=AT_ONCE, NONE=charts.NONE, MINUS=charts.MINUS)
-    for kind in ("css", "js"):  # our own files, not templates: nothing in them is escaped
-        env.globals[kind] = Markup(  # noqa: S704
-            (files(__package__ or "") / f"report.{kind}").read_text("utf-8").strip()
-        )
+
+    # Nothing in these two is escaped: they are our own files, and no templates.
+    folder = files(__package__ or "")
+    for kind in ("css", "js"):
+        text = (folder / f"report.{kind}").read_text("utf-8")
+        env.globals[kind] = Markup(text.strip())  # noqa: S704
     return env
+
+
+def _json(value: Any) -> str:
+    return json.dumps(value, ensure_ascii=False)
 
 
 @dataclass(frozen=True, slots=True)
@@ -232,7 +249,7 @@ class Latency:
     """
 
     chart: BarChart | None  # None: no server reported its stages
-    stages: list[str]  # that any policy has
+    stages: list[str]  # those that any policy has
     # (policy id, ms, the env's reset in ms, answers)
     rows: list[tuple[str, list[float | None], float | None, int]]
     transports: list[str]
@@ -241,36 +258,35 @@ class Latency:
 
 def latency(summary: Summary) -> Latency | None:
     """Return the latencies; None if no episode was played."""
-    results = summary.results
-    by_name = {
-        name: [one for case in results.of(name) for one in case.counted]
-        for name in results.contenders
-    }
-    if not (played := {name: counted for name, counted in by_name.items() if counted}):
+    counted: dict[str, list[EpisodeResult]] = {}  # by policy id
+    for name in summary.results.contenders:
+        results = summary.results.only(name).counted
+        if results:
+            counted[name] = results
+    if not counted:
         return None
-    spent: dict[str, dict[str, float]] = {}
-    for name, counted in played.items():
-        known = {
-            stage: median(one.timing_ms.get(key) for one in counted)
-            for key, stage in STAGES.items()
-        }
-        spent[name] = {stage: ms for stage, ms in known.items() if ms is not None}
-    timed = {name: found for name, found in spent.items() if found}
-    bars = dict(list(timed.items())[:MOST_BARS])
-    stages = [stage for stage in STAGES.values() if any(stage in found for found in timed.values())]
-    rows = [
-        (
-            name,
-            [spent[name].get(stage) for stage in stages]
-            + [
-                median(getattr(one, field) for one in counted)
-                for field in ("policy_ms", "policy_p95_ms", "env_step_ms")
-            ],
-            median(one.reset_ms for one in counted),
-            sum(one.acts for one in counted),
-        )
-        for name, counted in played.items()
-    ]
+
+    stage_ms: dict[str, dict[str, float]] = {}  # the times of the stages of each policy id
+    for name, results in counted.items():
+        stage_ms[name] = {}
+        for key, stage in STAGES.items():
+            ms = median(result.timing_ms.get(key) for result in results)
+            if ms is not None:
+                stage_ms[name][stage] = ms
+    timed = {name: times for name, times in stage_ms.items() if times}
+    reported = set().union(*timed.values())
+    stages = [stage for stage in STAGES.values() if stage in reported]
+
+    rows = []
+    for name, results in counted.items():
+        times = [stage_ms[name].get(stage) for stage in stages]
+        times.append(median(result.policy_ms for result in results))
+        times.append(median(result.policy_p95_ms for result in results))
+        times.append(median(result.env_step_ms for result in results))
+        reset_ms = median(result.reset_ms for result in results)
+        rows.append((name, times, reset_ms, sum(result.acts for result in results)))
+
+    bars = dict(itertools.islice(timed.items(), MOST_BARS))
     chart = charts.bar_chart(bars, "One act of the policy, by stage") if bars else None
     return Latency(chart, stages, rows, summary.transports, len(timed))
 
@@ -315,70 +331,84 @@ class Repeat:
 
 def protocol(results: Results) -> list[Env]:
     """Return the description and contract of the envs; envs with the same ones are one entry."""
-    alike: dict[str, tuple[CaseResults, list[str]]] = {}
+    alike: dict[str, list[CaseResults]] = {}
     for case in results.cases:
         settings = {name: case.settings.get(name) for name in _SETTINGS}
-        same = json.dumps([case.described, case.contract, settings], sort_keys=True)
-        alike.setdefault(same, (case, []))[1].append(case.task)
+        text = json.dumps([case.described, case.contract, settings], sort_keys=True)
+        alike.setdefault(text, []).append(case)
+
     envs = []
-    for case, tasks in alike.values():
-        described = dict(case.described)
-        constants = described.pop("protocol", None)
-        of_benchmark = constants if isinstance(constants, Mapping) else None
-        settings = {name: value for name in _SETTINGS if (value := case.settings.get(name))}
-        contract = _yaml(case.contract) if case.contract else None
-        envs.append(Env(list(dict.fromkeys(tasks)), of_benchmark, described, settings, contract))
+    for cases in alike.values():
+        first = cases[0]
+        tasks = list(dict.fromkeys(case.task for case in cases))
+        described = dict(first.described)
+        protocol = described.pop("protocol", None)
+        constants = protocol if isinstance(protocol, Mapping) else None
+        settings = {name: first.settings.get(name) for name in _SETTINGS}
+        settings = {name: value for name, value in settings.items() if value}
+        contract = _yaml(first.contract) if first.contract else None
+        envs.append(Env(tasks, constants, described, settings, contract))
     return envs
 
 
 def configuration(results: Results) -> Configuration:
     """Return the software and the machines that made the results."""
-    named: list[tuple[str, str]] = []
+    programs: dict[str, Mapping[str, str]] = {}  # by env
+    checkpoints: dict[tuple[str, str], None] = {}
     for case in results.cases:
+        if case.program:
+            programs[case.env] = case.program
         commit = stated(case, "revision")
-        found = (
+        identities = (
             stated(case, "checkpoint"),
-            commit and f"commit {commit}",
+            None if commit is None else f"commit {commit}",
             stated(case, "weights"),
             pushed_of(case),
         )
-        named += [(case.contender, one) for one in found if one is not None]
-    workers: dict[tuple[str, str, str, str], set[tuple[int, int]]] = {}
-    for one in results.workers:
-        where = (one.host, one.policy, one.transport, one.renderer or "none")
-        workers.setdefault(where, set()).add((one.run, one.pid))
-    last = _last_runs(results)
+        for identity in identities:
+            if identity is not None:
+                checkpoints[case.contender, identity] = None
+
+    processes: dict[tuple[str, str, str, str], set[tuple[int, int]]] = {}  # (run, pid)
+    for worker in results.workers:
+        kind = (worker.host, worker.policy, worker.transport, worker.renderer or "none")
+        processes.setdefault(kind, set()).add((worker.run, worker.pid))
+
+    last_runs = _last_runs(results)
+    versions: list[Mapping[str, Any]] = []  # of each folder, those that are known
+    for run in last_runs:
+        versions.append({name: text for name, text in run.versions.items() if text is not None})
+
     return Configuration(
-        results.runs,
-        results.accepted_changes,
-        list(
-            {case.env: (case.env, case.program) for case in results.cases if case.program}.values()
-        ),
-        list(dict.fromkeys(named)),
-        [(*where, len(alike)) for where, alike in sorted(workers.items())],
-        [
-            {name: value for name, value in run.versions.items() if value is not None}
-            for run in last
-        ],
-        [(name, _yaml(metadata)) for name, metadata in results.policies.items()],
-        [(str(run.config.get("out")), _yaml(run.config)) for run in last],
+        runs=results.runs,
+        changes=results.accepted_changes,
+        programs=list(programs.items()),
+        checkpoints=list(checkpoints),
+        workers=[(*kind, len(members)) for kind, members in sorted(processes.items())],
+        versions=versions,
+        policies=[(name, _yaml(metadata)) for name, metadata in results.policies.items()],
+        settings=[(str(run.config.get("out")), _yaml(run.config)) for run in last_runs],
     )
 
 
 def repeat(results: Results) -> Repeat:
+    """Return the settings and the folders of the commands that repeat the evaluation.
+
+    The settings lack the addresses of policies that were served for the run.
+    """
     folders = list(dict.fromkeys(str(run.config.get("out")) for run in results.runs))
     runs = []
-    for run in _last_runs(results):  # without addresses of policies that were served for the run
+    for run in _last_runs(results):
         config = EvalConfig.model_validate(run.config)
         document = config.model_dump(
             mode="json", exclude_defaults=True, exclude={"out", "resume", "accept_changes"}
         )
+        lacks_a_policy = False
         for policy in document["policies"]:
             if policy.get("source") is not None:
                 policy.pop("url", None)
-        lacks_a_policy = any(
-            not {"source", "url"} & policy.keys() for policy in document["policies"]
-        )
+            elif policy.get("url") is None:
+                lacks_a_policy = True
         runs.append((_yaml(document), lacks_a_policy))
     return Repeat(runs, folders)
 

@@ -54,11 +54,11 @@ class ResultsDocument:
 
         It may take as long as reading the folder of results, on average at most 4 % of a core.
         """
-        since = time.monotonic() - self._read_at
-        if self.is_due(rested=since >= max(_EVERY_S, self._took_s / _SHARE)):
-            begun_s = time.thread_time()
+        age_s = time.monotonic() - self._read_at
+        if self.is_due(rested=age_s >= max(_EVERY_S, self._took_s / _SHARE)):
+            start_s = time.thread_time()
             self._document = {"evaluation": self._describe()}
-            self._took_s = time.thread_time() - begun_s
+            self._took_s = time.thread_time() - start_s
             self._read_at = time.monotonic()
         return self._document
 
@@ -90,59 +90,42 @@ class ResultsDocument:
             results = Results.load(self._out) if (self._out / FILE).is_file() else None
         state = self.state(results)
         cases = () if results is None else results.cases
-        contenders = [] if results is None else results.contenders
-        left_s = None
+
+        ends = None
         if results is not None and state == RUNNING:
+            now = time.time()
             run = results.runs[-1]
-            played = sum(one.run == run.run for case in cases for one in case.episodes)
+            played = sum(episode.run == run.run for episode in results.episodes)
             left = sum(_planned(case) - _done(case) for case in cases)
-            left_s = seconds_left(left, played, time.time() - run.started)
-        failed = [
-            (case, one)
-            for case in cases
-            for one in case.episodes
-            if not (one.beyond or one.result.success_once)
-        ]
-        failed.sort(key=lambda found: found[1].finished, reverse=True)
-        # The success rate at each step or version of a policy.
-        curves: dict[str, list[dict[str, Any]]] = {}
-        for contender in contenders:
-            mine = [case for case in cases if case.contender == contender]
-            if mine[0].step is not None:
-                whole = all(_done(case) == _planned(case) for case in mine)
-                point = {"step": mine[0].step, "whole": whole} | _rate(
-                    rate_of(mine, "success_once")
-                )
-                curves.setdefault(mine[0].policy, []).append(point)
+            left_s = seconds_left(left, played, now - run.started)
+            ends = None if left_s is None else now + left_s
+
+        unsolved: list[tuple[CaseResults, Episode]] = []
+        for case in cases:
+            for episode in case.episodes:
+                if not episode.beyond and not episode.result.success_once:
+                    unsolved.append((case, episode))
+        unsolved.sort(key=lambda failure: failure[1].finished, reverse=True)
+
         return {
             "name": self._out.name,
             "state": state,
             "reason": self.reason[:_TEXT],
-            "ends": None if left_s is None else time.time() + left_s,
+            "ends": ends,
             "goes_on": self.goes_on,
-            "contenders": contenders,
+            "contenders": [] if results is None else results.contenders,
             "tasks": list(dict.fromkeys(case.task for case in cases)),
             "done": sum(_done(case) for case in cases),
             "planned": sum(_planned(case) for case in cases),
-            "retries": sum(attempt.retried for case in cases for attempt in case.attempts),
-            "cases": [
-                {
-                    "policy": case.contender,
-                    "task": case.task,
-                    "done": _done(case),
-                    "planned": _planned(case),
-                }
-                | {"stopped": case.stopped_at is not None, "sequence": case.stop is not None}
-                | _rate(rate_of([case], "success_once"))
-                for case in cases
-            ],
-            "curves": [{"policy": policy, "points": points} for policy, points in curves.items()],
-            "failed": len(failed),
-            "failures": [self._failure(case, one) for case, one in failed[:_FAILURES]],
+            "retries": sum(_retries(case) for case in cases),
+            "cases": [_case(case) for case in cases],
+            "curves": [] if results is None else _curves(results),
+            "failed": len(unsolved),
+            "failures": [self._failure(case, episode) for case, episode in unsolved[:_FAILURES]],
         }
 
-    def _failure(self, case: CaseResults, one: Episode) -> dict[str, Any]:
-        result = one.result
+    def _failure(self, case: CaseResults, episode: Episode) -> dict[str, Any]:
+        result = episode.result
         return {
             "key": result.full_key,
             "policy": case.contender,
@@ -153,18 +136,52 @@ class ResultsDocument:
             "error": (result.error or "")[:_TEXT],
             "instruction": result.instruction[:_TEXT],
             "steps": result.steps,
-            "finished": one.finished,
-            "videos": [self._numbers.setdefault(video, len(self._numbers)) for video in one.videos],
+            "finished": episode.finished,
+            "videos": [self._number_of(video) for video in episode.videos],
         }
+
+    def _number_of(self, video: str) -> int:
+        """Return the number by which the page requests a video."""
+        return self._numbers.setdefault(video, len(self._numbers))
+
+
+def _case(case: CaseResults) -> dict[str, Any]:
+    return {
+        "policy": case.contender,
+        "task": case.task,
+        "done": _done(case),
+        "planned": _planned(case),
+        "stopped": case.stopped_at is not None,
+        "sequence": case.stop is not None,
+    } | _rate(rate_of([case], "success_once"))
+
+
+def _curves(results: Results) -> list[dict[str, Any]]:
+    """Return the success rates at each step or version of each policy that has any."""
+    points: dict[str, list[dict[str, Any]]] = {}  # by policy
+    for contender in results.contenders:
+        cases = results.of(contender)
+        policy, step = cases[0].policy, cases[0].step
+        if step is None:
+            continue
+        is_whole = all(_done(case) == _planned(case) for case in cases)
+        point = {"step": step, "whole": is_whole} | _rate(rate_of(cases, "success_once"))
+        points.setdefault(policy, []).append(point)
+    return [{"policy": policy, "points": its_points} for policy, its_points in points.items()]
 
 
 def _done(case: CaseResults) -> int:
     """Return the number of episodes with a result, those that infrastructure lost included."""
-    return sum(not one.beyond for one in case.episodes)
+    return sum(not episode.beyond for episode in case.episodes)
 
 
 def _planned(case: CaseResults) -> int:
+    """Return the number of episodes; of a case that stopped early, without those it spared."""
     return case.planned if case.stopped_at is None else _done(case)
+
+
+def _retries(case: CaseResults) -> int:
+    return sum(attempt.retried for attempt in case.attempts)
 
 
 def _rate(rate: Rate) -> dict[str, Any]:
@@ -205,6 +222,7 @@ class ProgressDocument(ResultsDocument, Progress):
         self._shown.stopped(case, at, spared)
 
     def end(self) -> None:
+        """Note that the evaluation has ended; the state is "waiting" if others follow."""
         if self.goes_on:
             self._change(WAITING)
         else:
@@ -217,15 +235,17 @@ class ProgressDocument(ResultsDocument, Progress):
             self._change(ENDED)
 
     def fail(self, reason: str) -> None:
+        """Note that an error stopped the evaluation."""
         self.reason = reason
         self._change(STOPPED)
 
     def is_due(self, *, rested: bool) -> bool:
-        final = self._changed and self._state in (ENDED, STOPPED)
-        due = final or (rested and (self._changed or self._state == RUNNING))
-        if due:
+        """Return whether to read the results: if anything changed, at once if it was the end."""
+        is_final = self._changed and self._state in (ENDED, STOPPED)
+        is_due = is_final or (rested and (self._changed or self._state == RUNNING))
+        if is_due:
             self._changed = False
-        return due
+        return is_due
 
     def state(self, results: Results | None) -> str:
         return super().state(results) if self._state == ENDED else self._state

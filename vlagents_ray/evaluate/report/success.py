@@ -49,63 +49,60 @@ class LearningCurve:
 
 
 def success_table(summary: Summary) -> SuccessTable:
+    """Return the table of success rates, with what a note below it has to say."""
     total = summary.total
-    parts = [part for name in summary.results.contenders for part in summary.parts(name).values()]
     return SuccessTable(
         list(_blocks(summary)),
-        len(summary.results.contenders) > 1,
-        None if total.success_once.bounds is None else total.stopped,
-        all(part.success_once.pooled for part in parts),
-        total.infra_failures > 0,
+        several=len(summary.results.contenders) > 1,
+        stopped=None if total.success_once.bounds is None else total.stopped,
+        pooled=summary.has_one_rate_each,
+        some_lost=total.infra_failures > 0,
     )
 
 
 def learning_curves(summary: Summary) -> list[LearningCurve]:
     """Return success over the training steps of each policy with several; empty if none has."""
-    return [
-        curve
-        for title, cases in _parts_with_a_rate(summary)
-        if (curve := _learning_curve(title, cases))
-    ]
+    curves = [_learning_curve(title, cases) for title, cases in _parts_with_a_rate(summary)]
+    return [curve for curve in curves if curve is not None]
 
 
 def _blocks(summary: Summary) -> Iterator[Block]:
     """Yield tasks in the order of the plan, the sum of each suite after its tasks, and last the
     sum of all.
     """
-    cases: dict[str, dict[str, list[Group]]] = {}
     order = {name: number for number, name in enumerate(summary.results.contenders)}
 
     def in_order(groups: list[Group]) -> list[Group]:
         return sorted(groups, key=lambda group: order[group.contender])
 
+    suites: dict[str, dict[str, list[Group]]] = {}  # the groups of each env of each suite
     for group in summary.cases:
-        cases.setdefault(group.suite, {}).setdefault(group.env, []).append(group)
-    for suite, envs in cases.items():
+        suites.setdefault(group.suite, {}).setdefault(group.env, []).append(group)
+
+    for suite, envs in suites.items():
         for env, groups in envs.items():
             yield Block(" ".join(filter(None, (suite, env))), in_order(groups))
-        if len(cases) > 1 and len(envs) > 1:
-            of_suite = [case for case in summary.results.cases if case.suite == suite]
-            yield Block(
-                f"all of {suite or 'the nameless suite'}",
-                in_order(_by_policy_id(of_suite, suite)),
-                is_sum=True,
-            )
+        if len(suites) > 1 and len(envs) > 1:
+            cases_of_suite = [case for case in summary.results.cases if case.suite == suite]
+            name = f"all of {suite or 'the nameless suite'}"
+            yield Block(name, in_order(_by_policy_id(cases_of_suite, suite)), is_sum=True)
+
     timings = by_timing(summary.results.cases)
-    for timing, found in timings.items():
-        suites = {case.suite for case in found}
-        envs_of_one = {case.env for case in found} if len(suites) == 1 else set()
-        if len(envs_of_one) == 1 or (envs_of_one and len(cases) > 1):
+    for timing, cases in timings.items():
+        is_one_suite = len({case.suite for case in cases}) == 1
+        is_one_task = is_one_suite and len({case.env for case in cases}) == 1
+        if is_one_task or (is_one_suite and len(suites) > 1):
             continue  # it is above, as the only row, or as the sum of its suite
         name = "all" if len(timings) == 1 else f"all {timing}"
-        yield Block(name, in_order(_by_policy_id(found, TOTAL)), is_sum=True)
+        yield Block(name, in_order(_by_policy_id(cases, TOTAL)), is_sum=True)
 
 
 def _by_policy_id(cases: Sequence[CaseResults], suite: str) -> list[Group]:
-    found: dict[str, list[CaseResults]] = {}
+    """Return the sum of the cases of each policy id."""
+    by_policy_id: dict[str, list[CaseResults]] = {}
     for case in cases:
-        found.setdefault(case.contender, []).append(case)
-    return [group_of((policy_id, suite, TOTAL), group) for policy_id, group in found.items()]
+        by_policy_id.setdefault(case.contender, []).append(case)
+    return [group_of((name, suite, TOTAL), members) for name, members in by_policy_id.items()]
 
 
 def _parts_with_a_rate(summary: Summary) -> Iterator[tuple[str, list[CaseResults]]]:
@@ -118,18 +115,24 @@ def _parts_with_a_rate(summary: Summary) -> Iterator[tuple[str, list[CaseResults
         suites: dict[str, list[CaseResults]] = {}
         for case in cases:
             suites.setdefault(case.suite, []).append(case)
-        if _all_have_rates(cases):
+
+        have_rates = _all_have_rates(cases)
+        if have_rates:
             yield f"Success over training{suffix}", cases
-        for suite, found in suites.items() if len(suites) > 1 or not _all_have_rates(cases) else ():
+            if len(suites) == 1:
+                continue  # the chart of the suite would be the same
+
+        for suite, members in suites.items():
             name = suite or "the nameless suite"
-            if _all_have_rates(found):
-                yield f"{name}{suffix}", found
+            if _all_have_rates(members):
+                yield f"{name}{suffix}", members
                 continue
-            for env in dict.fromkeys(case.env for case in found):
-                yield f"{name} {env}{suffix}", [case for case in found if case.env == env]
+            for env in dict.fromkeys(case.env for case in members):
+                yield f"{name} {env}{suffix}", [case for case in members if case.env == env]
 
 
 def _all_have_rates(cases: Sequence[CaseResults]) -> bool:
+    """Return whether each policy id has one rate over these cases."""
     return all(group.success_once.pooled for group in _by_policy_id(cases, ""))
 
 
@@ -144,30 +147,32 @@ def _learning_curve(title: str, cases: Sequence[CaseResults]) -> LearningCurve |
             without_steps.setdefault(case.policy, []).append(case)
         else:
             by_policy.setdefault(case.policy, {}).setdefault(case.step, []).append(case)
-    if not (swept := {policy: found for policy, found in by_policy.items() if len(found) > 1}):
+    swept = {policy: steps for policy, steps in by_policy.items() if len(steps) > 1}
+    if not swept:
         return None
-    lines = [
-        Series(
-            policy,
-            [(step, rate_of(group, "success_once")) for step, group in sorted(found.items())],
-        )
-        for policy, found in swept.items()
-    ]
-    first, last = (
-        min(min(found) for found in swept.values()),
-        max(max(found) for found in swept.values()),
-    )
+
+    curves = []
+    curve_rows: list[tuple[str, float | None, Rate]] = []
+    all_steps: set[int] = set()
+    for policy, steps in swept.items():
+        all_steps |= steps.keys()
+        points = [(step, rate_of(steps[step], "success_once")) for step in sorted(steps)]
+        curves.append(Series(policy, points))
+        curve_rows += [(policy, step, rate) for step, rate in points]
+
     levels = []
-    for policy, group in without_steps.items():
-        rate = rate_of(group, "success_once")
-        levels.append(Series(f"{policy} (no steps)", [(first, rate), (last, rate)], level=True))
-    rows: list[tuple[str, float | None, Rate]] = [
-        (line.name, None, line.points[0][1]) for line in levels
-    ]
-    rows += [(line.name, step, rate) for line in lines for step, rate in line.points]
-    pushed = all("pushed_weights" in case.settings for case in cases if case.step is not None)
-    of_axis = "version of the weights" if pushed else "training step"
-    return LearningCurve(rate_chart([*lines, *levels], of_axis, title), rows)
+    level_rows: list[tuple[str, float | None, Rate]] = []
+    first, last = min(all_steps), max(all_steps)
+    for policy, members in without_steps.items():
+        name = f"{policy} (no steps)"
+        rate = rate_of(members, "success_once")
+        levels.append(Series(name, [(first, rate), (last, rate)], level=True))
+        level_rows.append((name, None, rate))
+
+    is_pushed = all("pushed_weights" in case.settings for case in cases if case.step is not None)
+    x_label = "version of the weights" if is_pushed else "training step"
+    chart = rate_chart([*curves, *levels], x_label, title)
+    return LearningCurve(chart, level_rows + curve_rows)
 
 
 @dataclass(frozen=True, slots=True)
@@ -220,29 +225,38 @@ class Family:
 
 def families(summary: Summary, *, accept_changes: bool = False) -> list[Family]:
     """Compare all policy ids, apart for each timing; of very many pairs only the main ones."""
-    found = []
+    members = []
     for timing, cases in by_timing(summary.results.cases).items():
         results = summary.results.among(cases)
         of_timing = summarize(results)
-        every = list(itertools.combinations(results.contenders, 2))
-        wanted = every if len(every) <= MOST_COMPARED else _asked_first(of_timing, every)
-        pairs, reasons = comparable(results, wanted, accept_changes=accept_changes)
-        asked = _asked_first(of_timing, pairs)
-        ordered = [*asked, *(pair for pair in _later_first(results, pairs) if pair not in asked)]
-        # Whether a pair is the main one depends on the rates, so the adjustment is for all that
-        # could have been.
-        chosen_of = None if len(wanted) == len(every) else len(every)
-        compared = comparisons(results, ordered, chosen_of=chosen_of, accept_changes=accept_changes)
-        found.append(Family(timing, compared, len(asked), len(every) - len(wanted), reasons))
-    return found
+        all_pairs = list(itertools.combinations(results.contenders, 2))
+        candidates = all_pairs
+        chosen_of = None
+        if len(all_pairs) > MOST_COMPARED:
+            candidates = _main_pairs(of_timing, all_pairs)
+            # Whether a pair is a main one depends on the rates, so the adjustment is for all pairs
+            # that could have been main ones.
+            if len(candidates) < len(all_pairs):
+                chosen_of = len(all_pairs)
+
+        pairs, reasons = comparable(results, candidates, accept_changes=accept_changes)
+        main = _main_pairs(of_timing, pairs)
+        further = [pair for pair in _later_first(results, pairs) if pair not in main]
+        compared = comparisons(
+            results, main + further, chosen_of=chosen_of, accept_changes=accept_changes
+        )
+        left_out = len(all_pairs) - len(candidates)
+        members.append(Family(timing, compared, len(main), left_out, reasons))
+    return members
 
 
 def families_json(summary: Summary, *, accept_changes: bool = False) -> list[dict[str, Any]]:
     """Return the comparisons of the page for JSON, each with its timing."""
-    found = families(summary, accept_changes=accept_changes)
-    return [
-        one.to_json() | {"timing": family.timing} for family in found for one in family.comparisons
-    ]
+    entries = []
+    for family in families(summary, accept_changes=accept_changes):
+        for comparison in family.comparisons:
+            entries.append(comparison.to_json() | {"timing": family.timing})
+    return entries
 
 
 def compare_all(summary: Summary, *, accept_changes: bool = False) -> Comparisons | None:
@@ -250,51 +264,74 @@ def compare_all(summary: Summary, *, accept_changes: bool = False) -> Comparison
     if len(summary.results.contenders) < 2:
         return None
     parts: list[ComparisonPart] = []
-    found = families(summary, accept_changes=accept_changes)
-    for family in found:
+    reasons: list[str] = []
+    changes: list[Change] = []
+    left_out = 0
+    for family in families(summary, accept_changes=accept_changes):
         shown, folded = family.comparisons, family.comparisons[:0]
         if len(shown) > MOST_PAIRS:
             shown, folded = shown[: family.main], shown[family.main :]
-        by_suite = [[_difference(one, line) for line in one.suites] for one in shown if one.suites]
+        by_suite = []
+        for comparison in shown:
+            if comparison.suites:
+                by_suite.append([_difference(comparison, line) for line in comparison.suites])
         parts.append(ComparisonPart(family.timing, totals(shown), by_suite, totals(folded)))
-    changes = [change for family in found for one in family.comparisons for change in one.changes]
+
+        reasons += family.reasons
+        left_out += family.left_out
+        for comparison in family.comparisons:
+            changes += comparison.changes
+
     return Comparisons(
         parts,
-        sum(family.left_out for family in found),
-        len(found) > 1,
-        [reason for family in found for reason in family.reasons],
-        list(dict.fromkeys(changes)),
+        left_out,
+        several_timings=len(parts) > 1,
+        reasons=reasons,
+        changes=list(dict.fromkeys(changes)),
     )
 
 
-def totals(found: Sequence[Comparison]) -> list[Difference]:
-    return [_difference(one, one.total) for one in found]
+def totals(comparisons: Sequence[Comparison]) -> list[Difference]:
+    """Return the total of each comparison, as a row of a table."""
+    return [_difference(comparison, comparison.total) for comparison in comparisons]
 
 
-def _difference(one: Comparison, line: Line) -> Difference:
-    decided = line.adjusted < ERROR_RATE
-    return Difference(one.a, one.b, line.suite, line.pairs, line.interval, line.adjusted, decided)
+def _difference(comparison: Comparison, line: Line) -> Difference:
+    return Difference(
+        comparison.a,
+        comparison.b,
+        line.suite,
+        line.pairs,
+        line.interval,
+        line.adjusted,
+        decided=line.adjusted < ERROR_RATE,
+    )
 
 
-def _asked_first(summary: Summary, pairs: Sequence[tuple[str, str]]) -> list[tuple[str, str]]:
+def _main_pairs(summary: Summary, pairs: Sequence[tuple[str, str]]) -> list[tuple[str, str]]:
     """Return each checkpoint with the one before it, and the best of all with the best of each
-    other policy.
+    other policy; only those among `pairs`.
     """
-    cases = {case.contender: (case.policy, case.step) for case in summary.results.cases}
-    known = dict.fromkeys(_later_first(summary.results, pairs))
-    asked = [
-        (b, a)
-        for a, b in itertools.pairwise(summary.results.contenders)
-        if cases[a][0] == cases[b][0] and cases[a][1] is not None
-    ]  # the checkpoints of a policy are in the order of their steps
-    leaders: dict[str, str] = {}
+    policies: dict[str, str] = {}  # by policy id
+    steps: dict[str, int | None] = {}
+    for case in summary.results.cases:
+        policies[case.contender] = case.policy
+        steps[case.contender] = case.step
+
+    main = []
+    # The checkpoints of a policy are in the order of their steps.
+    for earlier, later in itertools.pairwise(summary.results.contenders):
+        if policies[earlier] == policies[later] and steps[earlier] is not None:
+            main.append((later, earlier))
+
+    best_of_policy: dict[str, str] = {}
     for name in summary.best:
-        leaders.setdefault(cases[name][0], name)
+        best_of_policy.setdefault(policies[name], name)
     best = summary.best[0]
-    asked += [
-        pair for pair in known if best in pair and all(one in leaders.values() for one in pair)
-    ]
-    return [pair for pair in dict.fromkeys(asked) if pair in known]
+    leaders = set(best_of_policy.values())
+    available = dict.fromkeys(_later_first(summary.results, pairs))
+    main += [pair for pair in available if best in pair and leaders.issuperset(pair)]
+    return [pair for pair in dict.fromkeys(main) if pair in available]
 
 
 def _later_first(results: Results, pairs: Sequence[tuple[str, str]]) -> list[tuple[str, str]]:

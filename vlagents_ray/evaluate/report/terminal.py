@@ -31,7 +31,7 @@ from vlagents_ray.evaluate.results.summary import (
 )
 
 LINE_EVERY_S = 5.0
-MOST_ROWS = 12
+MOST_ROWS = 12  # of the table of a running evaluation
 
 
 class Progress:
@@ -87,31 +87,36 @@ class _CountedProgress(Progress):
         _CountedProgress.begin(self, [], {}, 0)
 
     def begin(self, cases: Sequence[EvalCase], recorded: Mapping[str, Rate], left: int) -> None:
+        """Start the counts from the rates of earlier runs."""
         self._started = monotonic()
         self._cases = {case.fingerprint: case for case in cases}
-        self._rates = {case: recorded.get(case, Rate(0, 0)) for case in self._cases}
+        # These two by the case's fingerprint:
+        self._rates = {case_id: recorded.get(case_id, Rate(0, 0)) for case_id in self._cases}
         self._infra_failed = dict.fromkeys(self._cases, 0)
         self._steps = 0
         self._played = 0  # in this run
         self._left = left
         self._retries = 0
         self._causes: set[tuple[str, str]] = set()  # (policy id, cause) of errors that were shown
-        self._alone = len({case.contender for case in cases}) == 1
+        self._is_one_policy = len({case.contender for case in cases}) == 1
 
     def episode(self, case: EvalCase, result: EpisodeResult) -> None:
+        """Count an episode; print an error of the policy if its cause is new."""
         self._played += 1
         self._left -= 1
         self._steps += result.steps
         if result.status == "infra_failed":
             self._infra_failed[case.fingerprint] += 1
             return
+
         before = self._rates[case.fingerprint]
-        successes, episodes = before.successes + bool(result.success_once), before.episodes + 1
-        error_rate = before.error_rate  # of a case that may stop early
-        bounds = (
-            None if error_rate is None else confidence_sequence(successes, episodes, error_rate)
-        )
-        self._rates[case.fingerprint] = Rate(successes, episodes, bounds, error_rate)
+        successes = before.successes + bool(result.success_once)
+        episodes = before.episodes + 1
+        bounds = None
+        if before.error_rate is not None:  # the case may stop early
+            bounds = confidence_sequence(successes, episodes, before.error_rate)
+        self._rates[case.fingerprint] = Rate(successes, episodes, bounds, before.error_rate)
+
         if result.status == "policy_error":
             error = (result.error or "").strip().partition("\n")[0]
             cause = case.contender, cause_of(error)
@@ -121,12 +126,14 @@ class _CountedProgress(Progress):
                 self._print(f"{where}, counted as no success: {error}")
 
     def retry(self, job: Job, failure: Failure) -> None:
+        """Print why an attempt failed."""
         self._retries += 1
         first_line = failure.message.strip().partition("\n")[0]
         attempt = f"{job.key.env} episode {job.key.episode}: attempt {job.attempt}"
         self._print(f"{attempt} failed, trying again: {first_line}")
 
     def stopped(self, case: EvalCase, at: int, spared: int) -> None:
+        """Print after how many episodes the case stopped."""
         self._left -= spared
         name = " ".join(filter(None, case.name))
         self._print(f"{name}: certain enough, stopped after {at} of {case.planned} episodes")
@@ -140,17 +147,16 @@ class _CountedProgress(Progress):
         """Return (name, "done/planned", success so far), of many cases only for those being
         played.
         """
-        done = {case: self._rates[case].episodes + self._infra_failed[case] for case in self._cases}
-        cases = list(self._cases)
-        if len(cases) > MOST_ROWS:
-            cases = [case for case in cases if 0 < done[case] < self._cases[case].planned][
-                :MOST_ROWS
-            ]
-        rows = []
-        for case in cases:
-            # Of one policy, without its id.
-            name = " ".join(filter(None, self._cases[case].name[self._alone :]))
-            rows.append((name, f"{done[case]}/{self._cases[case].planned}", str(self._rates[case])))
+        show_all = len(self._cases) <= MOST_ROWS
+        rows: list[tuple[str, str, str]] = []
+        for case_id, case in self._cases.items():
+            rate = self._rates[case_id]
+            done = rate.episodes + self._infra_failed[case_id]
+            is_being_played = 0 < done < case.planned
+            if len(rows) < MOST_ROWS and (show_all or is_being_played):
+                contender, suite, env = case.name
+                names = (suite, env) if self._is_one_policy else (contender, suite, env)
+                rows.append((" ".join(filter(None, names)), f"{done}/{case.planned}", str(rate)))
         return rows
 
     def _overall(self) -> str:
@@ -158,12 +164,12 @@ class _CountedProgress(Progress):
         parts = ["waiting for the first episode"]
         if self._played:
             parts = [f"{self._steps / elapsed_s:.0f} steps/s"]
-            if (left_s := seconds_left(self._left, self._played, elapsed_s)) is not None:
+            left_s = seconds_left(self._left, self._played, elapsed_s)
+            if left_s is not None:
                 parts.append(f"{datetime.timedelta(seconds=round(left_s))} left")
         if self._retries:
-            parts.append(
-                f"{self._retries} infrastructure {'retry' if self._retries == 1 else 'retries'}"
-            )
+            noun = "retry" if self._retries == 1 else "retries"
+            parts.append(f"{self._retries} infrastructure {noun}")
         if any(self._infra_failed.values()):
             parts.append(f"{sum(self._infra_failed.values())} infrastructure failures")
         return " · ".join(parts)
@@ -231,12 +237,14 @@ def results_table(summary: Summary) -> Table:
     """Make a table of success, length and speed: for each policy id a row for each env, and one
     for all together.
     """
-    names, error_rate = summary.results.contenders, summary.total.success_once.error_rate
+    names = summary.results.contenders
     interval = "the Wilson 95 % interval"
+    error_rate = summary.total.success_once.error_rate
     if error_rate is not None:
         interval = f"the confidence sequence of early stopping (error rate {error_rate:.2g})"
     title = f"{', '.join(names)}: success in %, with {interval}"
     table = Table(title=title, box=SIMPLE_HEAD, padding=0, pad_edge=False)
+
     if len(names) > 1:
         table.add_column("policy", overflow="fold")
     table.add_column("env", overflow="fold")
@@ -244,16 +252,18 @@ def results_table(summary: Summary) -> Table:
     rates = ("once", "once with lost", "at end") if some_lost else ("once", "at end")
     for title in ("episodes", *rates, "steps", "policy ms", "env ms"):
         table.add_column(title, justify="right", no_wrap=True)
+
     for name, total in zip(names, summary.totals, strict=True):
-        groups = [(group, "") for group in summary.cases if group.contender == name]
-        parts = summary.parts(name)
-        totals = (
-            [(total, "")] if len(parts) == 1 else [(part, timing) for timing, part in parts.items()]
-        )
-        for group, timing in [*groups, *totals] if len(groups) > 1 else groups:
-            table.add_row(
-                *([name] if len(names) > 1 else []), *_cells(group, timing, some_lost=some_lost)
-            )
+        rows = [(group, "") for group in summary.cases if group.contender == name]
+        if len(rows) > 1:
+            parts = summary.parts(name)
+            if len(parts) == 1:
+                rows.append((total, ""))
+            else:
+                rows += [(part, timing) for timing, part in parts.items()]
+        for group, timing in rows:
+            cells = _cells(group, timing, some_lost=some_lost)
+            table.add_row(*([name, *cells] if len(names) > 1 else cells))
         table.add_section()
     return table
 
@@ -265,20 +275,41 @@ def print_summary(console: Console, summary: Summary) -> None:
         console: The console.
         summary: The result of `evaluate`.
     """
-    from vlagents_ray.evaluate.report.page import FILE  # late: Jinja is needed when all is played
+    # Imported late, as Jinja is not needed before all is played.
+    from vlagents_ray.evaluate.report.page import FILE
 
     console.print(results_table(summary))
-    total = summary.total
-    if total.policy_errors:
-        table = Table(title="Errors of policies", box=SIMPLE_HEAD, padding=0, pad_edge=False)
-        for title in ("policy", "env", "error"):
-            table.add_column(title, overflow="fold")
-        table.add_column("episodes", justify="right", no_wrap=True)
-        for (policy, task, error), number in errors_of_policies(summary.results):
-            table.add_row(policy, task, Text(error.strip().partition("\n")[0]), str(number))
-        console.print(table)
+    if summary.total.policy_errors:
+        console.print(_errors_table(summary))
+
+    lines = [*_speed(summary), *_losses(summary)]
+    lines += [f"accepted change: {change}" for change in summary.results.accepted_changes]
+    lines += [*_pushed_weights(summary), *_early_stops(summary), *_clock_gaps(summary)]
+    if summary.state == RUNNING:
+        lines.append("still running")
+    elif summary.state != "complete":
+        lines.append(f"{summary.state}: go on with --resume")
+
+    lines.append(f"results: {summary.out}")
+    written = {"report": summary.out / FILE, "videos": summary.out / "videos"}
+    lines += [f"{name}: {path}" for name, path in written.items() if path.exists()]
+    for line in lines:
+        console.print(line, markup=False, highlight=False, soft_wrap=True)
+
+
+def _errors_table(summary: Summary) -> Table:
+    table = Table(title="Errors of policies", box=SIMPLE_HEAD, padding=0, pad_edge=False)
+    for title in ("policy", "env", "error"):
+        table.add_column(title, overflow="fold")
+    table.add_column("episodes", justify="right", no_wrap=True)
+    for (policy, task, error), number in errors_of_policies(summary.results):
+        table.add_row(policy, task, Text(error.strip().partition("\n")[0]), str(number))
+    return table
+
+
+def _speed(summary: Summary) -> list[str]:
+    lines = [f"{summary.total.steps} steps in {summary.wall_seconds:.1f} s"]
     speed = summary.rollout_steps_per_second
-    lines = [f"{total.steps} steps in {summary.wall_seconds:.1f} s"]
     if speed is not None:
         lines[0] += f", {speed:.1f} a second once the workers had started"
     if summary.env_busy is not None and summary.policy_busy is not None:
@@ -286,6 +317,13 @@ def print_summary(console: Console, summary: Summary) -> None:
             f"envs busy for {summary.env_busy:.0%} of the workers' time, "
             f"the policy for {summary.policy_busy:.0%} of one replica's"
         )
+    return lines
+
+
+def _losses(summary: Summary) -> list[str]:
+    """Return the lines about episodes and attempts that errors ended."""
+    total = summary.total
+    lines = []
     if total.policy_errors:
         lines.append(
             f"{total.policy_errors} episodes ended by an error of the policy; they count as no "
@@ -301,66 +339,77 @@ def print_summary(console: Console, summary: Summary) -> None:
         lines.append(
             "once with lost: the bounds if all lost episodes had failed, or had been solved"
         )
-    lines += [f"accepted change: {change}" for change in summary.results.accepted_changes]
-    pushed = {
-        case.contender: words
-        for case in summary.results.cases
-        if (words := pushed_of(case)) is not None
-    }
-    lines += [f"{name}: weights pushed by a learner, {words}" for name, words in pushed.items()]
-    for one in (group for group in summary.cases if group.stopped):
-        name, error_rate = (
-            " ".join(filter(None, (one.contender, one.suite, one.env))),
-            one.success_once.error_rate or 0,
-        )
-        lines.append(
-            f"{name}: stopped after {one.episodes} of {one.planned} (error rate "
-            f"{100 * error_rate:.2g} %)"
-        )
-    parts = [part for name in summary.results.contenders for part in summary.parts(name).values()]
-    if not all(part.success_once.pooled for part in parts):
+    return lines
+
+
+def _pushed_weights(summary: Summary) -> list[str]:
+    weights: dict[str, str] = {}  # by policy id
+    for case in summary.results.cases:
+        versions = pushed_of(case)
+        if versions is not None:
+            weights[case.contender] = versions
+    return [
+        f"{name}: weights pushed by a learner, {versions}" for name, versions in weights.items()
+    ]
+
+
+def _early_stops(summary: Summary) -> list[str]:
+    lines = []
+    for group in summary.cases:
+        if group.stopped:
+            name = " ".join(filter(None, (group.contender, group.suite, group.env)))
+            error_rate = group.success_once.error_rate or 0
+            lines.append(
+                f"{name}: stopped after {group.episodes} of {group.planned} (error rate "
+                f"{100 * error_rate:.2g} %)"
+            )
+    if not summary.has_one_rate_each:
         lines.append(
             "cases that stopped after different numbers of episodes have no rate in common: quote "
             "each alone"
         )
-    for gap in clock_gaps(summary.results):  # as in the report, on the episodes of both clocks
-        counted = [one for case in gap.cases for one in case.counted]
-        # 0 if the policy failed before the first step of each.
-        steps = max(1, sum(one.steps for one in counted))
-        waited, held = (
-            sum(getattr(one, what) for one in counted) for what in ("ticks_waited", "ticks_held")
-        )
+    return lines
+
+
+def _clock_gaps(summary: Summary) -> list[str]:
+    """Return a line for each gap of the report, on the episodes of both clocks."""
+    lines = []
+    for gap in clock_gaps(summary.results):
+        counted: list[EpisodeResult] = []
+        for case in gap.cases:
+            counted += case.counted
+        # The number of steps is 0 if the policy failed before the first step of each episode.
+        steps = max(1, sum(result.steps for result in counted))
+        waited = sum(result.ticks_waited for result in counted) / steps
+        without_row = sum(result.ticks_held for result in counted) / steps
         low, high = gap.total.interval
         lines.append(
             f"{gap.a}: {100 * (gap.total.pairs.difference or 0):+.1f} points to the synchronous "
-            "score "
-            f"({100 * low:+.1f} to {100 * high:+.1f}, {gap.total.pairs.total} pairs); "
-            f"{waited / steps:.0%} of its ticks waited for an answer, {held / steps:.0%} with "
-            "nothing to execute"
+            f"score ({100 * low:+.1f} to {100 * high:+.1f}, {gap.total.pairs.total} pairs); "
+            f"{waited:.0%} of its ticks waited for an answer, {without_row:.0%} with nothing to "
+            "execute"
         )
-    if summary.state != "complete":
-        lines.append(
-            "still running" if summary.state == RUNNING else f"{summary.state}: go on with --resume"
-        )
-    lines.append(f"results: {summary.out}")
-    written = {"report": summary.out / FILE, "videos": summary.out / "videos"}
-    lines += [f"{name}: {path}" for name, path in written.items() if path.exists()]
-    for line in lines:
-        console.print(line, markup=False, highlight=False, soft_wrap=True)
+    return lines
 
 
 def _cells(group: Group, timing: str, *, some_lost: bool) -> list[str]:
-    bounds = group.with_lost(group.success_once)
-    return [
+    """Return the cells of a row, from the column "env" on."""
+    cells = [
         " ".join(filter(None, (group.suite, group.env, timing))),
         f"{group.episodes}/{group.planned}",
         str(group.success_once),
-        *(
-            ["-" if bounds is None else f"{100 * bounds[0]:.0f} to {100 * bounds[1]:.0f}%"]
-            if some_lost
-            else []
-        ),
-        "-" if group.success_at_end.rate is None else f"{group.success_at_end.rate:.0%}",
+    ]
+    if some_lost:
+        bounds = group.with_lost(group.success_once)
+        if bounds is None:
+            cells.append("-")
+        else:
+            low, high = bounds
+            cells.append(f"{100 * low:.0f} to {100 * high:.0f}%")
+    at_end = group.success_at_end.rate
+    return [
+        *cells,
+        "-" if at_end is None else f"{at_end:.0%}",
         _number(group.mean_steps),
         _number(group.policy_ms, 2),
         _number(group.env_step_ms, 2),

@@ -15,8 +15,7 @@ _OF_CHECKPOINT = {"checkpoint", "checkpoint_step"}  # settings that the identity
 _SWEPT = "checkpoint: "  # prefix of a file that each step of a sweep has
 _DIGITS = 12  # of a digest that a person reads
 MIX = (
-    "bring the old files back, give a new folder (--out), or mix both and have the report say "
-    "so "
+    "bring the old files back, give a new folder (--out), or mix both and have the report say so "
     "(--accept-changes)"
 )
 
@@ -56,7 +55,7 @@ class Change:
 
 def listed(changes: Sequence[Change]) -> str:
     """Return a line for each change, for an error."""
-    return "\n".join(f"- {one}" for one in changes)
+    return "\n".join(f"- {change}" for change in changes)
 
 
 def program_changes(
@@ -76,17 +75,20 @@ def env_changes(env: str, was: EnvStatement, now: EnvStatement) -> list[Change]:
     changes: list[Change] = []
     for kind in EnvStatement._fields:
         before, after = getattr(was, kind), getattr(now, kind)
-        if not before or not after:
-            continue
-        names = sorted(
-            name for name in before.keys() | after.keys() if before.get(name) != after.get(name)
-        )
-        changes += [
-            Change(
-                f"env {env}", f"its {kind} {name!r}", repr(before.get(name)), repr(after.get(name))
-            )
-            for name in names
-        ]
+        if before and after:
+            changes += _changed_values(f"env {env}", f"its {kind}", before, after)
+    return changes
+
+
+def _changed_values(
+    subject: str, of: str, before: Mapping[str, Any], after: Mapping[str, Any]
+) -> list[Change]:
+    """Compare two mappings by name; a change is called "`of` 'NAME'"."""
+    changes = []
+    for name in sorted(before.keys() | after.keys()):
+        was, now = before.get(name), after.get(name)
+        if was != now:
+            changes.append(Change(subject, f"{of} {name!r}", repr(was), repr(now)))
     return changes
 
 
@@ -99,8 +101,11 @@ def changed(known: Mapping[str, Any], now: Mapping[str, Any], *, swept: bool) ->
     for field in IDENTITY[: 1 if swept else 2]:
         if known.get(field) != now.get(field):
             return field
-    found = policy_changes("", known, now, swept=swept)
-    return None if not found else "weights" if found[-1].name == "weights" else "program"
+
+    changes = policy_changes("", known, now, swept=swept)
+    if not changes:
+        return None
+    return "weights" if changes[-1].name == "weights" else "program"
 
 
 def policy_changes(
@@ -109,14 +114,16 @@ def policy_changes(
     """Compare files, settings and weights that two metadata of a policy's server state; the
     weights come last.
     """
-    found = program_changes(
+    changes = program_changes(
         subject, policy_program(known, swept=swept), policy_program(now, swept=swept)
     )
-    found += _settings_changes(subject, known, now)
-    before, after = ((metadata.get("weights") or {}).get("digest") for metadata in (known, now))
+    changes += _settings_changes(subject, known, now)
+
+    before = (known.get("weights") or {}).get("digest")
+    after = (now.get("weights") or {}).get("digest")
     if not swept and before and after and before != after:
-        found.append(Change(subject, "weights", before, after))
-    return found
+        changes.append(Change(subject, "weights", before, after))
+    return changes
 
 
 def _settings_changes(
@@ -126,12 +133,10 @@ def _settings_changes(
     changes: list[Change] = []
     before, after = known.get("config"), now.get("config")
     if before is not None and after is not None:
-        names = sorted((before.keys() | after.keys()) - _OF_CHECKPOINT)
-        changes += [
-            Change(subject, f"its setting {name!r}", repr(before.get(name)), repr(after.get(name)))
-            for name in names
-            if before.get(name) != after.get(name)
-        ]
+        before = {name: value for name, value in before.items() if name not in _OF_CHECKPOINT}
+        after = {name: value for name, value in after.items() if name not in _OF_CHECKPOINT}
+        changes += _changed_values(subject, "its setting", before, after)
+
     before, after = known.get("wrappers"), now.get("wrappers")
     if before is not None and after is not None and before != after:
         changes.append(Change(subject, "its wrappers", canonical(before), canonical(after)))
@@ -139,11 +144,15 @@ def _settings_changes(
 
 
 def policy_program(metadata: Mapping[str, Any], *, swept: bool) -> dict[str, str] | None:
-    if (program := metadata.get("program")) is None:
+    """Return the digests of a policy's files by name, in a sweep without those of its checkpoint;
+    None if its server reports none.
+    """
+    program = metadata.get("program")
+    if program is None:
         return None
-    return {
-        name: value for name, value in program.items() if not (swept and name.startswith(_SWEPT))
-    }
+    if not swept:
+        return dict(program)
+    return {name: digest for name, digest in program.items() if not name.startswith(_SWEPT)}
 
 
 def program_id(program: Mapping[str, str] | None) -> str | None:

@@ -44,44 +44,51 @@ def combined(folders: Sequence[Results]) -> Results:
     require_distinct(results.out for results in folders)
     _require_different_evaluations(folders)
     clashing = _clashing_policies(folders)
+
     homes = [results.out.resolve() for results in folders]
     base = Path(os.path.commonpath(homes))
+    # The names of the folders or, if some are the same, their paths under `base`.
+    labels = [home.name for home in homes]
+    if len(set(labels)) < len(labels):
+        labels = [str(home.relative_to(base)) for home in homes]
+
     cases: list[CaseResults] = []
     runs: list[Run] = []
     policies: dict[str, dict[str, Any]] = {}
     workers: list[Worker] = []
-    # The folders' last parts or, if some are the same, their paths under `base`.
-    labels = [home.name for home in homes]
-    if len(set(labels)) < len(labels):
-        labels = [str(home.relative_to(base)) for home in homes]
     for results, home, label in zip(folders, homes, labels, strict=True):
-        names = {}
+        new_names = {}
         for case in results.cases:
-            names[case.policy] = (
-                f"{case.policy} ({label})" if case.policy in clashing else case.policy
-            )
+            clashes = case.policy in clashing
+            new_names[case.policy] = f"{case.policy} ({label})" if clashes else case.policy
+
         earlier_runs = len(runs)
         prefix = home.relative_to(base)
         for case in results.cases:
-            episodes = []
-            for episode in case.episodes:
-                videos = tuple(str(prefix / video) for video in episode.videos)
-                episodes.append(replace(episode, run=episode.run + earlier_runs, videos=videos))
-            attempts = [
-                replace(attempt, run=attempt.run + earlier_runs) for attempt in case.attempts
-            ]
-            renamed = names[case.policy]
-            cases.append(
-                replace(case, policy=renamed, episodes=tuple(episodes), attempts=tuple(attempts))
-            )
-        for policy, of_server in results.policies.items():
-            policies[names.get(policy, policy)] = of_server
+            moved = _moved(case, prefix, earlier_runs)
+            cases.append(replace(moved, policy=new_names[case.policy]))
+
+        for policy, metadata in results.policies.items():
+            policies[new_names.get(policy, policy)] = metadata
         for worker in results.workers:
-            renamed = names.get(worker.policy, worker.policy)
-            workers.append(replace(worker, policy=renamed, run=worker.run + earlier_runs))
+            policy = new_names.get(worker.policy, worker.policy)
+            workers.append(replace(worker, policy=policy, run=worker.run + earlier_runs))
         runs += [replace(run, run=run.run + earlier_runs) for run in results.runs]
-    parts = tuple(sorted(homes, reverse=True))  # subfolders before their parents
-    return Results(base, tuple(cases), tuple(runs), policies, tuple(workers), parts)
+
+    subfolders_first = tuple(sorted(homes, reverse=True))
+    return Results(base, tuple(cases), tuple(runs), policies, tuple(workers), subfolders_first)
+
+
+def _moved(case: CaseResults, prefix: Path, earlier_runs: int) -> CaseResults:
+    """Return the case with its videos below `prefix`, and its runs counted after
+    `earlier_runs`.
+    """
+    episodes = []
+    for episode in case.episodes:
+        videos = tuple(str(prefix / video) for video in episode.videos)
+        episodes.append(replace(episode, run=episode.run + earlier_runs, videos=videos))
+    attempts = [replace(attempt, run=attempt.run + earlier_runs) for attempt in case.attempts]
+    return replace(case, episodes=tuple(episodes), attempts=tuple(attempts))
 
 
 def _require_different_evaluations(folders: Sequence[Results]) -> None:
@@ -89,14 +96,13 @@ def _require_different_evaluations(folders: Sequence[Results]) -> None:
     first_folders: dict[str, Path] = {}
     for results in folders:
         for case in results.cases:
-            if (first := first_folders.setdefault(case.case_id, results.out)) is not results.out:
+            first = first_folders.setdefault(case.case_id, results.out)
+            if first is not results.out:
                 raise ConfigError(
                     f"report: {first} and {results.out} both have {case.contender!r} in "
-                    f"{case.env!r} with the same "
-                    "settings; put parts of one evaluation into one folder first: `vlagents-ray "
-                    f"merge {first} "
-                    f"{results.out} --out OUT`, with --accept-changes if code or weights changed "
-                    "between them"
+                    f"{case.env!r} with the same settings; put parts of one evaluation into one "
+                    f"folder first: `vlagents-ray merge {first} {results.out} --out OUT`, with "
+                    "--accept-changes if code or weights changed between them"
                 )
 
 
@@ -104,26 +110,27 @@ def _clashing_policies(folders: Sequence[Results]) -> set[str]:
     """Return the policies that are not the same in all folders, or are in one env more than
     once.
     """
-    all_cases = [case for results in folders for case in results.cases]
+    all_cases: list[CaseResults] = []
+    for results in folders:
+        all_cases += results.cases
     counts = Counter((case.contender, case.suite, case.env) for case in all_cases)
     clashing = {
         case.policy for case in all_cases if counts[case.contender, case.suite, case.env] > 1
     }
-    weights_by_checkpoint: dict[tuple[str, str | None], str] = {}  # by policy id and checkpoint
+
+    known_weights: dict[tuple[str, str | None], str] = {}  # by policy id and checkpoint
     for case in all_cases:
         weights, checkpoint = stated(case, "weights"), stated(case, "checkpoint")
-        if (
-            weights is not None
-            and weights_by_checkpoint.setdefault((case.contender, checkpoint), weights) != weights
-        ):
+        if weights is None:
+            continue
+        if known_weights.setdefault((case.contender, checkpoint), weights) != weights:
             clashing.add(case.policy)
+
     swept = {case.policy for case in all_cases if case.step is not None}
-    metadata: dict[str, dict[str, Any]] = {}  # of the first folder with the policy
+    first_metadata: dict[str, dict[str, Any]] = {}  # of the first folder with the policy
     for results in folders:
-        for name, of_server in results.policies.items():
-            if (
-                changed(metadata.setdefault(name, of_server), of_server, swept=name in swept)
-                is not None
-            ):
+        for name, metadata in results.policies.items():
+            first = first_metadata.setdefault(name, metadata)
+            if changed(first, metadata, swept=name in swept) is not None:
                 clashing.add(name)
     return clashing

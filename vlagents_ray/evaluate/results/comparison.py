@@ -5,6 +5,7 @@ counterpart.
 from __future__ import annotations
 
 import itertools
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
@@ -21,8 +22,7 @@ from vlagents_ray.evaluate.results.reader import CaseResults, Results, by_timing
 from vlagents_ray.evaluate.results.statistics import Pairs, difference_interval, holm
 from vlagents_ray.naming import did_you_mean
 
-# The policy's settings among a case's, in which compared cases may differ. All others are the
-# env's.
+# The settings of the policy, in which compared cases may differ; all others are the env's.
 OF_POLICY = frozenset(
     {
         "policy",
@@ -62,8 +62,8 @@ class Line:
 
     def to_json(self) -> dict[str, Any]:
         """Return the fields for JSON."""
-        beside = {"interval_95": list(self.interval), "p_holm": self.adjusted}
-        return {"suite": self.suite} | self.pairs.to_json() | beside
+        test = {"interval_95": list(self.interval), "p_holm": self.adjusted}
+        return {"suite": self.suite} | self.pairs.to_json() | test
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,7 +77,7 @@ class Comparison:
     # One for each suite, in the order of the plan; empty if they share only one.
     suites: tuple[Line, ...]
     total: Line
-    cases: tuple[CaseResults, ...] = ()  # of `clock_gaps`: the cases in real time
+    cases: tuple[CaseResults, ...] = ()  # the cases in real time; only of `clock_gaps`
     changes: tuple[Change, ...] = ()  # accepted differences between the two environments
 
     def to_json(self) -> dict[str, Any]:
@@ -87,7 +87,7 @@ class Comparison:
             "a": self.a,
             "b": self.b,
             "lines": lines,
-            "accepted_changes": [asdict(one) for one in self.changes],
+            "accepted_changes": [asdict(change) for change in self.changes],
         }
 
 
@@ -125,7 +125,7 @@ def compare(
 
 def comparisons(
     results: Results,
-    which: Sequence[tuple[str, str]],
+    policy_pairs: Sequence[tuple[str, str]],
     *,
     chosen_of: int | None = None,
     accept_changes: bool = False,
@@ -133,51 +133,72 @@ def comparisons(
     """Return `compare` for each of these pairs of policy ids, with p-values adjusted for one
     another.
 
-    Those of one suite are one family for Holm's method, and those of all suites together another.
+    The comparisons on one suite are one family for Holm's method, and those on all suites together
+    another.
 
     Args:
+        results: Results that hold all of them.
+        policy_pairs: The pairs of policy ids.
         chosen_of: The number of all pairs, if these were chosen among them by their outcomes: the
             p-values are then adjusted for all.
+        accept_changes: As for `compare`.
     """
-    not_shown = max(0, (chosen_of or 0) - len(which))
-    shared = [_shared(results, a, b, accept_changes=accept_changes) for a, b in which]
-    found = [suites for suites, _ in shared]
-    together = [
-        [pairs for strata in suites.values() for pairs in strata.values()] for suites in found
-    ]
-    totals = _lines(ALL, together, not_shown)
-    lines: list[list[Line]] = [[] for _ in which]
-    for suite in dict.fromkeys(suite for suites in found for suite in suites):
-        having = [
-            index for index, suites in enumerate(found) if suite in suites and len(suites) > 1
-        ]
-        family = _lines(suite, [list(found[index][suite].values()) for index in having], not_shown)
-        for index, line in zip(having, family, strict=True):
+    not_shown = max(0, (chosen_of or 0) - len(policy_pairs))
+    suites_of_pairs: list[dict[str, Strata]] = []
+    changes_of_pairs: list[list[Change]] = []
+    for a, b in policy_pairs:
+        suites, changes = _shared(results, a, b, accept_changes=accept_changes)
+        suites_of_pairs.append(suites)
+        changes_of_pairs.append(changes)
+
+    strata_of_pairs: list[list[Pairs]] = []
+    names: dict[str, None] = {}  # of all suites
+    for suites in suites_of_pairs:
+        names |= dict.fromkeys(suites)
+        strata_of_pairs.append([])
+        for strata in suites.values():
+            strata_of_pairs[-1] += strata.values()
+    totals = _lines(ALL, strata_of_pairs, not_shown)
+
+    # A pair that shares a single suite has no line for it: it would repeat the total.
+    lines: list[list[Line]] = [[] for _ in policy_pairs]
+    for name in names:
+        members = []  # indices of the pairs that have a line for this suite
+        strata_of_members = []
+        for index, suites in enumerate(suites_of_pairs):
+            if name in suites and len(suites) > 1:
+                members.append(index)
+                strata_of_members.append(list(suites[name].values()))
+        family = _lines(name, strata_of_members, not_shown)
+        for index, line in zip(members, family, strict=True):
             lines[index].append(line)
+
     return [
-        Comparison(a, b, tuple(lines[i]), totals[i], changes=tuple(shared[i][1]))
-        for i, (a, b) in enumerate(which)
+        Comparison(a, b, tuple(lines[i]), totals[i], changes=tuple(changes_of_pairs[i]))
+        for i, (a, b) in enumerate(policy_pairs)
     ]
 
 
 def comparable(
     results: Results,
-    which: Sequence[tuple[str, str]] | None = None,
+    policy_pairs: Sequence[tuple[str, str]] | None = None,
     *,
     accept_changes: bool = False,
 ) -> tuple[list[tuple[str, str]], list[str]]:
-    """Return the pairs of policy ids that `compare` accepts, and the reason for each refused
-    one; by default of all.
+    """Return the pairs of policy ids that `compare` accepts, and for each other pair the reason
+    why it does not; by default of all pairs.
     """
-    pairs, reasons = [], []
-    for a, b in itertools.combinations(results.contenders, 2) if which is None else which:
+    if policy_pairs is None:
+        policy_pairs = list(itertools.combinations(results.contenders, 2))
+    accepted, reasons = [], []
+    for a, b in policy_pairs:
         try:
             _shared(results, a, b, accept_changes=accept_changes)
         except ConfigError as error:
             reasons.append(str(error))
         else:
-            pairs.append((a, b))
-    return pairs, reasons
+            accepted.append((a, b))
+    return accepted, reasons
 
 
 def clock_gaps(results: Results) -> list[Comparison]:
@@ -186,22 +207,26 @@ def clock_gaps(results: Results) -> list[Comparison]:
     A is named "POLICY_ID, SUITE in real time", B "POLICY_ID, SUITE". A suite without a counterpart
     is left out.
     """
-    found: dict[tuple[str, str], Strata] = {}
+    strata: dict[tuple[str, str], Strata] = {}  # by the names of A and B
     cases: dict[tuple[str, str], list[CaseResults]] = {}
     order = {name: number for number, name in enumerate(results.contenders)}
     for case in sorted(results.cases, key=lambda case: order[case.contender]):
         counterpart = synchronous_twin(results, case)
-        if counterpart is not None and (pairs := _pairs(case, counterpart)).total:
-            name = (
+        if counterpart is None:
+            continue
+        pairs = _pairs(case, counterpart)
+        if pairs.total:
+            names = (
                 f"{case.contender}, {case.suite} in real time",
                 f"{case.contender}, {counterpart.suite}".rstrip(", "),
             )
-            found.setdefault(name, {})[case.env] = pairs
-            cases.setdefault(name, []).append(case)
-    lines = _lines(ALL, [list(strata.values()) for strata in found.values()])
+            strata.setdefault(names, {})[case.env] = pairs
+            cases.setdefault(names, []).append(case)
+
+    lines = _lines(ALL, [list(by_env.values()) for by_env in strata.values()])
     return [
-        Comparison(*name, (), line, tuple(of))
-        for (name, of), line in zip(cases.items(), lines, strict=True)
+        Comparison(a, b, (), line, tuple(compared))
+        for ((a, b), compared), line in zip(cases.items(), lines, strict=True)
     ]
 
 
@@ -219,36 +244,40 @@ def _shared(
     results: Results, a: str, b: str, *, accept_changes: bool
 ) -> tuple[dict[str, Strata], list[Change]]:
     """Return the pairs of outcomes by suite and env, and the accepted changes between the two."""
-    if unknown := sorted({a, b} - set(results.contenders)):
+    unknown = sorted({a, b} - set(results.contenders))
+    if unknown:
         raise ConfigError(
             f"compare: expected two of the policies {results.contenders}, got {unknown}"
             + did_you_mean(unknown[0], results.contenders)
         )
-    others = {(case.suite, case.env): case for case in results.of(b)}
-    found: dict[str, Strata] = {}
+
+    cases_of_b = {(case.suite, case.env): case for case in results.of(b)}
+    suites: dict[str, Strata] = {}
     changes: dict[Change, None] = {}
     compared: list[CaseResults] = []
     for case in results.of(a):
-        if (other := others.get((case.suite, case.env))) is None:
+        other = cases_of_b.get((case.suite, case.env))
+        if other is None:
             continue
         changes |= dict.fromkeys(
             _changes_between(results, case, other, accept_changes=accept_changes)
         )
         pairs = _pairs(case, other)
         if pairs.total:
-            found.setdefault(case.suite, {})[case.env] = pairs
+            suites.setdefault(case.suite, {})[case.env] = pairs
             compared.append(case)
-    if len(timings := by_timing(compared)) > 1:
+
+    timings = by_timing(compared)
+    if len(timings) > 1:
         raise ConfigError(
             f"compare: {a!r} and {b!r} share episodes of several clocks, which have no rate in "
-            "common; want one of "
-            f"them, timing={' or '.join(map(repr, timings))}"
+            f"common; want one of them, timing={' or '.join(map(repr, timings))}"
         )
-    if not found:
+    if not suites:
         raise ConfigError(
             f"compare: {a!r} and {b!r} share no finished episode; evaluate both with the same seeds"
         )
-    return found, list(changes)
+    return suites, list(changes)
 
 
 _COMPARE_ALL_THE_SAME = "or compare them nevertheless and have the report say so (--accept-changes)"
@@ -264,34 +293,34 @@ def _changes_between(
             or one of the cases mixes several versions of them or of its policy, and
             `accept_changes` is off.
     """
-    one, two = (
-        {k: value for k, value in each.settings.items() if k not in OF_POLICY}
-        for each in (case, other)
-    )
-    for name in sorted(one.keys() | two.keys()):
-        if one.get(name) != two.get(name):
+    for name in sorted((case.settings.keys() | other.settings.keys()) - OF_POLICY):
+        value, other_value = case.settings.get(name), other.settings.get(name)
+        if value != other_value:
             raise ConfigError(
-                f"compare: {case.env!r} had {name} {one.get(name)!r} for {case.contender!r}, but "
-                f"{two.get(name)!r} for "
-                f"{other.contender!r}; evaluate both alike, or name the suites apart"
+                f"compare: {case.env!r} had {name} {value!r} for {case.contender!r}, but "
+                f"{other_value!r} for {other.contender!r}; evaluate both alike, or name the "
+                "suites apart"
             )
+
     changes = program_changes(f"env {case.env}", case.program or None, other.program or None)
-    statements = [EnvStatement(each.described, each.contract) for each in (case, other)]
-    changes += env_changes(case.env, *statements)
+    changes += env_changes(
+        case.env,
+        EnvStatement(case.described, case.contract),
+        EnvStatement(other.described, other.contract),
+    )
     if changes and not accept_changes:
         raise ConfigError(
             f"compare: {case.contender!r} and {other.contender!r} were not played in the same "
             "environment:\n"
             f"{listed(changes)}\nevaluate both in the same one, {_COMPARE_ALL_THE_SAME}"
         )
+
     mixed = _mixed(results, case, other)
     if mixed and not accept_changes:
         raise ConfigError(
             f"compare: episodes of {case.contender!r} and {other.contender!r} in {case.env!r} were "
-            "played with "
-            f"{' and '.join(mixed)}, as --accept-changes allowed; evaluate both again in a new "
-            "folder, "
-            f"{_COMPARE_ALL_THE_SAME}"
+            f"played with {' and '.join(mixed)}, as --accept-changes allowed; evaluate both again "
+            f"in a new folder, {_COMPARE_ALL_THE_SAME}"
         )
     return changes
 
@@ -300,44 +329,50 @@ def _mixed(results: Results, case: CaseResults, other: CaseResults) -> list[str]
     """Return what the episodes of the two cases, or of one of them, do not have in common, in
     words.
     """
-    env_programs = {
-        one.env_program for each in (case, other) for one in each.episodes if one.counts
-    } - {None}
-    mixed = [f"{len(env_programs)} versions of its files"] if len(env_programs) > 1 else []
-    for each in (case, other):
-        counted = [one for one in each.episodes if one.counts]
-        programs = {one.policy_program for one in counted} - {None}
-        weights = {one.result.weights for one in counted} - {None}
+    accepted = results.accepted_changes
+    counted_by_case = [
+        [episode for episode in either.episodes if episode.counts] for either in (case, other)
+    ]
+
+    mixed = []
+    env_programs = {episode.env_program for episode in itertools.chain(*counted_by_case)} - {None}
+    if len(env_programs) > 1:
+        mixed.append(f"{len(env_programs)} versions of its files")
+
+    for either, counted in zip((case, other), counted_by_case, strict=True):
+        programs = {episode.policy_program for episode in counted} - {None}
         if len(programs) > 1:
-            mixed.append(f"{len(programs)} versions of the files of {each.contender!r}")
+            mixed.append(f"{len(programs)} versions of the files of {either.contender!r}")
+
+        weights = {episode.result.weights for episode in counted} - {None}
         if len(weights) > 1:
-            mixed.append(f"{len(weights)} weights of {each.contender!r}")
-        settings = [
-            change for change in results.accepted_changes if change.is_setting_of(each.policy)
-        ]
-        if settings:
-            mixed.append(
-                f"several settings of {each.contender!r} ({'; '.join(map(str, settings))})"
-            )
-    stated = [change for change in results.accepted_changes if change.is_statement_of(case.env)]
-    if stated:
-        mixed.append(f"several versions of the environment ({'; '.join(map(str, stated))})")
+            mixed.append(f"{len(weights)} weights of {either.contender!r}")
+
+        of_policy = [str(change) for change in accepted if change.is_setting_of(either.policy)]
+        if of_policy:
+            mixed.append(f"several settings of {either.contender!r} ({'; '.join(of_policy)})")
+
+    of_env = [str(change) for change in accepted if change.is_statement_of(case.env)]
+    if of_env:
+        mixed.append(f"several versions of the environment ({'; '.join(of_env)})")
     return mixed
 
 
 def _pairs(a: CaseResults, b: CaseResults) -> Pairs:
     """Return the episodes of both cases, by success once."""
-    theirs = {(one.key.episode, one.key.seed): bool(one.success_once) for one in b.counted}
-    outcomes = [
-        (bool(one.success_once), theirs[one.key.episode, one.key.seed])
-        for one in a.counted
-        if (one.key.episode, one.key.seed) in theirs
-    ]
+    solved_by_b = {
+        (result.key.episode, result.key.seed): bool(result.success_once) for result in b.counted
+    }
+    counts: Counter[tuple[bool, bool]] = Counter()
+    for result in a.counted:
+        episode = result.key.episode, result.key.seed
+        if episode in solved_by_b:
+            counts[bool(result.success_once), solved_by_b[episode]] += 1
     return Pairs(
-        *(
-            outcomes.count(outcome)
-            for outcome in ((True, True), (True, False), (False, True), (False, False))
-        )
+        both=counts[True, True],
+        only_a=counts[True, False],
+        only_b=counts[False, True],
+        neither=counts[False, False],
     )
 
 
@@ -345,8 +380,8 @@ def _lines(suite: str, family: Sequence[Sequence[Pairs]], not_shown: int = 0) ->
     """Return the lines of one family, of which `not_shown` members were left out after a look at
     their outcomes.
 
-    These count as undecided (p = 1). Holm's method rejects no more hypotheses if some p-values are
-    larger, so that the family-wise error holds for any choice.
+    The members left out count as undecided (p = 1). Holm's method rejects no more hypotheses if
+    some p-values are larger, so that the family-wise error holds for any choice.
     """
     p_values = [sum(strata, Pairs()).p_value for strata in family]
     adjusted = holm(p_values + [1.0] * not_shown)[: len(p_values)]

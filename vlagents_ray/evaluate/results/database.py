@@ -133,8 +133,10 @@ def create(db: sqlite3.Connection) -> None:
 
 def insert(db: sqlite3.Connection, table: str, row: Mapping[str, Any]) -> None:
     """Insert `row`, its values by the names of their columns, which are those of `SCHEMA`."""
-    columns, marks = ", ".join(row), ", ".join("?" * len(row))
-    db.execute(f"INSERT INTO {table} ({columns}) VALUES ({marks})", tuple(row.values()))  # noqa: S608 (our own names)
+    columns = ", ".join(row)
+    placeholders = ", ".join("?" * len(row))
+    query = f"INSERT INTO {table} ({columns}) VALUES ({placeholders})"  # noqa: S608 (our own names)
+    db.execute(query, tuple(row.values()))
 
 
 def require_readable(out: Path, db: sqlite3.Connection) -> None:
@@ -144,41 +146,42 @@ def require_readable(out: Path, db: sqlite3.Connection) -> None:
     A file from elsewhere may have any text as names of columns, by which `merge` inserts rows, and
     views or triggers, which would run arbitrary SQL when a table is read or written.
     """
-    # A virtual table is also listed as a table.
-    begins = {"table": "CREATE TABLE", "index": "CREATE INDEX"}
+    # A virtual table is also listed as a table, so the beginning of the statement is compared.
+    statements = {"table": "CREATE TABLE", "index": "CREATE INDEX"}
     for kind, name, sql in db.execute(
         "SELECT type, name, sql FROM sqlite_master WHERE sql IS NOT NULL"
     ):
-        if kind not in begins or not str(sql).startswith(begins[kind]):
+        if kind not in statements or not str(sql).startswith(statements[kind]):
             raise ConfigError(
                 f"{out / FILE}: got {name!r}, which is a {kind} that no evaluation makes: do not "
                 "trust its author"
             )
+
     if not db.execute("SELECT count(*) FROM sqlite_master").fetchone()[0]:
         raise ConfigError(
             f"{out / FILE}: expected a database of results, got an empty file, as of a copy that "
-            "was cut off; copy it "
-            f"again, or choose another folder"
+            "was cut off; copy it again, or choose another folder"
         )
-    if (version := db.execute("PRAGMA user_version").fetchone()[0]) != VERSION:
+
+    version = db.execute("PRAGMA user_version").fetchone()[0]
+    if version != VERSION:
         raise ConfigError(
             f"{out / FILE}: got version {version} of the results, want {VERSION}; choose another "
             "folder"
         )
+
     for table, known in _known_columns().items():
-        there = _columns(db, table)
-        unknown, missing = there - known, known - there
-        if unknown or missing:
-            got = (
-                f"the unknown columns {sorted(unknown)}"
-                if unknown
-                else f"none of the columns {sorted(missing)}"
-            )
-            raise ConfigError(
-                f"{out / FILE}: got {got} in its table {table!r}, want those of this version of "
-                "vlagents-ray; read it "
-                f"with the version that wrote it"
-            )
+        columns = _columns(db, table)
+        unknown, missing = columns - known, known - columns
+        if not unknown and not missing:
+            continue
+        difference = f"none of the columns {sorted(missing)}"
+        if unknown:
+            difference = f"the unknown columns {sorted(unknown)}"
+        raise ConfigError(
+            f"{out / FILE}: got {difference} in its table {table!r}, want those of this version of "
+            "vlagents-ray; read it with the version that wrote it"
+        )
 
 
 @functools.cache
@@ -205,8 +208,8 @@ def read_only(out: Path) -> sqlite3.Connection:
 
 LOCK = "results.lock"
 _NO_LOCKS = (errno.ENOSYS, errno.EOPNOTSUPP, errno.ENOLCK)
-_READER_S = 1.0  # more than `is_locked` of another process holds the lock
-_AGAIN_S = 0.01
+_READER_S = 1.0  # longer than `is_locked` of another process holds the lock
+_RETRY_EVERY_S = 0.01
 
 
 def lock(out: Path) -> int:
@@ -216,13 +219,13 @@ def lock(out: Path) -> int:
         A descriptor: closing it releases the lock, as does the end of this process.
     """
     file = os.open(out / LOCK, os.O_RDWR | os.O_CREAT, 0o644)
-    give_up = time.monotonic() + _READER_S
+    deadline = time.monotonic() + _READER_S
     while True:
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError as error:
-            if time.monotonic() < give_up:
-                time.sleep(_AGAIN_S)
+            if time.monotonic() < deadline:
+                time.sleep(_RETRY_EVERY_S)
                 continue
             os.close(file)
             raise ConfigError(
@@ -234,8 +237,8 @@ def lock(out: Path) -> int:
                 raise
             raise ConfigError(
                 f"{out}: its file system knows no locks ({error.strerror}), so that two "
-                "evaluations could write to one "
-                f"folder; choose another one with --out (Lustre: have it mounted with `-o flock`)"
+                "evaluations could write to one folder; choose another one with --out (Lustre: "
+                "have it mounted with `-o flock`)"
             ) from error
         return file
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import sqlite3
 from collections.abc import Iterator, Sequence
@@ -43,9 +44,9 @@ class Episode:
     finished: float  # seconds since 1970
     env_program: str | None = None  # digest of the files of its environment, None if installed
     policy_program: str | None = None  # the same for its policy
-    # Whether it comes after the end of its stopped case, or is no longer planned.
+    # Whether the episode comes after the end of its stopped case, or is no longer planned.
     beyond: bool = False
-    unplanned: bool = False  # the latter of the two
+    unplanned: bool = False  # whether it is no longer planned
 
     @property
     def counts(self) -> bool:
@@ -59,9 +60,9 @@ class Episode:
 class Attempt:
     """An attempt at an episode that failed because of the infrastructure, not of the policy."""
 
-    key: str
+    key: str  # of the episode
     case_id: str
-    attempt: int
+    attempt: int  # its number, from 1
     run: int
     at: float  # seconds since 1970
     cause: str
@@ -114,7 +115,7 @@ class CaseResults:
     episodes: tuple[Episode, ...]  # by seed
     attempts: tuple[Attempt, ...]
     stop: StopConfig | None = None  # the rule by which it could stop early
-    # The number of episodes after which it stopped; later ones are kept, not counted.
+    # The number of episodes after which the case stopped; later ones are kept, but not counted.
     stopped_at: int | None = None
 
     @property
@@ -148,13 +149,26 @@ class Results:
     # The metadata of each policy's server, by the policy's name.
     policies: dict[str, dict[str, Any]]
     workers: tuple[Worker, ...] = ()  # in the order of time
-    # The folders, below `out`, if several were read as one (`combined`)
+    # The folders, below `out`, if several were read as one (`combined`).
     parts: tuple[Path, ...] = ()
+
+    @property
+    def episodes(self) -> list[Episode]:
+        """All recorded episodes, case by case."""
+        return list(itertools.chain.from_iterable(case.episodes for case in self.cases))
+
+    @property
+    def counted(self) -> list[EpisodeResult]:
+        """The results of all episodes that are in the rates, case by case."""
+        return list(itertools.chain.from_iterable(case.counted for case in self.cases))
 
     @property
     def accepted_changes(self) -> list[Change]:
         """Changes of files and weights between episodes, which `--accept-changes` accepted."""
-        return list(dict.fromkeys(change for run in self.runs for change in run.changes))
+        changes: list[Change] = []
+        for run in self.runs:
+            changes += run.changes
+        return list(dict.fromkeys(changes))
 
     @classmethod
     def load(cls, out: str | Path) -> Results:
@@ -171,55 +185,46 @@ class Results:
                 read.
         """
         out = Path(out)
-        written = is_locked(out)
+        was_locked = is_locked(out)
         with reading(out) as db:
-            episodes: dict[str, list[Episode]] = {}
+            episodes: dict[str, list[Episode]] = {}  # by case
             for row in table(db, "episodes", "seed"):
                 episodes.setdefault(row["case_id"], []).append(episode_of(row))
-            attempts: dict[str, list[Attempt]] = {}
+
+            attempts: dict[str, list[Attempt]] = {}  # by case
             for row in table(db, "attempts"):
-                attempts.setdefault(row["case_id"], []).append(
-                    Attempt(**row | {"retried": bool(row["retried"])})
-                )
-            runs = []
-            for row in table(db, "runs"):
-                parsed = {name: json.loads(row[name]) for name in ("config", "versions")}
-                changes = tuple(Change(**one) for one in json.loads(row["changes"] or "[]"))
-                runs.append(Run(**row | parsed | {"changes": changes}))
-            written = written or is_locked(out)  # it may have begun by now
-            return cls(
-                out,
-                tuple(
-                    _case(
-                        row,
-                        tuple(episodes.get(row["case_id"], ())),
-                        tuple(attempts.get(row["case_id"], ())),
-                    )
-                    for row in table(db, "cases")
-                ),
-                tuple(
-                    replace(run, state=KILLED)
-                    if run.state == RUNNING and not (written and run is runs[-1])
-                    else run
-                    for run in runs
-                ),
-                {row["name"]: json.loads(row["metadata"]) for row in table(db, "policies")},
-                tuple(Worker(**row) for row in table(db, "workers")),
-            )
+                attempt = Attempt(**row | {"retried": bool(row["retried"])})
+                attempts.setdefault(attempt.case_id, []).append(attempt)
+
+            cases = []
+            for row in table(db, "cases"):
+                case_id = row["case_id"]
+                cases.append(_case(row, episodes.get(case_id, []), attempts.get(case_id, [])))
+
+            runs = [_run(row) for row in table(db, "runs")]
+            policies = {row["name"]: json.loads(row["metadata"]) for row in table(db, "policies")}
+            workers = [Worker(**row) for row in table(db, "workers")]
+            # An evaluation may have begun after the first look at the lock.
+            is_written = was_locked or is_locked(out)
+
+        for index, run in enumerate(runs):
+            runs_now = is_written and index == len(runs) - 1
+            if run.state == RUNNING and not runs_now:
+                runs[index] = replace(run, state=KILLED)
+
+        return cls(out, tuple(cases), tuple(runs), policies, tuple(workers))
 
     @property
     def contenders(self) -> list[str]:
         """The policy ids: policies without steps first, then the checkpoints of each policy by
         their step.
         """
-        policies = {
-            policy: number
-            for number, policy in enumerate(dict.fromkeys(case.policy for case in self.cases))
-        }
-        ordered = sorted(
-            self.cases,
-            key=lambda case: (case.step is not None, policies[case.policy], case.step or 0),
-        )
+        policies = list(dict.fromkeys(case.policy for case in self.cases))
+
+        def rank(case: CaseResults) -> tuple[bool, int, int]:
+            return case.step is not None, policies.index(case.policy), case.step or 0
+
+        ordered = sorted(self.cases, key=rank)
         return list(dict.fromkeys(case.contender for case in ordered))
 
     def of(self, contender: str) -> list[CaseResults]:
@@ -234,8 +239,10 @@ class Results:
             ConfigError: The path leads out of the folder of results, or follows a symbolic link out
                 of it.
         """
-        home = next((one for one in self.parts if (self.out / path).is_relative_to(one)), self.out)
-        return inside(home, str((self.out / path).relative_to(home)))
+        absolute = self.out / path
+        folders = (folder for folder in self.parts if absolute.is_relative_to(folder))
+        home = next(folders, self.out)
+        return inside(home, str(absolute.relative_to(home)))
 
     def among(self, cases: Sequence[CaseResults]) -> Results:
         """Return the same results with these cases only."""
@@ -254,18 +261,18 @@ class Results:
         Raises:
             ConfigError: No case is left.
         """
-        left = [
-            one
-            for one in self.cases
-            if contender in (None, one.contender) and env in (None, one.env)
+        selected = [
+            case
+            for case in self.cases
+            if contender in (None, case.contender) and env in (None, case.env)
         ]
-        if not left:
-            have = sorted({f"{one.contender} in {one.env}" for one in self.cases})
+        if not selected:
+            known = sorted({f"{case.contender} in {case.env}" for case in self.cases})
             raise ConfigError(
                 f"{self.out}: has nothing of {contender or 'any policy'} in {env or 'any env'}: "
-                f"{have}"
+                f"{known}"
             )
-        return self.among(left)
+        return self.among(selected)
 
 
 @contextmanager
@@ -283,7 +290,7 @@ def reading(out: Path) -> Iterator[sqlite3.Connection]:
             db.execute("BEGIN")
             yield db
     except sqlite3.DatabaseError as error:
-        # Where the caller writes a copy.
+        # The disk is full on which the caller writes a copy.
         if getattr(error, "sqlite_errorcode", None) == _SQLITE_FULL:
             raise
         raise ConfigError(
@@ -294,74 +301,101 @@ def reading(out: Path) -> Iterator[sqlite3.Connection]:
 
 
 def table(db: sqlite3.Connection, name: str, order: str = "rowid") -> Iterator[dict[str, Any]]:
-    """Yield the rows of a table, by its columns' names."""
-    return (dict(row) for row in db.execute(f"SELECT * FROM {name} ORDER BY {order}"))  # noqa: S608 (constants)
+    """Yield the rows of a table, each as its values by their columns' names."""
+    rows = db.execute(f"SELECT * FROM {name} ORDER BY {order}")  # noqa: S608 (constants)
+    return map(dict, rows)
 
 
 def episode_of(row: dict[str, Any]) -> Episode:
     """Return the episode of a row of the table; raises `ConfigError` for a path that leads out
     of the folder.
     """
-    names = {field.name for field in fields(EpisodeResult)}
-    known = {name: value for name, value in row.items() if name in names and name != "key"}
+    names = {field.name for field in fields(EpisodeResult)} - {"key"}
+    values = {name: value for name, value in row.items() if name in names}
     for name in ("success_once", "success_at_end"):
-        known[name] = None if known[name] is None else bool(known[name])
+        if values[name] is not None:
+            values[name] = bool(values[name])
+    values["timing_ms"] = json.loads(row["timing_ms"])
     key = EpisodeKey(row["env"], row["episode"], row["seed"], row["case_id"])
-    result = EpisodeResult(**known | {"key": key, "timing_ms": json.loads(row["timing_ms"])})
-    videos = tuple(require_below(path) for path in json.loads(row["videos"]))
-    trajectory = None if row["trajectory"] is None else require_below(row["trajectory"])
-    programs = row["env_program"], row["policy_program"]
+
+    trajectory = row["trajectory"]
     return Episode(
-        result, videos, trajectory, row["attempts"], row["run"], row["finished"], *programs
+        EpisodeResult(**values, key=key),
+        videos=tuple(require_below(path) for path in json.loads(row["videos"])),
+        trajectory=None if trajectory is None else require_below(trajectory),
+        attempts=row["attempts"],
+        run=row["run"],
+        finished=row["finished"],
+        env_program=row["env_program"],
+        policy_program=row["policy_program"],
     )
+
+
+def _run(row: dict[str, Any]) -> Run:
+    """Return the run of a row of the table."""
+    changes = [Change(**change) for change in json.loads(row["changes"] or "[]")]
+    parsed = {
+        "config": json.loads(row["config"]),
+        "versions": json.loads(row["versions"]),
+        "changes": tuple(changes),
+    }
+    return Run(**row | parsed)
 
 
 def _case(
-    row: dict[str, Any], episodes: tuple[Episode, ...], attempts: tuple[Attempt, ...]
+    row: dict[str, Any], episodes: Sequence[Episode], attempts: Sequence[Attempt]
 ) -> CaseResults:
+    """Return the case of a row of the table, with its episodes marked by whether they count."""
     seeds, rule = json.loads(row.pop("seeds")), row.pop("stop")
     names = ("settings", "described", "contract", "code", "program")
     parsed = {name: json.loads(row[name] or "{}") for name in names}
-    each = row["planned"] // len(seeds)
-    # After a resumption with fewer episodes, the others that were already played would be a biased
-    # selection.
-    outside = [place_in_plan(one.result.key, seeds, each) is None for one in episodes]
-    episodes = tuple(
-        replace(one, beyond=is_outside, unplanned=is_outside)
-        for one, is_outside in zip(episodes, outside, strict=True)
-    )
-    stop, stopped_at = None, None
+
+    stop, stopping = None, None
     if rule is not None:
         stop = StopConfig.model_validate_json(rule)
         stopping = Stopping(stop, seeds, row["planned"])
         stopping.add_all(episode.result for episode in episodes)
-        stopped_at = stopping.at
-        episodes = tuple(
-            replace(one, beyond=one.beyond or not stopping.counts(one.result.key))
-            for one in episodes
-        )
+
+    episodes_per_seed = row["planned"] // len(seeds)
+    marked = []
+    for episode in episodes:
+        key = episode.result.key
+        # After a resumption with fewer episodes, the others that were already played would be a
+        # biased selection.
+        unplanned = place_in_plan(key, seeds, episodes_per_seed) is None
+        after_stop = stopping is not None and not stopping.counts(key)
+        marked.append(replace(episode, beyond=unplanned or after_stop, unplanned=unplanned))
+
     return CaseResults(
-        **row | parsed, episodes=episodes, attempts=attempts, stop=stop, stopped_at=stopped_at
+        **row | parsed,
+        episodes=tuple(marked),
+        attempts=tuple(attempts),
+        stop=stop,
+        stopped_at=None if stopping is None else stopping.at,
     )
 
 
-def rate_of(cases: Sequence[CaseResults], what: Literal["success_once", "success_at_end"]) -> Rate:
+def rate_of(
+    cases: Sequence[CaseResults], outcome: Literal["success_once", "success_at_end"]
+) -> Rate:
     """Return the success rate of one case, or of several together, with bounds that hold if cases
     could stop early.
 
     Cases without a common rate (`have_common_rate`) are counted, and their rate is None.
     """
-    counts = [
-        (sum(bool(getattr(one, what)) for one in case.counted), len(case.counted)) for case in cases
-    ]
-    successes, episodes = (
-        (sum(column) for column in zip(*counts, strict=True)) if counts else (0, 0)
-    )
-    together = have_common_rate(cases)
-    if not (rules := [case.stop for case in cases if case.stop is not None]):
-        return Rate(successes, episodes, pooled=together)
-    error_rate = max(rule.error_rate for rule in rules)
-    return Rate(successes, episodes, pooled(counts, error_rate), error_rate, together)
+    counts = []  # (successes, episodes) of each case
+    for case in cases:
+        solved = sum(bool(getattr(result, outcome)) for result in case.counted)
+        counts.append((solved, len(case.counted)))
+    successes = sum(solved for solved, _ in counts)
+    episodes = sum(number for _, number in counts)
+
+    share_a_rate = have_common_rate(cases)
+    error_rates = [case.stop.error_rate for case in cases if case.stop is not None]
+    if not error_rates:
+        return Rate(successes, episodes, pooled=share_a_rate)
+    error_rate = max(error_rates)
+    return Rate(successes, episodes, pooled(counts, error_rate), error_rate, share_a_rate)
 
 
 def have_common_rate(cases: Sequence[CaseResults]) -> bool:
@@ -381,22 +415,19 @@ def by_timing(cases: Sequence[CaseResults]) -> dict[str, list[CaseResults]]:
     """Group the cases by their clock: "synchronous" first, then "in real time", or one such
     group for each clock.
     """
-    clocks: dict[str, list[CaseResults]] = {}
-    for case in sorted(cases, key=lambda case: case.settings.get("clock") is not None):
-        clocks.setdefault(json.dumps(case.settings.get("clock"), sort_keys=True), []).append(case)
-    running = [clock for clock in clocks if clock != "null"]
-    found = {}
-    for clock, members in clocks.items():
+    synchronous = [case for case in cases if case.settings.get("clock") is None]
+    clocks: dict[str, list[CaseResults]] = {}  # of the others, by their settings
+    for case in cases:
+        clock = case.settings.get("clock")
+        if clock is not None:
+            clocks.setdefault(json.dumps(clock, sort_keys=True), []).append(case)
+
+    groups = {SYNCHRONOUS: synchronous} if synchronous else {}
+    for members in clocks.values():
         suites = ", ".join(dict.fromkeys(case.suite or "the nameless suite" for case in members))
-        name = (
-            SYNCHRONOUS
-            if clock == "null"
-            else REAL_TIME
-            if len(running) == 1
-            else f"{REAL_TIME} ({suites})"
-        )
-        found[name] = members
-    return found
+        name = REAL_TIME if len(clocks) == 1 else f"{REAL_TIME} ({suites})"
+        groups[name] = members
+    return groups
 
 
 def synchronous_twin(results: Results, case: CaseResults) -> CaseResults | None:
@@ -413,5 +444,5 @@ def synchronous_twin(results: Results, case: CaseResults) -> CaseResults | None:
     """
     if case.settings["clock"] is None:
         return None
-    wanted = case.settings | {"clock": None}
-    return next((other for other in results.cases if other.settings == wanted), None)
+    settings = case.settings | {"clock": None}
+    return next((other for other in results.cases if other.settings == settings), None)

@@ -52,13 +52,16 @@ def wilson(successes: int, trials: int, z: float = Z_95) -> tuple[float, float]:
         )
     if trials == 0:
         return 0.0, 1.0
+
     rate = successes / trials
     scale = 1 + z * z / trials
     centre = (rate + z * z / (2 * trials)) / scale
-    half = z / scale * math.sqrt(rate * (1 - rate) / trials + z * z / (4 * trials * trials))
-    # The bounds are exactly 0 and 1 there; floating point would leave 1e-17.
-    low = 0.0 if successes == 0 else centre - half
-    high = 1.0 if successes == trials else centre + half
+    half_width = z / scale * math.sqrt(rate * (1 - rate) / trials + z * z / (4 * trials * trials))
+
+    # Without a success the lower bound is exactly 0, and without a failure the upper one exactly 1;
+    # floating point would leave 1e-17.
+    low = 0.0 if successes == 0 else centre - half_width
+    high = 1.0 if successes == trials else centre + half_width
     return low, high
 
 
@@ -68,11 +71,11 @@ class Rate:
 
     successes: int
     episodes: int
-    # If an evaluation could stop early: the confidence sequence (`confidence_sequence`), and its
-    # error rate.
+    # The confidence sequence and its error rate (`confidence_sequence`), if the evaluation could
+    # stop early.
     bounds: tuple[float, float] | None = None
     error_rate: float | None = None
-    # False: the cases of these episodes have no common rate, so that `rate` is None.
+    # Whether the cases of these episodes have a common rate; otherwise `rate` is None.
     pooled: bool = True
 
     @property
@@ -189,12 +192,15 @@ def mcnemar(only_a: int, only_b: int, *, mid: bool = False) -> float:
     """
     if min(only_a, only_b) < 0:
         raise InvalidInput(f"mcnemar: got {only_a} and {only_b} episodes, want no count below 0")
+
     n = only_a + only_b
-    # To choose k of n, and up to k of n: integers, exact for any number of episodes.
+    # The numbers of ways to choose k of n, and up to k of n: integers, which are exact for any
+    # number of episodes.
     ways = tail = 1
     for k in range(min(only_a, only_b)):
         ways = ways * (n - k) // (k + 1)
         tail += ways
+
     # Both tails contain the observed table, of which half is counted.
     if mid and n and only_a == only_b:
         return 1.0 - ways / (2 << n)
@@ -224,25 +230,28 @@ def difference_interval(strata: Sequence[Pairs]) -> tuple[float, float]:
         (low, high) of the success rate of A minus that of B, each in [-1, 1]; (-1, 1) without
         episodes.
     """
-    if (n := sum(one.total for one in strata)) == 0:
+    n = sum(pairs.total for pairs in strata)
+    if n == 0:
         return -1.0, 1.0
-    # (2n + 1,), one for each sum from -n to n.
+
+    # The sum of n steps is one of 2n + 1 values, from -n to n, so that as many points of the
+    # characteristic function determine its distribution.
     turns = np.exp(2j * np.pi * np.arange(2 * n + 1) / (2 * n + 1))
-    transformed = np.ones_like(turns)
-    for one in strata:
-        # Of each outcome: in proportion to the env's episodes.
-        more = _PSEUDO_EPISODES / 4 * one.total / n
-        a, b = (
-            (only + more) / (one.total + 4 * more) if one.total else 0.0
-            for only in (one.only_a, one.only_b)
-        )
-        transformed *= (a * turns + b / turns + (1 - a - b)) ** one.total
-    # In proportion, of -n, …, n.
-    chances = np.fft.fftshift(np.fft.fft(transformed).real).clip(min=0.0)
-    low, high = (
-        np.searchsorted(np.cumsum(chances) / chances.sum(), [ERROR_RATE / 2, 1 - ERROR_RATE / 2])
-        - n
-    )
+    characteristic = np.ones_like(turns)
+    for pairs in strata:
+        if not pairs.total:
+            continue
+        # What is added to each of the four outcomes, in proportion to the env's episodes.
+        added = _PSEUDO_EPISODES / 4 * pairs.total / n
+        total = pairs.total + 4 * added
+        a = (pairs.only_a + added) / total
+        b = (pairs.only_b + added) / total
+        characteristic *= (a * turns + b / turns + (1 - a - b)) ** pairs.total
+
+    # Proportional to the chances of the sums -n, …, n.
+    weights = np.fft.fftshift(np.fft.fft(characteristic).real).clip(min=0.0)
+    cumulative = np.cumsum(weights) / weights.sum()
+    low, high = np.searchsorted(cumulative, [ERROR_RATE / 2, 1 - ERROR_RATE / 2]) - n
     return float(low / n), float(high / n)
 
 
@@ -297,9 +306,10 @@ def confidence_sequence(
             f"confidence_sequence: got {successes} successes in {trials} trials, want 0 <= "
             "successes <= trials"
         )
+
     failures = trials - successes
-    # log of (n + 1) C(n, s) / error_rate; s log p + (n - s) log(1 - p) must be at least its
-    # negative
+    # The logarithm of (n + 1) C(n, s) / error_rate. The interval consists of the p for which
+    # s log p + (n - s) log(1 - p) is larger than its negative.
     room = (
         math.lgamma(trials + 2)
         - math.lgamma(successes + 1)
@@ -307,14 +317,14 @@ def confidence_sequence(
         - math.log(error_rate)
     )
 
-    def possible(p: float) -> bool:
-        log_p = successes * math.log(p) if successes else 0.0
-        log_q = failures * math.log1p(-p) if failures else 0.0
-        return log_p + log_q > -room
+    def is_inside(p: float) -> bool:
+        log_of_successes = successes * math.log(p) if successes else 0.0
+        log_of_failures = failures * math.log1p(-p) if failures else 0.0
+        return log_of_successes + log_of_failures > -room
 
     rate = successes / trials if trials else 0.5
-    low = 0.0 if not successes else _boundary(possible, inside=rate, outside=0.0)
-    high = 1.0 if not failures else _boundary(possible, inside=rate, outside=1.0)
+    low = 0.0 if not successes else _boundary(is_inside, inside=rate, outside=0.0)
+    high = 1.0 if not failures else _boundary(is_inside, inside=rate, outside=1.0)
     return low, high
 
 
@@ -326,13 +336,18 @@ def pooled(counts: Sequence[tuple[int, int]], error_rate: float) -> tuple[float,
     gets an equal share of the error rate: then all their bounds hold at once, and so does any
     weighted mean.
     """
-    counts = [one for one in counts if one[1]]
-    if not (total := sum(trials for _, trials in counts)):
+    counts = [(successes, trials) for successes, trials in counts if trials]
+    total = sum(trials for _, trials in counts)
+    if not total:
         return 0.0, 1.0
-    bounds = [(*confidence_sequence(s, n, error_rate / len(counts)), n / total) for s, n in counts]
-    return sum(low * share for low, _, share in bounds), sum(
-        high * share for _, high, share in bounds
-    )
+
+    pooled_low = pooled_high = 0.0
+    for successes, trials in counts:
+        low, high = confidence_sequence(successes, trials, error_rate / len(counts))
+        share = trials / total
+        pooled_low += low * share
+        pooled_high += high * share
+    return pooled_low, pooled_high
 
 
 class Stopping:
@@ -344,13 +359,14 @@ class Stopping:
         """
         self._stop = stop
         self._seeds = list(seeds)
-        self._each = planned // len(seeds)
-        self._outcomes: dict[int, bool] = {}  # by place in the plan
-        self._begun = 0  # length of the unbroken prefix
-        self._successes = 0  # in it
-        self.at: int | None = None  # after so many episodes the case stops; None: not yet
+        self._episodes_per_seed = planned // len(seeds)
+        self._outcomes: dict[int, bool] = {}  # by index in the plan
+        self._in_order = 0  # the number of episodes in the unbroken prefix of the plan
+        self._successes = 0  # in that prefix
+        self.at: int | None = None  # the case stops after so many episodes; None: not yet
 
     def add_all(self, results: Iterable[EpisodeResult]) -> None:
+        """Add the outcomes of several episodes."""
         for result in results:
             self.add(result)
 
@@ -358,43 +374,46 @@ class Stopping:
         """Add the outcome of an episode. One that failed by infrastructure has none yet, and is
         awaited.
         """
-        place = place_in_plan(result.key, self._seeds, self._each)
-        if place is not None and result.success_once is not None:
-            self._outcomes[place] = result.success_once
-        while self.at is None and self._begun in self._outcomes:
-            self._successes += self._outcomes[self._begun]
-            self._begun += 1
-            low, high = confidence_sequence(self._successes, self._begun, self._stop.error_rate)
-            target, width = self._stop.target, self._stop.width
-            certain = (target is not None and not low <= target <= high) or (
-                width is not None and high - low < width
-            )
-            if self._begun >= self._stop.at_least and certain:
-                self.at = self._begun
+        index = place_in_plan(result.key, self._seeds, self._episodes_per_seed)
+        if index is not None and result.success_once is not None:
+            self._outcomes[index] = result.success_once
+        while self.at is None and self._in_order in self._outcomes:
+            self._successes += self._outcomes[self._in_order]
+            self._in_order += 1
+            if self._in_order >= self._stop.at_least and self._is_certain():
+                self.at = self._in_order
 
     def counts(self, key: EpisodeKey) -> bool:
         """Return whether the episode counts, as it comes before the end of the case."""
-        place = place_in_plan(key, self._seeds, self._each)
-        return self.at is None or (place is not None and place < self.at)
+        index = place_in_plan(key, self._seeds, self._episodes_per_seed)
+        return self.at is None or (index is not None and index < self.at)
+
+    def _is_certain(self) -> bool:
+        """Return whether the interval excludes the target, or is narrow enough."""
+        low, high = confidence_sequence(self._successes, self._in_order, self._stop.error_rate)
+        target, width = self._stop.target, self._stop.width
+        excludes_target = target is not None and not low <= target <= high
+        is_narrow = width is not None and high - low < width
+        return excludes_target or is_narrow
 
 
-def place_in_plan(key: EpisodeKey, seeds: Sequence[int], each: int) -> int | None:
+def place_in_plan(key: EpisodeKey, seeds: Sequence[int], episodes_per_seed: int) -> int | None:
     """Return the index of an episode in its case's part of `jobs.plan`; None if it is no longer
     planned.
     """
-    first = key.seed - key.episode
-    return (
-        seeds.index(first) * each + key.episode if first in seeds and key.episode < each else None
-    )
+    first_seed = key.seed - key.episode
+    if first_seed not in seeds or key.episode >= episodes_per_seed:
+        return None
+    return seeds.index(first_seed) * episodes_per_seed + key.episode
 
 
-def _boundary(possible: Callable[[float], bool], inside: float, outside: float) -> float:
-    """Return the first point from `inside` to `outside` that is not `possible`."""
+def _boundary(is_inside: Callable[[float], bool], inside: float, outside: float) -> float:
+    """Return the first point from `inside` to `outside` that is not inside."""
     for _ in range(_HALVINGS):
         middle = (inside + outside) / 2
         if middle in (inside, outside):
             break
-        if possible(middle):
+        if is_inside(middle):
             inside = middle
         else:
             outside = middle

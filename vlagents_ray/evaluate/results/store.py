@@ -62,20 +62,24 @@ class Store(AbstractContextManager["Store"]):
             StorageFailed: The folder cannot be written to.
         """
         self.cases = plan_cases(config)
+        self._cases_by_id = {case.fingerprint: case for case in self.cases}
         self._out = config.out
         with storing(config.out):
             self._out.mkdir(parents=True, exist_ok=True)
             self._lock = lock(self._out)
+
+        # The state of this run.
         self._run = 0
         self._accepts = config.accept_changes
-        self._changes: list[Change] = []  # accepted in this run
-        # policies, cases and places whose change was accepted in this run.
-        self._accepted: set[Hashable] = set()
-        self._policy_programs: dict[str, str | None] = {}  # by policy; of this run
-        self._case = {case.fingerprint: case for case in self.cases}
-        # By case, and by (policy, step, checkpoint); read when first needed.
+        self._changes: list[Change] = []  # those that were accepted
+        self._accepted: set[Hashable] = set()  # policies, cases and places with accepted changes
+        self._policy_programs: dict[str, str | None] = {}  # by policy
+        self._compared_envs: set[str] = set()  # places whose env was compared with earlier runs
+
+        # The digest of the weights by case, and by (policy, step, checkpoint); read from the
+        # database when it is first needed.
         self._weights: dict[Hashable, str] = {}
-        self._made: set[str] = set()  # places whose env is known to be that of earlier runs
+
         try:
             with storing(config.out):
                 self._db = self._open(config)
@@ -87,6 +91,7 @@ class Store(AbstractContextManager["Store"]):
         self.close()
 
     def close(self) -> None:
+        """Close the database, and release the lock of the folder."""
         self._db.close()
         os.close(self._lock)
 
@@ -94,22 +99,23 @@ class Store(AbstractContextManager["Store"]):
         self, config: EvalConfig, versions: dict[str, Any], started: float | None = None
     ) -> None:
         """Record that a run over the plan begins, or began at `started`, s since 1970."""
+        row = (
+            time.time() if started is None else started,
+            RUNNING,
+            config.model_dump_json(),
+            canonical(versions),
+        )
+        programs = [(canonical(case.program), case.fingerprint) for case in self.cases]
         with self._db:
-            row = (
-                time.time() if started is None else started,
-                RUNNING,
-                config.model_dump_json(),
-                canonical(versions),
-            )
             cursor = self._db.execute(
                 "INSERT INTO runs (started, state, config, versions) VALUES (?, ?, ?, ?)", row
             )
             self._run = int(cursor.lastrowid or 0)
             self._write_changes()
-            programs = [(canonical(case.program), case.fingerprint) for case in self.cases]
             self._db.executemany("UPDATE cases SET program = ? WHERE case_id = ?", programs)
 
     def end_run(self, state: str) -> None:
+        """Record that the run ends now, in one of the states of `Run.state`."""
         with self._db:
             self._db.execute(
                 "UPDATE runs SET ended = ?, state = ? WHERE run = ?",
@@ -118,12 +124,8 @@ class Store(AbstractContextManager["Store"]):
 
     def finished(self) -> set[str]:
         """Return the keys of the episodes that will not be played again."""
-        return {
-            key
-            for (key,) in self._db.execute(
-                "SELECT key FROM episodes WHERE status != 'infra_failed'"
-            )
-        }
+        query = "SELECT key FROM episodes WHERE status != 'infra_failed'"
+        return {key for (key,) in self._db.execute(query)}
 
     def record(
         self,
@@ -141,32 +143,11 @@ class Store(AbstractContextManager["Store"]):
         case, as after a swap, by other weights of the same name, or by other weights than the
         pushed ones of its case: a rate has one checkpoint.
         """
-        case = self._case[result.key.settings]
-        want = case.policy.pushed_weights
-        acted = (result.first_policy_version, result.policy_version, result.policy_fingerprint)
-        if (
-            want
-            and result.policy_version is not None
-            and acted != (want.version, want.version, want.fingerprint)
-        ):
-            raise WeightsLost(
-                f"policy: {result.key} was played by versions {acted[0]} to {acted[1]} of the "
-                f"weights ({acted[2]}), "
-                f"want {want.version} ({want.fingerprint}); push nothing while a version is "
-                "evaluated, and let the "
-                f"policy's `options` ask for no other"
-            )
-        known = self._db.execute(
-            "SELECT checkpoint FROM episodes WHERE case_id = ? AND checkpoint IS NOT NULL LIMIT 1",
-            (result.key.settings,),
-        ).fetchone()
-        if known is not None and result.checkpoint not in (None, known[0]):
-            raise ConfigError(
-                f"policy: {result.key} was played by checkpoint {result.checkpoint!r}, the results "
-                f"in {self._out} "
-                f"are of {known[0]!r}; serve that one again, or choose another out folder"
-            )
+        case = self._cases_by_id[result.key.settings]
+        _require_pushed_weights(case, result)
+        self._require_same_checkpoint(result)
         self._require_same_weights(result)
+
         row = asdict(result)
         key = row.pop("key")
         del key["policy_seed"]  # in an evaluation, it is that of the environment
@@ -189,7 +170,26 @@ class Store(AbstractContextManager["Store"]):
             )
             insert(self._db, "episodes", row)
 
+    def _require_same_checkpoint(self, result: EpisodeResult) -> None:
+        """Raise `ConfigError` if other episodes of the case were played by another checkpoint."""
+        query = (
+            "SELECT checkpoint FROM episodes WHERE case_id = ? AND checkpoint IS NOT NULL LIMIT 1"
+        )
+        row = self._db.execute(query, (result.key.settings,)).fetchone()
+        if row is None or result.checkpoint is None:
+            return
+        (known,) = row
+        if result.checkpoint != known:
+            raise ConfigError(
+                f"policy: {result.key} was played by checkpoint {result.checkpoint!r}, the results "
+                f"in {self._out} are of {known!r}; serve that one again, or choose another out "
+                "folder"
+            )
+
     def _require_same_weights(self, result: EpisodeResult) -> None:
+        """Require the weights of earlier episodes of the case, and of other cases with the same
+        checkpoint, unless other ones are accepted.
+        """
         if result.weights is None:
             return
         if not self._weights:
@@ -198,65 +198,72 @@ class Store(AbstractContextManager["Store"]):
                 " FROM episodes e JOIN cases c ON c.case_id = e.case_id"
                 " WHERE e.weights IS NOT NULL"
             )
-            for of, *checkpoint, weights in self._db.execute(query):
-                self._weights |= {of: weights, tuple(checkpoint): weights}
-        case = self._case[result.key.settings]
-        for of in (case.fingerprint, (case.policy.name, case.step, result.checkpoint)):
-            known = self._weights.setdefault(of, result.weights)
-            if result.weights != known:
-                change = Change(
-                    f"policy {case.contender}",
-                    result.checkpoint or "weights",
-                    known,
-                    result.weights,
-                )
-                self._accept_or_raise(
-                    of, [change], f"{result.key} was played by other weights than the results in"
-                )
-                self._weights[of] = result.weights
+            for case_id, policy, step, checkpoint, weights in self._db.execute(query):
+                self._weights[case_id] = weights
+                self._weights[policy, step, checkpoint] = weights
+
+        case = self._cases_by_id[result.key.settings]
+        owners: tuple[Hashable, ...] = (
+            case.fingerprint,
+            (case.policy.name, case.step, result.checkpoint),
+        )
+        for owner in owners:
+            known = self._weights.setdefault(owner, result.weights)
+            if result.weights == known:
+                continue
+            name = result.checkpoint or "weights"
+            change = Change(f"policy {case.contender}", name, known, result.weights)
+            self._accept_or_raise(
+                owner, [change], f"{result.key} was played by other weights than the results in"
+            )
+            self._weights[owner] = result.weights
 
     def _accept_or_raise(
-        self, what: Hashable, changes: list[Change], where: str, cure: str = MIX
+        self, subject: Hashable, changes: list[Change], where: str, cure: str = MIX
     ) -> None:
-        """Record changes since earlier runs, once for each `what` in a run; raise `ConfigError`
-        unless they are
-        accepted.
+        """Record changes since earlier runs, once for each subject in a run; raise `ConfigError`
+        unless they are accepted.
 
-        A second change within a run means that processes have different files.
+        A second change of a subject within a run means that processes have different files.
         """
         if not changes:
             return
-        if not self._accepts or what in self._accepted:
+        if not self._accepts or subject in self._accepted:
             cure = "all processes of a run need the same files" if self._accepts else cure
             raise ConfigError(f"{where} {self._out}:\n{listed(changes)}\n{cure}")
-        self._accepted.add(what)
-        self._changes += [one for one in changes if one not in self._changes]
+
+        self._accepted.add(subject)
+        self._changes += [change for change in changes if change not in self._changes]
         if self._run:
             with self._db:
                 self._write_changes()
 
     def _write_changes(self) -> None:
-        value = canonical([asdict(one) for one in self._changes])
+        value = canonical([asdict(change) for change in self._changes])
         self._db.execute("UPDATE runs SET changes = ? WHERE run = ?", (value, self._run))
 
     def record_attempt(self, job: Job, failure: Failure, *, retried: bool) -> None:
-        where = (str(job.key), job.key.settings, job.attempt, self._run, time.time())
-        why = (
-            failure.cause,
-            failure.code,
-            failure.message,
-            failure.traceback,
-            failure.log,
-            retried,
-        )
+        """Record an attempt that infrastructure failed; `retried` is whether another follows."""
+        row = {
+            "key": str(job.key),
+            "case_id": job.key.settings,
+            "attempt": job.attempt,
+            "run": self._run,
+            "at": time.time(),
+            "cause": failure.cause,
+            "code": failure.code,
+            "error": failure.message,
+            "traceback": failure.traceback,
+            "log": failure.log,
+            "retried": retried,
+        }
         with self._db:
-            self._db.execute(
-                "INSERT INTO attempts VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)", where + why
-            )
+            insert(self._db, "attempts", row)
 
-    def note_worker(self, where: WorkerInfo) -> None:
+    def note_worker(self, worker: WorkerInfo) -> None:
+        """Record a worker that has connected to its policy, or made its env."""
         with self._db:
-            insert(self._db, "workers", asdict(where) | {"run": self._run, "at": time.time()})
+            insert(self._db, "workers", asdict(worker) | {"run": self._run, "at": time.time()})
 
     def note_env(self, place: str, made: EnvInfo) -> None:
         """Record the description, contract and code of the env of the cases at `place`.
@@ -265,46 +272,53 @@ class Store(AbstractContextManager["Store"]):
         update of the simulator, or if the worker has other files than the process that made the
         plan.
         """
-        [case, *_] = [case for case in self.cases if case.place == place]
-        odd = program_changes(f"env {case.env}", case.program, made.program)
-        # The environment itself may write a file that its settings name.
-        if any(one.was is not None for one in odd):
+        cases = [case for case in self.cases if case.place == place]
+        env = cases[0].env
+        changes = program_changes(f"env {env}", cases[0].program, made.program)
+        # A file that was not there before is allowed: the environment itself may write a file that
+        # its settings name.
+        if any(change.was is not None for change in changes):
             raise ConfigError(
                 f"the worker on {made.host} has other files than this process, or they were edited "
-                "since the start:\n"
-                f"{listed(odd)}\ngive both the same files, and go on with --resume"
+                f"since the start:\n{listed(changes)}\ngive both the same files, and go on with "
+                "--resume"
             )
-        self._require_same_env(case, made)
+
+        # Another worker of this run may have made the env; descriptions may differ between nodes.
+        if place not in self._compared_envs:
+            self._compared_envs.add(place)
+            self._require_same_env(cases, made)
+
+        described = json.dumps(made.described, default=str)
         code = {} if made.code is None else made.code.to_json()
-        found = (json.dumps(made.described, default=str), canonical(made.contract), canonical(code))
+        values = (described, canonical(made.contract), canonical(code))
         with self._db:
             self._db.executemany(
                 "UPDATE cases SET described = ?, contract = ?, code = ? WHERE case_id = ?",
-                [(*found, case.fingerprint) for case in self.cases if case.place == place],
+                [(*values, case.fingerprint) for case in cases],
             )
 
-    def _require_same_env(self, case: EvalCase, made: EnvInfo) -> None:
-        # By another worker of this run; descriptions may differ between nodes.
-        if case.place in self._made:
-            return
-        self._made.add(case.place)
+    def _require_same_env(self, cases: Sequence[EvalCase], made: EnvInfo) -> None:
+        """Require the description and the contract that earlier runs recorded for any of the
+        cases, unless other ones are accepted.
+
+        The cases share one env; those of other policies are included, as they are compared with
+        each other.
+        """
+        env, place = cases[0].env, cases[0].place
         now = EnvStatement(
             json.loads(json.dumps(made.described, default=str)),
             json.loads(canonical(made.contract)),
         )
+        query = "SELECT described, contract FROM cases WHERE case_id = ? AND described IS NOT NULL"
         changes: dict[Change, None] = {}
-        for other in self.cases:  # also those of other policies, which are compared with this one
-            if other.place != case.place:
-                continue
-            query = (
-                "SELECT described, contract FROM cases WHERE case_id = ? AND described IS NOT NULL"
-            )
-            if (known := self._db.execute(query, (other.fingerprint,)).fetchone()) is not None:
-                was = EnvStatement(*map(json.loads, known))
-                changes |= dict.fromkeys(env_changes(case.env, was, now))
-        self._accept_or_raise(
-            case.place, list(changes), "the environment is not that of the results in"
-        )
+        for case in cases:
+            row = self._db.execute(query, (case.fingerprint,)).fetchone()
+            if row is not None:
+                described, contract = row
+                was = EnvStatement(json.loads(described), json.loads(contract))
+                changes |= dict.fromkeys(env_changes(env, was, now))
+        self._accept_or_raise(place, list(changes), "the environment is not that of the results in")
 
     def note_policy(self, name: str, metadata: dict[str, Any]) -> None:
         """Record the metadata of a policy's server; raises `ConfigError` if it is another policy
@@ -314,14 +328,18 @@ class Store(AbstractContextManager["Store"]):
         known = None if row is None else json.loads(row[0])
         swept = any(case.step is not None for case in self.cases if case.policy.name == name)
         if known is not None:
-            if (what := changed(known, metadata, swept=swept)) in ("policy", "checkpoint"):
+            field = changed(known, metadata, swept=swept)
+            if field in ("policy", "checkpoint"):
                 raise ConfigError(
-                    f"policy {name!r}: the server has {what} {metadata.get(what)!r}, the results "
-                    f"in {self._out} are of "
-                    f"{known.get(what)!r}; serve that one again, or choose another out folder"
+                    f"policy {name!r}: the server has {field} {metadata.get(field)!r}, the results "
+                    f"in {self._out} are of {known.get(field)!r}; serve that one again, or choose "
+                    "another out folder"
                 )
-            odd = policy_changes(f"policy {name}", known, metadata, swept=swept)
-            self._accept_or_raise(("policy", name), odd, "the policy is not that of the results in")
+            changes = policy_changes(f"policy {name}", known, metadata, swept=swept)
+            self._accept_or_raise(
+                ("policy", name), changes, "the policy is not that of the results in"
+            )
+
         self._policy_programs[name] = program_id(policy_program(metadata, swept=swept))
         with self._db:
             value = json.dumps(metadata, default=str)
@@ -338,21 +356,26 @@ class Store(AbstractContextManager["Store"]):
             stop = _rule(config)
             with db:
                 for case in self.cases:
-                    identity = (case.policy.name, case.step, case.suite.name, case.env)
-                    extent = (case.planned, canonical(case.suite.seeds), stop)
-                    row = (
-                        case.fingerprint,
-                        *identity,
-                        canonical(case.settings),
-                        *extent,
-                        canonical(case.program),
-                    )
+                    row = {
+                        "case_id": case.fingerprint,
+                        "policy": case.policy.name,
+                        "step": case.step,
+                        "suite": case.suite.name,
+                        "env": case.env,
+                        "settings": canonical(case.settings),
+                        "planned": case.planned,
+                        "seeds": canonical(case.suite.seeds),
+                        "stop": stop,
+                        "program": canonical(case.program),
+                    }
                     db.execute(
-                        "INSERT INTO cases (case_id, policy, step, suite, env, settings, planned, "
-                        "seeds, stop, program)"
-                        " VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?)"
-                        " ON CONFLICT DO UPDATE SET planned = ?, seeds = ?, stop = ?",
-                        row + extent,
+                        "INSERT INTO cases (case_id, policy, step, suite, env, settings, planned,"
+                        " seeds, stop, program)"
+                        " VALUES (:case_id, :policy, :step, :suite, :env, :settings, :planned,"
+                        " :seeds, :stop, :program)"
+                        " ON CONFLICT DO UPDATE SET planned = :planned, seeds = :seeds,"
+                        " stop = :stop",
+                        row,
                     )
         except BaseException:
             db.close()
@@ -360,54 +383,65 @@ class Store(AbstractContextManager["Store"]):
         return db
 
     def _require_resumable(self, db: sqlite3.Connection, config: EvalConfig) -> None:
-        runs, episodes = (
-            db.execute(f"SELECT COUNT(*) FROM {table}").fetchone()[0]  # noqa: S608
-            for table in ("runs", "episodes")
-        )
+        """Require that the results in the folder, if any, may be continued by this plan.
+
+        The remains of a plan that could not begin are deleted.
+        """
+        (runs,) = db.execute("SELECT COUNT(*) FROM runs").fetchone()
+        (episodes,) = db.execute("SELECT COUNT(*) FROM episodes").fetchone()
         causes = {cause for (cause,) in db.execute("SELECT DISTINCT cause FROM attempts")}
         if not runs and config.resume:
-            others = [file.parent.name for file in self._out.parent.glob(f"*/{FILE}")]
+            folders = {file.parent.name for file in self._out.parent.glob(f"*/{FILE}")}
             log.warning(
                 "%s: has no results to resume (--resume), so that the evaluation begins there%s",
                 self._out,
-                did_you_mean(self._out.name, set(others) - {self._out.name}),
+                did_you_mean(self._out.name, folders - {self._out.name}),
             )
-        if not runs or (not episodes and causes == {"user"}):
+
+        could_not_begin = not episodes and causes == {"user"}
+        if not runs or could_not_begin:
             with db:
                 for table in ("attempts", "cases", "policies", "workers", "runs"):
-                    db.execute(f"DELETE FROM {table}")  # noqa: S608 - of a plan that could not begin
+                    db.execute(f"DELETE FROM {table}")  # noqa: S608 - one of these names
             return
+
         if not config.resume:
             raise ConfigError(
                 f"{self._out} already has results ({episodes} episodes): resume them (--resume), "
-                f"or choose another out folder"
+                "or choose another out folder"
             )
-        if found := [f"- {text}" for case in self.cases for text in _differences(db, case)]:
-            odd = "\n".join(found)
-            raise ConfigError(
-                f"{self._out} has results of other settings:\n{odd}\n"
-                f"take the old settings, or choose another out folder"
-            )
-        lacking, programs = self._other_plan(db, config), dict[Change, None]()
+
+        differences: list[str] = []
         for case in self.cases:
-            query = (
-                "SELECT program FROM cases WHERE env = ? AND program IS NOT NULL AND case_id = ?"
+            differences += [f"- {difference}" for difference in _differences(db, case)]
+        if differences:
+            listing = "\n".join(differences)
+            raise ConfigError(
+                f"{self._out} has results of other settings:\n{listing}\n"
+                "take the old settings, or choose another out folder"
             )
-            if (row := db.execute(query, (case.env, case.fingerprint)).fetchone()) is not None:
-                programs |= dict.fromkeys(
-                    program_changes(f"env {case.env}", json.loads(row[0]), case.program)
-                )
+
         self._accept_or_raise(
             "plan",
-            lacking,
+            self._other_plan(db, config),
             "this plan is not that of the results in",
             "plan all of it; give a new folder (--out); or go on with this plan and have the "
-            "report say so "
-            "(--accept-changes)",
+            "report say so (--accept-changes)",
         )
         self._accept_or_raise(
-            "program", list(programs), "the environment is not that of the results in"
+            "program", self._other_programs(db), "the environment is not that of the results in"
         )
+
+    def _other_programs(self, db: sqlite3.Connection) -> list[Change]:
+        """Return the changes of the environments' files since earlier runs."""
+        query = "SELECT program FROM cases WHERE case_id = ? AND program IS NOT NULL"
+        changes: dict[Change, None] = {}
+        for case in self.cases:
+            row = db.execute(query, (case.fingerprint,)).fetchone()
+            if row is not None:
+                was = json.loads(row[0])
+                changes |= dict.fromkeys(program_changes(f"env {case.env}", was, case.program))
+        return list(changes)
 
     def _other_plan(self, db: sqlite3.Connection, config: EvalConfig) -> list[Change]:
         """Return the cases and episodes of the results that this plan lacks, and other rules of
@@ -417,25 +451,42 @@ class Store(AbstractContextManager["Store"]):
         trainer evaluates versions of policies one after the other into one folder, each with its
         plan, so cases of other policies are not missing.
         """
-        trained = all(case.policy.pushed_weights for case in self.cases)
+        is_training = all(case.policy.pushed_weights for case in self.cases)
         policies = {case.policy.name for case in self.cases}
-        mine = {(case.policy.name, case.suite.name, case.env) for case in self.cases}
-        rows = db.execute(
-            "SELECT DISTINCT policy, suite, env FROM cases WHERE case_id IN (SELECT case_id FROM "
-            "episodes)"
+        planned = {(case.policy.name, case.suite.name, case.env) for case in self.cases}
+        recorded = db.execute(
+            "SELECT DISTINCT policy, suite, env FROM cases"
+            " WHERE case_id IN (SELECT case_id FROM episodes)"
         )
-        gone = [
-            " ".join(filter(None, row))
-            for row in rows
-            if row not in mine and (row[0] in policies or not trained)
-        ]
-        changes = [Change("plan", name, "in it", None) for name in gone]
+        changes = []
+        for policy, suite, env in recorded:
+            is_expected = policy in policies or not is_training
+            if is_expected and (policy, suite, env) not in planned:
+                name = " ".join(filter(None, (policy, suite, env)))
+                changes.append(Change("plan", name, "in it", None))
+
         rule = _rule(config)
+        query = "SELECT planned, seeds, stop FROM cases WHERE case_id = ?"
         for case in self.cases:
-            query = "SELECT planned, seeds, stop FROM cases WHERE case_id = ?"
-            if (row := db.execute(query, (case.fingerprint,)).fetchone()) is not None:
+            row = db.execute(query, (case.fingerprint,)).fetchone()
+            if row is not None:
                 changes += _plan_changes(case, rule, *row)
         return changes
+
+
+def _require_pushed_weights(case: EvalCase, result: EpisodeResult) -> None:
+    """Raise `WeightsLost` if other weights acted than the pushed ones that the case evaluates."""
+    pushed = case.policy.pushed_weights
+    if pushed is None or result.policy_version is None:
+        return
+    first, last = result.first_policy_version, result.policy_version
+    acted = (first, last, result.policy_fingerprint)
+    if acted != (pushed.version, pushed.version, pushed.fingerprint):
+        raise WeightsLost(
+            f"policy: {result.key} was played by versions {first} to {last} of the weights "
+            f"({result.policy_fingerprint}), want {pushed.version} ({pushed.fingerprint}); push "
+            "nothing while a version is evaluated, and let the policy's `options` ask for no other"
+        )
 
 
 def _rule(config: EvalConfig) -> str | None:
@@ -477,16 +528,18 @@ def _differences(db: sqlite3.Connection, case: EvalCase) -> list[str]:
     ).fetchone()
     if row is None:
         return []
-    stored, seeds = map(json.loads, row)
-    differing = [
-        (name, stored.get(name), value)
-        for name, value in case.settings.items()
-        if stored.get(name) != value
-    ]
-    if any(old != new for old, new in zip(seeds, case.suite.seeds, strict=False)):
-        differing.append(("seeds", seeds, case.suite.seeds))
-    where = " ".join(filter(None, case.name))
+    recorded, recorded_seeds = map(json.loads, row)
+
+    differing: list[tuple[str, Any, Any]] = []  # (name, recorded value, planned value)
+    for name, value in case.settings.items():
+        if recorded.get(name) != value:
+            differing.append((name, recorded.get(name), value))
+    both_seeds = zip(recorded_seeds, case.suite.seeds, strict=False)
+    if any(old != new for old, new in both_seeds):
+        differing.append(("seeds", recorded_seeds, case.suite.seeds))
+
+    case_name = " ".join(filter(None, case.name))
     return [
-        f"{where}: {name}: the results have {old!r}, now it is {new!r}"
+        f"{case_name}: {name}: the results have {old!r}, now it is {new!r}"
         for name, old, new in differing
     ]

@@ -117,6 +117,15 @@ class Summary:
         }
 
     @property
+    def has_one_rate_each(self) -> bool:
+        """Whether each policy id has one rate for all its cases with one clock."""
+        for contender in self.results.contenders:
+            parts = self.parts(contender).values()
+            if not all(part.success_once.pooled for part in parts):
+                return False
+        return True
+
+    @property
     def best(self) -> list[str]:
         """The policy ids, the best first, by the mean success rate of their cases with one clock.
 
@@ -127,15 +136,16 @@ class Summary:
         timings = list(by_timing(self.results.cases).values())
         for case in timings[0] if timings else []:
             rates[case.contender].append(rate_of([case], "success_once").rate or 0.0)
-        means = {
-            name: sum(values) / len(values) if values else 0.0 for name, values in rates.items()
-        }
+
+        means = {}
+        for name, values in rates.items():
+            means[name] = sum(values) / len(values) if values else 0.0
         return sorted(means, key=lambda name: -means[name])
 
     @property
     def transports(self) -> list[str]:
         """The transports by which observations reached the policies."""
-        return sorted({result.transport for result in self._counted})
+        return sorted({result.transport for result in self.results.counted})
 
     @property
     def steps_per_second(self) -> float | None:
@@ -156,39 +166,25 @@ class Summary:
         """The share of the workers' time in which they reset and stepped environments; None on a
         robot.
         """
-        played = [one for one in self._counted if one.env_seconds is not None]
-        return _share([one.env_seconds for one in played], sum(one.seconds for one in played))
+        simulated = [result for result in self.results.counted if result.env_seconds is not None]
+        busy_s = [result.env_seconds for result in simulated]
+        return _share(busy_s, sum(result.seconds for result in simulated))
 
     @property
     def policy_busy(self) -> float | None:
         """The share of `rollout_seconds` in which policies computed, above 1 with several
         replicas; None as above.
         """
-        return _share([one.policy_seconds for one in self._counted], self.rollout_seconds)
-
-    @property
-    def _counted(self) -> list[EpisodeResult]:
-        return [result for case in self.results.cases for result in case.counted]
+        computed_s = [result.policy_seconds for result in self.results.counted]
+        return _share(computed_s, self.rollout_seconds)
 
     def to_json(self) -> dict[str, Any]:
         """Return the content of summary.json."""
-        cases = [
-            group.to_json()
-            | {what: stated(case, what) for what in get_args(Stated)}
-            | {"pushed_weights": pushed_of(case)}
-            | {"settings": case.settings, "env": case.env}
-            | {"described": case.described, "contract": case.contract, "code": case.code}
-            | {"program": case.program}
-            | {
-                "stopped_at": case.stopped_at,
-                "gap_to_synchronous": gap_to_synchronous(self.results, case),
-            }
-            for group, case in zip(self.cases, self.results.cases, strict=True)
-        ]
-        last = self.results.runs[-1]
+        groups_and_cases = zip(self.cases, self.results.cases, strict=True)
+        last_run = self.results.runs[-1]
         return {
             "state": self.state,
-            "cases": cases,
+            "cases": [self._case_json(group, case) for group, case in groups_and_cases],
             "totals": [group.to_json() for group in self.totals],
             "wall_seconds": self.wall_seconds,
             "rollout_seconds": self.rollout_seconds,
@@ -197,37 +193,59 @@ class Summary:
             "env_busy": self.env_busy,
             "policy_busy": self.policy_busy,
             "transports": self.transports,
-            "accepted_changes": [asdict(one) for one in self.results.accepted_changes],
+            "accepted_changes": [asdict(change) for change in self.results.accepted_changes],
             "policies": self.results.policies,
-            "versions": last.versions,
-            "config": last.config,
+            "versions": last_run.versions,
+            "config": last_run.config,
         }
+
+    def _case_json(self, group: Group, case: CaseResults) -> dict[str, Any]:
+        """Return the entry of a case, of which `group` is the aggregate."""
+        weights = {field: stated(case, field) for field in get_args(Stated)}
+        return (
+            group.to_json()
+            | weights
+            | {
+                "pushed_weights": pushed_of(case),
+                "settings": case.settings,
+                "env": case.env,
+                "described": case.described,
+                "contract": case.contract,
+                "code": case.code,
+                "program": case.program,
+                "stopped_at": case.stopped_at,
+                "gap_to_synchronous": gap_to_synchronous(self.results, case),
+            }
+        )
 
 
 def summarize(results: Results) -> Summary:
     """Aggregate results, those of earlier runs included."""
     wall_s = rollout_s = 0.0
     for run in results.runs:
-        played = [one for case in results.cases for one in case.episodes if one.run == run.run]
-        last = max((one.finished for one in played), default=run.started)
-        # A killed one ended with its last episode.
-        wall_s += (last if run.ended is None else run.ended) - run.started
-        rollout_s += last - min((one.finished - one.result.seconds for one in played), default=last)
-    return Summary(
-        results,
-        tuple(group_of((case.contender, case.suite, case.env), [case]) for case in results.cases),
-        tuple(group_of((name, "", TOTAL), results.of(name)) for name in results.contenders),
-        wall_s,
-        rollout_s,
-    )
+        played = [episode for episode in results.episodes if episode.run == run.run]
+        begins = [episode.finished - episode.result.seconds for episode in played]
+        last_end = max((episode.finished for episode in played), default=run.started)
+
+        # A killed run ended with its last episode.
+        end = last_end if run.ended is None else run.ended
+        wall_s += end - run.started
+        rollout_s += last_end - min(begins, default=last_end)
+
+    cases = [group_of((case.contender, case.suite, case.env), [case]) for case in results.cases]
+    totals = [group_of((name, "", TOTAL), results.of(name)) for name in results.contenders]
+    return Summary(results, tuple(cases), tuple(totals), wall_s, rollout_s)
 
 
-def stated(case: CaseResults, what: Stated) -> str | None:
+def stated(case: CaseResults, field: Stated) -> str | None:
     """Return the checkpoint, the digest of the weights, or the weights' commit on the hub; None
-    if none was stated.
+    if the policy named none.
     """
-    found: list[str | None] = [getattr(one, what) for one in case.counted]
-    return next((one for one in found if one is not None), None)
+    for result in case.counted:
+        value: str | None = getattr(result, field)
+        if value is not None:
+            return value
+    return None
 
 
 def pushed_of(case: CaseResults) -> str | None:
@@ -236,22 +254,21 @@ def pushed_of(case: CaseResults) -> str | None:
 
     The rate of a case of several versions describes none of them.
     """
-    named = {
-        one.policy_version: one.policy_fingerprint
-        for one in case.counted
-        if one.policy_version is not None
-    }
-    numbers = {
-        one.first_policy_version for one in case.counted if one.first_policy_version is not None
-    } | named.keys()
-    if not any(numbers):
+    fingerprints: dict[int, str | None] = {}  # by version, of the last acts
+    versions: set[int] = set()
+    for result in case.counted:
+        if result.policy_version is not None:
+            fingerprints[result.policy_version] = result.policy_fingerprint
+            versions.add(result.policy_version)
+        if result.first_policy_version is not None:
+            versions.add(result.first_policy_version)
+    if not any(versions):
         return None
-    first, last = min(numbers), max(numbers)
-    return (
-        f"version {last} ({named[last]})"
-        if first == last
-        else f"versions {first} to {last}, one after the other"
-    )
+
+    first, last = min(versions), max(versions)
+    if first == last:
+        return f"version {last} ({fingerprints[last]})"
+    return f"versions {first} to {last}, one after the other"
 
 
 def cause_of(error: str) -> str:
@@ -265,51 +282,69 @@ def errors_of_policies(results: Results) -> list[tuple[tuple[str, str, str], int
     """Return errors that ended episodes: (policy id, task, an error of the cause), and the
     number of episodes.
     """
-    found: dict[tuple[str, str, str], list[str]] = {}
+    by_cause: dict[tuple[str, str, str], list[str]] = {}  # by policy id, task and cause
     for case in results.cases:
-        for one in case.counted:
-            if one.status == "policy_error":
-                error = one.error or ""
-                found.setdefault((case.contender, case.task, cause_of(error)), []).append(error)
-    return [((policy, task, errors[0]), len(errors)) for (policy, task, _), errors in found.items()]
+        for result in case.counted:
+            if result.status == "policy_error":
+                error = result.error or ""
+                key = (case.contender, case.task, cause_of(error))
+                by_cause.setdefault(key, []).append(error)
+    return [
+        ((policy, task, errors[0]), len(errors)) for (policy, task, _), errors in by_cause.items()
+    ]
 
 
 def failing_cases(results: Results) -> list[CaseResults]:
     """Return the cases in which an error of the policy ended every episode."""
-    outcomes = [(case, {one.status for one in case.counted}) for case in results.cases]
-    return [case for case, statuses in outcomes if statuses == {"policy_error"}]
+    failing = []
+    for case in results.cases:
+        statuses = {result.status for result in case.counted}
+        if statuses == {"policy_error"}:
+            failing.append(case)
+    return failing
 
 
 def write_summary(summary: Summary) -> Path:
+    """Write summary.json into the folder of results, whole or not at all; return its path."""
     path = summary.out / FILE
-    with whole(path) as part:
-        part.write_text(json.dumps(summary.to_json(), indent=2) + "\n")
+    text = json.dumps(summary.to_json(), indent=2) + "\n"
+    with whole(path) as temporary:
+        temporary.write_text(text)
     return path
 
 
 def group_of(name: tuple[str, str, str], cases: Sequence[CaseResults]) -> Group:
     """Aggregate these cases under the name (policy id, suite, env)."""
-    finished: list[EpisodeResult] = [result for case in cases for result in case.counted]
-    has_means = bool(finished) and have_common_rate(cases)
+    finished: list[EpisodeResult] = []
+    infra_failures = retries = 0
+    for case in cases:
+        finished += case.counted
+        retries += sum(attempt.retried for attempt in case.attempts)
+        for episode in case.episodes:
+            if episode.result.status == "infra_failed" and not episode.beyond:
+                infra_failures += 1
+
+    steps = [result.steps for result in finished]
+    mean_steps = mean_return = None
+    if finished and have_common_rate(cases):
+        mean_steps = float(np.mean(steps))
+        mean_return = float(np.mean([result.episode_return for result in finished]))
+
     return Group(
         *name,
         planned=sum(case.planned for case in cases),
         stopped=sum(case.stopped_at is not None for case in cases),
         success_once=rate_of(cases, "success_once"),
         success_at_end=rate_of(cases, "success_at_end"),
-        policy_errors=sum(one.status == "policy_error" for one in finished),
-        infra_failures=sum(
-            one.result.status == "infra_failed" and not one.beyond
-            for case in cases
-            for one in case.episodes
-        ),
-        retries=sum(attempt.retried for case in cases for attempt in case.attempts),
-        steps=sum(one.steps for one in finished),
-        mean_steps=float(np.mean([one.steps for one in finished])) if has_means else None,
-        mean_return=float(np.mean([one.episode_return for one in finished])) if has_means else None,
-        env_step_ms=median([one.env_step_ms for one in finished]),
-        policy_ms=median([one.policy_ms for one in finished]),
-        policy_p95_ms=median([one.policy_p95_ms for one in finished]),
+        policy_errors=sum(result.status == "policy_error" for result in finished),
+        infra_failures=infra_failures,
+        retries=retries,
+        steps=sum(steps),
+        mean_steps=mean_steps,
+        mean_return=mean_return,
+        env_step_ms=median(result.env_step_ms for result in finished),
+        policy_ms=median(result.policy_ms for result in finished),
+        policy_p95_ms=median(result.policy_p95_ms for result in finished),
     )
 
 
@@ -319,6 +354,7 @@ def median(values: Iterable[float | None]) -> float | None:
     return float(np.median(known)) if known else None
 
 
-def _share(parts: Sequence[float | None], whole_s: float) -> float | None:
-    known = [part for part in parts if part is not None]
-    return sum(known) / whole_s if known and whole_s else None
+def _share(seconds: Sequence[float | None], total_s: float) -> float | None:
+    """Return the share of `total_s` that the known `seconds` take; None if it is not known."""
+    known = [value for value in seconds if value is not None]
+    return sum(known) / total_s if known and total_s else None
