@@ -2,7 +2,8 @@
 
 The episodes of a batch are played in lockstep: at each step, one request to the policy serves all
 that need an answer. A single environment is a batch of one. Each episode has the same result as if
-it were played alone, except for the times."""
+it were played alone, except for the times.
+"""
 
 from __future__ import annotations
 
@@ -10,7 +11,6 @@ import hashlib
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
 from time import perf_counter
 from typing import Any, Literal
 
@@ -36,7 +36,7 @@ from vlagents_ray.interface import POLICY, Act, Agent, Obs
 from vlagents_ray.validation import check_action
 
 _LITTLE_ENDIAN = np.dtype("<f4")
-_KEPT = (  # what `EpisodeStats` counts as a result has it
+_FIELDS_OF_RESULT = (  # those that `EpisodeStats` and a result have in common
     "key",
     "steps",
     "episode_return",
@@ -64,8 +64,9 @@ class EpisodeStats:
     success: bool = False
     first_success: int | None = None
     ending: Ending = "error"
-    # One after the other; the last is the present one.
-    instructions: list[str] = field(default_factory=list)
+    instructions: list[str] = field(
+        default_factory=list
+    )  # of each task so far; the last is current
     checkpoint: str | None = None
     weights: str | None = None
     revision: str | None = None
@@ -83,60 +84,72 @@ class EpisodeStats:
     timing_ms: dict[str, list[float]] = field(default_factory=dict)
 
     def began(self, info: object) -> None:
-        said = info if isinstance(info, dict) else {}
-        self.checkpoint, self.weights, self.revision = (
-            value if isinstance(value := said.get(name), str) else None
-            for name in ("checkpoint", "weights", "revision")
-        )
+        """Record the checkpoint and the weights that the policy's reset named."""
+        named = info if isinstance(info, dict) else {}
+        for name in ("checkpoint", "weights", "revision"):
+            value = named.get(name)
+            setattr(self, name, value if isinstance(value, str) else None)
 
     def acted(self, act: Act, seconds: float, latency_s: float | None) -> None:
         """Record an answer of the policy, its duration and, in real-time mode, its latency."""
         self.act_ms.append(1e3 * seconds)
+        if latency_s is not None:
+            self.latency_ms.append(1e3 * latency_s)
+
         timing = act.info.get("timing", {})
         # Each answer counts its share of a batch; a policy in this process computes during the
         # whole wait.
         computed_ms = timing.get("inference_ms", 1e3 * seconds)
         self.policy_seconds += computed_ms / 1e3 / max(1, timing.get("batch_size", 1))
-        for stage, spent in timing.items():
+        for stage, value in timing.items():
             if stage.endswith("_ms"):  # the batch size is not a time
-                self.timing_ms.setdefault(stage, []).append(float(spent))
-        if (version := version_of(act)) is not None:
-            self.policy_version, self.policy_fingerprint = (
-                version,
-                act.info[POLICY].get("fingerprint") or None,
-            )
-            self.first_policy_version = (
-                version if self.first_policy_version is None else self.first_policy_version
-            )
-        if latency_s is not None:
-            self.latency_ms.append(1e3 * latency_s)
+                self.timing_ms.setdefault(stage, []).append(float(value))
+
+        version = version_of(act)
+        if version is not None:
+            self.policy_version = version
+            self.policy_fingerprint = act.info[POLICY].get("fingerprint") or None
+            if self.first_policy_version is None:
+                self.first_policy_version = version
 
     def result(self, transport: str, failed: PolicyFailed | None = None) -> EpisodeResult:
         """Return the result of the finished episode; `failed` is the policy error that ended it,
         if any.
         """
-        kept = {name: getattr(self, name) for name in _KEPT}
-        return EpisodeResult(
-            **kept,
-            status="done" if failed is None else "policy_error",
-            success_once=self.first_success is not None and failed is None,
-            success_at_end=self.success and failed is None,
-            first_success=self.first_success if failed is None else None,
-            ending=self.ending if failed is None else "error",
+        seconds = perf_counter() - self.started
+        common = {name: getattr(self, name) for name in _FIELDS_OF_RESULT}
+        medians_ms = {
+            stage: float(np.median(times)) for stage, times in sorted(self.timing_ms.items())
+        }
+        result = EpisodeResult(
+            **common,
+            status="done",
+            success_once=self.first_success is not None,
+            success_at_end=self.success,
+            first_success=self.first_success,
+            ending=self.ending,
             instruction="; ".join(self.instructions),
-            error=None if failed is None else f"{failed.code}: {failed}",
-            seconds=perf_counter() - self.started,
+            seconds=seconds,
             env_step_ms=_quantile(self.step_ms, 0.5),
             env_seconds=((self.reset_ms or 0.0) + sum(self.step_ms)) / 1e3,
             acts=len(self.act_ms),
             policy_ms=_quantile(self.act_ms, 0.5),
             policy_p95_ms=_quantile(self.act_ms, 0.95),
             latency_ms=_quantile(self.latency_ms, 0.5),
-            timing_ms={
-                stage: float(np.median(spent)) for stage, spent in sorted(self.timing_ms.items())
-            },
+            timing_ms=medians_ms,
             transport=transport,
             actions_sha256=self.actions.hexdigest(),
+        )
+        if failed is None:
+            return result
+        return replace(
+            result,
+            status="policy_error",
+            success_once=False,
+            success_at_end=False,
+            first_success=None,
+            ending="error",
+            error=f"{failed.code}: {failed}",
         )
 
 
@@ -215,52 +228,66 @@ def run_episodes(
     if not len(keys) == len(sessions) <= env.num_envs or not keys:
         raise ConfigError(
             f"got {len(keys)} episodes and {len(sessions)} sessions for {env.num_envs} "
-            "environments; "
-            f"want one session an episode, and an environment for each"
+            "environments; want one session an episode, and an environment for each"
         )
+
+    # Reset the environments.
     watch("env reset", 0)
-    begun = perf_counter()
+    start = perf_counter()
     with failures.env_side("reset"):
         contract = env.contract
-        seen = env.reset(
-            seeds=[key.seed for key in keys],
-            options=[options_of_reset(env, key.episode, reset_options) for key in keys],
-        )
-        first = [
-            (
-                failures.checked_obs(obs, contract, "reset"),
-                failures.checked_instruction(text, "reset"),
-            )
-            for obs, text in zip(seen, env.instructions, strict=True)
-        ]
-    reset_ms = 1e3 * (perf_counter() - begun)
-    executor = partial(ChunkExecutor, execute, clock, contract)
-    watched = observers or [EpisodeObserver()] * len(keys)
-    episodes = []
-    for i, (key, session, observer, (obs, text)) in enumerate(
-        zip(keys, sessions, watched, first, strict=True)
+        seeds = [key.seed for key in keys]
+        options = [options_of_reset(env, key.episode, reset_options) for key in keys]
+        returned = env.reset(seeds=seeds, options=options)
+        observations = []
+        instructions = []
+        for obs, text in zip(returned, env.instructions, strict=True):
+            observations.append(failures.checked_obs(obs, contract, "reset"))
+            instructions.append(failures.checked_instruction(text, "reset"))
+    reset_ms = 1e3 * (perf_counter() - start)
+
+    def new_executor() -> ChunkExecutor:
+        return ChunkExecutor(execute, clock, contract)
+
+    observers = observers or [EpisodeObserver()] * len(keys)
+    episodes: list[_Episode] = []
+    for key, session, observer, obs, text in zip(
+        keys, sessions, observers, observations, instructions, strict=True
     ):
         observer.add_observation(obs)
-        stats = EpisodeStats(key, begun, instructions=[text], reset_ms=reset_ms)
-        episodes.append(_Episode(i, session, stats, observer, executor, obs))
+        stats = EpisodeStats(key, start, instructions=[text], reset_ms=reset_ms)
+        episodes.append(_Episode(len(episodes), session, stats, observer, new_executor, obs))
+
     watch("policy reset", 0)
     _reset_policy(agent, episodes, contract, policy_options or {})
-    steps, playing = 0, _unfinished(episodes)
+
+    # Play until all are finished.
+    steps = 0
+    playing = _unfinished(episodes)
     while playing:
-        if requesting := [episode for episode in playing if not episode.ticks]:
+        requesting = [episode for episode in playing if not episode.ticks]
+        if requesting:
             watch("policy act", steps)
             _request_actions(agent, requesting, contract)
             playing = _unfinished(playing)
-        if playing:
-            watch("env step", steps)
-            asks = steps + 1 < env.max_steps and any(len(episode.ticks) == 1 for episode in playing)
-            env.looked_at = images or asks
-            _step(env, episodes, playing, contract)
-            steps, playing = steps + 1, _unfinished(playing)
-            if env.several_tasks and (begun_anew := _instructed(env, playing)):
+            if not playing:
+                break
+
+        watch("env step", steps)
+        some_request_next = any(len(episode.ticks) == 1 for episode in playing)
+        is_last_step = steps + 1 >= env.max_steps
+        env.looked_at = images or (some_request_next and not is_last_step)
+        _step(env, episodes, playing, contract)
+        steps += 1
+        playing = _unfinished(playing)
+
+        if env.several_tasks:
+            instructed = _instructed(env, playing)
+            if instructed:
                 watch("policy reset", steps)
-                _reset_policy(agent, begun_anew, contract, policy_options or {})
+                _reset_policy(agent, instructed, contract, policy_options or {})
                 playing = _unfinished(playing)
+
     return [episode.outcome for episode in episodes if episode.outcome is not None]
 
 
@@ -304,6 +331,7 @@ class _Episode:
         self._executor, self._done = self.new_executor(), False
 
     def request(self) -> Obs:
+        """Return the newest observation, with what observer and executor add to its info."""
         info = {**self.observer.request_info, **self._executor.request_info()}
         return replace(self.obs, info={**self.obs.info, **info}) if info else self.obs
 
@@ -315,13 +343,15 @@ class _Episode:
                     raise answer
                 latency_s = self._executor.latency_s(seconds)
                 self.stats.acted(answer, seconds, latency_s)
+
             rows = Act(check_action(answer.action, contract)).rows()
-            # If the environment's contract states no size.
+            # The contract of the environment may state no size.
             if self._width not in (None, rows.shape[1]):
                 raise InvalidAction(
                     f"action: got {rows.shape}, want {self._width} numbers a row, as in the first"
                 )
             self._width = rows.shape[1]
+
             ticks = list(
                 self._executor.ticks(rows, latency_s or 0.0, answer.info, done=answer.done)
             )
@@ -342,11 +372,17 @@ class _Episode:
         stats.success = step.success
         if stats.success and stats.first_success is None:
             stats.first_success = stats.steps
-        if over := step.terminated or step.truncated or stats.steps >= limit:
-            stats.ending = "terminated" if step.terminated else "truncated"
-        elif over := self._done and not self.ticks:
+
+        is_over = True
+        if step.terminated:
+            stats.ending = "terminated"
+        elif step.truncated or stats.steps >= limit:
+            stats.ending = "truncated"
+        elif self._done and not self.ticks:
             stats.ending = "policy_done"
-        if over:
+        else:
+            is_over = False
+        if is_over:
             self.outcome = stats.result(transport_of(self.session))
         self.observer.add_action(tick.action, step.reward, step.success)
 
@@ -366,6 +402,7 @@ class _Episode:
         self.outcome = Diverged(error, self.stats.result(transport_of(self.session), cause))
 
     def failed(self, error: VLAgentsError) -> None:
+        """End the episode with an error; one of the policy is a result."""
         if isinstance(error, PolicyFailed) and not isinstance(error, CheckpointFailed):
             self.outcome = self.stats.result(transport_of(self.session), error)
         else:
@@ -374,42 +411,58 @@ class _Episode:
 
 def _instructed(env: BatchEnv, playing: Sequence[_Episode]) -> list[_Episode]:
     """Return the episodes whose environment has a further task."""
+    instructed = []
     with _STEPPING:
-        texts = env.instructions if playing else []
-        found = [one for one in playing if texts[one.number] != one.stats.instructions[-1]]
-        for episode in found:
-            episode.instructed(failures.checked_instruction(texts[episode.number], "step"))
-    return found
+        instructions = env.instructions if playing else []
+        for episode in playing:
+            instruction = instructions[episode.number]
+            if instruction != episode.stats.instructions[-1]:
+                episode.instructed(failures.checked_instruction(instruction, "step"))
+                instructed.append(episode)
+    return instructed
 
 
 def _reset_policy(
     agent: Agent, episodes: Sequence[_Episode], contract: Contract, options: Mapping[str, Any]
 ) -> None:
     """Reset the session of each episode with its observation, in one message to a server."""
-    keys, sessions = [one.stats.key for one in episodes], [one.session for one in episodes]
-    first, texts = [one.obs for one in episodes], [one.stats.instructions[-1] for one in episodes]
+    keys = [episode.stats.key for episode in episodes]
+    sessions = [episode.session for episode in episodes]
+    observations = [episode.obs for episode in episodes]
+    instructions = [episode.stats.instructions[-1] for episode in episodes]
     seeds = [key.seed if key.policy_seed is None else key.policy_seed for key in keys]
-    given = {**options, "env": keys[0].env}
+    all_options = {**options, "env": keys[0].env}
     if hasattr(agent, "metadata"):  # a server also compares the contract, and answers 409
-        given["contract"] = contract.to_json()
+        all_options["contract"] = contract.to_json()
+
     answers: list[dict[str, Any] | Exception] = []
     if isinstance(agent, RemoteAgent):
         try:
-            answers = agent.reset_batch(first, texts, sessions, seeds=seeds, **given)  # type: ignore[arg-type]
+            answers = agent.reset_batch(
+                observations,
+                instructions,
+                sessions,  # type: ignore[arg-type]
+                seeds=seeds,
+                **all_options,
+            )
         except VLAgentsError as error:
             answers = [error] * len(episodes)
     else:
-        for session, obs, text, seed in zip(sessions, first, texts, seeds, strict=True):
+        for session, obs, text, seed in zip(
+            sessions, observations, instructions, seeds, strict=True
+        ):
             try:
-                answers.append(session.reset(obs, text, **{**given, "seed": seed}))
+                answers.append(session.reset(obs, text, **{**all_options, "seed": seed}))
             except Exception as error:  # noqa: BLE001 - becomes the outcome of the episode
                 answers.append(error)
+
     for episode, answer in zip(episodes, answers, strict=True):
         episode.began(answer)
 
 
 def _request_actions(agent: Agent, episodes: Sequence[_Episode], contract: Contract) -> None:
-    begun = perf_counter()
+    """Request an action for each episode, all in one call of the policy."""
+    start = perf_counter()
     try:
         with _ACTING:
             requests = [episode.request() for episode in episodes]
@@ -423,7 +476,8 @@ def _request_actions(agent: Agent, episodes: Sequence[_Episode], contract: Contr
                 )
     except VLAgentsError as error:
         answers = [error] * len(episodes)
-    seconds = perf_counter() - begun
+    seconds = perf_counter() - start
+
     for episode, answer in zip(episodes, answers, strict=True):
         episode.answered(answer, contract, seconds)
 
@@ -431,16 +485,21 @@ def _request_actions(agent: Agent, episodes: Sequence[_Episode], contract: Contr
 def _step(
     env: BatchEnv, episodes: Sequence[_Episode], playing: Sequence[_Episode], contract: Contract
 ) -> None:
-    acts = [
-        Act(episode.ticks[0].action) if episode.outcome is None else None for episode in episodes
-    ]
-    begun = perf_counter()
+    """Execute the next tick of each episode that is playing; others are idle in the same step."""
+    acts: list[Act | None] = []
+    for episode in episodes:
+        is_playing = episode.outcome is None
+        acts.append(Act(episode.ticks[0].action) if is_playing else None)
+
+    start = perf_counter()
     try:
         with _STEPPING:
-            seen, rewards, terminated, truncated, infos = env.step(acts)
-            answers = list(zip(episodes, seen, rewards, terminated, truncated, infos, strict=True))
+            observations, rewards, terminated, truncated, infos = env.step(acts)
+            outputs = list(
+                zip(episodes, observations, rewards, terminated, truncated, infos, strict=True)
+            )
     except (EnvFailed, InvalidAction) as error:
-        # Of environments that one simulator runs: the error does not name the episode.
+        # One simulator runs all environments, so that the error does not name the episode.
         if len(playing) > 1:
             raise
         if failures.raised_by_divergence(error):
@@ -450,26 +509,28 @@ def _step(
             raise
         playing[0].failed(error)
         return
-    took_ms = 1e3 * (perf_counter() - begun)
-    for episode, obs, reward, terminated, truncated, info in answers:
-        if episode.outcome is None:
-            raised = info.get(ERROR) if isinstance(info, Mapping) else None
-            try:
-                with _STEPPING:
-                    if isinstance(raised, BaseException):
-                        raise raised
-                step = failures.checked_step(
-                    obs, reward, terminated, truncated, info, contract, images=env.looked_at
-                )
-            except VLAgentsError as error:
-                finite = raised is not None or failures.is_finite(obs, reward)
-                if not finite or failures.raised_by_divergence(error):
-                    episode.diverged(error)
-                else:
-                    episode.failed(error)
-                continue
-            episode.stats.step_ms.append(took_ms)
-            episode.stepped(step, env.max_steps)
+    step_ms = 1e3 * (perf_counter() - start)
+
+    for episode, obs, reward, is_terminated, is_truncated, info in outputs:
+        if episode.outcome is not None:
+            continue
+        raised = info.get(ERROR) if isinstance(info, Mapping) else None
+        try:
+            with _STEPPING:
+                if isinstance(raised, BaseException):
+                    raise raised
+            step = failures.checked_step(
+                obs, reward, is_terminated, is_truncated, info, contract, images=env.looked_at
+            )
+        except VLAgentsError as error:
+            is_finite = raised is not None or failures.is_finite(obs, reward)
+            if not is_finite or failures.raised_by_divergence(error):
+                episode.diverged(error)
+            else:
+                episode.failed(error)
+            continue
+        episode.stats.step_ms.append(step_ms)
+        episode.stepped(step, env.max_steps)
 
 
 def transport_of(agent: Agent) -> str:
@@ -483,5 +544,5 @@ def options_of_reset(
     """Return the options for the environment's reset: the user's `options` override the
     benchmark's.
     """
-    begin = {} if env.init_states is None else {"init_state": episode % env.init_states}
-    return begin | dict(options or {}) or None
+    of_benchmark = {} if env.init_states is None else {"init_state": episode % env.init_states}
+    return of_benchmark | dict(options or {}) or None

@@ -29,12 +29,13 @@ Cause = Literal["user", "policy", "worker", "operator"]
 # Ends of messages about the policy's server: the likely causes, and how to find the line of a
 # policy.
 _CURES: dict[type[errors.VLAgentsError], str] = {
-    errors.ConnectionLost: ("; or find the line that ends it in this process with --workers 0"),
+    errors.ConnectionLost: "; or find the line that ends it in this process with --workers 0",
     errors.DeadlineExceeded: (
         "; in an evaluation, timeout_s is policy_timeout_s; or see where it hangs in this process "
         "with --workers 0"
     ),
 }
+# Errors that the user can correct.
 _USER = (
     errors.ConfigError,
     errors.ContractMismatch,
@@ -48,9 +49,9 @@ _USER = (
     errors.UnknownApp,
     errors.UnknownCheckpoint,
 )
-# InvalidInput here: an unusable observation of the environment.
+# Errors of the simulator; an `InvalidInput` reports an unusable observation of the environment.
 _WORKER = (errors.EnvFailed, errors.InvalidInput)
-# Other `InvalidInput`, of the connection to the policy.
+# These subclasses of `InvalidInput` are errors of the connection to the policy.
 _POLICY = (errors.UnknownSession, errors.NotReset)
 # These errors of an environment are no breakdown: they report settings, a breach of its contract, a
 # missing package, or a refused action.
@@ -86,16 +87,18 @@ def explain(error: errors.VLAgentsError) -> Failure:
     """Return the failure for `error`. A `PolicyFailed` outside an episode means that the policy
     cannot start.
     """
-    cause: Cause = (
-        "worker" if isinstance(error, _WORKER) and not isinstance(error, _POLICY) else "policy"
-    )
+    cause: Cause = "policy"
     if isinstance(error, _USER):
         cause = "user"
+    elif isinstance(error, _WORKER) and not isinstance(error, _POLICY):
+        cause = "worker"
+
     message = str(error)
     if isinstance(error, errors.MissingDependency):
         message += f" (worker's Python: {sys.executable})"
     if cause == "policy":
-        message += next((cure for kind, cure in _CURES.items() if isinstance(error, kind)), "")
+        cures = (cure for kind, cure in _CURES.items() if isinstance(error, kind))
+        message += next(cures, "")
     return Failure(cause, error.code, message, "".join(traceback.format_exception(error)))
 
 
@@ -115,10 +118,10 @@ class _Side:
     again.
     """
 
-    __slots__ = ("_what",)
+    __slots__ = ("_phase",)
 
-    def __init__(self, what: str) -> None:
-        self._what = what
+    def __init__(self, phase: str) -> None:
+        self._phase = phase
 
     def __enter__(self) -> None:
         pass
@@ -133,7 +136,7 @@ class env_side(_Side):  # noqa: N801 - a context manager
         _raise_if_quit(error)
         # ManiSkill raises SystemExit when an asset is missing.
         if isinstance(error, Exception | SystemExit) and not isinstance(error, _FROM_ENV):
-            raise errors.EnvFailed(f"env {self._what}: {type(error).__name__}: {error}") from error
+            raise errors.EnvFailed(f"env {self._phase}: {type(error).__name__}: {error}") from error
 
 
 class policy_side(_Side):  # noqa: N801 - a context manager
@@ -143,7 +146,7 @@ class policy_side(_Side):  # noqa: N801 - a context manager
         _raise_if_quit(error)
         if isinstance(error, Exception) and not isinstance(error, errors.VLAgentsError):
             raise errors.PolicyFailed(
-                f"policy {self._what}: {type(error).__name__}: {error}"
+                f"policy {self._phase}: {type(error).__name__}: {error}"
             ) from error
 
 
@@ -225,12 +228,12 @@ def checked_step(
             finite number, or a flag is not a bool.
     """
     if not isinstance(info, (dict, Mapping)) or "success" not in info:
-        got = (
-            f"info with {sorted(map(str, info))}"
-            if isinstance(info, Mapping)
-            else f"{type(info).__name__} as info"
+        description = f"{type(info).__name__} as info"
+        if isinstance(info, Mapping):
+            description = f"info with {sorted(map(str, info))}"
+        raise errors.EnvFailed(
+            f"env step: got {description}, want 'success' among it; see EvalEnv.step"
         )
-        raise errors.EnvFailed(f"env step: got {got}, want 'success' among it; see EvalEnv.step")
     return EnvStep(
         checked_obs(obs, contract, "step", images=images),
         _number(reward),
@@ -248,28 +251,30 @@ def checked_obs(obs: object, contract: Contract, where: str, *, images: bool = T
             way.
         EnvFailed: A number is not finite, or a later observation does not fit.
     """
-    wrong: type[errors.VLAgentsError] = (
-        errors.ContractMismatch if where == "reset" else errors.EnvFailed
-    )
+    error_class: type[errors.VLAgentsError] = errors.EnvFailed
+    if where == "reset":
+        error_class = errors.ContractMismatch
+
     if not isinstance(obs, Obs):
-        raise wrong(
+        raise error_class(
             f"env {where}: got {type(obs).__name__} in place of the observation, want an Obs"
         )
-    for name, part in (("cameras", obs.cameras), ("state", obs.state), ("info", obs.info)):
-        if not isinstance(part, (dict, Mapping)):  # testing for a dict first is faster
-            raise wrong(
-                f"env {where}: got {type(part).__name__} as the observation's {name}, want a dict"
+    for name, value in (("cameras", obs.cameras), ("state", obs.state), ("info", obs.info)):
+        if not isinstance(value, (dict, Mapping)):  # testing for a dict first is faster
+            raise error_class(
+                f"env {where}: got {type(value).__name__} as the observation's {name}, want a dict"
             )
+
     try:
         check_observation(obs, contract if images else replace(contract, cameras=None))
     except errors.InvalidObservation as error:
         if not is_finite(obs, 0.0):
-            wrong = errors.EnvFailed
-        raise wrong(
+            error_class = errors.EnvFailed
+        raise error_class(
             f"env {where}: the observation does not fit the env's own contract: {error}"
         ) from error
     except TypeError as error:  # such as a gripper that is not a number
-        raise wrong(
+        raise error_class(
             f"env {where}: got {obs.gripper!r} as the gripper, want a number in [0, 1]"
         ) from error
     return obs
@@ -277,7 +282,8 @@ def checked_obs(obs: object, contract: Contract, where: str, *, images: bool = T
 
 def _number(reward: Any) -> float:
     try:
-        # A diverged simulation; neither the results file nor JSON has a NaN.
+        # The reward of a diverged simulation may be a NaN, which neither the results file nor JSON
+        # can hold.
         if math.isfinite(reward):
             return float(reward)
     except (TypeError, ValueError):

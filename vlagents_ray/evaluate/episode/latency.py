@@ -59,19 +59,15 @@ class ChunkExecutor:
                 "1/s"
             )
         self._spec = env.action
-        self._still = (
-            stopping(env.action) if self._clock.meanwhile == "chunk" else self._clock.meanwhile
-        )
-        if (
-            self._clock.latency != 0
-            and self._clock.neutral is None
-            and stopping(env.action) != "zero"
-        ):
+        self._still: str = self._clock.meanwhile
+        if self._still == "chunk":
+            self._still = stopping(env.action)
+        needs_neutral = self._clock.latency != 0 and stopping(env.action) != "zero"
+        if needs_neutral and self._clock.neutral is None:
             raise ConfigError(
                 "clock: the env's contract does not say that its actions are relative, so that "
-                "zeros may be a pose to "
-                "go to; give clock.neutral, the action that is executed before the first answer "
-                "comes"
+                "zeros may be a pose to go to; give clock.neutral, the action that is executed "
+                "before the first answer comes"
             )
         self._plan = ChunkBuffer()
         self._last: np.ndarray | None = None  # (D,) action
@@ -112,21 +108,24 @@ class ChunkExecutor:
         if self._clock.real_time_chunking and not done and len(rows) <= (execute or len(rows)):
             raise ConfigError(
                 f"clock.real_time_chunking: got chunks of {len(rows)} rows, all of which are "
-                "executed before the next "
-                "request, so that nothing is left to continue; give an `execute` below that, and "
-                "none in the policy"
+                "executed before the next request, so that nothing is left to continue; give an "
+                "`execute` below that, and none in the policy"
             )
-        wait = math.ceil(latency_s * self._hz - _EXACTLY)
-        self._delay.add(wait)
-        asked = self._plan.executed
-        for tick in self._waiting(wait, rows.shape[1]):
+
+        # The ticks between the observation and its answer.
+        ticks_waited = math.ceil(latency_s * self._hz - _EXACTLY)
+        self._delay.add(ticks_waited)
+        executed_at_request = self._plan.executed
+        for tick in self._waiting(ticks_waited, rows.shape[1]):
             self._last = tick.action
             yield tick
-        if self._plan.outruns(asked, info or {}):
+        if self._plan.outruns(executed_at_request, info or {}):
             return
+
         # The last row is always executed, else a policy slower than its chunks would never act.
-        late = self._plan.executed - len(rows) + 1
-        self._plan.replace(rows, max(asked, late) if self._clock.align else None)
+        latest_start = self._plan.executed - len(rows) + 1
+        start = max(executed_at_request, latest_start)
+        self._plan.replace(rows, start if self._clock.align else None)
         first = self._plan.take()
         self._last = first.action
         yield Tick(first.action)
@@ -140,12 +139,9 @@ class ChunkExecutor:
             step = self._plan.next if self._clock.meanwhile == "chunk" else None
             if step is None:
                 tick = Tick(self._held(dim), waited=True, held=True)
-                # A held relative action moves the robot on, so that it counts as a row.
-                if (
-                    self._clock.meanwhile == "hold"
-                    and self._plan.executed > 0
-                    and stopping(self._spec) == "zero"
-                ):
+                # A relative action that is repeated moves the robot on, so that it counts as a row.
+                repeats = self._clock.meanwhile == "hold" and self._plan.executed > 0
+                if repeats and stopping(self._spec) == "zero":
                     self._plan.advance()
                 yield tick
             else:
@@ -154,14 +150,20 @@ class ChunkExecutor:
 
     def _held(self, dim: int) -> np.ndarray:
         """Return the action of a tick for which no row is left, (D,)."""
-        given = self._clock.neutral
-        start = neutral(self._spec, dim) if given is None else np.asarray(given, np.float32)
-        if start.shape != (dim,):
+        configured = self._clock.neutral
+        if configured is None:
+            still = neutral(self._spec, dim)
+        else:
+            still = np.asarray(configured, np.float32)
+        if still.shape != (dim,):
             raise ConfigError(
-                f"clock.neutral: got {len(start)} numbers, the policy's actions have {dim}"
+                f"clock.neutral: got {len(still)} numbers, the policy's actions have {dim}"
             )
+
         if self._last is None:
-            return start
+            return still
         if self._still == "hold":
             return self._last
-        return start if given is not None else SafeAction("zero", self._spec)(Obs(), self._last)
+        if configured is not None:
+            return still
+        return SafeAction("zero", self._spec)(Obs(), self._last)

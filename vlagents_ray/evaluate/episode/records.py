@@ -70,14 +70,12 @@ class EpisodeResult:
         """Return the fields that are equal in all runs of one key: all except times and
         transport.
         """
-        return {
-            one.name: getattr(self, one.name)
-            for one in fields(self)
-            if one.name not in _CIRCUMSTANCES
-        }
+        names = [field.name for field in fields(self) if field.name not in _CIRCUMSTANCES]
+        return {name: getattr(self, name) for name in names}
 
 
-# "weights" is checked separately, and other versions of the weights show in the actions.
+# Fields that may differ between two runs of one key. "weights" is checked separately, and other
+# versions of the weights show in the actions.
 _CIRCUMSTANCES = {
     "seconds",
     "reset_ms",
@@ -140,6 +138,6 @@ class EpisodeObserver:
 
 def version_of(act: Act) -> int | None:
     """Return the version of the weights that chose an action; None if the policy names none."""
-    said = act.info.get(POLICY)
-    version = said.get("version") if isinstance(said, Mapping) else None
+    policy = act.info.get(POLICY)
+    version = policy.get("version") if isinstance(policy, Mapping) else None
     return int(version) if isinstance(version, int | np.integer) else None

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import zlib
 from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -45,8 +46,8 @@ def play_actions(
     for number, action in enumerate(actions):
         watch("env step", number)
         with env_side("step"):
-            [seen], [reward], [terminated], [truncated], [info] = env.step([Act(action)])
-            step = checked_step(seen, reward, terminated, truncated, info, contract, images=images)
+            [obs], [reward], [terminated], [truncated], [info] = env.step([Act(action)])
+            step = checked_step(obs, reward, terminated, truncated, info, contract, images=images)
         yield step.obs, step
 
 
@@ -54,20 +55,26 @@ class PlayedEpisode(EpisodeObserver):
     """The actions and outcomes of an episode, with digests in place of images."""
 
     def __init__(self) -> None:
-        # Numbers and images of each observation, by name.
-        self._seen: list[tuple[dict[str, Any], dict[str, Any]]] = []
-        self._done: list[tuple[np.ndarray, float, bool]] = []  # (D,) action, reward, success
+        self._observations: list[_Digests] = []
+        self._actions: list[np.ndarray] = []  # (D,) each
+        self._outcomes: list[tuple[float, bool]] = []  # (reward, success) of each action
 
     @property
     def lacks_images(self) -> bool:
         """Whether an observation lacks images that the first one has."""
-        return any(images.keys() != self._seen[0][1].keys() for _, images in self._seen)
+        if not self._observations:
+            return False
+        names = self._observations[0].images.keys()
+        return any(digests.images.keys() != names for digests in self._observations)
 
     def add_observation(self, obs: Obs) -> None:
-        self._seen.append(_digests(obs))
+        """Keep the digests of an observation."""
+        self._observations.append(_Digests.from_obs(obs))
 
     def add_action(self, action: np.ndarray, reward: float, success: bool) -> None:
-        self._done.append((np.array(action), reward, success))
+        """Keep an action and its outcome."""
+        self._actions.append(np.array(action))
+        self._outcomes.append((reward, success))
 
     def play_again(
         self,
@@ -86,22 +93,19 @@ class PlayedEpisode(EpisodeObserver):
         Returns:
             The first difference, which ends the pass; None if there is none.
         """
-        played = play_actions(
-            env, seed, options, (action for action, _, _ in self._done), images=True, watch=watch
-        )
+        played = play_actions(env, seed, options, self._actions, images=True, watch=watch)
         try:
             for number, (obs, step) in enumerate(played):
                 record(obs)
-                then, now = self._seen[number], _digests(obs)
-                parts = [(kind, name) for kind in (0, 1) for name in then[kind]]
-                differs = next(
-                    (name for kind, name in parts if then[kind][name] != now[kind].get(name)), None
-                )
-                if step is not None and (step.reward, step.success) != self._done[number - 1][1:]:
-                    differs = "reward or success"
-                if differs is not None:
-                    steps = "the last step" if number == len(self._done) else f"{number} steps"
-                    return f"after {steps}, {differs} differs"
+                difference = self._observations[number].difference(_Digests.from_obs(obs))
+                if step is not None:
+                    outcome = (step.reward, step.success)
+                    if outcome != self._outcomes[number - 1]:
+                        difference = "reward or success"
+                if difference is not None:
+                    is_last = number == len(self._actions)
+                    steps = "the last step" if is_last else f"{number} steps"
+                    return f"after {steps}, {difference} differs"
         except VLAgentsError as error:  # such as an earlier end of the episode
             return str(error)
         return None
@@ -111,9 +115,31 @@ class PlayedEpisode(EpisodeObserver):
 SecondPass = Callable[[PlayedEpisode, Callable[[Obs], None]], str | None]
 
 
-def _digests(obs: Obs) -> tuple[dict[str, Any], dict[str, Any]]:
-    numbers: dict[str, Any] = {
-        f"state {name!r}": part.tobytes() for name, part in obs.state.items()
-    }
-    images = {f"image {name!r}": zlib.crc32(one.tobytes()) for name, one in obs.cameras.items()}
-    return numbers | {"the gripper": obs.gripper}, images
+@dataclass(frozen=True, slots=True)
+class _Digests:
+    """The numbers of an observation, and the checksums of its images, by names for a message."""
+
+    numbers: dict[str, Any]
+    images: dict[str, int]
+
+    @classmethod
+    def from_obs(cls, obs: Obs) -> _Digests:
+        numbers: dict[str, Any] = {}
+        for name, values in obs.state.items():
+            numbers[f"state {name!r}"] = values.tobytes()
+        numbers["the gripper"] = obs.gripper
+
+        images = {}
+        for name, image in obs.cameras.items():
+            images[f"image {name!r}"] = zlib.crc32(image.tobytes())
+        return cls(numbers, images)
+
+    def difference(self, other: _Digests) -> str | None:
+        """Return the first name whose value `other` does not have; None if there is none."""
+        for name, number in self.numbers.items():
+            if other.numbers.get(name) != number:
+                return name
+        for name, checksum in self.images.items():
+            if other.images.get(name) != checksum:
+                return name
+        return None
