@@ -6,7 +6,7 @@ import contextlib
 import os
 from abc import abstractmethod
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -22,7 +22,7 @@ from vlagents_ray.ray_tools.private import node_of_this_process
 # Planned steps up to which Ray's start, some seconds, is a large part of the time.
 SHORT_STEPS = 10_000
 _STEPS = 300  # of an episode, if the options of its environment name no `max_steps`
-SIGNAL_S = 0.2  # s by which a signal may reach this process later than a worker
+SIGNAL_S = 0.2  # the time by which a signal may reach this process later than a worker, s
 VARIABLES = "env_vars"  # in Ray's runtime environment
 
 
@@ -38,31 +38,38 @@ def chosen_workers(config: EvalConfig) -> int:
     Raises:
         ConfigError: `config.workers` is 0, and something needs Ray.
     """
-    planned, urls = (
-        plan_cases(config),
-        [url for one in config.policies for url in (one.url, one.source) if url],
-    )
-    needs = [f"{url} is inside a Ray cluster" for url in urls if url.startswith("serve://")]
-    packages = {name for case in planned for name in case.worker.runtime_env} - {VARIABLES}
-    needs += [f"a worker's runtime_env has {name!r}" for name in sorted(packages)]
-    if config.workers == 0 and needs:
+    cases = plan_cases(config)
+    reasons = _reasons_for_ray(config, cases)
+    if config.workers == 0 and reasons:
         raise ConfigError(
-            f"workers: got 0, which plays in this process without Ray, but {needs[0]}; want 1 or "
+            f"workers: got 0, which plays in this process without Ray, but {reasons[0]}; want 1 or "
             "more"
         )
     if config.workers is not None:
         return config.workers
-    limits = [(case.planned, case.suite.env_options.get("max_steps")) for case in planned]
-    steps = sum(
-        episodes * (limit if isinstance(limit, int) else _STEPS) for episodes, limit in limits
-    )
-    in_cluster = node_of_this_process() is not None or bool(os.environ.get("RAY_ADDRESS"))
-    return int(
-        bool(needs)
-        or in_cluster
-        or any(case.worker.gpus for case in planned)
-        or steps > SHORT_STEPS
-    )
+
+    is_in_cluster = node_of_this_process() is not None or bool(os.environ.get("RAY_ADDRESS"))
+    needs_gpu = any(case.worker.gpus for case in cases)
+    steps = 0
+    for case in cases:
+        limit = case.suite.env_options.get("max_steps")
+        steps += case.planned * (limit if isinstance(limit, int) else _STEPS)
+    return 1 if reasons or is_in_cluster or needs_gpu or steps > SHORT_STEPS else 0
+
+
+def _reasons_for_ray(config: EvalConfig, cases: Sequence[EvalCase]) -> list[str]:
+    """Return why the evaluation cannot be played without Ray, one reason an entry."""
+    reasons = []
+    for policy in config.policies:
+        for url in (policy.url, policy.source):
+            if url and url.startswith("serve://"):
+                reasons.append(f"{url} is inside a Ray cluster")
+
+    settings: set[str] = set()
+    for case in cases:
+        settings |= case.worker.runtime_env.keys()
+    reasons += [f"a worker's runtime_env has {name!r}" for name in sorted(settings - {VARIABLES})]
+    return reasons
 
 
 @dataclass(slots=True, eq=False)
@@ -96,6 +103,7 @@ class Workers(contextlib.AbstractContextManager["Workers"]):
 
     @property
     def busy(self) -> bool:
+        """Whether any worker plays."""
         return any(worker.jobs for worker in self._workers)
 
     def kinds(self, *, occupied: bool = True) -> Counter[str]:
@@ -103,6 +111,10 @@ class Workers(contextlib.AbstractContextManager["Workers"]):
         which may be starting.
         """
         return Counter(worker.kind for worker in self._workers if occupied or not worker.jobs)
+
+    def busy_places(self) -> Counter[str]:
+        """Return the number of busy workers at each place."""
+        return Counter(worker.jobs[0].case.place for worker in self._workers if worker.jobs)
 
     def idle(self) -> list[WorkerHandle]:
         """Return the workers that can take a job."""
@@ -136,13 +148,15 @@ def dispatch(
     called with the jobs.
     """
     for worker in pool.idle():
-        working = Counter(one.jobs[0].case.place for one in pool._workers if one.jobs)
-        if jobs := queue.take(worker.kind, worker.env_place, working):
+        jobs = queue.take(worker.kind, worker.env_place, pool.busy_places())
+        if jobs:
             begin(jobs)
             pool.dispatch(worker, jobs)
-    while (
-        case := queue.needs_worker(pool.kinds(), pool.kinds(occupied=False))
-    ) is not None and pool.free_slot():
+
+    while True:
+        case = queue.needs_worker(pool.kinds(), pool.kinds(occupied=False))
+        if case is None or not pool.free_slot():
+            return
         pool.start(case)
 
 
@@ -171,15 +185,21 @@ class FailedAttempts:
         return failure.cause != "user" and job.attempt <= self._config.retries
 
     def note_played(self) -> None:
+        """Note that an episode ended without an error."""
         self._lost = self._policy_errors = 0
 
     def note_policy_error(self, error: str) -> None:
+        """Note that an error of the policy ended an episode.
+
+        Raises:
+            PolicyFailed: Too many episodes in a row ended so.
+        """
         self._policy_errors += 1
         if self._policy_errors == self._config.abort_after:
             raise PolicyFailed(
                 f"{self._policy_errors} episodes in a row ended by an error of the policy: "
-                f"{error.strip()}; mend the "
-                f"policy and evaluate it with a new --out, or raise abort_after"
+                f"{error.strip()}; mend the policy and evaluate it with a new --out, or raise "
+                "abort_after"
             )
 
     def note_lost(self, failure: Failure, cure: str) -> None:

@@ -70,16 +70,16 @@ def runtime_env(case: EvalCase) -> dict[str, Any]:
     No secret may be in it: Ray writes runtime environments to logs that every user of a machine can
     read.
     """
-    given: dict[str, Any] = dict(case.worker.runtime_env)
-    # Or it is in the worker.
-    hides_gpus = not case.worker.gpus and bool(case.policy.url or case.policy.source)
+    configured: dict[str, Any] = dict(case.worker.runtime_env)
     variables = dict.fromkeys(THREAD_VARIABLES, str(case.worker.threads))
-    if hides_gpus:  # Ray does not hide GPUs from an actor that requests none
+    # Ray does not hide GPUs from an actor that requests none. A policy in the worker may need them.
+    is_served = bool(case.policy.url or case.policy.source)
+    if not case.worker.gpus and is_served:
         variables[GPUS] = ""
-    return given | {"env_vars": variables | given.get("env_vars", {})}
+    return configured | {"env_vars": variables | configured.get("env_vars", {})}
 
 
-def unused_gpus(case: EvalCase, where: WorkerInfo) -> str | None:
+def unused_gpus(case: EvalCase, worker: WorkerInfo) -> str | None:
     """Return a warning that the workers of `case` render in software in a cluster with GPUs;
     None if they do not.
     """
@@ -87,9 +87,8 @@ def unused_gpus(case: EvalCase, where: WorkerInfo) -> str | None:
     if not gpus:
         return None
     return (
-        f"{case.env} draws on {where.renderer}, as its workers have no GPU; the cluster has "
-        f"{gpus:g}: {SHARE}, "
-        f"see docs/cluster/scaling.md"
+        f"{case.env} draws on {worker.renderer}, as its workers have no GPU; the cluster has "
+        f"{gpus:g}: {SHARE}, see docs/cluster/scaling.md"
     )
 
 
@@ -148,9 +147,11 @@ class CapacityMonitor:
         self._warned = False  # whether the user was warned that there is no room for all
 
     def note_playing(self) -> None:
+        """Note that an episode is being played."""
         self._last_played = self._now()
 
     def note_started(self) -> None:
+        """Note that a worker has started, so that a later shortage is reported again."""
         self._warned = False
 
     def timed_out(self, since: float) -> bool:
@@ -166,13 +167,12 @@ class CapacityMonitor:
         if self._warned and not idle_too_long:
             return
         self._warned = True
-        want = {"CPU": worker.cpus, "GPU": worker.gpus}
+        needed = {"CPU": worker.cpus, "GPU": worker.gpus}
         message = (
             f"the cluster found no room for a worker in {self._config.place_timeout_s:g} s: each "
-            f"needs {want}, "
-            f"free are {ray.available_resources()} of {ray.cluster_resources()}; lower `workers` "
-            "or "
-            f"`worker.cpus`, or raise `place_timeout_s` if the cluster is still growing"
+            f"needs {needed}, free are {ray.available_resources()} of {ray.cluster_resources()}; "
+            "lower `workers` or `worker.cpus`, or raise `place_timeout_s` if the cluster is still "
+            "growing"
         )
         if idle_too_long:
             raise ConfigError(message)
@@ -181,12 +181,14 @@ class CapacityMonitor:
 
 def tail(paths: Sequence[str]) -> str:
     """Return the end of each file under its name, except of missing files."""
-    parts = []
+    ends = []
     for path in paths:
         with contextlib.suppress(OSError), open(path, "rb") as file:
-            file.seek(max(0, os.fstat(file.fileno()).st_size - MOST_BYTES // len(paths)))
-            parts.append(f"== {Path(path).name}\n{file.read().decode(errors='replace').strip()}")
-    return "\n".join(parts)
+            size = os.fstat(file.fileno()).st_size
+            file.seek(max(0, size - MOST_BYTES // len(paths)))
+            text = file.read().decode(errors="replace").strip()
+            ends.append(f"== {Path(path).name}\n{text}")
+    return "\n".join(ends)
 
 
 def tail_at(host: str, paths: Sequence[str]) -> str:
@@ -200,10 +202,11 @@ def tail_at(host: str, paths: Sequence[str]) -> str:
     ]
     if not nodes:
         return ""
-    there = NodeAffinitySchedulingStrategy(nodes[0], soft=False)
+
+    on_that_host = NodeAffinitySchedulingStrategy(nodes[0], soft=False)
+    read = ray.remote(tail).options(num_cpus=0, scheduling_strategy=on_that_host)
     try:
-        read = ray.remote(tail).options(num_cpus=0, scheduling_strategy=there).remote(list(paths))
-        return str(ray.get(read, timeout=TIMEOUT_S))
+        return str(ray.get(read.remote(list(paths)), timeout=TIMEOUT_S))
     except GetTimeoutError:
         raise TimeoutError(f"host {host} did not answer within {TIMEOUT_S:g} s") from None
     except RayError:  # the node is gone with its files

@@ -24,7 +24,7 @@ from vlagents_ray.ray_tools.signals import raised_at_once
 log = logging.getLogger(__name__)
 
 
-_LOOK_S = 1.0  # between two looks at the phase
+_LOOK_S = 1.0  # the time between two looks at the phase
 _STACK_LINES = 6  # the innermost three calls
 
 
@@ -76,7 +76,8 @@ class InProcessWorkers(Workers):
                 reports = self._rollout.run(jobs)
             if reports[0].env is not None:
                 worker.env_place = jobs[0].case.place
-            if any(one.failure is not None and one.failure.cause == "worker" for one in reports):
+            failures = [report.failure for report in reports if report.failure is not None]
+            if any(failure.cause == "worker" for failure in failures):
                 self.close()
                 worker.env_place = None
             yield from zip(jobs, reports, strict=True)
@@ -96,11 +97,12 @@ def _exits_raised() -> Iterator[None]:
 
     Else it would end the command without a message, and possibly with status 0.
     """
-    end_process, process, thread = os._exit, os.getpid(), threading.get_ident()
+    end_process = os._exit
+    player = (os.getpid(), threading.get_ident())
 
     def end(status: int) -> NoReturn:
-        # A child, or the watcher of Ray.
-        if (os.getpid(), threading.get_ident()) != (process, thread):
+        # A child of this process, or Ray's watcher in another thread, may end its process.
+        if (os.getpid(), threading.get_ident()) != player:
             end_process(status)
         caller = sys._getframe(1)
         line = f"{os.path.basename(caller.f_code.co_filename)}:{caller.f_lineno}"
@@ -118,7 +120,8 @@ def _hangs_reported(rollout: Rollout, config: EvalConfig) -> Iterator[None]:
     """Log the line at which a phase of an episode has exceeded its time limit, once for each
     such phase.
     """
-    ended, limits_s = threading.Event(), phase_limits_s(config)
+    ended = threading.Event()
+    limits_s = phase_limits_s(config)
 
     def watch() -> None:
         reported = ("", -1)
@@ -128,13 +131,13 @@ def _hangs_reported(rollout: Rollout, config: EvalConfig) -> Iterator[None]:
             phase = (heartbeat.phase, heartbeat.steps)
             if heartbeat.phase != "idle" and heartbeat.age_s > limit_s and phase != reported:
                 reported = phase
+                innermost = "\n".join(heartbeat.stack.splitlines()[-_STACK_LINES:])
                 log.warning(
                     "%s after %d steps has taken longer than %g s, and may hang; Ctrl-C ends the "
-                    "evaluation. It is "
-                    "at\n%s",
+                    "evaluation. It is at\n%s",
                     *phase,
                     limit_s,
-                    "\n".join(heartbeat.stack.splitlines()[-_STACK_LINES:]),
+                    innermost,
                 )
 
     threading.Thread(target=watch, name="hangs", daemon=True).start()

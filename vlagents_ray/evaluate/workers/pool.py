@@ -33,13 +33,13 @@ from vlagents_ray.evaluate.workers.cluster import (
 from vlagents_ray.evaluate.workers.rollout import AgentFactory, Heartbeat, Report, Rollout
 from vlagents_ray.ray_tools.head_monitor import HeadMonitor, head_is_gone
 
-WATCH_S = 1.0  # s between two queries of a busy worker, unless there are many
+WATCH_S = 1.0  # the time between two queries of a busy worker, unless there are many workers
 QUERIES_PER_S = 250  # of all workers, at most: each takes the driver up to 1 ms
-GRACE_S = 5.0  # s that a call past its deadline has to fail by itself
-KILL_S = 3.0  # s for Ray to register that workers are to be killed
-CLOSE_S = 10.0  # s for workers to close their simulators when they end
+GRACE_S = 5.0  # the time that a call past its deadline has to fail by itself
+KILL_S = 3.0  # the time that Ray has to register that workers are to be killed
+CLOSE_S = 10.0  # the time that workers have to close their simulators when they end
 MOST_FAILED_STARTS = 3  # in a row; workers that fail together, as with their node, count as one
-# S without further requests to a host that did not return a lost worker's logs.
+# The time without further requests to a host that did not return a lost worker's logs.
 UNREACHABLE_S = 60.0
 
 log = logging.getLogger(__name__)
@@ -59,18 +59,19 @@ class WorkerPool(Workers):
         recorders: RecorderFactory = Recording,
     ) -> None:
         super().__init__()
-        self._config, self._recorders = config, recorders
-        self._actor_class = ray.remote(concurrency_groups={"watch": 1})(Rollout)
+        self._config = config
         self._agent_factory = agent_factory
-        # from this process's environment, which workers on other nodes do not inherit
+        self._recorders = recorders
+        self._actor_class = ray.remote(concurrency_groups={"watch": 1})(Rollout)
+        # The API key of this process's environment, which workers on other nodes do not inherit.
         self._credentials = Credentials()
         self._head = HeadMonitor(
             "what was played is kept: go on with --resume when there is a cluster again"
         )
         self._placement = Placement()
-        self._failed_starts = 0
-        self._failed_start = 0.0  # time of the last one
-        # By silent host: time until which no request is sent.
+        self._failed_starts = 0  # in a row
+        self._last_failed_start = 0.0  # its time
+        # The time until which no request is sent to a host that did not answer.
         self._unreachable: dict[str, float] = {}
         self._capacity = CapacityMonitor(config)
         self._limits_s = phase_limits_s(config)
@@ -79,9 +80,10 @@ class WorkerPool(Workers):
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         if kind is ClusterLost:  # nothing can kill them; Ray ends them when the head is lost
             return
-        actors = [worker.actor for worker in self._workers] + [actor for actor, _ in self._leaving]
+        actors = [worker.actor for worker in self._workers]
+        actors += [actor for actor, _ in self._leaving]
         # A Ray cluster that is being stopped, for instance with its job, does not answer; the
-        # results must still be kept.
+        # results must still be kept, so that this thread does not wait for it.
         killing = threading.Thread(target=_kill, args=(actors,), daemon=True)
         killing.start()
         killing.join(KILL_S)
@@ -93,18 +95,20 @@ class WorkerPool(Workers):
             return False
         if len(self._workers) < (self._config.workers or 1):
             return True
-        if not (idle := self.idle()):
+        idle = self.idle()
+        if not idle:
             return False
-        self._workers.remove(idle[0])
-        idle[0].actor.close.remote()  # frees its simulator; some need that for a clean exit
-        idle[0].actor.__ray_terminate__.remote()
-        self._leaving.append((idle[0].actor, monotonic()))
+
+        worker = idle[0]
+        self._workers.remove(worker)
+        worker.actor.close.remote()  # frees its simulator; some need that for a clean exit
+        worker.actor.__ray_terminate__.remote()
+        self._leaving.append((worker.actor, monotonic()))
         return True
 
     def start(self, case: EvalCase) -> None:
-        node = self._placement.node(
-            case.policy.url, Counter(worker.node for worker in self._workers)
-        )
+        workers_by_node = Counter(worker.node for worker in self._workers)
+        node = self._placement.node(case.policy.url, workers_by_node)
         options = {
             "num_cpus": case.worker.cpus,
             "num_gpus": case.worker.gpus,
@@ -115,12 +119,15 @@ class WorkerPool(Workers):
         actor = self._actor_class.options(**options).remote(
             self._config, self._agent_factory, self._recorders
         )
-        starting, now = actor.ready.remote(self._credentials), monotonic()
-        self._workers.append(
-            WorkerHandle(
-                case.worker, case.kind, actor, starting=starting, started_at=now, node=node
-            )
+        worker = WorkerHandle(
+            case.worker,
+            case.kind,
+            actor,
+            starting=actor.ready.remote(self._credentials),
+            started_at=monotonic(),
+            node=node,
         )
+        self._workers.append(worker)
 
     def dispatch(self, worker: WorkerHandle, jobs: tuple[Job, ...]) -> None:
         phase: Phase = "env reset" if worker.env_place == jobs[0].case.place else "make"
@@ -139,26 +146,26 @@ class WorkerPool(Workers):
             ClusterLost: The head of the cluster has not answered for long.
         """
         self._head.answers()
-        refs = {
-            ref: one
-            for one in self._workers
-            for ref in (one.starting, one.running, one.query)
-            if ref is not None
-        }
-        if refs:
-            done, waiting = ray.wait(list(refs), num_returns=1, timeout=timeout_s)
-            # take all that have arrived: each pass looks at every worker, so it must not serve only
-            # one
+        owners: dict[Any, WorkerHandle] = {}  # by the reference of an awaited answer
+        for worker in self._workers:
+            for ref in (worker.starting, worker.running, worker.query):
+                if ref is not None:
+                    owners[ref] = worker
+
+        if owners:
+            done, waiting = ray.wait(list(owners), num_returns=1, timeout=timeout_s)
+            # Each pass looks at every worker, so it takes all answers that have arrived.
             if done and waiting:
                 done += ray.wait(waiting, num_returns=len(waiting), timeout=0)[0]
             for ref in done:
-                yield from self._handle_answer(refs[ref], ref)
+                yield from self._handle_answer(owners[ref], ref)
         yield from self._check_workers()
 
     def close(self) -> None:
-        if not (closing := {worker.actor.close.remote(): worker for worker in self.idle()}):
+        closing = [worker.actor.close.remote() for worker in self.idle()]
+        if not closing:
             return
-        done, late = ray.wait(list(closing), num_returns=len(closing), timeout=CLOSE_S)
+        done, late = ray.wait(closing, num_returns=len(closing), timeout=CLOSE_S)
         for ref in done:
             try:
                 ray.get(ref)
@@ -181,35 +188,40 @@ class WorkerPool(Workers):
             except RayError as error:  # the result of its job reports the same error
                 log.debug("a worker did not answer: %s", error)
         elif worker.jobs:
-            jobs, worker.jobs, worker.running = worker.jobs, (), None
-            try:
-                reports: list[Report] = ray.get(ref)
-            except RayError as error:
-                what = "died" if isinstance(error, RayActorError) else "failed"
-                reason = f"the worker on {worker.process['host']} {what}: {error}"
-                reports = [Report(failure=Failure("worker", EnvFailed.code, reason))] * len(jobs)
-            if reports[0].env is not None:
-                worker.env_place = jobs[0].case.place
-            broken = [
-                one.failure
-                for one in reports
-                if one.failure is not None and one.failure.cause == "worker"
-            ]
-            if broken:
-                self._kill_worker(worker)
-                with_log = self._with_log(broken[0], worker)
-                reports = [
-                    replace(one, failure=with_log) if one.failure in broken else one
-                    for one in reports
-                ]
-            yield from zip(jobs, reports, strict=True)
+            jobs = worker.jobs
+            yield from zip(jobs, self._reports(worker, ref), strict=True)
+
+    def _reports(self, worker: WorkerHandle, ref: Any) -> list[Report]:
+        """Return the reports of a worker that has played its jobs; kill it if it broke."""
+        jobs, worker.jobs, worker.running = worker.jobs, (), None
+        try:
+            reports: list[Report] = ray.get(ref)
+        except RayError as error:
+            event = "died" if isinstance(error, RayActorError) else "failed"
+            reason = f"the worker on {worker.process['host']} {event}: {error}"
+            reports = [Report(failure=Failure("worker", EnvFailed.code, reason))] * len(jobs)
+        if reports[0].env is not None:
+            worker.env_place = jobs[0].case.place
+
+        failures = [report.failure for report in reports if report.failure is not None]
+        breakdowns = [failure for failure in failures if failure.cause == "worker"]
+        if not breakdowns:
+            return reports
+        self._kill_worker(worker)
+        with_log = self._with_log(breakdowns[0], worker)
+        return [
+            replace(report, failure=with_log) if report.failure in breakdowns else report
+            for report in reports
+        ]
 
     def _started(self, worker: WorkerHandle) -> None:
         try:
             worker.process = ray.get(worker.starting)
         except RayError as error:
-            if worker.started_at > self._failed_start:
-                self._failed_starts, self._failed_start = self._failed_starts + 1, monotonic()
+            # Workers that were requested before the last failure may have failed together with it.
+            if worker.started_at > self._last_failed_start:
+                self._failed_starts += 1
+                self._last_failed_start = monotonic()
             if self._failed_starts >= MOST_FAILED_STARTS:
                 raise EnvFailed(
                     f"workers do not start, {self._failed_starts} in a row: {error}"
@@ -232,26 +244,30 @@ class WorkerPool(Workers):
             if now - since > CLOSE_S:
                 ray.kill(actor)
         self._leaving = [(actor, since) for actor, since in self._leaving if now - since <= CLOSE_S]
+
         for worker in list(self._workers):
             if worker.starting is not None:
                 if self._capacity.timed_out(worker.started_at) and self._head.answers():
-                    self._capacity.report_shortage(
-                        worker.config, sum(one.starting is None for one in self._workers)
-                    )
-            elif worker.jobs:
-                if (reason := self._overdue(worker, now)) is not None:
-                    self._kill_worker(worker)
-                    failure = self._with_log(
-                        Failure("worker", EnvFailed.code, reason, worker.heartbeat.stack), worker
-                    )
-                    yield from ((job, Report(failure=failure)) for job in worker.jobs)
-                elif worker.query is None and now - worker.queried_at > watch_s(len(self._workers)):
-                    worker.queried_at = now
-                    worker.query = worker.actor.progress.options(concurrency_group="watch").remote()
+                    running = sum(handle.starting is None for handle in self._workers)
+                    self._capacity.report_shortage(worker.config, running)
+                continue
+            if not worker.jobs:
+                continue
+
+            reason = self._overdue(worker, now)
+            if reason is not None:
+                self._kill_worker(worker)
+                failure = Failure("worker", EnvFailed.code, reason, worker.heartbeat.stack)
+                report = Report(failure=self._with_log(failure, worker))
+                yield from ((job, report) for job in worker.jobs)
+            elif worker.query is None and now - worker.queried_at > watch_s(len(self._workers)):
+                worker.queried_at = now
+                worker.query = worker.actor.progress.options(concurrency_group="watch").remote()
 
     def _overdue(self, worker: WorkerHandle, now: float) -> str | None:
         """Return why the busy `worker` must be replaced; None if it need not be."""
-        heartbeat, env_s = worker.heartbeat, self._config.env_timeout_s
+        heartbeat = worker.heartbeat
+        env_s = self._config.env_timeout_s
         limit_s = self._limits_s.get(heartbeat.phase, env_s)
         if heartbeat.age_s > limit_s + GRACE_S:
             return (
@@ -275,8 +291,9 @@ class WorkerPool(Workers):
         host: str = worker.process["host"]
         if monotonic() < self._unreachable.get(host, 0.0) or not self._head.answers():
             return failure
+        # Slurm signals all processes of a job at once. Ray's calls would then block until it kills
+        # this process.
         sleep(SIGNAL_S)
-        # Slurm signals all of a job at once; Ray's calls would block until it kills this process.
         if head_is_gone():
             return failure
         try:
