@@ -27,6 +27,7 @@ from dataclasses import asdict, dataclass
 from functools import cache, partial
 from http.client import HTTPConnection
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 from urllib.parse import urlsplit
 
@@ -49,7 +50,7 @@ from websockets.uri import parse_uri
 from vlagents_ray.client.agent import RemoteAgent
 from vlagents_ray.client.credentials import Credentials
 from vlagents_ray.client.transports.shm import ShmTransport
-from vlagents_ray.errors import PolicyUnavailable
+from vlagents_ray.errors import MalformedMessage, PolicyUnavailable
 from vlagents_ray.images import jpeg_png
 from vlagents_ray.interface import Act, Agent, Obs
 from vlagents_ray.protocol import frame_layout
@@ -111,8 +112,30 @@ def serve() -> None:
     near = ShmServer(engine, limits, admit)
     with pytest.MonkeyPatch.context() as patch, tempfile.TemporaryDirectory() as folder:
         plasma = plasma_server(engine, limits, patch, Path(folder))
-        del plasma.pool.claim  # of tests whose channels are in this process; none is leased here
+        plasma.pool.claim = _claim
         _serve_replica(engine, keys, own, near, plasma)
+
+
+class _LeasedChannel:
+    """A channel in this process, leased to the client that names it; see `LEASED`."""
+
+    capacity = 2**20
+
+    def __init__(self, key: bytes) -> None:
+        self.ref = SimpleNamespace(binary=lambda: key)
+        self._content = LEASED[key]
+
+    def read(self) -> np.ndarray:
+        """Return a copy of what the client wrote."""
+        if self._content is None:
+            raise MalformedMessage("plasma: a message came without a frame in its channel")
+        return np.frombuffer(self._content, np.uint8).copy()
+
+
+def _claim(key: bytes) -> _LeasedChannel:
+    if key not in LEASED:
+        raise MalformedMessage("plasma: this channel is not leased; ask for one")
+    return _LeasedChannel(key)
 
 
 def _serve_replica(
@@ -897,7 +920,15 @@ NEAR: dict[str, tuple[bool, bytes, bool]] = {
 }
 PLASMA = "plasma"
 _CHANNEL = PlasmaAddress.REQUEST
-# The same, of a process of this user that no channel is leased to; the endpoint needs no key.
+# The content of the leased channels by their ids; None is a channel without a frame.
+LEASED: dict[bytes, bytes | None] = {
+    b"empty".ljust(28, b"\0"): None,
+    b"garbage".ljust(28, b"\0"): bytes(range(256)) * 4096,
+    b"half".ljust(28, b"\0"): _assembled('{"op":"act","obs":{},"blobs":[1048576]}') + bytes(1000),
+}
+_EMPTY, _GARBAGE, _HALF_FRAME = LEASED
+# The same, of a process of this user; the endpoint needs no key. The last five have leased channels,
+# which a process of the cluster may.
 NEAR_PLASMA: dict[str, tuple[bool, bytes, bool]] = {
     "nothing": (False, b"", False),
     "closed at once": (False, b"", False),
@@ -905,6 +936,11 @@ NEAR_PLASMA: dict[str, tuple[bool, bytes, bool]] = {
     "a long message": (False, bytes(200_000), True),
     "a channel that is not leased": (False, _CHANNEL.pack(bytes(28), 0), True),
     "many connections": (False, b"", False),
+    "a leased channel that is held": (False, _CHANNEL.pack(_GARBAGE, 0), False),
+    "a leased channel without a frame": (False, _CHANNEL.pack(_EMPTY, 0), True),
+    "garbage in a leased channel": (False, _CHANNEL.pack(_GARBAGE, 0), True),
+    "half a frame in a leased channel": (False, _CHANNEL.pack(_HALF_FRAME, 0), True),
+    "a leased channel that is left": (False, _CHANNEL.pack(_GARBAGE, 0), False),
 }
 _MANY = 60  # connections of each thread
 
@@ -921,7 +957,9 @@ def misbehave_near(way: str, behaviour: str, where: Where, end: float) -> None:
             connection.connect(address)
             if shows_key:
                 connection.send(key_of(way).encode())
-        if behaviour == "closed at once":
+        if behaviour in ("a leased channel that is held", "a leased channel that is left"):
+            connection.send(message)
+        if behaviour in ("closed at once", "a leased channel that is left"):
             return
         threading.Thread(target=_drain, args=(connection,), daemon=True).start()
         if behaviour == "a file that is shorter":
