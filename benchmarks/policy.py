@@ -99,7 +99,7 @@ def measure_policy(
     agent: Agent = build_agent(plan.args.policy, plan.args.config, plan.args.wrappers)
 
     def view(contract: Contract | None, seed: int) -> Obs:
-        return random_observation(contract, seed, side=plan.side, dims=plan.dims)
+        return random_observation(contract, seed, image_size=plan.side, dims=plan.dims)
 
     measured = BareAndQueued(
         agent,

@@ -37,18 +37,18 @@ class DatasetContract:
     """The meaning of the numbers and images of a dataset."""
 
     contract: Contract  # of a policy that is trained on the dataset
-    # Concatenated parts of `observation.state`; "gripper" is `Obs.gripper`.
+    # The concatenated parts of `observation.state`; "gripper" is `Obs.gripper`.
     state: tuple[str, ...] = ()
     cameras: Mapping[str, str] = field(default_factory=dict)  # feature -> camera
-    # (first) index in `observation.state` -> centre, rad.
+    # The centre of each angle or rotation vector, rad, by its first index in `observation.state`.
     angles: Mapping[int, Centre] = field(default_factory=dict)
-    environment: tuple[str, ...] = ()  # concatenated parts of `observation.environment_state`
+    environment: tuple[str, ...] = ()  # the parts of `observation.environment_state`
 
     @property
     def width(self) -> int:
         """The number of values in `observation.state`; parts of unknown width count as zero."""
         specs = self.contract.state or {}
-        return sum((specs[part].dim or 0) if part in specs else 1 for part in self.state)
+        return sum((specs[name].dim or 0) if name in specs else 1 for name in self.state)
 
     def wrapped(self, state: np.ndarray) -> np.ndarray:
         """Return `observation.state`, (..., D) float32, with each of `angles` within pi of its
@@ -59,27 +59,26 @@ class DatasetContract:
         """
         if not self.angles:
             return state
-        changed = state.copy()
-        for place, centre in self.angles.items():
+        wrapped = state.copy()
+        for index, centre in self.angles.items():
             if isinstance(centre, tuple):
-                vector = slice(place, place + 3)
-                changed[..., vector] = _near_vector(
-                    state[..., vector].astype(np.float64), np.array(centre)
-                )
+                columns = slice(index, index + 3)
+                vectors = state[..., columns].astype(np.float64)
+                wrapped[..., columns] = _near_vector(vectors, np.array(centre))
             else:
-                changed[..., place] = _near(state[..., place].astype(np.float64), centre)
-        return changed
+                wrapped[..., index] = _near(state[..., index].astype(np.float64), centre)
+        return wrapped
 
     def to_json(self) -> dict[str, Any]:
         """Return the contract as plain JSON values."""
+        angles = {}
+        for index, centre in self.angles.items():
+            angles[str(index)] = list(centre) if isinstance(centre, tuple) else centre
         return {
             "state": list(self.state),
             "environment": list(self.environment),
             "cameras": dict(self.cameras),
-            "angles": {
-                str(at): list(one) if isinstance(one, tuple) else one
-                for at, one in self.angles.items()
-            },
+            "angles": angles,
             "contract": self.contract.to_json(),
         }
 
@@ -89,25 +88,14 @@ class DatasetContract:
         cannot read it.
         """
         try:
-            found = cls(
+            contract = cls(
                 Contract.from_json(data["contract"]),
                 tuple(map(str, data["state"])),
                 {str(key): str(name) for key, name in data["cameras"].items()},
-                {int(place): _centre(centre) for place, centre in data["angles"].items()},
+                {int(index): _centre(centre) for index, centre in data["angles"].items()},
                 tuple(map(str, data["environment"])),
             )
-            if unknown := {*found.state, *found.environment} - {
-                *(found.contract.state or {}),
-                GRIPPER,
-            }:
-                raise ValueError(f"its contract has no state {sorted(unknown)}")
-            numbers = {at: np.atleast_1d(centre) for at, centre in found.angles.items()}
-            if odd := [
-                at
-                for at, one in numbers.items()
-                if not 0 <= at <= found.width - len(one) or np.isnan(one).any()
-            ]:
-                raise ValueError(f"its state has no angles at {odd}")
+            contract._check()
         except (MalformedMessage, AttributeError, KeyError, TypeError, ValueError) as error:
             raise ConfigError(
                 "the contract of the dataset in the checkpoint cannot be read "
@@ -115,7 +103,22 @@ class DatasetContract:
                 "vlagents-ray, or merged of datasets with different contracts? Update this one, or "
                 "export the results of `vlagents-ray merge`"
             ) from error
-        return found
+        return contract
+
+    def _check(self) -> None:
+        """Raise `ValueError` if a part or an angle is not in the state."""
+        known = {*(self.contract.state or {}), GRIPPER}
+        unknown = {*self.state, *self.environment} - known
+        if unknown:
+            raise ValueError(f"its contract has no state {sorted(unknown)}")
+
+        invalid = []
+        for index, centre in self.angles.items():
+            numbers = np.atleast_1d(centre)
+            if not 0 <= index <= self.width - len(numbers) or np.isnan(numbers).any():
+                invalid.append(index)
+        if invalid:
+            raise ValueError(f"its state has no angles at {invalid}")
 
     def to_statistics(self, frames: int) -> dict[str, dict[str, list[int]]]:
         """Return the entry of `stats.json` with the contract, for a dataset of `frames` frames.
@@ -123,9 +126,11 @@ class DatasetContract:
         It has all statistics of a feature, since LeRobot's tools average them when they merge
         datasets.
         """
-        text = list(json.dumps(self.to_json(), separators=(",", ":"), ensure_ascii=False).encode())
-        same = dict.fromkeys(("min", "max", BYTES, "q01", "q10", "q50", "q90", "q99"), text)
-        return {STATISTICS: same | {"std": [0] * len(text), "count": [frames]}}
+        text = json.dumps(self.to_json(), separators=(",", ":"), ensure_ascii=False)
+        numbers = list(text.encode())
+        names = ("min", "max", BYTES, "q01", "q10", "q50", "q90", "q99")
+        statistics = dict.fromkeys(names, numbers)
+        return {STATISTICS: statistics | {"std": [0] * len(numbers), "count": [frames]}}
 
     @classmethod
     def from_statistics(cls, numbers: Iterable[float]) -> DatasetContract:
@@ -159,31 +164,41 @@ def state_parts(
         ConfigError: The sizes of the parts are unknown, or do not add up to `width`.
     """
     specs = dict((policy and policy.state) or {})
-    parts = list(chosen if chosen is not None else wanted_parts(policy) or [_JOINTS])
-    dims: dict[str, int | None] = {
-        part: 1 if part == GRIPPER else specs[part].dim if part in specs else None for part in parts
-    }
-    unknown = [part for part, dim in dims.items() if dim is None]
-    left = width - sum(dim or 0 for dim in dims.values())
+    names = list(chosen if chosen is not None else wanted_parts(policy) or [_JOINTS])
+
+    dims: dict[str, int | None] = {}
+    for name in names:
+        if name == GRIPPER:
+            dims[name] = 1
+        else:
+            dims[name] = specs[name].dim if name in specs else None
+
+    # A single part of unknown size gets all numbers that are left, at least one.
+    unknown = [name for name, dim in dims.items() if dim is None]
+    remaining = width - sum(dim or 0 for dim in dims.values())
     if len(unknown) == 1:
-        dims[unknown[0]] = left
-    if (
-        left < (len(unknown) == 1)
-        or len(unknown) > 1
-        or sum(dim or 0 for dim in dims.values()) != width
-    ):
+        dims[unknown[0]] = remaining
+        is_divided = remaining >= 1
+    else:
+        is_divided = not unknown and remaining == 0
+    if not is_divided:
         raise ConfigError(
-            f"observation.state: got {width} numbers, want them divided into {parts} of the "
+            f"observation.state: got {width} numbers, want them divided into {names} of the "
             f"policy, of which the sizes are {dims}; name the parts in their order: {option}"
         )
-    return [(part, dim or 0) for part, dim in dims.items()]
+    return [(name, dim or 0) for name, dim in dims.items()]
 
 
 def wanted_parts(policy: Contract | None) -> list[str]:
     """Return the parts of the state that a policy's contract names, "gripper" for `Obs.gripper`
     last.
     """
-    return [] if policy is None else [*(policy.state or {}), *([GRIPPER] if policy.gripper else [])]
+    if policy is None:
+        return []
+    names = list(policy.state or {})
+    if policy.gripper:
+        names.append(GRIPPER)
+    return names
 
 
 def divided_state(
@@ -201,43 +216,48 @@ def divided_state(
     """
     state: dict[str, np.ndarray] = {}
     gripper = None
-    for name, listed in parts.items():
-        place = 0
-        for part, dim in listed:
-            if part == GRIPPER and dim == 1:
-                gripper = float(vectors[name][place])
+    for feature, parts_of_feature in parts.items():
+        vector = vectors[feature]
+        start = 0
+        for name, dim in parts_of_feature:
+            if name == GRIPPER and dim == 1:
+                gripper = float(vector[start])
             else:
-                state[part] = vectors[name][place : place + dim]
-            place += dim
+                state[name] = vector[start : start + dim]
+            start += dim
     return state, gripper
 
 
-def angles_in(part: str, unit: str | None, dim: int) -> range:
+def angles_in(name: str, unit: str | None, dim: int) -> range:
     """Return the indices of the angles in a part of the state that wrap at -pi and pi, by the
     part's unit.
 
     The numbers of a rotation vector (`rotation_vector_in`) and of a quaternion are not such angles.
     """
-    if rotation_vector_in(part, unit, dim) is not None:
+    if rotation_vector_in(name, unit, dim) is not None:
         return range(0)
     if unit == "rad":
         return range(dim)
-    return range(3, 6) if unit == "m+rad" and dim == 6 else range(0)  # x, y, z, roll, pitch, yaw
+    if unit == "m+rad" and dim == 6:  # x, y, z, roll, pitch, yaw
+        return range(3, 6)
+    return range(0)
 
 
-def rotation_vector_in(part: str, unit: str | None, dim: int) -> int | None:
+def rotation_vector_in(name: str, unit: str | None, dim: int) -> int | None:
     """Return the index of the first number of a rotation vector (axis times angle) in a part of the
     state, or None.
 
     Such a part has "axis" in its name, as in `xyz_axis_angle`, and only a position before the
     vector.
     """
-    return {("rad", 3): 0, ("m+rad", 6): 3}.get((unit or "", dim)) if "axis" in part else None
+    if "axis" not in name:
+        return None
+    return {("rad", 3): 0, ("m+rad", 6): 3}.get((unit or "", dim))
 
 
-def usual_unit(part: str) -> str | None:
+def usual_unit(name: str) -> str | None:
     """Return the usual unit of a part with this name, for a dataset without a contract."""
-    return next((unit for end, unit in _USUAL.items() if part.endswith(end)), None)
+    return next((unit for end, unit in _USUAL.items() if name.endswith(end)), None)
 
 
 def centre_between(lowest: float, highest: float) -> float | None:
@@ -246,8 +266,10 @@ def centre_between(lowest: float, highest: float) -> float | None:
 
     Wrapping around this centre does not change values within the range.
     """
-    outside = max(-lowest, highest) > math.pi + _SLACK
-    return (lowest + highest) / 2 if outside and highest - lowest < _TURN else None
+    is_outside = max(-lowest, highest) > math.pi + _SLACK
+    if not is_outside or highest - lowest >= _TURN:
+        return None
+    return (lowest + highest) / 2
 
 
 def centre_of(episodes: Sequence[np.ndarray]) -> float | None:
@@ -265,10 +287,12 @@ def centre_of(episodes: Sequence[np.ndarray]) -> float | None:
         or np.abs(np.diff(values)).max(initial=0) <= math.pi
     ):
         return None
+
     circle = np.sort(values)
     arcs = np.diff(circle, append=circle[0] + _TURN)
     widest = int(arcs.argmax())
-    return round(float(_near(np.array(circle[widest] + arcs[widest] / 2 + math.pi), 0.0)), 6)
+    opposite = circle[widest] + arcs[widest] / 2 + math.pi
+    return round(float(_near(np.array(opposite), 0.0)), 6)
 
 
 def rotation_centre_of(episodes: Sequence[np.ndarray]) -> tuple[float, float, float] | None:
@@ -286,6 +310,7 @@ def rotation_centre_of(episodes: Sequence[np.ndarray]) -> tuple[float, float, fl
     before, after = vectors[:-1], vectors[1:]
     if angles.max(initial=0) > _TURN + _SLACK or np.array_equal(_near_vector(after, before), after):
         return None
+
     # The mean of unit quaternions of either sign (Markley et al., Averaging Quaternions, 2007).
     quaternions = np.hstack([np.cos(angles / 2), np.sinc(angles / _TURN) * vectors / 2])  # w first
     mean = np.linalg.eigh(quaternions.T @ quaternions)[1][:, -1]
@@ -296,6 +321,7 @@ def rotation_centre_of(episodes: Sequence[np.ndarray]) -> tuple[float, float, fl
 
 
 def _centre(value: Any) -> Centre:
+    """Read the centre of an angle or a rotation vector."""
     if not isinstance(value, list):
         return float(value)
     x, y, z = map(float, value)

@@ -221,30 +221,33 @@ def _install(package: str, extra: str | None = None, distribution: str = CORE) -
     simulators = [entry for entry in entries("envs").values() if package in entry.needs]
     policies = entries("policies").values()
     users = [entry for entry in (*simulators, *policies) if package in entry.needs]
-    extra = extra or next(
-        (name for name, installed in _EXTRAS.items() if package in installed), None
-    )
+    if not extra:
+        extras = (name for name, packages in _EXTRAS.items() if package in packages)
+        extra = next(extras, None)
     if extra:
         return pip_install(extra, distribution)
+
     with_extra = next((entry for entry in users if entry.extra), None)
     if with_extra is not None:
         return pip_install(with_extra.extra, with_extra.distribution)
+
     if simulators:
         return (
             f"run `vlagents-ray env make {simulators[0].requirements[0]}` and give the "
             "evaluation's workers that environment's Python, `runtime_env: {py_executable: ...}`"
         )
+
     needed = _BROUGHT.get(package, package)
     families = [entry for entry in policies if entry.requirements and needed in entry.needs]
     environments = sorted({entry.requirements[0] for entry in families})
     if environments:
-        several = len(environments) > 1
-        family = (
-            f"; NAME is that of the policy's family: {', '.join(environments)}" if several else ""
-        )
+        name, explanation = environments[0], ""
+        if len(environments) > 1:
+            name = "NAME"
+            explanation = f"; NAME is that of the policy's family: {', '.join(environments)}"
         return (
-            f"run `vlagents-ray env make {'NAME' if several else environments[0]}` and name the "
-            f"environment in the deployment's `environment`{family}"
+            f"run `vlagents-ray env make {name}` and name the environment in the deployment's "
+            f"`environment`{explanation}"
         )
     return install_alone(package)
 
@@ -269,17 +272,18 @@ def requirements_file(name: str) -> Path:
     Raises:
         ConfigError: No installed policy or environment names it.
     """
-    named: dict[str, RegistryEntry] = {}
+    entry_by_file: dict[str, RegistryEntry] = {}
     for entry in (*entries("policies").values(), *entries("envs").values()):
-        named.update(dict.fromkeys(entry.requirements, entry))
-    if name not in named:
+        entry_by_file.update(dict.fromkeys(entry.requirements, entry))
+
+    if name not in entry_by_file:
         absent = sorted({*not_installed("policies").values(), *not_installed("envs").values()})
         more = f"; more are in {', '.join(absent)}, not installed here" if absent else ""
         raise ConfigError(
-            f"requirements {name!r}: expected a file, such as needs.txt, or one of {sorted(named)}"
-            f"{did_you_mean(name, named)}{more}"
+            f"requirements {name!r}: expected a file, such as needs.txt, or one of "
+            f"{sorted(entry_by_file)}{did_you_mean(name, entry_by_file)}{more}"
         )
-    package = named[name].target.partition(":")[0].partition(".")[0]
+    package = entry_by_file[name].target.partition(":")[0].partition(".")[0]
     return Path(str(resources.files(package).joinpath("requirements", f"{name}.txt")))
 
 
@@ -311,7 +315,7 @@ def entries(kind: str) -> dict[str, RegistryEntry]:
     """Return the entries of all names of `kind`; one that cannot be loaded is left out, and its
     error is logged.
     """
-    found = {}
+    entry_by_name = {}
     for name in names(kind):
         try:
             entry = find_entry(kind, name)
@@ -319,8 +323,8 @@ def entries(kind: str) -> dict[str, RegistryEntry]:
             logger.warning("%s", error)
             continue
         if entry is not None:
-            found[name] = entry
-    return found
+            entry_by_name[name] = entry
+    return entry_by_name
 
 
 def target_of(kind: str, name: str) -> str:
@@ -358,6 +362,7 @@ def _load(points: tuple[EntryPoint, ...]) -> RegistryEntry:
             f"{point.name!r} is registered in {point.group} by {' and '.join(distributions)}: "
             "uninstall one of them"
         )
+
     expected = (
         f"{point.group}: expected {point.name!r} of {distributions[0]} to name a RegistryEntry"
     )
@@ -381,10 +386,11 @@ def _distribution_of(point: EntryPoint) -> str:
 
 def plugin_distributions() -> list[str]:
     """Return the installed distributions that register names, other than this package's own."""
-    points = (
-        point for kind in _BUILT_IN for found in _entry_points(kind).values() for point in found
-    )
-    return sorted({_distribution_of(point) for point in points if point.dist is not None})
+    distributions = set()
+    for kind in _BUILT_IN:
+        for points in _entry_points(kind).values():
+            distributions |= {_distribution_of(point) for point in points if point.dist is not None}
+    return sorted(distributions)
 
 
 @functools.cache
@@ -534,11 +540,12 @@ def load_target(name: str, unknown: type[ConfigError] = ConfigError) -> Any:
                 f"it{did_you_mean(error.name, (file.stem for file in Path.cwd().glob('*.py')))}"
             ) from error
         raise MissingDependency(f"{name!r} needs {error.name!r}, which is not installed") from error
-    found = getattr(loaded, attribute, None)
-    if found is None:
+
+    target = getattr(loaded, attribute, None)
+    if target is None:
         classes = [other for other, value in vars(loaded).items() if isinstance(value, type)]
         raise unknown(
             f"{name!r}: module {module!r} has no class "
             f"{attribute!r}{did_you_mean(attribute, classes)}"
         )
-    return found
+    return target

@@ -23,15 +23,15 @@ _WORD_ERRORS = (
     "sequence_str",
     *_BOUNDS,
 )
-# How to write a value, by the type of error and the type of the value.
+# A hint how to write the value, by the type of error and the type of the value.
 _SPELLINGS = {
     ("list_type", dict): "; begin each of its entries with '- '",
     ("string_type", bool): "; put the word in quotation marks",
     ("string_type", datetime.date): "; put it in quotation marks",
 }
 _WANT = "Input should be "  # pydantic's wording
-# Types of values that a plain type allows: also numpy's, and whole numbers for a float, since YAML
-# reads 1 as int.
+# The types of values that a plain type allows: numpy's are allowed, and whole numbers for a float,
+# since YAML reads 1 as int.
 _PLAIN: dict[type, tuple[type, ...]] = {
     bool: (bool, np.bool_),
     int: (numbers.Integral,),
@@ -41,7 +41,9 @@ _PLAIN: dict[type, tuple[type, ...]] = {
 }
 
 
-def require_arguments(what: str, function: Callable[..., Any], given: Mapping[str, Any]) -> None:
+def require_arguments(
+    subject: str, function: Callable[..., Any], arguments: Mapping[str, Any]
+) -> None:
     """Raise `ConfigError` unless a function accepts these keyword arguments.
 
     The type of a value is compared with its parameter's annotation, or with the default if there is
@@ -49,45 +51,54 @@ def require_arguments(what: str, function: Callable[..., Any], given: Mapping[st
     left to the function.
 
     Args:
-        what: The object that the function makes, for the message.
+        subject: The object that the function makes, for the message.
         function: The function or class that will be called.
-        given: The keyword arguments.
+        arguments: The keyword arguments.
     """
     signature = inspect.signature(function)
     try:
-        signature.bind(**given)
+        signature.bind(**arguments)
     except TypeError as error:
-        takes = [name for name in signature.parameters if name != "self"]
-        unknown = (name for name in given if name not in takes)
-        meant = next(filter(None, (did_you_mean(name, takes) for name in unknown)), "")
-        raise ConfigError(f"{what}: {error}; it takes {sorted(takes)}{meant}") from error
+        accepted = [name for name in signature.parameters if name != "self"]
+        suggestion = ""
+        for name in arguments:
+            if name not in accepted and not suggestion:
+                suggestion = did_you_mean(name, accepted)
+        raise ConfigError(f"{subject}: {error}; it takes {sorted(accepted)}{suggestion}") from error
+
     annotated = function.__init__ if isinstance(function, type) else function  # type: ignore[misc]
     try:
         annotations = get_type_hints(annotated)
     except (NameError, TypeError, AttributeError):  # they name types that cannot be found
         annotations = {}
-    for name, value in given.items():
+
+    for name, value in arguments.items():
         parameter = signature.parameters.get(name)
-        # A value for **kwargs, or the default itself.
+        # It may be a value for **kwargs, or the default itself.
         if parameter is None or value is parameter.default:
             continue
-        default = parameter.default  # without an annotation, the default 1 allows 0.5 as well
-        own = Any if default is None else float if type(default) is int else type(default)
-        annotation: Any = annotations.get(name, own)
-        kinds = (
-            list(get_args(annotation))
-            if get_origin(annotation) in (Union, UnionType)
-            else [annotation]
-        )
+        annotation = annotations.get(name, _type_of_default(parameter.default))
+        is_union = get_origin(annotation) in (Union, UnionType)
+        kinds: list[Any] = list(get_args(annotation)) if is_union else [annotation]
         if not all(isinstance(kind, type) and kind in _PLAIN for kind in kinds):
             continue
-        # A boolean does not count as a number.
-        if not any(
-            isinstance(value, _PLAIN[kind]) and (kind is bool or type(value) is not bool)
-            for kind in kinds
-        ):
-            wanted = " or ".join("None" if kind is type(None) else kind.__name__ for kind in kinds)
-            raise ConfigError(f"{what}: {name}: got {value!r}, want {wanted}")
+        if not any(_is_of_kind(value, kind) for kind in kinds):
+            expected = " or ".join(
+                "None" if kind is type(None) else kind.__name__ for kind in kinds
+            )
+            raise ConfigError(f"{subject}: {name}: got {value!r}, want {expected}")
+
+
+def _type_of_default(default: object) -> Any:
+    """Return the type of a parameter without an annotation: the default 1 allows 0.5 as well."""
+    if default is None:
+        return Any
+    return float if type(default) is int else type(default)
+
+
+def _is_of_kind(value: object, kind: type) -> bool:
+    """Return whether a value is of a plain type; a boolean does not count as a number."""
+    return isinstance(value, _PLAIN[kind]) and (kind is bool or type(value) is not bool)
 
 
 def wrong_settings(error: ValueError, model: type | None = None, option: str | None = None) -> str:
@@ -103,57 +114,61 @@ def wrong_settings(error: ValueError, model: type | None = None, option: str | N
     if listed is None:
         return str(error)
     lines = [_sentence(item, model, option) for item in listed()]
-    return lines[0] if len(lines) == 1 else "\n" + "\n".join(f"- {line}" for line in lines)
+    if len(lines) == 1:
+        return lines[0]
+    return "\n" + "\n".join(f"- {line}" for line in lines)
 
 
 def _sentence(item: Mapping[str, Any], model: type | None, option: str | None) -> str:
+    """Return the message for an item of pydantic's list of errors."""
+    kind, value = item["type"], item["input"]
     where = ".".join(map(str, item["loc"]))
     message = str(item["msg"]).removeprefix("Value error, ")
     name = str(item["loc"][-1]) if item["loc"] else ""
-    beside = _fields(model, item["loc"][:-1])
-    got = (
-        item["input"]
-        if isinstance(item["input"], (bool, int, float))
-        else type(item["input"]).__name__
-    )
-    # In place of a number or a list: no secret.
-    if item["type"] in _WORD_ERRORS and isinstance(item["input"], str):
-        got = shown(item["input"])
+    siblings = _fields(model, item["loc"][:-1])
+
+    # Other values are named by their type alone, as they may be secrets.
+    value_text = value if isinstance(value, (bool, int, float)) else type(value).__name__
+    # A word in place of a number or a list is no secret.
+    if kind in _WORD_ERRORS and isinstance(value, str):
+        value_text = shown(value)
         message = message.partition(", unable to")[0]
-        if item["type"] in ("list_type", "sequence_str"):
-            message += f", such as [{item['input'][:40]}]"
-    # A word of a list is no secret.
-    if item["type"] == "literal_error" and isinstance(item["input"], str):
-        got = shown(item["input"])
-        message += did_you_mean(item["input"], item["ctx"]["expected"].split("'")[1::2])
+        if kind in ("list_type", "sequence_str"):
+            message += f", such as [{value[:40]}]"
+    # A word in place of one of a list is no secret, either.
+    if kind == "literal_error" and isinstance(value, str):
+        value_text = shown(value)
+        message += did_you_mean(value, item["ctx"]["expected"].split("'")[1::2])
+
     if message.startswith(_WANT):
-        spelling = _SPELLINGS.get((item["type"], type(item["input"])), "")
-        message = f"got {got}, want {message.removeprefix(_WANT)}{spelling}"
-    if item["type"] == "path_type":
-        message = f"got {got}, want a path"
-    if item["type"] in ("model_type", "model_attributes_type", "dict_type"):
-        takes = sorted(_fields(model, item["loc"]))
-        message = f"got {got}, want a mapping" + (f" with some of {takes}" if takes else "")
-        message += did_you_mean(name, beside.keys() - {name})
-    elif item["type"] == "missing":
-        example = next(iter(getattr(beside.get(name), "examples", None) or ()), "…")
-        message = (
-            "is missing; give "
-            f"{f'`{name}: {example}`' if option is None else f'{option} {where}={example}'}"
-        )
-    elif item["type"] == "extra_forbidden":
-        takes = sorted(beside)
+        spelling = _SPELLINGS.get((kind, type(value)), "")
+        message = f"got {value_text}, want {message.removeprefix(_WANT)}{spelling}"
+    if kind == "path_type":
+        message = f"got {value_text}, want a path"
+
+    if kind in ("model_type", "model_attributes_type", "dict_type"):
+        accepted = sorted(_fields(model, item["loc"]))
+        message = f"got {value_text}, want a mapping"
+        if accepted:
+            message += f" with some of {accepted}"
+        message += did_you_mean(name, siblings.keys() - {name})
+    elif kind == "missing":
+        example = next(iter(getattr(siblings.get(name), "examples", None) or ()), "…")
+        setting = f"`{name}: {example}`" if option is None else f"{option} {where}={example}"
+        message = f"is missing; give {setting}"
+    elif kind == "extra_forbidden":
+        accepted = sorted(siblings)
         message = "there is no such setting"
         if ":" in name:
             message += " (write a space after the colon)"
-        if takes:
-            message += f"; want one of {takes}{did_you_mean(name, takes)}"
+        if accepted:
+            message += f"; want one of {accepted}{did_you_mean(name, accepted)}"
     return f"{where}: {message}" if where else message
 
 
-def _fields(model: type | None, place: Iterable[Any]) -> Mapping[str, Any]:
-    """Return the fields at a place below `model`; empty if they cannot be determined."""
-    for name in place:
+def _fields(model: type | None, path: Iterable[Any]) -> Mapping[str, Any]:
+    """Return the fields at a path below `model`; empty if they cannot be determined."""
+    for name in path:
         if isinstance(name, int):  # an index in a list
             continue
         field = _of(model).get(name)
@@ -170,5 +185,5 @@ def _of(model: type | None) -> Mapping[str, Any]:
 def _parts(annotation: Any) -> Iterator[Any]:
     """Yield a type and its arguments, recursively: `Batch` of `Batch | None`."""
     yield annotation
-    for one in get_args(annotation):
-        yield from _parts(one)
+    for argument in get_args(annotation):
+        yield from _parts(argument)

@@ -19,7 +19,7 @@ import copy
 import sys
 import threading
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, fields, is_dataclass, replace
@@ -84,25 +84,31 @@ def difference(a: object, b: object, where: str, atol: float = 0.0) -> str | Non
     """
     if a is b:
         return None
+
     a, b = _plain(a), _plain(b)
     if isinstance(a, np.ndarray) and isinstance(b, np.ndarray):
         return _array_difference(a, b, where, atol)
     if isinstance(a, Mapping) and isinstance(b, Mapping):
         if a.keys() != b.keys():
             return f"{where} has {sorted(a)} once and {sorted(b)} the other time"
-        found_inside = (difference(a[key], b[key], f"{where}[{key!r}]", atol) for key in a)
-        return next((found for found in found_inside if found), None)
+        return _first_difference([(a[key], b[key], f"{where}[{key!r}]") for key in a], atol)
     if isinstance(a, (list, tuple)) and isinstance(b, (list, tuple)):
         if len(a) != len(b):
             return f"{where} has {len(a)} items once and {len(b)} the other time"
-        in_items = (
-            difference(x, y, f"{where}[{i}]", atol)
-            for i, (x, y) in enumerate(zip(a, b, strict=True))
-        )
-        return next((found for found in in_items if found), None)
-    return (
-        None if type(a) is type(b) and a == b else f"{where} is {a!r} once and {b!r} the other time"
-    )
+        items = [(a[i], b[i], f"{where}[{i}]") for i in range(len(a))]
+        return _first_difference(items, atol)
+    if type(a) is type(b) and a == b:
+        return None
+    return f"{where} is {a!r} once and {b!r} the other time"
+
+
+def _first_difference(items: Iterable[tuple[Any, Any, str]], atol: float) -> str | None:
+    """Describe the first difference between the items of two values, each with its place."""
+    for a, b, where in items:
+        description = difference(a, b, where, atol)
+        if description:
+            return description
+    return None
 
 
 def _plain(value: object) -> object:
@@ -114,14 +120,14 @@ def _plain(value: object) -> object:
     if isinstance(value, Obs):
         return {name: getattr(value, name) for name in ("cameras", "gripper", "state", "info")}
     if is_dataclass(value) and not isinstance(value, type):
-        return {part.name: getattr(value, part.name) for part in fields(value)}
+        return {field.name: getattr(value, field.name) for field in fields(value)}
     if hasattr(value, "__array__") and not isinstance(value, (np.ndarray, np.generic)):
         if "bfloat16" in str(getattr(value, "dtype", "")):  # which NumPy lacks
             value = value.float()  # type: ignore[attr-defined]
         return np.asarray(value)
-    return (
-        vars(value) if type(value).__eq__ is object.__eq__ and hasattr(value, "__dict__") else value
-    )
+    if type(value).__eq__ is object.__eq__ and hasattr(value, "__dict__"):
+        return vars(value)
+    return value
 
 
 def _array_difference(a: np.ndarray, b: np.ndarray, where: str, atol: float) -> str | None:
@@ -142,8 +148,9 @@ def require_same(a: Any, b: Any, where: str, because: str, atol: float = 0.0) ->
     """Raise `ContractViolation` with the difference and the reason `because` unless two values
     are equal.
     """
-    if found := difference(a, b, where, atol):
-        raise ContractViolation(f"{found}; {because}")
+    description = difference(a, b, where, atol)
+    if description:
+        raise ContractViolation(f"{description}; {because}")
 
 
 def check_close(made: Agent | EvalEnv) -> None:
@@ -192,19 +199,29 @@ def check_agent(
         raise ContractViolation(
             f"agent: got {agent!r}, want an object of a class that derives from vlagents_ray.Agent"
         )
+
     agent.initialize()
     contract = agent.contract
     if contract is not None and not isinstance(contract, Contract):
         raise ContractViolation(f"contract: got {type(contract).__name__}, want a Contract or None")
+
     views = [obs] if isinstance(obs, Obs) else list(obs or ())
     views = views or [random_observation(contract, seed) for seed in range(_SESSIONS)]
-    views, texts = [*islice(cycle(views), _SESSIONS)], [*islice(cycle(instructions), _SESSIONS)]
-    suite = _AgentSuite(agent, contract, views, texts, dict(reset_kwargs or {}))
+    suite = _AgentSuite(
+        agent,
+        contract,
+        list(islice(cycle(views), _SESSIONS)),
+        list(islice(cycle(instructions), _SESSIONS)),
+        dict(reset_kwargs or {}),
+    )
 
+    # The actions of each session alone.
     alone = [suite.play_alone(i, steps) for i in range(_SESSIONS)]
     because = "the same observations, instruction and seed must give the same actions"
     for i, again in enumerate([suite.play_alone(i, steps) for i in range(_SESSIONS)]):
         require_same(alone[i], again, f"act of session {i}", because)
+
+    # All sessions in turn.
     because = (
         "it depends on other sessions: keep what belongs to an episode in self, and out of `shared`"
     )
@@ -214,6 +231,8 @@ def check_agent(
             require_same(
                 alone[i][step], suite.act(i, session), f"act {step} of session {i}", because
             )
+
+    # Prepared observations, also from several threads.
     if type(agent).prepare is not Agent.prepare:
         because = "`prepare` must compute what `act` computes without it"
         for i, session in enumerate([suite.begin(i) for i in range(_SESSIONS)]):
@@ -221,6 +240,8 @@ def check_agent(
                 where = f"act {step} of session {i} on a prepared observation"
                 require_same(alone[i][step], suite.act(i, session, prepared=True), where, because)
         _check_threads(suite, [acts[0] for acts in alone])
+
+    # Batches.
     because = "act_batch must give each session what act gives it alone"
     for size in range(1, _SESSIONS + 1):
         batch = [suite.begin(i) for i in range(size)]
@@ -245,6 +266,7 @@ def _check_threads(suite: _AgentSuite, first: list[Act]) -> None:
     )
 
     def prepare(number: int) -> None:
+        """Prepare the observations of a session until all rounds have ended."""
         while not ended.is_set():
             i = number % _SESSIONS
             require_same(
@@ -255,8 +277,8 @@ def _check_threads(suite: _AgentSuite, first: list[Act]) -> None:
             )
 
     with ThreadPoolExecutor(_THREADS) as threads:
-        running = [threads.submit(prepare, number) for number in range(_THREADS)]
-        usual = sys.getswitchinterval()
+        preparing = [threads.submit(prepare, number) for number in range(_THREADS)]
+        usual_interval = sys.getswitchinterval()
         sys.setswitchinterval(_SWITCH_S)
         try:
             begun = time.monotonic()
@@ -265,13 +287,14 @@ def _check_threads(suite: _AgentSuite, first: list[Act]) -> None:
                     break
                 i = number % _SESSIONS
                 *_, session = (suite.begin(i) for _ in range(_RESETS))
-                found = suite.act(i, session, prepared=number % 2 == 0)
-                require_same(first[i], found, f"act of session {i} while threads prepare", cure)
+                act = suite.act(i, session, prepared=number % 2 == 0)
+                require_same(first[i], act, f"act of session {i} while threads prepare", cure)
         finally:
-            sys.setswitchinterval(usual)
+            sys.setswitchinterval(usual_interval)
             ended.set()
-    for one in running:
-        one.result()
+
+    for future in preparing:
+        future.result()
 
 
 @dataclass(slots=True)
@@ -280,10 +303,11 @@ class _AgentSuite:
 
     _agent: Agent
     _contract: Contract | None
-    _views: list[Obs]  # of each session
-    _instructions: list[str]  # of each session
+    _views: list[Obs]  # the observation of each session
+    _instructions: list[str]  # the instruction of each session
     _reset_kwargs: dict[str, Any]
-    cure: str = (  # of errors that the agent raises
+    # The cure of errors that the agent raises, for messages.
+    cure: str = (
         "if the policy parses its instructions or takes only some observations, give "
         "check_agent(…, instructions=[…], obs=[…]) those that it knows"
     )
@@ -298,6 +322,7 @@ class _AgentSuite:
                 f"the initialized agent cannot be copied for a session: {error}; "
                 f"name the attributes that sessions may share in `shared`"
             ) from error
+
         obs = self._views[i]
         before = copy.deepcopy(obs)
         with self._calling("reset", i):
@@ -309,16 +334,20 @@ class _AgentSuite:
         return session
 
     def play_alone(self, i: int, steps: int) -> list[Act]:
-        session, given, kept = self.begin(i), list[Act](), list[Act]()
+        """Act `steps` times in session `i`, and return copies of the acts."""
+        session = self.begin(i)
+        acts: list[Act] = []
+        copies: list[Act] = []
         for _ in range(steps):
-            given.append(self.act(i, session))
-            kept.append(copy.deepcopy(given[-1]))
+            acts.append(self.act(i, session))
+            copies.append(copy.deepcopy(acts[-1]))
         require_same(
-            kept, given, "an earlier act", "a later one changed it: give a new array each time"
+            copies, acts, "an earlier act", "a later one changed it: give a new array each time"
         )
-        return kept
+        return copies
 
     def act(self, i: int, session: Agent, *, prepared: bool = False) -> Act:
+        """Act once in session `i`, on a prepared observation if `prepared`."""
         obs = self._views[i]
         before = copy.deepcopy(obs)
         if prepared:
@@ -329,10 +358,12 @@ class _AgentSuite:
         return self._checked(act, "act")
 
     def prepare(self, i: int, session: Agent) -> Any:
+        """Return what session `i` prepares of its observation."""
         with self._calling("prepare", i):
             return session.prepare(self._views[i])
 
     def act_batch(self, sessions: list[Agent]) -> list[Act]:
+        """Act once in the first sessions, in one batch."""
         views = self._views[: len(sessions)]
         before = copy.deepcopy(views)
         acts = self._agent.act_batch(views, sessions)
@@ -340,21 +371,23 @@ class _AgentSuite:
             before, views, "the observations", "act_batch changed the caller's: work on copies"
         )
         if not isinstance(acts, list) or len(acts) != len(sessions):
-            got = f"{len(acts)} of them" if isinstance(acts, list) else type(acts).__name__
-            raise ContractViolation(f"act_batch: got {got}, want a list of {len(sessions)} acts")
+            result = f"{len(acts)} of them" if isinstance(acts, list) else type(acts).__name__
+            raise ContractViolation(f"act_batch: got {result}, want a list of {len(sessions)} acts")
         return [self._checked(act, "act_batch") for act in acts]
 
     @contextmanager
     def _calling(self, method: str, i: int) -> Iterator[None]:
+        """Turn an error of a method that is called within this context into a violation."""
         try:
             yield
         except Exception as error:
-            got = f"{method}: raised {error!r} for the instruction {self._instructions[i]!r}"
+            event = f"{method}: raised {error!r} for the instruction {self._instructions[i]!r}"
             if method != "reset":
-                got += f" and the observation of session {i}"
-            raise ContractViolation(f"{got}, want no error; {self.cure}") from error
+                event += f" and the observation of session {i}"
+            raise ContractViolation(f"{event}, want no error; {self.cure}") from error
 
     def _checked(self, act: object, where: str) -> Act:
+        """Return the result of `act`; raise `ContractViolation` if it is no valid `Act`."""
         if isinstance(act, Exception):
             raise ContractViolation(
                 f"{where}: failed with {act!r} for an observation that `act` takes"
@@ -362,16 +395,15 @@ class _AgentSuite:
         if not isinstance(act, Act):
             raise ContractViolation(f"{where}: got {type(act).__name__}, want an Act")
         if not isinstance(act.action, np.ndarray) or act.action.dtype != np.float32:
-            got = (
-                act.action.dtype
-                if isinstance(act.action, np.ndarray)
-                else type(act.action).__name__
-            )
-            raise ContractViolation(f"{where}: the action is {got}, want a numpy array of float32")
+            is_array = isinstance(act.action, np.ndarray)
+            kind = act.action.dtype if is_array else type(act.action).__name__
+            raise ContractViolation(f"{where}: the action is {kind}, want a numpy array of float32")
+
         try:
             check_action(act.action, self._contract)
         except InvalidAction as error:
             raise ContractViolation(f"{where}: {error}") from error
+
         chunk = self._contract.chunk if self._contract is not None else None
         if chunk not in (None, len(act.rows())):
             raise ContractViolation(
@@ -387,7 +419,7 @@ def random_observation(
     contract: Contract | None,
     seed: int,
     *,
-    side: int = _SIDE,
+    image_size: int = _SIDE,
     dims: Mapping[str, int] | None = None,
 ) -> Obs:
     """Make a random observation that fits a contract; equal seeds give equal observations.
@@ -395,8 +427,8 @@ def random_observation(
     Args:
         contract: The contract; None for one camera and one state.
         seed: The seed.
-        side: Height and width of images whose size the contract does not state, pixels.
-        dims: Sizes of parts of the state that the contract does not state.
+        image_size: The height and width, in pixels, of images whose size is not in the contract.
+        dims: The sizes of parts of the state whose size is not in the contract.
     """
     rng = np.random.default_rng(seed)
     cameras: Mapping[str, CameraSpec] = {"front": CameraSpec()}
@@ -404,17 +436,16 @@ def random_observation(
     if contract is not None:
         cameras = cameras if contract.cameras is None else contract.cameras
         state = state if contract.state is None else contract.state
-    sizes = {name: part.dim or (dims or {}).get(name, _DIM) for name, part in state.items()}
-    return Obs(
-        cameras={
-            name: rng.integers(
-                0, 256, (camera.height or side, camera.width or side, 3), dtype=np.uint8
-            )
-            for name, camera in cameras.items()
-        },
-        gripper=float(rng.uniform()),
-        state={name: rng.uniform(-1, 1, size).astype(np.float32) for name, size in sizes.items()},
-    )
+
+    obs = Obs()
+    for name, camera in cameras.items():
+        shape = (camera.height or image_size, camera.width or image_size, 3)
+        obs.cameras[name] = rng.integers(0, 256, shape, dtype=np.uint8)
+    obs.gripper = float(rng.uniform())
+    for name, spec in state.items():
+        dim = spec.dim or (dims or {}).get(name, _DIM)
+        obs.state[name] = rng.uniform(-1, 1, dim).astype(np.float32)
+    return obs
 
 
 def check_env(
@@ -449,6 +480,7 @@ def check_env(
         raise ContractViolation(
             f"env: got {env!r}, want an EvalEnv; make one of Gymnasium by make_env('gymnasium/ID')"
         )
+
     contract = env.contract
     if not isinstance(contract, Contract):
         raise ContractViolation(f"contract: got {type(contract).__name__}, want a Contract")
@@ -461,18 +493,20 @@ def check_env(
     require_wireable(env.describe(), "describe()")
     if not all(isinstance(name, str) for name in env.tasks()):
         raise ContractViolation(f"tasks(): got {env.tasks()!r}, want a list of names")
+
     suite = _EnvSuite(env, contract, options)
     actions = suite.random_actions(steps)
     first = suite.play(seeds[0], actions)
     other = suite.play(seeds[1], actions)
     again = suite.play(seeds[0], actions)
+
     because = (
         "an episode must be a pure function of its seed and options, whatever was played before"
     )
     require_same(first.instruction, again.instruction, "instruction", because)
-    require_same(first.seen[0], again.seen[0], "the first observation", because)
+    require_same(first.copies[0], again.copies[0], "the first observation", because)
     if same_steps:
-        for i, (a, b) in enumerate(zip(first.seen, again.seen, strict=False)):
+        for i, (a, b) in enumerate(zip(first.copies, again.copies, strict=False)):
             require_same(a, b, f"the observation after step {i}", because)
         require_same(
             first.outcomes,
@@ -481,10 +515,12 @@ def check_env(
             because,
         )
         suite.check_unseen(seeds[0], actions, first)
+
     because = "a later step or reset changed it: give new arrays each time"
     for rollout in (first, other, again):
-        for i, (given, kept) in enumerate(zip(rollout.given, rollout.seen, strict=True)):
-            require_same(kept, given, f"the observation after step {i}", because)
+        for i, (obs, obs_copy) in enumerate(zip(rollout.observations, rollout.copies, strict=True)):
+            require_same(obs_copy, obs, f"the observation after step {i}", because)
+
     suite.check_invalid_actions(seeds[0])
     if step_limit:
         suite.check_step_limit(seeds[0])
@@ -493,10 +529,12 @@ def check_env(
 
 @dataclass(slots=True)
 class _Rollout:
+    """An episode of random actions."""
+
     instruction: str
-    given: list[Obs]  # the env's own objects
-    seen: list[Obs]  # copies of them, made immediately
-    outcomes: list[Any]
+    observations: list[Obs]  # the env's own objects
+    copies: list[Obs]  # copies of them, made immediately
+    outcomes: list[Any]  # of each step: reward, terminated, truncated and success
 
 
 @dataclass(slots=True)
@@ -508,26 +546,28 @@ class _EnvSuite:
     _options: Mapping[str, Any] | None
 
     def random_actions(self, count: int) -> list[np.ndarray]:
+        """Return random actions within the contract's bounds, (D,) float32 each."""
         spec = self._contract.action
         low = -1.0 if spec.low is None else spec.low
         high = 1.0 if spec.high is None else spec.high
-        return list(
-            np.random.default_rng(0).uniform(low, high, (count, spec.dim or 1)).astype(np.float32)
-        )
+        rows = np.random.default_rng(0).uniform(low, high, (count, spec.dim or 1))
+        return list(rows.astype(np.float32))
 
     def play(self, seed: int, actions: list[np.ndarray]) -> _Rollout:
+        """Execute actions in an episode, until it ends."""
         obs = self.reset(seed)
         rollout = _Rollout(self._env.instruction, [obs], [copy.deepcopy(obs)], [])
         for action in actions:
             obs, outcome = self.step(action)
-            rollout.given.append(obs)
-            rollout.seen.append(copy.deepcopy(obs))
+            rollout.observations.append(obs)
+            rollout.copies.append(copy.deepcopy(obs))
             rollout.outcomes.append(outcome)
             if outcome[1] or outcome[2]:
                 break
         return rollout
 
     def reset(self, seed: int) -> Obs:
+        """Begin an episode, check the results, and return the first observation."""
         result = self._env.reset(seed=seed, options=self._options)
         if not isinstance(result, tuple) or len(result) != 2:
             raise ContractViolation(f"reset: got {kind_of(result)}, want (Obs, info)")
@@ -536,6 +576,7 @@ class _EnvSuite:
         if not isinstance(info, dict):
             raise ContractViolation(f"reset: info is {kind_of(info)}, want a dict")
         require_wireable(info, "reset: info")
+
         instruction = self._env.instruction
         if not isinstance(instruction, str):
             raise ContractViolation(f"instruction: got {kind_of(instruction)}, want a str")
@@ -556,6 +597,7 @@ class _EnvSuite:
             raise ContractViolation(
                 f"step: got {kind_of(result)}, want (Obs, reward, terminated, truncated, info)"
             )
+
         obs, *outcome, info = result
         _check_obs(obs, self._contract, "step")
         kinds = (("reward", float), ("terminated", bool), ("truncated", bool))
@@ -571,34 +613,36 @@ class _EnvSuite:
         require_wireable(info, "step: info")
         return obs, [*outcome, info["success"]]
 
-    def check_unseen(self, seed: int, actions: list[np.ndarray], seen: _Rollout) -> None:
-        """Repeat the episode `seen` with `looked_at` False before the last step; only images may
-        be absent.
+    def check_unseen(self, seed: int, actions: list[np.ndarray], rollout: _Rollout) -> None:
+        """Repeat an episode with `looked_at` False before the last step; only images may be
+        absent.
         """
         self.reset(seed)
-        last = len(seen.outcomes) - 1
+        last = len(rollout.outcomes) - 1
         because = "`looked_at` may omit images and must change nothing else"
-        for i, (action, expected) in enumerate(zip(actions, seen.seen[1:], strict=False)):
+        for i, (action, expected) in enumerate(zip(actions, rollout.copies[1:], strict=False)):
             self._env.looked_at = i == last
             obs, reward, terminated, truncated, info = self._env.step(Act(action.copy()))
-            a, b = (
-                one if i == last else Obs({}, one.gripper, one.state) for one in (expected, obs)
-            )
-            require_same(a, b, f"the observation after step {i}", because)
+            if i != last:
+                expected = Obs({}, expected.gripper, expected.state)  # noqa: PLW2901
+                obs = Obs({}, obs.gripper, obs.state)
+            require_same(expected, obs, f"the observation after step {i}", because)
+
             outcome = [reward, terminated, truncated, info["success"]]
             require_same(
-                seen.outcomes[i],
+                rollout.outcomes[i],
                 outcome,
                 f"[reward, terminated, truncated, success] of step {i}",
                 because,
             )
 
     def check_invalid_actions(self, seed: int) -> None:
+        """Check that invalid actions raise `InvalidAction`, and that a valid one then works."""
         self.reset(seed)
-        [good] = self.random_actions(1)
-        dim = len(good)
-        for what, action in (
-            (f"of shape ({dim + 1},)", np.append(good, good[0])),
+        [valid_action] = self.random_actions(1)
+        dim = len(valid_action)
+        for description, action in (
+            (f"of shape ({dim + 1},)", np.append(valid_action, valid_action[0])),
             ("that holds NaN", np.full(dim, np.nan, np.float32)),
         ):
             try:
@@ -607,12 +651,15 @@ class _EnvSuite:
                 continue
             except Exception as error:
                 raise ContractViolation(
-                    f"step: an action {what} raised {error!r}, want InvalidAction"
+                    f"step: an action {description} raised {error!r}, want InvalidAction"
                 ) from error
-            raise ContractViolation(f"step: an action {what} was executed, want InvalidAction")
-        self.step(good)
+            raise ContractViolation(
+                f"step: an action {description} was executed, want InvalidAction"
+            )
+        self.step(valid_action)
 
     def check_step_limit(self, seed: int) -> None:
+        """Check that an episode is truncated at step `max_steps`, and not before."""
         self.reset(seed)
         [action] = self.random_actions(1)
         limit = self._env.max_steps
@@ -626,22 +673,24 @@ class _EnvSuite:
 
 
 def _check_obs(obs: object, contract: Contract, where: str) -> None:
+    """Raise `ContractViolation` if an observation is invalid or differs from the contract."""
     if not isinstance(obs, Obs):
         raise ContractViolation(f"{where}: the observation is {kind_of(obs)}, want an Obs")
     try:
         check_observation(obs, contract)
     except InvalidObservation as error:
         raise ContractViolation(f"{where}: {error}") from error
-    for name, part in obs.state.items():
-        if part.dtype != np.float32:
-            raise ContractViolation(f"{where}: state {name!r} is {part.dtype}, want float32")
-    for kind, have, stated in (
+
+    for name, values in obs.state.items():
+        if values.dtype != np.float32:
+            raise ContractViolation(f"{where}: state {name!r} is {values.dtype}, want float32")
+    for kind, names, expected in (
         ("cameras", obs.cameras, contract.cameras),
         ("state", obs.state, contract.state),
     ):
-        if stated is not None and set(have) != set(stated):
+        if expected is not None and set(names) != set(expected):
             raise ContractViolation(
-                f"{where}: {kind} are {sorted(have)}, the contract states {sorted(stated)}"
+                f"{where}: {kind} are {sorted(names)}, the contract states {sorted(expected)}"
             )
     if contract.gripper is False and obs.gripper is not None:
         raise ContractViolation(

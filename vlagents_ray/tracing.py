@@ -38,10 +38,12 @@ def flush() -> None:
 
 @functools.cache
 def _provider() -> Any:
-    own = require("opentelemetry.trace", extra="otel").get_tracer_provider()
+    """Return the program's tracer provider if it has set one; else a new one with an exporter."""
+    program_provider = require("opentelemetry.trace", extra="otel").get_tracer_provider()
     sdk = require("opentelemetry.sdk.trace", extra="otel")
-    if isinstance(own, sdk.TracerProvider):
-        return own
+    if isinstance(program_provider, sdk.TracerProvider):
+        return program_provider
+
     export = require("opentelemetry.sdk.trace.export", extra="otel")
     otlp = require("opentelemetry.exporter.otlp.proto.http.trace_exporter", extra="otel")
     provider = sdk.TracerProvider()

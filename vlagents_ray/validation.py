@@ -17,7 +17,7 @@ from vlagents_ray.errors import (
 from vlagents_ray.interface import WANT, Obs
 
 LARGEST_ACTION = 1e9  # beyond it no number of an action has a meaning, in any unit
-_FEW = 64  # size of arrays up to which Python's own check is faster than numpy's
+_SMALL = 64  # the size of arrays up to which Python's own check is faster than numpy's
 _UINT8, _FLOAT32 = np.dtype(np.uint8), np.dtype(np.float32)
 
 
@@ -43,10 +43,10 @@ def check_observation(obs: Obs, contract: Contract | None) -> None:
         raise InvalidObservation(
             "observation: got a camera or state without a name (''), want a name for each"
         )
-    for name, part in obs.state.items():
-        if not isinstance(part, np.ndarray) or part.ndim != 1 or part.dtype.kind not in "fiu":
-            raise InvalidObservation(f"state {name!r}: got {described(part)}, want (D,) float32")
-        if not _finite(part):
+    for name, values in obs.state.items():
+        if not isinstance(values, np.ndarray) or values.ndim != 1 or values.dtype.kind not in "fiu":
+            raise InvalidObservation(f"state {name!r}: got {described(values)}, want (D,) float32")
+        if not _finite(values):
             raise InvalidObservation(
                 f"state {name!r}: got NaN or infinity, want finite numbers; check the sensor"
             )
@@ -54,22 +54,27 @@ def check_observation(obs: Obs, contract: Contract | None) -> None:
         raise InvalidObservation(
             f"gripper: got {obs.gripper}, want a number in [0, 1] where 1 = open"
         )
+
     if WANT in obs.info:
-        wanted, offered = obs.info[WANT], (contract and contract.behaviour) or ()
-        if not isinstance(wanted, list) or not all(isinstance(name, str) for name in wanted):
+        requested = obs.info[WANT]
+        offered = (contract and contract.behaviour) or ()
+        if not isinstance(requested, list) or not all(isinstance(name, str) for name in requested):
             raise InvalidObservation(
-                f"info[{WANT!r}]: got {described(wanted)}, want a list of names"
+                f"info[{WANT!r}]: got {described(requested)}, want a list of names"
             )
-        if unknown := sorted(set(wanted) - set(offered)):
+        unknown = sorted(set(requested) - set(offered))
+        if unknown:
             raise NotOffered(
                 f"info[{WANT!r}]: got {unknown}, want some of {sorted(offered)}, the `behaviour` "
                 "of the policy's contract; take a policy that returns it, or leave it out"
             )
+
     if contract is not None and (contract.cameras or contract.state or contract.gripper):
         _check_needs(obs, contract)
 
 
 def _check_needs(obs: Obs, contract: Contract) -> None:
+    """Raise `InvalidObservation` unless `obs` has the inputs that `contract` names."""
     for name, camera in (contract.cameras or {}).items():
         if name not in obs.cameras:
             raise MissingCamera(name, have=obs.cameras)
@@ -98,12 +103,13 @@ def check_action(action: object, contract: Contract | None) -> np.ndarray:
     try:
         array = np.ascontiguousarray(action, dtype=_FLOAT32)
     except (TypeError, ValueError, RuntimeError) as error:
-        # RuntimeError: a torch tensor that requires grad
+        # A torch tensor that requires grad raises RuntimeError.
         raise InvalidAction(
             f"action: got {described(action)}, want (D,) or (H, D) float32"
         ) from error
     if array.ndim not in (1, 2) or array.size == 0:
         raise InvalidAction(f"action: got {described(action)}, want (D,) or (H, D) float32")
+
     largest = _largest(array)
     if not largest <= LARGEST_ACTION:
         if not math.isfinite(largest):
@@ -121,14 +127,14 @@ def _finite(array: np.ndarray) -> bool:
     """Return whether all numbers are finite; for a robot's few numbers Python is four times as
     fast as numpy.
     """
-    if array.size <= _FEW:
+    if array.size <= _SMALL:
         return all(map(math.isfinite, array.ravel().tolist()))
     return bool(np.isfinite(array).all())
 
 
 def _largest(array: np.ndarray) -> float:
     """Return the largest absolute value; NaN or infinity if there is one."""
-    if array.size <= _FEW:
+    if array.size <= _SMALL:
         values = array.ravel().tolist()
         return max(map(abs, values)) if all(map(math.isfinite, values)) else math.inf
     return float(np.abs(array).max())

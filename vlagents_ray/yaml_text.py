@@ -50,8 +50,13 @@ def read_yaml(file: Path | str, *, extra: str = "serve") -> Any:
 
 @functools.cache
 def _loader(yaml: Any) -> Any:
+    """Return a class of PyYAML's that rejects a key that is written twice, and reads `1e-4` as a
+    number.
+    """
+
     class Loader(yaml.SafeLoader):  # type: ignore[misc]
         def construct_mapping(self, node: Any, deep: bool = False) -> Any:
+            """Return a mapping, whose keys must differ."""
             first: dict[tuple[str, str], Any] = {}
             for key, _ in node.value if isinstance(node, yaml.MappingNode) else ():
                 if not isinstance(key, yaml.ScalarNode) or key.tag == "tag:yaml.org,2002:merge":

@@ -169,7 +169,7 @@ class Lab:
 
 def view(contract: Contract | None, seed: int) -> Obs:
     """Return an observation that fits the contract."""
-    return random_observation(contract, seed, side=224)
+    return random_observation(contract, seed, image_size=224)
 
 
 class Session:

@@ -337,7 +337,7 @@ class WritersAndReaders(RuleBasedStateMachine):
 def few_layouts(request: pytest.FixtureRequest) -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         if "layout" in request.node.name:
-            patch.setattr(shm_layout, "_MOST", 4)
+            patch.setattr(shm_layout, "_MAX_LAYOUTS", 4)
         yield
 
 

@@ -26,7 +26,7 @@ _PREFIX = struct.Struct("<3sBI")
 _ALIGN = 8
 HEADER_BYTES = 2**20  # maximum size of a request's JSON; only the size of the body limits a reply's
 VALUES = 20_000  # maximum number of values in a request's JSON; parsing as many takes about 2 ms
-# Longer JSON is parsed within a budget, which may move it to a decoding thread.
+# JSON that is longer than this is parsed within a budget, which may move it to a decoding thread.
 _INLINE_BYTES = 64 * 1024
 _LONG_VALUES = 1_000_000
 _PLAIN = re.compile(r"[<|][biuf][1248]")
@@ -46,11 +46,11 @@ def assemble(header: str, blobs: list[Buffer]) -> list[Buffer]:
     """Return the pieces of a frame whose header is JSON text that already contains "blobs"."""
     head = header.encode()
     parts: list[Buffer] = [_PREFIX.pack(b"VLA", PROTOCOL_VERSION, len(head)), head]
-    at = _PREFIX.size + len(head)
+    offset = _PREFIX.size + len(head)
     for blob in blobs:
-        gap = -at % _ALIGN
+        gap = -offset % _ALIGN
         parts += (b"\0" * gap, blob)
-        at += gap + len(blob)
+        offset += gap + len(blob)
     return parts
 
 
@@ -69,6 +69,7 @@ def unpack(
         raise MessageTooLarge(f"frame: got {len(data)} bytes, the limit is {limits.body_bytes}")
     if len(data) < _PREFIX.size:
         raise MalformedMessage(f"frame: got {len(data)} bytes, want at least {_PREFIX.size}")
+
     magic, version, length = _PREFIX.unpack_from(data)
     if magic != b"VLA":
         raise MalformedMessage(
@@ -78,29 +79,32 @@ def unpack(
         raise MalformedMessage(
             f"frame: got version {version}, this side speaks {PROTOCOL_VERSION}; upgrade the older"
         )
+
     view = memoryview(data)
-    at = _PREFIX.size + length
-    if at > len(view):
+    offset = _PREFIX.size + length
+    if offset > len(view):
         raise MalformedMessage(
-            f"frame: ends inside its header ({len(view)} of {at} bytes); it was truncated"
+            f"frame: ends inside its header ({len(view)} of {offset} bytes); it was truncated"
         )
     header = parse_json(
-        view[_PREFIX.size : at], "frame: the header is", budget=budget, long=budget is None
+        view[_PREFIX.size : offset], "frame: the header is", budget=budget, long=budget is None
     )
+
     lengths = header.get("blobs") if isinstance(header, dict) else None
     if not isinstance(lengths, list) or not all(type(n) is int and n >= 0 for n in lengths):
         raise MalformedMessage("frame: the header has no list 'blobs' of lengths")
     blobs: list[Buffer] = []
-    for n in lengths:
-        at += -at % _ALIGN
-        if at + n > len(view):
+    for blob_length in lengths:
+        offset += -offset % _ALIGN
+        end = offset + blob_length
+        if end > len(view):
             raise MalformedMessage(
-                f"frame: ends inside a blob ({len(view)} of {at + n} bytes); it was truncated"
+                f"frame: ends inside a blob ({len(view)} of {end} bytes); it was truncated"
             )
-        blobs.append(view[at : at + n])
-        at += n
-    if at != len(view):
-        raise MalformedMessage(f"frame: {len(view) - at} bytes follow its last blob")
+        blobs.append(view[offset:end])
+        offset = end
+    if offset != len(view):
+        raise MalformedMessage(f"frame: {len(view) - offset} bytes follow its last blob")
     return header, blobs
 
 
@@ -133,27 +137,29 @@ def parse_json(
         )
     if budget is not None and len(text) > _INLINE_BYTES:
         budget.parse(len(text))
+
     data = text if isinstance(text, str) else bytes(text)
-    most = _LONG_VALUES if long else VALUES
-    if len(data) > 2 * most:  # each value takes at least two characters
+    max_values = _LONG_VALUES if long else VALUES
+    if len(data) > 2 * max_values:  # each value takes at least two characters
         marks: tuple[Any, ...] = (",", "[", "{") if isinstance(data, str) else (b",", b"[", b"{")
         # Parsing would need far more memory and time than the length suggests.
-        if sum(map(data.count, marks)) > most:
+        if sum(map(data.count, marks)) > max_values:
             raise MessageTooLarge(
-                f"message: more than {most} values in its JSON; send arrays instead of lists"
+                f"message: more than {max_values} values in its JSON; send arrays instead of lists"
             )
+
     try:
         decoded = data if isinstance(data, str) else data.removeprefix(codecs.BOM_UTF8).decode()
         value = json.loads(decoded, object_pairs_hook=pairs)
         if "\\u" in decoded:
-            # Raises an error for an unpaired surrogate.
+            # This raises an error for an unpaired surrogate.
             json.dumps(value, ensure_ascii=False).encode()
     except (ValueError, RecursionError) as error:
         raise MalformedMessage(f"{what} not JSON ({error})") from error
     return value
 
 
-# Arrays in messages: only booleans, integers and floats, and only if the number of bytes matches.
+# Arrays in messages have only booleans, integers and floats, and their number of bytes must match.
 
 
 def is_plain(dtype: Any) -> bool:
@@ -166,10 +172,10 @@ def plain_dtype(dtype: Any) -> np.dtype[Any]:
     if not is_plain(dtype):
         raise MalformedMessage(f"array: got dtype {shown(dtype, 20)}, want one like '<f4' or '|u1'")
     try:
-        found: np.dtype[Any] = np.dtype(dtype)
+        named_dtype: np.dtype[Any] = np.dtype(dtype)
     except TypeError as error:
         raise MalformedMessage(f"array: got dtype {dtype!r}, which numpy does not know") from error
-    return found
+    return named_dtype
 
 
 def read_array(data: Buffer, dtype: Any, shape: Any) -> np.ndarray:
@@ -192,7 +198,7 @@ def read_array(data: Buffer, dtype: Any, shape: Any) -> np.ndarray:
     try:
         return np.ndarray(shape, kind, data)
     except (ValueError, OverflowError) as error:
-        # numpy cannot represent such a long axis, even beside an empty one
+        # numpy cannot represent such a long axis, even beside an empty one.
         raise MalformedMessage(
             f"array: got shape {shown(shape)}, which numpy does not know"
         ) from error

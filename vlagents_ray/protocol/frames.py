@@ -92,7 +92,8 @@ def _write_request(request: Request, writer: ValueWriter, codec: ImageCodec) -> 
     if request.history:
         node["history"] = [write_obs(obs, writer, codec) for obs in request.history]
     for name, default in _OPTIONAL.items():
-        if (value := getattr(request, name)) != default:
+        value = getattr(request, name)
+        if value != default:
             node[name] = value
     if request.step is not None:
         node["step"] = str(request.step)
@@ -130,24 +131,26 @@ def decode_requests(data: Buffer, budget: Budget, ops: Sequence[Op] = OPS) -> De
         raise MessageTooLarge(
             f"requests: got {len(nodes)}, the limit is {limits.requests} in one frame"
         )
+
     decoded = Decoded([], {})
     reader = ValueReader(blobs, budget)
-    for place, node in enumerate(nodes):
+    for index, node in enumerate(nodes):
         try:
             budget.begin(node.get("op"), node.get("priority"))
             reader.begin()
             decoded.requests.append(_read_request(node, reader, ops))
         except VLAgentsError as error:
-            name = node.get("request_id")
-            decoded.refused[place] = Reply(
-                name if isinstance(name, str) and is_name(name) else "", error=error
-            )
+            request_id = node.get("request_id")
+            if not (isinstance(request_id, str) and is_name(request_id)):
+                request_id = ""
+            decoded.refused[index] = Reply(request_id, error=error)
     return decoded
 
 
 def _read_request(node: dict[str, Any], reader: ValueReader, ops: Sequence[Op]) -> Request:
     limits = reader.limits
-    if unknown := node.keys() - _REQUEST_KEYS:
+    unknown = node.keys() - _REQUEST_KEYS
+    if unknown:
         raise MalformedMessage(
             f"request: unknown keys {shown(sorted(unknown))}, want some of {sorted(_REQUEST_KEYS)}"
         )
@@ -155,7 +158,9 @@ def _read_request(node: dict[str, Any], reader: ValueReader, ops: Sequence[Op]) 
         raise MalformedMessage(f"op: got {shown(node.get('op'))}, want one of {list(ops)}")
     if node["op"] == "close":  # a close has no payload and costs nothing
         node = {name: value for name, value in node.items() if name in _OF_CLOSE}
-    obs, history = node.get("obs"), node.get("history") or []
+
+    obs = node.get("obs")
+    history = node.get("history") or []
     if not isinstance(history, list):
         raise MalformedMessage(
             f"history: got {type(history).__name__}, want a list of observations"
@@ -164,26 +169,26 @@ def _read_request(node: dict[str, Any], reader: ValueReader, ops: Sequence[Op]) 
         raise MessageTooLarge(
             f"history: got {len(history)} observations, the limit is {limits.history}"
         )
-    return check_request(
-        Request(
-            op=cast(Op, node["op"]),
-            obs=None if obs is None else read_obs(obs, reader),
-            instruction=node.get("instruction"),
-            kwargs=reader.value(node.get("kwargs") or {}),
-            contract=node.get("contract"),
-            history=[read_obs(one, reader) for one in history],
-            step=_step(node),
-            **{name: node.get(name, default) for name, default in _OPTIONAL.items()},
-        ),
-        limits,
+
+    request = Request(
+        op=cast(Op, node["op"]),
+        obs=None if obs is None else read_obs(obs, reader),
+        instruction=node.get("instruction"),
+        kwargs=reader.value(node.get("kwargs") or {}),
+        contract=node.get("contract"),
+        history=[read_obs(earlier_obs, reader) for earlier_obs in history],
+        step=_step(node),
+        **{name: node.get(name, default) for name, default in _OPTIONAL.items()},
     )
+    return check_request(request, limits)
 
 
 def _step(node: dict[str, Any]) -> Any:
     """Return the `step` of a request or reply. It is sent as text: some JSON parsers round
     numbers above 2**53.
     """
-    if (step := node.get("step")) is None:
+    step = node.get("step")
+    if step is None:
         return None
     if not (isinstance(step, str) and step.isascii() and step.isdecimal() and len(step) < 20):
         raise MalformedMessage(
@@ -201,14 +206,16 @@ def check_request(request: Request, limits: MessageLimits) -> Request:
         raise MalformedMessage(f"kwargs: got {type(request.kwargs).__name__}, want an object")
     if request.contract is not None and not isinstance(request.contract, dict):
         raise MalformedMessage(f"contract: got {type(request.contract).__name__}, want an object")
-    if request.op in ("act", "close") and (
-        of_reset := [name for name in _OF_RESET if getattr(request, name)]
-    ):
-        raise MalformedMessage(
-            f"{request.op}: got {of_reset}, which a reset states for its whole episode"
-        )
+
+    if request.op in ("act", "close"):
+        reset_fields = [name for name in _OF_RESET if getattr(request, name)]
+        if reset_fields:
+            raise MalformedMessage(
+                f"{request.op}: got {reset_fields}, which a reset states for its whole episode"
+            )
     if request.obs is None and request.op in _WITH_OBS:
         raise MalformedMessage(f"{request.op}: no 'obs'; send the observation")
+
     for name in ("instruction", "request_id", "session"):
         text = getattr(request, name)
         if not isinstance(text, str) and not (name == "instruction" and text is None):
@@ -219,10 +226,14 @@ def check_request(request: Request, limits: MessageLimits) -> Request:
             raise MalformedMessage(
                 f"{name}: got {text[:40]!r}, want visible ASCII characters without spaces"
             )
-    if request.op == "reset" and (taken := _RESET_PARAMETERS & request.kwargs.keys()):
-        raise MalformedMessage(
-            f"kwargs: got {sorted(taken)}, which are parameters of `reset` itself; rename them"
-        )
+
+    if request.op == "reset":
+        parameters = _RESET_PARAMETERS & request.kwargs.keys()
+        if parameters:
+            raise MalformedMessage(
+                f"kwargs: got {sorted(parameters)}, which are parameters of `reset` itself; rename "
+                "them"
+            )
     if not isinstance(request.priority, str) or request.priority not in PRIORITIES:
         raise MalformedMessage(
             f"priority: got {shown(request.priority)}, want one of {list(PRIORITIES)}"
@@ -247,20 +258,22 @@ def encode_replies(replies: Sequence[Reply], *, arrived: float | None = None) ->
     begun = time.perf_counter()
     writer = ValueWriter()
     nodes = [dump(_write_reply(reply, writer)) for reply in replies]
+
     if len(nodes) > 1 and sum(map(len, (*nodes, *writer.blobs))) > DEFAULT_LIMITS.body_bytes:
-        large = MessageTooLarge(
+        error = MessageTooLarge(
             f"replies: over {DEFAULT_LIMITS.body_bytes} bytes together; ask for fewer at once"
         )
-        return encode_replies(
-            [Reply(reply.request_id, error=large) for reply in replies], arrived=arrived
-        )
+        error_replies = [Reply(reply.request_id, error=error) for reply in replies]
+        return encode_replies(error_replies, arrived=arrived)
+
     if arrived is not None:
         ended = time.perf_counter()
-        both = {"encode_ms": (ended - begun) * 1e3, "total_ms": (ended - arrived) * 1e3}
+        times_ms = {"encode_ms": (ended - begun) * 1e3, "total_ms": (ended - arrived) * 1e3}
         for reply in replies:
             if reply.error is None:
-                reply.timing |= both
-    # last, in a separate loop, so that `timing` covers the encoding of the rest.
+                reply.timing |= times_ms
+
+    # The timing is encoded last, in a separate loop, so that it covers the encoding of all else.
     for i, reply in enumerate(replies):
         if reply.timing:  # 4 decimals (0.1 us): all digits would take a third of the encoding time
             times = ",".join(
@@ -270,6 +283,7 @@ def encode_replies(replies: Sequence[Reply], *, arrived: float | None = None) ->
                 ]
             )
             nodes[i] = f'{nodes[i][:-1]},"timing":{{{times}}}}}'
+
     blobs = f"[{','.join([str(len(blob)) for blob in writer.blobs])}]"
     head = nodes[0][1:-1] if len(nodes) == 1 else f'"replies":[{",".join(nodes)}]'
     return b"".join(assemble(f'{{{head},"blobs":{blobs}}}', writer.blobs))
@@ -310,9 +324,11 @@ def _read_reply(node: dict[str, Any], reader: ValueReader) -> Reply:
         draining=bool(node.get("draining")),
         timing=_timing(node.get("timing")),
     )
-    if (error := node.get("error")) is not None:
-        reply.error = read_error(error)
-    elif (act := node.get("act")) is not None:
+    error_node = node.get("error")
+    act = node.get("act")
+    if error_node is not None:
+        reply.error = read_error(error_node)
+    elif act is not None:
         try:
             reply.act = Act(
                 reader.blob(act["action"]), bool(act["done"]), _info(act["info"], reader)
@@ -331,6 +347,7 @@ def _read_reply(node: dict[str, Any], reader: ValueReader) -> Reply:
 
 
 def _info(node: object, reader: ValueReader) -> dict[str, Any]:
+    """Return the `info` of a reply."""
     value = reader.value(node)
     if not isinstance(value, dict):
         raise MalformedMessage(f"reply: info: got {shown(node)}, expected an object")
@@ -338,6 +355,7 @@ def _info(node: object, reader: ValueReader) -> dict[str, Any]:
 
 
 def _timing(node: object) -> dict[str, float]:
+    """Return the `timing` of a reply."""
     if node is None:
         return {}
     if not isinstance(node, dict) or not all(is_number(value) for value in node.values()):

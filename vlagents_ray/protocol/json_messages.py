@@ -47,6 +47,7 @@ def request_from_parts(
     document = parse_json(text, "obs:", without_duplicate_keys, budget=budget)
     if not isinstance(document, dict):
         raise MalformedMessage(f"obs: got {type(document).__name__}, want an object")
+
     unknown = document.keys() - _KEYS
     if "cameras" in unknown:
         raise MalformedMessage(
@@ -57,22 +58,21 @@ def request_from_parts(
         raise MalformedMessage(
             f"obs: unknown keys {shown(sorted(unknown))}, want some of {sorted(_KEYS)}"
         )
+
     names = [] if op == "close" else list(images)  # a close has no payload and costs nothing
     reader = ValueReader([images[name] for name in names], budget)
     obs = {key: document[key] for key in ("gripper", "state", "info") if key in document}
     obs["cameras"] = {name: {"$": ["img", index]} for index, name in enumerate(names)}
-    return check_request(
-        Request(
-            op=op,
-            obs=read_obs(obs, reader),
-            instruction=document.get("instruction"),
-            kwargs=reader.value(document.get("kwargs") or {}),
-            contract=document.get("contract"),
-            request_id=document.get("request_id", ""),
-            deadline_ms=document.get("deadline_ms"),
-        ),
-        budget.limits,
+    request = Request(
+        op=op,
+        obs=read_obs(obs, reader),
+        instruction=document.get("instruction"),
+        kwargs=reader.value(document.get("kwargs") or {}),
+        contract=document.get("contract"),
+        request_id=document.get("request_id", ""),
+        deadline_ms=document.get("deadline_ms"),
     )
+    return check_request(request, budget.limits)
 
 
 def reply_to_json(reply: Reply) -> dict[str, Any]:
@@ -113,18 +113,16 @@ def plain_values(value: Any) -> Any:
     if isinstance(value, (list, tuple)):
         return [plain_values(item) for item in value]
     if isinstance(value, np.ndarray):
-        return (
-            value.tolist()
-            if value.dtype.kind != "f" or np.isfinite(value).all()
-            else plain_values(value.tolist())
-        )
+        items = value.tolist()
+        is_finite = value.dtype.kind != "f" or np.isfinite(value).all()
+        return items if is_finite else plain_values(items)
     if isinstance(value, np.generic):
         return plain_values(value.item())
     if isinstance(value, float) and not math.isfinite(value):
         return None
     if isinstance(value, (bytes, bytearray, memoryview)):
         return base64.b64encode(value).decode()
-    # Such as a deque, which a frame has as a list.
+    # Other sequences, such as a deque, are lists in a frame.
     if isinstance(value, Sequence) and not isinstance(value, str):
         return [plain_values(item) for item in value]
     return value

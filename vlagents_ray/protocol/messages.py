@@ -144,9 +144,9 @@ class MessageLimits:
     requests: int = 512  # requests in one frame
     history: int = 256  # observations sent with a reset
     reply_bytes: int = 16 * 2**20  # size of the action and the info of one reply
-    # Size of the images and bytes in one request, counted once for each reference to them.
+    # The size of the images and bytes in one request, counted once for each reference to them.
     decoded_bytes: int = 128 * 2**20
-    # Size of all messages that a replica is processing, encoded and decoded.
+    # The size of all messages that a replica is processing, encoded and decoded.
     in_flight_bytes: int = 512 * 2**20
 
 
@@ -232,6 +232,7 @@ def read_address(kind: type[Address], document: object) -> Address | None:
         raise MalformedMessage(
             f"metadata: got {shown(document)}, expected the entries of a {kind.__name__}"
         )
+
     values: dict[str, Any] = {}
     for entry in fields(kind):
         if entry.name not in document and entry.default is not MISSING:

@@ -30,7 +30,7 @@ from vlagents_ray.protocol.values import require_array_name
 
 _ALIGN = 64
 _ID_BYTES = 40  # maximum length of a request's id
-_MOST = 1024  # maximum number of layouts of one connection
+_MAX_LAYOUTS = 1024  # maximum number of layouts of one connection
 _NONE = float("nan")
 _UINT8, _FLOAT32 = np.dtype(np.uint8), np.dtype(np.float32)
 
@@ -40,7 +40,7 @@ ITEM = struct.Struct(f"<IIqdd{_ID_BYTES}s")
 # id, step, flags, dimensions, H, D, batch size, times in ms.
 ANSWER = struct.Struct(f"<{_ID_BYTES}sqBB2xIIIddddd")
 _DONE, _DRAINING, _POLICY = 1, 2, 4
-# Per answer, after all actions, if the flag _POLICY is set: version, digest.
+# The weights of an answer, after all actions, if the flag _POLICY is set: version, digest.
 WEIGHTS = struct.Struct("<q16s")
 
 
@@ -80,29 +80,31 @@ class Layout:
             return None
         if len(obs.cameras) != len(self.cameras) or len(obs.state) != len(self.state):
             return None
+
         arrays = []
-        for (name, shape, offset), (own, image) in zip(
+        for (name, shape, offset), (camera, image) in zip(
             self.cameras, obs.cameras.items(), strict=True
         ):
             if (
                 type(image) is not np.ndarray
-                or own != name
+                or camera != name
                 or image.shape != shape
                 or image.dtype != _UINT8
             ):
                 return None
             arrays.append((at + offset, image))
-        for (name, shape, offset), (own, part) in zip(self.state, obs.state.items(), strict=True):
+        for (name, shape, offset), (state_name, values) in zip(
+            self.state, obs.state.items(), strict=True
+        ):
             if (
-                type(part) is not np.ndarray
-                or own != name
-                or part.shape != shape
-                or part.dtype.kind != "f"
+                type(values) is not np.ndarray
+                or state_name != name
+                or values.shape != shape
+                or values.dtype.kind != "f"
             ):
                 return None
-            arrays.append(
-                (at + offset, part if part.dtype == _FLOAT32 else part.astype(np.float32))
-            )
+            numbers = values if values.dtype == _FLOAT32 else values.astype(np.float32)
+            arrays.append((at + offset, numbers))
         return arrays
 
 
@@ -111,7 +113,7 @@ class ShmWriter:
 
     def __init__(self) -> None:
         self._known: dict[Any, tuple[int, Layout]] = {}
-        # By session; its next act probably has the same layout.
+        # The layout of the last act of each session; its next act probably has the same one.
         self._latest: dict[str, tuple[int, Layout]] = {}
 
     def write(self, requests: Sequence[Request]) -> Written | None:
@@ -128,19 +130,24 @@ class ShmWriter:
             known = self._latest.get(request.session)
             placed = None if known is None else known[1].placed(request, at)
             if known is None or placed is None:
-                if (key := _key(request)) is None:
+                key = _key(request)
+                if key is None:
                     return None
-                if (known := self._known.get(key) or new.get(key)) is None:
-                    if (number := len(self._known) + len(new)) >= _MOST:
+                known = self._known.get(key) or new.get(key)
+                if known is None:
+                    number = len(self._known) + len(new)
+                    if number >= _MAX_LAYOUTS:
                         return None
                     known = new[key] = (number, Layout.of(*key))
                     text = json.dumps(key).encode()
                     texts.append(text)
                 latest[request.session] = known
                 placed = known[1].placed(request, at) or []
+
             number, layout = known
             arrays += placed
             at += layout.size
+
             obs: Obs = request.obs  # type: ignore[assignment]  # a request with a layout has one
             step = -1 if request.step is None else request.step
             deadline_ms = _NONE if request.deadline_ms is None else request.deadline_ms
@@ -150,6 +157,7 @@ class ShmWriter:
                     number, len(text), step, deadline_ms, gripper, request.request_id.encode()
                 )
             )
+
         if latest:
             self._known |= new
             self._latest |= latest
@@ -158,6 +166,8 @@ class ShmWriter:
 
 @dataclass(slots=True)
 class Written:
+    """Acts in compact form: the message, and the arrays for the shared memory."""
+
     message: bytes
     size: int  # size of the memory for the arrays, bytes
     arrays: list[tuple[int, np.ndarray]]  # offset, array
@@ -194,15 +204,16 @@ class ShmReader:
                 raise MessageTooLarge(
                     f"local: got {count} acts, the limit is {self._limits.requests} in one message"
                 )
+
             text_at = COUNT.size + count * ITEM.size
             requests = []
             at = 0
             for item in ITEM.iter_unpack(message[COUNT.size : text_at]):
                 number, text_bytes, step, deadline_ms, gripper, request_id = item
                 if text_bytes:
-                    if number >= _MOST:
+                    if number >= _MAX_LAYOUTS:
                         raise MessageTooLarge(
-                            f"local: layout {number}, want a number below {_MOST}"
+                            f"local: layout {number}, want a number below {_MAX_LAYOUTS}"
                         )
                     self._known[number] = self._layout(
                         bytes(message[text_at : text_at + text_bytes])
@@ -213,19 +224,22 @@ class ShmReader:
                     raise MalformedMessage(
                         f"local: {memory.size} bytes of memory, the arrays need more"
                     )
+
                 id_bytes = request_id.rstrip(b"\0")
                 name_of_request = id_bytes.decode()
-                # The first of these is no call of Python.
+                # `isalnum` is faster than `is_name`, and most ids pass it.
                 if not id_bytes.isalnum() and not is_name(name_of_request):
                     raise MalformedMessage(
                         f"local: request_id: got {name_of_request!r}, want visible ASCII characters"
                     )
+
                 obs = Obs(gripper=None if math.isnan(gripper) else gripper)
-                for name, shape, place in layout.cameras:
-                    obs.cameras[name] = np.ndarray(shape, _UINT8, memory, at + place)
-                for name, shape, place in layout.state:
-                    obs.state[name] = np.ndarray(shape, _FLOAT32, memory, at + place)
+                for name, shape, offset in layout.cameras:
+                    obs.cameras[name] = np.ndarray(shape, _UINT8, memory, at + offset)
+                for name, shape, offset in layout.state:
+                    obs.state[name] = np.ndarray(shape, _FLOAT32, memory, at + offset)
                 at += layout.size
+
                 request = Request(
                     "act",
                     obs,
@@ -242,11 +256,13 @@ class ShmReader:
             raise MalformedMessage(
                 f"local: not an act ({type(error).__name__}: {error})"
             ) from error
+
         if len(requests) != count or not count:
             raise MalformedMessage(f"local: {len(requests)} acts in a message that says {count}")
         return requests
 
     def _layout(self, text: bytes) -> Layout:
+        """Read a layout, the JSON text of a `_key`; raise an error if it exceeds the limits."""
         limits = self._limits
         session, priority, cameras, state = json.loads(text)
         check_request(Request("close", session=session, priority=priority), limits)
@@ -257,9 +273,10 @@ class ShmReader:
                 f"obs: got {len(cameras)} cameras and {len(state)} states, the limit is "
                 f"{limits.cameras}"
             )
-        for (name, shape), dimensions, most in (
-            *((each, 3, limits.pixels) for each in cameras),
-            *((each, 1, limits.state_values) for each in state),
+
+        for (name, shape), dimensions, max_size in (
+            *((camera, 3, limits.pixels) for camera in cameras),
+            *((state_part, 1, limits.state_values) for state_part in state),
         ):
             if not isinstance(name, str) or not isinstance(shape, list) or len(shape) != dimensions:
                 raise MalformedMessage(
@@ -272,9 +289,10 @@ class ShmReader:
                 raise MalformedMessage(
                     f"local: {name!r}: got shape {shape!r}, want (H, W, 3) or (D,)"
                 )
-            if (size := math.prod(shape[:2])) > most:
+            size = math.prod(shape[:2])
+            if size > max_size:
                 raise MessageTooLarge(
-                    f"local: {name!r}: got {size} pixels or values, the limit is {most}"
+                    f"local: {name!r}: got {size} pixels or values, the limit is {max_size}"
                 )
         return Layout.of(session, priority, cameras, state)
 
@@ -300,14 +318,15 @@ def _key(request: Request) -> tuple[Any, ...] | None:
             or image.shape[2] != 3
         ):
             return None
-    for part in obs.state.values():
-        if type(part) is not np.ndarray or part.ndim != 1 or part.dtype.kind != "f":
+    for values in obs.state.values():
+        if type(values) is not np.ndarray or values.ndim != 1 or values.dtype.kind != "f":
             return None
+
     return (
         request.session,
         request.priority,
         tuple([(name, image.shape) for name, image in obs.cameras.items()]),
-        tuple([(name, part.shape) for name, part in obs.state.items()]),
+        tuple([(name, values.shape) for name, values in obs.state.items()]),
     )
 
 
@@ -322,7 +341,8 @@ def write_answers(replies: Sequence[Reply], *, arrived: float) -> bytes | None:
         if reply.error is not None or act is None or act.action.dtype != _FLOAT32:
             return None
         if act.info:
-            if (packed := _packed(act.info)) is None:
+            packed = _packed(act.info)
+            if packed is None:
                 return None
             weights.append(packed)
         if (
@@ -332,10 +352,12 @@ def write_answers(replies: Sequence[Reply], *, arrived: float) -> bytes | None:
         ):
             return None
         actions.append(act.action.tobytes())
+
     # The compact form has weights for all replies or for none.
     if weights and len(weights) != len(replies):
         return None
-    named = _POLICY if weights else 0
+    weights_flag = _POLICY if weights else 0
+
     ended = time.perf_counter()
     parts = [COUNT.pack(len(replies))]
     for reply in replies:
@@ -344,7 +366,7 @@ def write_answers(replies: Sequence[Reply], *, arrived: float) -> bytes | None:
         encode_ms = timing["encode_ms"] = (ended - begun) * 1e3
         total_ms = timing["total_ms"] = (ended - arrived) * 1e3
         shape = act.action.shape  # type: ignore[union-attr]
-        flags = named | (_DONE if act.done else 0) | (_DRAINING if reply.draining else 0)  # type: ignore[union-attr]
+        flags = weights_flag | (_DONE if act.done else 0) | (_DRAINING if reply.draining else 0)  # type: ignore[union-attr]
         parts.append(
             ANSWER.pack(
                 reply.request_id.encode(),
@@ -374,31 +396,33 @@ def _packed(info: Mapping[str, Any]) -> bytes | None:
     try:
         return _pack(policy["version"], policy["fingerprint"])
     except (KeyError, TypeError, AttributeError, ValueError, struct.error):
-        # the policy uses this key for other data
+        # The policy uses this key for other data.
         return None
 
 
 @lru_cache(64)
 def _pack(version: int, digest: str) -> bytes | None:
-    return (
-        WEIGHTS.pack(version, digest.encode("ascii"))
-        if len(digest) <= 16 and "\0" not in digest
-        else None
-    )
+    """Encode the weights of an answer; None if the digest does not fit."""
+    if len(digest) > 16 or "\0" in digest:
+        return None
+    return WEIGHTS.pack(version, digest.encode("ascii"))
 
 
 @lru_cache(64)
 def _text(digest: bytes) -> str:
+    """Decode the digest of weights."""
     return digest.rstrip(b"\0").decode("ascii")
 
 
 def read_answers(message: memoryview) -> list[Reply]:
     """Decode the replies in a message, the inverse of `write_answers`."""
     (count,) = COUNT.unpack_from(message)
-    at = COUNT.size + count * ANSWER.size
-    named = len(message) - count * WEIGHTS.size  # start of the weights, if the flag _POLICY is set
+    action_at = COUNT.size + count * ANSWER.size
+    # The offset of the next answer's weights, if the flag _POLICY is set.
+    weights_at = len(message) - count * WEIGHTS.size
+
     replies = []
-    for answer in ANSWER.iter_unpack(message[COUNT.size : at]):
+    for answer in ANSWER.iter_unpack(message[COUNT.size : action_at]):
         (
             request_id,
             step,
@@ -413,10 +437,9 @@ def read_answers(message: memoryview) -> list[Reply]:
             encode,
             total,
         ) = answer
-        action = np.frombuffer(
-            message, _FLOAT32, columns if dimensions == 1 else rows * columns, at
-        ).copy()
-        at += action.nbytes
+        count_of_numbers = columns if dimensions == 1 else rows * columns
+        action = np.frombuffer(message, _FLOAT32, count_of_numbers, action_at).copy()
+        action_at += action.nbytes
         if dimensions == 2:
             action = action.reshape(rows, columns)
         timing = {
@@ -429,13 +452,17 @@ def read_answers(message: memoryview) -> list[Reply]:
         }
         info = {}
         if flags & _POLICY:
-            version, digest = WEIGHTS.unpack_from(message, named)
-            named += WEIGHTS.size
+            version, digest = WEIGHTS.unpack_from(message, weights_at)
+            weights_at += WEIGHTS.size
             info = {POLICY: {"version": version, "fingerprint": _text(digest)}}
-        act, draining = Act(action, bool(flags & _DONE), info), bool(flags & _DRAINING)
+
         replies.append(
             Reply(
-                request_id.rstrip(b"\0").decode(), act, step=step, draining=draining, timing=timing
+                request_id.rstrip(b"\0").decode(),
+                Act(action, bool(flags & _DONE), info),
+                step=step,
+                draining=bool(flags & _DRAINING),
+                timing=timing,
             )
         )
     return replies

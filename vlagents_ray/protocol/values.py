@@ -49,6 +49,7 @@ class ValueWriter:
         return {"$": ["nd", len(self.blobs) - 1, dtype.str, value.shape]}
 
     def image(self, file: bytes) -> dict[str, Any]:
+        """Return a reference to an encoded image, which becomes a blob."""
         self.blobs.append(file)
         return {"$": ["img", len(self.blobs) - 1]}
 
@@ -63,15 +64,13 @@ class ValueWriter:
         if isinstance(value, np.ndarray):
             return self.array(value)
         if isinstance(value, np.generic):
-            return (
-                self.value(value.item())
-                if value.dtype.kind in "biuf"
-                else self.array(np.asarray(value))
-            )
+            if value.dtype.kind in "biuf":
+                return self.value(value.item())
+            return self.array(np.asarray(value))
         if isinstance(value, (bytes, bytearray, memoryview)):
             self.blobs.append(bytes(value))
             return {"$": ["bin", len(self.blobs) - 1]}
-        # `dict` first: an abstract class takes ten times as long.
+        # `dict` stands first, since the check of an abstract class takes ten times as long.
         if isinstance(value, (dict, Mapping)):
             for key in value:
                 if not isinstance(key, str) or key == "$":
@@ -92,10 +91,10 @@ class ValueReader:
         self._blobs, self._budget = blobs, budget
         self.limits = budget.limits
         self._items = 0
-        # By blob: each image is decoded once, whatever its number of uses.
+        # The decoded images by blob; each is decoded once, whatever its number of uses.
         self._images: dict[int, np.ndarray] = {}
-        self._copies: dict[int, bytes] = {}  # by blob: the bytes of each are copied once
-        # Blobs that were decoded in advance and have no reference yet.
+        self._copies: dict[int, bytes] = {}  # the bytes by blob; each is copied once
+        # The blobs that were decoded in advance and have no reference yet.
         self._fresh: set[int] = set()
 
     def begin(self) -> None:
@@ -140,7 +139,8 @@ class ValueReader:
 
     def blob(self, node: Any) -> Any:
         """Return the array, image, bytes or number that `{"$": [...]}` refers to."""
-        if not (reference := _reference(node)) or len(node) != 1:
+        reference = _reference(node)
+        if not reference or len(node) != 1:
             raise MalformedMessage(f"reference: got {shown(node)}, want {{'$': [kind, blob, ...]}}")
         kind, *rest = reference
         if kind == "nd" and len(rest) == 3:
@@ -159,7 +159,8 @@ class ValueReader:
 
     def _image(self, index: Any) -> np.ndarray:
         data = self._get(index)
-        if (image := self._images.get(index)) is None:
+        image = self._images.get(index)
+        if image is None:
             [image] = decode_files([data], self._budget)
             self._images[index] = image
         elif index in self._fresh:  # the budget was charged when the image was decoded
@@ -171,12 +172,13 @@ class ValueReader:
 
     def _bytes_of(self, index: Any) -> bytes:
         data = self._get(index)
-        if (known := self._copies.get(index)) is None:
+        content = self._copies.get(index)
+        if content is None:
             self._budget.hold(len(data))
-            known = self._copies[index] = bytes(data)
+            content = self._copies[index] = bytes(data)
         else:
             self._budget.count(len(data))
-        return known
+        return content
 
     def _get(self, index: Any) -> Buffer:
         if type(index) is not int or not 0 <= index < len(self._blobs):
@@ -199,12 +201,16 @@ def read_obs(node: Any, reader: ValueReader) -> Obs:
     limits = reader.limits
     if not isinstance(node, dict):
         raise MalformedMessage(f"obs: got {type(node).__name__}, want an object")
-    if unknown := node.keys() - _OBS_KEYS:
+    unknown = node.keys() - _OBS_KEYS
+    if unknown:
         raise MalformedMessage(
             f"obs: unknown keys {shown(sorted(unknown))}, want some of {sorted(_OBS_KEYS)}"
         )
-    cameras, state = node.get("cameras") or {}, node.get("state") or {}
-    info, gripper = node.get("info") or {}, node.get("gripper")
+
+    cameras = node.get("cameras") or {}
+    state = node.get("state") or {}
+    info = node.get("info") or {}
+    gripper = node.get("gripper")
     for name, value in (("cameras", cameras), ("state", state), ("info", info)):
         if not isinstance(value, dict):
             raise MalformedMessage(f"obs.{name}: got {type(value).__name__}, want an object")
@@ -213,12 +219,14 @@ def read_obs(node: Any, reader: ValueReader) -> Obs:
             f"obs: got {len(cameras)} cameras and {len(state)} states, the limit is "
             f"{limits.cameras}"
         )
+
     for name in (*cameras, *state):
         require_array_name(name)
     if gripper is not None and not is_number(gripper):
         raise InvalidObservation(
             f"gripper: got {shown(gripper)}, want a number in [0, 1] where 1 = open"
         )
+
     reader.decode_images(cameras)
     read_info = reader.value(info)
     # A reference is an object in JSON, and may be an array, bytes or a number.
@@ -230,8 +238,8 @@ def read_obs(node: Any, reader: ValueReader) -> Obs:
         },
         gripper=None if gripper is None else float(gripper),
         state={
-            name: as_state(name, reader.blob(part) if isinstance(part, dict) else part, limits)
-            for name, part in state.items()
+            name: as_state(name, reader.blob(item) if isinstance(item, dict) else item, limits)
+            for name, item in state.items()
         },
         info=read_info,
     )
@@ -269,22 +277,23 @@ def as_camera(name: str, image: Any, limits: MessageLimits) -> np.ndarray:
     return image
 
 
-def as_state(name: str, part: Any, limits: MessageLimits) -> np.ndarray:
-    """Convert `part`, a list of numbers or an array, to (D,) float32 within the limits; errors
-    mention `name`.
+def as_state(name: str, values: Any, limits: MessageLimits) -> np.ndarray:
+    """Convert a list of numbers or an array to (D,) float32 within the limits; errors mention
+    `name`.
     """
-    is_list = isinstance(part, list)
+    is_list = isinstance(values, list)
     if not is_list and (
-        not isinstance(part, np.ndarray) or part.ndim != 1 or part.dtype.kind not in "fiu"
+        not isinstance(values, np.ndarray) or values.ndim != 1 or values.dtype.kind not in "fiu"
     ):
-        raise InvalidObservation(f"state {name!r}: got {described(part)}, want (D,) float32")
-    if len(part) > limits.state_values:
+        raise InvalidObservation(f"state {name!r}: got {described(values)}, want (D,) float32")
+    if len(values) > limits.state_values:
         raise MessageTooLarge(
-            f"state {name!r}: got {len(part)} values, the limit is {limits.state_values}"
+            f"state {name!r}: got {len(values)} values, the limit is {limits.state_values}"
         )
-    if is_list and not all(is_number(x) for x in part):
+    if is_list and not all(is_number(number) for number in values):
         raise InvalidObservation(f"state {name!r}: want a list of numbers")
-    array: np.ndarray = np.array(part, dtype=np.float64) if is_list else part
+
+    array: np.ndarray = np.array(values, dtype=np.float64) if is_list else values
     if array.dtype == _FLOAT32:  # numpy's `errstate` takes longer than all other work on a state
         return array
     try:
@@ -308,15 +317,17 @@ def require_obs(obs: Any) -> None:
             raise InvalidObservation(
                 f"{name}: expected a dict of values by name, got {described(value)}"
             )
+
     for name, image in obs.cameras.items():
         if not hasattr(image, "dtype"):
             raise InvalidObservation(
                 f"camera {name!r}: expected (H, W, 3) uint8 RGB, got {described(image)}; leave out "
                 "a camera that has no picture, and convert others: np.asarray(image, np.uint8)"
             )
-    for name, part in obs.state.items():
-        if not hasattr(part, "dtype") or part.dtype.kind not in "fiub":
-            _as_float32(name, part)
+    for name, values in obs.state.items():
+        if not hasattr(values, "dtype") or values.dtype.kind not in "fiub":
+            _as_float32(name, values)
+
     if obs.gripper is not None:
         try:
             float(obs.gripper)
@@ -326,16 +337,17 @@ def require_obs(obs: Any) -> None:
             ) from error
 
 
-def _as_float32(name: str, part: Any) -> np.ndarray:
+def _as_float32(name: str, values: Any) -> np.ndarray:
+    """Convert a part of the state; raise `InvalidObservation` if it has no numbers."""
     try:
-        array = np.asarray(part)
-        # Text and complex numbers would also be converted.
-        if part is None or array.dtype.kind not in "fiubO":
+        array = np.asarray(values)
+        # Without this check, text and complex numbers would also be converted.
+        if values is None or array.dtype.kind not in "fiubO":
             raise TypeError
         return array.astype(np.float32)
     except (TypeError, ValueError) as error:
         raise InvalidObservation(
-            f"state {name!r}: expected (D,) float32, numbers, got {described(part)}"
+            f"state {name!r}: expected (D,) float32, numbers, got {described(values)}"
         ) from error
 
 
@@ -352,7 +364,7 @@ def write_obs(obs: Obs, writer: ValueWriter, codec: ImageCodec) -> dict[str, Any
         "cameras": cameras,
         "gripper": None if obs.gripper is None else float(obs.gripper),
         "state": {
-            name: writer.array(np.asarray(part, np.float32)) for name, part in obs.state.items()
+            name: writer.array(np.asarray(values, np.float32)) for name, values in obs.state.items()
         },
         "info": writer.value(obs.info),
     }

@@ -84,13 +84,12 @@ class ReceiveBuffer(StreamReader):
 
     def parse(self, data: bytes | memoryview) -> None:
         """Parse bytes of memory that is reused, and copy the rest after the last complete frame."""
-        if (
-            self._between_frames
-            and not self._fragments
-            and (message := self._message(data)) is not None
-        ):
-            self._protocol.events.append(Frame(Opcode.BINARY, message))
-            return
+        if self._between_frames and not self._fragments:
+            message = self._message(data)
+            if message is not None:
+                self._protocol.events.append(Frame(Opcode.BINARY, message))
+                return
+
         self._protocol.receive_data(data)  # type: ignore[arg-type]
         self._fragments |= any(
             isinstance(event, Frame) and not event.fin for event in self._protocol.events
@@ -141,8 +140,8 @@ class ReceiveBuffer(StreamReader):
                 raise EOFError(f"stream ends after {self.size} bytes, expected {n} bytes")
             yield
         begin, self._start = self._start, self._start + n
-        found = self.buffer[begin : self._start]
-        return found if n > _SMALL_BYTES else bytearray(found)  # type: ignore[return-value]
+        data = self.buffer[begin : self._start]
+        return data if n > _SMALL_BYTES else bytearray(data)  # type: ignore[return-value]
 
     def at_eof(self) -> Generator[None, None, bool]:
         """Return whether the connection has ended, as soon as that is known; unparsed bytes mean

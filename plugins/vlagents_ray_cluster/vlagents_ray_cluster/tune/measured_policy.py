@@ -281,7 +281,7 @@ def _serve(settings: ProcessSettings, answer: Callable[[Mapping[str, Any]], None
 
     def view(contract: Contract | None, i: int) -> Obs:
         if not recorded:
-            return random_observation(contract, i, side=settings.side, dims=settings.dims)
+            return random_observation(contract, i, image_size=settings.side, dims=settings.dims)
         check_observation(recorded[i % len(recorded)], contract)
         return recorded[i % len(recorded)]
 

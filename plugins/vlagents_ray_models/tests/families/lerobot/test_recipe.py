@@ -75,7 +75,7 @@ def acts(config: dict[str, Any]) -> LeRobot:
     policy.initialize()
     chunks = []
     for seed in (0, 1):
-        obs = random_observation(policy.contract, seed, side=256)
+        obs = random_observation(policy.contract, seed, image_size=256)
         policy.reset(obs, "pick up the cube", seed=0)
         chunks.append(np.asarray(policy.act(obs).action))
     assert np.isfinite(chunks).all()

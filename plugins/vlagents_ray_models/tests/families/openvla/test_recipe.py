@@ -26,7 +26,7 @@ def test_it_loads_and_acts_with_every_dimension_inside_its_range(tmp_path: Path)
     assert written.parameters == sum(one.numel() for one in policy.model.base.network.parameters())
     found = []
     for seed in range(4):
-        obs = random_observation(policy.contract, seed, side=224)
+        obs = random_observation(policy.contract, seed, image_size=224)
         policy.reset(obs, "pick up the cube", seed=0)
         found.append(np.asarray(policy.act(obs).action))
     scale = policy.model.base.statistics.scale("bridge_orig")

@@ -60,6 +60,6 @@ def test_the_full_size_is_the_published_one(tmp_path: Path) -> None:
 
 
 def chunk_of(policy: Pi0, seed: int) -> np.ndarray:
-    obs = random_observation(policy.contract, seed, side=224)
+    obs = random_observation(policy.contract, seed, image_size=224)
     policy.reset(obs, "pick up the cube", seed=0)
     return np.asarray(policy.act(obs).action)
