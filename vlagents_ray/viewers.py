@@ -64,25 +64,25 @@ class ViewerFrame:
     note: str = ""  # a message to show, such as why the action is a safe one
 
     @classmethod
-    def of(cls, obs: Obs, tick: int, **what: Any) -> ViewerFrame:
+    def from_obs(cls, obs: Obs, tick: int, **fields: Any) -> ViewerFrame:
         """Make a frame of an observation.
 
         Args:
             obs: The observation, whose arrays are copied.
             tick: The tick of the episode.
-            what: Further fields.
+            fields: Further fields.
 
         Returns:
-            The frame, with the time of `info["captured_at"]` if the observation states it, else the
+            The frame, with the time of `info["captured_at"]` if the observation has it, else the
             current time.
         """
-        state = {name: np.array(part) for name, part in obs.state.items()}
+        state = {name: np.array(values) for name, values in obs.state.items()}
         if obs.gripper is not None:
             state["gripper"] = np.array([obs.gripper], np.float32)
         cameras = {name: np.array(image) for name, image in obs.cameras.items()}
         return cls(
             tick,
-            **{"time": obs.info.get(CAPTURED, time.time()), **what},
+            **{"time": obs.info.get(CAPTURED, time.time()), **fields},
             cameras=cameras,
             state=state,
         )
@@ -107,18 +107,9 @@ class RerunRecordings:
         self._folder = None if is_live else Path(target)
         self.closing_s = CLOSING_S if self._folder is None else None
         """Time limit, s, for writing the remaining frames when it is closed; None for no limit."""
+
         if self._folder is None:
-            # If nothing listens at the address, the SDK would retry forever.
-            where = urlsplit(self.target)
-            try:
-                with socket.create_connection(
-                    (where.hostname or "", where.port or _PORT), CLOSING_S
-                ):
-                    pass
-            except OSError as error:
-                raise ConfigError(
-                    f"rerun: no viewer listens at {self.target}: {error}; start it with `rerun`"
-                ) from error
+            self._require_listener()
             self._rerun.unregister_shutdown()  # it would wait forever for a viewer that has gone
         else:
             try:
@@ -127,6 +118,17 @@ class RerunRecordings:
                 raise ConfigError(
                     f"viewer {target}: {error}; want a folder that can be written to"
                 ) from error
+
+    def _require_listener(self) -> None:
+        """Raise `ConfigError` if nothing listens at the address: the SDK would retry forever."""
+        address = urlsplit(self.target)
+        try:
+            host, port = address.hostname or "", address.port or _PORT
+            socket.create_connection((host, port), CLOSING_S).close()
+        except OSError as error:
+            raise ConfigError(
+                f"rerun: no viewer listens at {self.target}: {error}; start it with `rerun`"
+            ) from error
 
     def begin(self, name: str, instruction: str) -> RerunEpisode:
         """Begin an episode; `name` is also the name of its file, and an empty `instruction` is
@@ -142,32 +144,39 @@ class RerunRecordings:
 
 
 class RerunEpisode:
+    """Writes the frames of one episode to a recording."""
+
     def __init__(self, rerun: Any, recording: Any, instruction: str, *, live: bool) -> None:
         self._rerun, self._recording, self._live = rerun, recording, live
         if instruction:
             recording.log("instruction", rerun.TextDocument(instruction), static=True)
 
     def write(self, frame: ViewerFrame) -> None:
+        """Write a frame."""
         rerun, recording = self._rerun, self._recording
         recording.set_time("tick", sequence=frame.tick)
         recording.set_time("time", timestamp=frame.time)
+
         for name, image in frame.cameras.items():
             picture = rerun.EncodedImage(contents=encode_jpeg(image), media_type="image/jpeg")
             recording.log(["cameras", name], picture)
-        for name, part in frame.state.items():
-            recording.log(["state", name], rerun.Scalars(part))
+        for name, values in frame.state.items():
+            recording.log(["state", name], rerun.Scalars(values))
+
         for name, action in (("executed", frame.executed), ("planned", frame.planned)):
             if action is not None:
                 recording.log(["action", name], rerun.Scalars(action))
         if frame.chunk is not None:
             chunk = np.asarray(frame.chunk, np.float32)
             recording.log(["action", "chunk"], rerun.Tensor(chunk, dim_names=("row", "dimension")))
+
         for name, value in frame.numbers.items():
             recording.log(["timing", name], rerun.Scalars(value))
         if frame.note:
             recording.log("log", rerun.TextLog(frame.note, level="WARN"))
 
     def close(self) -> None:
+        """End the recording."""
         if self._live:
             self._recording.flush(timeout_sec=CLOSING_S)
         self._recording.disconnect()
@@ -195,7 +204,7 @@ class EpisodeViewer:
 
         with open_viewer("recordings") as viewer:
             with viewer.episode("stack_0", "stack the cups"):
-                viewer.add(ViewerFrame.of(obs, tick=0, executed=action))
+                viewer.add(ViewerFrame.from_obs(obs, tick=0, executed=action))
 
     `add` puts the frame into a queue and returns. If the queue is full, because the disk or the
     other side of a live connection is slow, the frame is dropped and counted in `dropped`. If
@@ -207,14 +216,14 @@ class EpisodeViewer:
     """
 
     def __init__(self, target: RerunRecordings, *, frames: int = FRAMES) -> None:
-        self.dropped = 0  # frames
-        self.episodes = 0  # number of episodes written without an error
+        self.dropped = 0  # the number of dropped frames
+        self.episodes = 0  # the number of episodes written without an error
         self.error: Exception | None = None  # the first error
         self._recordings = target
         self._frames = frames
         self._queue: queue.SimpleQueue[ViewerFrame | tuple[str, str] | None] = queue.SimpleQueue()
-        self._put = 0  # frames added, counted by the caller's thread
-        self._got = 0  # frames written, counted by the writing thread
+        self._added = 0  # the number of frames added, counted by the caller's thread
+        self._written = 0  # the number of frames written, counted by the writing thread
         self._closed = False
         self._thread = threading.Thread(target=self._run, name="vlagents-ray-rerun", daemon=True)
         self._thread.start()
@@ -222,7 +231,7 @@ class EpisodeViewer:
     @property
     def has_room(self) -> bool:
         """Whether a frame added now would be shown."""
-        return self._put - self._got < self._frames
+        return self._added - self._written < self._frames
 
     @contextlib.contextmanager
     def episode(self, name: str, instruction: str = "") -> Iterator[None]:
@@ -244,7 +253,7 @@ class EpisodeViewer:
         if not self.has_room:
             self.dropped += 1
             return
-        self._put += 1
+        self._added += 1
         self._queue.put(frame)
 
     def close(self) -> None:
@@ -266,11 +275,9 @@ class EpisodeViewer:
             f"rerun: {self.episodes} episodes in {self._recordings.target}, {self.dropped} "
             "frames dropped"
         )
-        return (
-            line
-            if self.error is None
-            else f"{line}; stopped by {type(self.error).__name__}: {self.error}"
-        )
+        if self.error is None:
+            return line
+        return f"{line}; stopped by {type(self.error).__name__}: {self.error}"
 
     def __enter__(self) -> EpisodeViewer:
         return self
@@ -281,8 +288,13 @@ class EpisodeViewer:
     def _run(self) -> None:
         with contextlib.suppress(OSError):
             os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), _NICE)
-        while isinstance(item := self._queue.get(), tuple):
-            (name, instruction), frames = item, self._until_the_end()
+
+        while True:
+            item = self._queue.get()
+            if not isinstance(item, tuple):
+                break
+            name, instruction = item
+            frames = self._frames_of_episode()
             try:
                 with contextlib.closing(self._recordings.begin(name, instruction)) as writer:
                     for frame in frames:
@@ -291,13 +303,17 @@ class EpisodeViewer:
             except Exception as error:  # noqa: BLE001 - what is shown goes on without the viewer
                 logger.warning("rerun: episode %s is not shown: %s", name, error)
                 self.error = self.error or error
-            for _ in frames:
+            for _ in frames:  # those that were not written
                 pass
 
-    def _until_the_end(self) -> Iterator[ViewerFrame]:
-        while isinstance(frame := self._queue.get(), ViewerFrame):
+    def _frames_of_episode(self) -> Iterator[ViewerFrame]:
+        """Yield the queued frames until the end of the episode."""
+        while True:
+            frame = self._queue.get()
+            if not isinstance(frame, ViewerFrame):
+                return
             yield frame
-            self._got += 1
+            self._written += 1
 
 
 class LoopView:
@@ -330,27 +346,33 @@ class LoopView:
         """Show a tick with the time that the loop worked, `work_s`, and the reason of a stop;
         never waits.
         """
-        if (viewer := self._viewer) is None:
+        viewer = self._viewer
+        if viewer is None:
             return
         if not viewer.has_room:
             viewer.dropped += 1
             return
+
         info = act.info
-        rows, note = info.get(PLANNED), stop or str(info.get(SAFE, ""))
-        spells = {"safe": SAFE in info, "intervention": INTERVENTION in info, "stopped": bool(stop)}
-        frame = ViewerFrame.of(
+        rows = info.get(PLANNED)
+        note = stop or str(info.get(SAFE, ""))
+        numbers: dict[str, float] = dict(info.get("timing") or {})
+        numbers |= {name: float(info[name]) for name in (AGE, SILENT) if name in info}
+        numbers["work_ms"] = work_s * 1e3
+        numbers["safe"] = float(SAFE in info)
+        numbers["intervention"] = float(INTERVENTION in info)
+        numbers["stopped"] = float(bool(stop))
+
+        frame = ViewerFrame.from_obs(
             obs,
             tick,
             executed=None if executed is None else np.array(executed),
             planned=info.get(WANTED) if rows is None else rows[info["row"]],
             chunk=None if rows is self._chunk else rows,
-            numbers={
-                **(info.get("timing") or {}),
-                **{name: float(info[name]) for name in (AGE, SILENT) if name in info},
-                "work_ms": work_s * 1e3,
-                **{name: float(on) for name, on in spells.items()},
-            },
+            numbers=numbers,
             note=note if note != self._note else "",
         )
-        self._chunk, self._note = self._chunk if rows is None else rows, note
+        if rows is not None:
+            self._chunk = rows
+        self._note = note
         viewer.add(frame)

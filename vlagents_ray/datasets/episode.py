@@ -56,13 +56,14 @@ class FinishedEpisode:
 
     instruction: str
     features: dict[str, Any]  # as in `meta/info.json`
-    # (N, D) float32, or (N,) of the feature's dtype; of texts, (N,) objects.
+    # The values of each feature: (N, D) float32, or (N,) of the feature's dtype, or of texts (N,)
+    # objects.
     rows: dict[str, np.ndarray]
     images: dict[str, Stats]  # statistics of the videos' frames
     videos: dict[str, Path]  # MP4 files with at least N frames, of which the first N count
     about: DatasetContract  # the same for each episode of a dataset
     label: Label | None = None
-    # Of the running episode, which is removed with the rest of its files.
+    # The folder of the running episode, which is removed with all files that are left in it.
     folder: Path | None = None
 
 
@@ -70,7 +71,7 @@ class FinishedEpisode:
 class RunningEpisode:
     """A running episode, to which frames are added."""
 
-    folder: Path  # of its videos
+    folder: Path  # the folder of its videos
     instruction: str
     fps: float
     features: dict[str, Any]  # those of earlier episodes; empty in the first
@@ -90,13 +91,14 @@ class RunningEpisode:
         tick: int,
         safe: bool,
         intervention: bool = False,
-        wanted: np.ndarray | None = None,
+        policy_action: np.ndarray | None = None,
         more: Mapping[str, Any] = MappingProxyType({}),
     ) -> None:
         """Append a frame; raises `InvalidObservation` if cameras or shapes differ from those of the
         frames before.
 
-        `wanted` is the policy's action, (D,), if another one was executed; None if it is not known.
+        `policy_action` is the policy's action, (D,), if another one was executed; None if it is not
+        known.
         `more` are further columns by name, the same in each frame: a bool, int, float, text, or
         (D,) float32.
         """
@@ -105,6 +107,7 @@ class RunningEpisode:
         )
         if not self.rows:
             self._first(obs, names, len(action), more)
+
         keys = camera_keys(obs.cameras)
         if set(keys.values()) != self.videos.keys():
             raise InvalidObservation(
@@ -116,6 +119,7 @@ class RunningEpisode:
                 raise InvalidObservation(
                     f"recording: got {name} of {shape}, want {first} as in the first frame"
                 )
+
         for name, image in obs.cameras.items():
             self.videos[keys[name]][1].add(image)
             self.images[keys[name]].add(image)
@@ -129,11 +133,14 @@ class RunningEpisode:
         if len(values):
             frame[STATE] = values
         if self.interventions:
-            policy = wanted if safe or intervention else action
+            if not safe and not intervention:
+                policy_action = action
+            is_known = policy_action is not None
             frame[WANTED_ACTION] = (
-                np.zeros_like(frame[ACTION]) if policy is None else np.asarray(policy, np.float32)
+                np.asarray(policy_action, np.float32) if is_known else np.zeros_like(frame[ACTION])
             )
-            frame |= {INTERVENTION_COLUMN: intervention, "policy_known": policy is not None}
+            frame |= {INTERVENTION_COLUMN: intervention, "policy_known": is_known}
+
         for key, value in frame.items():
             self.rows.setdefault(key, []).append(value)
 
@@ -141,10 +148,11 @@ class RunningEpisode:
         """Complete the videos, and return the episode."""
         for _, video in self.videos.values():
             video.finish()
-        rows = {
-            key: np.array(values, object) if isinstance(values[0], str) else np.stack(values)
-            for key, values in self.rows.items()
-        }
+
+        rows = {}
+        for key, values in self.rows.items():
+            is_text = isinstance(values[0], str)
+            rows[key] = np.array(values, object) if is_text else np.stack(values)
         if self.interventions:
             success = np.zeros(len(rows[ACTION]), bool)
             success[-1] = label == "success"
@@ -167,6 +175,7 @@ class RunningEpisode:
         shutil.rmtree(self.folder, ignore_errors=True)
 
     def _first(self, obs: Obs, names: list[str], action_dim: int, more: Mapping[str, Any]) -> None:
+        """Begin the videos, and determine the features and the contract by the first frame."""
         features: dict[str, Any] = {}
         keys = camera_keys(obs.cameras)
         for name, image in sorted(obs.cameras.items()):
@@ -178,6 +187,7 @@ class RunningEpisode:
             features[key] = video_feature(
                 height, width, self.fps, "gbrp" if self.lossless else "yuv420p"
             )
+
         if names:
             features[STATE] = vector_feature(names)
         features[ACTION] = vector_feature([f"action_{i}" for i in range(action_dim)])
@@ -190,21 +200,19 @@ class RunningEpisode:
             dtype = "float32" if isinstance(value, np.ndarray) else _DTYPES[type(value)]
             features[name] = {"dtype": dtype, "shape": [np.size(value)], "names": None}
         if self.features and self.features != features:
-            odd = sorted(
-                k
-                for k in self.features.keys() | features.keys()
-                if self.features.get(k) != features.get(k)
-            )
+            keys_of_both = sorted(self.features.keys() | features.keys())
+            differing = [key for key in keys_of_both if self.features.get(key) != features.get(key)]
             raise InvalidObservation(
-                f"recording: {odd} differ from the dataset's; record into a new folder"
+                f"recording: {differing} differ from the dataset's; record into a new folder"
             )
         self.features = features
+
         parts = parts_of(obs.state, obs.gripper is not None)
-        own = [part for part in parts if part != GRIPPER or obs.gripper is None]
+        state_names = [name for name in parts if name != GRIPPER or obs.gripper is None]
         self.about = DatasetContract(
             Contract(
                 cameras={name: CameraSpec(*image.shape[:2]) for name, image in obs.cameras.items()},
-                state={part: StateSpec(len(obs.state[part])) for part in own},
+                state={name: StateSpec(len(obs.state[name])) for name in state_names},
                 gripper=obs.gripper is not None,
                 action=replace(self.meaning, dim=action_dim),
                 control_hz=self.fps,
@@ -220,10 +228,9 @@ def parts_of(state: Iterable[str], gripper: bool) -> list[str]:
     If an observation has `Obs.gripper`, "gripper" is `Obs.gripper`, and a part of the state of that
     name is left out.
     """
-    return [
-        *sorted(part for part in state if part != GRIPPER or not gripper),
-        *([GRIPPER] if gripper else []),
-    ]
+    if not gripper:
+        return sorted(state)
+    return [*sorted(name for name in state if name != GRIPPER), GRIPPER]
 
 
 def camera_keys(names: Iterable[str]) -> dict[str, str]:
@@ -276,16 +283,18 @@ def state_vector(
     `gripper`, (...,), is the opening. Returns the numbers, (..., D) float32, and a name for each of
     the D.
     """
-    chosen = parts_of(parts, gripper is not None) if order is None else order
+    if order is None:
+        order = parts_of(parts, gripper is not None)
+
     columns: list[np.ndarray] = []
     names: list[str] = []
-    for part in chosen:
-        if part == GRIPPER and gripper is not None:
+    for name in order:
+        if name == GRIPPER and gripper is not None:
             columns.append(gripper[..., np.newaxis])
             names.append(GRIPPER)
         else:
-            columns.append(parts[part])
-            names += [f"{part}_{i}" for i in range(parts[part].shape[-1])]
+            columns.append(parts[name])
+            names += [f"{name}_{i}" for i in range(parts[name].shape[-1])]
     values = np.concatenate(columns, axis=-1) if columns else np.zeros(0)
     return values.astype(np.float32), names
 
@@ -321,9 +330,9 @@ class ImageStatistics:
 
     def add(self, image: np.ndarray) -> None:
         """Count a sample of the pixels of an image, (H, W, 3) uint8."""
-        seen = image[::_PIXEL_STRIDE, ::_PIXEL_STRIDE]
+        sample = image[::_PIXEL_STRIDE, ::_PIXEL_STRIDE]
         for channel in range(3):
-            self._counts[channel] += np.bincount(seen[..., channel].ravel(), minlength=256)
+            self._counts[channel] += np.bincount(sample[..., channel].ravel(), minlength=256)
         self._images += 1
 
     def result(self) -> Stats:

@@ -73,6 +73,7 @@ class Dataset:
         self._pq: Any = require("pyarrow.parquet")
         self._pa: Any = require("pyarrow")
         require("av")
+
         rate = int(fps) if float(fps).is_integer() else fps
         self.info: dict[str, Any] = {
             "codebase_version": VERSION,
@@ -91,21 +92,24 @@ class Dataset:
         }
         self._stats: dict[str, Stats] = {}
         self.tasks: list[str] = []
+
         if (root / "meta/info.json").exists():
             self._open(rate)
         elif root.is_dir() and any(path.name != UNFINISHED_FOLDER for path in root.iterdir()):
             raise ConfigError(
                 f"{root}: not a LeRobotDataset, and not empty; record into a new folder"
             )
+
         # Remove the files of a running or uncounted episode after a crash.
         shutil.rmtree(root / UNFINISHED_FOLDER, ignore_errors=True)
-        stray = FILE.format(**_place(self.episodes))
+        uncounted = FILE.format(**_file_numbers(self.episodes))
         for folder in ("data", "videos/*", "meta/episodes"):
-            for path in root.glob(f"{folder}/{stray}.*"):
+            for path in root.glob(f"{folder}/{uncounted}.*"):
                 path.unlink()
 
     @property
     def episodes(self) -> int:
+        """The number of complete episodes."""
         return int(self.info["total_episodes"])
 
     def begin(self, instruction: str, meaning: ActionSpec | None = None) -> RunningEpisode:
@@ -128,11 +132,14 @@ class Dataset:
         )
 
     def save(self, episode: FinishedEpisode) -> None:
-        number, frames = self.episodes, len(episode.rows[ACTION])
-        place = _place(number)
+        """Move the files of an episode into the dataset, and write its rows and metadata."""
+        number = self.episodes
+        frames = len(episode.rows[ACTION])
+        file_numbers = _file_numbers(number)
         first = int(self.info["total_frames"])
         if episode.instruction not in self.tasks:
             self.tasks.append(episode.instruction)
+
         index = np.arange(frames)
         rows = episode.rows | {
             "timestamp": (index / self.info["fps"]).astype(np.float32),
@@ -144,6 +151,7 @@ class Dataset:
         numbers = {key: values for key, values in rows.items() if values.dtype != object}
         stats = {key: of_values(values.reshape(frames, -1)) for key, values in numbers.items()}
         stats |= episode.images
+
         about: dict[str, Any] = {
             "episode_index": number,
             "tasks": [episode.instruction],
@@ -151,39 +159,36 @@ class Dataset:
         }
         if self.interventions:
             about["label"] = episode.label or "none"
-        about |= {f"data/{name}": value for name, value in place.items()}
+        about |= {f"data/{name}": value for name, value in file_numbers.items()}
         about |= {"dataset_from_index": first, "dataset_to_index": first + frames}
         for key in episode.videos:
-            about |= {f"videos/{key}/{name}": value for name, value in place.items()}
+            about |= {f"videos/{key}/{name}": value for name, value in file_numbers.items()}
             about |= {
                 f"videos/{key}/from_timestamp": 0.0,
                 f"videos/{key}/to_timestamp": frames / self.info["fps"],
             }
-        about |= {f"meta/episodes/{name}": value for name, value in place.items()}
-        about |= {
-            f"stats/{key}/{name}": v.tolist()
-            for key, one in stats.items()
-            for name, v in one.items()
-        }
+        about |= {f"meta/episodes/{name}": value for name, value in file_numbers.items()}
+        for key, statistics in stats.items():
+            about |= {f"stats/{key}/{name}": v.tolist() for name, v in statistics.items()}
 
         for key, path in episode.videos.items():
-            self._move(path, self.root / VIDEO.format(video_key=key, **place))
-        self._parquet(self._table(rows, episode.features), DATA.format(**place))
+            self._move(path, self.root / VIDEO.format(video_key=key, **file_numbers))
+        self._parquet(self._table(rows, episode.features), DATA.format(**file_numbers))
         self._parquet(self._tasks_table(), "meta/tasks.parquet")
-        self._parquet(self._pa.Table.from_pylist([about]), EPISODES.format(**place))
+        self._parquet(self._pa.Table.from_pylist([about]), EPISODES.format(**file_numbers))
+
         stats = joined(self._stats, stats)
-        total = {
+        info = self.info | {
             "total_episodes": number + 1,
             "total_frames": first + frames,
             "total_tasks": len(self.tasks),
+            "features": episode.features,
+            "splits": {"train": f"0:{number + 1}"},
+            INFO: episode.about.to_json(),
         }
-        info = (
-            self.info
-            | total
-            | {"features": episode.features, "splits": {"train": f"0:{number + 1}"}}
-        )
-        info[INFO] = episode.about.to_json()
-        plain = {key: {name: v.tolist() for name, v in one.items()} for key, one in stats.items()}
+        plain = {}
+        for key, statistics in stats.items():
+            plain[key] = {name: values.tolist() for name, values in statistics.items()}
         self._json(plain | episode.about.to_statistics(first + frames), "meta/stats.json")
         self._json(info, "meta/info.json")
         self.info, self._stats = info, stats
@@ -191,46 +196,55 @@ class Dataset:
             shutil.rmtree(episode.folder, ignore_errors=True)
 
     def _open(self, fps: float) -> None:
+        """Read the metadata of an existing dataset; raise `ConfigError` if it cannot be
+        continued.
+        """
         info = json.loads((self.root / "meta/info.json").read_text())
-        for key, mine in (
+        for key, expected in (
             ("codebase_version", VERSION),
             ("fps", fps),
             ("data_path", DATA),
             ("video_path", VIDEO),
         ):
-            if info.get(key) != mine:
+            if info.get(key) != expected:
                 raise ConfigError(
-                    f"{self.root}: has {key} {info.get(key)!r}, want {mine!r}; record into a new "
-                    "folder"
+                    f"{self.root}: has {key} {info.get(key)!r}, want {expected!r}; record into a "
+                    "new folder"
                 )
-        has = INTERVENTION_COLUMN in info["features"]
-        if self.interventions and not has:
+
+        has_interventions = INTERVENTION_COLUMN in info["features"]
+        if self.interventions and not has_interventions:
             raise ConfigError(
                 f"{self.root}: was recorded without interventions, so its frames lack the column "
                 f"{INTERVENTION_COLUMN!r}; record into a new folder"
             )
-        self.info, self.interventions = info, has
+        self.info = info
+        self.interventions = has_interventions
+
         stats = json.loads((self.root / "meta/stats.json").read_text())
         stats.pop(STATISTICS, None)
-        self._stats = {
-            key: {name: np.array(value) for name, value in one.items()}
-            for key, one in stats.items()
-        }
+        self._stats = {}
+        for key, statistics in stats.items():
+            self._stats[key] = {name: np.array(value) for name, value in statistics.items()}
         table = self._pq.read_table(self.root / "meta/tasks.parquet")
         self.tasks = table.column("__index_level_0__").to_pylist()[: info["total_tasks"]]
-        # A crash left an uncounted episode.
+
+        # After a crash, the statistics may include an uncounted episode: compute them again.
         if int(self._stats[ACTION]["count"][0]) != info["total_frames"]:
             self._stats = {}
             for number in range(self.episodes):
-                [about] = self._pq.read_table(
-                    self.root / EPISODES.format(**_place(number))
-                ).to_pylist()
-                found: dict[str, Stats] = {}
-                for column, value in about.items():
-                    if column.startswith("stats/"):
-                        key, _, name = column.removeprefix("stats/").rpartition("/")
-                        found.setdefault(key, {})[name] = np.array(value)
-                self._stats = joined(self._stats, found)
+                self._stats = joined(self._stats, self._stats_of_episode(number))
+
+    def _stats_of_episode(self, number: int) -> dict[str, Stats]:
+        """Read the statistics of an episode, by feature."""
+        table = self._pq.read_table(self.root / EPISODES.format(**_file_numbers(number)))
+        [about] = table.to_pylist()
+        stats: dict[str, Stats] = {}
+        for column, value in about.items():
+            if column.startswith("stats/"):
+                key, _, name = column.removeprefix("stats/").rpartition("/")
+                stats.setdefault(key, {})[name] = np.array(value)
+        return stats
 
     def _table(self, rows: Mapping[str, np.ndarray], features: Mapping[str, Any]) -> Any:
         pa = self._pa
@@ -276,33 +290,36 @@ class Dataset:
         return table.replace_schema_metadata({"pandas": json.dumps(pandas)})
 
     def _parquet(self, table: Any, name: str) -> None:
-        part = self._part(name)
-        self._pq.write_table(table, part, compression="snappy")
-        self._move(part, self.root / name)
+        """Write a Parquet file of the dataset."""
+        unfinished = self._unfinished_file(name)
+        self._pq.write_table(table, unfinished, compression="snappy")
+        self._move(unfinished, self.root / name)
 
     def _json(self, value: object, name: str) -> None:
-        part = self._part(name)
-        part.write_text(json.dumps(value, indent=4, ensure_ascii=False))
-        self._move(part, self.root / name)
+        """Write a JSON file of the dataset."""
+        unfinished = self._unfinished_file(name)
+        unfinished.write_text(json.dumps(value, indent=4, ensure_ascii=False))
+        self._move(unfinished, self.root / name)
 
-    def _part(self, name: str) -> Path:
+    def _unfinished_file(self, name: str) -> Path:
+        """Return the path at which a file is written before it is complete."""
         folder = self.root / UNFINISHED_FOLDER
         folder.mkdir(parents=True, exist_ok=True)
         return folder / name.replace("/", "_")
 
-    def _move(self, part: Path, path: Path) -> None:
-        """Rename a complete file, which is on the disk with its new name when this returns, if
-        that is wanted.
+    def _move(self, complete: Path, path: Path) -> None:
+        """Rename a complete file; with `durable`, it is on the disk with its new name when this
+        returns.
         """
         path.parent.mkdir(parents=True, exist_ok=True)
         if self._durable:
-            _sync(part)
-        os.replace(part, path)
+            _sync(complete)
+        os.replace(complete, path)
         if self._durable:
             _sync(path.parent)
 
 
-def _place(episode: int) -> dict[str, int]:
+def _file_numbers(episode: int) -> dict[str, int]:
     """Return the numbers in the names of an episode's files."""
     return {"chunk_index": episode // FILES_IN_CHUNK, "file_index": episode % FILES_IN_CHUNK}
 

@@ -55,7 +55,7 @@ class Layout:
     size: int  # total size of the arrays, bytes
 
     @classmethod
-    def of(
+    def from_shapes(
         cls, session: str, priority: PriorityName, cameras: Sequence[Any], state: Sequence[Any]
     ) -> Layout:
         """Compute the layout of arrays, given as pairs of name and shape: (H, W, 3) for cameras,
@@ -138,7 +138,7 @@ class ShmWriter:
                     number = len(self._known) + len(new)
                     if number >= _MAX_LAYOUTS:
                         return None
-                    known = new[key] = (number, Layout.of(*key))
+                    known = new[key] = (number, Layout.from_shapes(*key))
                     text = json.dumps(key).encode()
                     texts.append(text)
                 latest[request.session] = known
@@ -294,7 +294,7 @@ class ShmReader:
                 raise MessageTooLarge(
                     f"local: {name!r}: got {size} pixels or values, the limit is {max_size}"
                 )
-        return Layout.of(session, priority, cameras, state)
+        return Layout.from_shapes(session, priority, cameras, state)
 
 
 def _is_plain(request: Request, obs: Obs) -> bool:

@@ -590,7 +590,7 @@ class _Run:
                 tick=tick,
                 safe=SAFE in act.info,
                 intervention=is_intervention,
-                wanted=act.info.get(WANTED),
+                policy_action=act.info.get(WANTED),
             )
 
     def go_to_rest(self, pacer: Pacer) -> None:

@@ -55,24 +55,24 @@ class Recorder:
         self.error: Exception | None = None  # the first error in writing
         try:
             self._dataset = Dataset(Path(root), fps, interventions=interventions)
-            # Else the error would come with the first frame.
+            # Without this, an unusable folder would raise only with the first frame.
             Path(root).mkdir(parents=True, exist_ok=True)
         except (OSError, ValueError, KeyError) as error:
-            # no such folder, no permission, or damaged files
+            # There is no such folder, no permission, or its files are damaged.
             raise ConfigError(
                 f"recorder {root}: {type(error).__name__}: {error}; record into a new folder that "
                 "can be written to"
             ) from error
         self._label: Label | None = None
         self._frames = frames
-        # What the thread does next, given the running episode; each returns the one that runs then.
-        # None ends it.
+        # The next steps of the thread: functions of the running episode that return the episode
+        # that runs afterwards. None ends the thread.
         self._queue: queue.SimpleQueue[
             Callable[[RunningEpisode | None], RunningEpisode | None] | None
         ]
         self._queue = queue.SimpleQueue()
-        self._put = 0  # frames added, counted by the loop's thread
-        self._got = 0  # frames taken from the queue, counted by the writing thread
+        self._added = 0  # the number of frames added, counted by the loop's thread
+        self._taken = 0  # the number of frames taken from the queue, counted by the writing thread
         self._thread = threading.Thread(target=self._run, name="vlagents-ray-recorder", daemon=True)
         self._thread.start()
 
@@ -125,7 +125,7 @@ class Recorder:
         tick: int,
         safe: bool = False,
         intervention: bool = False,
-        wanted: np.ndarray | None = None,
+        policy_action: np.ndarray | None = None,
     ) -> None:
         """Record a frame; never waits.
 
@@ -135,24 +135,27 @@ class Recorder:
             tick: The tick of the control loop.
             safe: Whether the action is a safe one, not the policy's.
             intervention: Whether an operator moved the robot at this tick.
-            wanted: The policy's action, (D,), if another one was applied; None if it is not known.
+            policy_action: The policy's action, (D,), if another one was applied; None if it is not
+                known.
         """
-        if self._put - self._got >= self._frames:
+        if self._added - self._taken >= self._frames:
             self.dropped += 1
             return
         if CAPTURED not in obs.info:
             obs = Obs(obs.cameras, obs.gripper, obs.state, {CAPTURED: time.time()})
-        seen, applied = copied(obs), np.array(action)
+        obs_copy, action_copy = copied(obs), np.array(action)
 
         def write(episode: RunningEpisode | None) -> RunningEpisode | None:
-            self._got += 1
+            """Add the frame to the running episode."""
+            self._taken += 1
             if episode is not None:  # else it was abandoned after an error
+                captured_at = float(obs_copy.info[CAPTURED])
                 episode.add(
-                    seen, applied, float(seen.info[CAPTURED]), tick, safe, intervention, wanted
+                    obs_copy, action_copy, captured_at, tick, safe, intervention, policy_action
                 )
             return episode
 
-        self._put += 1
+        self._added += 1
         self._queue.put(write)
 
     def close(self) -> None:
@@ -175,7 +178,11 @@ class Recorder:
         with contextlib.suppress(OSError):
             os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), _NICE)
         episode: RunningEpisode | None = None
-        while (step := self._queue.get()) is not None:
+
+        while True:
+            step = self._queue.get()
+            if step is None:
+                break
             try:
                 episode = step(episode)
             except Exception as error:  # noqa: BLE001 - raised by `close`; the robot continues
@@ -183,10 +190,12 @@ class Recorder:
                 if episode is not None:
                     episode.abandon()
                 episode = None
+
         if episode is not None:
             episode.abandon()
 
     def _end(self, label: Label | None, episode: RunningEpisode | None) -> None:
+        """Save the running episode, or abandon it if it is empty or is to be discarded."""
         if episode is not None and episode.rows and label != "discard":
             self._dataset.save(episode.finish(label))
         elif episode is not None:
