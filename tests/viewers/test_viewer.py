@@ -126,7 +126,9 @@ def test_the_end_of_a_live_viewer_that_takes_nothing_more_is_not_waited_for() ->
 
 def test_a_frame_is_a_copy_of_the_observation() -> None:
     image, joints = np.full((4, 4, 3), 7, np.uint8), np.ones(2, np.float32)
-    frame = ViewerFrame.from_obs(Obs({"front": image}, 0.25, {"joints": joints}, {"captured_at": 5.0}), 3)
+    frame = ViewerFrame.from_obs(
+        Obs({"front": image}, 0.25, {"joints": joints}, {"captured_at": 5.0}), 3
+    )
     image[:], joints[:] = 0, 0
     assert (frame.tick, frame.time) == (3, 5.0)
     assert frame.cameras["front"].min() == 7

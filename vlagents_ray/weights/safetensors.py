@@ -53,12 +53,12 @@ class ValueSpec:
         return math.prod(self.shape) * self.dtype.itemsize
 
 
-def header_of(named: Mapping[str, np.ndarray]) -> bytes:
+def header_of(values: Mapping[str, np.ndarray]) -> bytes:
     """Return the header of a file with these values; raises `InvalidWeights` for a type that the
     format lacks.
     """
     document, begin = {}, 0
-    for name, value in named.items():
+    for name, value in values.items():
         if value.dtype not in _CODES:
             raise InvalidWeights(
                 f"{name!r}: got {value.dtype}, want one of {', '.join(sorted(_TYPES))}"
@@ -75,12 +75,12 @@ def header_of(named: Mapping[str, np.ndarray]) -> bytes:
     return _LENGTH.pack(len(text)) + text
 
 
-def parts_of(named: Mapping[str, np.ndarray], length: int = PART_BYTES) -> Iterator[bytes]:
+def parts_of(values: Mapping[str, np.ndarray], length: int = PART_BYTES) -> Iterator[bytes]:
     """Yield the bytes of the values, in the header's order, in parts of `length` bytes; the last
     may be shorter.
     """
     part = bytearray()
-    for value in named.values():
+    for value in values.values():
         data = memoryview(np.ascontiguousarray(value).reshape(-1).view(np.uint8).data)
         while data:
             taken = data[: length - len(part)]
@@ -107,6 +107,7 @@ def read_header(data: bytes) -> dict[str, ValueSpec]:
             f"safetensors: got {len(data)} bytes that announce a header of {announced}, want 8 "
             f"bytes with the length of the header, and the header, at most {MESSAGE_BYTES} together"
         )
+
     try:
         document = json.loads(
             data[_LENGTH.size :], parse_int=_whole, object_pairs_hook=without_duplicate_keys
@@ -118,20 +119,24 @@ def read_header(data: bytes) -> dict[str, ValueSpec]:
             f"safetensors: got {type(document).__name__}, want an object with a value for each name"
         )
     document.pop(_METADATA, None)
-    placed = sorted((*_read_value(name, entry), name) for name, entry in document.items())
-    specs, at = {}, 0
-    for begin, end, code, shape, name in placed:
+
+    in_order = sorted((*_read_value(name, entry), name) for name, entry in document.items())
+    specs = {}
+    offset = 0
+    for begin, end, code, shape, name in in_order:
         spec = ValueSpec(_TYPES[code], shape)
-        if begin != at or end - begin != spec.size:
+        if begin != offset or end - begin != spec.size:
             raise MalformedMessage(
-                f"safetensors: {name!r}: got bytes {begin} to {end}, want {at} to {at + spec.size} "
-                f"for {code} of shape {list(shape)}"
+                f"safetensors: {name!r}: got bytes {begin} to {end}, want {offset} to "
+                f"{offset + spec.size} for {code} of shape {list(shape)}"
             )
-        specs[name], at = spec, end
+        specs[name] = spec
+        offset = end
     return specs
 
 
 def _read_value(name: str, entry: Any) -> tuple[int, int, str, tuple[int, ...]]:
+    """Return the begin and the end of a value's bytes, its type and its shape."""
     if len(name) > _NAME_LENGTH:
         raise MalformedMessage(
             f"safetensors: got a name of {len(name)} characters, the limit is {_NAME_LENGTH}"
@@ -159,6 +164,7 @@ def _are_whole(numbers: Any) -> bool:
 
 
 def _whole(text: str) -> int:
+    """Return a whole number of a JSON text; very long ones would take too much time."""
     if len(text) > _DIGITS:
         raise ValueError(f"a number of {len(text)} digits")
     return int(text)
@@ -173,9 +179,10 @@ class ValuesReader:
         """Read the values that a header announces, see `read_header`."""
         self._left = deque(specs.items())
         self._values: dict[str, np.ndarray] = {}
-        self._room = np.empty(0, np.uint8)  # of the value that is being read
-        self.received = 0  # bytes
-        self.size = sum(spec.size for spec in specs.values())  # bytes
+        # The bytes of the current value that have not arrived yet.
+        self._room = np.empty(0, np.uint8)
+        self.received = 0  # the number of bytes that have arrived
+        self.size = sum(spec.size for spec in specs.values())  # the number of all bytes
 
     def add(self, part: bytes) -> None:
         """Append the next bytes; raises `MalformedMessage` if there are more than the header
@@ -217,12 +224,12 @@ class ValuesReader:
         self._room = value.reshape(-1).view(np.uint8)
 
 
-def write_values(file: BinaryIO, named: Mapping[str, np.ndarray]) -> None:
+def write_values(file: BinaryIO, values: Mapping[str, np.ndarray]) -> None:
     """Write values into a file, from its place on; raises `InvalidWeights` for a type that the
     format lacks.
     """
-    file.write(header_of(named))
-    file.writelines(parts_of(named))
+    file.write(header_of(values))
+    file.writelines(parts_of(values))
     file.flush()
 
 

@@ -28,8 +28,11 @@ _SHOWN = 5  # faults in a message
 _THREADS = 4  # threads that compute a fingerprint: numpy releases Python's lock
 # 4-byte words of a value that are summed at once for a fingerprint; on a GPU that takes 40 MB.
 _WORDS = 2**20
-_FACTOR = -7046029254386353131  # odd, of a fingerprint's sum before that of the next words
-_AT_ONCE = 2**24  # elements of a tensor for which operations on versions need further memory
+# The odd factor by which the sum of a fingerprint is multiplied before the next words are added.
+_FACTOR = -7046029254386353131
+# The number of elements of a tensor on which an operation works at once, as it needs further memory
+# for them.
+_AT_ONCE = 2**24
 _KINDS = (("float", "bfloat"), ("int", "uint"), ("bool",), ("complex",))
 
 
@@ -41,55 +44,62 @@ def named_values(trainable: Any) -> dict[str, Any]:
         # A module may add state other than tensors (`get_extra_state`), which a learner does not
         # train.
         return {name: value for name, value in trainable.state_dict().items() if is_array(value)}
-    found = dict[str, Any]()
+
+    values = dict[str, Any]()
     for name, container, key in _leaves(trainable):
         if _is_module(container[key]):
-            found |= {f"{name}/{own}": value for own, value in named_values(container[key]).items()}
+            for inner_name, value in named_values(container[key]).items():
+                values[f"{name}/{inner_name}"] = value
         else:
-            found[name] = container[key]
-    return found
+            values[name] = container[key]
+    return values
 
 
-def set_values(trainable: Any, named: Mapping[str, Any]) -> None:
+def set_values(trainable: Any, values: Mapping[str, Any]) -> None:
     """Replace values of a trainable object by those of the same shapes, types and devices; other
     names keep theirs.
 
     Values on a GPU are copied to the addresses of the old ones, which a CUDA graph may have
-    recorded. All others are replaced by reference, which takes no time and no memory; `named` must
+    recorded. All others are replaced by reference, which takes no time and no memory; `values` must
     not be changed afterwards.
     """
-    if not _is_module(trainable):
-        for name, container, key in list(_leaves(trainable)):
-            value, within = container[key], f"{name}/"
-            if _is_module(value):
-                set_values(
-                    value,
-                    {
-                        one.removeprefix(within): named[one]
-                        for one in named
-                        if one.startswith(within)
-                    },
-                )
-            elif name in named and _is_tensor(value) and _on_gpu(value):
-                _overwrite(value, named[name])
-            elif name in named:
-                container[key] = named[name]
+    if _is_module(trainable):
+        _set_values_of_module(trainable, values)
         return
-    held = dict(trainable.named_buffers(remove_duplicate=False))
-    held |= trainable.named_parameters(remove_duplicate=False)
+
+    for name, container, key in list(_leaves(trainable)):
+        current = container[key]
+        if _is_module(current):
+            prefix = f"{name}/"
+            inner_names = [full for full in values if full.startswith(prefix)]
+            set_values(current, {full.removeprefix(prefix): values[full] for full in inner_names})
+        elif name in values and _is_tensor(current) and _on_gpu(current):
+            _overwrite(current, values[name])
+        elif name in values:
+            container[key] = values[name]
+
+
+def _set_values_of_module(module: Any, values: Mapping[str, Any]) -> None:
+    """Replace values of a torch module, as `set_values`."""
+    tensors = dict(module.named_buffers(remove_duplicate=False))
+    tensors |= module.named_parameters(remove_duplicate=False)
     with sys.modules["torch"].no_grad():
-        for name, alias in trainable.state_dict().items():
-            if name not in named:
+        for name, alias in module.state_dict().items():
+            if name not in values:
                 continue
-            if name in held and alias.device.type == "cpu":
-                held[name].data = named[name]
+            if name in tensors and alias.device.type == "cpu":
+                tensors[name].data = values[name]
             else:
-                _overwrite(alias, named[name])
+                _overwrite(alias, values[name])
 
 
-def _overwrite(held: Any, value: Any) -> None:
+def _overwrite(target: Any, value: Any) -> None:
+    """Copy a tensor into the memory of another one."""
     with sys.modules["torch"].no_grad():
-        copy(value, held) if held.is_contiguous() else held.copy_(value)
+        if target.is_contiguous():
+            copy(value, target)
+        else:
+            target.copy_(value)
 
 
 @contextmanager
@@ -97,19 +107,22 @@ def evaluation_mode(trainable: Any) -> Iterator[None]:
     """Put torch modules into evaluation mode (no dropout, no batch statistics), and restore the
     mode of each part.
     """
-    leaves: Iterable[tuple[str, Any, Any]] = (
-        _leaves(trainable) if isinstance(trainable, dict | list) else [("", [trainable], 0)]
-    )
-    values = [container[key] for _, container, key in leaves]
-    parts = [part for value in values if _is_module(value) for part in value.modules()]
-    modes = [part.training for part in parts]
+    values = [trainable]
+    if isinstance(trainable, dict | list):
+        values = [container[key] for _, container, key in _leaves(trainable)]
+    modules: list[Any] = []
+    for value in values:
+        if _is_module(value):
+            modules += value.modules()
+
+    modes = [module.training for module in modules]
     try:
-        for part in parts:
-            part.training = False
+        for module in modules:
+            module.training = False
         yield
     finally:
-        for part, mode in zip(parts, modes, strict=True):
-            part.training = mode
+        for module, mode in zip(modules, modes, strict=True):
+            module.training = mode
 
 
 def is_copied(trainable: Any) -> bool:
@@ -156,14 +169,14 @@ def swap(first: Mapping[str, Any], second: Mapping[str, Any]) -> None:
     of `completed`.
     """
     with sys.modules["torch"].no_grad():
-        for name, value in {
-            memory_of(name, value): (name, value) for name, value in first.items()
-        }.values():
-            parts = [one.view(-1).split(_AT_ONCE) for one in (value, second[name])]
-            for one, other in zip(*parts, strict=True):
-                before = one.clone()
-                one.copy_(other)
-                other.copy_(before)
+        untied = {memory_of(name, value): (name, value) for name, value in first.items()}
+        for name, value in untied.values():
+            pieces = value.view(-1).split(_AT_ONCE)
+            other_pieces = second[name].view(-1).split(_AT_ONCE)
+            for piece, other_piece in zip(pieces, other_pieces, strict=True):
+                before = piece.clone()
+                piece.copy_(other_piece)
+                other_piece.copy_(before)
 
 
 def memory_of(name: str, value: Any) -> Any:
@@ -175,28 +188,30 @@ def memory_of(name: str, value: Any) -> Any:
     return value.device, value.data_ptr(), value.shape, value.stride(), value.dtype
 
 
-def mapped(function: Callable[[Any], Any], named: Mapping[str, Any]) -> dict[str, Any]:
+def mapped(function: Callable[[Any], Any], values: Mapping[str, Any]) -> dict[str, Any]:
     """Return the results of a function of values, by name; tied values are passed once, and so
     are their results.
     """
-    values = {memory_of(name, value): value for name, value in named.items()}
-    results = {place: function(value) for place, value in values.items()}
-    return {name: results[memory_of(name, value)] for name, value in named.items()}
+    untied = {memory_of(name, value): value for name, value in values.items()}
+    results = {memory: function(value) for memory, value in untied.items()}
+    return {name: results[memory_of(name, value)] for name, value in values.items()}
 
 
 def own_copy(value: Any) -> Any:
+    """Return a copy of a value in memory that is not shared."""
     if _is_tensor(value):
         return value.detach().clone()
     return np.array(value) if isinstance(value, np.ndarray) else value  # JAX arrays never change
 
 
-def converted(value: Any, held: Any) -> Any:
-    """Convert `value` to the type, precision and device of `held`, in memory that is not shared.
+def converted(value: Any, current: Any) -> Any:
+    """Convert `value` to the type, precision and device of the current value, in memory that is not
+    shared.
 
     Read-only numpy arrays that own read-only memory, such as Ray's objects, are not copied if
-    `held` is on the CPU.
+    `current` is on the CPU.
     """
-    if _is_tensor(held):
+    if _is_tensor(current):
         torch = sys.modules["torch"]
         if _is_tensor(value):
             tensor = value.detach()
@@ -204,20 +219,23 @@ def converted(value: Any, held: Any) -> Any:
             array = _unchanging(np.asarray(value))
             is_bfloat16 = array.dtype.kind == "V"
             with warnings.catch_warnings():
-                # Nothing writes into it.
+                # torch warns of a read-only array, but nothing writes into it.
                 warnings.filterwarnings("ignore", message=".*not writ", category=UserWarning)
                 tensor = torch.from_numpy(array.view(np.int16) if is_bfloat16 else array)
             tensor = tensor.view(torch.bfloat16) if is_bfloat16 else tensor
-        if held.is_cuda and not tensor.is_cuda:
-            return copy(tensor, torch.empty_like(held, memory_format=torch.contiguous_format))
-        new = tensor.to(held.device, held.dtype)
-        return new.clone() if _is_tensor(value) and new.data_ptr() == value.data_ptr() else new
+
+        if current.is_cuda and not tensor.is_cuda:
+            return copy(tensor, torch.empty_like(current, memory_format=torch.contiguous_format))
+        new = tensor.to(current.device, current.dtype)
+        is_shared = _is_tensor(value) and new.data_ptr() == value.data_ptr()
+        return new.clone() if is_shared else new
+
     array = to_numpy(value)
-    if isinstance(held, np.ndarray):
-        array = _unchanging(array) if array.dtype == held.dtype else array.astype(held.dtype)
+    if isinstance(current, np.ndarray):
+        array = _unchanging(array) if array.dtype == current.dtype else array.astype(current.dtype)
         array.flags.writeable = False
         return array
-    return sys.modules["jax"].device_put(array.astype(held.dtype), held.sharding)
+    return sys.modules["jax"].device_put(array.astype(current.dtype), current.sharding)
 
 
 def dtype_name(value: Any) -> str:
@@ -226,6 +244,7 @@ def dtype_name(value: Any) -> str:
 
 
 def is_array(value: Any) -> bool:
+    """Return whether a value is an array or a tensor of any library."""
     return hasattr(value, "shape") and hasattr(value, "dtype")
 
 
@@ -405,94 +424,98 @@ def copy(source: Any, target: Any) -> Any:
     return target
 
 
-# Checks that pushed values fit those of a policy, and a digest of values.
+# The following functions check that pushed values fit those of a policy, and compute a digest.
 
 
 def accepted(
-    held: Mapping[str, Any], pushed: Mapping[str, Any], *, partial: bool = False
+    current: Mapping[str, Any], pushed: Mapping[str, Any], *, partial: bool = False
 ) -> dict[str, Any]:
-    """Return pushed values with the types and devices of those held.
+    """Return pushed values with the types and devices of the current ones.
 
-    Of those held, only these and the shapes are read, except where pushed ones are not finite.
-
-    Names whose values are tied in `held` get the same value, the last one that was pushed.
+    Of the current values, only types, devices and shapes are read, except where pushed values are
+    not finite. Names whose current values are tied get the same value, the last one that was
+    pushed.
 
     Args:
-        held: The current values of the policy, by name.
+        current: The current values of the policy, by name.
         pushed: The new values, by name: numpy or JAX arrays or torch tensors, on any device.
         partial: Whether names may be missing, as in a push of adapters alone.
 
     Raises:
         InvalidWeights: A name is unknown or missing, or a value has another shape or kind of type,
-            or is neither finite nor equal to the one held.
+            or is neither finite nor equal to the current one.
     """
-    require_fit(held, pushed, partial=partial)
-    places = {name: memory_of(name, value) for name, value in held.items()}
-    last = {places[name]: name for name in pushed}
-    new = {place: converted(pushed[name], held[name]) for place, name in last.items()}
-    named = {name: new[place] for place, name in last.items()}
-    finite = _all_finite_tensors(named)
-    finite |= {name: _is_finite(value) for name, value in named.items() if not finite.get(name)}
-    finite |= _fetched({name: one for name, one in finite.items() if _is_tensor(one)})
+    require_fit(current, pushed, partial=partial)
+    memories = {name: memory_of(name, value) for name, value in current.items()}
+    last_names = {memories[name]: name for name in pushed}
+    new = {memory: converted(pushed[name], current[name]) for memory, name in last_names.items()}
+
+    values = {name: new[memory] for memory, name in last_names.items()}
+    finite = _all_finite_tensors(values)
+    finite |= {name: _is_finite(value) for name, value in values.items() if not finite.get(name)}
+    finite |= _fetched({name: result for name, result in finite.items() if _is_tensor(result)})
+
     # Constants of a module, such as masks of attention, may be infinite: a learner pushes them
     # unchanged.
-    wrong = [
-        name
-        for name, is_so in finite.items()
-        if not is_so and not _is_equal(new[places[name]], held[name])
-    ]
+    not_finite = [name for name, is_finite in finite.items() if not is_finite]
+    wrong = [name for name in not_finite if not _is_equal(new[memories[name]], current[name])]
     _refuse([f"{name!r}: got NaN or infinite values, want finite ones" for name in wrong])
-    return {name: new[place] for name, place in places.items() if place in new}
+    return {name: new[memory] for name, memory in memories.items() if memory in new}
 
 
 def completed(
-    held: Mapping[str, Any],
+    current: Mapping[str, Any],
     new: Mapping[str, Any],
     *,
     allow_same: bool = False,
     in_place: bool = False,
 ) -> dict[str, Any]:
-    """Return the values of a new version: the result of `accepted`, and the held values of the
+    """Return the values of a new version: the result of `accepted`, and the current values of the
     missing names.
 
     Args:
-        held: The current values of the policy, by name.
+        current: The current values of the policy, by name.
         new: The new ones.
-        allow_same: Whether all may equal those held.
-        in_place: Whether the values held will change in their memory, so that those of missing
+        allow_same: Whether all may equal the current ones.
+        in_place: Whether the current values will change in their memory, so that those of missing
             names are copied.
 
     Raises:
-        UnchangedWeights: All values equal those held, and `allow_same` is not set.
+        UnchangedWeights: All values equal the current ones, and `allow_same` is not set.
     """
-    if not allow_same and all(_is_equal(value, held[name]) for name, value in new.items()):
+    if not allow_same and all(_is_equal(value, current[name]) for name, value in new.items()):
         raise UnchangedWeights(
             f"weights: all {len(new)} values equal those that the policy holds; push what the "
             "optimizer changes, or allow it with allow_same=True"
         )
-    missing = {name: value for name, value in held.items() if name not in new}
-    all_values = {**new, **(mapped(own_copy, missing) if in_place else missing)}
-    return {name: all_values[name] for name in held}
+
+    missing = {name: value for name, value in current.items() if name not in new}
+    if in_place:
+        missing = mapped(own_copy, missing)
+    all_values = {**new, **missing}
+    return {name: all_values[name] for name in current}
 
 
-def are_apart(named: Mapping[str, Any]) -> bool:
+def are_apart(values: Mapping[str, Any]) -> bool:
     """Return whether tensors share no memory, other than tied ones, so that `swap` can exchange
     each of them.
     """
-    values = {
-        memory_of(name, value): value for name, value in named.items() if value.numel()
-    }.values()
+    untied = {memory_of(name, value): value for name, value in values.items() if value.numel()}
+    if not all(value.is_contiguous() for value in untied.values()):
+        return False
+
     spans = sorted(
-        (str(value.device), value.data_ptr(), value.data_ptr() + value.nbytes) for value in values
+        (str(value.device), value.data_ptr(), value.data_ptr() + value.nbytes)
+        for value in untied.values()
     )
-    apart = all(
-        one[0] != other[0] or one[2] <= other[1] for one, other in itertools.pairwise(spans)
-    )
-    return apart and all(value.is_contiguous() for value in values)
+    for (device, _, end), (next_device, next_begin, _) in itertools.pairwise(spans):
+        if device == next_device and end > next_begin:
+            return False
+    return True
 
 
 def require_fit(
-    held: Mapping[str, Any], pushed: Mapping[str, Any], *, partial: bool = False
+    current: Mapping[str, Any], pushed: Mapping[str, Any], *, partial: bool = False
 ) -> None:
     """Raise `InvalidWeights` if a name is unknown or missing, or a value has another shape or kind
     of type.
@@ -500,30 +523,27 @@ def require_fit(
     `pushed` are values, or their `vlagents_ray.weights.safetensors.ValueSpec`; with `partial`,
     names may be missing.
     """
+    unknown = [name for name in pushed if name not in current]
     faults = [
-        f"{name!r}: unknown, want one of the policy's {len(held)} names"
-        for name in pushed
-        if name not in held
+        f"{name!r}: unknown, want one of the policy's {len(current)} names" for name in unknown
     ]
     if not partial:
-        faults += [
-            f"{name!r}: missing; push it, or set partial=True"
-            for name in held
-            if name not in pushed
-        ]
+        missing = [name for name in current if name not in pushed]
+        faults += [f"{name!r}: missing; push it, or set partial=True" for name in missing]
     elif not pushed:
-        faults += ["no value: push at least one"]
+        faults.append("no value: push at least one")
+
     # A variable with a value here would keep the learner's memory open as long as the error has
     # this frame.
-    faults += [
-        fault
-        for name in pushed
-        if name in held and (fault := _misfit(name, pushed[name], held[name]))
-    ]
+    for name in pushed:
+        if name in current:
+            fault = _misfit(name, pushed[name], current[name])
+            if fault:
+                faults.append(fault)
     _refuse(faults)
 
 
-def fingerprint(named: Mapping[str, Any]) -> str:
+def fingerprint(values: Mapping[str, Any]) -> str:
     """Return a digest of 32 hexadecimal characters over names, shapes, types and all bytes of
     values on any device.
 
@@ -531,20 +551,24 @@ def fingerprint(named: Mapping[str, Any]) -> str:
     on its place, and summed modulo 2**64, on a GPU if the value is there. A cryptographic digest
     would need all values on the host, and take a few seconds for a large model.
     """
-    found = hashlib.blake2b(digest_size=16)
-    on_gpus = {name: value for name, value in named.items() if _is_tensor(value) and value.is_cuda}
-    others = [name for name in named if name not in on_gpus]
+    on_gpus = {name: value for name, value in values.items() if _is_tensor(value) and value.is_cuda}
+    on_host_names = [name for name in values if name not in on_gpus]
     with ThreadPoolExecutor(_THREADS, "fingerprint") as threads:
-        sums = dict(zip(others, threads.map(_sums, (named[name] for name in others)), strict=True))
+        sums_on_host = threads.map(_sums, (values[name] for name in on_host_names))
+        sums = dict(zip(on_host_names, sums_on_host, strict=True))
     keys = dict[Any, Any]()
     sums |= _fetched({name: _sums_on_gpu(value, keys) for name, value in on_gpus.items()})
-    for name in sorted(named):
-        found.update(f"{name} {dtype_name(named[name])} {tuple(named[name].shape)}\n".encode())
-        found.update(sums[name].tobytes())
-    return found.hexdigest()
+
+    digest = hashlib.blake2b(digest_size=16)
+    for name in sorted(values):
+        shape = tuple(values[name].shape)
+        digest.update(f"{name} {dtype_name(values[name])} {shape}\n".encode())
+        digest.update(sums[name].tobytes())
+    return digest.hexdigest()
 
 
 def _refuse(faults: list[str]) -> None:
+    """Raise `InvalidWeights` if there are faults."""
     if faults:
         more = f"; and {len(faults) - _SHOWN} more" if len(faults) > _SHOWN else ""
         raise InvalidWeights(
@@ -552,13 +576,14 @@ def _refuse(faults: list[str]) -> None:
         )
 
 
-def _misfit(name: str, pushed: Any, held: Any) -> str | None:
+def _misfit(name: str, pushed: Any, current: Any) -> str | None:
+    """Describe the difference of a pushed value's shape or kind of type; None if it fits."""
     if not is_array(pushed):
         return f"{name!r}: got {type(pushed).__name__}, want an array"
-    if tuple(pushed.shape) != tuple(held.shape):
-        return f"{name!r}: got shape {tuple(pushed.shape)}, want {tuple(held.shape)}"
-    if _kind(dtype_name(pushed)) != _kind(dtype_name(held)):
-        return f"{name!r}: got {dtype_name(pushed)}, want {dtype_name(held)}"
+    if tuple(pushed.shape) != tuple(current.shape):
+        return f"{name!r}: got shape {tuple(pushed.shape)}, want {tuple(current.shape)}"
+    if _kind(dtype_name(pushed)) != _kind(dtype_name(current)):
+        return f"{name!r}: got {dtype_name(pushed)}, want {dtype_name(current)}"
     return None
 
 
@@ -582,39 +607,46 @@ def _is_finite(value: Any) -> Any:
         return bool(sys.modules["jax"].numpy.isfinite(value).all())
     if value.is_complex():
         value = sys.modules["torch"].view_as_real(value)
-    # Which needs no memory, as above.
+    # Minimum and maximum need no memory, as above.
     return sys.modules["torch"].stack(value.aminmax()).isfinite().all()
 
 
-def _all_finite_tensors(named: Mapping[str, Any]) -> dict[str, Any]:
+def _all_finite_tensors(values: Mapping[str, Any]) -> dict[str, Any]:
     """Return the names of torch tensors of real numbers that are surely finite, each with True.
 
     The largest absolute values of all tensors of a device and type are computed together: several
     operations for each of hundreds of tensors would share the GPU, and Python's lock, with acts.
     """
     groups: dict[Any, list[str]] = {}
-    for name, value in named.items():
+    for name, value in values.items():
         if _is_tensor(value) and value.is_floating_point() and value.numel():
             groups.setdefault((value.device, value.dtype), []).append(name)
     finite: dict[str, Any] = {}
     for names in groups.values():
         torch = sys.modules["torch"]
-        largest = torch._foreach_norm([named[name].detach() for name in names], float("inf"))
+        largest = torch._foreach_norm([values[name].detach() for name in names], float("inf"))
         are_finite = on_host(torch.stack(largest).isfinite()).tolist()
-        finite |= {name: True for name, is_so in zip(names, are_finite, strict=True) if is_so}
+        for name, is_finite in zip(names, are_finite, strict=True):
+            if is_finite:
+                finite[name] = True
     return finite
 
 
-def _is_equal(new: Any, held: Any) -> bool:
+def _is_equal(new: Any, current: Any) -> bool:
+    """Return whether all numbers of two values of the same shape and type are equal."""
     if isinstance(new, np.ndarray):
-        return np.array_equal(new, held)
+        return np.array_equal(new, current)
     if not _is_tensor(new):
-        return bool((new == held).all())
-    parts = zip(new.reshape(-1).split(_AT_ONCE), held.reshape(-1).split(_AT_ONCE), strict=True)
-    moved = new.is_cuda and not held.is_cuda
-    return all(
-        bool((one == (converted(other, one) if moved else other)).all()) for one, other in parts
-    )
+        return bool((new == current).all())
+
+    must_move = new.is_cuda and not current.is_cuda
+    new_pieces = new.reshape(-1).split(_AT_ONCE)
+    current_pieces = current.reshape(-1).split(_AT_ONCE)
+    for new_piece, current_piece in zip(new_pieces, current_pieces, strict=True):
+        other_piece = converted(current_piece, new_piece) if must_move else current_piece
+        if not bool((new_piece == other_piece).all()):
+            return False
+    return True
 
 
 @functools.cache
@@ -632,16 +664,17 @@ def _sums(value: Any) -> np.ndarray:
     words = (np.pad(data, (0, -len(data) % 4)) if len(data) % 4 else data).view(np.int32)
     sums: np.ndarray = np.zeros(2, np.int64)
     for begin in range(0, len(words), _WORDS):
-        part = words[begin : begin + _WORDS].astype(np.int64)
-        sums = sums * _FACTOR + _keys(_WORDS)[:, : len(part)] @ part
+        piece = words[begin : begin + _WORDS].astype(np.int64)
+        sums = sums * _FACTOR + _keys(_WORDS)[:, : len(piece)] @ piece
     return sums
 
 
 def _sums_on_gpu(value: Any, keys: dict[Any, Any]) -> Any:
-    """Return those of a tensor on a GPU, as a tensor there; `keys` holds the result of `_keys`
-    by device.
+    """Return the two sums of a tensor on a GPU, as a tensor there; `keys` has the result of
+    `_keys` by device.
     """
-    torch, value = sys.modules["torch"], value.detach()
+    torch = sys.modules["torch"]
+    value = value.detach()
     if value.device not in keys:
         keys[value.device] = copy(
             torch.from_numpy(_keys(_WORDS)), value.new_empty((2, _WORDS), dtype=torch.int64)
@@ -650,19 +683,20 @@ def _sums_on_gpu(value: Any, keys: dict[Any, Any]) -> Any:
     if len(data) % 4 or data.storage_offset() % 4:
         data = torch.nn.functional.pad(data, (0, -len(data) % 4))
     sums = keys[value.device].new_zeros(2)
-    for part in data.view(torch.int32).split(_WORDS) if len(data) else ():
-        sums = sums * _FACTOR + (keys[value.device][:, : len(part)] * part.to(torch.int64)).sum(1)
+    device_keys = keys[value.device]
+    for piece in data.view(torch.int32).split(_WORDS) if len(data) else ():
+        products = device_keys[:, : len(piece)] * piece.to(torch.int64)
+        sums = sums * _FACTOR + products.sum(1)
     return sums
 
 
-def _fetched(named: Mapping[str, Any]) -> dict[str, np.ndarray]:
+def _fetched(tensors: Mapping[str, Any]) -> dict[str, np.ndarray]:
     """Return small tensors of equal shapes as arrays: one copy from each device waits for all of
     them.
     """
-    found: dict[str, np.ndarray] = {}
-    for device in {value.device for value in named.values()}:
-        own = {name: value for name, value in named.items() if value.device == device}
-        found.update(
-            zip(own, on_host(sys.modules["torch"].stack([*own.values()])).numpy(), strict=True)
-        )
-    return found
+    arrays: dict[str, np.ndarray] = {}
+    for device in {tensor.device for tensor in tensors.values()}:
+        names = [name for name, tensor in tensors.items() if tensor.device == device]
+        stacked = on_host(sys.modules["torch"].stack([tensors[name] for name in names])).numpy()
+        arrays.update(zip(names, stacked, strict=True))
+    return arrays

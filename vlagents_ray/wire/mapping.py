@@ -122,14 +122,15 @@ def each(top: Mapping[str, Any], name: str, read: Callable[[Any, str], T]) -> di
 def entry(cls: type[T], value: Any, where: str) -> T:
     """Return an entry of a mapping as the dataclass `cls`; a text is its key."""
     values = closed(cls, {"key": value} if isinstance(value, str) else value, where, ConfigError)
-    known = [one.name for one in fields(cls)]  # type: ignore[arg-type]
+    known = [field.name for field in fields(cls)]  # type: ignore[arg-type]
     if "key" in known and not values.get("key"):
         raise ConfigError(f"{where}: no key; say where it lies in their observation")
     if values.get("layout", "hwc") not in get_args(Layout):
         raise ConfigError(
             f"{where}.layout: got {values['layout']!r}, want one of {get_args(Layout)}"
         )
-    if "*" in (key := values.get("key", "")) and key.index("*") != len(key) - 1:
+    key = values.get("key", "")
+    if "*" in key and key.index("*") != len(key) - 1:
         raise ConfigError(f"{where}: got key {key!r}, want '*' at its end alone")
     if "open" in known and values.get("open", 1.0) == values.get("closed", 0.0):
         raise ConfigError(f"{where}: open and closed are the same, {values.get('open', 1.0)}")
@@ -141,29 +142,30 @@ def parts(value: Any, where: str) -> tuple[StateKey, ...]:
     values = value if isinstance(value, list) else [value]
     if not values:
         raise ConfigError(f"{where}: got an empty list, want one key at least")
-    return tuple(entry(StateKey, one, where) for one in values)
+    return tuple(entry(StateKey, item, where) for item in values)
 
 
 def text(value: Any, where: str) -> str:
+    """Return a value that must be text."""
     if not isinstance(value, str):
         raise ConfigError(f"{where}: got {type(value).__name__}, want text")
     return value
 
 
-def stated(value: Any) -> Any:
+def without_none(value: Any) -> Any:
     """Return `value` as plain JSON values, without fields that are None."""
     if isinstance(value, dict):
-        return {name: stated(item) for name, item in value.items() if item is not None}
-    return [stated(item) for item in value] if isinstance(value, (list, tuple)) else value
+        return {name: without_none(item) for name, item in value.items() if item is not None}
+    if isinstance(value, (list, tuple)):
+        return [without_none(item) for item in value]
+    return value
 
 
-# Paths into nested observations, such as `images/wrist`: either that key itself, or `wrist` within
-# `images`.
-#
-# `states|state` means the first of the two that exists.
+# The following functions use paths into nested observations. `images/wrist` is either that key
+# itself, or `wrist` within `images`; `states|state` is the first of the two that exists.
 
-_SHOWN = 40  # largest number of keys that an error lists, and of characters of a key
-_LONGEST = 200  # characters of a client's key that are compared
+_SHOWN = 40  # the largest number of keys that an error lists, and of characters of a key
+_LONGEST = 200  # the number of characters of a client's key that are compared
 
 
 def lookup(nested: Mapping[Any, Any], path: str) -> Any:
@@ -171,14 +173,19 @@ def lookup(nested: Mapping[Any, Any], path: str) -> Any:
     if path in nested:
         return nested[path]
     if "|" in path:
-        return next(
-            (value for one in path.split("|") if (value := lookup(nested, one)) is not None), None
-        )
+        for alternative in path.split("|"):
+            value = lookup(nested, alternative)
+            if value is not None:
+                return value
+        return None
+
     end = path.find("/")
     while end >= 0:
-        inside = nested.get(path[:end])
-        if isinstance(inside, Mapping) and (value := lookup(inside, path[end + 1 :])) is not None:
-            return value
+        inner = nested.get(path[:end])
+        if isinstance(inner, Mapping):
+            value = lookup(inner, path[end + 1 :])
+            if value is not None:
+                return value
         end = path.find("/", end + 1)
     return None
 
@@ -229,34 +236,36 @@ def pick(
     """
     if "*" not in key:
         value = lookup(flat, key)
-        there = [] if value is None or isinstance(value, Mapping) else [(name, key, value)]
-    else:
-        folder, _, last = key.rpartition("/")
-        inside = lookup(flat, folder) if folder else flat
-        prefix = last.removesuffix("*")
-        there = [
-            (
-                name.replace("*", theirs.removeprefix(prefix)),
-                f"{folder}/{theirs}".removeprefix("/"),
-                value,
-            )
-            for theirs, value in (inside.items() if isinstance(inside, Mapping) else ())
-            if isinstance(theirs, str) and theirs.startswith(prefix) and len(theirs) > len(prefix)
-        ]
-        optional = True
-    if not there and not optional:
-        raise missing(key, have=keys(flat))
-    return there
+        if value is not None and not isinstance(value, Mapping):
+            return [(name, key, value)]
+        if not optional:
+            raise missing(key, have=keys(flat))
+        return []
+
+    folder, _, last = key.rpartition("/")
+    inner = lookup(flat, folder) if folder else flat
+    if not isinstance(inner, Mapping):
+        return []
+    prefix = last.removesuffix("*")
+    picked = []
+    for their_name, value in inner.items():
+        if not isinstance(their_name, str) or not their_name.startswith(prefix):
+            continue
+        matched = their_name.removeprefix(prefix)
+        if matched:
+            path = f"{folder}/{their_name}".removeprefix("/")
+            picked.append((name.replace("*", matched), path, value))
+    return picked
 
 
-# Conversion of values in another system's observation to ours.
+# The following functions convert values in another system's observation to ours.
 
 
 def read_image(key: str, value: Any, layout: str, limits: MessageLimits) -> np.ndarray:
     """Return an image as (H, W, 3) uint8 RGB; raise `InvalidObservation` or `MessageTooLarge`."""
     if isinstance(value, np.ndarray):
         value = _newest(key, value, 3)
-        # As in openpi's own server (`_parse_image` in its policies): rounded down.
+        # Floats are rounded down, as in openpi's own server (`_parse_image` in its policies).
         if value.dtype.kind == "f":
             if value.size and not (value.min() >= 0 and value.max() <= 1):  # also true for NaN
                 raise InvalidObservation(
@@ -276,6 +285,7 @@ def read_image(key: str, value: Any, layout: str, limits: MessageLimits) -> np.n
 
 
 def may_be_camera(value: Any) -> bool:
+    """Return whether a value may be an image."""
     return isinstance(value, np.ndarray) and value.ndim >= 3
 
 
@@ -292,23 +302,25 @@ def read_state(
     """Return the state `name`, its parts concatenated, (D,) float32; several states if the name
     ends with `*`.
     """
-    joined: dict[str, list[np.ndarray]] = {}
-    for part in sources:
-        found = pick(flat, name, part.key, part.optional, MissingState)
-        for ours, key, value in found:
+    vectors_by_name: dict[str, list[np.ndarray]] = {}
+    for source in sources:
+        picked = pick(flat, name, source.key, source.optional, MissingState)
+        for our_name, key, value in picked:
             vector = read_vector(key, value, limits)
-            if part.stop is not None and part.stop > vector.size:
+            if source.stop is not None and source.stop > vector.size:
                 raise InvalidObservation(
-                    f"state {key!r}: got {vector.size} numbers, want {part.stop} at least"
+                    f"state {key!r}: got {vector.size} numbers, want {source.stop} at least"
                 )
-            joined.setdefault(ours, []).append(vector[part.start : part.stop])
+            vectors = vectors_by_name.setdefault(our_name, [])
+            vectors.append(vector[source.start : source.stop])
     return {
-        ours: vectors[0] if len(vectors) == 1 else np.concatenate(vectors)
-        for ours, vectors in joined.items()
+        our_name: vectors[0] if len(vectors) == 1 else np.concatenate(vectors)
+        for our_name, vectors in vectors_by_name.items()
     }
 
 
 def read_vector(key: str, value: Any, limits: MessageLimits) -> np.ndarray:
+    """Return a number, or a vector of numbers, as (D,) float32."""
     if isinstance(value, np.ndarray):
         value = np.atleast_1d(_newest(key, value, 1))
     elif isinstance(value, np.number):
@@ -367,11 +379,11 @@ class KeyMapping:
     """The key mapping of one system; the module's docstring describes its fields."""
 
     cameras: Mapping[str, CameraKey] = field(default_factory=dict)
-    # Concatenated in this order.
+    # The keys of each state, whose values are concatenated in this order.
     state: Mapping[str, tuple[StateKey, ...]] = field(default_factory=dict)
     gripper: GripperKey | None = None
     instruction: str | None = None
-    # By the integer that is sent in their place.
+    # The instructions by the integer that is sent in their place.
     instructions: Mapping[str, str] = field(default_factory=dict)
     info: Mapping[str, str] = field(default_factory=dict)  # all optional
     action: Mapping[str, ActionRange] = field(default_factory=dict)
@@ -388,6 +400,8 @@ class KeyMapping:
             raise ConfigError(f"mapping.instruction: got {type(instruction).__name__}, want a key")
         gripper = top.get("gripper")
         grippers = top.get("action_gripper") or []
+        if not isinstance(grippers, list):
+            grippers = [grippers]
         return cls(
             cameras=each(top, "cameras", lambda value, where: entry(CameraKey, value, where)),
             state=each(top, "state", parts),
@@ -397,8 +411,7 @@ class KeyMapping:
             info=each(top, "info", lambda value, where: entry(StateKey, value, where).key),
             action=each(top, "action", lambda value, where: entry(ActionRange, value, where)),
             action_gripper=tuple(
-                entry(ActionGripper, one, "mapping.action_gripper")
-                for one in (grippers if isinstance(grippers, list) else [grippers])
+                entry(ActionGripper, item, "mapping.action_gripper") for item in grippers
             ),
         )
 
@@ -406,9 +419,10 @@ class KeyMapping:
         """Return the mapping as plain JSON values for `from_json`, without fields that are not
         set.
         """
+        values = asdict(self)
         return {
-            name: stated(value)
-            for name, value in asdict(self).items()
+            name: without_none(value)
+            for name, value in values.items()
             if value not in (None, {}, ())
         }
 
@@ -435,6 +449,7 @@ class KeyMapping:
         for name, camera in self.cameras.items():
             for ours, key, value in pick(flat, name, camera.key, camera.optional, MissingCamera):
                 cameras[ours] = read_image(key, value, camera.layout, limits)
+
         state: dict[str, np.ndarray] = {}
         for name, sources in self.state.items():
             state |= read_state(flat, name, sources, limits)
@@ -443,14 +458,12 @@ class KeyMapping:
                 f"observation: got {len(cameras)} cameras and {len(state)} states, the limit is "
                 f"{limits.cameras}"
             )
-        info = {
-            name: value
-            for name, key in self.info.items()
-            if (value := lookup(flat, key)) is not None
-        }
-        gripper = self._opening(
-            flat, limits, needed=contract is not None and bool(contract.gripper)
-        )
+
+        info = {name: lookup(flat, key) for name, key in self.info.items()}
+        info = {name: value for name, value in info.items() if value is not None}
+        is_gripper_needed = contract is not None and bool(contract.gripper)
+        gripper = self._opening(flat, limits, needed=is_gripper_needed)
+
         obs = Obs(cameras, gripper, state, info)
         if not cameras or not state:
             self._require_read(flat, obs)
@@ -478,23 +491,25 @@ class KeyMapping:
         """Return our action, (D,) or (H, D), as (H, D) float32 with the gripper's commands in the
         client's convention.
 
-        `spec`, the action of the policy's contract, states the policy's own convention; without it,
-        the commands stay unchanged.
+        `spec`, the action of the policy's contract, has the policy's convention; without it, the
+        commands stay unchanged.
         """
         rows = np.atleast_2d(np.asarray(action, np.float32))
         if spec is None or spec.gripper_open is None or spec.gripper_closed is None:
             return rows
-        ours = spec.gripper_open - spec.gripper_closed
-        for one in self.action_gripper:
-            if (one.open, one.closed) == (spec.gripper_open, spec.gripper_closed):
+
+        our_range = spec.gripper_open - spec.gripper_closed
+        for gripper in self.action_gripper:
+            if (gripper.open, gripper.closed) == (spec.gripper_open, spec.gripper_closed):
                 continue
-            if not -rows.shape[1] <= one.index < rows.shape[1]:
+            index = gripper.index
+            if not -rows.shape[1] <= index < rows.shape[1]:
                 raise InvalidAction(
-                    f"action: got {rows.shape[1]} numbers a row, want a gripper's at {one.index}"
+                    f"action: got {rows.shape[1]} numbers a row, want a gripper's at {index}"
                 )
             rows = rows.copy()
-            opening = (rows[:, one.index] - spec.gripper_closed) / ours
-            rows[:, one.index] = one.closed + opening * (one.open - one.closed)
+            opening = (rows[:, index] - spec.gripper_closed) / our_range
+            rows[:, index] = gripper.closed + opening * (gripper.open - gripper.closed)
         return rows
 
     def actions(self, action: np.ndarray, spec: ActionSpec | None = None) -> dict[str, np.ndarray]:
@@ -508,7 +523,7 @@ class KeyMapping:
         """Return the columns of (H, D) rows, or of a row (D,), by the client's names; none if
         the mapping has none.
         """
-        return {name: rows[..., one.start : one.stop] for name, one in self.action.items()}
+        return {name: rows[..., span.start : span.stop] for name, span in self.action.items()}
 
     def lacks(self, contract: Contract | None) -> list[str]:
         """Return the policy's inputs that no observation of this mapping has, each as a sentence
@@ -516,36 +531,39 @@ class KeyMapping:
         """
         if contract is None:
             return []
-        found = [
-            (
-                f"{kind} {name!r}: the policy needs it, the mapping gives {sorted(given)}; add it "
-                f"to mapping.{field_}"
-            )
-            for kind, field_, needs, given in (
-                ("camera", "cameras", contract.cameras or {}, self.cameras),
-                ("state", "state", contract.state or {}, self.state),
-            )
-            for name in needs
-            if not any(matches(name, pattern) for pattern in given)
-        ]
+
+        sentences = []
+        for kind, setting, needed, patterns in (
+            ("camera", "cameras", contract.cameras or {}, self.cameras),
+            ("state", "state", contract.state or {}, self.state),
+        ):
+            for name in needed:
+                if not any(matches(name, pattern) for pattern in patterns):
+                    sentences.append(
+                        f"{kind} {name!r}: the policy needs it, the mapping gives "
+                        f"{sorted(patterns)}; add it to mapping.{setting}"
+                    )
         if contract.gripper and self.gripper is None:
-            found.append("gripper: the policy needs it, the mapping has none; add mapping.gripper")
+            sentences.append(
+                "gripper: the policy needs it, the mapping has none; add mapping.gripper"
+            )
         if contract.instruction and self.instruction is None:
-            found.append(
+            sentences.append(
                 "instruction: the policy needs one, the mapping has none; add mapping.instruction"
             )
+
         dim = contract.action.dim
-        last = max(
-            (one.index + 1 if one.index >= 0 else -one.index for one in self.action_gripper),
-            default=0,
-        )
-        last = max([last, *(max(one.start or 0, one.stop or 0) for one in self.action.values())])
-        if dim is not None and last > dim:
-            found.append(
-                f"action: the policy gives {dim} numbers a row, the mapping wants {last}; change "
-                "mapping.action"
+        mapped_dims = [0]
+        for gripper in self.action_gripper:
+            mapped_dims.append(gripper.index + 1 if gripper.index >= 0 else -gripper.index)
+        for span in self.action.values():
+            mapped_dims.append(max(span.start or 0, span.stop or 0))
+        if dim is not None and max(mapped_dims) > dim:
+            sentences.append(
+                f"action: the policy gives {dim} numbers a row, the mapping wants "
+                f"{max(mapped_dims)}; change mapping.action"
             )
-        return found
+        return sentences
 
     def warn_of_unread_cameras(self, flat: Mapping[str, Any], dialect: str) -> None:
         """Log the cameras of a client's observation that the mapping does not read, and the policy
@@ -554,47 +572,63 @@ class KeyMapping:
         A message is logged once for all clients of a dialect with the same cameras. This looks at
         each key: call it when a session begins, not for each observation.
         """
-        if unread := self._unread(flat, may_be_camera):
-            _log_unread(
-                dialect, tuple(unread), tuple(camera.key for camera in self.cameras.values())
-            )
+        unread = self._unread(flat, may_be_camera)
+        if unread:
+            _log_unread(dialect, tuple(unread), tuple(self._camera_keys()))
 
-    def _unread(self, flat: Mapping[str, Any], is_one: Callable[[Any], bool]) -> list[str]:
-        """Return the paths of the values for which `is_one` is true and which no key of the
+    def _camera_keys(self) -> list[str]:
+        """Return the client's keys of the cameras."""
+        return [camera.key for camera in self.cameras.values()]
+
+    def _state_keys(self) -> list[str]:
+        """Return the client's keys of the states."""
+        keys_of_states = []
+        for sources in self.state.values():
+            keys_of_states += [source.key for source in sources]
+        return keys_of_states
+
+    def _gripper_keys(self) -> list[str]:
+        """Return the client's key of the gripper, if there is one."""
+        return [] if self.gripper is None else [self.gripper.key]
+
+    def _unread(self, flat: Mapping[str, Any], is_relevant: Callable[[Any], bool]) -> list[str]:
+        """Return the paths of the values for which `is_relevant` is true and which no key of the
         mapping matches.
         """
-        known = [one.key for one in self.cameras.values()] + [
-            one.key for all_ in self.state.values() for one in all_
-        ]
-        known += [*self.info.values(), *([] if self.gripper is None else [self.gripper.key])]
-        patterns = [pattern for key in known for pattern in key.split("|")]
-        return [
-            short_path(path)
-            for path, value in islice(leaves(flat), _SHOWN)
-            if is_one(value) and not any(matches(path, pattern) for pattern in patterns)
-        ]
+        known = [*self._camera_keys(), *self._state_keys(), *self.info.values()]
+        known += self._gripper_keys()
+        patterns: list[str] = []
+        for key in known:
+            patterns += key.split("|")
+
+        unread = []
+        for path, value in islice(leaves(flat), _SHOWN):
+            if is_relevant(value) and not any(matches(path, pattern) for pattern in patterns):
+                unread.append(short_path(path))
+        return unread
 
     def _require_read(self, flat: Mapping[str, Any], obs: Obs) -> None:
         """Raise if `obs` has nothing of the client's observation, or none of its cameras or none
         of its states.
         """
-        images = [camera.key for camera in self.cameras.values()]
-        numbers = [part.key for sources in self.state.values() for part in sources]
-        known = [*images, *numbers, *([] if self.gripper is None else [self.gripper.key])]
+        camera_keys, state_keys = self._camera_keys(), self._state_keys()
+        known = [*camera_keys, *state_keys, *self._gripper_keys()]
         if known and not obs.cameras and not obs.state and obs.gripper is None:
             raise InvalidObservation(
                 f"observation: got {keys(flat)}, of which the mapping reads nothing; it looks for "
                 f"{known}: choose the preset of this client, or change the mapping"
             )
-        for kind, wanted, found, is_one in (
-            ("cameras", images, obs.cameras, may_be_camera),
-            ("state", numbers, obs.state, may_be_state),
+
+        for kind, mapped_keys, values, is_relevant in (
+            ("cameras", camera_keys, obs.cameras, may_be_camera),
+            ("state", state_keys, obs.state, may_be_state),
         ):
-            if wanted and not found and (lost := self._unread(flat, is_one)):
+            unread = self._unread(flat, is_relevant) if mapped_keys and not values else []
+            if unread:
                 raise InvalidObservation(
-                    f"observation: got {lost}, which the mapping does not read, and nothing at "
-                    f"{wanted}; add them to mapping.{kind}, or to mapping.info if the policy does "
-                    "without"
+                    f"observation: got {unread}, which the mapping does not read, and nothing at "
+                    f"{mapped_keys}; add them to mapping.{kind}, or to mapping.info if the policy "
+                    "does without"
                 )
 
     def _opening(
@@ -603,17 +637,21 @@ class KeyMapping:
         """Return the gripper's opening in [0, 1], 1 = open; None if it is missing, or invalid
         and not `needed`.
         """
-        if (gripper := self.gripper) is None:
+        gripper = self.gripper
+        if gripper is None:
             return None
-        if (value := lookup(flat, gripper.key)) is None:
+        value = lookup(flat, gripper.key)
+        if value is None:
             if gripper.optional:
                 return None
             raise MissingState(gripper.key, have=keys(flat))
+
         vector = read_vector(gripper.key, value, limits)
         if not -vector.size <= gripper.index < vector.size:
             raise InvalidObservation(
                 f"{gripper.key!r}: got {vector.size} numbers, want the gripper's at {gripper.index}"
             )
+
         reading = float(vector[gripper.index])
         opening = (reading - gripper.closed) / (gripper.open - gripper.closed)
         if not -_OVERSHOOT <= opening <= 1 + _OVERSHOOT:  # also true for NaN
@@ -628,6 +666,7 @@ class KeyMapping:
 
 @lru_cache(maxsize=64)  # each message is logged once
 def _log_unread(dialect: str, unread: tuple[str, ...], read: tuple[str, ...]) -> None:
+    """Log the cameras of a client that the mapping does not read."""
     logger.warning(
         f"{dialect}: a client sends the cameras {list(unread)}, which the policy does not get: the "
         f"mapping reads {list(read)}; if the policy takes them, add them to mapping.cameras"

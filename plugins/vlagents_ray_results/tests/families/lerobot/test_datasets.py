@@ -118,7 +118,11 @@ def test_lerobot_reads_what_a_human_corrected(tmp_path: Path) -> None:
                     human = i >= 3
                     wanted = np.full(2, -i, np.float32) if i == 3 else None
                     recorder.add(
-                        obs, np.full(2, i, np.float32), tick=i, intervention=human, policy_action=wanted
+                        obs,
+                        np.full(2, i, np.float32),
+                        tick=i,
+                        intervention=human,
+                        policy_action=wanted,
                     )
                 recorder.label(label)  # type: ignore[arg-type]
     dataset = LeRobotDataset("corrections/cups", root=tmp_path / "dataset")
