@@ -147,7 +147,7 @@ def test_helpers_keep_off_the_callers_core_but_not_off_all_others(
     thread_map.thread_map(lambda _: together.wait(WAIT_S), [0] * together.parties, MUCH)
     may = os.sched_getaffinity(0)
     for core in may:
-        monkeypatch.setattr(thread_map, "here", lambda core=core: core)
+        monkeypatch.setattr(thread_map, "current_core", lambda core=core: core)
         thread_map.thread_map(abs, [1, 2], MUCH)
         affinities = [os.sched_getaffinity(helper.native_id or 0) for helper in helpers()]
         assert affinities == [may - {core}] * thread_map._MOST_HELPERS

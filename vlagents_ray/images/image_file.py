@@ -240,9 +240,9 @@ def _check_size(
             f"image: declares {height}x{width} pixels, the limit is {max_pixels}; send a smaller "
             "one, or raise `limits.pixels`"
         )
-    most = 2 * pixel_bytes * height * width + _MOST_METADATA
-    if file_bytes > most:
+    max_bytes = 2 * pixel_bytes * height * width + _MOST_METADATA
+    if file_bytes > max_bytes:
         raise MessageTooLarge(
             f"image: a file of {file_bytes} bytes for {height}x{width} pixels, the limit is "
-            f"{most}; encode it again without metadata"
+            f"{max_bytes}; encode it again without metadata"
         )

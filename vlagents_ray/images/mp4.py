@@ -51,16 +51,16 @@ class Mp4:
         self._av: Any = require("av")
         self._shape = shape
         height, width = shape[:2]
-        # yuv420p halves both dimensions.
+        # The pixel format yuv420p halves both dimensions, so these must be even.
         self._pad = (0, 0) if lossless else (height % 2, width % 2)
-        self._container = self._av.open(
-            target if isinstance(target, io.BytesIO) else str(target), "w", format="mp4"
-        )
-        options = {
-            "preset": "ultrafast",
-            "threads": "1",
-            **({"qp": "0"} if lossless else {"crf": "23"}),
-        }
+        file = target if isinstance(target, io.BytesIO) else str(target)
+        self._container = self._av.open(file, "w", format="mp4")
+
+        options = {"preset": "ultrafast", "threads": "1"}
+        if lossless:
+            options["qp"] = "0"
+        else:
+            options["crf"] = "23"
         if key_frames is not None:
             options["g"] = str(key_frames)
         self._stream = self._container.add_stream(
@@ -68,6 +68,7 @@ class Mp4:
             rate=Fraction(fps).limit_denominator(1000),
             options=options,
         )
+
         # Unless the video is lossless, the last row or column of an odd image is repeated.
         self.size = self._stream.height, self._stream.width = (
             height + self._pad[0],

@@ -14,15 +14,22 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from functools import cache
 from typing import TypeVar
 
-here: Callable[[], int] = lambda: -1  # noqa: E731
+
+def _unknown_core() -> int:
+    return -1
+
+
+current_core: Callable[[], int] = _unknown_core
 """Return the core on which the calling thread runs; -1 if it is not known."""
 if hasattr(os, "sched_setaffinity"):
-    here = getattr(ctypes.CDLL(None), "sched_getcpu", here)
+    current_core = getattr(ctypes.CDLL(None), "sched_getcpu", _unknown_core)
 
 
 def allowed() -> int:
     """Return the number of cores that this thread may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
 
 
 Item = TypeVar("Item")
@@ -45,11 +52,13 @@ def thread_map(
     threads = min(len(items), allowed(), MOST_THREADS)
     if threads < 2 or work_s < _LEAST_WORK_S:
         return [function(item) for item in items]
+
     todo = iter(range(len(items)))  # shared by all threads, so that a late helper delays nothing
     results: dict[int, Result] = {}
     errors: dict[int, BaseException] = {}
 
     def work() -> None:
+        """Compute the next items until none is left."""
         for index in todo:
             try:
                 results[index] = function(items[index])
@@ -57,12 +66,13 @@ def thread_map(
                 errors[index] = error
 
     helpers = _helpers(os.getpid())
-    helpers.keep_off(here())
+    helpers.keep_off(current_core())
     helping: list[Future[None]] = []
     with contextlib.suppress(RuntimeError):  # while the interpreter exits, the caller works alone
         for _ in range(threads - 1):
             helping.append(helpers.submit(work))
     work()
+
     for helper in helping:
         if not helper.cancel():  # it has begun: `items` are in use until it ends
             helper.result()
@@ -81,7 +91,7 @@ class _Helpers(ThreadPoolExecutor):
     def __init__(self) -> None:
         super().__init__(_MOST_HELPERS, "vlagents-ray-images", initializer=self._started)
         self._ids: list[int] = []
-        self._cores: set[int] = set()  # on which the threads may run
+        self._cores: set[int] = set()  # the cores on which the threads may run
 
     def _started(self) -> None:
         self._ids.append(threading.get_native_id())

@@ -110,7 +110,7 @@ def unpack(
 
 def parse_json(
     text: Buffer | str,
-    what: str,
+    beginning: str,
     pairs: Callable[[list[tuple[str, Any]]], Any] | None = None,
     *,
     budget: Budget | None = None,
@@ -120,7 +120,7 @@ def parse_json(
 
     Args:
         text: The text; bytes are UTF-8.
-        what: The beginning of the error message, such as "obs:".
+        beginning: The beginning of the error message, such as "obs:".
         pairs: Converts the keys and values of each object; its `ValueError`s become
             `MalformedMessage`.
         budget: The budget to charge before a long text is parsed.
@@ -155,7 +155,7 @@ def parse_json(
             # This raises an error for an unpaired surrogate.
             json.dumps(value, ensure_ascii=False).encode()
     except (ValueError, RecursionError) as error:
-        raise MalformedMessage(f"{what} not JSON ({error})") from error
+        raise MalformedMessage(f"{beginning} not JSON ({error})") from error
     return value
 
 

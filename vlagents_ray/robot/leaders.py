@@ -62,13 +62,15 @@ def leader_named(option: str, name: str) -> OpenLeader:
     if ":" in name:
         make = import_class(option, name, LEADER)
 
-        def open_own(
+        def open_class(
             contract: Contract | None, /, *, step: float | None, measure: Measure | None
         ) -> AbstractContextManager[Leader]:
+            """Make a leader of the user's class."""
             del contract, step, measure  # a class of the user's has its own settings
             return _opened(f"{option} {name}", make)
 
-        return open_own
+        return open_class
+
     open_leader: OpenLeader = registered_function("leaders", name)
     return open_leader
 

@@ -38,8 +38,8 @@ class Pacer:
             raise ConfigError(f"hz: got {hz}, want a rate above 0")
         self.period_s = 1.0 / hz
         self.missed = 0
-        self.ticks = 0  # ticks that began
-        # Lateness of the last ticks that began.
+        self.ticks = 0  # the number of ticks that began
+        # The lateness of the last ticks that began, s.
         self.late_s: deque[float] = deque(maxlen=KEPT_TICKS)
         self._begin = time.perf_counter()
         self._tick = -1
@@ -107,23 +107,30 @@ def undisturbed(*, real_time: bool = False) -> Iterator[list[str]]:
     0.6 ms with the priority, 0.02 ms with SCHED_FIFO; beside a busy Python thread of the same
     process 5.3 ms without, 1.3 ms with them.
     """
-    collects, switch_s, frozen = gc.isenabled(), sys.getswitchinterval(), gc.get_freeze_count() > 0
+    was_collecting = gc.isenabled()
+    had_frozen_objects = gc.get_freeze_count() > 0
+    switch_interval_s = sys.getswitchinterval()
+
     gc.collect()
     gc.freeze()
     gc.disable()
     sys.setswitchinterval(_SWITCH_S)
-    done = ["garbage collection off", "switch interval 0.5 ms"]
+    measures = ["garbage collection off", "switch interval 0.5 ms"]
+
     with contextlib.ExitStack() as undo:
-        if not frozen:  # else the process itself froze objects, which `unfreeze` would undo
+        if (
+            not had_frozen_objects
+        ):  # else the process itself froze objects, which `unfreeze` would undo
             undo.callback(gc.unfreeze)
-        if collects:
+        if was_collecting:
             undo.callback(gc.enable)
-        undo.callback(sys.setswitchinterval, switch_s)
-        done.append(_prioritise(real_time, undo))
-        yield done
+        undo.callback(sys.setswitchinterval, switch_interval_s)
+        measures.append(_prioritise(real_time, undo))
+        yield measures
 
 
 def _prioritise(real_time: bool, undo: contextlib.ExitStack) -> str:
+    """Raise the priority of the calling thread, and return the measure in words."""
     if not sys.platform.startswith("linux"):  # elsewhere both calls do not act on a thread
         return "no priority (only on Linux)"
     thread = threading.get_native_id()

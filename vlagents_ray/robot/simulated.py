@@ -39,34 +39,36 @@ class SimulatedRobot:
         }
         # Gradients with a little noise, which codecs compress like a camera's.
         self._pictures: dict[str, np.ndarray] = {}
-        for name, camera in (
-            contract.cameras or {"front": CameraSpec(), "wrist": CameraSpec()}
-        ).items():
+        cameras = contract.cameras or {"front": CameraSpec(), "wrist": CameraSpec()}
+        for name, camera in cameras.items():
             height, width = camera.height or _SIDE, camera.width or _SIDE
             y, x = np.mgrid[:height, :width]
             noise = np.random.default_rng(0).integers(0, 8, (height, width))
             channels = [x * 200 // width + noise, y * 200 // height + noise, (x + y) % 160 + noise]
             self._pictures[name] = np.stack(channels, -1).astype(np.uint8)
+
         self._joints = np.zeros(self._action.dim or 7, np.float32)
         self._grippers = self._action.gripper_columns(len(self._joints))
         self._target = self._joints.copy()
-        self.applied = 0  # actions
+        self.applied = 0  # the number of applied actions
         self.stopped = False
 
     def observe(self) -> Obs:
         """Return the current state, in new arrays each time."""
         self._joints = self._joints + _SMOOTHING * (self._target - self._joints)
-        state = {
-            name: np.resize(self._joints, dim if dim is not None else len(self._joints)).astype(
-                np.float32
-            )
-            for name, dim in self._parts.items()
-        }
-        opened, closed, opening = self._action.gripper_open, self._action.gripper_closed, 1.0
+        state: dict[str, np.ndarray] = {}
+        for name, dim in self._parts.items():
+            size = len(self._joints) if dim is None else dim
+            state[name] = np.resize(self._joints, size).astype(np.float32)
+
+        opened, closed = self._action.gripper_open, self._action.gripper_closed
+        opening = 1.0
         if opened is not None and closed is not None and opened != closed:
             position = float(self._joints[self._grippers].mean())
             opening = min(1.0, max(0.0, (position - closed) / (opened - closed)))
-        images = {name: still.copy() for name, still in self._pictures.items()}
+
+        # A red dot moves with the first joint.
+        images = {name: picture.copy() for name, picture in self._pictures.items()}
         turn = float(self._joints[0])
         for image in images.values():
             height, width = image.shape[:2]
@@ -86,9 +88,9 @@ class SimulatedRobot:
 
     def stop(self) -> None:
         """Make the current position of the joints their target; the grippers keep their grasp."""
-        held = self._joints.copy()
-        held[self._grippers] = self._target[self._grippers]
-        self._target = held
+        target = self._joints.copy()
+        target[self._grippers] = self._target[self._grippers]
+        self._target = target
         self.stopped = True
 
 

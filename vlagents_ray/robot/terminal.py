@@ -36,8 +36,9 @@ class Terminal:
                 "terminal: got no terminal, want one to read keys from; run this in one"
             )
         self.descriptor = descriptor
-        about = os.fstat(descriptor)
-        self._own = self._consumers.setdefault((about.st_dev, about.st_ino), [])
+        status = os.fstat(descriptor)
+        # The consumers of this terminal, oldest first, which all objects of it share.
+        self._own_consumers = self._consumers.setdefault((status.st_dev, status.st_ino), [])
 
     @contextlib.contextmanager
     def keys_at_once(self) -> Iterator[None]:
@@ -61,23 +62,23 @@ class Terminal:
         all others.
         """
         with self._lock:
-            self._own.insert(0 if last else len(self._own), consumer)
+            self._own_consumers.insert(0 if last else len(self._own_consumers), consumer)
         try:
             yield
         finally:
             with self._lock:
-                self._own.remove(consumer)
+                self._own_consumers.remove(consumer)
 
     def read(self, consumer: Consumer) -> bool:
         """Pass typed keys to their consumers, if this one is the newest; return whether the
         terminal is open.
         """
         with self._lock:
-            if consumer not in self._own:
+            if consumer not in self._own_consumers:
                 raise ConfigError(
                     "terminal: this consumer has not begun; want `with` around its use"
                 )
-            if self._own[-1] != consumer:
+            if self._own_consumers[-1] != consumer:
                 return True
             while self._is_in_foreground() and select.select([self.descriptor], [], [], 0)[0]:
                 typed = b""
@@ -86,8 +87,14 @@ class Terminal:
                 if not typed:
                     return False
                 for key in typed.decode(errors="replace").lower().replace("\r", "\n"):
-                    any(one(key) for one in reversed(self._own))
+                    self._pass_key(key)
             return True
+
+    def _pass_key(self, key: str) -> None:
+        """Pass a key to the consumers, the newest first, until one has a meaning for it."""
+        for consumer in reversed(self._own_consumers):
+            if consumer(key):
+                return
 
     @contextlib.contextmanager
     def read_in_background(self, consumer: Consumer) -> Iterator[None]:
@@ -95,6 +102,7 @@ class Terminal:
         over = threading.Event()
 
         def read() -> None:
+            """Read keys until the context ends."""
             while self.read(consumer) and not over.wait(0.1):
                 pass
 

@@ -130,13 +130,18 @@ class Watchdog:
             The reason, or None; and the time, s, until the next limit may be over, or None.
         """
         with self._changed:
-            now, silent = time.monotonic(), self.control.silent
-            waiting = {
-                n: self._heard[n] + s - now for n, s in self._limits.items() if n not in silent
-            }
-            name = min(waiting, key=lambda n: waiting[n]) if waiting else None
-            if name is None or waiting[name] > 0:
-                return None, None if name is None else waiting[name]
+            now = time.monotonic()
+            silent = self.control.silent
+            left_s: dict[str, float] = {}
+            for name, limit_s in self._limits.items():
+                if name not in silent:
+                    left_s[name] = self._heard[name] + limit_s - now
+            if not left_s:
+                return None, None
+
+            name = min(left_s, key=lambda source: left_s[source])
+            if left_s[name] > 0:
+                return None, left_s[name]
             reason = f"{name}: silent for {now - self._heard[name]:.2f} s"
             self.control.stop(reason, silent=name)
             return reason, None
@@ -151,6 +156,7 @@ class Watchdog:
             self.error = error
 
     def _watch(self) -> None:
+        """Stop the robot at each silence, until the watchdog is closed."""
         me = threading.current_thread()
         while True:
             with self._changed:

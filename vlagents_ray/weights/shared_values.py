@@ -64,22 +64,27 @@ class SharedValues:
         """Return JSON values of all but `others`, from which `from_json` makes the handles
         again.
         """
-        storages = {
-            key: [one.allocation.hex(), one.size, one.begin, one.counters.hex(), one.counter]
-            for key, one in self.storages.items()
-        }
-        views = {name: astuple(one) for name, one in self.views.items()}
+        storages = {}
+        for address, handle in self.storages.items():
+            storages[address] = [
+                handle.allocation.hex(),
+                handle.size,
+                handle.begin,
+                handle.counters.hex(),
+                handle.counter,
+            ]
+        views = {name: astuple(view) for name, view in self.views.items()}
         return {"gpu": self.gpu, "storages": storages, "views": views}
 
     @classmethod
     def from_json(cls, node: dict[str, Any], others: Mapping[str, Any]) -> SharedValues:
         """Return the handles that `to_json` described, with the other values."""
-        storages = {
-            int(key): StorageHandle(
+        storages = {}
+        for address, fields in node["storages"].items():
+            allocation, size, begin, counters, counter = fields
+            storages[int(address)] = StorageHandle(
                 bytes.fromhex(allocation), size, begin, bytes.fromhex(counters), counter
             )
-            for key, (allocation, size, begin, counters, counter) in node["storages"].items()
-        }
         views = {
             name: ValueView(storage, dtype, begin, tuple(shape), tuple(stride))
             for name, (storage, dtype, begin, shape, stride) in node["views"].items()
@@ -302,9 +307,11 @@ class _GpuMemory:
         """
         cuda = sys.modules["torch"].cuda
         uuids = [self._uuid(device) for device in range(cuda.device_count())]
-        own = uuids.index(gpu)
+        index = uuids.index(gpu)
         return tuple(
-            uuids[i] for i in range(len(uuids)) if i == own or cuda.can_device_access_peer(own, i)
+            uuid
+            for i, uuid in enumerate(uuids)
+            if i == index or cuda.can_device_access_peer(index, i)
         )
 
     @staticmethod

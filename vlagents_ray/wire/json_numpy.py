@@ -51,7 +51,8 @@ def rows(value: list[Any]) -> np.ndarray:
     make none.
     """
     if value and all(isinstance(row, np.ndarray) for row in value):
-        if len(shapes := {row.shape for row in value}) != 1:
+        shapes = {row.shape for row in value}
+        if len(shapes) != 1:
             raise MalformedMessage(
                 f"action: got rows of the shapes {sorted(shapes)[:8]}, want the same in all"
             )
@@ -65,20 +66,21 @@ def rows(value: list[Any]) -> np.ndarray:
     return array
 
 
-def decode_base64(data: object, what: str) -> bytes:
-    """Decode base64 in the standard or the URL-safe alphabet; `what` is the name of the data in
+def decode_base64(data: object, name: str) -> bytes:
+    """Decode base64 in the standard or the URL-safe alphabet; `name` is that of the data in
     errors.
     """
     if not isinstance(data, str):
-        raise MalformedMessage(f"{what}: got {type(data).__name__}, want base64")
+        raise MalformedMessage(f"{name}: got {type(data).__name__}, want base64")
     try:
         altchars = b"-_" if "-" in data or "_" in data else None
         return base64.b64decode(data, altchars, validate=True)
     except (binascii.Error, ValueError) as error:
-        raise MalformedMessage(f"{what}: not base64 ({error})") from error
+        raise MalformedMessage(f"{name}: not base64 ({error})") from error
 
 
 def _hook(node: dict[str, Any]) -> Any:
+    """Return the array that an object describes, or the object itself."""
     if "__numpy__" not in node:
         return node
     if node.keys() != _KEYS:
@@ -87,6 +89,7 @@ def _hook(node: dict[str, Any]) -> Any:
 
 
 def _plain(value: Any) -> Any:
+    """Convert a value that JSON lacks to one that it has."""
     if isinstance(value, (np.ndarray, np.generic)):
         if value.dtype.kind not in "biuf":
             raise InvalidInput(f"document: got dtype {value.dtype}, want bool, integers or floats")
