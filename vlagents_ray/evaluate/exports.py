@@ -160,11 +160,11 @@ def rows(results: Results, *, flat: bool = False) -> Iterator[dict[str, Any]]:
     """
     for case in results.cases:
         for episode in case.episodes:
-            row = {column.name: column.value(case, episode) for column in COLUMNS}
-            yield row | {name: canonical(row[name]) for name in _JSON if flat}
-
-
-_JSON = {column.name for column in COLUMNS if column.type == "json"}
+            row = {}
+            for column in COLUMNS:
+                value = column.value(case, episode)
+                row[column.name] = canonical(value) if flat and column.type == "json" else value
+            yield row
 
 
 def to_json(results: Results, path: Path) -> int:
@@ -172,12 +172,11 @@ def to_json(results: Results, path: Path) -> int:
     number of episodes.
     """
     require_folder_of(path)
-    found = list(rows(results))
-    with whole(path) as part:
-        part.write_text(
-            json.dumps(found, indent=1, default=_text, ensure_ascii=False) + "\n", encoding="utf-8"
-        )
-    return len(found)
+    episodes = list(rows(results))
+    text = json.dumps(episodes, indent=1, default=_text, ensure_ascii=False)
+    with whole(path) as temporary:
+        temporary.write_text(text + "\n", encoding="utf-8")
+    return len(episodes)
 
 
 def to_csv(results: Results, path: Path) -> int:
@@ -188,19 +187,17 @@ def to_csv(results: Results, path: Path) -> int:
     """
     require_folder_of(path)
     number = 0
-    with whole(path) as part, part.open("w", encoding="utf-8", newline="") as file:
+    with whole(path) as temporary, temporary.open("w", encoding="utf-8", newline="") as file:
         writer = csv.DictWriter(file, [column.name for column in COLUMNS])
         writer.writeheader()
-        for number, row in enumerate(rows(results, flat=True), 1):  # noqa: B007 - the last one counts
-            row |= {
-                name: str(value).lower() for name, value in row.items() if isinstance(value, bool)
-            }
-            writer.writerow(
-                {
-                    name: _text(one) if isinstance(one, datetime) else one
-                    for name, one in row.items()
-                }
-            )
+        for row in rows(results, flat=True):
+            for name, value in row.items():
+                if isinstance(value, bool):
+                    row[name] = str(value).lower()
+                elif isinstance(value, datetime):
+                    row[name] = _text(value)
+            writer.writerow(row)
+            number += 1
     return number
 
 

@@ -97,23 +97,30 @@ def find(results: Results, name: str | None) -> Recorded:
     Raises `ConfigError` if no name is given, if there is none, if there are several, or if it
     failed by infrastructure.
     """
-    found = [
-        Recorded(results, case, one)
-        for case in results.cases
-        for one in case.episodes
-        if name
-        in (one.result.full_key, str(one.result.key), f"{case.env}#{one.result.key.episode}")
-    ]
-    if not found:
-        have = [one.result.full_key for case in results.cases for one in case.episodes][:_FEW]
-        got = "got no episode" if name is None else f"has no episode {name!r}"
-        raise ConfigError(f"{results.out}: {got}, want a key as {have}, or ENV#NUMBER")
-    if len(found) > 1:
-        keys = [f"{one.episode.result.full_key} ({one.case.contender})" for one in found]
-        raise ConfigError(f"{name!r} stands for {len(found)} episodes; want one of the keys {keys}")
-    if found[0].episode.result.status == "infra_failed":
-        raise ConfigError(f"{name!r} was never played to its end: {found[0].episode.result.error}")
-    return found[0]
+    matching = []
+    for case in results.cases:
+        for episode in case.episodes:
+            result = episode.result
+            names = (result.full_key, str(result.key), f"{case.env}#{result.key.episode}")
+            if name in names:
+                matching.append(Recorded(results, case, episode))
+
+    if not matching:
+        examples = [episode.result.full_key for episode in results.episodes[:_FEW]]
+        problem = "got no episode" if name is None else f"has no episode {name!r}"
+        raise ConfigError(f"{results.out}: {problem}, want a key as {examples}, or ENV#NUMBER")
+    if len(matching) > 1:
+        keys = [
+            f"{recorded.episode.result.full_key} ({recorded.case.contender})"
+            for recorded in matching
+        ]
+        raise ConfigError(
+            f"{name!r} stands for {len(matching)} episodes; want one of the keys {keys}"
+        )
+    [recorded] = matching
+    if recorded.episode.result.status == "infra_failed":
+        raise ConfigError(f"{name!r} was never played to its end: {recorded.episode.result.error}")
+    return recorded
 
 
 def compare(recorded: Recorded, replayed: Results) -> list[str]:

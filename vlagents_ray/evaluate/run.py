@@ -190,30 +190,32 @@ class _Run:
     def __post_init__(self) -> None:
         config, store = self.config, self.store
         self._attempts = FailedAttempts(config)
-        self._checked_gpus = not config.workers  # when an env first drew
-        earlier = {case.case_id: case for case in Results.load(config.out).cases}
+        self._checked_gpus = not config.workers  # set when an env has first drawn
+        results = Results.load(config.out)
+        earlier = {case.case_id: case for case in results.cases}
         self._recorded = {
-            case: rate_of([results], "success_once") for case, results in earlier.items()
+            case_id: rate_of([case], "success_once") for case_id, case in earlier.items()
         }
-        # Steps and digest of the actions.
+        # The number of steps, and the digest of the actions, of episodes whose simulation diverged.
         self._diverged: dict[EpisodeKey, tuple[int, str | None]] = {}
-        self._stopping: dict[str, Stopping] = {}
+
+        self._stopping: dict[str, Stopping] = {}  # by case
         if config.stop is not None:
             for case in store.cases:
                 stopping = Stopping(config.stop, case.suite.seeds, case.planned)
                 stopping.add_all(episode.result for episode in earlier[case.fingerprint].episodes)
                 self._stopping[case.fingerprint] = stopping
+
         finished = store.finished()
-        wanted = [
-            job for job in plan(store.cases) if self.only in (None, (job.key.episode, job.key.seed))
-        ]
-        pending = [
-            job for job in wanted if str(job.key) not in finished and not self._has_stopped(job)
-        ]
+        pending = []
+        for job in plan(store.cases):
+            is_selected = self.only in (None, (job.key.episode, job.key.seed))
+            if is_selected and str(job.key) not in finished and not self._has_stopped(job):
+                pending.append(job)
         self._queue = JobQueue(pending)
         self._left = Counter(job.key.settings for job in pending)  # by case
-        played = (one.result.seconds for case in earlier.values() for one in case.episodes)
-        self._deadline = Deadline(self.end_at, played)
+        durations_s = (episode.result.seconds for episode in results.episodes)
+        self._deadline = Deadline(self.end_at, durations_s)
 
     def play(self, factory: AgentFactory) -> tuple[str, Summary]:
         """Play all queued episodes, until a signal or the deadline ends the run; returns its state
@@ -287,18 +289,20 @@ class _Run:
                 from vlagents_ray.evaluate.workers.cluster import unused_gpus
 
                 self._checked_gpus = True
-                if (hint := unused_gpus(job.case, report.worker)) is not None:
+                hint = unused_gpus(job.case, report.worker)
+                if hint is not None:
                     log.warning(hint)
+
         if report.failure is not None:
             self._failed(job, report.failure)
         elif report.result is not None:
             if report.result.status != "policy_error":
                 self._attempts.note_played()
-            if (reason := report.artifacts.not_repeatable) is not None:
+            reason = report.artifacts.not_repeatable
+            if reason is not None:
                 log.warning(
                     "%s: nothing of it is recorded, as its actions do not repeat it in the "
-                    "simulator: %s; its worker "
-                    "renders further episodes as they are played",
+                    "simulator: %s; its worker renders further episodes as they are played",
                     job.key,
                     reason,
                 )
@@ -309,8 +313,9 @@ class _Run:
     def _failed(self, job: Job, failure: Failure) -> None:
         if self._diverged_again(job, failure):
             return
-        beyond = self._has_stopped(job)  # it is no longer needed
-        retried = self._attempts.repeats(job, failure) and not beyond
+
+        is_needed = not self._has_stopped(job)
+        retried = is_needed and self._attempts.repeats(job, failure)
         self.store.record_attempt(job, failure, retried=retried)
         if failure.cause == "user":
             raise from_code(failure.code, failure.message)
@@ -318,7 +323,7 @@ class _Run:
             self._queue.put_back(job.again(alone=failure.names_no_episode))
             self.progress.retry(job, failure)
             return
-        if beyond:
+        if not is_needed:
             return
         lost = EpisodeResult(job.key, "infra_failed", error=f"{failure.code}: {failure.message}")
         self._record(job, lost, Artifacts())
@@ -378,16 +383,17 @@ class Deadline:
         self._end_at = end_at
         self._longest_s = max(known_s, default=0.0)
         self._now = now
-        self._begun: dict[EpisodeKey, float] = {}
+        self._starts: dict[EpisodeKey, float] = {}  # of the episodes that are being played
 
     def begin(self, jobs: Iterable[Job]) -> None:
         """Note that a worker begins these episodes."""
-        self._begun |= dict.fromkeys((job.key for job in jobs), self._now())
+        self._starts |= dict.fromkeys((job.key for job in jobs), self._now())
 
     def end(self, job: Job) -> None:
         """Note that an attempt at this episode has ended, successful or not."""
-        if (begun := self._begun.pop(job.key, None)) is not None:
-            self._longest_s = max(self._longest_s, self._now() - begun)
+        start = self._starts.pop(job.key, None)
+        if start is not None:
+            self._longest_s = max(self._longest_s, self._now() - start)
 
     @property
     def leaves_room(self) -> bool:

@@ -55,16 +55,18 @@ class EvalCase:
 
     @property
     def policy_options(self) -> dict[str, Any]:
+        """The options of each reset of the policy."""
         return self.policy.options | ({"checkpoint_step": self.step} if self.policy.steps else {})
 
     @property
     def settings(self) -> dict[str, Any]:
         """All that an episode depends on, apart from its number and seed."""
-        pushed, robot = self.policy.pushed_weights, {}
+        pushed = self.policy.pushed_weights
+        robot = {}
         if self.robot is not None:
-            settings, task = self.on_robot
-            stated = settings.model_dump(exclude={"tasks", "key", "accept_misfit"})
-            robot = {"robot": stated | {"task": task.model_dump()}}
+            config, task = self.on_robot
+            settings = config.model_dump(exclude={"tasks", "key", "accept_misfit"})
+            robot = {"robot": settings | {"task": task.model_dump()}}
         return robot | {
             "pushed_weights": None if pushed is None else pushed.model_dump(),
             "env": self.env,
@@ -106,6 +108,7 @@ class EvalCase:
 
     @property
     def planned(self) -> int:
+        """The number of its episodes, for all seeds together."""
         return self.suite.episodes * len(self.suite.seeds)
 
 
@@ -115,27 +118,24 @@ def env_program(case: EvalCase, code: Callable[[str], Program] = code_of_class) 
     """
     if case.robot is not None:
         return code(case.on_robot[0].arm or "")
+
     cls = env_class(case.env)
-    settings = with_defaults(cls, case.suite.env_options) | {
-        "reset_options": case.suite.reset_options
-    }
+    program = dict(code(f"{cls.__module__}:{cls.__name__}"))
+
+    # The module that registers the id of an environment of Gymnasium.
     task = env_task(case.env) or ""
-    # Of an id of Gymnasium; this module registers it.
     namespace = task.rpartition(":")[0] or task.rpartition("/")[0]
-    modules = [
-        f"{cls.__module__}:{cls.__name__}",
-        case.suite.env_options.get("module") or namespace,
-    ]
-    found = {
-        name: digest
-        for module in modules
-        if isinstance(module, str)
-        for name, digest in code(module).items()
-    }
-    return found | files_named(settings, folders=False)
+    module = case.suite.env_options.get("module") or namespace
+    if isinstance(module, str):
+        program |= code(module)
+
+    settings = with_defaults(cls, case.suite.env_options)
+    settings |= {"reset_options": case.suite.reset_options}
+    return program | files_named(settings, folders=False)
 
 
 def contender(policy: str, step: int | None) -> str:
+    """Return the policy id of a policy at a step: "pi0", or "pi0@20000" in a sweep."""
     return policy if step is None else f"{policy}@{step}"
 
 
@@ -147,45 +147,65 @@ def plan_cases(config: EvalConfig) -> list[EvalCase]:
     names that differ only in characters that file names cannot have, as their episodes would have
     the same files.
     """
-    robot, envs = config.real_robot, []
+    robot = config.real_robot
+    envs: list[tuple[SuiteConfig, str]] = []
     for suite in config.suites:
         for pattern in suite.envs:
-            tasks = expand(pattern) if robot is None else fnmatch.filter(robot.tasks, pattern)
-            if robot is not None and not tasks:
-                have = sorted(robot.tasks)
-                raise UnknownEnv(
-                    f"{pattern!r}: matches none of the plan's `robot.tasks`, which are {have}"
-                )
-            envs += [(suite, env) for env in tasks]
-    contenders: list[tuple[PolicyConfig, int | None]] = []
+            names = expand(pattern) if robot is None else _tasks_of_robot(robot, pattern)
+            envs += [(suite, name) for name in names]
+
+    cases = []
     for policy in config.policies:
-        alone = None if policy.pushed_weights is None else policy.pushed_weights.version
-        contenders += [(policy, step) for step in policy.steps] or [(policy, alone)]
-    found = [
-        EvalCase(policy, step, suite, env, suite.worker or config.worker, robot)
-        for policy, step in contenders
-        for suite, env in envs
-    ]
-    names = Counter(case.name for case in found)
-    if twice := sorted({env for (_, _, env), number in names.items() if number > 1}):
-        raise ConfigError(
-            f"suites: {twice} are in two suites of one name; give each suite another `name`"
+        steps: list[int | None] = [*policy.steps]
+        if not steps:
+            pushed = policy.pushed_weights
+            steps = [None if pushed is None else pushed.version]
+        for step in steps:
+            for suite, env in envs:
+                worker = suite.worker or config.worker
+                cases.append(EvalCase(policy, step, suite, env, worker, robot))
+
+    _require_distinct(cases)
+    return cases
+
+
+def _tasks_of_robot(robot: RobotConfig, pattern: str) -> list[str]:
+    """Return the tasks that match; raises `UnknownEnv` if there are none."""
+    tasks = fnmatch.filter(robot.tasks, pattern)
+    if not tasks:
+        raise UnknownEnv(
+            f"{pattern!r}: matches none of the plan's `robot.tasks`, which are "
+            f"{sorted(robot.tasks)}"
         )
-    folders: dict[tuple[str, ...], tuple[str, ...]] = {}
+    return tasks
+
+
+def _require_distinct(cases: list[EvalCase]) -> None:
+    """Raise `ConfigError` if two cases have one name, the same files, or the same episodes."""
+    names = Counter(case.name for case in cases)
+    repeated = sorted({env for (_, _, env), number in names.items() if number > 1})
+    if repeated:
+        raise ConfigError(
+            f"suites: {repeated} are in two suites of one name; give each suite another `name`"
+        )
+
+    names_by_path: dict[tuple[str, ...], tuple[str, ...]] = {}
     for name in names:
-        if (other := folders.setdefault(tuple(plain(part) for part in name), name)) != name:
+        path = tuple(plain(word) for word in name)
+        other = names_by_path.setdefault(path, name)
+        if other != name:
             raise ConfigError(
                 f"{' '.join(name)!r} and {' '.join(other)!r} would share files; give one another "
                 "name"
             )
-    prints = Counter(case.fingerprint for case in found)
-    if twice := sorted({case.env for case in found if prints[case.fingerprint] > 1}):
+
+    fingerprints = Counter(case.fingerprint for case in cases)
+    repeated = sorted({case.env for case in cases if fingerprints[case.fingerprint] > 1})
+    if repeated:
         raise ConfigError(
-            f"suites: {twice} stand in two suites with the same settings, so that these are the "
-            "same episodes; "
-            f"leave them out of one of the two"
+            f"suites: {repeated} stand in two suites with the same settings, so that these are the "
+            "same episodes; leave them out of one of the two"
         )
-    return found
 
 
 def require_envs(config: EvalConfig) -> None:
@@ -203,10 +223,10 @@ def expand(pattern: str) -> list[str]:
     cls = env_class(pattern)
     if "*" not in pattern:
         return [pattern]
+
     suite = env_suite(pattern)
-    known = [f"{suite}/{task}" for task in cls.tasks()]
-    if not (found := fnmatch.filter(known, pattern)):
-        raise UnknownEnv(
-            f"{pattern!r}: matches none of the tasks of {suite!r}, which knows {known}"
-        )
-    return found
+    envs = [f"{suite}/{task}" for task in cls.tasks()]
+    matching = fnmatch.filter(envs, pattern)
+    if not matching:
+        raise UnknownEnv(f"{pattern!r}: matches none of the tasks of {suite!r}, which knows {envs}")
+    return matching

@@ -20,7 +20,7 @@ class EpisodeKey:
     episode: int  # its number within the env, from 0
     seed: int  # of the resets of env and policy
     settings: str  # fingerprint of everything else that changes the outcome
-    # Of the policy's reset, for episodes that share the env's; None: `seed`.
+    # The seed of the policy's reset, where it differs from the env's; None: `seed`.
     policy_seed: int | None = None
 
     def __str__(self) -> str:
@@ -45,12 +45,13 @@ class Job:
 
 def plan(cases: Iterable[EvalCase]) -> list[Job]:
     """Return every episode of `cases`, case by case and seed by seed."""
-    return [
-        Job(EpisodeKey(case.env, i, seed + i, case.fingerprint), case)
-        for case in cases
-        for seed in case.suite.seeds
-        for i in range(case.suite.episodes)
-    ]
+    jobs = []
+    for case in cases:
+        for seed in case.suite.seeds:
+            for number in range(case.suite.episodes):
+                key = EpisodeKey(case.env, number, seed + number, case.fingerprint)
+                jobs.append(Job(key, case))
+    return jobs
 
 
 class JobQueue:
@@ -83,14 +84,15 @@ class JobQueue:
         """
         if made is not None and self._waiting.get(made):
             return self._first(made)
-        waiting = {
-            place: len(jobs)
-            for place, jobs in self._waiting.items()
-            if jobs and self._kinds[place] == kind
-        }
-        if not waiting:
+
+        places = self._places_of(kind)
+        if not places:
             return ()
-        return self._first(max(waiting, key=lambda one: waiting[one] / (1 + working.get(one, 0))))
+
+        def jobs_per_worker(place: str) -> float:
+            return len(self._waiting[place]) / (1 + working.get(place, 0))
+
+        return self._first(max(places, key=jobs_per_worker))
 
     def needs_worker(
         self, workers: Mapping[str, int], unoccupied: Mapping[str, int]
@@ -100,19 +102,20 @@ class JobQueue:
         Both arguments count workers by kind. The case is of the kind with the most waiting jobs for
         each of the `workers`.
         """
-        waiting: Counter[str] = Counter()
+        batches: Counter[str] = Counter()  # waiting ones, by kind
         for place, jobs in self._waiting.items():
             if jobs:
-                waiting[self._kinds[place]] += math.ceil(len(jobs) / jobs[0].case.suite.num_envs)
-        short = [kind for kind, number in waiting.items() if number > unoccupied.get(kind, 0)]
+                batches[self._kinds[place]] += math.ceil(len(jobs) / jobs[0].case.suite.num_envs)
+        short = [kind for kind, number in batches.items() if number > unoccupied.get(kind, 0)]
         if not short:
             return None
-        kind = max(short, key=lambda one: waiting[one] / (1 + workers.get(one, 0)))
-        return next(
-            jobs[0].case
-            for place, jobs in self._waiting.items()
-            if jobs and self._kinds[place] == kind
-        )
+
+        def batches_per_worker(kind: str) -> float:
+            return batches[kind] / (1 + workers.get(kind, 0))
+
+        kind = max(short, key=batches_per_worker)
+        place = self._places_of(kind)[0]
+        return self._waiting[place][0].case
 
     def drop(self, settings: str) -> int:
         """Remove the waiting jobs of the case with this fingerprint; returns their number."""
@@ -121,17 +124,22 @@ class JobQueue:
             self._waiting[place] = deque(job for job in jobs if job.key.settings != settings)
         return before - len(self)
 
+    def _places_of(self, kind: str) -> list[str]:
+        """Return the places with waiting jobs for workers of this kind."""
+        return [
+            place for place, jobs in self._waiting.items() if jobs and self._kinds[place] == kind
+        ]
+
     def _first(self, place: str) -> tuple[Job, ...]:
+        """Take the first job at a place, and those that may be played together with it."""
         jobs = self._waiting[place]
-        taken = [jobs.popleft()]
-        case = taken[0].case
-        number = 1 if taken[0].alone else case.suite.num_envs
-        while (
-            jobs
-            and len(taken) < number
-            and jobs[0].case.fingerprint == case.fingerprint
-            and not jobs[0].alone
-        ):
+        first = jobs.popleft()
+        taken = [first]
+        number = 1 if first.alone else first.case.suite.num_envs
+        while jobs and len(taken) < number:
+            is_same_case = jobs[0].case.fingerprint == first.case.fingerprint
+            if not is_same_case or jobs[0].alone:
+                break
             taken.append(jobs.popleft())
         return tuple(taken)
 
