@@ -574,8 +574,8 @@ class _Receiving:
         """All fit."""
         return read_header(header)
 
-    async def push_received(self, named: Any, options: Any) -> PushResult:
-        for mark in named:
+    async def push_received(self, values: Any, options: Any) -> PushResult:
+        for mark in values:
             self._replica.policy.done.append(mark)
             self._replica.priorities[mark] = "ROBOT"
         return PushResult(1, "", ("replica",))

@@ -59,9 +59,21 @@ def application(args: ServerArgs, *, drains: bool = True) -> Application:
         ConfigError: The policy cannot run in its environment.
     """
     args = args.model_copy(update={"environment": with_process(args.environment)})
+
+    actor_options: dict[str, Any] = {
+        "num_cpus": args.resources.num_cpus,
+        "num_gpus": args.resources.num_gpus,
+        "resources": args.resources.custom,
+    }
+    if args.resources.memory is not None:
+        actor_options["memory"] = args.resources.memory
+    runtime_env = args.environment.runtime_env()
+    if runtime_env:  # without this setting, Serve applies the application's
+        actor_options["runtime_env"] = runtime_env
+
     options: dict[str, Any] = {
         "name": POLICY,
-        # Three failures replace it.
+        # A replica is replaced after three failed checks.
         "health_check_period_s": 1 if args.environment.process == "child" else 5,
         # A replica that does not reply is frozen, or its policy holds the interpreter's lock: then
         # only these checks limit the time of a call. Together they take the limit of a call;
@@ -70,27 +82,17 @@ def application(args: ServerArgs, *, drains: bool = True) -> Application:
         # A policy that failed to load once will fail again. While other replicas run, Serve retries
         # forever.
         "max_constructor_retry_count": 1,
-        # Settings of the policy that a file states beside `args`; they change without a restart.
+        # Settings of the policy that a file has next to `args`; they change without a restart.
         "user_config": {},
-        "ray_actor_options": {
-            "num_cpus": args.resources.num_cpus,
-            "num_gpus": args.resources.num_gpus,
-            "resources": args.resources.custom,
-            **({} if args.resources.memory is None else {"memory": args.resources.memory}),
-            # Without this setting, Serve applies the application's.
-            **(
-                {"runtime_env": environment}
-                if (environment := args.environment.runtime_env())
-                else {}
-            ),
-        },
+        "ray_actor_options": actor_options,
         # A WebSocket session counts as a request as long as it lasts, so the limit must allow all
         # sessions and two batches. It is no protection against overload, since requests wait in the
         # batch queue.
         "max_ongoing_requests": args.sessions.limit + 2 * args.batch.max_size,
         "graceful_shutdown_timeout_s": 20,
-        **({} if drains else _AT_ONCE),
     }
+    if not drains:
+        options.update(_AT_ONCE)
     if args.autoscaling is not None:
         options["autoscaling_config"] = args.autoscaling.options()
     else:
@@ -100,11 +102,13 @@ def application(args: ServerArgs, *, drains: bool = True) -> Application:
         options["request_router_config"] = RequestRouterConfig(
             request_router_class="vlagents_ray.serve.scaling.router.SessionRouter"
         )
+
     replica = serve.ingress()(PolicyReplica)
     # `metrics_interval_s` is deprecated for a variable that affects a whole cluster.
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DeprecationWarning)
         policy = serve.deployment(**options)(replica)
+
     gateways = args.dialects.gateways()
     settings = args.model_dump(mode="json", exclude=_OUTSIDE | {"dialects": set(gateways)})
     return policy.bind(settings, _gateway(args) if gateways else None)

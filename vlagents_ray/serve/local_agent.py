@@ -105,18 +105,18 @@ class LocalAgent(Agent):
         return reply.info or {}
 
     def act_batch(self, obs: Sequence[Obs], sessions: Sequence[Agent]) -> list[Act | Exception]:
-        acts: list[Act | Exception] = []
-        for reply in self._replies(
-            sessions, [Request("act", one, priority="simulation") for one in obs]
-        ):
+        """Act in several sessions at once; each result has its `timing` in its info."""
+        requests = [Request("act", observation, priority="simulation") for observation in obs]
+        results: list[Act | Exception] = []
+        for reply in self._replies(sessions, requests):
             if reply.act is not None:
                 reply.act.info["timing"] = reply.timing
-            acts.append(
+            results.append(
                 reply.error
                 or reply.act
                 or PolicyFailed("act: the policy answered without an action")
             )
-        return acts
+        return results
 
     def close(self) -> None:
         self._replies([self], [Request("close", priority="simulation")])
@@ -124,14 +124,15 @@ class LocalAgent(Agent):
     def _replies(self, sessions: Sequence[Any], requests: Sequence[Request]) -> list[Reply]:
         """Return the reply to one request of each session."""
         answers: list[Future[Reply]] = [Future() for _ in requests]
-        self.engine.submit(
-            [
-                PendingRequest(session._session, request, answer.set_result, Priority.SIMULATION)
-                for session, request, answer in zip(sessions, requests, answers, strict=True)
-            ]
-        )
+        pending = [
+            PendingRequest(session._session, request, answer.set_result, Priority.SIMULATION)
+            for session, request, answer in zip(sessions, requests, answers, strict=True)
+        ]
+        self.engine.submit(pending)
+
         while not self.engine.threaded and not all(answer.done() for answer in answers):
-            if (taken := self.engine.queue.take()) is None:
+            taken = self.engine.queue.take()
+            if taken is None:
                 break
             self.engine.run(taken)
             if not taken.batch:

@@ -41,7 +41,7 @@ Answered = Callable[["IncomingMessage"], None]
 
 logger = logging.getLogger(__name__)
 
-# After the total as in `STAGES`.
+# Times of a reply's `timing`: the total, then the stages in the order of `STAGES`.
 _TIMES = ("total_ms", "decode_ms", "queue_ms", "inference_ms", "encode_ms")
 _NOT_MEASURED = (0.0,) * 4  # stages of a request that failed
 
@@ -58,11 +58,12 @@ class CheckpointChoice:
     def __str__(self) -> str:
         if self == DEFAULT:
             return "the deployment's own checkpoint"
-        step = "" if self.step is None else f"step {self.step}"
-        return (
-            "checkpoint "
-            f"{' at '.join(filter(None, ('' if self.name is None else repr(self.name), step)))}"
-        )
+        parts = []
+        if self.name is not None:
+            parts.append(repr(self.name))
+        if self.step is not None:
+            parts.append(f"step {self.step}")
+        return f"checkpoint {' at '.join(parts)}"
 
 
 DEFAULT = CheckpointChoice()
@@ -75,8 +76,8 @@ class Origin:
     transport: str = ""  # transport, for the metrics
     owner: str = ""  # connection with which its sessions end; empty without one
     # The sender, whose requests share one turn in the queue; if empty, each session has a turn.
-    connection: str = ""
     # It starts with the prefix, so that callers with different keys never share a turn.
+    connection: str = ""
     caller: Caller | None = None  # None if no key is required
     prefix: str = ""  # prefix of the session ids of the caller's key
     # The owner's sessions, by their ids in the engine: the step at which the episode began that the
@@ -113,7 +114,7 @@ class PendingRequest:
     request: Request
     done: Callable[[Reply], None]
     priority: Priority = Priority.ROBOT
-    # s, of the engine's clock, by default this one.
+    # Time of arrival, s, of the engine's clock, which is this one by default.
     arrived: float = field(default_factory=time.perf_counter)
     deadline: float = math.inf  # time after which an answer is of no use, s, of the engine's clock
     origin: Origin = NOWHERE
@@ -132,10 +133,10 @@ class PendingRequest:
     preparation: Preparation | None = None  # preparation of its observation, on another thread
     # Recent time from an answer to the session's next request, s, if known.
     return_s: float | None = None
-    place: int = 0  # index among the requests of its message
+    index: int = 0  # index among the requests of its message
     # For observers: the image files of its message, and the observers' own data until the answer.
     files: DecodedFiles = None  # type: ignore[assignment]
-    kept: dict[Any, Any] = None  # type: ignore[assignment]
+    observer_data: dict[Any, Any] = None  # type: ignore[assignment]
 
     def finish(self, reply: Reply) -> None:
         """Deliver the answer, unless the request is over."""
@@ -232,8 +233,8 @@ class IncomingMessage:
         """Record that the requests are decoded, with their operations and priorities."""
         self._decoded = time.perf_counter()
         self._asked = [(request.op, request.priority) for request in decoded.requests]
-        for place in sorted(decoded.refused):
-            self._asked.insert(place, ("unknown", "robot"))
+        for index in sorted(decoded.refused):
+            self._asked.insert(index, ("unknown", "robot"))
 
     def decoded_alike(self, requests: int = 1) -> None:
         """Record that `requests` requests, all of the message's own `op` and `priority`, are
@@ -250,20 +251,21 @@ class IncomingMessage:
         self._missing = requests
         self._then = then
 
-    def put(self, place: int, reply: Reply) -> None:
+    def put(self, index: int, reply: Reply) -> None:
         """Store the answer to the request at that index; a second answer is ignored."""
         if reply.error is None:
             reply.timing["decode_ms"] = (self._decoded - self.arrived) * 1e3
         else:
             reply.error.__traceback__ = None  # its frames would retain this message and its bytes
         with self._lock:
-            if self.replies[place] is not None:
+            if self.replies[index] is not None:
                 return
-            self.replies[place] = reply
+            self.replies[index] = reply
             self._missing -= 1
             if self._missing:
                 return
-        # It may refer to the requests, which refer to this message.
+
+        # `then` may refer to the requests, which refer to this message.
         then, self._then = self._then, None
         if then is not None:
             then(self)
@@ -332,6 +334,7 @@ class IncomingMessage:
         """
         if len(self.replies) != len(self._asked):  # the message was unreadable as a whole
             self._asked = self._asked[:1]
+
         for (op, priority), reply in zip(self._asked, self.replies, strict=True):
             if reply.error is None:
                 # Replies too large together are sent as errors, without times.

@@ -153,11 +153,11 @@ class SessionTable(Generic[M]):
 
     def get(self, session_id: str) -> Session[M]:
         """Return the session, and mark it used; raise `UnknownSession` if it is not here."""
-        if (session := self._sessions.get(session_id)) is None:
+        session = self._sessions.get(session_id)
+        if session is None:
             raise UnknownSession(
                 f"session {session_id!r}: unknown here; it was never reset, idled for "
-                f"{self._idle_s:g} s, "
-                f"or its replica was replaced: send a reset first"
+                f"{self._idle_s:g} s, or its replica was replaced: send a reset first"
             )
         session.used = time.monotonic()
         return session
@@ -170,7 +170,8 @@ class SessionTable(Generic[M]):
             TooManyRequests: The key of the origin's caller has reached its limit of sessions.
         """
         with self._lock:
-            if (session := self._sessions.get(session_id)) is None:
+            session = self._sessions.get(session_id)
+            if session is None:
                 self.require_allowed(origin)
                 if len(self._sessions) >= self.limit:
                     self.drop_idle()
@@ -240,16 +241,18 @@ class SessionTable(Generic[M]):
         with self._lock:
             self.forget_expected(arriving)
             self._require_newer(arriving)
-            here = self._sessions.get(arriving.id)
-            if here is None:
+            replaced = self._sessions.get(arriving.id)
+            if replaced is None:
                 self.opened += 1
             else:
-                self.ended(here)
+                self.ended(replaced)
             self._sessions[arriving.id] = arriving
 
     def _require_newer(self, arriving: Session[M]) -> None:
-        here = self._sessions.get(arriving.id)
-        newest = max(self._left.get(arriving.id, (0, 0)), (0, 0) if here is None else here.version)
+        present = self._sessions.get(arriving.id)
+        newest = self._left.get(arriving.id, (0, 0))
+        if present is not None:
+            newest = max(newest, present.version)
         if arriving.version <= newest:
             raise Outdated(
                 f"session {arriving.id!r}: a newer state of it is here, or has been; reset it"
@@ -283,12 +286,12 @@ class SessionTable(Generic[M]):
     def held(self, session_ids: Iterable[str]) -> dict[str, Version]:
         """Return the versions of the given sessions that are here and have an episode."""
         with self._lock:
-            here = [
-                self._sessions[session_id]
-                for session_id in session_ids
-                if session_id in self._sessions
-            ]
-            return {session.id: session.version for session in here if session.agent is not None}
+            sessions = [self._sessions.get(session_id) for session_id in session_ids]
+            return {
+                session.id: session.version
+                for session in sessions
+                if session is not None and session.agent is not None
+            }
 
     def versions(self) -> dict[str, Version]:
         """Return the versions of all sessions, including those whose first reset is in progress."""
@@ -355,9 +358,8 @@ class SessionTable(Generic[M]):
     def close_those_of(self, model: M) -> None:
         """Close all sessions of that model."""
         with self._lock:
-            for session in [
-                session for session in self._sessions.values() if session.model is model
-            ]:
+            of_model = [session for session in self._sessions.values() if session.model is model]
+            for session in of_model:
                 self._forget(session.id)
 
     def all(self) -> list[Session[M]]:
@@ -376,11 +378,12 @@ class SessionTable(Generic[M]):
         since = time.monotonic() - within_s
         with self._lock:
             sessions = list(self._sessions.values())
-        return Counter(
-            s.origin.connection
-            for s in sessions
-            if s.origin.transport in transports and s.used >= since
-        )
+        active = [
+            session
+            for session in sessions
+            if session.origin.transport in transports and session.used >= since
+        ]
+        return Counter(session.origin.connection for session in active)
 
     def ids(self) -> list[str]:
         """Return the ids of all sessions."""
@@ -391,11 +394,13 @@ class SessionTable(Generic[M]):
         """Close sessions without a request for longer than the idle time."""
         oldest = time.monotonic() - self._idle_s
         with self._lock:
-            for session_id in [s.id for s in self._sessions.values() if s.used < oldest]:
+            idle = [session.id for session in self._sessions.values() if session.used < oldest]
+            for session_id in idle:
                 self._forget(session_id)
 
     def _forget(self, session_id: str, left: Version | None = None) -> None:
-        if (session := self._sessions.pop(session_id, None)) is not None:
+        session = self._sessions.pop(session_id, None)
+        if session is not None:
             self._remember(session_id, left or (session.steps, _ANY))
             self.ended(session)
 

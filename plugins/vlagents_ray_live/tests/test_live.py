@@ -45,7 +45,7 @@ def observe(
     files: DecodedFiles | None = None,
 ) -> None:
     pending = PendingRequest(
-        session, request, lambda _: None, PRIORITIES[request.priority], kept={}
+        session, request, lambda _: None, PRIORITIES[request.priority], observer_data={}
     )
     pending.files = files or {}
     observer.on_request(pending)

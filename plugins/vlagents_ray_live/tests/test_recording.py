@@ -37,7 +37,7 @@ def rows(root: Path, episode: int = 0) -> dict[str, list]:
 
 
 def pending(request: Request) -> Any:
-    return SimpleNamespace(session_id="a", request=request, files={}, kept={})
+    return SimpleNamespace(session_id="a", request=request, files={}, observer_data={})
 
 
 def only(folder: Path) -> Path:
@@ -248,7 +248,7 @@ def test_requests_that_wait_are_bounded(
         waiting = [pending(Request("act", obs)) for _ in range(3)]
         for one in waiting:
             server.recorder.on_request(one)
-        assert [bool(one.kept) for one in waiting] == kept
+        assert [bool(one.observer_data) for one in waiting] == kept
         del one, waiting
         wait_for(lambda: server.recorder._held == 0)  # nobody waits for them any more
 

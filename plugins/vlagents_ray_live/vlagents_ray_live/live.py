@@ -166,7 +166,7 @@ class LiveObserver(Observer):
 
     def on_request(self, pending: PendingRequest) -> None:
         """Keep the request's observation, and read the outcomes of commands."""
-        pending.kept[self] = self._keep(pending)
+        pending.observer_data[self] = self._keep(pending)
         if self._commands is not None:
             self._commands.read_outcomes(pending.session_id, pending.request)
 
@@ -177,7 +177,7 @@ class LiveObserver(Observer):
 
     def on_answer(self, pending: PendingRequest, reply: Reply) -> None:
         """Add the answer to its session's observation."""
-        observation = pending.kept.pop(self, None)
+        observation = pending.observer_data.pop(self, None)
         if (
             observation is not None
             and reply.act is not None

@@ -246,7 +246,7 @@ class SessionRecorder(Observer):
             if not self._hold(size):
                 self.dropped += 1
                 return
-        recorded = pending.kept[self] = _Recorded(
+        recorded = pending.observer_data[self] = _Recorded(
             self,
             pending.session_id,
             request.op,
@@ -260,7 +260,7 @@ class SessionRecorder(Observer):
 
     def on_answer(self, pending: PendingRequest, reply: Reply) -> None:
         """Record the frame of the answered request."""
-        if (recorded := pending.kept.pop(self, None)) is not None and reply.error is None:
+        if (recorded := pending.observer_data.pop(self, None)) is not None and reply.error is None:
             self._write_later(partial(self._handle, recorded, reply))
 
     def close(self) -> None:

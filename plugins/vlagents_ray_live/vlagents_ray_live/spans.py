@@ -60,11 +60,14 @@ class RequestSpans(Observer):
         if pending.request.op in _OPS:
             obs = pending.request.obs
             stated = "" if obs is None else obs.info.get(tracing.TRACEPARENT, "")  # untrusted
-            pending.kept[self] = stated[:_TEXT] if isinstance(stated, str) else "", time.time_ns()
+            pending.observer_data[self] = (
+                stated[:_TEXT] if isinstance(stated, str) else "",
+                time.time_ns(),
+            )
 
     def on_answer(self, pending: PendingRequest, reply: Reply) -> None:
         """Export the span of the answered request."""
-        begun: tuple[str, int] | None = pending.kept.pop(self, None)
+        begun: tuple[str, int] | None = pending.observer_data.pop(self, None)
         if begun is not None:
             about = pending.session_id, pending.request.op, pending.priority.name.lower()
             error = "" if reply.error is None else f"{reply.error.code}: {reply.error}"[:_TEXT]

@@ -84,8 +84,8 @@ class Alone:
         self.rest = self._pusher.rest
         self._engine = engine
 
-    async def push_received(self, named: Mapping[str, Any], options: PushOptions) -> PushResult:
-        return await self._pusher.push(named, options)
+    async def push_received(self, values: Mapping[str, Any], options: PushOptions) -> PushResult:
+        return await self._pusher.push(values, options)
 
     async def versions_of_weights(self) -> list[int]:
         return [self._engine.weights.number]

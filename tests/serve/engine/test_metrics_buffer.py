@@ -106,7 +106,7 @@ def test_what_was_answered_is_recorded_with_its_code(client: TestClient, engine:
     def are_all_recorded() -> bool:  # some of it just after the answer
         collected = engine.stats.collect()
         batches.extend(collected.batches.values)
-        requests.update({kind: sample.seen for kind, sample in collected.requests.items()})
+        requests.update({kind: sample.count for kind, sample in collected.requests.items()})
         return len(batches) >= 2 and requests.total() >= 7
 
     wait_for(are_all_recorded)
@@ -131,7 +131,7 @@ def test_nothing_is_kept_for_nobody_and_each_thing_once() -> None:
     stats.batch(3, 4)
     stats.enable()
     nothing = stats.collect()
-    assert (nothing.requests, nothing.batches.seen, nothing.padding) == ({}, 0, 0)
+    assert (nothing.requests, nothing.batches.count, nothing.padding) == ({}, 0, 0)
     stats.handled(KIND, (2.0,))
     stats.batch(3, 4)
     found = stats.collect()
@@ -151,7 +151,7 @@ def test_all_are_counted_from_whatever_thread_and_a_fair_sample_is_kept() -> Non
     for thread in threads:
         thread.join()
     sample = stats.collect().requests[KIND]
-    assert (sample.seen, len(sample.values)) == (40_000, SAMPLE)
+    assert (sample.count, len(sample.values)) == (40_000, SAMPLE)
     mean = sum(value for (value,) in sample.values) / SAMPLE
     # Five standard errors of a uniform draw.
     assert abs(mean - 5_000) < 5 * 10_000 / 12**0.5 / SAMPLE**0.5

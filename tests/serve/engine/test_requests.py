@@ -253,7 +253,7 @@ def test_too_many_replies_for_one_frame_are_errors_and_recorded(
     assert all(
         isinstance(reply.error, MessageTooLarge) for reply in decode_replies(message.frame())
     )
-    assert sum(sample.seen for sample in stats.collect().requests.values()) == 2
+    assert sum(sample.count for sample in stats.collect().requests.values()) == 2
 
 
 def test_an_observer_that_fails_costs_no_answer(
@@ -283,14 +283,14 @@ class Noting(Observer):
     def on_request(self, pending: PendingRequest) -> None:
         assert pending.request.obs is not None
         self.requests += 1
-        pending.kept[self] = self.requests
+        pending.observer_data[self] = self.requests
         self.seen.append(f"request of {pending.session_id}")
 
     def before_answer(self, pending: PendingRequest, reply: Reply) -> None:
         self.seen.append(f"before {pending.session_id}")
 
     def on_answer(self, pending: PendingRequest, reply: Reply) -> None:
-        self.seen.append(f"answer {pending.kept[self]} to {pending.session_id}")
+        self.seen.append(f"answer {pending.observer_data[self]} to {pending.session_id}")
 
 
 def test_the_requests_of_a_message_are_seen_around_its_answer_without_those_that_could_not_be_read(

@@ -62,7 +62,7 @@ class ReceivesWeights(Protocol):
         the policy.
         """
 
-    async def push_received(self, named: Mapping[str, Any], options: PushOptions) -> PushResult:
+    async def push_received(self, values: Mapping[str, Any], options: PushOptions) -> PushResult:
         """Make all replicas act with new weights."""
 
     async def rest(self, rest: Rest) -> None:

@@ -52,9 +52,9 @@ class Admission:
     """
 
     def __init__(self, in_flight_bytes: int) -> None:
-        # Number of bytes in flight that all messages may take together, by whether it is a robot's
-        # that needs more.
-        self._most = {True: in_flight_bytes, False: int(in_flight_bytes * (1 - _ROBOTS_SHARE))}
+        # Maximum number of bytes in flight of all messages together, by whether the message that
+        # needs more is a robot's.
+        self._limits = {True: in_flight_bytes, False: int(in_flight_bytes * (1 - _ROBOTS_SHARE))}
         self.held = 0  # number of bytes in flight
         # Bytes to release with each message that has no admission.
         self.messages: dict[weakref.ref[Any], int] = {}
@@ -84,33 +84,36 @@ class Admission:
             Overloaded: The bytes in flight leave no room at the moment.
             MessageTooLarge: The message alone exceeds the limit.
         """
-        most = self._most[robot]
-        alone = most if key is None else int(most * _KEYS_SHARE)
-        if message_bytes + size > alone:
+        limit = self._limits[robot]
+        message_limit = limit if key is None else int(limit * _KEYS_SHARE)
+        if message_bytes + size > message_limit:
             raise MessageTooLarge(
                 f"message: takes {message_bytes + size} bytes, decoded, and all in flight may take "
-                f"{alone}; send fewer "
-                f"requests at once, or raise `limits.in_flight_bytes`"
+                f"{message_limit}; send fewer requests at once, or raise `limits.in_flight_bytes`"
             )
+
         given_up: list[ArrivingBytes] = []
         with self._lock:
-            room = self._room(most, key)
-            while size > room and (arriving := self._largest_arriving(size, most, robot, key)):
+            room = self._room(limit, key)
+            while size > room:
+                arriving = self._largest_arriving(size, limit, robot, key)
+                if arriving is None:
+                    break
                 self._resize(arriving, 0)
                 given_up.append(arriving)
-                room = self._room(most, key)
-            held, has_room = self.held, size <= room
+                room = self._room(limit, key)
+
+            held_bytes, has_room = self.held, size <= room
             if has_room:
                 self._count(size, key)
+
         for arriving in given_up:
             arriving.give_up()
         if not has_room:
             raise Overloaded(
-                f"the messages in flight here take {held} bytes, and may take {most}, of which one "
-                "key may take half "
-                "of what other keys leave free; send the request again after "
-                f"{Overloaded.retry_after_s:g} s, or raise "
-                f"`limits.in_flight_bytes`"
+                f"the messages in flight here take {held_bytes} bytes, and may take {limit}, of "
+                "which one key may take half of what other keys leave free; send the request "
+                f"again after {Overloaded.retry_after_s:g} s, or raise `limits.in_flight_bytes`"
             )
 
     def release(self, size: int, key: str | None = None) -> None:
@@ -122,10 +125,10 @@ class Admission:
         """Count `size` bytes of incomplete messages in place of those counted before; raise
         `Overloaded`.
         """
-        most = self._most[arriving.robot]
+        limit = self._limits[arriving.robot]
         with self._lock:
             more = size - self._arriving.get(arriving, 0)
-            has_room = more <= 0 or more <= self._room(most, arriving.key)
+            has_room = more <= 0 or more <= self._room(limit, arriving.key)
             if has_room:
                 self._resize(arriving, size)
         if not has_room:
@@ -133,28 +136,28 @@ class Admission:
                 "the messages in flight leave no room for one that arrives slowly; send it again"
             )
 
-    def _room(self, most: int, key: str | None) -> int:
+    def _room(self, limit: int, key: str | None) -> int:
         """Return how many bytes a sender may take; the caller holds the lock."""
-        room = most - self.held
-        return room if key is None else min(room, self._room_of_key(most, key))
+        room = limit - self.held
+        return room if key is None else min(room, self._room_of_key(limit, key))
 
-    def _room_of_key(self, most: int, key: str) -> int:
+    def _room_of_key(self, limit: int, key: str) -> int:
         """Return how many bytes a key may take, if the incomplete messages of others give way."""
         arriving_of_others = sum(self._arriving_by.values()) - self._arriving_by[key]
         by_others = self.held - self._held_by[key] - arriving_of_others
-        return int(_KEYS_SHARE * (most - by_others)) - self._held_by[key]
+        return int(_KEYS_SHARE * (limit - by_others)) - self._held_by[key]
 
     def _largest_arriving(
-        self, size: int, most: int, robot: bool, key: str | None
+        self, size: int, limit: int, robot: bool, key: str | None
     ) -> ArrivingBytes | None:
-        """Return incomplete messages to give up: of the key with most bytes, or of a key over its
-        share.
+        """Return incomplete messages to give up: those of the key with the most bytes, or of a key
+        over its share.
 
         None if there are none, or only those of robots and the bytes are for a simulation. The
         caller holds the lock.
         """
         candidates = [arriving for arriving in self._arriving if robot or not arriving.robot]
-        if key is not None and size > self._room_of_key(most, key):
+        if key is not None and size > self._room_of_key(limit, key):
             candidates = [arriving for arriving in candidates if arriving.key == key]
         return max(candidates, key=lambda arriving: self._held_by[arriving.key or ""], default=None)
 
@@ -189,7 +192,8 @@ class Admission:
         with self._lock:
             if self._closed:
                 raise PolicyUnavailable("the replica is stopping; connect again")
-            if (threads := self._threads.get(robot)) is None:
+            threads = self._threads.get(robot)
+            if threads is None:
                 number = max(1, thread_map.allowed() - 1 if robot else thread_map.allowed() // 2)
                 name = f"decode-{'robots' if robot else 'others'}"
                 threads = self._threads[robot] = ThreadPoolExecutor(number, name)
@@ -199,9 +203,9 @@ class Admission:
         """Cancel waiting decoding jobs, and accept no more."""
         with self._lock:
             self._closed = True
-            threads = list(self._threads.values())
-        for each in threads:
-            each.shutdown(wait=False, cancel_futures=True)
+            pools = list(self._threads.values())
+        for pool in pools:
+            pool.shutdown(wait=False, cancel_futures=True)
 
 
 class ArrivingBytes:
@@ -278,6 +282,7 @@ class MessageAdmission(Budget):
             key: The name of the sender's key; None without one.
         """
         super().__init__(limits)
+
         self.files = {} if keep_files else None
         self._admission, self._admit = admission, admit
         self.size = size  # size of the message, until it is counted
@@ -296,7 +301,8 @@ class MessageAdmission(Budget):
         if self._admit is not None:
             if not self._refusals:
                 self._refusals.append(self._refusal_of(self._admit, "message"))
-            if (refusal := self._refusals[0]) is not None:
+            refusal = self._refusals[0]
+            if refusal is not None:
                 raise refusal
 
     def parse(self, size: int) -> None:
@@ -316,8 +322,10 @@ class MessageAdmission(Budget):
             self._index += 1
             if self._index == len(self._refusals):
                 self._refusals.append(self._refusal_of(self._admit, op))
-            if (refusal := self._refusals[self._index]) is not None:
+            refusal = self._refusals[self._index]
+            if refusal is not None:
                 raise refusal
+
         self.serial = not (self._robot or self._inline)
         if self.size:
             self.grow(self.size)
@@ -387,9 +395,9 @@ class MessageAdmission(Budget):
 
     def release(self) -> None:
         """Release the bytes of a message that is answered or dropped."""
-        held, self._held, self._decoded = self._held, 0, 0
-        if held:
-            self._admission.release(held, self._key)
+        held_bytes, self._held, self._decoded = self._held, 0, 0
+        if held_bytes:
+            self._admission.release(held_bytes, self._key)
 
     def __del__(self) -> None:
         self.release()
@@ -405,5 +413,8 @@ class MessageAdmission(Budget):
 
 def image_bytes(request: Request) -> int:
     """Return the decoded size of all images of a request, including its history, in bytes."""
-    seen = request.history if request.obs is None else [request.obs, *request.history]
-    return sum([image.nbytes for obs in seen for image in obs.cameras.values()])
+    observations = request.history if request.obs is None else [request.obs, *request.history]
+    size = 0
+    for obs in observations:
+        size += sum([image.nbytes for image in obs.cameras.values()])
+    return size

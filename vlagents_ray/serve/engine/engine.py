@@ -115,15 +115,18 @@ class Engine:
         loader = Loader(self._source, version, batch_sizes, max_batch_size, check, self.calls)
         self.models = ModelManager(self._source, loader, self.sessions)
         self.sessions.ended = self.models.release
+
         self.stats, self.admission = MetricsBuffer(), Admission(in_flight_bytes)
         loader.on_out_of_memory, loader.on_gpu_ms = self.stats.out_of_memory, self.stats.gpu
         self._batch_sizes, self._reply_bytes = batch_sizes, reply_bytes
         self._preparations: Preparations | None = None  # None if the engine has no threads
+
         self._loading = self.models.loading()
         self._unready: VLAgentsError | None = self._loading  # error for clients
         # Reason why the policy did not load, for the operator.
         self._failure: PolicyFailed | None = None
         self._hung: PolicyCall | None = None  # overdue call that `notice_hung` found
+
         # Whether the replica will stop, so that replies request reconnections.
         self.draining = False
         self.drain_list = DrainList()  # connections to move only because others hold fewer sessions
@@ -135,13 +138,15 @@ class Engine:
             clock=clock,
             poller=poller,
         )
+
         self._thread = threading.Thread(target=self._serve, name="policy", daemon=True)
         # Done when loading the policy has succeeded or failed.
         self._started: Future[None] = Future()
-        # Whether that is the engine's own thread, and not the one that called `start`.
+        # Whether the policy's thread is the engine's own, and not the one that called `start`.
         self.threaded = True
         self.alive = False  # whether a thread takes batches from the queue
-        # Sent by another thread while the next batch runs.
+
+        # Answers that another thread sends while the next batch runs.
         self._unsent: list[tuple[PendingRequest, Reply]] = []
         self._answers = ThreadPoolExecutor(1, "policy-answers")
         # Held while the policy's thread runs a batch, and while the policy sleeps.
@@ -165,7 +170,8 @@ class Engine:
             self.alive, self.threaded = True, threaded
             if threaded:
                 self._thread.start()
-                if not wait([self._started], limit_s := self.calls.limits.load_s).done:
+                limit_s = self.calls.limits.load_s
+                if not wait([self._started], limit_s).done:
                     raise TimeoutError(f"not loaded within {limit_s:g} s, its limit")
                 self._started.result()
             else:
@@ -176,6 +182,7 @@ class Engine:
             self._unready = PolicyFailed(f"{failed}; the server's log says why")
             self._failure = PolicyFailed(f"{failed}: {error}{raised_at(error)}")
             raise self._failure from error
+
         if threaded:
             self._preparations = Preparations()
             self.pauses.start()
@@ -190,6 +197,7 @@ class Engine:
             self.queue.poller.close()
             self._started.set_exception(error)
             return
+
         self.queue.bind()
         self._started.set_result(None)
         try:
@@ -197,6 +205,7 @@ class Engine:
                 if self._unsent:
                     unsent, self._unsent = self._unsent, []
                     self._answers.submit(_send, unsent)
+
                 if not self._acting.acquire(blocking=False):
                     self._acting.acquire()  # the policy has slept
                     taken = self._without_late(taken)
@@ -205,6 +214,7 @@ class Engine:
                 finally:
                     self._acting.release()
                 del taken  # their observations may be in the sender's memory
+
             _send(self._unsent)
             self._answers.shutdown()
             self.queue.poller.close()
@@ -219,9 +229,8 @@ class Engine:
         ]
         for pending in late:
             pending.begun = False
-        return Taken(
-            [pending for pending in taken.batch if pending not in late], [*taken.expired, *late]
-        )
+        in_time = [pending for pending in taken.batch if pending not in late]
+        return Taken(in_time, [*taken.expired, *late])
 
     @property
     def ready(self) -> bool:
@@ -252,8 +261,9 @@ class Engine:
         """
         if self._failure is not None:
             raise self._failure
-        if (call := self.calls.overdue()) is not None:
-            raise PolicyUnavailable(call.describe())
+        overdue = self.calls.overdue()
+        if overdue is not None:
+            raise PolicyUnavailable(overdue.describe())
         self.require_ready()
         self.calls.check_health()
         self.models.check_health()
@@ -264,27 +274,32 @@ class Engine:
 
         This is called several times a second, on a thread that makes no calls of the policy.
         """
-        if (call := self.calls.overdue()) is None:
+        call = self.calls.overdue()
+        if call is None:
             if self._hung is not None:
                 logger.warning("the policy has returned from %r after all", self._hung.op)
                 self._hung = None
                 if self._failure is None:
                     self._unready = None
             return
-        said = call.describe()
-        refusal = PolicyUnavailable(f"{said}; the session begins again at another replica")
+
+        description = call.describe()
+        refusal = PolicyUnavailable(f"{description}; the session begins again at another replica")
         if self._hung is None:
             self._hung, self._unready = call, refusal
             logger.error(
-                "%s. This replica is not healthy until it does. Its thread:\n%s", said, call.stack()
+                "%s. This replica is not healthy until it does. Its thread:\n%s",
+                description,
+                call.stack(),
             )
             self.stats.hung(call.op)
+
         # The policy may still act on the running batch, so its requests must not be sent again;
         # waiting requests may be. This is repeated at each call, since a request that was checked
         # before may be queued later.
         running, waiting = self.queue.clear()
         for pending in running:
-            pending.fail(OutcomeUnknown(said))
+            pending.fail(OutcomeUnknown(description))
         for pending in waiting:
             self._fail(pending, refusal)
 
@@ -307,9 +322,10 @@ class Engine:
         """Refuse all requests except those of the running batch, and wait at most `timeout_s`
         for its end.
         """
-        # The policy is loading, or its GPU has too little memory for it to wake.
+        # This fails if the policy is loading, or if its GPU has too little memory for it to wake.
         with suppress(Exception):
             self.weights.rest(Rest("wake"))
+
         stopping = PolicyUnavailable("the replica is stopping; connect again")
         if self._failure is None:
             # Otherwise the end of the policy's thread would be taken for a failure.
@@ -341,6 +357,7 @@ class Engine:
                 public = public_error(error, pending)
                 if not self._seek(pending, public):
                     self._fail(pending, public)
+
         try:
             if ready:
                 self.queue.put(*ready)
@@ -361,27 +378,29 @@ class Engine:
         ):
             raise NotReset("act before reset: this connection has no session yet; reset first")
         self.require_ready()
+
         if request.op == "act":
             pending.session = session = self.sessions.get(pending.session_id)
             if session.agent is None:
                 raise NotReset(
                     f"session {pending.session_id!r}: act before a successful reset; reset first"
                 )
-            if (
-                (step := request.step) is not None
-                and step > session.steps
-                and step > session.expected
-            ):
+            step = request.step
+            if step is not None and step > session.steps and step > session.expected:
                 raise session.wrong_step(step)
+
             if pending.episode is None:
                 known = origin.sessions.get(pending.session_id)
                 pending.episode = self._latest_episode(pending, session) if known is None else known
             if (pending.episode if step is None else step) >= session.expected:
                 # An act of an older episode, which will be refused, does not use the session.
                 session.origin = origin
-            if (model := session.model) is not None:  # another thread may set it to None
+
+            model = session.model  # another thread may set it to None
+            if model is not None:
                 model.check(request)
                 pending.model = model
+
             if self._preparations is not None and self.queue.window.overlaps:
                 pending.preparation = self._preparations.begin(session.agent, request.obs)
         elif request.op == "reset":
@@ -389,13 +408,16 @@ class Engine:
             opening = Opening(
                 choice, kwargs, follows(kwargs, by_default=pending.priority is not Priority.ROBOT)
             )
-            # Otherwise it is checked after loading.
-            if (model := self.models.loaded(choice)) is not None:
+            # If the checkpoint is not loaded, the request is checked after loading.
+            model = self.models.loaded(choice)
+            if model is not None:
                 model.check(request)
+
             session = self.sessions.open(pending.session_id, origin)
             opening.first = self.sessions.begin(session, request.step)
             session.last_reset = pending.arrived
             pending.opening = opening
+
         if origin.owner and request.op != "close":
             self._bind(pending)
 
@@ -466,17 +488,19 @@ class Engine:
         pending.sought, pending.begun = True, False
 
         def retry() -> None:
+            """Queue the act again once the search has ended."""
             if pending.is_abandoned:
                 pending.fail(error)
                 return
             try:
-                # It stays elsewhere if its key has no room for it here.
+                # The session stays elsewhere if its key has no room for it here.
                 if pending.session_id not in self.sessions:
                     self.sessions.require_allowed(pending.origin)
                 self.check(pending)
                 self.queue.put(pending)
-            except Exception as again:  # noqa: BLE001 - becomes the reply
-                pending.fail(error if type(again) is type(error) else public_error(again, pending))
+            except Exception as later:  # noqa: BLE001 - becomes the reply
+                is_same = type(later) is type(error)
+                pending.fail(error if is_same else public_error(later, pending))
 
         origin = pending.origin
         searcher = origin.owner if origin.caller is None else origin.caller.name
@@ -522,8 +546,8 @@ class Engine:
         try:
             self._run(taken.batch)
         except BaseException as error:
-            # a policy that calls sys.exit() must not end the replica's only thread
-            # Ctrl-C in the thread that called.
+            # A policy that calls sys.exit() must not end the replica's only thread. Where the
+            # caller's thread runs the policy, Ctrl-C ends it.
             if not self.threaded and not isinstance(error, SystemExit):
                 raise
             logger.exception("the batch failed")
@@ -549,6 +573,7 @@ class Engine:
                     if pending.session_id not in self.sessions and self._seek(pending, public):
                         continue
                 self._fail(pending, public)
+
         for (model, weights), group in acting.items():
             prepared_s = 0.0
             if self.queue.window.slow:
@@ -569,22 +594,18 @@ class Engine:
                 raise UnknownSession(
                     f"session {session_id!r}: reset elsewhere, or ended, while this reset waited"
                 )
+
             session = self.sessions.open(session_id, pending.origin)
             session.agent, session.weights, session.follows = None, None, opening.follows
             session.steps, session.resetting = opening.first, pending
             session.first, session.moves = opening.first, 0
             session.expected = max(session.expected, opening.first)
-            session.began, session.last_reset = (
-                pending.arrived,
-                max(session.last_reset, pending.arrived),
-            )
+            session.began = pending.arrived
+            session.last_reset = max(session.last_reset, pending.arrived)
+
             is_abandoned = partial(self._is_abandoned, pending, session)
-            if (
-                self.models.hold(
-                    session, opening.choice, partial(self._requeue, pending), is_abandoned
-                )
-                is None
-            ):
+            requeue = partial(self._requeue, pending)
+            if self.models.hold(session, opening.choice, requeue, is_abandoned) is None:
                 # The policy does no work on it while its checkpoint is loaded.
                 pending.begun = False
                 return  # `_requeue` queues it again
@@ -597,11 +618,12 @@ class Engine:
             if self._is_abandoned(pending, session):
                 self.models.release_model(session)
                 raise too_late(opening.choice)
+
         session.resetting = None
         try:
             self._begin_episode(pending, opening, session)
         except BaseException:
-            # Otherwise the session would hold the model without an episode.
+            # The session must not hold the model without an episode.
             self.models.release_model(session)
             raise
 
@@ -615,6 +637,7 @@ class Engine:
                 f"session {pending.session_id!r}: closed before its reset was over"
             )
         model.check(request)
+
         with model.busy, model.uncaptured, model.call("reset") as call:
             model.require_open()
             model.parameters.use(model.parameters.begin(session, follows=opening.follows))
@@ -624,12 +647,14 @@ class Engine:
                 raise PolicyFailed(f"reset: the policy returned {type(info).__name__}, want a dict")
             for obs in request.history:
                 agent.observe(obs)
+
         info = {**model.identity, **info}  # a session with an adapter returns both by itself
         spent = timing(pending, call.began, call.ended)
         require_serializable(info, self._reply_bytes)
         session.agent, session.instruction = agent, request.instruction or ""
         model.padding.record_reset(request, opening.kwargs)
         request.drop_observations()
+
         reply = Reply(request.request_id, info=info, step=session.steps, timing=spent)
         if session.announced or self.finder is None:
             pending.finish(reply)
@@ -689,7 +714,7 @@ class Engine:
         self, pending: PendingRequest
     ) -> tuple[Session[LoadedModel], LoadedModel, WeightsVersion]:
         session: Session[LoadedModel] | None = pending.session
-        # Since the lookup it has ended, or arrived here from another replica.
+        # Since the lookup the session has ended, or arrived here from another replica.
         if session is None or session.over:
             session = self.sessions.get(pending.session_id)
         model, weights = session.model, session.weights
@@ -703,14 +728,14 @@ class Engine:
             raise session.wrong_episode()
         if model is None or weights is None:
             raise UnknownSession(f"session {pending.session_id!r}: has just been closed; reset it")
-        # A reset before it in the queue chose another, or it has arrived since.
+        # A reset before it in the queue chose another model, or the session has arrived since.
         if model is not pending.model:
             model.check(pending.request)
         return session, model, weights
 
     def _observe(self, pending: PendingRequest) -> None:
         session, model, weights = self._ready(pending)
-        # `_ready` and the decoder ensure both.
+        # `_ready` and the decoder ensure both conditions.
         if session.agent is not None and pending.request.obs is not None:
             with model.busy, model.uncaptured, model.call("observe"):
                 model.require_open()
@@ -730,13 +755,14 @@ class Engine:
             return acting, 0.0
         with model.busy, model.uncaptured, model.call("act", "prepare") as call:
             errors = {} if model.closed else Preparations.finish(preparations)
-        for place, error in errors.items():
-            pending = acting[place][0]
+
+        for index, error in errors.items():
+            pending = acting[index][0]
             pending.request.drop_observations()
             pending.fail(public_error(error, pending))
-        return [
-            one for place, one in enumerate(acting) if place not in errors
-        ], call.ended - call.began
+
+        prepared = [pair for index, pair in enumerate(acting) if index not in errors]
+        return prepared, call.ended - call.began
 
     def _act(
         self,
@@ -752,10 +778,11 @@ class Engine:
         if self._batch_sizes:
             with model.busy, model.uncaptured:
                 padding = model.pad(observations, agents)
+
         rows = len(observations)
         call = model.call("act", rows if self._batch_sizes else None)
         slow = self.queue.window.slow
-        # Two calls would take a fiftieth of the fastest acts.
+        # The time is not measured for fast acts: two calls take a fiftieth of the fastest ones.
         worked_s = time.thread_time() if slow else 0.0
         try:
             with model.busy, model.uncaptured, call:
@@ -768,25 +795,29 @@ class Engine:
                 )
         except Exception as error:  # noqa: BLE001 - becomes the replies
             results = [error] * rows
+
         worked_s = time.thread_time() - worked_s if slow else 0.0
         # This is skipped for a lone act that succeeded like the one before: it would take a
         # hundredth of the act's time.
         if len(acting) > 1 or isinstance(results[0], Exception) or model.calls.failed_batches:
             model.calls.record_batch(results[: len(acting)])
+
         del observations  # they may be in the sender's memory
         for pending, _ in acting:
             pending.request.drop_observations()
         if padding:
             model.padding.check_results(results[len(acting) :])
             results = results[: len(acting)]
-        # Replies are sent while the next full batch runs: to simulations, and after a full batch to
-        # robots, too, if the policy leaves the interpreter to other threads while it waits for a
-        # GPU or another process. Beside one that computes in Python, the slowest robots would wait
-        # longer.
+
+        # Replies to simulations are sent while the next full batch runs. After a full batch this
+        # also applies to robots, if the policy leaves the interpreter to other threads while it
+        # waits for a GPU or another process. If it computes in Python, the slowest robots would
+        # wait longer.
         defer = self.queue.full_batch_waits()
         robots = len(acting) == self.queue.largest and worked_s < _WORKING * (
             call.ended - call.began
         )
+
         unsent = []
         for (pending, session), result in zip(acting, results, strict=True):
             reply = build_reply(
@@ -799,6 +830,7 @@ class Engine:
                 unsent.append((pending, reply))
             else:
                 pending.finish(reply)
+
         if unsent:
             self._unsent.extend(unsent)
         self.stats.batch(len(acting), rows)
@@ -862,6 +894,7 @@ class Engine:
         """
         self.require_ready()
         self.sessions.require_room(session_id)
+
         first, moves = state["first"], state["moves"] + 1
         arriving: Session[LoadedModel] = Session(
             session_id,
@@ -883,6 +916,7 @@ class Engine:
                 raise UnknownSession(
                     f"session {session_id!r}: of another version of the policy; reset it"
                 )
+
             number, fingerprint = state["parameters"]
             # The session holds the version until `find` returns it, or a newer one.
             if weights is not None:

@@ -28,19 +28,21 @@ Times = tuple[float, ...]
 class Sample(Generic[T]):
     """The number of values added, and a uniform random sample of up to `SAMPLE` of them."""
 
-    __slots__ = ("seen", "values")
+    __slots__ = ("count", "values")
 
     def __init__(self) -> None:
-        self.seen = 0
+        self.count = 0
         self.values: list[T] = []
 
     def add(self, value: T) -> None:
         """Add a value (Vitter's algorithm R)."""
-        self.seen += 1
-        if self.seen <= SAMPLE:
+        self.count += 1
+        if self.count <= SAMPLE:
             self.values.append(value)
-        elif (place := int(random.random() * self.seen)) < SAMPLE:
-            self.values[place] = value
+        else:
+            index = int(random.random() * self.count)
+            if index < SAMPLE:
+                self.values[index] = value
 
 
 @dataclass(slots=True)
@@ -76,7 +78,8 @@ class MetricsBuffer:
         if not self._enabled:
             return
         with self._lock:
-            if (sample := self._collected.requests.get(kind)) is None:
+            sample = self._collected.requests.get(kind)
+            if sample is None:
                 sample = self._collected.requests[kind] = Sample()
             sample.add(times)
 

@@ -41,7 +41,7 @@ class Observer:
 
 
 class Observers(Observer):
-    """The observers of an engine, which are themselves one. Thread-safe."""
+    """The observers of an engine, called as one observer. Thread-safe."""
 
     def __init__(self) -> None:
         # Whether there are observers: without any, each request costs only this check.
@@ -58,7 +58,7 @@ class Observers(Observer):
     def remove(self, observer: Observer) -> None:
         """Remove an observer; does nothing if it was not added."""
         with self._lock:
-            self._all = tuple(one for one in self._all if one is not observer)
+            self._all = tuple(other for other in self._all if other is not observer)
             self.any = bool(self._all)
 
     def on_request(self, pending: PendingRequest) -> None:

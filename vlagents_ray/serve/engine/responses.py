@@ -25,7 +25,7 @@ from vlagents_ray.validation import check_action
 
 logger = logging.getLogger(__name__)
 
-# Of this package and Python's library.
+# Folders of this package and of Python's library.
 _LIBRARIES = (str(Path(__file__).parents[2]), sysconfig.get_path("stdlib"))
 
 
@@ -56,8 +56,10 @@ def build_reply(
             raise result
         if not isinstance(result, Act):
             raise PolicyFailed(f"act: the policy returned {type(result).__name__}, want an Act")
-        # Before the action is copied and checked.
-        if (size := getattr(result.action, "nbytes", 0)) > limit:
+
+        # The size is checked before the action is copied.
+        size = getattr(result.action, "nbytes", 0)
+        if size > limit:
             raise PolicyFailed(_too_large("action", size, limit))
         act = Act(check_action(result.action, contract), bool(result.done), result.info)
         # The policy may return a list of numbers, which has no `nbytes`.
@@ -65,10 +67,12 @@ def build_reply(
             raise PolicyFailed(_too_large("action", act.action.nbytes, limit))
         if act.info:
             require_serializable(act.info, limit - act.action.nbytes)
+
         # The result's own info takes precedence; it may be None.
         act.info = {**policy, **(act.info or {})}
     except Exception as error:  # noqa: BLE001 - becomes the reply
         return Reply(request_id, error=public_error(error, pending))
+
     session.steps += 1
     return Reply(request_id, act=act, step=session.steps)
 
@@ -169,5 +173,5 @@ class _BoundedWriter(ValueWriter):
         return super().value(value)
 
 
-def _too_large(what: str, got: int, limit: int) -> str:
-    return f"{what}: got {got} bytes, want {limit} at most (`limits.reply_bytes`); return less"
+def _too_large(field: str, size: int, limit: int) -> str:
+    return f"{field}: got {size} bytes, want {limit} at most (`limits.reply_bytes`); return less"

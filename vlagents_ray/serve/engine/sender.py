@@ -73,6 +73,7 @@ class Sender:
             raise TypeError(
                 f"caller: got {caller!r}, want a Caller, or a NoKey where none is asked for"
             )
+
         self._engine = engine
         self._session_id = session_id or uuid.uuid4().hex
         self._counted = not connected if counted is None else counted
@@ -83,6 +84,7 @@ class Sender:
         # Whether a message without an admission, and with it its first request, was counted.
         self._paid = False
         self._refused = 0  # number of consecutive refused messages
+
         # Prefix of the sender's session ids.
         self._prefix = f"{caller.name}/" if isinstance(caller, Caller) else ""
         # Id of the sender's own session in the engine.
@@ -110,13 +112,12 @@ class Sender:
             )
 
         def admit(op: object) -> bool:
+            """Charge a message or a request to the key; see `MessageAdmission`."""
             nonlocal counted
-            free, counted = counted, False
-            return (
-                self._count_message(caller)
-                if op == "message" and not free
-                else self._count(caller, op, free)
-            )
+            is_free, counted = counted, False
+            if op == "message" and not is_free:
+                return self._count_message(caller)
+            return self._count(caller, op, is_free)
 
         return MessageAdmission(
             self._engine.admission,
@@ -155,8 +156,10 @@ class Sender:
 
     async def wait_unthrottled(self) -> None:
         """Wait until the server may read from the sender."""
-        while (wait_s := self.throttled_s()) > 0:
+        wait_s = self.throttled_s()
+        while wait_s > 0:
             await asyncio.sleep(wait_s)
+            wait_s = self.throttled_s()
 
     @property
     def refused_too_often(self) -> bool:
@@ -183,9 +186,11 @@ class Sender:
             waited_s: Time that the message waited before it was read, s, which counts towards the
                 deadlines.
         """
-        engine, now, (requests, refused) = self._engine, self._engine.clock(), decoded
-        watched = engine.observers.any
+        engine, (requests, refused) = self._engine, decoded
+        now = engine.clock()
+        is_observed = engine.observers.any
         sent: list[PendingRequest] = []
+
         size = REQUEST_BYTES * len(requests)
         overloaded = None
         try:
@@ -196,36 +201,39 @@ class Sender:
                     self._caller is None or self._caller.priority != "simulation"
                 )
                 engine.admission.hold(size, is_robot, 0)
-                # Also released if the requests are dropped without an answer, as those of an ended
-                # connection.
-                engine.admission.messages[weakref.ref(message, engine.admission.release_with)] = (
-                    size
-                )
+                # The bytes are also released if the requests are dropped without an answer, as
+                # those of an ended connection.
+                reference = weakref.ref(message, engine.admission.release_with)
+                engine.admission.messages[reference] = size
         except VLAgentsError as error:
             overloaded = error
-        answered = partial(self._answered, then, admission, sent if watched else ())
+
+        answered = partial(self._answered, then, admission, sent if is_observed else ())
         message.expect(len(requests) + len(refused), answered)
-        place = 0
+
+        index = 0
         for request in requests:
-            while place in refused:
-                place += 1
+            while index in refused:
+                index += 1
             pending = PendingRequest(
                 self._prefix + (request.session or self._session_id),
                 request,
-                partial(message.put, place),
+                partial(message.put, index),
                 PRIORITIES[request.priority],
                 now,
                 origin=self._origin,
-                place=place,
+                index=index,
             )
             if request.deadline_ms is not None:
                 pending.deadline = now + request.deadline_ms / 1e3 - waited_s
             sent.append(pending)
-            place += 1
-        if watched:
+            index += 1
+
+        if is_observed:
             for pending in sent:
-                pending.files, pending.kept = (admission and admission.files) or {}, {}
+                pending.files, pending.observer_data = (admission and admission.files) or {}, {}
                 engine.observers.on_request(pending)
+
         if overloaded is not None:
             for pending in sent:
                 pending.fail(overloaded)
@@ -235,8 +243,9 @@ class Sender:
             engine.submit(
                 self._admitted(self._caller, sent, admission is not None or self._counted)
             )
-        for place, reply in refused.items():
-            message.put(place, reply)
+
+        for index, reply in refused.items():
+            message.put(index, reply)
         return sent
 
     def _admitted(
@@ -266,7 +275,7 @@ class Sender:
         self,
         then: Answered,
         admission: MessageAdmission | None,
-        watched: Sequence[PendingRequest],
+        observed: Sequence[PendingRequest],
         message: IncomingMessage,
     ) -> None:
         if self._engine.drain_list.ask(self.session_id):
@@ -277,12 +286,13 @@ class Sender:
                 reply.draining = True
         if admission is not None:
             admission.release()
+
         observers = self._engine.observers
-        for pending in watched:
-            observers.before_answer(pending, message.replies[pending.place])
+        for pending in observed:
+            observers.before_answer(pending, message.replies[pending.index])
         then(message)
-        for pending in watched:
-            observers.on_answer(pending, message.replies[pending.place])
+        for pending in observed:
+            observers.on_answer(pending, message.replies[pending.index])
 
     async def ask(
         self, message: IncomingMessage, decoded: Decoded, admission: MessageAdmission | None = None
@@ -303,15 +313,18 @@ class Sender:
             admission=admission,
             waited_s=waited_s,
         )
+
         timer = None
         if sent and all(request.deadline_ms is not None for request in decoded.requests):
             last_s = max(pending.deadline for pending in sent) - sent[0].arrived
             timer = loop.call_later(last_s, self._expire, message, sent)
+
         try:
             return await future
         finally:
-            if left := [pending for pending in sent if not pending.over]:
-                self._engine.withdraw(*left)
+            unanswered = [pending for pending in sent if not pending.over]
+            if unanswered:
+                self._engine.withdraw(*unanswered)
             if timer is not None:
                 timer.cancel()
 
@@ -343,7 +356,7 @@ class Sender:
         self._origin.ended = True
         owner = self._origin.owner
         if owner and (for_good or not (self._asked_to_reconnect or self._engine.draining)):
-            # A migrator's thread may add one.
+            # The sessions are copied, since a migrator's thread may add one.
             self._engine.sessions.close_owned(owner, tuple(self._origin.sessions))
 
     def _count(self, caller: Caller, op: object, counted: bool) -> bool:

@@ -69,20 +69,21 @@ class Checkpoints:
         """
         if not self._adapters:
             return dict(config)
-        named = config.get(_ADAPTERS) or {}
-        if not isinstance(named, Mapping):
+        adapters = config.get(_ADAPTERS) or {}
+        if not isinstance(adapters, Mapping):
             raise ConfigError(
-                f"adapters: got {named!r}, want a folder or hub id by the name of each"
+                f"adapters: got {adapters!r}, want a folder or hub id by the name of each"
             )
-        if double := sorted(
-            name for name, source in self._adapters.items() if named.get(name, source) != source
-        ):
+
+        conflicts = sorted(
+            name for name, source in self._adapters.items() if adapters.get(name, source) != source
+        )
+        if conflicts:
             raise ConfigError(
-                f"adapters: got {double} both in the policy's settings and among the deployment's "
-                "checkpoints, want "
-                f"each name once; rename one"
+                f"adapters: got {conflicts} both in the policy's settings and among the "
+                "deployment's checkpoints, want each name once; rename one"
             )
-        return {**config, _ADAPTERS: {**named, **self._adapters}}
+        return {**config, _ADAPTERS: {**adapters, **self._adapters}}
 
     def split_options(self, options: Mapping[str, Any]) -> tuple[CheckpointChoice, dict[str, Any]]:
         """Split the options of a reset into the chosen checkpoint and the options for the policy.
@@ -104,8 +105,10 @@ class Checkpoints:
                     f"{ADAPTER}: got {rest[ADAPTER]!r} and {CHOICE} {choice!r}, want one of them"
                 )
             return DEFAULT, {**rest, ADAPTER: choice}
+
         if choice is not None and (not isinstance(choice, str) or choice not in self._choices):
             raise UnknownCheckpoint(f"{CHOICE}: got {choice!r}, want {self._offered()}")
+
         if step is not None:
             if not self._steps:
                 raise UnknownCheckpoint(

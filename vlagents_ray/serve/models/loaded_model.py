@@ -44,9 +44,9 @@ class _DummySession:
     acts: int = 0
 
 
-def powers_up_to(most: int) -> list[int]:
-    """Return the powers of two below `most`, and `most` itself: 1, 2, 4, …"""
-    return [*(2**power for power in range((most - 1).bit_length())), most]
+def powers_up_to(largest: int) -> list[int]:
+    """Return the powers of two below `largest`, and `largest` itself: 1, 2, 4, …"""
+    return [*(2**power for power in range((largest - 1).bit_length())), largest]
 
 
 class Padding:
@@ -100,12 +100,12 @@ class Padding:
         used = self._rows[: len(results)]
         for row in used:
             row.acts += 1
-        kept = [
+        usable = [
             row
             for row, result in zip(used, results, strict=True)
             if isinstance(result, Act) and row.acts < _LIFE
         ]
-        self._rows[: len(results)] = kept
+        self._rows[: len(results)] = usable
 
 
 @dataclass(slots=True, eq=False)
@@ -176,7 +176,8 @@ class LoadedModel:
         Calls with the same `op` and `kind` take similarly long, and never run on two threads at
         once.
         """
-        if (call := self._calls_by_kind.get((op, kind))) is None:
+        call = self._calls_by_kind.get((op, kind))
+        if call is None:
             call = self._calls_by_kind[op, kind] = PolicyCall(self.calls, op)
         return call
 
@@ -262,21 +263,24 @@ class Loader:
         agent = agent or self._source.make(settings)
         try:
             with (
-                used_checkpoints() as found,
+                used_checkpoints() as checkpoints,
                 loading_report(
                     self.on_progress, self._compiled_sizes, self.on_out_of_memory, self.on_gpu_ms
                 ) as report,
             ):
                 agent.initialize()
-            weights = agent.weights_id or weights_of(found)
+            weights = agent.weights_id or weights_of(checkpoints)
+
             policy = agent
             while isinstance(policy, Wrapper):
                 policy = policy.agent
-            named = with_defaults(type(policy), settings)
-            files = files_named({**named, CHOICE: resolved(named)}, folders=not weights)
+            full_settings = with_defaults(type(policy), settings)
+            files = files_named(
+                {**full_settings, CHOICE: resolved(full_settings)}, folders=not weights
+            )
             if weights is None and files:
                 weights = {"digest": digest_of(files), "revision": None}
-            # Also of weights that have no digest, for the comparison with a robot.
+            # The statistics are for the comparison with a robot, also of weights without a digest.
             if agent.statistics is not None:
                 weights = {
                     "digest": None,
@@ -284,6 +288,7 @@ class Loader:
                     **(weights or {}),
                     "statistics": agent.statistics,
                 }
+
             contract = agent.contract
             self._check(contract)
             copies = AgentCopies(agent)
@@ -291,11 +296,13 @@ class Loader:
         except BaseException:
             _close_agent(agent)
             raise
+
         padding = Padding(() if report.pads else self._batch_sizes, copies.make)
         digest = (weights or {}).get("digest") or ""
         version = (self.version(settings), f"{copies.fingerprint} {digest}")
         if weights is not None and digest:
             logger.info("weights: %s, revision: %s", digest, weights.get("revision"))
+
         busy = threading.Lock()
         make = (
             agent.model_weights if isinstance(agent, HoldsWeights) else partial(ModelWeights, agent)

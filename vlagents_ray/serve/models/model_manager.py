@@ -187,15 +187,19 @@ class ModelCache:
         for model in idle:
             if not self._source.offers(model.choice, model.settings, self.config):
                 return EvictTask(model.key)
-        if (wanted := self._most_wanted()) is None:
+
+        awaited = self._next_load()
+        if awaited is None:
             return None
-        task, since = wanted
+        task, since = awaited
+
         limit = self._source.limit
         if len(self.loaded) < limit:
             if self._fits(len(self.loaded)):
                 return task
             limit = len(self.loaded)
-        # Episodes begin with it during a swap: evicted last.
+
+        # During a swap episodes still begin with the old settings, so their model is evicted last.
         old = None if self.next is None else self.config
         if idle:
             self.draining = min(idle, key=lambda model: model.settings == old).key
@@ -222,7 +226,7 @@ class ModelCache:
     def _settings(self, choice: CheckpointChoice) -> dict[str, Any]:
         return self._source.settings(choice, self.config)
 
-    def _most_wanted(self) -> tuple[LoadTask, float] | None:
+    def _next_load(self) -> tuple[LoadTask, float] | None:
         """Return the next model to load, and the start of the wait for it, s; a swap has
         priority.
         """
@@ -280,12 +284,13 @@ class ModelManager:
         """Set the deployment's own settings: the first call sets the initial ones, a later one
         starts a swap.
         """
-        own = self._source.own(config)
+        settings = self._source.own(config)
         with self._changed:
             if not self._begun:
-                self._begun, self._cache.config, self._first = True, own, self._source.make(own)
+                self._begun, self._cache.config = True, settings
+                self._first = self._source.make(settings)
             else:
-                self._cache.next = None if own == self.config else own
+                self._cache.next = None if settings == self.config else settings
                 self._cache.failure = None
                 self._wake()
 
@@ -347,10 +352,11 @@ class ModelManager:
         """Return the parts of the loaded models that run without compilation, although their
         settings request it.
         """
+        uncompiled: list[str] = []
         with self._changed:
-            return [
-                what for model in self._cache.loaded.values() for what in model.report.uncompiled
-            ]
+            for model in self._cache.loaded.values():
+                uncompiled.extend(model.report.uncompiled)
+        return uncompiled
 
     def gpu_memory(self) -> dict[str, int]:
         """Return the memory of the GPUs of the deployment's own model, see
@@ -418,7 +424,9 @@ class ModelManager:
         with self._changed:
             self._require_open()
             self.release_model(session)
-            if (model := self._cache.free(choice)) is not None and not session.over:
+
+            model = self._cache.free(choice)
+            if model is not None and not session.over:
                 return self._cache.assign(session, model)
             self._cache.waiting.append(Waiter(session, choice, on_loaded, is_abandoned))
             self._wake()
@@ -441,12 +449,14 @@ class ModelManager:
         """
         with self._changed:
             self._require_open()
-            if (model := self._cache.loaded.get(key_of(settings))) is not None:
+            model = self._cache.loaded.get(key_of(settings))
+            if model is not None:
                 return self._cache.assign(session, model)
             if timeout_s <= 0 or not self._source.offers(choice, settings, self.config):
                 raise UnknownSession(
                     f"session {session.id!r}: {choice} is not loaded here; reset it"
                 )
+
         done = threading.Event()
         errors: list[VLAgentsError] = []
 
@@ -456,13 +466,11 @@ class ModelManager:
 
         if self.hold(session, choice, on_loaded) is None:
             done.wait(timeout_s)
-        if session.model is None:
-            raise (
-                errors[0]
-                if errors
-                else UnknownSession(f"session {session.id!r}: {choice} takes long; reset it")
-            )
-        return session.model
+        if session.model is not None:
+            return session.model
+        if errors:
+            raise errors[0]
+        raise UnknownSession(f"session {session.id!r}: {choice} takes long; reset it")
 
     def release_model(self, session: Session[LoadedModel]) -> None:
         """Release the model of a session that has no episode."""
@@ -516,14 +524,19 @@ class ModelManager:
         """
         with self._changed:
             while not self._closed:
-                if (model := self._cache.swap()) is not None:
+                model = self._cache.swap()
+                if model is not None:
                     self._set_own_model(model)
                     logger.info("new episodes begin with %s", model.checkpoint)
-                # Before `plan`, which might evict a model that was just loaded.
-                if due := self._cache.pop_due():
+
+                # This precedes `plan`, which might evict a model that was just loaded.
+                due = self._cache.pop_due()
+                if due:
                     return due
+
                 draining = self._cache.draining
-                if (task := self._cache.plan()) is not None:
+                task = self._cache.plan()
+                if task is not None:
                     return task
                 if self._cache.draining == draining:
                     self._changed.wait(_CHECK_S if self._cache.waiting else None)

@@ -72,6 +72,7 @@ class BatchQueue:
         self._clock, self._idle_s = clock, idle_s
         self.largest = max_batch_size
         self._waiting = FairQueue()
+
         self._load_timer = LoadTimer()  # counts the time until the policy is loaded as idle
         self._lock = threading.Lock()
         self._closed = False
@@ -80,6 +81,7 @@ class BatchQueue:
         # Whether a caller of `take` drives the queue; each new request then wakes that caller.
         self._driven = False
         self._dense = False  # whether requests arrive in quick succession
+
         self.poller = poller or Poller()
         self.window = BatchWindow(patience, max_batch_size, is_open)
         self._gathering = False
@@ -341,8 +343,12 @@ class LoadMeter:
     def read(self) -> QueueLoad:
         """Return the mean load since the last call, or since the meter was created."""
         now = (time.perf_counter(), *self._queue.load_s())
-        elapsed, idle, waited = (b - a for a, b in zip(self._last, now, strict=True))
+        elapsed_s, idle_s, waited_s = (
+            current - last for last, current in zip(self._last, now, strict=True)
+        )
         self._last = now
-        if elapsed <= 0:
+        if elapsed_s <= 0:
             return QueueLoad(0.0, 0.0)
-        return QueueLoad(min(1.0, max(0.0, 1.0 - idle / elapsed)), max(0.0, waited / elapsed))
+
+        utilisation = min(1.0, max(0.0, 1.0 - idle_s / elapsed_s))
+        return QueueLoad(utilisation, waiting=max(0.0, waited_s / elapsed_s))

@@ -70,7 +70,9 @@ class BatchCost:
     def add(self, size: int, duration: float) -> None:
         """Add a batch of `size` observations that took `duration` s."""
         new = (1.0, size, duration, size * size, size * duration)
-        self._sums = tuple(_KEPT * old + one for old, one in zip(self._sums, new, strict=True))  # type: ignore[assignment]
+        self._sums = tuple(  # type: ignore[assignment]
+            _KEPT * total + term for total, term in zip(self._sums, new, strict=True)
+        )
 
     def fixed_s(self) -> float:
         """Return the fixed cost of a batch, s; `inf` until batches of different sizes were
@@ -112,13 +114,14 @@ class BatchWindow:
 
     def record_start(self, batch: Sequence[PendingRequest]) -> None:
         """Record that a batch begins."""
-        self._previous, self._last = (
-            self._last,
-            _AnsweredBatch(batch) if self.slow else self._no_batch,
+        last = _AnsweredBatch(batch) if self.slow else self._no_batch
+        previous = self._last
+        self._previous, self._last = previous, last
+
+        is_one_session = last.lone != "" and (
+            previous is self._no_batch or previous.lone == last.lone
         )
-        last, previous = self._last, self._previous
-        one_session = last.lone != "" and (previous is self._no_batch or previous.lone == last.lone)
-        self.overlaps = self.slow and not one_session
+        self.overlaps = self.slow and not is_one_session
 
     def record_end(self, now: float, duration: float) -> None:
         """Record that the batch ended at `now`, s, after `duration` s."""
@@ -152,6 +155,7 @@ class BatchWindow:
         bound = self._bound = min(patience * self._duration, self._cost.fixed_s())
         if bound <= 0 or not self.slow or waiting.sessions >= self._size:
             return 0.0
+
         self._missing = {
             session_id
             for session_id, return_s in self._last.returns[self._priority].items()
@@ -161,6 +165,7 @@ class BatchWindow:
             and session_id not in waiting
             and self._is_open(session_id)
         }
+
         self._until = now + bound
         if not self._missing or any(self._must_not_wait(pending) for pending in waiting.heads()):
             return 0.0

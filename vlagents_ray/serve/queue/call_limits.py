@@ -18,7 +18,8 @@ from dataclasses import dataclass
 from vlagents_ray.errors import PolicyFailed, PolicyUnavailable, VLAgentsError
 from vlagents_ray.policies.base.accelerator import is_device_failure
 
-# Per kind of call: the first one compiles, and the second one compiles for dynamic sizes.
+# Calls of a kind that may take long: the first one compiles, the second one compiles for dynamic
+# sizes.
 _WARM_UP_CALLS = 2
 _MULTIPLE = 10  # limit of a call, as a multiple of the longest call of its kind so far
 LOAD = "load"
@@ -97,8 +98,7 @@ class PolicyCall:
         """
         return (
             f"the policy has not returned from {self.op!r} for {self.lasted_s:.3g} s; its "
-            "limit "
-            f"is {self.limit_s:.3g} s"
+            f"limit is {self.limit_s:.3g} s"
         )
 
     def stack(self) -> str:
@@ -129,7 +129,7 @@ class PolicyCalls:
         """Count consecutive batches with errors of the policy only; errors of requests do not
         count.
         """
-        errors = [one for one in results if isinstance(one, Exception)]
+        errors = [result for result in results if isinstance(result, Exception)]
         for error in errors:
             self.record_error(error)
         if len(errors) < len(results):
@@ -148,8 +148,7 @@ class PolicyCalls:
             error = f"{type(self.broken).__name__}: {str(self.broken).partition(chr(10))[0]}"
             raise PolicyUnavailable(
                 f"the policy's accelerator failed ({error}); this replica is replaced, and the "
-                "session begins again at "
-                f"another one"
+                "session begins again at another one"
             ) from self.broken
 
     def check_health(self) -> None:

@@ -36,8 +36,10 @@ class _SourceQueue:
         self.queues: dict[str, deque[_SessionQueue]] = {}
 
     def add(self, queue: _SessionQueue) -> None:
+        """Add the queue of a session that did not wait before, at the end of its source."""
         source = queue[0].origin.connection or queue[0].session_id
-        if (queues := self.queues.get(source)) is None:
+        queues = self.queues.get(source)
+        if queues is None:
             self.queues[source] = deque((queue,))
             self.sources.append(source)
         else:
@@ -50,15 +52,19 @@ class _SourceQueue:
         source = self.sources.popleft()
         queues = self.queues[source]
         queue = queues.popleft()
+
         if queues:
             self.sources.append(source)
         else:
             del self.queues[source]
         return queue
 
-    def impatient(self, now: float) -> bool:
+    def is_impatient(self, now: float) -> bool:
         """Return whether the next request has waited for longer than `PATIENCE_S`."""
-        return bool(self.sources) and now - self.queues[self.sources[0]][0][0].arrived > PATIENCE_S
+        if not self.sources:
+            return False
+        next_queue = self.queues[self.sources[0]][0]
+        return now - next_queue[0].arrived > PATIENCE_S
 
 
 class FairQueue:
@@ -108,7 +114,8 @@ class FairQueue:
             self._append(lone)
 
     def _append(self, pending: PendingRequest) -> None:
-        if (queue := self._sessions.get(pending.session_id)) is not None:
+        queue = self._sessions.get(pending.session_id)
+        if queue is not None:
             queue.append(pending)
             return
         queue = self._sessions[pending.session_id] = deque((pending,))
@@ -129,30 +136,37 @@ class FairQueue:
             self._yielded = False
             return [lone], []
         self._enqueue_lone()
+
         batch: list[PendingRequest] = []
         expired: list[PendingRequest] = []
-        again: list[_SessionQueue] = []
+        still_waiting: list[_SessionQueue] = []  # sessions with further requests
+
         robots, simulations = self._queues_by_priority
-        yields = bool(robots.sources) and not self._yielded and simulations.impatient(now)
-        if yields:
-            self._pick(simulations.next(), now, batch, expired, again)
-        self._yielded = bool(batch)  # not if all requests there are over or have expired
-        for priority_queue in self._queues_by_priority:
-            while priority_queue.sources and len(batch) < size:
-                self._pick(priority_queue.next(), now, batch, expired, again)
-        for queue in again:
+        if robots.sources and not self._yielded and simulations.is_impatient(now):
+            self._pick(simulations.next(), now, batch, expired, still_waiting)
+        # It has not yielded if all requests of that session are over or have expired.
+        self._yielded = bool(batch)
+
+        for source_queue in self._queues_by_priority:
+            while source_queue.sources and len(batch) < size:
+                self._pick(source_queue.next(), now, batch, expired, still_waiting)
+
+        for queue in still_waiting:
             self._queues_by_priority[queue[0].priority].add(queue)
         return batch, expired
 
     def clear(self) -> list[PendingRequest]:
         """Remove and return all waiting requests."""
         self._enqueue_lone()
-        left = [pending for queue in self._sessions.values() for pending in queue]
+        waiting: list[PendingRequest] = []
+        for queue in self._sessions.values():
+            waiting.extend(queue)
+
         self._sessions.clear()
         self._queues_by_priority = [_SourceQueue() for _ in Priority]
         self.depth = [0] * len(Priority)
         self.size = 0
-        return left
+        return waiting
 
     def _pick(
         self,
@@ -160,27 +174,32 @@ class FairQueue:
         now: float,
         batch: list[PendingRequest],
         expired: list[PendingRequest],
-        again: list[_SessionQueue],
+        still_waiting: list[_SessionQueue],
     ) -> None:
         """Move the session's first live request to the batch, and drop finished and expired
         requests before it.
+
+        A session with further requests is added to `still_waiting`.
         """
         session_id = queue[0].session_id
         while queue:
             pending = queue.popleft()
             self.depth[pending.priority] -= 1
             self.size -= 1
-            # Otherwise it must run, to release the checkpoint that its session holds.
+
+            # A reset whose checkpoint was loaded must run, to release that checkpoint.
             if pending.loaded is None:
                 if pending.over:
                     continue
                 if pending.is_useless(now):
                     expired.append(pending)
                     continue
+
             pending.begun = True
             batch.append(pending)
             break
+
         if queue:
-            again.append(queue)
+            still_waiting.append(queue)
         else:
             del self._sessions[session_id]

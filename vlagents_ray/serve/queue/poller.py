@@ -77,7 +77,7 @@ class Poller:
 
     def wake(self) -> None:
         """End the current `poll`, or the next one. May be called on any thread."""
-        # The pipe is full: a wake-up is already pending.
+        # If the pipe is full, a wake-up is already pending.
         with self._waking, contextlib.suppress(BlockingIOError):
             if not self._released:
                 os.write(self._wake_write, b"x")
@@ -151,7 +151,8 @@ class Poller:
             if lent and not self._lent.is_set():
                 # The epoll is level-triggered: the owner's next poll reports the remaining events.
                 return
-            if (ready := self._ready.get(descriptor)) is None:
+            ready = self._ready.get(descriptor)
+            if ready is None:
                 continue  # an earlier callback of this loop has stopped watching it
             try:
                 ready()

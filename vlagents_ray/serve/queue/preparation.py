@@ -51,24 +51,25 @@ class Preparations:
         """
         errors: dict[int, Exception] = {}
 
-        def finish(place: int, *, begun: bool) -> None:
-            preparation, agent = preparations[place]
+        def finish_at(index: int, *, begun: bool) -> None:
+            preparation, agent = preparations[index]
             if preparation is None or agent is not preparation.agent:  # the session has been reset
                 return
             obs, future = preparation.obs, preparation.future
             try:
                 obs.prepared = future.result() if begun else preparation.agent.prepare(obs)
             except Exception as error:  # noqa: BLE001 - fails the request of that observation
-                errors[place] = error
+                errors[index] = error
 
-        begun = []
-        for place, (preparation, _) in reversed(list(enumerate(preparations))):
+        begun = []  # indices of the preparations that run on other threads, or have ended
+        for index, (preparation, _) in reversed(list(enumerate(preparations))):
             if preparation is not None and preparation.future.cancel():
-                finish(place, begun=False)
+                finish_at(index, begun=False)
             elif preparation is not None:
-                begun.append(place)
-        for place in begun:
-            finish(place, begun=True)
+                begun.append(index)
+
+        for index in begun:
+            finish_at(index, begun=True)
         return errors
 
     def close(self) -> None:

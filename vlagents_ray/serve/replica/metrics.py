@@ -144,19 +144,21 @@ class Exporter:
         self._uncompiled.set(len(self._engine.models.uncompiled))
         for kind, size in self._engine.models.gpu_memory().items():
             self._gpu_memory.set(size, {"kind": kind})
-        if new := CudaGraph.replays - self._replayed:
-            self._replays.inc(new)
-            self._replayed += new
+
+        new_replays = CudaGraph.replays - self._replayed
+        if new_replays:
+            self._replays.inc(new_replays)
+            self._replayed += new_replays
         self._unreadable.set(0.0 if self._keys is None else self._keys.unreadable_s)
 
     def _export_collected(self, collected: Collected) -> None:
         for (op, transport, priority, code), sample in collected.requests.items():
-            what = {"op": op, "transport": transport, "priority": priority}
-            self._requests.inc(sample.seen, {**what, "code": code})
+            tags = {"op": op, "transport": transport, "priority": priority}
+            self._requests.inc(sample.count, {**tags, "code": code})
             if code != "ok":
                 continue
             for total_ms, *stages in _in_slices(sample.values):
-                self._latency.observe(total_ms, what)
+                self._latency.observe(total_ms, tags)
                 if op == "act":
                     for stage, stage_ms in zip(STAGES, stages, strict=True):
                         self._stage.observe(stage_ms, {"stage": stage, "transport": transport})

@@ -77,7 +77,7 @@ class PartContext:
     node: str  # name of its node
     metadata: Callable[[], Mapping[str, Any]]  # the document of `GET /v1/metadata`
     part: str = ""  # name of the part, its key in the deployment file
-    # Of its series, see `replica.metrics.series`.
+    # Tags of its metrics, see `replica.metrics.series`.
     metric_tags: Mapping[str, str] = field(default_factory=dict)
     # The application's other replicas.
     siblings: Callable[[], Awaitable[Sequence[OtherReplica]]] = no_siblings
@@ -133,14 +133,13 @@ class ReplicaPart:
     Config: ClassVar[type[PartConfig]] = PartConfig
     sibling_methods: ClassVar[Mapping[str, float | None]] = {}
     """The methods that the same part of other replicas may call, and the time limit of each for an
-    answer, s; None is
-    no limit. A coroutine function runs on the replica's event loop, any other one in a thread."""
+    answer, s; None is no limit. A coroutine function runs on the replica's event loop, any other
+    one in a thread."""
 
     pages: ClassVar[Mapping[str, str]] = {}
     """Paths of pages for a browser, by title, such as {"live page": "/live"}; `vlagents-ray serve`
-    prints their
-    addresses. They need no key, which a browser cannot send with them: a page itself must hold no
-    data. Each is a route of the part; the replica does not start otherwise."""
+    prints their addresses. They need no key, which a browser cannot send with them: a page itself
+    must hold no data. Each is a route of the part; the replica does not start otherwise."""
 
     def __init__(self, settings: Any, context: PartContext) -> None:
         """Create a part with the `settings` of the deployment file, an instance of its `Config`."""

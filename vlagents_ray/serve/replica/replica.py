@@ -284,8 +284,8 @@ class PolicyReplica(ClientApi, SiblingApi):
             boot_id: The boot id of the client's machine.
             must_be_near: Whether the client's transport reaches no other machine.
         """
-        place = ClientLocation(node, boot_id, must_be_near)
-        return await self._rebalancer.place(place) or self._connection_info()
+        location = ClientLocation(node, boot_id, must_be_near)
+        return await self._rebalancer.place(location) or self._connection_info()
 
     async def call(self, session_id: str, frame: Any) -> bytes:
         """Execute a frame of requests from inside the cluster, a buffer that is read in place
@@ -319,8 +319,8 @@ class PolicyReplica(ClientApi, SiblingApi):
         or of this replica.
         """
         machines = [boot_id()] if caller == SERVERS_MACHINE else [caller, boot_id()]
-        places = [ClientLocation(boot_id=machine, must_be_near=True) for machine in machines]
-        metadata, _ = await self._rebalancer.place(*places) or (self.metadata(), None)
+        locations = [ClientLocation(boot_id=machine, must_be_near=True) for machine in machines]
+        metadata, _ = await self._rebalancer.place(*locations) or (self.metadata(), None)
         return {key: value for key, value in metadata.items() if key != "plasma"}
 
     # Other replicas: `SiblingApi`.
@@ -362,12 +362,12 @@ class PolicyReplica(ClientApi, SiblingApi):
         """Let all replicas sleep, restore their memory, or wake; called by a learner."""
         await self._pusher.rest(rest)
 
-    async def push_received(self, named: Mapping[str, Any], options: PushOptions) -> PushResult:
+    async def push_received(self, values: Mapping[str, Any], options: PushOptions) -> PushResult:
         """Make all replicas act with new weights, which this one has received over the network."""
         if not await self._peers.others():
-            return await self._pusher.push(named, options)
-        # A copy, which does not delay robots on this event loop.
-        reference = await asyncio.to_thread(ray.put, named)
+            return await self._pusher.push(values, options)
+        # The values are copied on another thread, to not delay robots on this event loop.
+        reference = await asyncio.to_thread(ray.put, values)
         return await self._pusher.push([reference], options)
 
     def read_header(self, header: bytes, options: PushOptions) -> dict[str, ValueSpec]:
@@ -377,10 +377,10 @@ class PolicyReplica(ClientApi, SiblingApi):
     async def versions_of_weights(self) -> list[int]:
         """Return the newest version of each replica that can be reached; called by a learner."""
         replicas: list[WeightsReplica] = [self._weights, *await self._peers.others()]
-        found = await asyncio.gather(
+        answers = await asyncio.gather(
             *(replica.weights(WeightUpdates.newest) for replica in replicas), return_exceptions=True
         )
-        return [newest.number for newest in found if isinstance(newest, NewestVersion)]
+        return [answer.number for answer in answers if isinstance(answer, NewestVersion)]
 
     # The replica's periodic tasks.
 
@@ -440,20 +440,21 @@ def _stream_endpoint(engine: Engine, args: ServerArgs, admit: Admit | NoKey) -> 
     )
 
 
-def hide_gpus(given: Sequence[str]) -> None:
-    """Hide the node's GPUs from this process and its children, unless Ray has assigned it some.
+def hide_gpus(assigned: Sequence[str]) -> None:
+    """Hide the node's GPUs from this process and its children, unless Ray has `assigned` it some.
 
     Ray itself does not hide them from a replica with `num_gpus: 0`, which would use unreserved
     memory of the first one. Call this before anything uses CUDA.
     """
-    if given:
+    if assigned:
         return
-    if found := gpus_here():
+
+    gpus = gpus_here()
+    if gpus:
         logger.warning(
-            "this node has %g GPUs, which are hidden from the policy, as its resources say "
-            "num_gpus: 0; with "
-            "resources: {num_gpus: 1} it gets one",
-            found,
+            "this node has %g GPUs, which are hidden from the policy, as its resources are "
+            "num_gpus: 0; with resources: {num_gpus: 1} it gets one",
+            gpus,
         )
     os.environ[VISIBLE] = ""
 

@@ -65,16 +65,18 @@ class MeasuredLoad:
         totals = {
             name: sum(metrics.get(name, {}).values()) for name in (UTILISATION, WAITING, SESSIONS)
         }
-        most = self._needed(totals, 1.0)
-        least = self._needed(totals, _MARGIN)
+
+        needed = self._needed(totals, 1.0)
+        needed_with_margin = self._needed(totals, _MARGIN)
         if totals[SESSIONS] or ctx.total_num_requests:
             # Only an unused application may have no replica.
-            most, least = max(1, most), max(1, least)
-        if most > target:
-            return most, {}
+            needed, needed_with_margin = max(1, needed), max(1, needed_with_margin)
+
+        if needed > target:
+            return needed, {}
         # A replica without a report may be busy.
-        if least < target and len(reported) >= ctx.current_num_replicas:
-            return least, {}
+        if needed_with_margin < target and len(reported) >= ctx.current_num_replicas:
+            return needed_with_margin, {}
         return target, {}
 
     def _needed(self, totals: Mapping[str, float], margin: float) -> int:

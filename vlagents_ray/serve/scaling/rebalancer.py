@@ -66,7 +66,7 @@ class ClientLocation:
         )
 
 
-def choose_replica(loads: Sequence[ReplicaLoad], place: ClientLocation) -> ReplicaLoad | None:
+def choose_replica(loads: Sequence[ReplicaLoad], location: ClientLocation) -> ReplicaLoad | None:
     """Return the least loaded replica near to the client, or the least loaded one if that has
     clearly fewer sessions.
 
@@ -75,27 +75,30 @@ def choose_replica(loads: Sequence[ReplicaLoad], place: ClientLocation) -> Repli
     """
     accepting = [load for load in loads if load.accepts]
     near = min(
-        (load for load in accepting if place.is_near(load)),
+        (load for load in accepting if location.is_near(load)),
         key=attrgetter("sessions"),
         default=None,
     )
-    least = min(accepting, key=attrgetter("sessions"), default=None)
-    if (
-        place.must_be_near
-        or least is None
-        or (near and near.sessions <= _tolerated(least.sessions))
-    ):
+    least_loaded = min(accepting, key=attrgetter("sessions"), default=None)
+    if location.must_be_near or least_loaded is None:
         return near
-    return least
+    if near and near.sessions <= _tolerated(least_loaded.sessions):
+        return near
+    return least_loaded
 
 
-def excess_sessions(mine: int, others: Iterable[int], leaving: int = 0) -> int:
+def excess_sessions(mine: int, siblings: Iterable[int], leaving: int = 0) -> int:
     """Return the number of sessions that a replica should send away, without the `leaving` ones.
 
     It is the excess over the mean, rounded down; 0 if that is at most 25 % of the mean or one
     session.
+
+    Args:
+        mine: Number of sessions of the replica.
+        siblings: Numbers of sessions of the other replicas.
+        leaving: Number of its sessions that are about to move away.
     """
-    loads = [mine, *others]
+    loads = [mine, *siblings]
     mean = sum(loads) / len(loads)
     if mine - leaving <= _tolerated(mean):
         return 0
@@ -149,7 +152,7 @@ class Rebalancer:
         # Times at which clients were sent here that have no session yet.
         self._expected: deque[float] = deque()
         self._opened = 0
-        self._others: list[ReplicaLoad] = []
+        self._sibling_loads: list[ReplicaLoad] = []
         self._asked_at = float("-inf")  # time of the last request for the others' loads
         self._uneven = False  # whether the last comparison found too many sessions here
         self._placing = asyncio.Lock()  # clients are placed in turn
@@ -178,11 +181,11 @@ class Rebalancer:
         self.load()
         self._expected.append(time.monotonic())
 
-    async def place(self, *places: ClientLocation) -> Any:
+    async def place(self, *locations: ClientLocation) -> Any:
         """Choose the replica for a new client, and announce the client there.
 
         Args:
-            *places: Locations of the client in order of preference; the first one that suits any
+            *locations: Locations of the client in order of preference; the first one that suits any
                 replica is used.
 
         Returns:
@@ -193,21 +196,23 @@ class Rebalancer:
             # Clients that arrived during the requests use those answers.
             if arrived > self._asked_at:
                 try:
-                    self._others = await self._siblings.loads()
+                    self._sibling_loads = await self._siblings.loads()
                 except Exception:
-                    # errors of the other replicas must not keep a client from connecting
+                    # Errors of the other replicas must not keep a client from connecting.
                     logger.exception("the other replicas could not be asked")
-                    self._others = []
+                    self._sibling_loads = []
                 self._asked_at = time.monotonic()
-            chosen = self._choose(places)
+            chosen = self._choose(locations)
         return None if chosen is None else await self._siblings.announce_client(chosen)
 
-    def _choose(self, places: Sequence[ClientLocation]) -> str | None:
+    def _choose(self, locations: Sequence[ClientLocation]) -> str | None:
         """Return the name of the replica for a client, and count it there; None for this one."""
         mine = self.load()
-        loads = [mine, *self._others]
+        loads = [mine, *self._sibling_loads]
         random.shuffle(loads)  # so that the choice among equally loaded replicas is random
-        chosen = next((found for place in places if (found := choose_replica(loads, place))), None)
+
+        choices = (choose_replica(loads, location) for location in locations)
+        chosen = next((choice for choice in choices if choice is not None), None)
         if chosen is None:
             return None
         if chosen is mine:
@@ -223,15 +228,19 @@ class Rebalancer:
         drain_list, sessions = self._engine.drain_list, self._engine.sessions
         drain_list.forget_older(_RECONNECT_S)
         sessions.drop_idle()
+
         mine = self.load()
         too_many = 0
         active = sessions.by_connection(MOVABLE, _ACTIVE_S)
         asked = drain_list.asked_within(_SETTLE_S)
         if mine.sessions > 1 and mine.accepts:  # a single session is never too many
-            others = [load for load in await self._siblings.loads() if load.accepts]
-            if others and all(load.version == mine.version for load in others):
-                gone = sum(count for group, count in active.items() if group in asked)
-                too_many = excess_sessions(mine.sessions, [load.sessions for load in others], gone)
+            siblings = [load for load in await self._siblings.loads() if load.accepts]
+            if siblings and all(load.version == mine.version for load in siblings):
+                leaving = sum(count for group, count in active.items() if group in asked)
+                too_many = excess_sessions(
+                    mine.sessions, [load.sessions for load in siblings], leaving
+                )
+
         if too_many <= 0 or not self._uneven:
             drain_list.mark(set())
         else:

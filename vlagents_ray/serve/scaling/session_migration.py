@@ -135,7 +135,8 @@ class HeldSessions:
 
     async def weights(self, session_id: str) -> dict[str, Any] | None:
         """Return the values of the weights with which the session acts; None if it is not here."""
-        session = next((one for one in self._engine.sessions.all() if one.id == session_id), None)
+        sessions = self._engine.sessions.all()
+        session = next((session for session in sessions if session.id == session_id), None)
         if session is None or session.model is None or session.weights is None:
             return None
         return await asyncio.to_thread(session.model.parameters.portable_values, session.weights)
@@ -338,6 +339,7 @@ class SessionMigrator:
             self._callers[caller] += 1
 
             def finished() -> None:
+                """End the search for its caller."""
                 with self._lock:
                     self._callers[caller] -= 1
                     if not self._callers[caller]:
@@ -374,21 +376,23 @@ class SessionMigrator:
 
         tried = set[tuple[str, Version]]()
         while True:
-            here = sorted(self._engine.sessions.versions().items() - tried)
-            if not (here or self._callbacks or self._offered):
+            remaining = sorted(self._engine.sessions.versions().items() - tried)
+            if not (remaining or self._callbacks or self._offered):
                 break
-            tried.update(here)
-            peers = await self._responsive_first() if here else []
-            # round-robin over the replicas.
+            tried.update(remaining)
+
+            peers = await self._responsive_first() if remaining else []
+            # The sessions are spread over the replicas by round-robin.
             orders = [peers[i:] + peers[:i] for i in range(max(1, len(peers)))]
             transfers = [
                 transfer(session_id, orders[i % len(orders)])
-                for i, (session_id, _) in enumerate(here)
+                for i, (session_id, _) in enumerate(remaining)
             ]
             await asyncio.gather(*transfers)
-            # Sessions are still being fetched, for earlier requests or since they were offered.
-            if not here:
+            if not remaining:
+                # Sessions are still being fetched, for earlier requests or since they were offered.
                 await asyncio.sleep(ON_ITS_WAY_S)
+
         self._closed = True
         # Later requests are refused, so that clients send them to the new replica.
         self._engine.stop(0.0)
@@ -440,15 +444,16 @@ class SessionMigrator:
                 # Another replica has given it to this one.
                 if self._engine.sessions.held([session_id]):
                     return
+
             await self.held.wait_until_left(session_id)
             holders = await self._holders(session_id, await self._answers(session_id))
             for version, peer in holders[1:]:
-                if version < holders[0][0]:
-                    self._spawn(
-                        self._answer(
-                            peer.ask(HeldSessions.drop_older, {session_id: holders[0][0][0]})
-                        )
-                    )
+                newest = holders[0][0]
+                if version < newest:
+                    newest_step = newest[0]
+                    dropping = peer.ask(HeldSessions.drop_older, {session_id: newest_step})
+                    self._spawn(self._answer(dropping))
+
             if holders and await self._move(session_id, holders[0][1]):
                 return
             misses = 0 if holders or self.held.is_leaving(session_id) else misses + 1
@@ -481,12 +486,13 @@ class SessionMigrator:
         if state is None:
             return False
         # The other replica received the call later than `asked`, so that this is no later than the
-        # episode's true
-        # begin: an act that arrived after the reset is never taken for one of an older episode.
+        # episode's true begin: an act that arrived after the reset is never taken for one of an
+        # older episode.
         began = asked - state["age_s"]
         origin = NOWHERE if offered else self._user_of(session_id, state, began)
         if origin is None:
             return True
+
         arriving = await self._prepare(peer, session_id, state, began, origin)
         version = state["steps"], state["moves"]
         release = self._spawn(
@@ -499,6 +505,7 @@ class SessionMigrator:
         if not release.result():
             self._engine.abandon(arriving)
             return False
+
         self._engine.enter(arriving)
         logger.info(
             "session %s: fetched from another replica, after %d acts",
@@ -515,6 +522,7 @@ class SessionMigrator:
         """
 
         async def prepare(weights: dict[str, Any] | None = None) -> Session[LoadedModel]:
+            """Create the copy on another thread, with the values of its weights if given."""
             create = self._engine.prepare_adoption
             arriving: Session[LoadedModel] = await self._in_thread(
                 create, session_id, state, _LOAD_S, began, origin, weights
@@ -560,8 +568,8 @@ class SessionMigrator:
             asked = [peer for peer in await self._peers() if peer.name not in self._silent]
             answers = {peer: self._spawn(self._query_peer(peer, list(query))) for peer in asked}
         finally:
-            for each in query.values():
-                each.set_result(answers)
+            for future in query.values():
+                future.set_result(answers)
 
     async def _query_peer(
         self, peer: Peer, session_ids: Sequence[str]
@@ -578,9 +586,9 @@ class SessionMigrator:
         """Return the replicas that have the session, with its version there, the newest version
         first.
         """
-        of = {task: peer for peer, task in answers.items()}
-        found: list[tuple[Version, Peer]] = []
-        waiting = set(of)
+        peer_of = {task: peer for peer, task in answers.items()}
+        holders: list[tuple[Version, Peer]] = []
+        waiting = set(peer_of)
         until = self._loop.time() + _ANSWER_S
         while waiting:
             left_s = max(0.0, until - self._loop.time())
@@ -590,11 +598,12 @@ class SessionMigrator:
             if not completed:
                 break
             for task in completed:
-                if session_id in (said := task.result() or {}):
-                    step, moves = said[session_id]
-                    found.append(((step, moves), of[task]))
+                versions = task.result() or {}
+                if session_id in versions:
+                    step, moves = versions[session_id]
+                    holders.append(((step, moves), peer_of[task]))
                     until = min(until, self._loop.time() + _OTHERS_S)
-        return sorted(found, key=lambda one: one[0], reverse=True)
+        return sorted(holders, key=lambda holder: holder[0], reverse=True)
 
     @staticmethod
     async def _answer(asked: Coroutine[Any, Any, T], timeout_s: float | None = None) -> T | None:
@@ -640,10 +649,10 @@ class SessionMigrator:
             answers may be older.
         """
         later: list[_Callback] = []
-        found = self._engine.sessions.held([session_id])
+        is_here = bool(self._engine.sessions.held([session_id]))
         with self._lock:
             callbacks = self._callbacks.pop(session_id, [])
-            if waiting is not None and not (found or self._closed):
+            if waiting is not None and not (is_here or self._closed):
                 later = [callback for callback in callbacks if callback not in waiting]
                 callbacks = [callback for callback in callbacks if callback in waiting]
             if later:

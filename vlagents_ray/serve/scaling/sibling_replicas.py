@@ -62,8 +62,8 @@ class PeerMethod(NamedTuple):
 
 
 PEER_METHODS = {
-    one.call.__qualname__: one
-    for one in (
+    method.call.__qualname__: method
+    for method in (
         PeerMethod(HeldSessions, HeldSessions.held, None),
         PeerMethod(HeldSessions, HeldSessions.copy, None),
         PeerMethod(HeldSessions, HeldSessions.weights, _TRANSFER_S),
@@ -79,8 +79,8 @@ PEER_METHODS = {
         PeerMethod(Rebalancer, Rebalancer.load, _QUICK_S),
     )
 }
-"""What replicas call at each other, beside `SiblingApi`: moves of sessions, pushes of weights,
-loads.
+"""The methods that replicas call on each other with `SiblingApi.peer`, by their qualified names:
+for moves of sessions, pushes of weights, and loads.
 """
 
 
@@ -90,8 +90,11 @@ class SiblingReplica(Peer):
     """
 
     def __init__(self, name: str, actor: Any, initialized: set[str]) -> None:
-        """`initialized` are the names of the replicas that are known to be; one that answers so
-        is added.
+        """Create the proxy of an actor.
+
+        Args:
+            initialized: Names of the replicas that are known to be initialized; the name of this
+                one is added when it is.
         """
         self.name, self._actor, self._initialized = name, actor, initialized
 
@@ -101,11 +104,12 @@ class SiblingReplica(Peer):
         *args: P.args,
         **kwargs: P.kwargs,
     ) -> T:
+        """Call a method of `HeldSessions`; raise `PeerEnded` or `PeerUnreachable`."""
         try:
-            found: T = await self.call(method, *args)
+            result: T = await self.call(method, *args)
         except VLAgentsError as error:  # the server has another version
             raise PeerUnreachable(str(error)) from error
-        return found
+        return result
 
     async def call(self, method: Callable[..., Any], *args: Any) -> Any:
         """Call one of `PEER_METHODS`; raise `PeerEnded`, `PeerUnreachable` or the method's own
@@ -141,7 +145,7 @@ class SiblingReplica(Peer):
                 else PeerUnreachable(str(error))
             ) from error
         except (ray.exceptions.RayError, TimeoutError, asyncio.TimeoutError) as error:
-            # or the network is partitioned
+            # The replica hangs, or the network is partitioned.
             raise PeerUnreachable(str(error) or f"no answer within {limit_s} s") from error
 
     weights = call
@@ -187,14 +191,14 @@ class SiblingReplicas(ReplicasInCluster):
         """Return the loads of the replicas that answer within 0.3 s."""
         now = time.monotonic()
         self._silent = {name: until for name, until in self._silent.items() if until > now}
-        asked = [one for one in await self.others() if one.name not in self._silent]
+        asked = [replica for replica in await self.others() if replica.name not in self._silent]
         answers = await asyncio.gather(
-            *(one.call(Rebalancer.load) for one in asked), return_exceptions=True
+            *(replica.call(Rebalancer.load) for replica in asked), return_exceptions=True
         )
-        for one, answer in zip(asked, answers, strict=True):
+        for replica, answer in zip(asked, answers, strict=True):
             if not isinstance(answer, ReplicaLoad):
                 logger.info("another replica does not answer: %s", answer)
-                self._silent[one.name] = now + _SILENT_S
+                self._silent[replica.name] = now + _SILENT_S
         return [answer for answer in answers if isinstance(answer, ReplicaLoad)]
 
     async def announce_client(self, replica: str) -> Any:

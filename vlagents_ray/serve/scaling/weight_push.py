@@ -32,8 +32,7 @@ T = TypeVar("T")
 
 Values = Mapping[str, Any] | list[Awaitable[Mapping[str, Any]]] | SharedValues
 """Values by name; a list of one reference to them in Ray's object store, which each replica reads
-in place; or handles
-of a learner's memory on the GPU of all replicas."""
+in place; or handles of a learner's memory on the GPU of all replicas."""
 
 logger = logging.getLogger(__name__)
 
@@ -61,18 +60,23 @@ class ThisReplica(WeightsReplica):
 
     async def weights(self, method: Callable[..., T], *args: Any) -> T:
         """Call the method on another thread, since it may be slow."""
-        given = [await one[0] if isinstance(one, list) else one for one in args]
-        return await asyncio.to_thread(method, self._updates, *given)
+        values = []
+        for argument in args:
+            # A list holds one reference to values in Ray's object store.
+            values.append(await argument[0] if isinstance(argument, list) else argument)
+        return await asyncio.to_thread(method, self._updates, *values)
 
 
 class WeightPusher:
     """Pushes new weights to all replicas, on the event loop of one of them."""
 
     def __init__(
-        self, own: WeightsReplica, others: Callable[[], Awaitable[Sequence[WeightsReplica]]]
+        self,
+        this_replica: WeightsReplica,
+        siblings: Callable[[], Awaitable[Sequence[WeightsReplica]]],
     ) -> None:
-        """Push to the `own` replica and to the `others`, which are looked up for each push."""
-        self._own, self._others = own, others
+        """Push to `this_replica` and to its `siblings`, which are looked up for each push."""
+        self._this_replica, self._siblings = this_replica, siblings
         self._pushing = asyncio.Lock()
         self._known: set[str] = set()  # names of replicas that have answered
 
@@ -81,14 +85,15 @@ class WeightPusher:
         begun = time.perf_counter()
         async with self._pushing:
             newest = {
-                self._own: await self._own.weights(WeightUpdates.newest),
-                **await self._loaded(await self._others()),
+                self._this_replica: await self._this_replica.weights(WeightUpdates.newest),
+                **await self._loaded(await self._siblings()),
             }
-            if len({one.model for one in newest.values()}) > 1:
+            if len({version.model for version in newest.values()}) > 1:
                 raise PolicyUnavailable(
                     "weights: the replicas are changing their checkpoint; push again in a while"
                 )
-            last = max(one.number for one in newest.values())
+
+            last = max(version.number for version in newest.values())
             number = last + 1 if options.version is None else options.version
             if number <= last:
                 raise InvalidInput(
@@ -97,12 +102,13 @@ class WeightPusher:
             if number > last + _MOST_AHEAD:
                 raise InvalidInput(
                     f"version: got {number}, want at most {_MOST_AHEAD} above {last}, the newest "
-                    "that acts: versions "
-                    f"never go back, so that a number beyond would end all numbered pushes"
+                    "that acts: versions never go back, so that a number beyond would end all "
+                    "numbered pushes"
                 )
+
             if isinstance(values, SharedValues):
                 _require_gpu(values.gpu, newest)
-            staged: dict[WeightsReplica, str] = {}
+            staged: dict[WeightsReplica, str] = {}  # fingerprints of the staged values
 
             async def stage(replica: WeightsReplica) -> None:
                 staged[replica] = await replica.weights(
@@ -116,47 +122,53 @@ class WeightPusher:
                         raise _unreachable(replica) from result
                     if isinstance(result, BaseException) and not isinstance(result, PeerEnded):
                         raise result
-                if len(found := set(staged.values())) > 1:
+                fingerprints = set(staged.values())
+                if len(fingerprints) > 1:
                     raise InvalidWeights(
-                        f"weights: the replicas hold different values, {sorted(found)}; push them "
-                        "again"
+                        "weights: the replicas hold different values, "
+                        f"{sorted(fingerprints)}; push them again"
                     )
             except BaseException:
                 # Where staging failed, another push may have staged a version of the same number.
                 await asyncio.gather(
-                    *(one.weights(WeightUpdates.drop, number) for one in staged),
+                    *(replica.weights(WeightUpdates.drop, number) for replica in staged),
                     return_exceptions=True,
                 )
                 raise
-            done = await asyncio.gather(
+
+            committed = await asyncio.gather(
                 *(self._commit(replica, number, options) for replica in staged)
             )
-            await self._own.weights(WeightUpdates.pushed, 1e3 * (time.perf_counter() - begun))
+            took_ms = 1e3 * (time.perf_counter() - begun)
+            await self._this_replica.weights(WeightUpdates.pushed, took_ms)
+
             acting = sorted(
-                replica.name for replica, acts in zip(staged, done, strict=True) if acts
+                replica.name for replica, acts in zip(staged, committed, strict=True) if acts
             )
-            return PushResult(number, staged[self._own], tuple(acting))
+            return PushResult(number, staged[self._this_replica], tuple(acting))
 
     async def rest(self, rest: Rest) -> None:
         """Let all replicas take a step of a rest; if one cannot sleep, none does."""
         async with self._pushing:
-            replicas = [self._own, *await self._loaded(await self._others())]
+            replicas = [self._this_replica, *await self._loaded(await self._siblings())]
             results = await asyncio.gather(
                 *(replica.weights(WeightUpdates.rest, rest) for replica in replicas),
                 return_exceptions=True,
             )
             answers = dict(zip(replicas, results, strict=True))
             failed = {
-                one: error
-                for one, error in answers.items()
+                replica: error
+                for replica, error in answers.items()
                 if error is not None and type(error) is not PeerEnded
             }
             if not failed:
                 return
+
             if rest.step == "sleep":
-                asleep = [one for one in replicas if answers[one] is None]
-                wakes = (one.weights(WeightUpdates.rest, Rest("wake")) for one in asleep)
+                asleep = [replica for replica in replicas if answers[replica] is None]
+                wakes = [replica.weights(WeightUpdates.rest, Rest("wake")) for replica in asleep]
                 await asyncio.gather(*wakes, return_exceptions=True)
+
             replica, error = next(iter(failed.items()))
             if isinstance(error, PeerUnreachable):
                 raise _unreachable(replica) from error
@@ -168,30 +180,30 @@ class WeightPusher:
         A replica calls this before it is ready, and regularly, since it may have missed a commit.
         """
         async with self._pushing:
-            own = best = await self._own.weights(WeightUpdates.newest)
+            current = best = await self._this_replica.weights(WeightUpdates.newest)
             source = None
-            for replica in await self._others():
+            for replica in await self._siblings():
                 try:
                     newest = await replica.weights(WeightUpdates.newest)
                 except (PeerEnded, PeerUnreachable, VLAgentsError):
-                    # the replica has no newer version
-                    continue
-                if newest.number > best.number and newest.model == own.model:
+                    continue  # the replica has no newer version
+                if newest.number > best.number and newest.model == current.model:
                     best, source = newest, replica
             if source is None:
                 return
-            last = own.number
+
+            last = current.number
             for version in await source.weights(WeightUpdates.held):
-                if version.number > own.number:
+                if version.number > current.number:
                     mode: PushMode = (
                         "keep" if last < version.kept <= version.number else "next_episode"
                     )
                     last = version.number
                     options = PushOptions(mode=mode, allow_same=True, pin=version.pinned)
-                    await self._own.weights(
+                    await self._this_replica.weights(
                         WeightUpdates.stage, version.number, version.values, options
                     )
-                    await self._own.weights(WeightUpdates.commit, version.number, options)
+                    await self._this_replica.weights(WeightUpdates.commit, version.number, options)
             logger.info("took version %d of the weights from %s", best.number, source.name)
 
     async def _commit(self, replica: WeightsReplica, number: int, options: PushOptions) -> bool:
@@ -223,19 +235,20 @@ class WeightPusher:
         A replica that does not answer may be loading. One that has answered before has loaded, so
         it counts as unreachable.
         """
-        found: dict[WeightsReplica, NewestVersion] = {}
+        loaded: dict[WeightsReplica, NewestVersion] = {}
         answers = await asyncio.gather(
-            *(one.weights(WeightUpdates.newest) for one in replicas), return_exceptions=True
+            *(replica.weights(WeightUpdates.newest) for replica in replicas), return_exceptions=True
         )
         for replica, answer in zip(replicas, answers, strict=True):
             if isinstance(answer, NewestVersion):
-                found[replica] = answer
+                loaded[replica] = answer
             elif isinstance(answer, PeerUnreachable) and replica.name in self._known:
                 raise _unreachable(replica) from answer
             elif not isinstance(answer, PeerEnded | PeerUnreachable | PolicyUnavailable):
                 raise answer
-        self._known = {replica.name for replica in found}
-        return found
+
+        self._known = {replica.name for replica in loaded}
+        return loaded
 
 
 def _require_gpu(gpu: str, replicas: Mapping[WeightsReplica, NewestVersion]) -> None:
