@@ -122,8 +122,8 @@ class PendingRequest:
     begun: bool = False  # whether a batch has taken it for the policy; set under the queue's lock
     sought: bool = False  # whether other replicas were searched for its session
     session: Any = None  # the `Session` of an act at its arrival
-    # Of an act: the step at which the episode began that it was sent in, once that is known. Of a
-    # reset: that of the connection's episode before, which goes on if the reset is undone.
+    # For an act: the step at which the episode began that it was sent in, once that is known. For a
+    # reset: the same of the connection's previous episode, which continues if the reset is undone.
     episode: int | None = None
     model: Any = None  # for an act: the `LoadedModel` whose contract it was checked against
     opening: Opening | None = None  # for a reset: the server's settings

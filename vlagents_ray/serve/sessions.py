@@ -22,7 +22,7 @@ from vlagents_ray.serve.weights import WeightsVersion
 M = TypeVar("M")  # type of a loaded model
 
 
-# Number of remembered sessions that left, whose older states are refused (some 500 bytes each)
+# Number of remembered sessions that left, whose older states are refused (some 500 bytes each).
 _REMEMBERED = 4096
 _ANY = 2**63  # number of moves that makes a version newer than any other state of its step
 # Maximum number of acts at other replicas that neither the client nor this replica has seen.
@@ -79,16 +79,14 @@ class Session(Generic[M]):
         """Return the error for an act at another step, which would repeat or skip an act."""
         return UnknownSession(
             f"session {self.id!r}: is at step {self.steps} here, at {step} as its client knows; an "
-            "answer was lost, "
-            f"or this is another episode: reset it"
+            "answer was lost, or this is another episode: reset it"
         )
 
     def wrong_episode(self) -> UnknownSession:
         """Return the error for an act that was sent in another episode."""
         return UnknownSession(
             f"session {self.id!r}: another episode has begun since the act was sent, or the reset "
-            "before the act was "
-            f"not executed: reset it, or send the episode's step"
+            "before the act was not executed: reset it, or send the episode's step"
         )
 
 
@@ -141,7 +139,7 @@ class SessionTable(Generic[M]):
         self.opened = 0  # number of sessions opened so far
         self._idle_s, self._clock = idle_s, clock
         self._drawn = 0  # latest step drawn
-        # By session: version up to which its states are refused.
+        # Version up to which the states of a session that left are refused, by session.
         self._left: OrderedDict[str, Version] = OrderedDict()
         self._lock = threading.RLock()
 

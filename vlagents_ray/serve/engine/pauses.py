@@ -44,15 +44,19 @@ def _since_last_data_s() -> float | None:
     Serve does not expose its sockets, so this searches all sockets of the process, which takes
     milliseconds.
     """
-    if (ports := _PORTS.get()) is None:
+    ports = _PORTS.get()
+    if ports is None:
         return None
+
     with contextlib.suppress(OSError):  # the system does not list descriptors
         for descriptor in map(int, os.listdir("/proc/self/fd")):
             with contextlib.suppress(OSError):  # not a connected socket, or closed
                 connection = socket.socket(socket.AF_INET, socket.SOCK_STREAM, fileno=descriptor)
                 try:
                     names = connection.getsockname(), connection.getpeername()
-                    if tuple(name[1] for name in names if isinstance(name, tuple)) == ports:
+                    # The address of a Unix socket is no tuple.
+                    connected = tuple(name[1] for name in names if isinstance(name, tuple))
+                    if connected == ports:
                         info = connection.getsockopt(
                             socket.IPPROTO_TCP, socket.TCP_INFO, _LAST_DATA.size
                         )
@@ -90,16 +94,20 @@ class PauseDetector:
         extends the backlog.
         """
         now = self._clock()
-        if self._checked is not None and (lasted_s := now - self._checked) > _PAUSE_S:
-            if self._checked < self._backlog_until:
-                self._backlog_until += lasted_s
-            else:
-                least_s, most_s = _BACKLOG_S
-                self._pause_began, self._backlog_until = (
-                    self._checked,
-                    now + max(least_s, min(most_s, lasted_s / 2)),
-                )
+        if self._checked is not None and now - self._checked > _PAUSE_S:
+            self._record_pause(self._checked, now)
+        # This comes last: until then `waited_s` regards the pause as not recorded yet.
         self._checked = now
+
+    def _record_pause(self, began: float, ended: float) -> None:
+        lasted_s = ended - began
+        if began < self._backlog_until:
+            self._backlog_until += lasted_s
+            return
+
+        shortest_s, longest_s = _BACKLOG_S
+        self._pause_began = began
+        self._backlog_until = ended + max(shortest_s, min(longest_s, lasted_s / 2))
 
     def waited_s(self) -> float:
         """Return how long a request that was just read may have waited, s: 0 unless there was a

@@ -73,7 +73,8 @@ class _Shared:
 
     def add(self, obj: Any) -> int:
         """Add an object to the shared ones, and return its index."""
-        if (number := self.numbers.get(id(obj))) is None:
+        number = self.numbers.get(id(obj))
+        if number is None:
             number = self.numbers[id(obj)] = len(self.objects)
             self.objects.append(obj)
         return number
@@ -160,9 +161,8 @@ class AgentCopies:
         self.fingerprint = self._shared.fingerprint()
         if self._shared.refused:
             logger.warning(
-                "%s: sessions share objects of %s, which cannot be copied; if one of them holds an "
-                "episode's "
-                "state, create it in reset() instead of initialize()",
+                "%s: sessions share objects of %s, which cannot be copied; if one of them holds "
+                "the state of an episode, create it in reset() instead of initialize()",
                 type(agent).__name__,
                 sorted(self._shared.refused),
             )

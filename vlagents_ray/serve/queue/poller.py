@@ -31,7 +31,8 @@ class Poller:
     """
 
     def __init__(self) -> None:
-        # Not `selectors`, whose event objects cost as much as the transport of a request.
+        # `selectors` is not used, since its event objects cost as much as the transport of a
+        # request.
         self._poll = select.epoll()
         self._ready: dict[int, Callable[[], None]] = {}  # callbacks by descriptor
         self._wake_read, self._wake_write = os.pipe()

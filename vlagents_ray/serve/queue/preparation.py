@@ -52,6 +52,7 @@ class Preparations:
         errors: dict[int, Exception] = {}
 
         def finish_at(index: int, *, begun: bool) -> None:
+            """Finish one preparation, on this thread unless another one has begun it."""
             preparation, agent = preparations[index]
             if preparation is None or agent is not preparation.agent:  # the session has been reset
                 return

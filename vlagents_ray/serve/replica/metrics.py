@@ -91,7 +91,7 @@ class Exporter:
         self._depth = make(Gauge, "queue_depth", "Requests that wait.", "priority")
         self._sessions = make(Gauge, "sessions", "Sessions that are held.", "transport")
         self._utilisation = make(Gauge, "utilisation", "Busy share of the policy's thread.")
-        # Of a GPU in the replica's process, as for the next series; the kinds are allocated,
+        # This series and the next are of a GPU in the replica's process; the kinds are allocated,
         # reserved and free.
         self._gpu_memory = make(Gauge, "gpu_memory_bytes", "Memory of the GPU.", "kind")
         self._gpu_ms = make(Histogram, "gpu_ms", "Forward pass on the GPU.", boundaries=_MS)
@@ -101,7 +101,7 @@ class Exporter:
             Histogram, "weight_push_ms", "Time until all replicas act with weights.", boundaries=_MS
         )
         self._hung = make(Counter, "hung_calls", "Calls of the policy over their time limit.", "op")
-        # Not those in a child process.
+        # Batches in a child process are not counted.
         self._out_of_memory = make(
             Counter, "out_of_memory", "Forward passes that did not fit into memory."
         )

@@ -162,6 +162,7 @@ class PolicyReplica(ClientApi, SiblingApi):
         self._engine.models.configure(config)
         if self._configured:
             return
+
         self._configured = True
         try:
             await asyncio.to_thread(self._engine.start)
@@ -172,8 +173,10 @@ class PolicyReplica(ClientApi, SiblingApi):
             # Errors of this package contain the remedy; without this, `serve status` would show
             # both tracebacks first.
             raise PolicyFailed(str(error)) from None
+
         await self._catch_up()  # gets the other replicas' versions before this replica is ready
         await self._parts.before_ready()
+
         works = [
             self._watch_shutdown(),
             self._keep_catching_up(),
