@@ -78,9 +78,8 @@ class FairQueue:
         # The only waiting request, which is not in a session's queue.
         self._lone: PendingRequest | None = None
         self._yielded = False  # whether the last batch had a slot for an impatient simulation
-        self.depth = [0] * len(
-            Priority
-        )  # waiting requests by priority, including those that are over
+        # Waiting requests by priority, including those that are over.
+        self.depth = [0] * len(Priority)
         self.size = 0  # waiting requests of all priorities
 
     def __contains__(self, session_id: str) -> bool:
