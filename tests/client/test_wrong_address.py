@@ -2,54 +2,20 @@
 
 from __future__ import annotations
 
-import contextlib
-import http.server
 import ssl
-import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
 
-import numpy as np
 import pytest
 from certificates import authority
+from plain_servers import http_server
 
 from vlagents_ray import RemoteAgent
-from vlagents_ray.errors import ConfigError, PolicyUnavailable, UnknownApp, VLAgentsError
+from vlagents_ray.errors import ConfigError, PolicyUnavailable, VLAgentsError
 from vlagents_ray.serve.ports import free_port
-from vlagents_ray_learn import Publisher
 
 TIMEOUT_S = 1.0
-
-
-class WithoutPaths(http.server.BaseHTTPRequestHandler):
-    """A server that has no application at any path."""
-
-    protocol_version = "HTTP/1.1"
-
-    def do_GET(self) -> None:
-        self.send_error(404)
-
-    def log_message(self, *_: object) -> None: ...
-
-
-@contextlib.contextmanager
-def http_server(
-    context: ssl.SSLContext | None = None,
-    host: str = "127.0.0.1",
-    handler: type[http.server.BaseHTTPRequestHandler] = http.server.BaseHTTPRequestHandler,
-) -> Iterator[int]:
-    with http.server.ThreadingHTTPServer((host, 0), handler) as server:
-        server.handle_error = lambda *_: None  # type: ignore[method-assign]
-        if context is not None:
-            server.socket = context.wrap_socket(server.socket, server_side=True)
-        thread = threading.Thread(target=server.serve_forever)
-        thread.start()
-        try:
-            yield server.server_port
-        finally:
-            server.shutdown()
-            thread.join()
 
 
 @pytest.fixture(scope="module")
@@ -109,16 +75,3 @@ def test_a_name_that_the_certificate_does_not_have_is_named_with_the_cure(
         agent = RemoteAgent(f"https://{host}:{port}", ca=ours.file, timeout_s=TIMEOUT_S)
         with pytest.raises(ConfigError, match="write the URL with a name that the certificate has"):
             agent.initialize()
-
-
-def test_weights_for_a_port_that_speaks_tls_are_told_the_url(ports: dict[str, int]) -> None:
-    with pytest.raises(ConfigError, match=f"write https://127.0.0.1:{ports['TLS']}"):
-        Publisher(f"http://127.0.0.1:{ports['TLS']}").push({"w": np.zeros(1, np.float32)})
-
-
-def test_weights_for_an_application_that_does_not_exist_name_the_path() -> None:
-    with (
-        http_server(handler=WithoutPaths) as port,
-        pytest.raises(UnknownApp, match="no application at this path"),
-    ):
-        Publisher(f"http://127.0.0.1:{port}/raech").push({"w": np.zeros(1, np.float32)})

@@ -1,7 +1,5 @@
 """A server of two LoRA adapters over one base: sessions of both act in one pass, each as its
 fine-tune alone.
-
-A learner pushes the values of one of them.
 """
 
 from __future__ import annotations
@@ -17,10 +15,9 @@ from adapted_network import DIM, LAYERS, Small, base, merge, pairs, save
 
 from tests.integration.conftest import serving
 from vlagents_ray import Obs, RemoteAgent
-from vlagents_ray.errors import InvalidWeights, UnknownCheckpoint
+from vlagents_ray.errors import UnknownCheckpoint
 from vlagents_ray.interface import Act
 from vlagents_ray.serve.launch.server import Server
-from vlagents_ray_learn import Publisher
 
 pytestmark = pytest.mark.torch
 
@@ -98,39 +95,3 @@ def test_sessions_of_two_adapters_act_in_one_batch_as_each_merged_alone(
         np.testing.assert_allclose(
             act.action, alone.act(at(10 + seed)).action, rtol=1e-5, atol=1e-5
         )
-
-
-def played(server: Server, **options: Any) -> tuple[bytes, dict[str, Any]]:
-    """The first action of an episode, and the weights that it states."""
-    with RemoteAgent(server.url, transport="http", priority="simulation") as agent:
-        agent.reset(at(0), None, seed=0, **options)
-        act = agent.act(at(1))
-        return act.action.tobytes(), act.info["policy"]
-
-
-def test_an_adapter_that_is_pushed_over_the_network_acts_as_the_saved_one(
-    server: Server, folder: Path, values: dict[str, dict[str, np.ndarray]]
-) -> None:
-    before = {name: played(server, checkpoint=name) for name in RANKS}
-    plain, trained = played(server), pairs(policy(folder).model, LAYERS, RANKS["stack"], seed=9)
-    with Publisher(server.url) as weights:
-        version = weights.push(named(trained), partial=True)
-        with pytest.raises(InvalidWeights, match=r"unknown, want one of the policy's 16 names"):
-            weights.push({f"fold/{name}": value for name, value in trained.items()}, partial=True)
-        save(folder.parent / "trained", trained)
-        alone = Small.from_config(
-            {"checkpoint": str(folder), "adapters": {"stack": str(folder.parent / "trained")}}
-        )
-        alone.initialize()
-        alone.reset(at(0), None, seed=0, adapter="stack")
-        action, stated = played(server, checkpoint="stack")
-        assert action == alone.act(at(1)).action.tobytes() != before["stack"][0]
-        assert stated["version"] == version
-        assert played(server, checkpoint="pour") == (before["pour"][0], stated)
-        assert played(server) == plain
-        weights.push(named(values["stack"]), partial=True)
-        assert played(server, checkpoint="stack")[0] == before["stack"][0]
-
-
-def named(values: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    return {f"stack/{name}": value for name, value in values.items()}

@@ -28,8 +28,6 @@ from vlagents_ray.serve.replica.replica import PolicyReplica
 from vlagents_ray.serve.scaling.rebalancer import Rebalancer
 from vlagents_ray.serve.scaling.session_migration import HeldSessions
 from vlagents_ray.serve.scaling.sibling_replicas import PEER_METHODS
-from vlagents_ray.serve.scaling.weight_push import ThisReplica
-from vlagents_ray.serve.weights import WeightUpdates
 
 
 class Bare(PolicyReplica):
@@ -49,10 +47,8 @@ def replica(start: Any) -> Bare:
         _configured=False,
         _gateway=None,
         _rebalancer=SimpleNamespace(run=lambda: asyncio.sleep(0)),
-        _pusher=SimpleNamespace(catch_up=lambda: asyncio.sleep(0)),
         _parts=SimpleNamespace(before_ready=lambda: asyncio.sleep(0), run=lambda: asyncio.sleep(0)),
         _watch_shutdown=lambda: asyncio.sleep(0),
-        _keep_catching_up=lambda: asyncio.sleep(0),
     )
     return one
 
@@ -180,7 +176,7 @@ def test_what_other_replicas_call_reaches_the_part_that_has_it(
     monkeypatch: pytest.MonkeyPatch, method: str
 ) -> None:
     asked = PEER_METHODS[method]
-    parts = {part: SimpleNamespace() for part in (HeldSessions, WeightUpdates, Rebalancer)}
+    parts = {part: SimpleNamespace() for part in (HeldSessions, Rebalancer)}
 
     async def later(part: object, *args: object) -> object:
         return part, args
@@ -190,7 +186,6 @@ def test_what_other_replicas_call_reaches_the_part_that_has_it(
     one = object.__new__(Bare)
     vars(one).update(
         _migrator=SimpleNamespace(held=parts[HeldSessions]),
-        _weights=ThisReplica("this", parts[WeightUpdates]),  # type: ignore[arg-type]
         _rebalancer=parts[Rebalancer],
     )
     args = () if asked.part is Rebalancer else (1, "two")

@@ -63,13 +63,13 @@ from vlagents_ray.serve.endpoints.front import FrontMiddleware
 from vlagents_ray.serve.endpoints.http import build_http_app
 from vlagents_ray.serve.endpoints.shm import ShmServer
 from vlagents_ray.serve.endpoints.websocket import WebSocketServer
-from vlagents_ray.serve.endpoints.weights import weights_routes
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.ports import free_port, reserve
 from vlagents_ray.serve.replica.part import PartContext, open_parts
-from vlagents_ray.serve.weights import PushResult
 from vlagents_ray.weights.safetensors import ValueSpec, header_of, read_header
 from vlagents_ray_dialects.messages import vla_eval as vla_eval_codec
+from vlagents_ray_learn.weight_push import PushResult
+from vlagents_ray_learn.weights_endpoint import weights_routes
 
 ANSWER_S = 10.0
 LIMITS = MessageLimits(body_bytes=2**20)
@@ -178,7 +178,8 @@ class KeyedReplica:
             DialectArgs(**ALL), ReplicaContext(self.engine, lambda: METADATA, LIMITS)
         )
         metadata = METADATA | {"policy_version": None, "weights": None}
-        parts = open_parts(PartArgs(), PartContext(self.engine, "this", "here", lambda: metadata))
+        context = PartContext(self.engine, "this", "here", lambda: metadata)
+        parts = open_parts(PartArgs(weights=None), context)  # its routes have another receiver
         stack.callback(parts.close)
         others = [*weights_routes(_Receiving(self), 30.0, open_to_network=False), *parts.routes()]
         inside = build_http_app(self.engine, lambda: METADATA, LIMITS, more=[*routes, *others])
@@ -580,10 +581,10 @@ class _Receiving:
             self._replica.priorities[mark] = "ROBOT"
         return PushResult(1, "", ("replica",))
 
-    async def rest(self, rest: Any) -> None:
+    async def rest_all(self, rest: Any) -> None:
         """It is awake."""
 
-    async def versions_of_weights(self) -> list[int]:
+    async def versions(self) -> list[int]:
         return [1]
 
 

@@ -1,5 +1,5 @@
-"""Whether a loaded policy acts with weights that are pushed, and as before with those that it
-had.
+"""New weights for one engine or policy, without a learner: whether a loaded policy acts with
+weights that are pushed, and as before with those that it had.
 """
 
 from __future__ import annotations
@@ -11,10 +11,19 @@ from typing import Any
 import numpy as np
 
 from vlagents_ray.interface import Agent
+from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.weights import ModelWeights, PushOptions
 from vlagents_ray.weights.trainable import own_copy
 
 _FACTOR = 0.8  # of all numbers of a network, whose actions then differ, and remain finite
+
+
+def push(engine: Engine, named: Mapping[str, Any], **options: Any) -> int:
+    """Make an engine act with new weights, as the only replica; return their version."""
+    number = engine.weights.number + 1
+    engine.weights.stage(number, named, PushOptions(**options))
+    engine.weights.commit(number, PushOptions(**options))
+    return number
 
 
 def check_pushed_weights(agent: Agent, act: Callable[[], np.ndarray], part: str = "") -> None:

@@ -192,7 +192,7 @@ def _models(annotation: Any) -> Iterator[Any]:
 def paths() -> Iterator[str]:
     http = importlib.import_module("vlagents_ray.serve.endpoints.http")
     live = importlib.import_module("vlagents_ray_live.live_page")
-    weights = importlib.import_module("vlagents_ray.serve.endpoints.weights")
+    weights = importlib.import_module("vlagents_ray_learn.weights_endpoint")
     watched = live.live_routes(None, open_to_network=False)
     pushed = weights.weights_routes(None, 0.0, open_to_network=False)
     app = http.build_http_app(None, dict, None, more=[*watched, *pushed])

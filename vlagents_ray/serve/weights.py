@@ -1,11 +1,12 @@
 """The versions of one model's weights: which are held, which one the agent has, and which one each
 session acts with.
 
-Version 0 is the loaded checkpoint. A learner stages a version, which is checked and held but not
-used, and commits it when all replicas hold it. A commit copies and loads nothing: before a batch, a
-reset or an observation, the policy's thread loads the sessions' version into the agent
-(`ModelWeights.use`), which takes no time if the agent has it already. A version is freed when no
-session acts with it and it is neither the newest nor the pinned one.
+Version 0 is the loaded checkpoint. A push stages a version, which is checked and held but not used,
+and commits it when all replicas hold it; a part of the replica coordinates that (`serve.replica`).
+A commit copies and loads nothing: before a batch, a reset or an observation, the policy's thread
+loads the sessions' version into the agent (`ModelWeights.use`), which takes no time if the agent
+has it already. A version is freed when no session acts with it and it is neither the newest nor the
+pinned one.
 
 On a GPU, the agent's version is that in its parameters, where another one takes its place. Two
 versions share its memory, the agent's and a staged one; those with which no session acts are in the
@@ -17,7 +18,6 @@ from __future__ import annotations
 import logging
 import threading
 from abc import ABC, abstractmethod
-from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
@@ -56,7 +56,6 @@ PushMode = Literal["keep", "next_episode"]
 RestStep = Literal["sleep", "restore", "wake"]
 """No acts, and less memory; the memory back, still without acts; and acts again."""
 OPTION = "weights"  # option of a reset
-_COLLECTED = 1000  # maximum number of uncollected durations of pushes
 _LARGEST = 2**53 - 1  # largest version number, which JSON represents exactly
 _LONGEST_REST_S = 86_400.0
 _FOLLOW, _PINNED = "follow", "pinned"
@@ -599,15 +598,6 @@ class HoldsWeights(ABC):
 
 
 @dataclass(frozen=True, slots=True)
-class PushResult:
-    """The result of a successful push."""
-
-    version: int
-    fingerprint: str  # the same at all replicas
-    replicas: tuple[str, ...]  # names of the replicas that act with the version
-
-
-@dataclass(frozen=True, slots=True)
 class NewestVersion:
     """The newest version of a replica."""
 
@@ -651,17 +641,8 @@ class WeightUpdates:
         # Those of the policy that sleeps, for which `acting` is held.
         self._asleep: ModelWeights | None = None
         self._alarm: threading.Timer | None = None
-        self._pushes_ms: deque[float] = deque(maxlen=_COLLECTED)
         # In a child process: those that its replica refers to.
         self._given: dict[int, WeightsVersion] = {}
-
-    def pushed(self, took_ms: float) -> None:
-        """Record the duration of a push that this replica coordinated, for the metrics."""
-        self._pushes_ms.append(took_ms)
-
-    def collect_pushes_ms(self) -> list[float]:
-        """Return the durations of the pushes since the last call."""
-        return [self._pushes_ms.popleft() for _ in range(len(self._pushes_ms))]
 
     def stage(
         self, number: int, pushed: Mapping[str, Any] | SharedValues, options: PushOptions

@@ -16,7 +16,6 @@ from replica_process import ReplicaProcess, model
 from shared_cpu_memory import GPU, ReaderCounts, SharedCpuMemory
 
 from vlagents_ray.errors import InvalidWeights, UnchangedWeights
-from vlagents_ray.serve.scaling.weight_push import WeightPusher
 from vlagents_ray.serve.weights import PushOptions, WeightUpdates
 from vlagents_ray.weights import shared_values
 from vlagents_ray.weights.shared_values import (
@@ -28,6 +27,7 @@ from vlagents_ray.weights.shared_values import (
 )
 from vlagents_ray.weights.trainable import portable
 from vlagents_ray_learn.publisher import AppTarget
+from vlagents_ray_learn.weight_push import WeightPusher
 
 pytestmark = pytest.mark.torch
 
@@ -46,8 +46,9 @@ class Application(AppTarget):
         return []
 
     def _call(self, method: str, *args: Any, timeout_s: float) -> Any:
+        assert method == "push"
         self.sent.append(args[0])
-        return asyncio.run(getattr(self._pusher, method.removesuffix("_weights"))(*args))
+        return asyncio.run(self._pusher.push(*args))
 
 
 @pytest.fixture(params=["cpu", pytest.param("cuda", marks=pytest.mark.gpu)])

@@ -6,8 +6,8 @@ import asyncio
 import json
 import logging
 import os
-from collections.abc import Mapping, Sequence
-from contextlib import AbstractContextManager, closing, suppress
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, closing, contextmanager, suppress
 from dataclasses import asdict
 from itertools import chain
 from typing import Any
@@ -19,20 +19,29 @@ from vlagents_ray.client.credentials import Credentials
 from vlagents_ray.client.transports.base import CodecChoice
 from vlagents_ray.client.transports.http import HttpTransport, http_url
 from vlagents_ray.client.transports.websocket import ProxiedSocket, open_websocket
-from vlagents_ray.errors import ConfigError, InvalidWeights, PolicyUnavailable, VLAgentsError
+from vlagents_ray.errors import (
+    ConfigError,
+    Forbidden,
+    InvalidWeights,
+    PolicyUnavailable,
+    UnknownApp,
+    VLAgentsError,
+)
 from vlagents_ray.protocol.frames import read_error
-from vlagents_ray.serve.endpoints.weights import PATH
+from vlagents_ray.registry import pip_install
 from vlagents_ray.serve.engine.engine import Engine
-from vlagents_ray.serve.scaling.weight_push import ThisReplica, Values, WeightPusher, WeightsReplica
 from vlagents_ray.serve.weights import PushMode, PushOptions, Rest
 from vlagents_ray.weights.safetensors import MESSAGE_BYTES, header_of, parts_of
 from vlagents_ray.weights.shared_values import NotShared, gpu_of, shared
 from vlagents_ray.weights.trainable import is_array, portable
+from vlagents_ray_learn.weight_push import ThisReplica, Values, WeightPusher, WeightsReplica
+from vlagents_ray_learn.weights_endpoint import PART, PATH
 
 logger = logging.getLogger(__name__)
 
 _ANSWER_S = 10.0  # time limit for the request of the versions
 _PUSH_S = 600.0  # time limit for a push, which includes the transfer to all nodes
+_DISTRIBUTION = "vlagents-ray-learn"
 _WINDOW = 16  # parts (MiB) in flight over the network: with one, each would take a round trip
 
 
@@ -40,8 +49,9 @@ class Publisher(AbstractContextManager["Publisher"]):
     """Pushes new weights from the learner's memory to a served policy, without a checkpoint on
     disk.
 
-        with Publisher("serve://pi0") as weights:  # or "https://gpu:8000", with a key of the scope
-            "weights" version = weights.push(model.state_dict())
+        # Or "https://gpu:8000", with a key of the scope "weights".
+        with Publisher("serve://pi0") as weights:
+            version = weights.push(model.state_dict())
             assert weights.acknowledged(version) == 2  # replicas
 
     Every replica checks and holds a version before any acts with it, so that a push succeeds
@@ -118,6 +128,7 @@ class Publisher(AbstractContextManager["Publisher"]):
             Overloaded: Another push is under way.
             PolicyUnavailable: A replica cannot be reached; nothing was changed.
             Forbidden: The API key lacks the scope "weights".
+            ConfigError: The server takes no weights, since it lacks this package.
         """
         if not isinstance(named, Mapping):
             raise InvalidWeights(
@@ -240,25 +251,29 @@ class AppTarget:
         return self._push([ray.put(_portable(named))], options)
 
     def _push(self, values: Values, options: PushOptions) -> int:
-        return int(self._call("push_weights", values, options, timeout_s=_PUSH_S).version)
+        return int(self._call("push", values, options, timeout_s=_PUSH_S).version)
 
     def rest(self, rest: Rest) -> None:
-        self._call("rest", rest, timeout_s=_PUSH_S)
+        self._call("rest_all", rest, timeout_s=_PUSH_S)
 
     def versions(self) -> list[int]:
-        return list(self._call("versions_of_weights", timeout_s=_ANSWER_S))
+        return list(self._call("versions", timeout_s=_ANSWER_S))
 
     def _call(self, method: str, *args: Any, timeout_s: float) -> Any:
+        """Call a method of the `WeightsPart` of any replica; its module needs Ray, unlike this."""
         import ray
         from ray import serve
         from ray.serve.exceptions import RayServeException
 
         try:
             handle = serve.get_app_handle(self._app)
-            return getattr(handle, method).remote(*args).result(timeout_s=timeout_s)
+            answer = handle.call_part.remote(PART, method, *args)
+            return answer.result(timeout_s=timeout_s)
         except ray.exceptions.RayTaskError as error:
             if isinstance(error.cause, VLAgentsError):
                 raise error.cause from error
+            if type(error.cause) is LookupError:  # `ReplicaParts.call` raises it
+                raise _takes_none(f"serve://{self._app}") from error
             raise PolicyUnavailable(f"serve://{self._app}: {error.cause}") from error
         except (RayServeException, ray.exceptions.RayError, TimeoutError) as error:
             raise _unknown(f"serve://{self._app}", error) from error
@@ -297,9 +312,9 @@ class ServerTarget:
         query = {
             name: str(value).lower() for name, value in asdict(options).items() if value is not None
         }
-        with closing(
-            open_websocket(f"{self._url}?{urlencode(query)}", self._credentials, _ANSWER_S)
-        ) as socket:
+        with self._explained():
+            socket = open_websocket(f"{self._url}?{urlencode(query)}", self._credentials, _ANSWER_S)
+        with closing(socket):
             unanswered = 0
             window = 1  # the header alone is answered before any value is sent
             for message in chain((header,), parts_of(values)):
@@ -327,16 +342,44 @@ class ServerTarget:
 
     def rest(self, rest: Rest) -> None:
         query = urlencode({"offload": str(rest.offload).lower(), "at_most_s": rest.at_most_s})
-        with closing(HttpTransport(self._base, CodecChoice("raw"), self._credentials)) as http:
+        with self._explained(), self._http() as http:
             http.get(f"{PATH}/{rest.step}?{query}", _PUSH_S, method="POST")
 
     def versions(self) -> list[int]:
-        with closing(HttpTransport(self._base, CodecChoice("raw"), self._credentials)) as http:
+        with self._explained(), self._http() as http:
             return list(http.get(PATH, _ANSWER_S)["versions"])
+
+    def _http(self) -> closing[HttpTransport]:
+        return closing(HttpTransport(self._base, CodecChoice("raw"), self._credentials))
+
+    @contextmanager
+    def _explained(self) -> Iterator[None]:
+        """Replace the error of a path that a server without the part does not have."""
+        try:
+            yield
+        except (Forbidden, UnknownApp) as error:
+            if self._may_take_weights():
+                raise
+            raise _takes_none(self._base) from error
+
+    def _may_take_weights(self) -> bool:
+        """Return whether the server's metadata names the part, or cannot be read."""
+        try:
+            with self._http() as http:
+                return PART in http.get("/v1/metadata", _ANSWER_S)["parts"]
+        except (VLAgentsError, LookupError):
+            return True
 
 
 def _portable(named: Mapping[str, Any]) -> dict[str, Any]:
     return {name: portable(value) if is_array(value) else value for name, value in named.items()}
+
+
+def _takes_none(url: str) -> ConfigError:
+    return ConfigError(
+        f"{url}: this server takes no new weights; run `{pip_install(distribution=_DISTRIBUTION)}` "
+        f"in its environment, and remove `{PART}: null` from the `parts` of its deployment file"
+    )
 
 
 def _unknown(url: str, error: Exception) -> PolicyUnavailable:

@@ -1,8 +1,16 @@
-"""What this distribution registers: an entry for each command."""
+"""What this distribution registers: an entry for each command, and one for each part of a
+replica.
+"""
 
 from vlagents_ray.registry import RegistryEntry
 
 OPEN_LOOP = RegistryEntry(
     "vlagents_ray_learn.open_loop.command:open_loop_command",
     "Compare a policy's actions with those of a dataset.",
+)
+
+WEIGHTS = RegistryEntry(
+    "vlagents_ray_learn.weights_part:WeightsPart",
+    "Takes new weights from learners, `/v1/weights`.",
+    by_default=True,
 )

@@ -15,8 +15,11 @@ import ray
 
 from vlagents_ray.errors import BY_CODE
 from vlagents_ray.interface import Agent
+from vlagents_ray.serve.config.parts import PartConfig
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.replica import metrics
+from vlagents_ray.serve.replica.part import PartContext
+from vlagents_ray_learn import weights_part
 from vlagents_ray_live import recording
 
 ROOT = Path(__file__).parents[3]
@@ -34,7 +37,7 @@ class Series(NamedTuple):
 
 @pytest.fixture(scope="module")
 def exported() -> dict[str, Series]:
-    """The series that the exporter of a replica declares, by the name that Prometheus reads."""
+    """The series that a replica and its parts declare, by the name that Prometheus reads."""
     series = {}
 
     def declared(kind: str) -> Any:
@@ -52,11 +55,14 @@ def exported() -> dict[str, Series]:
     with pytest.MonkeyPatch.context() as patch:
         for kind in SUFFIXES:
             patch.setattr(metrics, kind, declared(kind))
-            patch.setattr(recording, kind, declared(kind), raising=False)  # it has no histogram
+            for part in (recording, weights_part):  # each has some of the kinds
+                patch.setattr(part, kind, declared(kind), raising=False)
         engine = Engine(Agent())
         tags = dict.fromkeys(TAGS, "x")
         metrics.Exporter(engine, tags)
         recording.RecordingMetrics(SimpleNamespace(), tags)  # type: ignore[arg-type]
+        context = PartContext(engine, "replica", "node", dict, metric_tags=tags)
+        weights_part.WeightsPart(PartConfig(), context)
         engine.close()
     return series
 

@@ -4,7 +4,6 @@ the bit.
 
 from __future__ import annotations
 
-import asyncio
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -14,17 +13,16 @@ import pytest
 from adapted_network import DIM, LAYERS, Small, base, pairs, save
 from gain_policies import in_child
 from in_flight import answered
+from pushed_weights import push
 
 from vlagents_ray import Agent, Obs
-from vlagents_ray.errors import InvalidWeights, UnchangedWeights
+from vlagents_ray.errors import InvalidWeights
 from vlagents_ray.interface import Act
 from vlagents_ray.protocol.messages import Request
 from vlagents_ray.serve.engine.engine import Engine
-from vlagents_ray.serve.scaling.weight_push import ThisReplica, WeightPusher
-from vlagents_ray.serve.weights import PushOptions
+from vlagents_ray.serve.weights import PushOptions, Rest
 from vlagents_ray.weights import trainable
 from vlagents_ray.weights.trainable import fingerprint
-from vlagents_ray_learn import Publisher
 
 pytestmark = pytest.mark.torch
 
@@ -117,8 +115,8 @@ def test_a_pushed_adapter_acts_as_the_saved_one_and_all_else_as_before(
         if process == "child"
         else Small.from_config(config)
     )
-    before, weights = played(engine), Publisher(engine)
-    assert weights.push(pushed(values["trained"]), partial=True) == 1
+    before = played(engine)
+    assert push(engine, pushed(values["trained"]), partial=True) == 1
     after, saved = (
         played(engine),
         played(serving(Small.from_config(settings(tmp_path, stack="trained", pour="pour")))),
@@ -137,39 +135,10 @@ def test_a_pushed_adapter_acts_as_the_saved_one_and_all_else_as_before(
     }
     named = {"version": 1, "fingerprint": fingerprint(whole)}
     assert [after[name][1] for name in ("stack", "pour")] == [named, named]
-    assert weights.push(pushed(values["stack"]) | pushed(values["pour"], "pour")) == 2
+    assert push(engine, pushed(values["stack"]) | pushed(values["pour"], "pour")) == 2
     assert {name: action for name, (action, _) in played(engine).items()} == {
         name: one for name, (one, _) in before.items()
     }
-
-
-@pytest.mark.parametrize("refused", [False, True])
-def test_all_replicas_act_with_it_or_none(
-    tmp_path: Path,
-    values: dict[str, dict[str, np.ndarray]],
-    serving: Callable[[Agent], Engine],
-    refused: bool,
-) -> None:
-    own, other = (
-        serving(Small.from_config(settings(tmp_path, stack="stack", pour="pour"))) for _ in range(2)
-    )
-    if refused:  # by the other one, which has these values already
-        Publisher(other).push(pushed(values["trained"]), partial=True)
-    before = [played(engine) for engine in (own, other)]
-
-    async def others() -> list[ThisReplica]:
-        return [ThisReplica("other", other.weights)]
-
-    pushing = WeightPusher(ThisReplica("own", own.weights), others).push(
-        pushed(values["trained"]), PushOptions(partial=True)
-    )
-    if refused:
-        with pytest.raises(UnchangedWeights):
-            asyncio.run(pushing)
-        assert [played(engine) for engine in (own, other)] == before
-    else:
-        assert asyncio.run(pushing).replicas == ("other", "own")
-        assert played(own) == played(other) != before[0]
 
 
 def test_a_replica_that_starts_later_states_and_does_the_same(
@@ -179,7 +148,7 @@ def test_a_replica_that_starts_later_states_and_does_the_same(
         serving(Small.from_config(settings(tmp_path, stack="stack", pour="pour"))) for _ in range(2)
     ]
     # As a training begins.
-    Publisher(engines[0]).push(pushed(values["stack"]), partial=True, allow_same=True)
+    push(engines[0], pushed(values["stack"]), partial=True, allow_same=True)
     [held] = [one for one in engines[0].weights.held() if one.number]
     engines[1].weights.stage(held.number, held.values, PushOptions(allow_same=True))
     engines[1].weights.commit(held.number, PushOptions())
@@ -196,14 +165,12 @@ def test_sessions_of_two_versions_keep_theirs_until_their_reset(
     for engine in engines:
         reset(engine, "stack")
     pushing, still = engines
-    Publisher(pushing).push(pushed(values["trained"]), partial=True)
+    push(pushing, pushed(values["trained"]), partial=True)
     reset(pushing, "pour")  # makes the version the agent's
     acts = [act(engine, "stack") for engine in engines]
     assert acts[0].action.tobytes() == acts[1].action.tobytes()
     assert acts[0].info["policy"] == acts[1].info["policy"]
-    Publisher(pushing).push(
-        pushed(values["pour"], "pour"), mode="keep", partial=True, allow_same=True
-    )
+    push(pushing, pushed(values["pour"], "pour"), mode="keep", partial=True, allow_same=True)
     assert act(pushing, "stack").info["policy"]["version"] == 2
     assert act(still, "stack").info["policy"]["version"] == 0
 
@@ -234,7 +201,7 @@ def test_values_that_do_not_fit_change_nothing(
     engine = serving(Small.from_config(settings(tmp_path, stack="stack", pour="pour")))
     before = played(engine)
     with pytest.raises(InvalidWeights, match=says):
-        Publisher(engine).push(pushed(values["trained"]) | change, partial=True)
+        push(engine, pushed(values["trained"]) | change, partial=True)
     assert played(engine) == before
 
 
@@ -243,7 +210,7 @@ def test_two_names_of_one_folder_are_one_adapter(
 ) -> None:
     engine = serving(Small.from_config(settings(tmp_path, stack="stack", pour="stack")))
     before = played(engine)
-    Publisher(engine).push(pushed(values["trained"]), partial=True)
+    push(engine, pushed(values["trained"]), partial=True)
     after = played(engine)
     assert after["stack"] == after["pour"] != before["pour"]
 
@@ -261,7 +228,7 @@ def test_a_transposed_view_is_pushed_by_its_values(
         for name, value in pushed(values["trained"]).items()
     }
     for engine, one in zip(engines, (views, pushed(values["trained"])), strict=True):
-        Publisher(engine).push(one, partial=True)
+        push(engine, one, partial=True)
     assert played(engines[0]) == played(engines[1])
 
 
@@ -274,9 +241,9 @@ def test_the_base_and_its_adapters_sleep_and_wake(
     monkeypatch.setattr(trainable, "_on_gpu", lambda _: True)  # the CPU takes the place of a GPU
     policy = Small.from_config(settings(tmp_path, stack="stack", pour="pour"))
     engine = serving(policy)
-    before, weights = played(engine), Publisher(engine)
+    before = played(engine)
     memories = [one.untyped_storage() for one in policy.model.state_dict().values()]
-    weights.sleep()
+    engine.weights.rest(Rest("sleep"))
     assert not any(memory.nbytes() for memory in memories)
-    weights.wake()
+    engine.weights.rest(Rest("wake"))
     assert played(engine) == before

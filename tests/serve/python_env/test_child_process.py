@@ -18,6 +18,7 @@ from eval_fakes import wait_for
 from gain_policies import gains, in_child
 from in_flight import checked, submit
 from in_process_replicas import export
+from pushed_weights import push
 from shared_cpu_memory import GPU, SharedCpuMemory
 from virtual_environments import ended
 
@@ -40,7 +41,6 @@ from vlagents_ray.serve.queue.call_limits import CallLimits
 from vlagents_ray.serve.weights import PushOptions
 from vlagents_ray.weights import shared_values
 from vlagents_ray.weights.shared_values import NotShared, shared
-from vlagents_ray_learn import Publisher
 
 SUPPORT = Path(__file__).parents[2] / "support"
 ROOT = Path(__file__).parents[3]
@@ -330,7 +330,7 @@ def test_a_push_to_a_child_that_dies_is_refused_and_leaves_nothing() -> None:
     with pytest.raises(
         PolicyUnavailable, match="exit status 9, so that nothing was changed; push again"
     ):
-        Publisher(served).push(gains(1))
+        push(served, gains(1))
     assert len(list(files.iterdir())) <= before
     assert served.weights.number == 0
     assert not served.ready
@@ -341,9 +341,8 @@ def test_a_push_to_a_child_that_dies_is_refused_and_leaves_nothing() -> None:
 
 def test_the_child_drops_versions_that_nobody_acts_with_and_gives_others_to_new_replicas() -> None:
     served, _ = learner("Counting")
-    weights = Publisher(served)
     for number in range(1, 5):
-        weights.push(gains(number), pin=True)
+        push(served, gains(number), pin=True)
         reply = ask(served, "a", "reset", priority="simulation")
         assert (info(reply)["gain"], info(ask(served, "a", "act"))["policy"]["version"]) == (
             number,

@@ -13,7 +13,7 @@ import itertools
 import queue
 import threading
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial, wraps
 from typing import Any
 
@@ -33,7 +33,6 @@ from vlagents_ray.protocol.messages import Reply, Request
 from vlagents_ray.serve.access.api_keys import Caller, NoKey
 from vlagents_ray.serve.engine.sender import Sender
 from vlagents_ray.serve.scaling.session_migration import HeldSessions
-from vlagents_ray.serve.scaling.weight_push import ThisReplica, WeightPusher, WeightsReplica
 from vlagents_ray.serve.weights import PushMode, PushOptions, Rest
 
 _NAMES = ("a", "b", "c")
@@ -150,7 +149,7 @@ class Moves(RuleBasedStateMachine):
 
     @rule(mode=st.sampled_from(["keep", "next_episode"]), pin=st.booleans(), missed=st.booleans())
     def push(self, mode: PushMode, pin: bool, missed: bool) -> None:
-        """New weights; a replica that has `missed` the commit catches up."""
+        """New weights; a replica that has `missed` the commit gets them from the other one."""
         number, options = self.newest + 1, PushOptions(mode=mode, pin=pin)
         first, second = (engine.weights for engine in self.served.engines)
         for updates in (first, second):
@@ -158,16 +157,9 @@ class Moves(RuleBasedStateMachine):
         first.commit(number, options)
         if missed:
             second.drop(number)
-            near, far = (
-                ThisReplica(str(at), updates) for at, updates in enumerate((first, second))
-            )
-
-            async def others() -> Sequence[WeightsReplica]:
-                return [near]
-
-            asyncio.run(WeightPusher(far, others).catch_up())
-        else:
-            second.commit(number, options)
+            [held] = [version for version in first.held() if version.number == number]
+            second.stage(number, held.values, replace(options, allow_same=True))
+        second.commit(number, options)
         self.newest = number
         if pin:
             self.pinned = number

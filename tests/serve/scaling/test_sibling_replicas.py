@@ -14,14 +14,13 @@ from ray.exceptions import ActorDiedError, ActorUnavailableError, RayTaskError
 from vlagents_ray.errors import InvalidWeights
 from vlagents_ray.serve.scaling import sibling_replicas
 from vlagents_ray.serve.scaling.rebalancer import ReplicaLoad
-from vlagents_ray.serve.scaling.session_migration import PeerEnded, PeerUnreachable
+from vlagents_ray.serve.scaling.session_migration import HeldSessions, PeerEnded, PeerUnreachable
 from vlagents_ray.serve.scaling.sibling_replicas import (
     PEER_METHODS,
     ReplicasInCluster,
     SiblingReplica,
     SiblingReplicas,
 )
-from vlagents_ray.serve.weights import PushOptions, WeightUpdates
 
 
 def raised(cause: Exception) -> RayTaskError:
@@ -46,14 +45,14 @@ def test_errors_of_another_replica(
         assert (actor, method.__name__, args) == (
             "actor",
             "peer",
-            ("WeightUpdates.stage", 1, {}, PushOptions()),
+            ("HeldSessions.weights", "arm"),
         )
         raise error
 
     monkeypatch.setattr(sibling_replicas, "call_replica", call)
     replica = SiblingReplica("r1", "actor", {"r1"})
     with pytest.raises(becomes) as found:
-        asyncio.run(replica.weights(WeightUpdates.stage, 1, {}, PushOptions()))
+        asyncio.run(replica.call(HeldSessions.weights, "arm"))
     assert type(found.value) is becomes
     assert str(found.value)
 

@@ -7,6 +7,7 @@ from __future__ import annotations
 import html
 import json
 import re
+from collections.abc import Mapping
 from typing import Any
 
 from vlagents_ray.docstrings import summary_of
@@ -50,9 +51,6 @@ _PATHS = f"""\
     Ends the session.
 `WS /v1/stream`
     Binary frames; sessions end with the connection. A message that begins with `VLA?` is a probe.
-`WS /v1/weights`, `GET /v1/weights`
-    New weights from a learner, with a key of the scope `weights`; see `vlagents_ray_learn.Publisher`. The versions
-    that act.
 `GET /v1/metadata`
     Policy, checkpoint, contract, protocol version, every way in.
 `GET /healthz`
@@ -101,11 +99,7 @@ def docs_page(metadata: dict[str, Any]) -> str:
         )
         for one in (metadata.get("dialects") or {}).values()
     )
-    pages = "".join(
-        f"`GET {part['page']}`\n    {part['summary']}\n"
-        for part in (metadata.get("parts") or {}).values()
-        if part.keys() >= {"page", "summary"}
-    )
+    parts = "".join(map(_entry_of_part, (metadata.get("parts") or {}).values()))
     errors = "".join(
         f"{cls.status} `{code}`\n    {summary_of(cls)}\n"
         for code, cls in sorted(BY_CODE.items(), key=lambda item: (item[1].status, item[0]))
@@ -120,7 +114,7 @@ Choose a session id for each robot or environment and send it as <code>{SESSION_
 <p>Where the server has API keys, send yours with every request: <code>Authorization: Bearer KEY</code>.</p>
 <h2>With curl</h2><pre>{html.escape(_CURL)}</pre>
 <h2>With Python</h2><pre>{html.escape(_PYTHON)}</pre>
-<h2>Paths</h2>{_entries(_PATHS + pages)}
+<h2>Paths</h2>{_entries(_PATHS + parts)}
 <p>A replica that stops hands its sessions over: the next request of the same session id goes on where it was.</p>
 <h2>Headers</h2>{_entries(_HEADERS)}
 {"<h2>Clients of other systems, as they are</h2>" + _entries(dialects) if dialects else ""}
@@ -133,6 +127,20 @@ transport, priority and outcome, latency, time by stage, batch sizes, queue dept
 {_entries(errors)}
 <h2>This policy</h2><pre>{html.escape(json.dumps(metadata, indent=2))}</pre>
 </body></html>"""
+
+
+def _entry_of_part(facts: Mapping[str, Any]) -> str:
+    """Return the entry of a part with these facts, as `ReplicaPart.describe` returns them; empty
+    if it has no paths.
+    """
+    if "summary" not in facts:
+        return ""
+    paths = list(facts.get("paths", ()))
+    if "page" in facts:
+        paths.append(f"GET {facts['page']}")
+    if not paths:
+        return ""
+    return ", ".join(f"`{path}`" for path in paths) + f"\n    {facts['summary']}\n"
 
 
 def _entries(text: str) -> str:

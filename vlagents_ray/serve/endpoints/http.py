@@ -1,9 +1,8 @@
 """The HTTP endpoint: HTTP and WebSocket on one port, as an ASGI application over an engine.
 
     POST /v1/reset, /v1/act, /v1/close   multipart/form-data, application/json, or one binary frame
-    WS   /v1/stream                      sessions that end with the connection; binary frames or
-    probes WS   /v1/weights                     new weights from a learner, see
-    `vlagents_ray.serve.endpoints.weights` GET  /healthz, /v1/metadata, /docs
+    WS   /v1/stream                      sessions that end with the connection; frames or probes
+    GET  /healthz, /v1/metadata, /docs
 
 Errors over HTTP are problem+json with a stable code; over WebSocket they are reply frames.
 """
@@ -58,8 +57,7 @@ def build_http_app(
     Args:
         metadata: Returns the document of `GET /v1/metadata`.
         machine_metadata: Returns the metadata for a caller on the machine with the given boot id.
-        more: The routes of other systems' clients, learners and viewers, see
-            `vlagents_ray.serve.dialects`, `vlagents_ray.serve.endpoints.weights` and
+        more: The routes of dialects and of parts, see `vlagents_ray.serve.dialects` and
             `vlagents_ray.serve.replica.part`.
     """
     server = _HttpEndpoint(engine, metadata, limits, machine_metadata)

@@ -31,7 +31,8 @@ logger = logging.getLogger(__name__)
 PERIOD_S = 1.0
 _SLICE_S = 50e-6
 _PAUSE_S = 300e-6
-_MS = [
+# Boundaries of histograms of durations, ms.
+MS_BOUNDARIES = [
     0.05,
     0.1,
     0.2,
@@ -77,10 +78,15 @@ class Exporter:
             "op",
             "transport",
             "priority",
-            boundaries=_MS,
+            boundaries=MS_BOUNDARIES,
         )
         self._stage = make(
-            Histogram, "stage_ms", "Time of an act by stage.", "stage", "transport", boundaries=_MS
+            Histogram,
+            "stage_ms",
+            "Time of an act by stage.",
+            "stage",
+            "transport",
+            boundaries=MS_BOUNDARIES,
         )
         self._batch = make(
             Histogram, "batch_size", "Observations in one forward pass.", boundaries=_SIZES
@@ -94,12 +100,11 @@ class Exporter:
         # This series and the next are of a GPU in the replica's process; the kinds are allocated,
         # reserved and free.
         self._gpu_memory = make(Gauge, "gpu_memory_bytes", "Memory of the GPU.", "kind")
-        self._gpu_ms = make(Histogram, "gpu_ms", "Forward pass on the GPU.", boundaries=_MS)
+        self._gpu_ms = make(
+            Histogram, "gpu_ms", "Forward pass on the GPU.", boundaries=MS_BOUNDARIES
+        )
         self._replays = make(Counter, "graph_replays", "Replays of CUDA graphs.")
         self._version = make(Gauge, "policy_version", "Newest version of the weights.")
-        self._pushes = make(
-            Histogram, "weight_push_ms", "Time until all replicas act with weights.", boundaries=_MS
-        )
         self._hung = make(Counter, "hung_calls", "Calls of the policy over their time limit.", "op")
         # Batches in a child process are not counted.
         self._out_of_memory = make(
@@ -138,8 +143,6 @@ class Exporter:
         for transport in _TRANSPORTS:
             self._sessions.set(sessions.get(transport, 0), {"transport": transport})
         self._utilisation.set(self._meter.read().utilisation)
-        for took_ms in self._engine.weights.collect_pushes_ms():
-            self._pushes.observe(took_ms)
         self._version.set(self._engine.weights.number)
         self._uncompiled.set(len(self._engine.models.uncompiled))
         for kind, size in self._engine.models.gpu_memory().items():

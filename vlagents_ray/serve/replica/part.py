@@ -132,9 +132,9 @@ class ReplicaPart:
 
     Config: ClassVar[type[PartConfig]] = PartConfig
     sibling_methods: ClassVar[Mapping[str, float | None]] = {}
-    """The methods that the same part of other replicas may call, and the time limit of each for an
-    answer, s; None is no limit. A coroutine function runs on the replica's event loop, any other
-    one in a thread."""
+    """The methods that the same part of other replicas, or a process of the cluster, may call, and
+    the time limit of each for an answer, s; None is no limit. A coroutine function runs on the
+    replica's event loop, any other one in a thread."""
 
     pages: ClassVar[Mapping[str, str]] = {}
     """Paths of pages for a browser, by title, such as {"live page": "/live"}; `vlagents-ray serve`
@@ -175,6 +175,9 @@ class ReplicaPart:
     def describe(self) -> Mapping[str, Any]:
         """Return facts for clients, which the replica's metadata has under `parts` and the name
         of this part.
+
+        `GET /docs` lists a part with a `summary` and the path of its `page` or its `paths`, such as
+        ["GET /count"].
         """
         return {}
 

@@ -7,7 +7,7 @@ import faulthandler
 import logging
 import os
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict
 from functools import partial
 from typing import Any
@@ -33,7 +33,6 @@ from vlagents_ray.serve.endpoints.http import build_http_app
 from vlagents_ray.serve.endpoints.plasma import PlasmaServer
 from vlagents_ray.serve.endpoints.shm import ShmServer
 from vlagents_ray.serve.endpoints.websocket import WebSocketServer
-from vlagents_ray.serve.endpoints.weights import weights_routes
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.engine.sender import Sender
 from vlagents_ray.serve.local_agent import build_engine, policy_metadata
@@ -45,9 +44,6 @@ from vlagents_ray.serve.scaling.autoscaling import SESSIONS, UTILISATION, WAITIN
 from vlagents_ray.serve.scaling.rebalancer import ClientLocation, Rebalancer, ReplicaLoad
 from vlagents_ray.serve.scaling.session_migration import HeldSessions, SessionMigrator
 from vlagents_ray.serve.scaling.sibling_replicas import PEER_METHODS, SiblingApi, SiblingReplicas
-from vlagents_ray.serve.scaling.weight_push import ThisReplica, Values, WeightPusher, WeightsReplica
-from vlagents_ray.serve.weights import NewestVersion, PushOptions, PushResult, Rest, WeightUpdates
-from vlagents_ray.weights.safetensors import ValueSpec
 
 logger = logging.getLogger(__name__)
 
@@ -59,8 +55,6 @@ _GATEWAY_POLL_S = 10.0
 # Time in which clients of a draining replica connect to another one before their WebSockets are
 # closed.
 _LEAVE_S = 5.0
-# Interval of the checks whether this replica has missed a version of the weights.
-_CATCH_UP_S = 10.0
 
 
 class PolicyReplica(ClientApi, SiblingApi):
@@ -107,8 +101,6 @@ class PolicyReplica(ClientApi, SiblingApi):
         self._configured = False
         self._migrator.start(self._engine)
         self._rebalancer = Rebalancer(self._engine, self._peers, self._load_of)
-        self._weights = ThisReplica(self._peers.own_name, self._engine.weights)
-        self._pusher = WeightPusher(self._weights, self._peers.others)
 
         # The parts that plug-ins add, and the metrics.
         node = ray.get_runtime_context().get_node_id()[:8]
@@ -174,12 +166,10 @@ class PolicyReplica(ClientApi, SiblingApi):
             # both tracebacks first.
             raise PolicyFailed(str(error)) from None
 
-        await self._catch_up()  # gets the other replicas' versions before this replica is ready
         await self._parts.before_ready()
 
         works = [
             self._watch_shutdown(),
-            self._keep_catching_up(),
             self._rebalancer.run(),
             self._parts.run(),
         ]
@@ -237,12 +227,11 @@ class PolicyReplica(ClientApi, SiblingApi):
 
     def __serve_build_asgi_app__(self) -> ASGIApp:
         slow_s, idle_s = self._args.limits.slow_s, self._args.sessions.idle_s
-        insecure, hosts = self._args.access.insecure, self._args.access.hosts
+        hosts = self._args.access.hosts
         more = [
             *dialect_routes(
                 self._args.dialects, ReplicaContext(self._engine, self.metadata, self._limits)
             ),
-            *weights_routes(self, slow_s, open_to_network=insecure),
             *self._parts.routes(),
         ]
         inside = build_http_app(
@@ -345,45 +334,13 @@ class PolicyReplica(ClientApi, SiblingApi):
         part, call, _ = PEER_METHODS[method]
         if part is HeldSessions:
             return await call(self._migrator.held, *args)
-        if part is Rebalancer:
-            return call(self._rebalancer)
-        return await self._weights.weights(call, *args)
+        return call(self._rebalancer)
 
     async def call_part(self, part: str, method: str, *args: Any) -> Any:
         """Call a method of a part for the same part of another replica, or for a process of the
         cluster.
         """
         return await self._parts.call(part, method, *args)
-
-    # New weights: from learners, and from the replica that coordinates a push.
-
-    async def push_weights(self, values: Values, options: PushOptions) -> PushResult:
-        """Make all replicas act with new weights; called by a learner."""
-        return await self._pusher.push(values, options)
-
-    async def rest(self, rest: Rest) -> None:
-        """Let all replicas sleep, restore their memory, or wake; called by a learner."""
-        await self._pusher.rest(rest)
-
-    async def push_received(self, values: Mapping[str, Any], options: PushOptions) -> PushResult:
-        """Make all replicas act with new weights, which this one has received over the network."""
-        if not await self._peers.others():
-            return await self._pusher.push(values, options)
-        # The values are copied on another thread, to not delay robots on this event loop.
-        reference = await asyncio.to_thread(ray.put, values)
-        return await self._pusher.push([reference], options)
-
-    def read_header(self, header: bytes, options: PushOptions) -> dict[str, ValueSpec]:
-        """Check the header of new weights, before they are received."""
-        return self._engine.weights.own().read_header(header, options)
-
-    async def versions_of_weights(self) -> list[int]:
-        """Return the newest version of each replica that can be reached; called by a learner."""
-        replicas: list[WeightsReplica] = [self._weights, *await self._peers.others()]
-        answers = await asyncio.gather(
-            *(replica.weights(WeightUpdates.newest) for replica in replicas), return_exceptions=True
-        )
-        return [answer.number for answer in answers if isinstance(answer, NewestVersion)]
 
     # The replica's periodic tasks.
 
@@ -406,20 +363,6 @@ class PolicyReplica(ClientApi, SiblingApi):
         if await asyncio.to_thread(_others_run):
             self._engine.drain()
         self._shutdown.begin(_LEAVE_S if self._engine.draining else 0.0)
-
-    async def _keep_catching_up(self) -> None:
-        """Get the other replicas' versions of the weights whenever this replica has missed one."""
-        while True:
-            await asyncio.sleep(_CATCH_UP_S)
-            await self._catch_up()
-
-    async def _catch_up(self) -> None:
-        try:
-            await self._pusher.catch_up()
-        except Exception:
-            logger.exception(
-                "the newest weights were not taken from the other replicas; tried again later"
-            )
 
     async def _poll_gateways(self) -> None:
         """Query the gateway periodically for its addresses, which may change without a restart

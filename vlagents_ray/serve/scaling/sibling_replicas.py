@@ -22,7 +22,6 @@ from vlagents_ray.serve.scaling.session_migration import (
     PeerEnded,
     PeerUnreachable,
 )
-from vlagents_ray.serve.weights import WeightUpdates
 
 P = ParamSpec("P")
 T = TypeVar("T")
@@ -70,24 +69,16 @@ PEER_METHODS = {
         PeerMethod(HeldSessions, HeldSessions.release, None),
         PeerMethod(HeldSessions, HeldSessions.take_over, None),
         PeerMethod(HeldSessions, HeldSessions.drop_older, None),
-        PeerMethod(WeightUpdates, WeightUpdates.newest, _ANSWER_S),
-        PeerMethod(WeightUpdates, WeightUpdates.stage, _TRANSFER_S),
-        PeerMethod(WeightUpdates, WeightUpdates.commit, _ANSWER_S),
-        PeerMethod(WeightUpdates, WeightUpdates.drop, _ANSWER_S),
-        PeerMethod(WeightUpdates, WeightUpdates.held, _TRANSFER_S),
-        PeerMethod(WeightUpdates, WeightUpdates.rest, _TRANSFER_S),
         PeerMethod(Rebalancer, Rebalancer.load, _QUICK_S),
     )
 }
 """The methods that replicas call on each other with `SiblingApi.peer`, by their qualified names:
-for moves of sessions, pushes of weights, and loads.
+for moves of sessions, and for loads.
 """
 
 
 class SiblingReplica(Peer):
-    """Another replica: for moving sessions, for pushes of weights (`WeightsReplica`), and for
-    parts of replicas.
-    """
+    """Another replica: for moving sessions, and for parts of replicas."""
 
     def __init__(self, name: str, actor: Any, initialized: set[str]) -> None:
         """Create the proxy of an actor.
@@ -147,8 +138,6 @@ class SiblingReplica(Peer):
         except (ray.exceptions.RayError, TimeoutError, asyncio.TimeoutError) as error:
             # The replica hangs, or the network is partitioned.
             raise PeerUnreachable(str(error) or f"no answer within {limit_s} s") from error
-
-    weights = call
 
 
 class ReplicasInCluster:

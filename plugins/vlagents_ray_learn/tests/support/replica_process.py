@@ -95,7 +95,7 @@ def _serve(pipe: Any, device: str, gpu: str) -> None:
 
 
 class ReplicaProcess:
-    """The replica as a push sees it: `vlagents_ray.serve.scaling.weight_push.WeightsReplica`."""
+    """The replica as a push sees it: `vlagents_ray_learn.weight_push.WeightsReplica`."""
 
     name = "replica"
 

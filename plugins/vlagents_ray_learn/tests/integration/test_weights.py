@@ -8,10 +8,10 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 import pytest
 from eval_fakes import wait_for
+from served_acts import first_act
 from shared_ray import shared_server
 
 from tests.integration.conftest import deploy, states
-from vlagents_ray import Obs, RemoteAgent
 from vlagents_ray.errors import InvalidWeights, PolicyUnavailable, UnchangedWeights
 from vlagents_ray.serve.launch.deployment_file import Deployment, deployment
 from vlagents_ray.serve.launch.server import Server
@@ -38,16 +38,7 @@ def gain(value: float) -> dict[str, np.ndarray]:
 
 
 def acts(server: Server, transport: str) -> tuple[int, float]:
-    return acts_of(server, "Trainable", transport)
-
-
-def acts_of(server: Server, app: str, transport: str) -> tuple[int, float]:
-    """Version and first number of the first act of an episode."""
-    url = f"serve://{app}" if transport in ("handle", "plasma") else server.url
-    with RemoteAgent(url, transport=transport, priority="simulation") as agent:
-        agent.reset(Obs(), None)
-        act = agent.act(Obs())
-        return act.info["policy"]["version"], float(act.action[0])
+    return first_act(server, "Trainable", transport)
 
 
 def test_both_replicas_act_with_a_push_on_every_transport(server: Server) -> None:

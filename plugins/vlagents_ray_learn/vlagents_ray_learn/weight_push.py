@@ -12,8 +12,8 @@ from __future__ import annotations
 
 import asyncio
 import logging
-import time
 from collections.abc import Awaitable, Callable, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any, Protocol, TypeVar
 
 from vlagents_ray.errors import InvalidInput, InvalidWeights, PolicyUnavailable, VLAgentsError
@@ -22,7 +22,6 @@ from vlagents_ray.serve.weights import (
     NewestVersion,
     PushMode,
     PushOptions,
-    PushResult,
     Rest,
     WeightUpdates,
 )
@@ -39,6 +38,15 @@ logger = logging.getLogger(__name__)
 # Maximum step from one version to the next if a learner numbers them, such as by its training step.
 _MOST_AHEAD = 10**9
 _ATTEMPTS = 3  # attempts to commit at a replica that cannot be reached
+
+
+@dataclass(frozen=True, slots=True)
+class PushResult:
+    """The result of a successful push."""
+
+    version: int
+    fingerprint: str  # the same at all replicas
+    replicas: tuple[str, ...]  # names of the replicas that act with the version
 
 
 class WeightsReplica(Protocol):
@@ -82,7 +90,6 @@ class WeightPusher:
 
     async def push(self, values: Values, options: PushOptions) -> PushResult:
         """Make all replicas act with new weights, or none of them."""
-        begun = time.perf_counter()
         async with self._pushing:
             newest = {
                 self._this_replica: await self._this_replica.weights(WeightUpdates.newest),
@@ -139,8 +146,6 @@ class WeightPusher:
             committed = await asyncio.gather(
                 *(self._commit(replica, number, options) for replica in staged)
             )
-            took_ms = 1e3 * (time.perf_counter() - begun)
-            await self._this_replica.weights(WeightUpdates.pushed, took_ms)
 
             acting = sorted(
                 replica.name for replica, acts in zip(staged, committed, strict=True) if acts

@@ -1,11 +1,13 @@
 """The endpoint for learners on other machines: new weights in the safetensors format, over a
 WebSocket.
 
-    WS   /v1/weights?mode=keep   a header, then the bytes of the values in parts; each is
-    acknowledged GET  /v1/weights             the newest version of each replica
-    POST /v1/weights/sleep       no acts, and less memory, until "wake"; see
-    `vlagents_ray.serve.weights.Rest` POST /v1/weights/restore     the memory back, still without
-    acts POST /v1/weights/wake        acts again
+    WS   /v1/weights?mode=keep   a header, then the bytes of the values in parts, all acknowledged
+    GET  /v1/weights             the newest version of each replica
+    POST /v1/weights/sleep       no acts, and less memory, until "wake"
+    POST /v1/weights/restore     the memory back, still without acts
+    POST /v1/weights/wake        acts again
+
+`vlagents_ray.serve.weights.Rest` describes the last three.
 
 One connection is one push, which ends with it, so that all of its parts reach one replica, and no
 data of a push remain if its learner dies. A learner sends the values when the header is
@@ -42,12 +44,14 @@ from vlagents_ray.errors import (
 from vlagents_ray.protocol.json_messages import problem
 from vlagents_ray.serve.access.api_keys import Caller, ScopeCheck, current_caller
 from vlagents_ray.serve.endpoints.http_messages import deny
-from vlagents_ray.serve.weights import PushOptions, PushResult, Rest
+from vlagents_ray.serve.weights import PushOptions, Rest
 from vlagents_ray.weights.safetensors import MESSAGE_BYTES, ValueSpec, ValuesReader
+from vlagents_ray_learn.weight_push import PushResult
 
 logger = logging.getLogger(__name__)
 
 PATH = "/v1/weights"
+PART = "weights"  # name of the replica's part that has these routes, as it is registered
 LEAST_RATE = 2**18  # minimum average rate of a push, bytes/s, since it blocks other pushes
 _SCOPE = "weights"
 _DIGITS = 20  # maximum number of digits of a version's number
@@ -65,10 +69,10 @@ class ReceivesWeights(Protocol):
     async def push_received(self, values: Mapping[str, Any], options: PushOptions) -> PushResult:
         """Make all replicas act with new weights."""
 
-    async def rest(self, rest: Rest) -> None:
+    async def rest_all(self, rest: Rest) -> None:
         """Let all replicas take a step of a rest."""
 
-    async def versions_of_weights(self) -> list[int]:
+    async def versions(self) -> list[int]:
         """Return the newest version of each replica."""
 
 
@@ -96,14 +100,14 @@ class _WeightsEndpoint:
 
     async def show(self, http: HttpRequest) -> Response:
         self._scopes.require(_SCOPE)
-        return JSONResponse({"versions": await self._replicas.versions_of_weights()})
+        return JSONResponse({"versions": await self._replicas.versions()})
 
     async def rest(self, http: HttpRequest) -> Response:
         self._scopes.require(_SCOPE)
         rest = _rest(http.path_params["step"], http.query_params)
         if isinstance(caller := current_caller(), Caller):
             caller.note("the policy's rest:", rest.step)
-        await self._replicas.rest(rest)
+        await self._replicas.rest_all(rest)
         return JSONResponse({})
 
     async def receive(self, socket: WebSocket) -> None:

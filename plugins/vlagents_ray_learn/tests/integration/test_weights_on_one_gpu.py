@@ -8,10 +8,10 @@ import logging
 from typing import Any
 
 import pytest
+from served_acts import first_act
 from shared_cpu_memory import SharedCpuMemory
 from shared_ray import shared_server
 
-from tests.integration.test_weights import acts_of
 from vlagents_ray.errors import InvalidWeights
 from vlagents_ray.serve.launch.deployment_file import deployment
 from vlagents_ray.weights import shared_values
@@ -47,7 +47,7 @@ def test_both_replicas_act_with_what_the_learner_hands_over(
     with shared_server(document) as server, Publisher("serve://OnOneGpu") as weights:
 
         def acted() -> set[tuple[int, float]]:
-            return {acts_of(server, "OnOneGpu", "http") for _ in range(4)}
+            return {first_act(server, "OnOneGpu", "http") for _ in range(4)}
 
         for version in (1, 2, 3):
             learner.weight.fill_(version)

@@ -41,13 +41,11 @@ from vlagents_ray.protocol.messages import MessageLimits
 from vlagents_ray.serve import weights as versions
 from vlagents_ray.serve.access import api_keys
 from vlagents_ray.serve.access.api_keys import Keys
-from vlagents_ray.serve.endpoints import weights as endpoint
+from vlagents_ray.serve.config.parts import PartConfig
 from vlagents_ray.serve.endpoints.access_middleware import AccessMiddleware
 from vlagents_ray.serve.endpoints.http import build_http_app
-from vlagents_ray.serve.endpoints.weights import weights_routes
 from vlagents_ray.serve.engine.engine import Engine
-from vlagents_ray.serve.scaling.weight_push import ThisReplica, WeightPusher
-from vlagents_ray.serve.weights import PushOptions, PushResult
+from vlagents_ray.serve.replica.part import PartContext
 from vlagents_ray.weights.safetensors import (
     MESSAGE_BYTES,
     PART_BYTES,
@@ -56,6 +54,8 @@ from vlagents_ray.weights.safetensors import (
     read_header,
 )
 from vlagents_ray_learn import Publisher, publisher
+from vlagents_ray_learn import weights_endpoint as endpoint
+from vlagents_ray_learn.weights_part import WeightsPart
 
 LENGTH = 3 * 2**20  # 12 MiB, so that there are several parts
 
@@ -68,27 +68,6 @@ class Gain(Agent):
 
     def act(self, obs: Obs) -> Act:
         return Act(self.tree["offset"])
-
-
-class Alone:
-    """One replica."""
-
-    def __init__(self, engine: Engine) -> None:
-        own = ThisReplica("this", engine.weights)
-
-        async def others() -> tuple[()]:
-            return ()
-
-        self.read_header = lambda *sent: engine.weights.own().read_header(*sent)
-        self._pusher = WeightPusher(own, others)
-        self.rest = self._pusher.rest
-        self._engine = engine
-
-    async def push_received(self, values: Mapping[str, Any], options: PushOptions) -> PushResult:
-        return await self._pusher.push(values, options)
-
-    async def versions_of_weights(self) -> list[int]:
-        return [self._engine.weights.number]
 
 
 Serving = Callable[..., SimpleNamespace]
@@ -108,8 +87,9 @@ def serving(monkeypatch: pytest.MonkeyPatch) -> Iterator[Serving]:
     ) -> SimpleNamespace:
         engine = Engine(agent or Gain())
         engine.start()
-        routes = weights_routes(Alone(engine), slow_s, open_to_network=insecure)
-        inside = build_http_app(engine, dict, MessageLimits(), more=routes)
+        context = PartContext(engine, "this", "here", dict, slow_s=slow_s, open_to_network=insecure)
+        part = WeightsPart(PartConfig(), context)
+        inside = build_http_app(engine, dict, MessageLimits(), more=part.routes())
         server = served(AccessMiddleware(inside, keys, "app"))
         opened.extend((server, engine))
         return SimpleNamespace(url=f"http://127.0.0.1:{server.__enter__()}", engine=engine)

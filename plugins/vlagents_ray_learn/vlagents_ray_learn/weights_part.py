@@ -1,0 +1,187 @@
+"""New weights as a part of a replica: the routes for learners, the methods for learners inside the
+cluster, and the calls between replicas.
+
+The part is on by default. `parts: {weights: null}` in a deployment file turns it off: the server
+then serves its checkpoints, and takes no pushes.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import time
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+from typing import Any, ClassVar, TypeVar
+
+import ray
+from ray.util.metrics import Histogram
+from starlette.routing import BaseRoute
+
+from vlagents_ray.serve.replica.metrics import MS_BOUNDARIES, series
+from vlagents_ray.serve.replica.part import PartContext, ReplicaPart, SiblingPart
+from vlagents_ray.serve.weights import (
+    HeldVersion,
+    NewestVersion,
+    PushOptions,
+    Rest,
+    WeightUpdates,
+)
+from vlagents_ray.weights.safetensors import ValueSpec
+from vlagents_ray_learn.weight_push import (
+    PushResult,
+    ThisReplica,
+    Values,
+    WeightPusher,
+    WeightsReplica,
+)
+from vlagents_ray_learn.weights_endpoint import PATH, weights_routes
+
+T = TypeVar("T")
+
+logger = logging.getLogger(__name__)
+
+# Interval of the checks whether this replica has missed a version of the weights.
+_CATCH_UP_S = 10.0
+_ANSWER_S = 3.0  # time limit for an answer; a replica that still loads does not answer
+_TRANSFER_S = 600.0  # time limit for the answer to a call that contains weights
+_SUMMARY = (
+    "New weights from a learner, with a key of the scope `weights`; see "
+    "`vlagents_ray_learn.Publisher`. The versions that act."
+)
+
+
+class WeightsPart(ReplicaPart):
+    """Takes new weights from learners for all replicas of the application.
+
+    Learners call `push`, `rest_all` and `versions` at any replica, which coordinates the others by
+    the methods of its `WeightUpdates`.
+    """
+
+    sibling_methods: ClassVar[Mapping[str, float | None]] = {
+        # For the replica that coordinates a push.
+        "newest": _ANSWER_S,
+        "stage": _TRANSFER_S,
+        "commit": _ANSWER_S,
+        "drop": _ANSWER_S,
+        "held": _TRANSFER_S,
+        "rest": _TRANSFER_S,
+        # For learners in the cluster, which have time limits of their own.
+        "push": None,
+        "rest_all": None,
+        "versions": None,
+    }
+
+    def __init__(self, settings: Any, context: PartContext) -> None:
+        super().__init__(settings, context)
+        self._updates = context.engine.weights
+        self._own = ThisReplica(context.replica, self._updates)
+        self._pusher = WeightPusher(self._own, self._others)
+        make = partial(series, context.metric_tags)
+        self._push_ms = make(
+            Histogram,
+            "weight_push_ms",
+            "Time until all replicas act with weights.",
+            boundaries=MS_BOUNDARIES,
+        )
+
+    async def before_ready(self) -> None:
+        """Take the versions of the other replicas, so that all act with the same ones."""
+        await self._catch_up()
+
+    async def run(self) -> None:
+        """Take the versions of the other replicas whenever this replica has missed one."""
+        while True:
+            await asyncio.sleep(_CATCH_UP_S)
+            await self._catch_up()
+
+    def routes(self) -> Sequence[BaseRoute]:
+        """Return the routes for learners on other machines."""
+        context = self.context
+        return weights_routes(self, context.slow_s, open_to_network=context.open_to_network)
+
+    def describe(self) -> Mapping[str, Any]:
+        """Return the paths for learners, for `GET /docs` and for a `Publisher`."""
+        return {"paths": [f"WS {PATH}", f"GET {PATH}"], "summary": _SUMMARY}
+
+    # For learners, by way of any replica.
+
+    async def push(self, values: Values, options: PushOptions) -> PushResult:
+        """Make all replicas act with new weights, or none of them."""
+        begun = time.perf_counter()
+        result = await self._pusher.push(values, options)
+        self._push_ms.observe(1e3 * (time.perf_counter() - begun))
+        return result
+
+    async def push_received(self, values: Mapping[str, Any], options: PushOptions) -> PushResult:
+        """Make all replicas act with new weights, which this one has received over the network."""
+        if not await self._others():
+            return await self.push(values, options)
+        # The values are copied on another thread, to not delay robots on this event loop.
+        reference = await asyncio.to_thread(ray.put, values)
+        return await self.push([reference], options)
+
+    def read_header(self, header: bytes, options: PushOptions) -> dict[str, ValueSpec]:
+        """Check the header of new weights, before they are received."""
+        return self._updates.own().read_header(header, options)
+
+    async def rest_all(self, rest: Rest) -> None:
+        """Let all replicas sleep, restore their memory, or wake."""
+        await self._pusher.rest(rest)
+
+    async def versions(self) -> list[int]:
+        """Return the newest version of each replica that can be reached."""
+        replicas: list[WeightsReplica] = [self._own, *await self._others()]
+        answers = await asyncio.gather(
+            *(replica.weights(WeightUpdates.newest) for replica in replicas), return_exceptions=True
+        )
+        return [newest.number for newest in answers if isinstance(newest, NewestVersion)]
+
+    # For the replica that coordinates a push or a rest, or catches up: see `WeightUpdates`.
+
+    def newest(self) -> NewestVersion:
+        """Return the newest version of this replica."""
+        return self._updates.newest()
+
+    async def stage(self, number: int, values: Values, options: PushOptions) -> str:
+        """Check and hold a new version at this replica, and return its fingerprint."""
+        return await self._own.weights(WeightUpdates.stage, number, values, options)
+
+    def commit(self, number: int, options: PushOptions) -> None:
+        """Use the staged version at this replica."""
+        self._updates.commit(number, options)
+
+    def drop(self, number: int) -> None:
+        """Drop the staged version of this replica."""
+        self._updates.drop(number)
+
+    def held(self) -> list[HeldVersion]:
+        """Return the versions that a replica that has missed them needs."""
+        return self._updates.held()
+
+    def rest(self, rest: Rest) -> None:
+        """Let this replica sleep, restore its memory, or wake."""
+        self._updates.rest(rest)
+
+    async def _others(self) -> list[WeightsReplica]:
+        return [_OtherReplica(sibling) for sibling in await self.siblings()]
+
+    async def _catch_up(self) -> None:
+        try:
+            await self._pusher.catch_up()
+        except Exception:
+            logger.exception(
+                "the newest weights were not taken from the other replicas; tried again later"
+            )
+
+
+class _OtherReplica(WeightsReplica):
+    """Another replica as the target of a push, through its part."""
+
+    def __init__(self, sibling: SiblingPart) -> None:
+        self.name, self._sibling = sibling.name, sibling
+
+    async def weights(self, method: Callable[..., T], *args: Any) -> T:
+        """Call the method of the same name of the part there."""
+        answer: T = await self._sibling.call(method, *args)
+        return answer
