@@ -153,8 +153,7 @@ def measure_evaluation(
                 rounds.setdefault(name, []).append(played := play(plan, run, folder))
                 progress(
                     f"round {number + 1}/{plan.rounds}: {name} {played.episodes_per_minute:.0f} "
-                    "episodes/min, "
-                    f"whole command {played.wall_s:.1f} s"
+                    f"episodes/min, whole command {played.wall_s:.1f} s"
                 )
     return {
         "plan": asdict(plan),
@@ -183,9 +182,8 @@ def play(plan: EvaluationPlan, run: Run, folder: Path) -> Played:
     if seeds != list(range(plan.episodes)) or steps != {plan.max_steps}:
         raise ProcessFailed(
             f"{folder.name}: played {len(episodes)} episodes with {len(set(seeds))} seeds and "
-            f"{sorted(steps)} steps, "
-            f"want each of {plan.episodes} once with {plan.max_steps}; its results stand for "
-            "something else"
+            f"{sorted(steps)} steps, want each of {plan.episodes} once with {plan.max_steps}; its "
+            "results stand for something else"
         )
     first = min(note.begun for note in episodes)
     playing_s = max(note.ended for note in episodes) - first
@@ -306,8 +304,8 @@ def show_evaluation(found: Mapping[str, Any]) -> None:
     )
     rows.title = (
         f"{plan['episodes']} episodes of {plan['max_steps']} steps of {plan['name']}, "
-        f"{plan['size']}x{plan['size']}, "
-        f"{plan['workers']} workers on {found['cores']} cores, medians of {plan['rounds']} rounds"
+        f"{plan['size']}x{plan['size']}, {plan['workers']} workers on {found['cores']} cores, "
+        f"medians of {plan['rounds']} rounds"
     )
     for name, row in found["medians"].items():
         ratio = found["ratios"].get(name)

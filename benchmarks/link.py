@@ -124,9 +124,8 @@ def refused(reasons: Sequence[str]) -> str:
     """Return the error message for users without the right to make namespaces, with the cure."""
     return (
         "link: cannot make a network namespace, neither as this user nor in a user namespace "
-        f"({'; '.join(reasons)}); "
-        "run it as root, or let users make them: sysctl kernel.unprivileged_userns_clone=1 "
-        "(Debian), "
+        f"({'; '.join(reasons)}); run it as root, or let users make them: sysctl "
+        "kernel.unprivileged_userns_clone=1 (Debian), "
         "kernel.apparmor_restrict_unprivileged_userns=0 (Ubuntu)"
     )
 

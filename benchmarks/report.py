@@ -274,13 +274,10 @@ def _origin(results: Mapping[str, Any]) -> str:
     versions = ", ".join(f"{name} {version}" for name, version in results["versions"].items())
     return (
         f"Measured {results['date']} by `{results['command']}` on {machine['cpu']}, "
-        f"{machine['cores']} cores, "
-        f"{machine['memory_gb']} GB, Linux {machine['kernel']}, load average {machine['load']:.1f} "
-        "before it began. "
-        f"{versions}. Two 224x224 RGB cameras, a policy that does nothing, all ways in turns of "
-        "100 calls in one run; "
-        "in brackets 95 % intervals. A turn begins cold, which is most of what the p99 column "
-        "shows."
+        f"{machine['cores']} cores, {machine['memory_gb']} GB, Linux {machine['kernel']}, load "
+        f"average {machine['load']:.1f} before it began. {versions}. Two 224x224 RGB cameras, a "
+        "policy that does nothing, all ways in turns of 100 calls in one run; in brackets 95 % "
+        "intervals. A turn begins cold, which is most of what the p99 column shows."
     )
 
 
@@ -381,8 +378,7 @@ def _use(use: Results) -> str:
     ]
     text = (
         "CPU time of the same acts, beyond that of the idle processes, and how often a thread of "
-        "client or server "
-        "waited or was preempted:"
+        "client or server waited or was preempted:"
     )
     return f"{text}\n\n{_table(('', *USE_COLUMNS), rows)}"
 
@@ -401,8 +397,8 @@ def _throughput(part: Results) -> str:
         )
     text = (
         f"Actions a second of one replica by K clients ({policy_of(part)}; ideal "
-        f"{part['ideal_actions_per_s']:.0f}, "
-        f"{part['ideal_is']}), and how long a robot among {part['clients'] - 1} simulations waits:"
+        f"{part['ideal_actions_per_s']:.0f}, {part['ideal_is']}), and how long a robot among "
+        f"{part['clients'] - 1} simulations waits:"
     )
     return f"{text}\n\n{_table(head, rows)}"
 

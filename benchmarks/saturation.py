@@ -150,8 +150,7 @@ def show_parts(rows: list[dict[str, Any]], load: Load) -> None:
     )
     grid.title = (
         f"{load.workers} workers, episodes of {load.episode_s:g} s and {load.steps} steps, chunks "
-        f"of {load.chunk}, "
-        f"batches of {load.batch} in {load.act_ms:g} ms"
+        f"of {load.chunk}, batches of {load.batch} in {load.act_ms:g} ms"
     )
     for row in rows:
         limit = "none" if row["saturates"] is None else f"{row['saturates']:,.0f}"

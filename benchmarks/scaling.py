@@ -305,9 +305,8 @@ def show_scaling(found: Mapping[str, Any]) -> None:
     rows.title = (
         f"{plan['steps']} steps of {plan['step_ms']:g} ms, policy {plan['policy_ms']:g} ms, "
         f"medians of {plan['rounds']} rounds on {found['cores']} cores, links of {plan['mbit']:g} "
-        "Mbit/s and "
-        f"{plan['delay_ms']:g} ms; near: workers on a replica's node; an act's image has "
-        f"{IMAGE_BYTES} bytes"
+        f"Mbit/s and {plan['delay_ms']:g} ms; near: workers on a replica's node; an act's image "
+        f"has {IMAGE_BYTES} bytes"
     )
     for cluster in found["clusters"]:
         for row in cluster["rows"]:
@@ -329,9 +328,8 @@ def show_driver(found: Mapping[str, Any]) -> None:
     costs, flooded = found["costs_ms"], found["flooded"]
     out.print(
         f"the driver's CPU time: {costs['episode']:.2f} ms an episode, {costs['step'] * 1e3:.1f} "
-        "µs a step, "
-        f"{costs['worker_second']:.2f} ms a second for each worker, {costs['second']:.1f} ms a "
-        "second at all\n"
+        f"µs a step, {costs['worker_second']:.2f} ms a second for each worker, "
+        f"{costs['second']:.1f} ms a second at all\n"
         f"flooded by {flooded['workers']} workers: {flooded['episodes_per_s']:.0f} episodes/s, "
         f"{flooded['driver_ms_per_episode']:.2f} ms each, {100 * flooded['driver_share']:.0f} % of "
         "a core",

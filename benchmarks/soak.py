@@ -320,8 +320,8 @@ def show_soak(found: Mapping[str, Any]) -> None:
     """Print the counts and the targets."""
     out.print(
         f"{found['plan']['episodes']} episodes, {found['episodes_per_minute']:.0f} a minute; "
-        "workers killed: "
-        f"{found['killed']}, retries: {found['retries']}, played again: {found['played_again']}",
+        f"workers killed: {found['killed']}, retries: {found['retries']}, played again: "
+        f"{found['played_again']}",
     )
     show_outcomes(soak_outcomes(found))
 

@@ -123,8 +123,7 @@ def test_joints_in_another_order_are_found_by_the_names_that_both_sides_have() -
         Contract(action=ActionSpec(names=("left_lift", "left_pan", "right_pan"))), env
     )
     assert found[0] == (
-        "action.names: number 0 is 'left_lift' of the policy and 'left_pan' of the env; use "
-        "one "
+        "action.names: number 0 is 'left_lift' of the policy and 'left_pan' of the env; use one "
         "order"
     )
     assert len(found) == 2
@@ -294,9 +293,8 @@ class TestAPolicyOfSeveralPartsServedAsOne:
         [told] = differences(Contract(state={"joints": StateSpec(21)}), self.ENV)
         assert told == (
             "state 'joints': the policy needs 21 numbers, the env gives 7; if it was trained on "
-            "several parts, set the "
-            "policy's `state` to them in their order: [joints, tquat, xyzrpy, gripper] has 21 "
-            "numbers here"
+            "several parts, set the policy's `state` to them in their order: [joints, tquat, "
+            "xyzrpy, gripper] has 21 numbers here"
         )
 
     def test_all_choices_are_told_where_there_are_several(self) -> None:
@@ -318,8 +316,7 @@ class TestAPolicyOfSeveralPartsServedAsOne:
         assert told == [
             (
                 "state 'joints': the policy needs 21 numbers, the env gives 7; is this another "
-                "task's "
-                "or robot's policy?"
+                "task's or robot's policy?"
             )
         ]
 

@@ -159,8 +159,13 @@ def test_a_bad_docstring_is_found(doc: str, fault: str) -> None:
 
 def test_a_good_docstring_has_no_fault() -> None:
     doc = (
-        "Add two numbers.\n\nArgs:\n    a: The first.\n    b: The second.\n\nReturns:\n    "
-        "Their "
-        "sum.\n"
+        "Add two numbers.\n"
+        "\n"
+        "Args:\n"
+        "    a: The first.\n"
+        "    b: The second.\n"
+        "\n"
+        "Returns:\n"
+        "    Their sum.\n"
     )
     assert list(Documented("add", doc, ("a", "b"), returns=True).faults()) == []

@@ -73,9 +73,9 @@ def write_checkpoint(
     if missing := [name for name in known.packages if importlib.util.find_spec(name) is None]:
         raise MissingDependency(
             f"{family}: {sys.executable} has no {', '.join(missing)}; run this command in the "
-            "family's environment: "
-            f"`vlagents-ray env make {known.environment} --out .venv-{known.environment}`, then "
-            f"`.venv-{known.environment}/bin/python -m benchmarks.checkpoints {family} {folder}`"
+            f"family's environment: `vlagents-ray env make {known.environment} --out "
+            f".venv-{known.environment}`, then `.venv-{known.environment}/bin/python -m "
+            f"benchmarks.checkpoints {family} {folder}`"
         )
     folder = folder.absolute()
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):

@@ -158,8 +158,7 @@ def to_markdown(document: Mapping[str, Any]) -> str:
     lines = [
         (
             f"Measured {document['date']} by `{document['command']}` in {document['seconds']:.0f} "
-            "s. "
-            f"{versions}."
+            f"s. {versions}."
         ),
         "",
     ]

@@ -278,10 +278,9 @@ class FlowRun:
                     )
                 print(
                     f"iteration {iteration + 1}: {solved:.1%} of {plan.episodes} episodes solved, "
-                    f"{played - begun:.1f} "
-                    f"s; {learned.acts} acts, {learned.clipped:.0%} clipped, log ratio "
-                    f"{learned.log_ratio:.1g}, "
-                    f"{time.monotonic() - played:.1f} s; {rollouts.stats.stale} stale episodes"
+                    f"{played - begun:.1f} s; {learned.acts} acts, {learned.clipped:.0%} clipped, "
+                    f"log ratio {learned.log_ratio:.1g}, {time.monotonic() - played:.1f} s; "
+                    f"{rollouts.stats.stale} stale episodes"
                 )
         self._play(curve)
         self._play(whole)
@@ -398,8 +397,7 @@ def compare_runs(
                 gains.append(pairs.difference)
                 print(
                     f"{folder}, within {ticks} ticks: {before / pairs.total:.1%} before, "
-                    f"{after / pairs.total:.1%} "
-                    f"after, of {pairs.total}; p {pairs.p_value:.2g}"
+                    f"{after / pairs.total:.1%} after, of {pairs.total}; p {pairs.p_value:.2g}"
                 )
             if len(gains) > 1:
                 print(

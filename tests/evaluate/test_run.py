@@ -43,8 +43,7 @@ def outcomes(config: EvalConfig) -> list[tuple[Any, ...]]:
     return query(
         config,
         "SELECT env, episode, seed, status, success_once, success_at_end, steps, episode_return, "
-        "instruction"
-        " FROM episodes ORDER BY env, episode",
+        "instruction FROM episodes ORDER BY env, episode",
     )
 
 

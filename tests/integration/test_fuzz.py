@@ -280,8 +280,7 @@ def test_no_message_crashes_hangs_or_bloats_the_server(server: Server) -> None:
         print(f"\n{share * len(TARGETS)} messages, the last three quarters in {took:.0f} s")
         print(
             f"replica before and after them: {before[0] / 2**20:.0f} and {after[0] / 2**20:.0f} "
-            "MiB, "
-            f"{before[1]} and {after[1]} threads, {before[2]} and {after[2]} descriptors"
+            f"MiB, {before[1]} and {after[1]} threads, {before[2]} and {after[2]} descriptors"
         )
         for target in TARGETS:
             print(f"{target.name}: {dict(target.seen)}")

@@ -127,8 +127,7 @@ def _block(language: str, above: list[tuple[int, str]], code: list[tuple[int, st
     else:
         raise ValueError(
             f"line {above[0][0]}: {mark!r}, want 'test', 'test: serve POLICY' ('with peers', 'with "
-            "ray'), "
-            f"'file: NAME' or 'not run: REASON'"
+            "ray'), 'file: NAME' or 'not run: REASON'"
         )
     if language == "console":  # what begins with a prompt was typed, the rest is output
         code = [(number, line[2:]) for number, line in code if line.startswith("$ ")]

@@ -153,8 +153,7 @@ def table(family: str) -> str:
         [
             (
                 f"`make verified FAMILIES={_quoted(requirements)}` runs these tests with small "
-                "random "
-                f"checkpoints. {ran}"
+                f"random checkpoints. {ran}"
             ),
             "",
             f"| the policy … | `{folder_of(family).relative_to(ROOT)}` | {' | '.join(cases)} |",

@@ -188,10 +188,9 @@ def _actions(recorded: Recorded, replayed: Path) -> str:
     if (path := recorded.episode.trajectory) is None:
         return (
             "actions: they differ; from which step on is not known, nor whether by more than "
-            "rounding, as no "
-            "trajectory was recorded (eval --record all, or `record: all` in its file); the size "
-            "of a batch, which "
-            "several episodes share, changes the last digits of an action, about 1e-7"
+            "rounding, as no trajectory was recorded (eval --record all, or `record: all` in its "
+            "file); the size of a batch, which several episodes share, changes the last digits of "
+            "an action, about 1e-7"
         )
     file = recorded.results.file(path)
     if not file.is_file():

@@ -10,8 +10,8 @@ from vlagents_ray.errors import ConfigError
 
 TRAINING = (
     "policy.type=vlagents: got a policy on a server, whose weights are not here; train with the "
-    "type of the checkpoint "
-    "that the server loads, or push weights into the server (docs/weights.md)"
+    "type of the checkpoint that the server loads, or push weights into the server "
+    "(docs/weights.md)"
 )
 
 

@@ -101,8 +101,7 @@ class Actor:
             self._channel.close()
             raise PolicyUnavailable(
                 f"HIL-SERL: no learner at {learner} within {connect_timeout_s:g} s "
-                f"({error.code().name}); start it: "
-                f"python -m lerobot.rl.learner"
+                f"({error.code().name}); start it: python -m lerobot.rl.learner"
             ) from error
         self._closed = threading.Event()
         self._parameters = self._stub.StreamParameters(services_pb2.Empty())

@@ -72,8 +72,8 @@ class VlagentsPolicy(PreTrainedPolicy):
         if pretrained_name_or_path is not None or config is None:
             raise ConfigError(
                 f"policy.path: got {str(pretrained_name_or_path)!r}, want none with "
-                "policy.type=vlagents: the server "
-                f"loads the checkpoint; --policy.checkpoint selects one of those that it offers"
+                "policy.type=vlagents: the server loads the checkpoint; --policy.checkpoint "
+                "selects one of those that it offers"
             )
         return cls(config, **{key: value for key, value in kwargs.items() if key == "dataset_meta"})
 
@@ -115,8 +115,7 @@ class VlagentsPolicy(PreTrainedPolicy):
         if len(lengths := {len(rows) for rows in chunks}) > 1:
             raise InvalidAction(
                 f"predict_action_chunk: got chunks of {sorted(lengths)} rows, want one length; set "
-                "a "
-                f"length in the server's deployment file, or use select_action"
+                "a length in the server's deployment file, or use select_action"
             )
         return torch.from_numpy(np.stack(chunks))
 
@@ -127,13 +126,10 @@ class VlagentsPolicy(PreTrainedPolicy):
         if not self._sessions.agent.continues_plans:
             raise ConfigError(
                 "inference.type: got rtc, and the server's policy ignores the plan that is "
-                "executed, so that its "
-                "chunks would not fit together; use --inference.type=sync, serve a policy with "
-                "real-time chunking and "
-                "`actions: chunk` (pi0, openpi, or smolvla, pi0 and pi05 of lerobot), or, to keep "
-                "the robot moving "
-                "while another policy computes, drive it by vlagents_ray's own ChunkPlayer(agent, "
-                "mode='async')"
+                "executed, so that its chunks would not fit together; use --inference.type=sync, "
+                "serve a policy with real-time chunking and `actions: chunk` (pi0, openpi, or "
+                "smolvla, pi0 and pi05 of lerobot), or, to keep the robot moving while another "
+                "policy computes, drive it by vlagents_ray's own ChunkPlayer(agent, mode='async')"
             )
         return True
 
@@ -148,8 +144,8 @@ class VlagentsPolicy(PreTrainedPolicy):
         if changed := [name for name in _GUIDANCE if getattr(wanted, name) != getattr(usual, name)]:
             raise ConfigError(
                 f"inference.rtc.{changed[0]}: got {getattr(wanted, changed[0])}, want none here: "
-                "the server guides the "
-                f"chunks; set it in its deployment file (for lerobot: overrides: {{rtc_config: …}})"
+                "the server guides the chunks; set it in its deployment file (for lerobot: "
+                "overrides: {rtc_config: …})"
             )
         self._of_all_threads = self._sessions
 
@@ -215,8 +211,7 @@ class _Robot:
         if rows is not None and (self.config.n_action_steps or 0) > rows:
             raise ConfigError(
                 f"policy.n_action_steps: got {self.config.n_action_steps}, want at most {rows}, "
-                "the rows "
-                f"of the server's chunks"
+                "the rows of the server's chunks"
             )
 
     def mapping(
@@ -349,8 +344,7 @@ class _Sessions:
         if contract is not None and contract.instruction and not all(tasks):
             raise ConfigError(
                 "task: got none, the policy needs an instruction; set --dataset.single_task, or "
-                "--policy.instruction "
-                "where the environment has none"
+                "--policy.instruction where the environment has none"
             )
         return [one or None for one in tasks]
 

@@ -53,8 +53,7 @@ class ObservationMapping:
         if unknown := [name for name in config.cameras.values() if name not in robots]:
             raise ConfigError(
                 f"policy.cameras: got {unknown[0]!r}, want some of the cameras here, "
-                f"{sorted(robots)}"
-                f"{did_you_mean(unknown[0], robots)}"
+                f"{sorted(robots)}{did_you_mean(unknown[0], robots)}"
             )
         known = {name: key for name, key in robots.items() if name not in config.cameras.values()}
         known |= {name: robots[robot] for name, robot in config.cameras.items()}
@@ -125,10 +124,10 @@ def require_fit(policy: Contract | None, here: Contract) -> None:
         require_match(policy, here)
     except ContractMismatch as error:
         raise ContractMismatch(
-            f"{error}\nThe env is what this command drives. --policy.cameras='{{POLICY: ROBOT, "
-            f"…}}' renames cameras, "
-            f"{_STATE_OPTION} names the parts of observation.state, --dataset.fps is the control "
-            "rate."
+            f"{error}\n"
+            "The env is what this command drives. --policy.cameras='{POLICY: ROBOT, …}' renames "
+            f"cameras, {_STATE_OPTION} names the parts of observation.state, --dataset.fps is the "
+            "control rate."
         ) from error
 
 
@@ -156,8 +155,8 @@ def _parts(
             if sorted(chosen) != sorted(wanted):
                 raise ConfigError(
                     f"observation.state: got the values {list(names) or 'without names'}, the "
-                    "policy wants the parts "
-                    f"{wanted}; name those in the order in which they are in it: {_STATE_OPTION}"
+                    f"policy wants the parts {wanted}; name those in the order in which they are "
+                    f"in it: {_STATE_OPTION}"
                 )
         found[OBS_STATE] = state_parts(
             widths[OBS_STATE], policy, chosen or None, option=_STATE_OPTION

@@ -387,9 +387,8 @@ class Arro(Wrapper):
             if track.missing and self.config.missing == "refuse":
                 raise InvalidObservation(
                     f"arro: camera {name!r} shows none of {track.missing}, found {track.seen}; is "
-                    "it in sight? Else "
-                    "name it in `objects` in other words, leave the camera out of `cameras`, or "
-                    "set missing: hide"
+                    "it in sight? Else name it in `objects` in other words, leave the camera out "
+                    "of `cameras`, or set missing: hide"
                 )
         self.tracks = dict(zip(names, tracks, strict=True))
         return self._changed(obs)

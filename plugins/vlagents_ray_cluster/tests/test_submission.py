@@ -27,8 +27,7 @@ KNOWN = {"--policy": True, "--resume": False, "--out": True}
 
 def test_what_the_command_knows_is_its_own_and_the_rest_is_sbatchs() -> None:
     words = (
-        "env/a --policy p --nodes 4 --resume --time=1:00:00 env/b --out=runs/x "
-        "--gpus-per-node "
+        "env/a --policy p --nodes 4 --resume --time=1:00:00 env/b --out=runs/x --gpus-per-node "
         "a100:2 --requeue"
     )
     own, sbatch = split(words.split(), KNOWN)

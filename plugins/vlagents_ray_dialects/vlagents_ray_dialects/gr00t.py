@@ -275,8 +275,7 @@ class GR00TConnection(GatewayClient):
                 self._count_refusal()
                 raise MalformedMessage(
                     f"gr00t: got an envelope of {len(envelope)} parts, want none or an empty one; "
-                    "connect each client "
-                    f"directly, without a ZeroMQ proxy"
+                    "connect each client directly, without a ZeroMQ proxy"
                 )
             self._identify(payload)
             admission = self._context.admission
@@ -416,8 +415,7 @@ class GR00TDialect(PortDialect):
     clients = "GR00T"
     summary = (
         "A session is the connection, until it is idle; `reset` begins an episode, and a batch of "
-        "B is B "
-        "sessions. `api_token` is the API key. An error is a map with `error`."
+        "B is B sessions. `api_token` is the API key. An error is a map with `error`."
     )
     requires = ("msgpack",)
     presets = PRESETS

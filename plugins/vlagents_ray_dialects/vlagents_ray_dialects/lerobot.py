@@ -118,8 +118,7 @@ class LeRobotConnection(GatewayClient):
         if self._checkpoint not in (None, robot.checkpoint):
             raise InvalidInput(
                 f"pretrained_name_or_path: got {robot.checkpoint[:80]!r}, this server acts for "
-                f"{self._checkpoint!r}; "
-                "start the client with that"
+                f"{self._checkpoint!r}; start the client with that"
             )
         logger.info(
             "lerobot: a client of %r %r begins", robot.policy_type[:80], robot.checkpoint[:80]
@@ -227,8 +226,8 @@ class LeRobotDialect(PortDialect):
     clients = "LeRobot"
     summary = (
         "A session is the connection, until it is idle; an episode begins with `Ready` and with "
-        "each new task. The "
-        "newest observation is acted on. Pickles are read as data: numbers, texts and numpy arrays."
+        "each new task. The newest observation is acted on. Pickles are read as data: numbers, "
+        "texts and numpy arrays."
     )
     scheme = "grpc"
     requires = ("grpc",)

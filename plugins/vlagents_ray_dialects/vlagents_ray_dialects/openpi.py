@@ -129,8 +129,7 @@ class OpenPiDialect(MapDialect):
     clients = "openpi"
     summary = (
         "A session is the connection, or a place in its batches; an episode begins with each new "
-        "prompt. An error is a "
-        "text, then close 1011."
+        "prompt. An error is a text, then close 1011."
     )
     paths: ClassVar[Mapping[str, str]] = {"WS /openpi": "stream"}
     presets = openpi.PRESETS
@@ -192,8 +191,7 @@ class RoboArenaDialect(MapDialect):
     clients = "RoboArena"
     summary = (
         "A session is the connection; `reset` or a new `session_id` begins an episode. An error is "
-        "a text, "
-        "then close 1011."
+        "a text, then close 1011."
     )
     paths: ClassVar[Mapping[str, str]] = {"WS /roboarena": "stream"}
     presets = openpi.ROBOARENA

@@ -43,8 +43,7 @@ class OpenVLADialect(HttpDialect):
     Config = OpenVLADialectConfig
     clients = "OpenVLA"
     summary = (
-        "An episode is one request, unless that names a session. An error has its status "
-        "and "
+        "An episode is one request, unless that names a session. An error has its status and "
         "problem+json."
     )
     paths: ClassVar[Mapping[str, str]] = {"POST /act": "act"}

@@ -419,8 +419,7 @@ class VlagentsDialect(PortDialect):
     clients = "vlagents"
     summary = (
         "A session is the connection; an episode begins with `reset` and with each new "
-        "instruction. An error "
-        "is raised at the client as a built-in exception."
+        "instruction. An error is raised at the client as a built-in exception."
     )
     scheme = "rpyc"
     presets: ClassVar[Mapping[str, Mapping[str, Any]]] = {

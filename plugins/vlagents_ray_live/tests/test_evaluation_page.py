@@ -35,8 +35,7 @@ SCROLL = "document.getElementById('failures').scrollIntoView()"
 # open.
 LOADING = (
     "[...document.querySelectorAll('#failures video:not([src])')].map((one) => "
-    "one.getBoundingClientRect())"
-    ".filter((box) => box.bottom > 0 && box.top < innerHeight).length"
+    "one.getBoundingClientRect()).filter((box) => box.bottom > 0 && box.top < innerHeight).length"
 )
 POINTS = "document.querySelectorAll('#curve .dot').length"
 

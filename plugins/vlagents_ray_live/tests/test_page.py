@@ -154,8 +154,7 @@ def test_an_error_is_its_code_until_it_is_unfolded(page: Page) -> None:
 
 def test_the_buttons_of_a_robot_are_in_one_row_on_a_phone(page: Page, server: LiveServer) -> None:
     tops = (
-        "new Set([...document.querySelectorAll('article .row:first-child button')].map((one) "
-        "=> "
+        "new Set([...document.querySelectorAll('article .row:first-child button')].map((one) => "
         "one.offsetTop)).size"
     )
     with operated(server):

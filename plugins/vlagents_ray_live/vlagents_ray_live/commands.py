@@ -88,8 +88,7 @@ class CommandBoard:
         if do not in COMMANDS:
             raise InvalidInput(
                 f"do: got {do[:40]!r}, want one of {list(COMMANDS)}; resume a robot, change its "
-                "instruction or move "
-                f"it at the robot"
+                "instruction or move it at the robot"
             )
         if session_id not in self._sessions:
             raise UnknownSession(

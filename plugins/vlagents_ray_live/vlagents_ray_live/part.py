@@ -20,8 +20,8 @@ from vlagents_ray_live.sibling_views import METHODS, SiblingViews
 
 _SUMMARY = (
     "A page that shows what the sessions do now. With keys, it asks for one with the scope "
-    "`watch`, and has buttons "
-    "for one that also has the scope `operate`. Robots that offer it are stopped there."
+    "`watch`, and has buttons for one that also has the scope `operate`. Robots that offer it are "
+    "stopped there."
 )
 
 

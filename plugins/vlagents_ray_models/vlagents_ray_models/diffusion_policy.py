@@ -193,9 +193,8 @@ class DiffusionNetwork:
         if not config.trust_checkpoint:
             raise ConfigError(
                 f"checkpoint {config.checkpoint!r}: this family's checkpoints are pickles, and "
-                "loading one runs "
-                "whatever code its author put in; set trust_checkpoint: true if you trust its "
-                "origin"
+                "loading one runs whatever code its author put in; set trust_checkpoint: true if "
+                "you trust its origin"
             )
         path = checkpoint_file(config)
         ensure_torchvision()
@@ -214,8 +213,7 @@ class DiffusionNetwork:
         if absent:
             raise ConfigError(
                 f"checkpoint {path}: its normalizer has nothing for {absent}, so its numbers have "
-                "no units; save it "
-                f"after the workspace has called set_normalizer"
+                "no units; save it after the workspace has called set_normalizer"
             )
         if config.steps is not None:
             module.num_inference_steps = config.steps
@@ -235,8 +233,8 @@ def checkpoint_file(config: DiffusionPolicyConfig) -> Path:
         repository = config.checkpoint.partition("@")[0]
         raise ConfigError(
             f"checkpoint {config.checkpoint!r}: a pickle of the hub, whose branches and tags may "
-            "become others; want "
-            f"the commit that you trust, such as {repository}@{commit}, which it is now"
+            f"become others; want the commit that you trust, such as {repository}@{commit}, which "
+            "it is now"
         )
     if path.is_file():
         return path
@@ -261,8 +259,7 @@ def _read(path: Path) -> tuple[Any, Mapping[str, Any]]:
     except Exception as error:  # unpickling can raise any exception
         raise ConfigError(
             f"checkpoint {path}: got no payload of a Diffusion Policy workspace "
-            f"({type(error).__name__}: {error}); "
-            f"want a .ckpt that its save_checkpoint wrote"
+            f"({type(error).__name__}: {error}); want a .ckpt that its save_checkpoint wrote"
         ) from error
     name = (
         "ema_model"
@@ -286,8 +283,7 @@ def _made(path: Path, settings: Any) -> Any:
     if not hasattr(module, "noise_scheduler"):
         raise ConfigError(
             f"checkpoint {path}: {type(module).__name__} is no diffusion policy; want one of "
-            "diffusion_policy.policy's "
-            f"Diffusion…Policy"
+            "diffusion_policy.policy's Diffusion…Policy"
         )
     if any(
         type(part).__name__ == "CropRandomizer" and "robomimic" in type(part).__module__
@@ -295,8 +291,7 @@ def _made(path: Path, settings: Any) -> Any:
     ):
         raise ConfigError(
             f"checkpoint {path}: its encoder crops at random while it acts, so actions would "
-            "depend on neighbours; "
-            f"want one trained with eval_fixed_crop: true"
+            "depend on neighbours; want one trained with eval_fixed_crop: true"
         )
     return module
 

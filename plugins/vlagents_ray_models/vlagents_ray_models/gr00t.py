@@ -84,16 +84,15 @@ class Embodiment:
         except (ValueError, KeyError, TypeError) as error:
             raise ConfigError(
                 f"checkpoint {folder}: {CONFIG} and {STATISTICS} are not those of GR00T's "
-                "processor "
-                f"({type(error).__name__}: {error}); {_CURE}"
+                f"processor ({type(error).__name__}: {error}); {_CURE}"
             ) from error
         known = sorted(set(configs) & set(statistics))
         chosen = name if name is not None else known[0] if len(known) == 1 else None
         if chosen is None or chosen not in known:
             others = sorted(set(configs) - set(statistics))
             raise ConfigError(
-                f"embodiment: got {name!r}, want one of {known}"
-                f"{f'; {others} have no statistics in this checkpoint' if others else ''}"
+                f"embodiment: got {name!r}, want one of "
+                f"{known}{f'; {others} have no statistics in this checkpoint' if others else ''}"
             )
         config, numbers = configs[chosen], statistics[chosen]
         names = ("q01", "q99") if settings.get("use_percentiles") else ("min", "max")
@@ -150,8 +149,8 @@ def _range(
     if bounds[0].ndim != 1 or not bounds[0].size or bounds[0].shape != bounds[1].shape:
         raise ConfigError(
             f"checkpoint {folder}: {STATISTICS} has no {list(names)} of {kind} {group!r}, has "
-            "those of "
-            f"{sorted(numbers.get(kind, {}))}; without them its numbers have no units: {_CURE}"
+            f"those of {sorted(numbers.get(kind, {}))}; without them its numbers have no units: "
+            f"{_CURE}"
         )
     if not np.isfinite(bounds).all():
         raise ConfigError(
@@ -276,8 +275,7 @@ class Gr00tNetwork:
                 raise ConfigError(
                     f"checkpoint {folder}: GR00T's code could not load it ({type(error).__name__}: "
                     f"{str(error).strip()[:500]}); is it complete, of this checkout's version, and "
-                    "its backbone on the "
-                    f"hub, in the cache, or in a folder that `backbone` names?"
+                    "its backbone on the hub, in the cache, or in a folder that `backbone` names?"
                 ) from error
         if not flash:
             use_torch_attention(model)
@@ -386,8 +384,8 @@ def _use_checkout(source_dir: str | None) -> Path:
     if importlib.util.find_spec("gr00t.policy") is None:
         raise ConfigError(
             f"{source_dir or os.environ.get(SOURCE) or 'gr00t'}: is GR00T's code of N1.5 or "
-            "before, want that of N1.6 "
-            f"or N1.7; serve N1.5 by its own server, and the policy `upstream` in front of it"
+            "before, want that of N1.6 or N1.7; serve N1.5 by its own server, and the policy "
+            "`upstream` in front of it"
         )
     # Otherwise its import queries PyPI for a newer version.
     os.environ.setdefault("NO_ALBUMENTATIONS_UPDATE", "1")

@@ -50,8 +50,7 @@ def use_source(
         where = f"${variable}, which is not set" if not checkout else f"{checkout!r}"
         raise ConfigError(
             f"{package!r}: neither installed nor in {where}; check out its repository, and name "
-            "that folder as the "
-            f"policy's source_dir or in {variable}"
+            f"that folder as the policy's source_dir or in {variable}"
         )
     sys.path[:0] = [str(folder) for folder in folders if str(folder) not in sys.path]
 

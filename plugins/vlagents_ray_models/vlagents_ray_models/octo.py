@@ -127,8 +127,7 @@ class Octo(ModelPolicy):
         if absent := [name for name in wanted if name not in statistics]:
             raise ConfigError(
                 f"normalization {config.normalization!r}: the statistics of {config.dataset!r} "
-                "have "
-                f"{sorted(statistics)}, not {absent}; set it as in training"
+                f"have {sorted(statistics)}, not {absent}; set it as in training"
             )
         if config.window is not None and config.window > network.longest:
             raise ConfigError(
@@ -223,8 +222,8 @@ class Octo(ModelPolicy):
             wanted = {"language": "an instruction", "image": f"info[{GOAL_IMAGE!r}]"}
             raise InvalidObservation(
                 f"task: got {'no goal image' if goal is None else 'a goal image'} and the "
-                f"instruction {instruction!r}, "
-                f"want {wanted.get(kind, ' or '.join(wanted.values()))}; see the policy's `goal`"
+                f"instruction {instruction!r}, want "
+                f"{wanted.get(kind, ' or '.join(wanted.values()))}; see the policy's `goal`"
             )
         if goal is None:
             return None
@@ -328,9 +327,8 @@ class OctoNetwork:
         except (OSError, ValueError, KeyError) as error:
             raise ConfigError(
                 f"checkpoint {folder}: Octo could not load it ({type(error).__name__}: {error}); "
-                "is it complete, of "
-                "this version of Octo, and is its language encoder's tokenizer on the hub or in "
-                "the cache?"
+                "is it complete, of this version of Octo, and is its language encoder's tokenizer "
+                "on the hub or in the cache?"
             ) from error
         network, example, jax = cls(model, chosen), model.example_batch, require("jax")
         init = partial(model.module.init, train=False)
@@ -500,8 +498,7 @@ def require_own_classes(file: Path) -> None:
             if not is_own(module, name):
                 raise ConfigError(
                     f"{file}: names {name!r} of {module!r}, want a class of {_PARTS}* or {_TEXT}: "
-                    "loading the "
-                    f"checkpoint would run that, whatever it is; {CURE}"
+                    f"loading the checkpoint would run that, whatever it is; {CURE}"
                 )
 
 

@@ -276,8 +276,8 @@ class OnnxGraph:
         if provider not in self._session.get_providers():
             raise ConfigError(
                 f"device {config.device!r}: {provider} did not start, as the log says; install the "
-                "CUDA and cuDNN that "
-                f"this onnxruntime-gpu needs, or set device: cpu with resources: {{num_gpus: 0}}"
+                "CUDA and cuDNN that this onnxruntime-gpu needs, or set device: cpu with "
+                "resources: {num_gpus: 0}"
             )
         self.outputs: list[str] = [one.name for one in self._session.get_outputs()]
         self.inputs: dict[str, Tensor] = {}
@@ -338,8 +338,7 @@ def read_graph(config: OnnxConfig) -> tuple[OnnxGraph | TorchScript, Path]:
     if len(found) != 1:
         raise ConfigError(
             f"checkpoint {path}: got {[one.name for one in found or files][:10]}, want one file "
-            "with the suffix .onnx "
-            f"or {', '.join(_TORCHSCRIPT)}; name that file"
+            f"with the suffix .onnx or {', '.join(_TORCHSCRIPT)}; name that file"
         )
     [file] = found
     # The parts beside it count for its digest, too: weights of a large graph, the tokenizer.
@@ -352,8 +351,7 @@ def read_graph(config: OnnxConfig) -> tuple[OnnxGraph | TorchScript, Path]:
     if not config.trust_checkpoint:
         raise ConfigError(
             f"checkpoint {file}: a TorchScript archive is a program, which can also read and write "
-            "files; set "
-            f"trust_checkpoint: true if you trust its author, or export it as ONNX"
+            "files; set trust_checkpoint: true if you trust its author, or export it as ONNX"
         )
     return TorchScript(file, config), file
 
@@ -369,8 +367,7 @@ def _shape(name: str, stated: Sequence[int] | None, config: OnnxConfig) -> tuple
     if shape is None or shape.count(-1) > 1:
         raise ConfigError(
             f"inputs: {name}: shape: got {given}, the file states {stated or 'none'}, want all "
-            "lengths that the policy "
-            f"was trained with, and -1 for the batch, such as [-1, 48]"
+            "lengths that the policy was trained with, and -1 for the batch, such as [-1, 48]"
         )
     return tuple(shape)
 
@@ -412,9 +409,8 @@ class Network:
             if example[later].shape != graph.inputs[name].row:
                 raise ConfigError(
                     f"recurrent: {{{name}: {later}}}: got an output {example[later].shape} for an "
-                    "input "
-                    f"{graph.inputs[name].row}, want equal shapes; name the output that is the "
-                    "input's next value"
+                    f"input {graph.inputs[name].row}, want equal shapes; name the output that is "
+                    "the input's next value"
                 )
         self.previous = np.zeros(example[self.action].size, np.float32)
         self._require_fitting(example)
@@ -523,8 +519,8 @@ class Network:
         if not _close(alone[0], again):
             raise ConfigError(
                 "the file computes another output from the same inputs: it draws noise, or keeps a "
-                "state, in which "
-                "sessions would mix; export that as an input (`noise: true`, or `recurrent`)"
+                "state, in which sessions would mix; export that as an input (`noise: true`, or "
+                "`recurrent`)"
             )
         self.batched = all(one.axis is not None for one in self.inputs.values())
         try:
@@ -568,8 +564,8 @@ class Network:
                 "the file has inputs "
                 f"{', '.join(f'{name} {one.shape}' for name, one in inputs.items())} and outputs "
                 f"{outputs}, which the settings do not fit, {said}; name each input in `cameras`, "
-                "`recurrent` or "
-                f"`inputs`, but for one, which has the parts in `state`, and the output in `action`"
+                "`recurrent` or `inputs`, but for one, which has the parts in `state`, and the "
+                "output in `action`"
             )
 
     def _require_used(self) -> None:
@@ -619,8 +615,7 @@ class Network:
             ):
                 raise ConfigError(
                     f"cameras: {name}: got an input {tensor.shape}, want (-1, 3, H, W) or (-1, H, "
-                    "W, 3), with "
-                    f"`history` images before them; is it an image?"
+                    "W, 3), with `history` images before them; is it an image?"
                 )
             scaled.append((f"inputs: {name}", self.options[name].normalized, np.zeros((1, 3))))
         for name, parts in self.vectors.items():
@@ -639,8 +634,7 @@ class Network:
             if not fits:
                 raise ConfigError(
                     f"{where}: got lists of statistics of another length, want {values.shape[-1]} "
-                    "numbers, or one for "
-                    f"all; with {PREVIOUS}, statistics by part"
+                    f"numbers, or one for all; with {PREVIOUS}, statistics by part"
                 )
 
     def _tokenizer(self, path: Path) -> Any:
@@ -844,8 +838,7 @@ class Onnx(ModelPolicy):
         if image.shape[:2] != size:
             raise InvalidObservation(
                 f"camera {network.cameras[name]!r}: got {image.shape[0]}x{image.shape[1]}, want "
-                f"{size[0]}x{size[1]}; "
-                f"send that size, or set `resize: true` for the input {name!r}"
+                f"{size[0]}x{size[1]}; send that size, or set `resize: true` for the input {name!r}"
             )
         if tensor.dtype != np.uint8:
             low, high = map(np.float32, option.range)

@@ -115,9 +115,8 @@ def choose_robot(config: str, transform: str, settings: OpenPiConfig) -> RobotCo
         if cameras is None or state is None:
             raise ConfigError(
                 f"config {config!r}: its observations go through {transform or 'no transform'}, "
-                "want one of "
-                f"{sorted(ROBOTS)}, or its keys, as in cameras: {{KEY: front}}, state: {{KEY: "
-                f"{{joints: 7}}}}"
+                f"want one of {sorted(ROBOTS)}, or its keys, as in cameras: {{KEY: front}}, state: "
+                "{KEY: {joints: 7}}"
             )
         usual = RobotConvention(cameras, {})
     if cameras is None and config == "pi0_aloha_sim":
@@ -282,8 +281,8 @@ def _statistics(folder: Path, asset: str | None) -> Any:
         )
         raise ConfigError(
             f"checkpoint {folder}: no assets/{asset}/norm_stats.json, has those of {have}; without "
-            "statistics a "
-            f"policy's actions have no units: copy them there, or choose the config of its training"
+            "statistics a policy's actions have no units: copy them there, or choose the config of "
+            "its training"
         ) from error
     if absent := sorted({"state", "actions"} - set(found)):
         raise ConfigError(
@@ -554,16 +553,15 @@ def load_jax(config: Any, folder: Path, settings: OpenPiConfig) -> OpenPiModel:
     except ValueError as error:
         raise ConfigError(
             f"checkpoint {folder}: does not fill the model of config {config.name!r} "
-            f"({str(error)[:400]}); "
-            f"choose the config that it was trained with"
+            f"({str(error)[:400]}); choose the config that it was trained with"
         ) from error
     _require_used(params, network, folder, config.name)
     network.eval()
     if settings.noise_level:
         raise ConfigError(
             f"noise_level: got {settings.noise_level} for a JAX checkpoint, want 0, as its "
-            "compiled loop has no random "
-            f"steps; convert it to PyTorch with openpi's script, or leave it out"
+            "compiled loop has no random steps; convert it to PyTorch with openpi's script, or "
+            "leave it out"
         )
     kind = JaxTokens if config.model.model_type is models.ModelType.PI0_FAST else JaxFlow
     return kind(network, device, settings)
@@ -608,8 +606,8 @@ def _require_used(params: Any, network: Any, folder: Path, name: str) -> None:
     if any("lora" in key for key in extra):
         raise ConfigError(
             f"checkpoint {folder}: was fine-tuned by LoRA, which config {name!r} does not have: "
-            f"{extra[:_LISTED]}; "
-            f"choose the config that it was trained with, such as pi0_libero_low_mem_finetune"
+            f"{extra[:_LISTED]}; choose the config that it was trained with, such as "
+            "pi0_libero_low_mem_finetune"
         )
     if extra:
         logger.warning(
@@ -696,8 +694,7 @@ class OpenPi(ModelPolicy):
         else:
             raise ConfigError(
                 f"checkpoint {folder}: has {sorted(p.name for p in folder.iterdir())}, want "
-                "params/ or "
-                f"model.safetensors; name the folder of one step, not that of the run"
+                "params/ or model.safetensors; name the folder of one step, not that of the run"
             )
         return LoadedOpenPi(model, transforms, robot, config.model.action_horizon)
 

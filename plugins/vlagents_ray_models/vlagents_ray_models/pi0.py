@@ -169,8 +169,7 @@ class Pi0(ModelPolicy):
         if other := [name for name in _STATISTICS if saved.get(name) not in (None, base[name])]:
             raise ConfigError(
                 f"{file}: got other {other} than the base has, want the same; merge the adapter "
-                "into its base, and "
-                f"serve that as a checkpoint of its own"
+                "into its base, and serve that as a checkpoint of its own"
             )
 
     def perceive(self, obs: Obs) -> StagedRow:
@@ -248,8 +247,7 @@ class Pi0(ModelPolicy):
         if (got := int(tokens["attention_mask"].sum()) - patches) > most:
             raise InvalidObservation(
                 f"instruction: got {got} tokens, want at most {most}, as in training; shorten it, "
-                "or set the policy's "
-                f"max_tokens"
+                "or set the policy's max_tokens"
             )
         if int((tokens["input_ids"] == processor.image_token_id).sum()) != patches:
             raise InvalidObservation(
@@ -335,8 +333,7 @@ def _processor(path: Path) -> Any:
     if absent := [name for name in _STATISTICS if getattr(processor, name) is None]:
         raise ConfigError(
             f"checkpoint {path}: {_PROCESSOR} has no {absent}; want those of the dataset it was "
-            "trained on: "
-            f"PI0Processor(…, {absent[0]}=[…]).save_pretrained(folder) writes them"
+            f"trained on: PI0Processor(…, {absent[0]}=[…]).save_pretrained(folder) writes them"
         )
     return processor
 
@@ -363,8 +360,8 @@ def _scale(processor: Any, staging: Staging) -> tuple[Any, Any, Any]:
     ):
         raise ConfigError(
             f"{_PROCESSOR}: its image processor changes an image of {levels.shape} by more than a "
-            "factor and a summand "
-            f"for each channel, want do_rescale and do_normalize alone; images are resized before"
+            "factor and a summand for each channel, want do_rescale and do_normalize alone; images "
+            "are resized before"
         )
     wide = processor.image_processor([image[: len(image) // 2]], return_tensors="np")[
         "pixel_values"

@@ -5,8 +5,7 @@ from vlagents_ray.registry import RegistryEntry
 LEROBOT = RegistryEntry(
     "vlagents_ray_models.lerobot:LeRobot",
     "ACT, Diffusion, multi-task DiT, SmolVLA, X-VLA, GR00T N1.7, VQ-BeT, TD-MPC, π0, π0.5 and "
-    "others of LeRobot "
-    "0.4 and 0.6",
+    "others of LeRobot 0.4 and 0.6",
     needs=("lerobot", "torch", "transformers"),
     requirements=("lerobot", "lerobot06"),
 )

@@ -142,15 +142,14 @@ def load_encoder(config: VJepa2AcConfig, saved: Mapping[str, Any] | None) -> Any
         if model.config.crop_size != config.image_size:
             raise ConfigError(
                 f"encoder {path}: made for images of {model.config.crop_size} px, want "
-                f"{config.image_size} as in "
-                f"image_size; give that of the checkpoint's predictor"
+                f"{config.image_size} as in image_size; give that of the checkpoint's predictor"
             )
         return model
     if saved is None:
         raise ConfigError(
             f"checkpoint {config.checkpoint!r}: it has no 'encoder'; name a folder with a "
-            "VJEPA2Model as the policy's "
-            f"`encoder`, or a checkpoint with both, such as vjepa2-ac-vitg.pt"
+            "VJEPA2Model as the policy's `encoder`, or a checkpoint with both, such as "
+            "vjepa2-ac-vitg.pt"
         )
     return from_upstream(saved, config)
 

@@ -219,8 +219,7 @@ def _manifest(
         where = ".".join(map(str, first["loc"]))
         raise ConfigError(
             f"{archive}: {MANIFEST} is not one of version 1: {where}: {first['msg']}; read it with "
-            "the version of "
-            f"vlagents-ray that wrote it"
+            "the version of vlagents-ray that wrote it"
         ) from error
 
 

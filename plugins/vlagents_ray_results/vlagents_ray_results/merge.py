@@ -136,8 +136,8 @@ def _add_policies(merged: _Merged, folder: Path, db: sqlite3.Connection) -> list
         if (what := changed(before, now, swept=is_swept)) in ("policy", "checkpoint"):
             raise ConfigError(
                 f"{folder}: policy {row['name']!r} has {what} {now.get(what)!r}, that of the "
-                "folders before it "
-                f"{before.get(what)!r}; give one of them another name in its evaluation"
+                f"folders before it {before.get(what)!r}; give one of them another name in its "
+                "evaluation"
             )
     return changes
 
@@ -201,8 +201,8 @@ def _extend(case: Row, other: Row, folder: Path) -> None:
     if any(high - low < episodes for low, high in itertools.pairwise(ordered)):
         raise ConfigError(
             f"{folder}: {case['env']} has the seeds {added}; together they are {ordered}, and with "
-            f"{episodes} episodes "
-            f"of each some would be played twice; want them {episodes} or more apart"
+            f"{episodes} episodes of each some would be played twice; want them {episodes} or more "
+            "apart"
         )
     case |= {"seeds": canonical(seeds), "planned": episodes * len(seeds)}
 
@@ -264,8 +264,7 @@ def _require_one_checkpoint(merged: _Merged, *, weights_may_differ: bool) -> Non
         if len(found_keys) > 1:
             raise ConfigError(
                 f"{where}: was played by several {what}: {found_keys}; merge those apart, or give "
-                "one of them another "
-                f"policy's `name` in its evaluation"
+                "one of them another policy's `name` in its evaluation"
             )
 
 

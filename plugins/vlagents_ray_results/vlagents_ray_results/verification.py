@@ -136,8 +136,7 @@ def verify(
             ) as error:
                 raise ConfigError(
                     f"{bundle}: its database holds values that no evaluation writes "
-                    f"({type(error).__name__}: {error}); "
-                    f"do not trust its author"
+                    f"({type(error).__name__}: {error}); do not trust its author"
                 ) from error
             if into is not None:
                 os.replace(folder, into)

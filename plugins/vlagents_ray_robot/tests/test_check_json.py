@@ -10,9 +10,10 @@ import pytest
 from vlagents_ray_robot.check_command import main
 
 ARM = (
-    "import numpy as np\nfrom vlagents_ray import Obs\nclass Arm:\n    def observe(self): "
-    "return "
-    "Obs(gripper=50.0)\n"
+    "import numpy as np\n"
+    "from vlagents_ray import Obs\n"
+    "class Arm:\n"
+    "    def observe(self): return Obs(gripper=50.0)\n"
 )
 ARM += "    def apply(self, action): pass\n    def stop(self): pass\n"
 

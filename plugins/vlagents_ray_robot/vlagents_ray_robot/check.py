@@ -498,8 +498,7 @@ class _Suite:
             got = f"the same picture of {name!r}, to the bit, for {_FROZEN_S:g} s"
             cure = (
                 "the camera hangs, or observe returns a stored picture: restart it, and read each "
-                "frame once; a "
-                "simulated robot declares `simulated = True`"
+                "frame once; a simulated robot declares `simulated = True`"
             )
             self.find("cameras", got, "new pictures, which differ by the noise of the sensor", cure)
 
@@ -594,8 +593,7 @@ class _Suite:
                     f"{np.round(pose[3:], 2)}, as it is not"
                 )
                 cure = (
-                    "give the pose in the frame of the arm's base, x forwards and z up, and "
-                    "the "
+                    "give the pose in the frame of the arm's base, x forwards and z up, and the "
                     "quaternion as xyzw"
                 )
                 self.find("place", got, "the pose that the operator sees", cure)
@@ -832,11 +830,9 @@ def _undeclared(contract: Contract) -> str:
         what = "its state has no `joints` of the size of an action, or its actions are not joints"
     return (
         f"the motion cannot be checked, as {what}. Give the class a `contract`, such as "
-        f"Contract(state={{'joints': StateSpec(6, 'rad')}}, action=ActionSpec(dim=6, "
-        "space='joint', delta=False)), "
-        "or check by the contract of a policy (--policy URL); topics of ROS state only targets, "
-        "by a measured pose as "
-        f"their `stop`; see docs/arms.md"
+        "Contract(state={'joints': StateSpec(6, 'rad')}, action=ActionSpec(dim=6, space='joint', "
+        "delta=False)), or check by the contract of a policy (--policy URL); topics of ROS state "
+        "only targets, by a measured pose as their `stop`; see docs/arms.md"
     )
 
 

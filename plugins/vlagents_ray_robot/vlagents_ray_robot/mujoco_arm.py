@@ -426,8 +426,7 @@ def _read(mujoco: Any, stated: ArmModel, model: str) -> Any:
         if stated.menagerie not in known:
             raise ConfigError(
                 f"arm: got {model!r}, want one of {list(ARMS)}, a model of the MuJoCo Menagerie, "
-                "or the path of an "
-                f"MJCF or URDF file{did_you_mean(model, [*ARMS, *known])}"
+                f"or the path of an MJCF or URDF file{did_you_mean(model, [*ARMS, *known])}"
             )
         robot = menagerie.get(stated.menagerie)
         try:

@@ -114,17 +114,15 @@ class AxesLeader:
         if spec is None or spec.dim is None or spec.relative is None:
             raise ConfigError(
                 f"teleoperation: got {spec} as the contract's action, want `dim`, and `delta` "
-                "(whether actions are "
-                "relative): state them in the policy's contract; with noop, serve it with `--set "
-                "delta=false`"
+                "(whether actions are relative): state them in the policy's contract; with noop, "
+                "serve it with `--set delta=false`"
             )
         if step is None and spec.relative and spec.low is not None and spec.high is not None:
             step = min(abs(spec.low), abs(spec.high)) / 2
         if step is None or not step > 0:
             raise ConfigError(
                 f"step: got {step}, want the change of a number at a tick, above 0; the contract "
-                "has no bounds of "
-                f"relative actions to compute it from"
+                "has no bounds of relative actions to compute it from"
             )
         self._spec, self._device, self._step = spec, device, step
         self._dim = spec.dim
@@ -132,17 +130,14 @@ class AxesLeader:
         if len(self._grippers) > 1:
             raise ConfigError(
                 f"teleoperation: expected at most one gripper, got the columns {self._grippers} of "
-                "the arms "
-                f"{spec.arms}; the device has one button, and would move a gripper that the "
-                "operator does not see to; "
-                "write a leader for both arms"
+                f"the arms {spec.arms}; the device has one button, and would move a gripper that "
+                "the operator does not see to; write a leader for both arms"
             )
         if self._grippers and (spec.gripper_open is None or spec.gripper_closed is None):
             raise ConfigError(
                 "teleoperation: expected both `gripper_open` and `gripper_closed` in the "
-                "contract's action, got "
-                f"{spec.gripper_open} and {spec.gripper_closed}; state both in the policy's "
-                "contract"
+                f"contract's action, got {spec.gripper_open} and {spec.gripper_closed}; state both "
+                "in the policy's contract"
             )
         self._measure = measure
         self._engaged = False
@@ -210,8 +205,7 @@ AXES |= {"o": (3, 1), "u": (3, -1), "i": (4, 1), "k": (4, -1), "j": (5, 1), "l":
 GRIPPER, TAKE = " ", "\n"
 HELP = (
     "w/s a/d r/f move along x, y, z and take over; u/o i/k j/l turn; space opens and closes the "
-    "gripper; "
-    "Enter takes over and gives back"
+    "gripper; Enter takes over and gives back"
 )
 JOINTS_HELP = (
     "w/s a/d r/f o/u i/k j/l move joints 1 to 6 and take over; space opens and closes the gripper; "
@@ -309,8 +303,7 @@ class SpaceMouse(AxesDevice):
         except (OSError, RuntimeError) as error:  # also of hidapi, which the library loads
             raise ConfigError(
                 f"SpaceMouse: {error}; plug one in, install hidapi (Debian: libhidapi-hidraw0), "
-                "and let this user read "
-                "its /dev/hidraw"
+                "and let this user read its /dev/hidraw"
             ) from error
         self._axes = np.zeros(6, np.float32)
         self._buttons: list[int] = []

@@ -124,8 +124,7 @@ def _definitions(path: Path, **given: Any) -> dict[str, Any]:
 VARIABLE = "CALVIN_SRC"
 _CURE = (
     "git clone --recurse-submodules https://github.com/mees/calvin, and name that folder in "
-    f"{VARIABLE} on every node, "
-    f"or as the env's option `source_dir`"
+    f"{VARIABLE} on every node, or as the env's option `source_dir`"
 )
 RendererName = Literal["egl", "tiny"]
 _PACKAGE, _CONF = Path("calvin_env"), Path("calvin_env/conf")

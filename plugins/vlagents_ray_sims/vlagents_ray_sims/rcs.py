@@ -131,17 +131,15 @@ def missing_packages(*packages: str) -> str | None:
         if importlib.util.find_spec(package) is None:
             return (
                 f"{package} is not installed; make an environment, `vlagents-ray env make rcs`, "
-                "and "
-                f"have the workers run in it: runtime_env: {{py_executable: "
-                f"/path/to/.venv-rcs/bin/python}}"
+                "and have the workers run in it: runtime_env: {py_executable: "
+                "/path/to/.venv-rcs/bin/python}"
             )
         variable, folder, further = _ASSETS[package]
         prefix = Path(os.environ.get(variable) or Path.home() / folder).expanduser()
         if not (prefix / _REQUIRED).is_file():
             return (
                 f"{package}'s assets are not in {prefix}: there is no {_REQUIRED}; set {variable} "
-                "to the folder "
-                "that holds its `assets`, or fetch them once by `python -c 'import "
+                "to the folder that holds its `assets`, or fetch them once by `python -c 'import "
                 f"{package}'`{further}"
             )
     return None

@@ -289,8 +289,6 @@ def require_assets(registries: Sequence[str] = REGISTRIES) -> None:
         types = " ".join(TYPES[part] for part in lacks)
         raise EnvFailed(
             f"robocasa: the assets in {folder} lack {lacks}; download them once, about 10 GB, with "
-            "that environment's "
-            f"Python: python -m robocasa.scripts.download_kitchen_assets --type {types}; or make "
-            "that folder a link to "
-            f"a copy of them"
+            "that environment's Python: python -m robocasa.scripts.download_kitchen_assets --type "
+            f"{types}; or make that folder a link to a copy of them"
         )

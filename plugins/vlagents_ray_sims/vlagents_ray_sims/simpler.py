@@ -105,8 +105,7 @@ class Simpler(SimulatorEnv):
         if assets is not None and used.resolve() != Path(assets).resolve():
             raise ConfigError(
                 f"simpler: assets is {assets!r}, but this process has read ManiSkill's from "
-                f"{str(used)!r}; "
-                f"set MS_ASSET_DIR before it starts"
+                f"{str(used)!r}; set MS_ASSET_DIR before it starts"
             )
         if missing := _missing_assets(used):
             raise EnvFailed(missing)

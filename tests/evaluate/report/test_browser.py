@@ -54,9 +54,8 @@ def test_what_counts_is_in_sight_beside_its_policies_on_a_narrow_screen(
 ) -> None:
     right = (
         "['success', 'comparison'].map((name) => document.querySelector(`#${name} ~ "
-        ".scroll`)).every((frame) =>"
-        "frame.querySelector('tr:last-child strong').getBoundingClientRect().right"
-        " <= frame.getBoundingClientRect().right)"
+        ".scroll`)).every((frame) =>frame.querySelector('tr:last-child "
+        "strong').getBoundingClientRect().right <= frame.getBoundingClientRect().right)"
     )
     names = (
         "[...document.querySelectorAll('#success ~ .scroll .over')].filter((row) => "
@@ -139,12 +138,10 @@ def test_videos_of_the_table_play_one_after_another(page: Page, report: Path) ->
     playing = "document.querySelector('.viewer video').currentSrc"
     words = "document.querySelector('.viewer p').textContent"
     ready = (
-        "new Promise((done) => { const video = document.querySelector('.viewer video');"
-        "const look = () => video.currentSrc === video.src && video.videoWidth && "
-        "video.style.height ?"
-        "done([video.videoWidth, video.clientWidth * video.videoHeight / video.videoWidth - "
-        "video.clientHeight]) :"
-        "setTimeout(look, 20); look(); })"
+        "new Promise((done) => { const video = document.querySelector('.viewer video');const look "
+        "= () => video.currentSrc === video.src && video.videoWidth && video.style.height "
+        "?done([video.videoWidth, video.clientWidth * video.videoHeight / video.videoWidth - "
+        "video.clientHeight]) :setTimeout(look, 20); look(); })"
     )
     width, below = page.value(ready)
     assert width == 48

@@ -147,8 +147,7 @@ def _no_prompts(task: str) -> Iterator[None]:
         robot = re.match(r"Robot (\S+) ", prompt)
         raise EnvFailed(
             f"maniskill/{task}: assets are missing ({prompt.partition(' Would you')[0]}); download "
-            "them with: "
-            f"python -m mani_skill.utils.download_asset {robot[1] if robot else task}"
+            f"them with: python -m mani_skill.utils.download_asset {robot[1] if robot else task}"
         ) from error
     finally:
         sys.stdin = stdin

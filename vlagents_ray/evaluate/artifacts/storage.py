@@ -76,8 +76,7 @@ def inside(home: Path, path: str) -> Path:
     if not found.is_relative_to(home.resolve()):
         raise ConfigError(
             f"{home / path}: is a symbolic link out of the folder of results; if you trust it, "
-            "copy what it leads to "
-            f"into the folder in its place"
+            "copy what it leads to into the folder in its place"
         )
     return found
 
@@ -98,8 +97,7 @@ def require_there(path: Path) -> Path:
     if not path.is_file():
         raise ConfigError(
             f"{path}: got no file, want the one that results.db names there; copy the folder again "
-            "from where it was "
-            f"evaluated, with its {VIDEOS}/ and {TRAJECTORIES}/"
+            f"from where it was evaluated, with its {VIDEOS}/ and {TRAJECTORIES}/"
         )
     return path
 

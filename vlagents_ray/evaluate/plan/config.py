@@ -210,15 +210,13 @@ class SuiteConfig(_PlanModel):
         if self.clock is not None and self.clock.latency == "measured" and self.num_envs > 1:
             raise ValueError(
                 f"num_envs: got {self.num_envs} with a measured clock.latency, which would be that "
-                "of the whole batch; "
-                f"want 1, or a latency in seconds"
+                "of the whole batch; want 1, or a latency in seconds"
             )
         for low, high in itertools.pairwise(sorted(self.seeds)):
             if high - low < self.episodes:
                 raise ValueError(
                     f"seeds: {low} and {high} with {self.episodes} episodes each would play some "
-                    "twice; "
-                    f"want them {self.episodes} or more apart"
+                    f"twice; want them {self.episodes} or more apart"
                 )
         return self
 

@@ -295,8 +295,7 @@ def reading(out: Path) -> Iterator[sqlite3.Connection]:
             raise
         raise ConfigError(
             f"{out / FILE}: cannot be read ({error}); if its evaluation was killed, --resume mends "
-            "it; else take a "
-            f"copy of the whole folder from where it was written"
+            "it; else take a copy of the whole folder from where it was written"
         ) from error
 
 

@@ -194,9 +194,8 @@ class Store(AbstractContextManager["Store"]):
             return
         if not self._weights:
             query = (
-                "SELECT DISTINCT e.case_id, c.policy, c.step, e.checkpoint, e.weights"
-                " FROM episodes e JOIN cases c ON c.case_id = e.case_id"
-                " WHERE e.weights IS NOT NULL"
+                "SELECT DISTINCT e.case_id, c.policy, c.step, e.checkpoint, e.weights FROM "
+                "episodes e JOIN cases c ON c.case_id = e.case_id WHERE e.weights IS NOT NULL"
             )
             for case_id, policy, step, checkpoint, weights in self._db.execute(query):
                 self._weights[case_id] = weights
@@ -369,12 +368,10 @@ class Store(AbstractContextManager["Store"]):
                         "program": canonical(case.program),
                     }
                     db.execute(
-                        "INSERT INTO cases (case_id, policy, step, suite, env, settings, planned,"
-                        " seeds, stop, program)"
-                        " VALUES (:case_id, :policy, :step, :suite, :env, :settings, :planned,"
-                        " :seeds, :stop, :program)"
-                        " ON CONFLICT DO UPDATE SET planned = :planned, seeds = :seeds,"
-                        " stop = :stop",
+                        "INSERT INTO cases (case_id, policy, step, suite, env, settings, planned, "
+                        "seeds, stop, program) VALUES (:case_id, :policy, :step, :suite, :env, "
+                        ":settings, :planned, :seeds, :stop, :program) ON CONFLICT DO UPDATE SET "
+                        "planned = :planned, seeds = :seeds, stop = :stop",
                         row,
                     )
         except BaseException:
@@ -455,8 +452,8 @@ class Store(AbstractContextManager["Store"]):
         policies = {case.policy.name for case in self.cases}
         planned = {(case.policy.name, case.suite.name, case.env) for case in self.cases}
         recorded = db.execute(
-            "SELECT DISTINCT policy, suite, env FROM cases"
-            " WHERE case_id IN (SELECT case_id FROM episodes)"
+            "SELECT DISTINCT policy, suite, env FROM cases WHERE case_id IN (SELECT case_id FROM "
+            "episodes)"
         )
         changes = []
         for policy, suite, env in recorded:
@@ -522,8 +519,8 @@ def _differences(db: sqlite3.Connection, case: EvalCase) -> list[str]:
     The first seeds must be the same: else episode 3 would be two episodes.
     """
     row = db.execute(
-        "SELECT settings, seeds FROM cases"
-        " WHERE policy = ? AND step IS ? AND suite = ? AND env = ?",
+        "SELECT settings, seeds FROM cases WHERE policy = ? AND step IS ? AND suite = ? AND env = "
+        "?",
         (case.policy.name, case.step, case.suite.name, case.env),
     ).fetchone()
     if row is None:

@@ -169,8 +169,7 @@ class TrialLog(contextlib.AbstractContextManager["TrialLog"]):
             if hidden is None:
                 raise ConfigError(
                     f"{self._path}: the hidden line of trial {attempt[0]} is missing in {HIDDEN}, "
-                    "or was changed; "
-                    "restore both files from one copy, or choose another out folder"
+                    "or was changed; restore both files from one copy, or choose another out folder"
                 )
             self.attempts.append(
                 LoggedTrial(*attempt, line.pop("at"), seen=line, hidden=json.loads(hidden))
@@ -415,10 +414,9 @@ class _RemainingTrials:
             except ContractMismatch as error:
                 raise ContractMismatch(
                     "a policy of this plan does not fit the robot. It is not named here, as the "
-                    "trials are blind; "
-                    f"`vlagents-ray robot URL --robot {case.on_robot[0].arm}` compares one policy "
-                    "with the robot, "
-                    f"before any motion.\n{error}"
+                    f"trials are blind; `vlagents-ray robot URL --robot {case.on_robot[0].arm}` "
+                    "compares one policy with the robot, before any motion.\n"
+                    f"{error}"
                 ) from None
             except VLAgentsError as error:
                 raise from_code(error.code, f"policy {case.contender!r}: {error}") from error
@@ -542,8 +540,7 @@ class _RemainingTrials:
             if what is not None:
                 raise ConfigError(
                     f"the {what} of a policy has changed since its earlier trials; serve all "
-                    "policies as before and go "
-                    "on with --resume, or choose another out folder"
+                    "policies as before and go on with --resume, or choose another out folder"
                 )
 
 

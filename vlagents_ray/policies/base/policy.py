@@ -229,9 +229,8 @@ class ModelPolicy(Agent, abc.ABC):
             if self.report.accelerated and self.compilation.mode not in (True, "require"):
                 logger.warning(
                     "quantization %r without compile: true: each product first writes its weights "
-                    "in 16 or 32 bits, "
-                    "which takes longer than without quantization; set compile: true, or leave "
-                    "quantization out",
+                    "in 16 or 32 bits, which takes longer than without quantization; set compile: "
+                    "true, or leave quantization out",
                     self.config.quantization,
                 )
         self._warm_up()

@@ -129,9 +129,8 @@ def choose(points: Sequence[MeasuredPoint], goal: TuningGoal) -> MeasuredPoint:
         found = min(points, key=lambda point: point.p99_ms)
         raise GoalMissed(
             f"--p99-ms: got {goal.p99_ms}; the shortest p99 of a round trip was {found.p99_ms:.1f} "
-            "ms, with "
-            f"{sessions(found.sessions)} and {found.variant.name}; raise --p99-ms, or use a faster "
-            "machine or model"
+            f"ms, with {sessions(found.sessions)} and {found.variant.name}; raise --p99-ms, or use "
+            "a faster machine or model"
         )
     variants = sorted(
         {point.variant.name: point.variant for point in reaching}.values(),
@@ -453,8 +452,8 @@ class Tuner:
                     raise VariantFailed(f"refused, as {off}")
                 raise VariantFailed(
                     f"{off}, for the same observations and seeds, so that nothing can be compared "
-                    "with them; let the "
-                    f"seed of `reset` determine what is random in the policy, or raise --tolerance"
+                    "with them; let the seed of `reset` determine what is random in the policy, or "
+                    "raise --tolerance"
                 )
             measured = MeasuredPoint(variant, size, difference)
             measured.add(self._turn(process, size))

@@ -100,15 +100,13 @@ def read_instructions(data: Buffer, limits: MessageLimits) -> PolicyInstructions
         elif not (name.startswith(IMAGES) and kind in ("image", "video")):
             raise InvalidObservation(
                 f"lerobot_features: got {name[:_SHOWN]!r} of {kind[:_SHOWN]!r}, want {STATE!r} of "
-                "float32, and "
-                f"images {IMAGES + 'NAME'!r}"
+                f"float32, and images {IMAGES + 'NAME'!r}"
             )
     cameras = tuple(name.removeprefix(IMAGES) for name in features if name != STATE)
     if len(cameras) > limits.cameras or len(state) > limits.state_values:
         raise MessageTooLarge(
             f"lerobot_features: got {len(cameras)} cameras and {len(state)} numbers of state, the "
-            "limits are "
-            f"{limits.cameras} and {limits.state_values}"
+            f"limits are {limits.cameras} and {limits.state_values}"
         )
     return PolicyInstructions(policy_type, checkpoint, state, cameras, rows)
 

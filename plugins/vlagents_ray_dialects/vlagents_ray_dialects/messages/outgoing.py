@@ -98,8 +98,7 @@ class Outgoing:
             if (stop := ranges[name].stop) is not None and part.shape[-1] != stop - start:
                 raise InvalidAction(
                     f"action {name!r}: got {part.shape[-1]} columns, mapping.action says "
-                    f"{stop - start}, "
-                    f"{start} to {stop}; change it"
+                    f"{stop - start}, {start} to {stop}; change it"
                 )
         return _joined("action", list(taken.values()), InvalidAction)
 

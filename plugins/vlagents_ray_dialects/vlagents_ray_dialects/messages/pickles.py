@@ -218,8 +218,7 @@ class _StackMachine:
         if found not in self._calls and found not in self._records:
             raise MalformedMessage(
                 f"pickle: names {module[:_SHOWN]!r} {name[:_SHOWN]!r}, which is not read here; "
-                "send numbers, texts and "
-                "numpy arrays of numbers"
+                "send numbers, texts and numpy arrays of numbers"
             )
         self.push(found)
 

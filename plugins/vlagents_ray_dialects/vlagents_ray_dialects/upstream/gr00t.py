@@ -112,8 +112,7 @@ class GR00TClient(UpstreamClient):
             if len(stated["steps"]) > 1:
                 found.append(
                     f"{kind}: the upstream needs the moments {stated['steps']}, and only the "
-                    "newest is sent; "
-                    f"serve a model that needs one"
+                    "newest is sent; serve a model that needs one"
                 )
         names = metadata.get("action", {"keys": []})["keys"]
         if names and (wrong := [name for name in mapping.action if name not in names]):

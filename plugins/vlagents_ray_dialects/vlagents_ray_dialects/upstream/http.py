@@ -208,8 +208,7 @@ class FlashRTClient(HttpClient):
         if len(shapes) != 1 or not observation.get("prompt"):
             raise InvalidObservation(
                 f"flashrt: got images of {shapes} and the keys {sorted(observation)}, want images "
-                "of one shape and a "
-                f"prompt; resize them, and reset with an instruction"
+                "of one shape and a prompt; resize them, and reset with an instruction"
             )
         body = {
             name: value.tolist() if isinstance(value, np.ndarray) else value

@@ -78,8 +78,7 @@ class WebSocketClient(UpstreamClient):
             if error.response.status_code in _REFUSED:
                 raise Unauthorized(
                     f"upstream {url}: it refuses the API key (HTTP {error.response.status_code}); "
-                    "name the environment "
-                    f"variable with the right one in key_env"
+                    "name the environment variable with the right one in key_env"
                 ) from error
             raise PolicyUnavailable(
                 f"upstream {url}: refused with HTTP {error.response.status_code}"

@@ -44,9 +44,8 @@ def find(config: LeRobotConfig) -> Path:
     if missing := [name for name in PIPELINES if not (folder / name).is_file()]:
         raise ConfigError(
             f"checkpoint {folder}: misses {missing}, with the normalisation; convert a checkpoint "
-            "from before LeRobot "
-            f"had processors by: python -m lerobot.processor.migrate_policy_normalization "
-            f"--pretrained-path {folder}"
+            "from before LeRobot had processors by: python -m "
+            f"lerobot.processor.migrate_policy_normalization --pretrained-path {folder}"
         )
     if not config.trust_remote_code:
         for name in PIPELINES:
@@ -76,8 +75,7 @@ def load(folder: Path, config: LeRobotConfig, device: Any) -> Any:
         raise ConfigError(
             f"checkpoint {folder}: LeRobot cannot load it as {settings.type!r} ({_said(error)}); "
             f"is it complete? {other_version()}. Without a network, what it names on the hub has "
-            "to be in the cache, "
-            f"or to be replaced by `overrides`"
+            "to be in the cache, or to be replaced by `overrides`"
         ) from error
     require_loaded(policy, _as_loaded(policy, saved))
     _warn_of_float32(settings, config, device)
@@ -107,8 +105,7 @@ def _settings(folder: Path, config: LeRobotConfig) -> Any:
     except Exception as error:
         raise ConfigError(
             f"checkpoint {folder}: config.json with overrides {config.overrides} is not LeRobot's "
-            f"({_said(error)}); "
-            f"{other_version()}. The types it knows here: "
+            f"({_said(error)}); {other_version()}. The types it knows here: "
             f"{sorted(base.get_known_choices())}"
         ) from error
 
@@ -126,12 +123,9 @@ def require_served(name: str, folder: Path) -> None:
         if found is None:
             raise ConfigError(
                 f"checkpoint {folder}: LeRobot's {name!r} needs transformers with openpi's "
-                "changes, which no release "
-                f"has; install the branch that LeRobot's page on {name} names into this "
-                "environment, serve it with "
-                "LeRobot 0.6.1, which does without (`vlagents-ray env make lerobot06`), by "
-                "'openpi' or, for π0, by "
-                f"'pi0'"
+                f"changes, which no release has; install the branch that LeRobot's page on {name} "
+                "names into this environment, serve it with LeRobot 0.6.1, which does without "
+                "(`vlagents-ray env make lerobot06`), by 'openpi' or, for π0, by 'pi0'"
             )
 
 
@@ -142,8 +136,7 @@ def _prepare(settings: Any, config: LeRobotConfig, device: Any) -> bool:
     if settings.use_peft:
         raise ConfigError(
             "checkpoint: is a PEFT adapter, want whole weights; merge it (merge_and_unload) and "
-            "save that, or "
-            "serve its base with the adapter as one of the deployment's `checkpoints`"
+            "save that, or serve its base with the adapter as one of the deployment's `checkpoints`"
         )
     settings.device = str(device)
     if hasattr(settings, "pretrained_backbone_weights"):
@@ -188,9 +181,8 @@ def _warn_of_float32(settings: Any, config: LeRobotConfig, device: Any) -> None:
     ):
         logger.warning(
             "dtype: auto is float32 here, as in the checkpoint's config.json: weights take twice "
-            "the memory of "
-            "bfloat16, and acts at least twice the time; set the policy's dtype: bfloat16, or "
-            "dtype: float32 to keep it"
+            "the memory of bfloat16, and acts at least twice the time; set the policy's dtype: "
+            "bfloat16, or dtype: float32 to keep it"
         )
 
 
@@ -210,10 +202,9 @@ def _require_no_nvidia(file: Path) -> None:
     if file.is_file() and "gr00t" in str(_config(file).get("model_type", "")).lower():
         raise ConfigError(
             f"checkpoint {file.parent}: is one of NVIDIA's own GR00T code, want one that LeRobot "
-            "saved; serve it by "
-            "the policy gr00t (docs/policies/gr00t.md), or train it on with LeRobot 0.6 "
-            "(lerobot-train "
-            f"--policy.type=groot --policy.base_model_path={file.parent})"
+            "saved; serve it by the policy gr00t (docs/policies/gr00t.md), or train it on with "
+            "LeRobot 0.6 (lerobot-train --policy.type=groot "
+            f"--policy.base_model_path={file.parent})"
         )
 
 

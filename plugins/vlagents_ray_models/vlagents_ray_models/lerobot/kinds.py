@@ -54,8 +54,7 @@ class Kind:
         if type(self) is Kind and self.steps > 1:
             raise ConfigError(
                 f"checkpoint: {policy.name!r} keeps {self.steps} observations by itself, so that "
-                "sessions would mix; "
-                f"want another type, or a policy with n_obs_steps 1"
+                "sessions would mix; want another type, or a policy with n_obs_steps 1"
             )
 
     @property
@@ -499,8 +498,7 @@ def require_groot_statistics(before: Sequence[Any], after: Sequence[Any], settin
     if pack.embodiment_tag not in pack.embodiment_mapping:
         raise ConfigError(
             f"checkpoint: got the embodiment {pack.embodiment_tag!r}, want one of "
-            f"{sorted(pack.embodiment_mapping)}: "
-            f"LeRobot would act as the first of them"
+            f"{sorted(pack.embodiment_mapping)}: LeRobot would act as the first of them"
         )
     sources = [
         ("policy_preprocessor.json", STATE, pack.stats),
@@ -520,9 +518,8 @@ def require_groot_statistics(before: Sequence[Any], after: Sequence[Any], settin
         if missing or short:
             raise ConfigError(
                 f"checkpoint: {file} has no usable {missing or short} of {key!r}, has "
-                f"{sorted(have)}, want {width} "
-                "numbers each; without them its inputs and actions are wrong: save it with its "
-                "dataset's statistics"
+                f"{sorted(have)}, want {width} numbers each; without them its inputs and actions "
+                "are wrong: save it with its dataset's statistics"
             )
 
 

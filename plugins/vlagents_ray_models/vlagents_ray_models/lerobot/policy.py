@@ -90,8 +90,7 @@ class LeRobot(ModelPolicy):
         if self.config.compile not in (False, "auto") and not self.compilation.cores:
             raise ConfigError(
                 f"compile: not for LeRobot's {settings.type!r}; leave it out, or have LeRobot "
-                "compile it, where its "
-                f"config has that: overrides: {{compile_model: true}}"
+                "compile it, where its config has that: overrides: {compile_model: true}"
             )
         if isinstance(kind, kinds.Flow):
             kind.noise_level, kind.passes.adapters = self.config.noise_level, self.adapters
@@ -103,8 +102,7 @@ class LeRobot(ModelPolicy):
         elif self.config.noise_level:
             raise ConfigError(
                 f"noise_level: got {self.config.noise_level} for LeRobot's {settings.type!r}, want "
-                "0, as its actions "
-                f"come out of no flow; those of {_FLOWS} do"
+                f"0, as its actions come out of no flow; those of {_FLOWS} do"
             )
         self.config = _with_defaults(self.config, kind)
         processors = Processors(folder, settings, self.config, kind.staging)
@@ -184,8 +182,8 @@ class LeRobot(ModelPolicy):
         if own.rename_map not in ({}, renames) or not (unsaid or stated in (None, model.trained)):
             raise ConfigError(
                 f"{folder}: its dataset has another contract, or its cameras other names, than "
-                "that of the base or of "
-                f"an adapter before, want the same; serve it in a deployment of its own"
+                "that of the base or of an adapter before, want the same; serve it in a deployment "
+                "of its own"
             )
         if trained != model.trained:
             self.model = model = replace(
@@ -260,8 +258,7 @@ def _with_defaults(config: LeRobotConfig, kind: kinds.Kind) -> LeRobotConfig:
     if (config.execute or 0) > kind.horizon:
         raise ConfigError(
             f"execute: got {config.execute}, the checkpoint's chunks have {kind.horizon} rows from "
-            "the observation on; "
-            f"want at most these"
+            "the observation on; want at most these"
         )
     return config.model_copy(
         update={k: v for k, v in defaults.items() if k not in config.model_fields_set}
@@ -297,8 +294,7 @@ def _trained(settings: Any, processors: Processors) -> DatasetContract:
         return dataset
     log.warning(
         "the contract of the checkpoint's dataset has %d numbers of state, the policy takes %d: it "
-        "is not used; "
-        "set `state` to the parts that the policy was trained with",
+        "is not used; set `state` to the parts that the policy was trained with",
         dataset.width,
         state.shape[0],
     )
@@ -351,8 +347,7 @@ def _cameras(
     if config.masked_cameras and settings.type not in kinds.MASKING:
         raise ConfigError(
             f"masked_cameras: LeRobot's {settings.type!r} needs all its cameras, "
-            f"{sorted(names.values())}; "
-            f"{sorted(kinds.MASKING)} can do without"
+            f"{sorted(names.values())}; {sorted(kinds.MASKING)} can do without"
         )
     seen = {key: name for key, name in names.items() if name not in config.masked_cameras}
     sources = {renamed: source for source, renamed in renames.items()}

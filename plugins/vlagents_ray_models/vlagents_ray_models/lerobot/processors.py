@@ -115,10 +115,10 @@ class Processors:
         except Exception as error:
             raise ConfigError(
                 f"checkpoint {folder}: its processors do not load ({type(error).__name__}: "
-                f"{error}); a tokenizer that "
-                f"is not here is replaced by processors: {{{_TOKENIZER}: {{tokenizer_name: …}}}}, "
-                f"GR00T's by {{{_GROOT_TOKENIZER}: {{model_name: …}}}}, π0-FAST's second one by "
-                f"{{action_tokenizer_processor: {{paligemma_tokenizer_name: …}}}}"
+                f"{error}); a tokenizer that is not here is replaced by processors: "
+                f"{{{_TOKENIZER}: {{tokenizer_name: …}}}}, GR00T's by {{{_GROOT_TOKENIZER}: "
+                "{model_name: …}}, π0-FAST's second one by {action_tokenizer_processor: "
+                "{paligemma_tokenizer_name: …}}"
             ) from error
         if settings.type not in _STATE_IN_PROMPT:
             self._keep_tokens()
@@ -182,9 +182,8 @@ class Processors:
                 if missing:
                     raise ConfigError(
                         f"checkpoint: {file} has no usable {missing} of {key!r}, has "
-                        f"{sorted(have)}; without them "
-                        "its inputs and actions are wrong: save its processors with the "
-                        "statistics of its dataset"
+                        f"{sorted(have)}; without them its inputs and actions are wrong: save its "
+                        "processors with the statistics of its dataset"
                     )
 
     def observe(self, rows: Sequence[Row], steps: int) -> dict[str, Any]:
@@ -331,9 +330,8 @@ def own_processors(
         said = ", ".join(what for what, differs in other.items() if differs)
         raise ConfigError(
             f"{folder}: its processors have other {said} than those of the base, want the same but "
-            "for the statistics "
-            f"of {sorted(allowed)}; merge the adapter into its base, and serve that as a "
-            "checkpoint of its own"
+            f"for the statistics of {sorted(allowed)}; merge the adapter into its base, and serve "
+            "that as a checkpoint of its own"
         )
     return own
 
@@ -368,8 +366,7 @@ def _require_same_network(file: Path, settings: Any, config: LeRobotConfig) -> N
             f"{file}: was trained with "
             f"{ ({name: theirs for name, (theirs, _) in other.items()}) }, the base with "
             f"{ ({name: ours for name, (_, ours) in other.items()}) }, want the same; merge the "
-            "adapter into its base, "
-            f"and serve that as a checkpoint of its own"
+            "adapter into its base, and serve that as a checkpoint of its own"
         )
 
 
@@ -385,8 +382,8 @@ def require_known_steps(file: Path) -> None:
         if not _is_lerobots(name):
             raise ConfigError(
                 f"{file}: got a step of the class {name!r}, want one with a registry_name, or a "
-                "processor step in "
-                f"lerobot.*: loading the checkpoint would run that, whatever it is; {CURE}"
+                "processor step in lerobot.*: loading the checkpoint would run that, whatever it "
+                f"is; {CURE}"
             )
 
 

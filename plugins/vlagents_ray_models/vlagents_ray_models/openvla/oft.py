@@ -198,8 +198,7 @@ def _action_dim(statistics: prismatic.Statistics, unnorm_key: str | None, head: 
     if len(dims) != 1:
         raise ConfigError(
             f"actions: the checkpoint's head and statistics have {sorted(dims)} numbers a row, "
-            "want one length; set "
-            f"unnorm_key to the dataset that the head was trained on"
+            "want one length; set unnorm_key to the dataset that the head was trained on"
         )
     return dims.pop()
 
@@ -456,8 +455,8 @@ def read_component(folder: Path, name: str) -> dict[str, Any]:
         have = sorted(path.name for path in folder.glob("*.pt"))
         raise ConfigError(
             f"checkpoint {folder}: got {files or have} for {name!r}, want one file "
-            f"{name}--STEP_checkpoint.pt; copy it "
-            f"there, or check `head`, `film` and `state` against how the checkpoint was trained"
+            f"{name}--STEP_checkpoint.pt; copy it there, or check `head`, `film` and `state` "
+            "against how the checkpoint was trained"
         )
     saved = require("torch").load(folder / files[0], map_location="cpu", weights_only=True)
     return {key.removeprefix(_WRAPPED): tensor for key, tensor in saved.items()}
@@ -469,8 +468,7 @@ def require_unused(folder: Path, names: Iterable[str]) -> None:
         if any(folder.glob(f"{name}--*")):
             raise ConfigError(
                 f"checkpoint {folder}: has {name}--…, which these settings do not use; set `head`, "
-                "`film` and `state` "
-                f"to how the checkpoint was trained, or move the file away"
+                "`film` and `state` to how the checkpoint was trained, or move the file away"
             )
 
 

@@ -102,8 +102,7 @@ class Statistics:
         if not found or not isinstance(found, dict):
             raise ConfigError(
                 f"checkpoint {checkpoint}: got no normalisation statistics, want {FILE}, or "
-                "norm_stats in config.json; "
-                f"copy it from where the training run saved it"
+                "norm_stats in config.json; copy it from where the training run saved it"
             )
         return cls(found, bounds)
 
@@ -122,8 +121,8 @@ class Statistics:
                 return str(name)
         raise InvalidObservation(
             f"unnorm_key: got {wanted!r}, want one of the checkpoint's datasets "
-            f"{sorted(self._datasets)}; set it in "
-            f"the policy's config, in reset(..., unnorm_key=...) or in an observation's info"
+            f"{sorted(self._datasets)}; set it in the policy's config, in reset(..., "
+            "unnorm_key=...) or in an observation's info"
         )
 
     def scale(self, key: str, part: Literal["action", "proprio"] = "action") -> Scale:
@@ -165,9 +164,8 @@ _PROMPT = "In: What action should the robot take to {}?\nOut:"
 # OpenVLA v0.1 was fine-tuned from Vicuna; upstream also detects it by the checkpoint's name.
 _PROMPT_V01 = (
     "A chat between a curious user and an artificial intelligence assistant. The assistant gives "
-    "helpful, detailed, "
-    "and polite answers to the user's questions. USER: What action should the robot take to {}? "
-    "ASSISTANT:"
+    "helpful, detailed, and polite answers to the user's questions. USER: What action should the "
+    "robot take to {}? ASSISTANT:"
 )
 
 
@@ -450,10 +448,9 @@ def find_source(source_dir: str | None) -> Path:
             return root
     raise ConfigError(
         f"OpenVLA's model classes: got {asked or 'no source tree'}, want a folder with "
-        "prismatic/extern/hf in it; set "
-        f"source_dir or ${VARIABLES[0]} to a clone of openvla or openvla-oft, or, if you trust the "
-        "Python code that "
-        f"lies beside the weights, trust_remote_code: true"
+        f"prismatic/extern/hf in it; set source_dir or ${VARIABLES[0]} to a clone of openvla or "
+        "openvla-oft, or, if you trust the Python code that lies beside the weights, "
+        "trust_remote_code: true"
     )
 
 
@@ -551,8 +548,8 @@ class PrismaticPolicy(ModelPolicy):
         if not dims[0] <= dims[1]:
             raise ConfigError(
                 f"{folder / FILE}: got actions of {sorted(dims[0])} numbers, want "
-                f"{sorted(dims[1])}, as the base's; "
-                f"merge the adapter into its base, and serve that as a checkpoint of its own"
+                f"{sorted(dims[1])}, as the base's; merge the adapter into its base, and serve "
+                "that as a checkpoint of its own"
             )
         self.model.base.own[adapter] = own
 

@@ -34,8 +34,7 @@ logger = logging.getLogger(__name__)
 _SILENT_S = 2.0
 _GET_ROS = (
     "source the setup file of ROS 2 (`. /opt/ros/jazzy/setup.bash`) and start its Python, or reach "
-    "ROS through a "
-    "rosbridge, `link: ws://arm-pc:9090`"
+    "ROS through a rosbridge, `link: ws://arm-pc:9090`"
 )
 # The kernel's time limit for a send, which websockets lacks: a dead link would block the control
 # loop for minutes.

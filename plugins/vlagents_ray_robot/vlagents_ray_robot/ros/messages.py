@@ -90,8 +90,7 @@ def image(message: Any) -> np.ndarray:
     if step < used or len(data) < step * height:
         raise MalformedMessage(
             f"image: got {len(data)} bytes in rows of {step}, want {height} rows of {used} or more "
-            f"for {width} pixels "
-            f"of {encoding}"
+            f"for {width} pixels of {encoding}"
         )
     rows = np.frombuffer(data, np.uint8, step * height).reshape(height, step)[:, :used]
     pixels = rows.reshape(height, width, _PIXEL[encoding])

@@ -258,10 +258,9 @@ def _check_command(command: ActionTopic, settings: RosSettings, where: str) -> N
     if not command.stop and command.type != TWIST_TYPE:
         raise ConfigError(
             f"{where}: stop: got none, want what stops {command.topic}: {ZEROS!r} where numbers "
-            "are velocities or "
-            "deltas, a part of the state with the measured pose where they are targets, or "
-            f"{NOTHING!r} where the "
-            f"controller stays at its last target and that is right"
+            "are velocities or deltas, a part of the state with the measured pose where they are "
+            f"targets, or {NOTHING!r} where the controller stays at its last target and that is "
+            "right"
         )
     if command.stop and command.stop not in (ZEROS, NOTHING):
         _one_of(f"{where}: stop", command.stop, (ZEROS, NOTHING, *settings.state))
@@ -270,8 +269,7 @@ def _check_command(command: ActionTopic, settings: RosSettings, where: str) -> N
     if command.grippers and command.stop == ZEROS and settings.gripper is None:
         raise ConfigError(
             f"{where}: grippers: got {list(command.grippers)} in a topic that zeros stop, and no "
-            "`gripper`; add the "
-            f"topic of its opening, as a stop publishes that in place of a zero"
+            "`gripper`; add the topic of its opening, as a stop publishes that in place of a zero"
         )
 
 
@@ -598,8 +596,8 @@ class RosRobot:
             if time.monotonic() > deadline:
                 raise ConfigError(
                     f"{self.settings.link}: got no message of {missing} within "
-                    f"{self.settings.ready_s:g} s, want one "
-                    f"of each; compare names and types with `ros2 topic list --show-types`"
+                    f"{self.settings.ready_s:g} s, want one of each; compare names and types with "
+                    "`ros2 topic list --show-types`"
                 )
             time.sleep(0.01)
         for reading in self.settings.sensors:
@@ -608,16 +606,14 @@ class RosRobot:
                 when = f"{abs(ago_s):.3g} s {'ahead' if ago_s < 0 else 'ago'}"
                 raise ConfigError(
                     f"{reading.topic}: got a message with the time stamp of {when}, want one of "
-                    "now; "
-                    "synchronize the clocks of both machines, or count from the arrival: `clock: "
-                    "arrival`"
+                    "now; synchronize the clocks of both machines, or count from the arrival: "
+                    "`clock: arrival`"
                 )
         for command in self.settings.actions:
             pose = self.settings.state.get(command.stop)
             if pose is not None and self._value(pose).shape != (command.dim,):
                 raise ConfigError(
                     f"{command.topic}: stop: got {command.stop!r} with {len(self._value(pose))} "
-                    "numbers, want "
-                    f"{command.dim}, as the topic takes; name a part of the state with these, in "
-                    "this order"
+                    f"numbers, want {command.dim}, as the topic takes; name a part of the state "
+                    "with these, in this order"
                 )

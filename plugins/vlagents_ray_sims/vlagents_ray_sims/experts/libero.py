@@ -218,7 +218,6 @@ class LiberoExpert(PickExpert):
             got: Any = sorted(state) if isinstance(state, dict) else type(state).__name__
             raise InvalidObservation(
                 f"info['sim_state']: got {got}, want goal, unmet, positions and quaternions, as "
-                f"the env {self._name} "
-                f"gives them; this expert cannot act on images"
+                f"the env {self._name} gives them; this expert cannot act on images"
             )
         return state

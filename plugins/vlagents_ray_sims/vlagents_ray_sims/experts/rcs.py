@@ -66,8 +66,7 @@ class RcsPick:
         if not isinstance(pose, np.ndarray) or pose.shape != (7,):
             raise InvalidObservation(
                 f"info['objects'][{_CUBOID!r}]: got {type(pose).__name__}, want (7,) float64; this "
-                "expert is for "
-                f"{self._name} in the control mode tquat"
+                f"expert is for {self._name} in the control mode tquat"
             )
         return pose
 

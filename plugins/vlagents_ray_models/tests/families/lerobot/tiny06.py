@@ -17,11 +17,11 @@ from benchmarks.checkpoints.tokenizer import byte_level, fast_tokenizer
 _VISION = ("<|vision_start|>", "<|image_pad|>", "<|vision_end|>", "<|video_pad|>")
 _ACTIONS = ("<|propri|>", "<|action|>", "<|action_fast|>")  # of WALL-X
 _CHAT = (
-    "{% for message in messages %}<|im_start|>{{ message['role'] }}\n{% for part in "
-    "message['content'] %}"
-    "{% if part['type'] == 'image' %}<|vision_start|><|image_pad|><|vision_end|>{% else %}{{ "
-    "part['text'] }}{% endif %}"
-    "{% endfor %}<|im_end|>\n{% endfor %}"
+    "{% for message in messages %}<|im_start|>{{ message['role'] }}\n"
+    "{% for part in message['content'] %}{% if part['type'] == 'image' "
+    "%}<|vision_start|><|image_pad|><|vision_end|>{% else %}{{ part['text'] }}{% endif %}{% endfor "
+    "%}<|im_end|>\n"
+    "{% endfor %}"
 )
 SIDE = 64  # of the images that GR00T's vision model gets
 
