@@ -379,7 +379,7 @@ def test_a_key_has_no_more_connections_than_sessions(keyed: Replica, way: str) -
     again.close()
     first.close()
     wait_for(lambda: not keyed.own._clients and not keyed.local._clients)
-    wait_for(lambda: not keyed.known.keys._held)
+    wait_for(lambda: not keyed.known.keys._connections)
 
 
 def test_a_local_client_shows_its_key_soon(keyed: Replica, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -407,7 +407,7 @@ def test_the_proxied_port_counts_a_keys_connections_too(
     ):
         pytest.fail("was let in")
     assert refused.value.response.status_code == 429
-    wait_for(lambda: not keyed.known.keys._held)
+    wait_for(lambda: not keyed.known.keys._connections)
     with connect(url, additional_headers=shown(token)) as again:
         again.ping().wait(5)
 
@@ -510,7 +510,7 @@ FAULTS = [
     (MessageAdmission, "decode_on_thread"),
     (ReceiveBuffer, "parse"),
     (websocket.WebSocketConnection, "_read"),
-    (websocket.WebSocketConnection, "_handshake"),
+    (websocket.WebSocketConnection, "_accept_handshake"),
     (websocket.WebSocketConnection, "_process"),
     (websocket.WebSocketConnection, "_submit"),
     (websocket.WebSocketConnection, "_hold_partial"),
@@ -601,7 +601,7 @@ def test_an_unexpected_error_anywhere_ends_that_connection_and_nothing_else(
     gc.collect()
     wait_for(lambda: keyed.engine.admission.held == 0, 20)
     wait_for(lambda: open_sockets() <= sockets, 20)
-    wait_for(lambda: "arm" not in keyed.known.keys._held, 20)
+    wait_for(lambda: "arm" not in keyed.known.keys._connections, 20)
 
 
 def test_a_look_that_fails_is_followed_by_the_next(caplog: pytest.LogCaptureFixture) -> None:

@@ -391,4 +391,4 @@ def at_rest(replica: KeyedReplica) -> None:
     wait_for(
         lambda: not any(thread.name.startswith("vlagents 127") for thread in threading.enumerate())
     )
-    wait_for(lambda: not replica.known.keys._held)
+    wait_for(lambda: not replica.known.keys._connections)

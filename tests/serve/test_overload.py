@@ -843,7 +843,7 @@ def test_the_messages_of_a_key_over_its_rate_stay_unread_at_uvicorns_websockets(
     assert _part(client, STREAM_BYTES) > STREAM_BYTES / 4, "the kernel's buffers hold 10 MB"
     client.close()
     # What they hold is read, which takes memory.
-    wait_for(lambda: visitor.name not in replica.known.keys._held)
+    wait_for(lambda: visitor.name not in replica.known.keys._connections)
 
 
 def test_an_act_in_compact_form_is_read_again_after_a_refusal(replica: KeyedReplica) -> None:

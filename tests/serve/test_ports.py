@@ -61,7 +61,7 @@ def test_no_port_is_given_twice_though_nobody_listens_yet(monkeypatch: pytest.Mo
     first, end = free_range(100)
     monkeypatch.setattr(ports, "_PORTS", (first, end))
     monkeypatch.setattr(ports, "_CLAIMS", 40)
-    monkeypatch.setattr(ports, "_kept", set())
+    monkeypatch.setattr(ports, "_excluded", set())
     keep(*range(first, first + 10))
     given = [free_port() for _ in range(200)]  # more than there are: the oldest are given again
     assert min(given) >= first + 10

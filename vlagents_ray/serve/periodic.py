@@ -39,12 +39,14 @@ class Periodic:
         periodic thread itself.
         """
         with self._lock:
-            self._calls = [one for one in self._calls if one != call]
-            thread, last = self._thread, not self._calls
-            if last and thread is not None:
+            self._calls = [added for added in self._calls if added != call]
+            thread = self._thread
+            was_last = not self._calls
+            if was_last and thread is not None:
                 self._stop.set()
                 self._thread = None
-        if last and thread is not None and thread is not threading.current_thread():
+
+        if was_last and thread is not None and thread is not threading.current_thread():
             thread.join()
 
     def _loop(self, stop: threading.Event) -> None:

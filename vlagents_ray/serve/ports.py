@@ -19,10 +19,10 @@ _BLOCKS = (20_000, 24_000)  # range of the ports for replicas
 _PORTS = (24_000, 32_700)
 _CLAIMS = 256  # maximum number of ports that this process claims at once, the latest ones
 _RELEASE_S = 2.0  # time limit for a server that is being replaced to close its port
-_PROBES = 64  # processes that may read whose a claim is
-_LISTEN_S = 0.002  # time for a process that has just bound its claim to listen, too
+_PROBES = 64  # maximum number of processes that read the owner of a claim at the same time
+_LISTEN_S = 0.002  # time within which a process listens at a claim that it has just bound
 _claims: deque[int] = deque()  # descriptors of the claims; the kernel closes them with the process
-_kept: set[int] = set()  # ports that `free_port` never returns
+_excluded: set[int] = set()  # ports that `free_port` never returns
 _random = random.SystemRandom()
 
 
@@ -38,7 +38,7 @@ def free_port(host: str = LOOPBACK) -> int:
     """
     for _ in range(100):
         port = _random.randrange(*_PORTS)
-        if port not in _kept and is_free(host, port) and _claim(port):
+        if port not in _excluded and is_free(host, port) and _claim(port):
             return port
     raise ConfigError(f"no free port between {_PORTS[0]} and {_PORTS[1]}")
 
@@ -58,7 +58,7 @@ def _claim(port: int) -> bool:
     except OSError:
         claim.close()
         return not _is_claim_of_this_user(name)
-    claim.listen(_PROBES)  # so that others can read whose it is
+    claim.listen(_PROBES)  # so that other processes can read its owner
     _claims.append(claim.detach())
     if len(_claims) > _CLAIMS:
         os.close(_claims.popleft())
@@ -80,7 +80,7 @@ def _is_claim_of_this_user(name: str) -> bool:
 
 def keep(*ports: int) -> None:
     """Exclude ports from `free_port`, since they belong to servers that may not listen yet."""
-    _kept.update(ports)
+    _excluded.update(ports)
 
 
 def free_block(size: int) -> int:
@@ -115,13 +115,13 @@ def reserve(name: str, host: str, port: int, timeout_s: float = _RELEASE_S) -> s
             such address.
     """
     try:
-        found = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)
+        addresses = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)
     except OSError as error:
-        cure = f"change dialects.{name}.host"
         raise ConfigError(
-            f"{name}: {host!r} is no address of this machine ({error}); {cure}"
+            f"{name}: {host!r} is no address of this machine ({error}); change dialects.{name}.host"
         ) from error
-    family, _, _, _, address = found[0]
+    family, _, _, _, address = addresses[0]
+
     deadline = time.monotonic() + timeout_s
     while True:
         listener = socket.socket(family, socket.SOCK_STREAM)
@@ -135,7 +135,6 @@ def reserve(name: str, host: str, port: int, timeout_s: float = _RELEASE_S) -> s
                 continue
             raise ConfigError(
                 f"{name}: cannot listen on {host}:{port} ({error.strerror}); choose another port "
-                "or host "
-                f"in dialects.{name}"
+                f"or host in dialects.{name}"
             ) from error
         return listener

@@ -423,7 +423,7 @@ def test_sessions_of_a_revoked_key_end_by_themselves(limited: Limited, replicas:
         assert rows(other.get_action(seen(1))[0])[-1] == 2
         with pytest.raises(RuntimeError, match="revoked"):
             client.get_action(seen(1))
-        wait_for(lambda: limited.known.keys._held == {"lab": 1})
+        wait_for(lambda: limited.known.keys._connections == {"lab": 1})
 
 
 def test_nothing_of_a_message_is_read_before_its_key(

@@ -1,7 +1,7 @@
 """The endpoint for learners on other machines: new weights in the safetensors format, over a
 WebSocket.
 
-    WS   /v1/weights?mode=keep   a header, then the bytes of the values in parts, all acknowledged
+    WS   /v1/weights?mode=keep   a header, then the values in parts, each of which is acknowledged
     GET  /v1/weights             the newest version of each replica
     POST /v1/weights/sleep       no acts, and less memory, until "wake"
     POST /v1/weights/restore     the memory back, still without acts
@@ -67,10 +67,10 @@ class ReceivesWeights(Protocol):
         """
 
     async def push_received(self, values: Mapping[str, Any], options: PushOptions) -> PushResult:
-        """Make all replicas act with new weights."""
+        """Make all replicas act with new weights, whose `values` are arrays by name."""
 
     async def rest_all(self, rest: Rest) -> None:
-        """Let all replicas take a step of a rest."""
+        """Make all replicas take a step of a rest."""
 
     async def versions(self) -> list[int]:
         """Return the newest version of each replica."""
@@ -103,22 +103,26 @@ class _WeightsEndpoint:
         return JSONResponse({"versions": await self._replicas.versions()})
 
     async def rest(self, http: HttpRequest) -> Response:
+        """Make the replicas take the step of a rest that the path names."""
         self._scopes.require(_SCOPE)
         rest = _rest(http.path_params["step"], http.query_params)
-        if isinstance(caller := current_caller(), Caller):
+        caller = current_caller()
+        if isinstance(caller, Caller):
             caller.note("the policy's rest:", rest.step)
         await self._replicas.rest_all(rest)
         return JSONResponse({})
 
     async def receive(self, socket: WebSocket) -> None:
+        """Receive one push, and answer with its version or with the error."""
         try:
             self._scopes.require(_SCOPE)
         except VLAgentsError as error:
             await deny(socket, error)
             return
+
         await socket.accept()
         try:
-            answer = await self._pushed(socket)
+            answer = await self._receive_push(socket)
         except WebSocketDisconnect:
             logger.info(
                 "a push of weights ended before all of them had arrived; nothing was changed"
@@ -129,11 +133,13 @@ class _WeightsEndpoint:
         except Exception:
             logger.exception("a push of weights failed")
             answer = problem(VLAgentsError("internal error; the server's log has the details"))
+
         with suppress(WebSocketDisconnect, RuntimeError):  # the learner has disconnected
             await socket.send_text(json.dumps(answer))
             await socket.close()
 
-    async def _pushed(self, socket: WebSocket) -> dict[str, Any]:
+    async def _receive_push(self, socket: WebSocket) -> dict[str, Any]:
+        """Receive the weights of a push, make the replicas act with them, and return the answer."""
         if self._receiving:
             raise Overloaded("weights: another push is under way here; push again when it is over")
         self._receiving = True
@@ -144,19 +150,20 @@ class _WeightsEndpoint:
             if isinstance(caller, Caller):
                 caller.admit()  # a push counts as one request
                 caller.note("pushes weights:", f"mode {options.mode}")
-            reader = ValuesReader(
-                await asyncio.to_thread(self._replicas.read_header, header, options)
-            )
+            specs = await asyncio.to_thread(self._replicas.read_header, header, options)
+            reader = ValuesReader(specs)
+
             begun = time.monotonic()
             while reader.received < reader.size:
                 await socket.send_text(json.dumps({"received": reader.received}))
                 reader.add(await self._message(socket))
-                if time.monotonic() - begun > self._slow_s + reader.received / LEAST_RATE:
+                elapsed_s = time.monotonic() - begun
+                if elapsed_s > self._slow_s + reader.received / LEAST_RATE:
                     raise MalformedMessage(
-                        f"weights: got {reader.received} bytes in {time.monotonic() - begun:.0f} "
-                        "s, want at least "
+                        f"weights: got {reader.received} bytes in {elapsed_s:.0f} s, want at least "
                         f"{LEAST_RATE} a second; another push may wait"
                     )
+
             # When all values have arrived, the push does not depend on the learner's connection.
             pushed = await asyncio.shield(self._replicas.push_received(reader.values(), options))
             return {
@@ -168,6 +175,7 @@ class _WeightsEndpoint:
             self._receiving = False
 
     async def _message(self, socket: WebSocket) -> bytes:
+        """Return the next message: the header, or a part of the values."""
         try:
             message = await asyncio.wait_for(socket.receive(), self._slow_s)
         except asyncio.TimeoutError:
@@ -176,52 +184,54 @@ class _WeightsEndpoint:
             ) from None
         if message["type"] == "websocket.disconnect":
             raise WebSocketDisconnect(message["code"])
+
         self._scopes.require(_SCOPE)
-        part: bytes | None = message.get("bytes")
-        if part is None:
+        data: bytes | None = message.get("bytes")
+        if data is None:
             raise MalformedMessage("weights: got a text message, want a binary one")
-        if len(part) > MESSAGE_BYTES:
+        if len(data) > MESSAGE_BYTES:
             raise MessageTooLarge(
-                f"weights: got a part of {len(part)} bytes, the limit is {MESSAGE_BYTES}"
+                f"weights: got a part of {len(data)} bytes, the limit is {MESSAGE_BYTES}"
             )
-        if not part:
+        if not data:
             raise MalformedMessage(
                 "weights: got an empty message, want a header or a part of the values"
             )
-        return part
+        return data
 
 
 def _rest(step: Any, query: Mapping[str, str]) -> Rest:
     """Return a step of a rest, with the options in the query of its URL, such as
     `offload=false&at_most_s=60`.
     """
-    read: dict[str, Callable[[str], Any]] = {"offload": _TRUTH.__getitem__, "at_most_s": float}
+    parsers: dict[str, Callable[[str], Any]] = {"offload": _TRUTH.__getitem__, "at_most_s": float}
     try:
-        return Rest(step, **{name: read[name](value) for name, value in query.items()})
+        options = {name: parsers[name](value) for name, value in query.items()}
+        return Rest(step, **options)
     except (KeyError, ValueError) as error:
         raise InvalidInput(
             f"rest: got {step[:20]!r}, {shown(dict(query), 99)}, want sleep, restore or wake, "
-            "offload=true or "
-            f"false, and at_most_s=SECONDS"
+            "offload=true or false, and at_most_s=SECONDS"
         ) from error
 
 
 def _options(query: Mapping[str, str]) -> PushOptions:
     """Return the options of a push from the query of its URL, such as `mode=keep&partial=true`."""
-    stated: dict[str, Any] = {}
+    known = {field.name for field in fields(PushOptions)}
+    options: dict[str, Any] = {}
     for name, value in query.items():
-        if name not in {field.name for field in fields(PushOptions)}:
+        if name not in known:
             raise InvalidInput(
                 f"weights: got the option {name[:40]!r}, want mode, partial, allow_same, pin or "
                 "version"
             )
         if name == "mode":
-            stated[name] = value
+            options[name] = value
         elif name == "version" and value.isdecimal() and len(value) <= _DIGITS:
-            stated[name] = int(value)
+            options[name] = int(value)
         elif name != "version" and value in _TRUTH:
-            stated[name] = _TRUTH[value]
+            options[name] = _TRUTH[value]
         else:
             want = "a number" if name == "version" else "true or false"
             raise InvalidInput(f"weights: {name}: got {value[:40]!r}, want {want}")
-    return PushOptions(**stated)
+    return PushOptions(**options)

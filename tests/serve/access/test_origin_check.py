@@ -53,7 +53,7 @@ def test_whoever_runs_the_server_says_which_of_them_are_its_own(
     require_own_page({"host": "policy.example.org:8000"}, ["policy.example.org"])
     with pytest.raises(Forbidden):
         require_own_page({"host": "policy.example.org"}, ["example.org"])
-    monkeypatch.setattr(origin_check, "_here", lambda: "gpu1.lab.example.org")
+    monkeypatch.setattr(origin_check, "_machine_name", lambda: "gpu1.lab.example.org")
     require_own_page({"host": "GPU1.lab.example.org:8000"})
 
 

@@ -39,7 +39,8 @@ _KEY_PROTOCOL = "vlagents.key."  # prefix of the WebSocket subprotocol that cont
 # Minimum and maximum time for which senders with a key over its rate are not read.
 _THROTTLED_S = (0.05, 1.0)
 _CHECK_S = 1.0  # minimum time between two checks of the file
-# For a check: a network drive that hangs delays one request, possibly on the policy's thread.
+# Maximum time for which a request waits for a check: a network drive that hangs delays one request,
+# possibly on the policy's thread.
 _WAIT_S = 0.25
 _CLOSE_S = 300.0  # time for which the keys stay valid while the file cannot be read
 _REMIND_S = 60.0  # time between two log lines about an unreadable file
@@ -72,19 +73,23 @@ class Keys:
             changed: Returns an object that differs when the text may have changed.
             where: The name of the key file in messages.
         """
-        self._read, self._changed, self._where = read, changed, where
-        self._keys: dict[bytes, Key] = {}
+        self._read = read
+        self._changed = changed
+        self._where = where
+        self._lock = threading.Lock()
+        self.audit = Audit()
+
+        self._keys: dict[bytes, Key] = {}  # by the SHA-256 of the key
         self._buckets: dict[str, TokenBucket] = {}
         # Time before which the senders with a key are not read, s.
         self._unread_until: dict[str, float] = {}
-        self._held: Counter[str] = Counter()  # number of connections, by the key's name
-        self._checked = float("-inf")
+        self._connections: Counter[str] = Counter()  # number of connections, by the key's name
+
+        self._checked = float("-inf")  # time of the last check of the file, s
         # Time since which the file is unreadable, s; None if it is readable.
         self._unreadable: float | None = None
-        self._reminded = 0.0
+        self._reminded = 0.0  # time of the last log line about an unreadable file, s
         self._hung: threading.Thread | None = None  # a check that has not returned
-        self._lock = threading.Lock()
-        self.audit = Audit()
         self._state: object = self._changed()
         self._load(self._read())
 
@@ -114,21 +119,23 @@ class Keys:
             self.audit.refused("", "no key")
             raise Unauthorized(
                 f"this server needs an API key: set {KEY_VARIABLE}, or api_key= (Python, C++), the "
-                "option `key` "
-                f"(TypeScript) or the header 'Authorization: Bearer KEY' (HTTP)"
+                "option `key` (TypeScript) or the header 'Authorization: Bearer KEY' (HTTP)"
             )
+
         self._refresh()
         digest = hashlib.sha256(token.encode(errors="surrogateescape")).digest()
-        found: bytes | None = None
         keys = self._keys  # another thread may replace the attribute
-        # Compares with all of them, so that the duration reveals nothing about the keys.
-        for known in keys:
-            if hmac.compare_digest(known, digest):
-                found = known
-        if found is None:
+        key: Key | None = None
+        # The digest is compared with those of all keys, so that the duration reveals nothing about
+        # the keys.
+        for known_digest, known_key in keys.items():
+            if hmac.compare_digest(known_digest, digest):
+                key = known_key
+        if key is None:
             self.audit.refused("", "an unknown key")
             raise Unauthorized("the server does not know this API key; ask its operator for one")
-        caller = Caller(self, found, keys[found].name, app)
+
+        caller = Caller(self, digest, key.name, app)
         caller.admit(free=True)
         return caller
 
@@ -141,20 +148,22 @@ class Keys:
         """Count a request of `key`; raise `TooManyRequests` if the key is over its rate."""
         if key.rate is None:
             return
+
         now = time.monotonic()
         with self._lock:
             bucket = self._buckets.get(key.name)
             if bucket is None or bucket.rate != key.rate:
                 bucket = self._buckets[key.name] = TokenBucket(key.rate, now)
                 self._unread_until.pop(key.name, None)
-            if (wait_s := bucket.take(now)) > 0:
-                least_s, most_s = _THROTTLED_S
-                self._unread_until[key.name] = now + min(most_s, max(least_s, wait_s))
+            wait_s = bucket.take(now)
+            if wait_s > 0:
+                shortest_s, longest_s = _THROTTLED_S
+                self._unread_until[key.name] = now + min(longest_s, max(shortest_s, wait_s))
+
         if wait_s > 0:
             error = TooManyRequests(
                 f"key {key.name!r}: over {key.rate:g} requests a second; wait {wait_s:.2g} s, send "
-                "fewer, or ask the "
-                f"operator of the server for a key with a higher rate"
+                "fewer, or ask the operator of the server for a key with a higher rate"
             )
             error.retry_after_s = wait_s
             raise error
@@ -165,20 +174,19 @@ class Keys:
         """
         return max(0.0, self._unread_until.get(name, 0.0) - time.monotonic())
 
-    def hold(self, name: str, number: int, most: int | None) -> None:
-        """Count `number` more connections of a key; over `most` count none and raise
+    def hold(self, name: str, number: int, limit: int | None) -> None:
+        """Count `number` more connections of a key; over `limit` count none and raise
         `TooManyRequests`.
         """
         with self._lock:
-            held = self._held[name] + number
-            if most is not None and number > 0 and held > most:
+            connections = self._connections[name]
+            if limit is not None and number > 0 and connections + number > limit:
                 raise TooManyRequests(
-                    f"key {name!r} has {held - number} connections here and may hold {most} "
-                    "sessions"
+                    f"key {name!r} has {connections} connections here and may hold {limit} sessions"
                 )
-            self._held[name] = held
-            if held <= 0:
-                del self._held[name]
+            self._connections[name] = connections + number
+            if self._connections[name] <= 0:
+                del self._connections[name]
 
     @property
     def unreadable_s(self) -> float:
@@ -188,13 +196,16 @@ class Keys:
         return 0.0 if since is None else time.monotonic() - since
 
     def _refresh(self) -> None:
+        """Check whether the file has changed, at most every `_CHECK_S`."""
         now = time.monotonic()
         if now - self._checked < _CHECK_S:
             return
+
         with self._lock:
-            if now - self._checked < _CHECK_S:
+            if now - self._checked < _CHECK_S:  # another thread has just checked it
                 return
             self._checked = now
+
             if self._hung is None:
                 reader = threading.Thread(
                     target=self._read_again, args=(now,), name="keys", daemon=True
@@ -214,44 +225,46 @@ class Keys:
         block.
         """
         try:
-            if (state := self._changed()) == self._state:
+            state = self._changed()
+            if state == self._state:
                 return
             self._load(None if state is None else self._read())
         except Exception as error:  # noqa: BLE001 - neither the file's content nor a disk error may fail a request
             self._handle_unreadable(error, now)
             return
+
         self._state = state
         if self._unreadable is not None:
             logger.warning("the key file can be read again")
             self._unreadable = None
 
     def _handle_unreadable(self, error: Exception, now: float) -> None:
-        first = self._unreadable is None
-        since = self._unreadable = now if self._unreadable is None else self._unreadable
+        """Log that the file is unreadable, and refuse all keys if it has been so for `_CLOSE_S`."""
+        is_first = self._unreadable is None
+        if self._unreadable is None:
+            self._unreadable = now
         self._state = _UNREAD
-        left_s = _CLOSE_S - (now - since)
+
+        left_s = _CLOSE_S - (now - self._unreadable)
         if left_s <= 0 and self._keys:
             self._keys = {}
             logger.critical(
                 "all keys are refused: for %g s no key file could be read: %s", _CLOSE_S, error
             )
-        elif first or now - self._reminded >= _REMIND_S:
-            until = (
-                f"the keys stay as they were for {left_s:.0f} s more"
-                if left_s > 0
-                else "all keys are refused"
-            )
-            logger.error("the key file cannot be read; %s: %s", until, error)
+        elif is_first or now - self._reminded >= _REMIND_S:
+            if left_s > 0:
+                consequence = f"the keys stay as they were for {left_s:.0f} s more"
+            else:
+                consequence = "all keys are refused"
+            logger.error("the key file cannot be read; %s: %s", consequence, error)
         else:
             return
         self._reminded = now
 
     def _load(self, text: str | None) -> None:
-        self._keys = (
-            {}
-            if text is None
-            else {bytes.fromhex(key.sha256): key for key in parse_keys(text, self._where)}
-        )
+        """Replace the keys by those in the text of a key file; by none if there is no file."""
+        keys = [] if text is None else parse_keys(text, self._where)
+        self._keys = {bytes.fromhex(key.sha256): key for key in keys}
 
 
 @dataclass(frozen=True, slots=True)
@@ -310,7 +323,8 @@ class Caller:
 
     def require_unthrottled(self) -> None:
         """Raise `TooManyRequests` for a new connection while senders with this key are not read."""
-        if (wait_s := self.throttled_s()) > 0:
+        wait_s = self.throttled_s()
+        if wait_s > 0:
             self._keys.audit.refused(self.name, TooManyRequests.code)
             error = TooManyRequests(
                 f"key {self.name!r}: over its rate; connect again after {wait_s:.2g} s"
@@ -328,9 +342,9 @@ class Caller:
             self._keys.audit.refused(self.name, error.code)
             raise
 
-    def note(self, what: str, of: str) -> None:
-        """Log an action of the key, see `vlagents_ray.serve.access.audit`."""
-        self._keys.audit.did(self.name, what, of)
+    def note(self, event: str, subject: str) -> None:
+        """Log an action of the key, see `Audit.did`."""
+        self._keys.audit.did(self.name, event, subject)
 
     def _admit(self, free: bool, scope: str | None = None) -> None:
         key = self._keys.key(self._digest)
@@ -360,8 +374,9 @@ def load_keys(file: str | None = None, environment: Mapping[str, str] = os.envir
     In the environment, `VLAGENTS_RAY_KEYS_FILE` is the path of a key file, `VLAGENTS_RAY_KEYS` its
     text.
     """
-    if file or (file := environment.get(FILE_VARIABLE)):
-        return Keys.from_file(file)
+    path = file or environment.get(FILE_VARIABLE)
+    if path:
+        return Keys.from_file(path)
     text = environment.get(TEXT_VARIABLE)
     return Keys.from_text(text) if text else None
 
@@ -377,9 +392,15 @@ def token_of(headers: Mapping[str, str]) -> str | None:
     kind, _, token = headers.get("authorization", "").strip().partition(" ")
     if kind.lower() in ("bearer", "api-key") and token.strip():
         return token.strip()
-    offered = (one.strip() for one in headers.get("sec-websocket-protocol", "").split(","))
-    stated = (one.removeprefix(_KEY_PROTOCOL) for one in offered if one.startswith(_KEY_PROTOCOL))
-    return headers.get("x-api-key") or next(stated, None)
+
+    key = headers.get("x-api-key")
+    if key:
+        return key
+    for protocol in headers.get("sec-websocket-protocol", "").split(","):
+        name = protocol.strip()
+        if name.startswith(_KEY_PROTOCOL):
+            return name.removeprefix(_KEY_PROTOCOL)
+    return None
 
 
 # The sender of requests: the holder of a key, or the reason why none is needed.
@@ -424,9 +445,8 @@ def require_access(host: str, keys: Keys | None, insecure: bool) -> None:
         raise ConfigError(
             f"host {host}: any client that reaches this server could command the policy. Make keys "
             "(`vlagents-ray keys new NAME --keys keys.json`) and serve with `--keys keys.json` "
-            "(in a deployment file: "
-            f"`access: {{keys_file: PATH}}` under `args`); or use `--insecure` (`access: "
-            f"{{insecure: true}}`)"
+            "(in a deployment file: `access: {keys_file: PATH}` under `args`); or use "
+            "`--insecure` (`access: {insecure: true}`)"
         )
 
 
@@ -435,10 +455,9 @@ def require_watch_keys(host: str, keys: Keys | None) -> None:
     if keys is None and not is_loopback(host):
         raise ConfigError(
             f"live page on {host}: without keys all cameras would be public. Make a key "
-            "(`vlagents-ray keys new NAME "
-            "--scope watch --file keys.json`) and set VLAGENTS_RAY_KEYS_FILE=keys.json; or stay "
-            "on loopback, and look "
-            f"at it through `ssh -L`"
+            "(`vlagents-ray keys new NAME --scope watch --file keys.json`) and set "
+            "VLAGENTS_RAY_KEYS_FILE=keys.json; or stay on loopback, and look at it through "
+            "`ssh -L`"
         )
 
 
@@ -447,9 +466,8 @@ def warn_of_plain_http(host: str) -> None:
     if not is_loopback(host):
         logger.warning(
             "host %s: API keys cross the network unencrypted, where others may read them. Serve "
-            "with --tls-cert and "
-            "--tls-key, or state that TLS ends elsewhere, with --plain-http (`access: {plain_http: "
-            "true}`)",
+            "with --tls-cert and --tls-key, or state that TLS ends elsewhere, with --plain-http "
+            "(`access: {plain_http: true}`)",
             host,
         )
 
@@ -476,19 +494,16 @@ class ScopeCheck:
         elif self.open_to_network:
             raise Forbidden(
                 f"{self.subject}: not on a server with `--insecure`; make a key with `vlagents-ray "
-                "keys new "
-                f"NAME --scope {scope}` and serve with `--keys`, or serve on loopback without "
-                "`--insecure`"
+                f"keys new NAME --scope {scope}` and serve with `--keys`, or serve on loopback "
+                "without `--insecure`"
             )
 
     def may(self, scope: str) -> bool:
         """Return whether the current request has the scope, as `require` checks it."""
         caller = current_caller()
-        return (
-            caller.refusal(scope) is None
-            if isinstance(caller, Caller)
-            else not self.open_to_network
-        )
+        if isinstance(caller, Caller):
+            return caller.refusal(scope) is None
+        return not self.open_to_network
 
 
 def caller_name() -> str:

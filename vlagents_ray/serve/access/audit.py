@@ -47,44 +47,51 @@ class _StderrHandler(logging.StreamHandler):  # type: ignore[type-arg]  # Python
         super().emit(record)
 
 
-def log_pressed(name: str, what: str) -> None:
-    """Log every command of the key `name` to a session; an empty name means a server without
-    keys.
-    """
-    logger.info("key %s: pressed %s", name or "(none)", what)
+def log_pressed(name: str, command: str) -> None:
+    """Log a command of the key `name` to a session; an empty name means a server without keys."""
+    logger.info("key %s: pressed %s", name or "(none)", command)
 
 
 class Audit:
-    """Writes the audit log; thread-safe. Only names of known keys are passed, which bounds the
-    number of kinds.
+    """Writes the audit log; thread-safe.
+
+    Only names of known keys are passed, which bounds the number of kinds of events.
     """
 
     def __init__(self) -> None:
-        # By name and event: time of the last line, s, monotonic, and the number of events since
-        # then.
+        # Time of the last line, s, monotonic, and the number of events since then, by name and
+        # event.
         self._kinds: dict[tuple[str, str], tuple[float, int]] = {}
         self._lock = threading.Lock()
 
-    def did(self, name: str, what: str, of: str) -> None:
-        """Log that the key `name` did `what` ("let in by", "reset session"); `of` is the object
-        of this event.
+    def did(self, name: str, event: str, subject: str) -> None:
+        """Log an action of the key `name`.
+
+        Args:
+            name: The name of the key.
+            event: The kind of the action, such as "let in by" or "reset session".
+            subject: The subject of the action, such as the name of the session.
         """
-        if (more := self._due(name, what)) is not None:
-            logger.info("key %s: %s %s%s", name, what, of, more)
+        suffix = self._count(name, event)
+        if suffix is not None:
+            logger.info("key %s: %s %s%s", name, event, subject, suffix)
 
-    def refused(self, name: str, why: str) -> None:
+    def refused(self, name: str, reason: str) -> None:
         """Log that the key `name` was refused; an empty name means a missing or an unknown key."""
-        if (more := self._due(name, why)) is not None:
-            logger.warning("key %s: refused: %s%s", name or "(none)", why, more)
+        suffix = self._count(name, reason)
+        if suffix is not None:
+            logger.warning("key %s: refused: %s%s", name or "(none)", reason, suffix)
 
-    def _due(self, name: str, what: str) -> str | None:
-        """Return the suffix of the line to log, or None if such an event was logged within
+    def _count(self, name: str, event: str) -> str | None:
+        """Count an event; return the suffix of its line, or None if such an event was logged within
         `_EVERY_S`.
         """
         now = time.monotonic()
         with self._lock:
-            logged, left_out = self._kinds.get((name, what), (-math.inf, 0))
-            due = now - logged >= _EVERY_S
-            self._kinds[name, what] = (now, 0) if due else (logged, left_out + 1)
-        more = f" ({left_out} more like this since the last line)" if left_out else ""
-        return more if due else None
+            logged, omitted = self._kinds.get((name, event), (-math.inf, 0))
+            is_due = now - logged >= _EVERY_S
+            self._kinds[name, event] = (now, 0) if is_due else (logged, omitted + 1)
+
+        if not is_due:
+            return None
+        return f" ({omitted} more like this since the last line)" if omitted else ""

@@ -66,25 +66,19 @@ class Key:
             raise ConfigError(
                 f"key {self.name!r}: apps: got {self.apps!r}, want names of applications"
             )
-        for field, kinds in (
-            ("rate", (int, float)),
-            ("sessions", (int,)),
-            ("expires", (int, float)),
-        ):
-            value = getattr(self, field)
-            if value is not None and (
-                isinstance(value, bool) or not isinstance(value, kinds) or not 0 < value < 1e12
-            ):
-                raise ConfigError(
-                    f"key {self.name!r}: {field}: got {value!r}, want a positive number"
-                )
+
+        self._require_positive("rate", int, float)
+        self._require_positive("sessions", int)
+        self._require_positive("expires", int, float)
+
         if self.priority is not None and self.priority not in PRIORITIES:
             meant = did_you_mean(str(self.priority), PRIORITIES)
             raise ConfigError(
                 f"key {self.name!r}: priority: got {self.priority!r}, want one of "
                 f"{list(PRIORITIES)}{meant}"
             )
-        if unknown := sorted(map(str, set(self.scopes) - set(SCOPES))):
+        unknown = sorted(map(str, set(self.scopes) - set(SCOPES)))
+        if unknown:
             meant = "".join(did_you_mean(scope, SCOPES) for scope in unknown)
             raise ConfigError(
                 f"key {self.name!r}: scopes: got {unknown}, want some of {list(SCOPES)}{meant}"
@@ -93,6 +87,15 @@ class Key:
             raise ConfigError(
                 f"key {self.name!r}: revoked: got {self.revoked!r}, want true or false"
             )
+
+    def _require_positive(self, field: str, *types: type) -> None:
+        """Raise `ConfigError` unless a field is None or a positive number of one of the types."""
+        value = getattr(self, field)
+        if value is None:
+            return
+        is_number = isinstance(value, types) and not isinstance(value, bool)
+        if not is_number or not 0 < value < 1e12:
+            raise ConfigError(f"key {self.name!r}: {field}: got {value!r}, want a positive number")
 
 
 def parse_keys(text: str, where: str = "keys") -> list[Key]:
@@ -110,9 +113,11 @@ def parse_keys(text: str, where: str = "keys") -> list[Key]:
         ) from error
     if not isinstance(entries, list):
         raise ConfigError(f"keys: got {type(entries).__name__}, want a list")
+
     keys = [_parse(entry) for entry in entries]
     names = [key.name for key in keys]
-    if double := sorted({name for name in names if names.count(name) > 1}):
+    double = sorted({name for name in names if names.count(name) > 1})
+    if double:
         raise ConfigError(
             f"keys: {double} stand there more than once; each needs a name of its own"
         )
@@ -124,19 +129,24 @@ def _parse(entry: Any) -> Key:
         raise ConfigError(
             f"keys: got {shown(entry)}, want an object with 'name' and 'sha256' at least"
         )
+
     known = {field.name for field in fields(Key)}
-    if unknown := entry.keys() - known:
+    unknown = entry.keys() - known
+    if unknown:
         meant = "".join(did_you_mean(field, known) for field in unknown)
         raise ConfigError(
             f"key {entry['name']!r}: unknown {sorted(unknown)}, want some of {sorted(known)}{meant}"
         )
-    lists = {field: entry.get(field) or [] for field in ("apps", "scopes")}
-    for field, values in lists.items():
-        if not isinstance(values, list) or not all(isinstance(value, str) for value in values):
+
+    values = dict(entry)
+    for field in ("apps", "scopes"):
+        names = entry.get(field) or []
+        if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
             raise ConfigError(
-                f"key {entry['name']!r}: {field}: got {values!r}, want a list of names"
+                f"key {entry['name']!r}: {field}: got {names!r}, want a list of names"
             )
-    return Key(**{**entry, **{field: tuple(values) for field, values in lists.items()}})
+        values[field] = tuple(names)
+    return Key(**values)
 
 
 def read_text(file: Path) -> str:
@@ -185,6 +195,7 @@ def new_key(file: Path, name: str, **allowed: Any) -> str:
     key = Key(name, hashlib.sha256(token.encode()).hexdigest(), **allowed)
 
     def add(keys: list[Key]) -> list[Key]:
+        """Return the keys with the new one in place of a revoked one of the same name."""
         if any(other.name == name and not other.revoked for other in keys):
             raise ConfigError(
                 f"key {name!r} is there already; choose another name, or revoke it first"
@@ -201,6 +212,7 @@ def revoke(file: Path, name: str) -> None:
     """
 
     def mark(keys: list[Key]) -> list[Key]:
+        """Return the keys, of which the one with that name is revoked."""
         if all(key.name != name for key in keys):
             have = sorted(key.name for key in keys)
             raise ConfigError(
@@ -220,15 +232,12 @@ def _change(file: Path, change: Callable[[list[Key]], list[Key]]) -> None:
     """
     with _locked(file) as folder:
         keys = change(read_keys(file))
-        stated = [
-            {name: value for name, value in asdict(key).items() if value not in (None, (), False)}
-            for key in keys
-        ]
-        text = json.dumps({"keys": stated}, indent=2) + "\n"
+        text = json.dumps({"keys": [_to_json(key) for key in keys]}, indent=2) + "\n"
+
         descriptor, name = tempfile.mkstemp(dir=file.parent, prefix=f".{file.name}.")
         try:
             with os.fdopen(descriptor, "w", encoding="utf-8") as written:
-                _belong(descriptor, file)
+                _copy_owner(descriptor, file)
                 written.write(text)
                 written.flush()
                 os.fsync(descriptor)
@@ -239,7 +248,12 @@ def _change(file: Path, change: Callable[[list[Key]], list[Key]]) -> None:
         os.fsync(folder)  # so that a revocation survives a power failure
 
 
-def _belong(descriptor: int, file: Path) -> None:
+def _to_json(key: Key) -> dict[str, Any]:
+    """Return the fields of a key that differ from their defaults."""
+    return {name: value for name, value in asdict(key).items() if value not in (None, (), False)}
+
+
+def _copy_owner(descriptor: int, file: Path) -> None:
     """Give the open file `descriptor` the owner, group and mode of `file`, which it is about to
     replace.
     """
@@ -256,8 +270,8 @@ def _belong(descriptor: int, file: Path) -> None:
     except OSError as error:
         raise ConfigError(
             f"keys file {file}: is user {old.st_uid}'s (group {old.st_gid}), which a new one "
-            "cannot be made "
-            f"({error.strerror}); nothing was changed: run this as that user, or as root"
+            f"cannot be made ({error.strerror}); nothing was changed: run this as that user, or as "
+            "root"
         ) from error
 
 

@@ -33,19 +33,18 @@ def require_own_page(headers: Mapping[str, str], hosts: Collection[str] = ()) ->
     Names of `headers` are in lower case, as are `hosts`, further host names of this server, without
     a port.
     """
-    origin, host = headers.get("origin"), headers.get("host")
-    if origin is not None and not _is_own(origin, host):
+    origin = headers.get("origin")
+    host = headers.get("host")
+    if origin is not None and not _is_page_of(host, origin):
         raise Forbidden(
             f"origin {origin[:100]!r}: a page of another site reaches no robot, not even with a "
-            "key; let the program "
-            f"behind that page send the request"
+            "key; let the program behind that page send the request"
         )
-    if host is not None and not _is_ours(host, hosts):
+    if host is not None and not _is_name_of_server(host, hosts):
         raise Forbidden(
             f"host {host[:100]!r}: a name that could be another site's, which has it lead here; if "
-            "it is the server's, "
-            f"state it under `access: {{hosts: [...]}}`, use the server's address, or serve with "
-            "keys"
+            "it is the server's, state it under `access: {hosts: [...]}`, use the server's "
+            "address, or serve with keys"
         )
 
 
@@ -56,13 +55,15 @@ def require_same_origin(headers: Mapping[str, str]) -> None:
     Raises:
         Forbidden: The browser reports that another site's page sent the request.
     """
-    if (site := headers.get("sec-fetch-site", "none")) not in ("same-origin", "none"):
+    site = headers.get("sec-fetch-site", "none")
+    if site not in ("same-origin", "none"):
         raise Forbidden(
             f"sec-fetch-site: got {site[:40]!r}, want 'same-origin'; open the live page itself"
         )
 
 
-def _is_own(origin: str, host: str | None) -> bool:
+def _is_page_of(host: str | None, origin: str) -> bool:
+    """Return whether the page is at the address `host` of this server, which is no DNS name."""
     try:
         parts = urlsplit(origin)
     except ValueError:  # the origin is not a URL
@@ -70,11 +71,12 @@ def _is_own(origin: str, host: str | None) -> bool:
     return parts.netloc == host and parts.hostname is not None and _is_address(parts.hostname)
 
 
-def _is_ours(host: str, hosts: Collection[str]) -> bool:
+def _is_name_of_server(host: str, hosts: Collection[str]) -> bool:
+    """Return whether the name in a `host` header belongs to this server, or to no other site."""
     if len(host) > _LONGEST:
         return False
-    name, ours = _name_of(host)
-    return ours or name in hosts or name == _here()
+    name, is_private = _name_of(host)
+    return is_private or name in hosts or name == _machine_name()
 
 
 @lru_cache(maxsize=64)  # every request of a robot has the same header
@@ -98,5 +100,5 @@ def _is_address(name: str) -> bool:
 
 
 @cache
-def _here() -> str:
+def _machine_name() -> str:
     return socket.gethostname().lower()

@@ -1,5 +1,5 @@
 """Access control of a replica's HTTP paths and WebSockets: API keys, time limits for slow clients,
-and their end.
+and the end of connections.
 
 The middleware wraps an ASGI application, so that all of its paths, including the dialects, are
 protected in the same way. Some paths require no key: `/healthz` reports only whether the policy is
@@ -27,7 +27,11 @@ from vlagents_ray.errors import MalformedMessage, PolicyUnavailable, Unauthorize
 from vlagents_ray.protocol.messages import REQUEST_ID_HEADER
 from vlagents_ray.serve.access.api_keys import Caller, Identity, Keys, NoKey, on_behalf_of, token_of
 from vlagents_ray.serve.access.origin_check import require_own_page
-from vlagents_ray.serve.endpoints.http_messages import headers_of, named, problem_response
+from vlagents_ray.serve.endpoints.http_messages import (
+    headers_of,
+    problem_response,
+    valid_request_id,
+)
 from vlagents_ray.serve.endpoints.incoming_frames import SCOPE_KEY, IncomingFrames
 from vlagents_ray.serve.engine.admission import Admission
 from vlagents_ray.serve.engine.pauses import note_connection
@@ -88,6 +92,7 @@ class AccessMiddleware:
 
         Args:
             keys: The server's keys; None if it has none.
+            name: The name of the application, for which a key must be valid.
             slow_s: Maximum time that a request may take to arrive, or a WebSocket's client to
                 accept a message, s.
             idle_s: Maximum time that a WebSocket may be silent, s.
@@ -97,9 +102,15 @@ class AccessMiddleware:
             shutdown: The end of the replica; by default it has none.
             public: The paths of pages without data, which need no key.
         """
-        self._admission, self._shutdown = admission, shutdown or Shutdown()
-        self._app, self._keys, self._name = app, keys, name
-        self._hosts, self._slow_s, self._idle_s = hosts, slow_s, idle_s
+        self._app = app
+        self._keys = keys
+        self._name = name
+
+        self._slow_s = slow_s
+        self._idle_s = idle_s
+        self._hosts = hosts
+        self._admission = admission
+        self._shutdown = shutdown or Shutdown()
         self._public = frozenset({_HEALTH, *public})
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
@@ -107,9 +118,11 @@ class AccessMiddleware:
         if scope["type"] not in ("http", "websocket"):
             await self._app(scope, receive, send)
             return
+
         headers = headers_of(scope)
         if scope["type"] == "http":
             note_connection(scope)
+
         caller: Identity = NoKey.OPEN
         try:
             if _is_page(scope, self._public):
@@ -119,8 +132,9 @@ class AccessMiddleware:
                 require_own_page(headers, self._hosts)
             else:
                 key = caller = self._keys.check(token_of(headers), self._name)
-                # Bounds how often the key's requests are refused.
-                if (wait_s := key.throttled_s()) > 0:
+                # The wait bounds how often the key's requests are refused.
+                wait_s = key.throttled_s()
+                if wait_s > 0:
                     await asyncio.sleep(wait_s)
                     key.require_unthrottled()
                 if scope["type"] == "http":
@@ -129,8 +143,10 @@ class AccessMiddleware:
                     key.hold()
                 key.note("let in by", scope["type"])
         except VLAgentsError as error:
-            await _refuse(error, named(headers.get(REQUEST_ID_HEADER, "")), scope, receive, send)
+            request_id = valid_request_id(headers.get(REQUEST_ID_HEADER, ""))
+            await _refuse(error, request_id, scope, receive, send)
             return
+
         with on_behalf_of(caller):
             if scope["type"] == "websocket":
                 try:
@@ -149,6 +165,7 @@ class AccessMiddleware:
         frames: IncomingFrames | None = scope.get(SCOPE_KEY)
         if frames is not None:
             frames.supervise(caller, self._admission)
+
         socket = _TimedWebSocket(
             caller, self._slow_s, self._idle_s, receive, send, frames, self._shutdown
         )
@@ -162,13 +179,11 @@ def _is_page(scope: Scope, public: Collection[str]) -> bool:
     return scope["type"] == "http" and scope["method"] in ("GET", "HEAD") and path in public
 
 
-def _has_body(scope: Scope, most: int = 0) -> bool:
-    """Return whether a body of more than `most` bytes, or of unstated length, follows the
-    headers.
-    """
+def _has_body(scope: Scope, max_bytes: int = 0) -> bool:
+    """Return whether a body of more than `max_bytes`, or of unknown length, follows the headers."""
     headers = headers_of(scope)
-    stated = headers.get("content-length", "0")
-    return "transfer-encoding" in headers or not stated.isdecimal() or int(stated) > most
+    length = headers.get("content-length", "0")
+    return "transfer-encoding" in headers or not length.isdecimal() or int(length) > max_bytes
 
 
 async def _refuse(
@@ -179,12 +194,14 @@ async def _refuse(
         answer.headers["www-authenticate"] = 'Bearer realm="vlagents_ray"'
     if scope["type"] == "http" and _has_body(scope, _DROPPED_BYTES):
         answer.headers["connection"] = "close"  # the body is not read, not even to discard it
+
     if scope["type"] == "websocket":
         await receive()  # the "websocket.connect" message
         if "websocket.http.response" not in scope.get("extensions", {}):
-            # Before acceptance it means HTTP 403.
+            # Before acceptance, a close message means HTTP 403.
             await send({"type": "websocket.close", "code": _POLICY_VIOLATION})
             return
+
     await answer(scope, receive, send)
 
 
@@ -194,13 +211,17 @@ async def _run_upload(
     """Serve an HTTP request whose body must arrive within `slow_s`, and before the replica
     stops.
     """
-    task, loop = asyncio.current_task(), asyncio.get_running_loop()
+    task = asyncio.current_task()
+    loop = asyncio.get_running_loop()
     begun = loop.time()
     refusal: Response | None = None
     timer: asyncio.TimerHandle
     answering = False
 
     def check_time() -> None:
+        """Cancel the application if the body is late or the replica stops; otherwise check
+        again later.
+        """
         nonlocal refusal, timer
         waited_s = loop.time() - begun
         if waited_s > slow_s:
@@ -218,7 +239,8 @@ async def _run_upload(
 
     timer = loop.call_later(min(_TICK_S, slow_s), check_time)
 
-    async def timed() -> Message:
+    async def receive_in_time() -> Message:
+        """Receive a message of the body; the last one ends the time limit."""
         _cancel_again(refusal is not None)
         message = await receive()
         if message["type"] == "http.disconnect" or not message.get("more_body", False):
@@ -226,13 +248,14 @@ async def _run_upload(
         return message
 
     async def answer(message: Message) -> None:
+        """Send a message of the answer, which ends the time limit."""
         nonlocal answering
         timer.cancel()  # the rest of the body is no longer awaited
         answering = True
         await send(message)
 
     try:
-        await app(scope, timed, answer)
+        await app(scope, receive_in_time, answer)
     except asyncio.CancelledError:
         if refusal is None or answering:
             raise
@@ -262,10 +285,15 @@ class _TimedWebSocket:
         frames: IncomingFrames | None,
         shutdown: Shutdown,
     ) -> None:
-        self._frames, self._shutdown = frames, shutdown
-        self._caller, self._slow_s, self._idle_s = caller, slow_s, idle_s
-        self._receive, self._send = receive, send
+        self._caller = caller
+        self._slow_s = slow_s
+        self._idle_s = idle_s
+        self._receive = receive
+        self._send = send
+        self._frames = frames
+        self._shutdown = shutdown
         self._loop = asyncio.get_running_loop()
+
         self._messages: asyncio.Queue[Message | Exception] = asyncio.Queue()  # read ahead
         # Start of the wait for the next message, s; None if there is no wait.
         self._silent_since: float | None = None
@@ -277,6 +305,7 @@ class _TimedWebSocket:
         self._is_closed = False  # whether either side has closed the WebSocket
 
     async def run(self, app: ASGIApp, scope: Scope) -> None:
+        """Run the application until it returns or the WebSocket has to end."""
         task = asyncio.current_task()
 
         def cancel() -> None:
@@ -285,9 +314,11 @@ class _TimedWebSocket:
                 task.cancel()
 
         def tick() -> None:
-            # first, so that an error below cannot stop the checks.
+            """End the WebSocket if that is due, and schedule the next check."""
+            # The next check is scheduled first, so that an error below cannot stop the checks.
             self._timer = self._loop.call_later(_TICK_S, tick)
-            if (cause := self._close_cause()) is not None:
+            cause = self._close_cause()
+            if cause is not None:
                 self._end = cause
                 self._timer.cancel()
                 cancel()
@@ -308,6 +339,7 @@ class _TimedWebSocket:
         finally:
             self._timer.cancel()
             reading.cancel()
+
         if self._end is not None and not self._is_closed:
             await self._close(*self._end)
 
@@ -318,7 +350,8 @@ class _TimedWebSocket:
             closing = self._frames.end(code, reason)
         else:
             closing = self._send({"type": "websocket.close", "code": code, "reason": reason[:120]})
-        # The client does not read, or closed the connection.
+
+        # These errors mean that the client does not read, or has closed the connection.
         with suppress(asyncio.TimeoutError, RuntimeError):
             await asyncio.wait_for(closing, _TICK_S)
 
@@ -341,6 +374,7 @@ class _TimedWebSocket:
         self._silent_since = self._loop.time()
         message = await self._messages.get()
         self._silent_since = None
+
         if isinstance(message, Exception):
             raise message
         if self._frames is not None and message["type"] == "websocket.receive":
@@ -368,9 +402,8 @@ class _TimedWebSocket:
             return _POLICY_VIOLATION, f"a message took longer than {self._slow_s:g} s"
         if self._silent_s() > self._idle_s:
             return _GOING_AWAY, "silent for too long"
-        if isinstance(self._caller, Caller) and (reason := self._caller.refusal()) is not None:
-            return _POLICY_VIOLATION, reason
-        return None
+        refusal = self._caller.refusal() if isinstance(self._caller, Caller) else None
+        return None if refusal is None else (_POLICY_VIOLATION, refusal)
 
 
 def _cancel_again(over: bool) -> None:

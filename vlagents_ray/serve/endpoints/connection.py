@@ -1,5 +1,5 @@
-"""Servers and connections that are read by the thread of the batch queue: shared memory, plasma,
-own WebSockets.
+"""Servers and connections that the thread of the batch queue reads: shared memory, plasma, and
+WebSockets at a replica's own port.
 
 That thread accepts clients, reads and decodes their messages, and submits the requests, so that a
 request needs no thread switch; while a batch runs for milliseconds, another thread does this
@@ -90,12 +90,14 @@ class PolledConnection(ABC):
     """One connection of a client; its sessions end with it."""
 
     def __init__(self, server: PolledServer[Any], connection: socket.socket) -> None:
-        self._engine, self._poller = server.engine, server.engine.queue.poller
+        self._engine = server.engine
+        self._poller = server.engine.queue.poller
         self._remove = server.remove
         self._name = server.name
         self._connection = connection
+
         self.caller: Identity | None = None  # None until the client has sent its key
-        self._sender: Sender | None = None  # None until then as well
+        self._sender: Sender | None = None  # None until the client has sent its key
         # Guards sending: other threads send answers, or end the connection.
         self._sending = threading.Lock()
         self._ended = False
@@ -129,8 +131,9 @@ class PolledConnection(ABC):
             self._poller.watch(self._connection, self.ready)
 
     def ready(self) -> None:
-        """Read the connection; the batch queue calls this. As `_run`, with one call less for
-        each message.
+        """Read the connection; the batch queue calls this.
+
+        It handles errors as `_run` does, with one call less for each message.
         """
         try:
             self._read()
@@ -164,16 +167,19 @@ class PolledConnection(ABC):
             self._poller.unwatch(self._connection)
 
     def _resume(self, reason: str) -> None:
+        """End the pause for this reason; poll the connection again if no other reason is left."""
         self._unpolled_for.discard(reason)
         self._continue()
 
-    def _is_throttled(self) -> bool:
-        """Return whether the client's key is over its rate; if so, schedule the next reading of
-        the connection.
-        """
+    def _throttle(self) -> bool:
+        """Pause the connection while the client's key is over its rate; return whether it is."""
         if THROTTLED in self._unpolled_for:
             return True
-        if self._ended or self._sender is None or (wait_s := self._sender.throttled_s()) <= 0:
+        if self._ended or self._sender is None:
+            return False
+
+        wait_s = self._sender.throttled_s()
+        if wait_s <= 0:
             return False
         self._pause(THROTTLED)
         self._call_later(wait_s, self._unthrottle)
@@ -181,19 +187,20 @@ class PolledConnection(ABC):
 
     def _unthrottle(self) -> None:
         """Read the connection again, unless it has ended or its key has exceeded the rate again."""
-        if self._may_read_again():
+        if self._end_throttling():
             self._continue()
 
-    def _may_read_again(self) -> bool:
-        """Return whether a pause for the rate of the key is over; disconnect a client that has hung
-        up.
+    def _end_throttling(self) -> bool:
+        """End the pause for the rate of the key; return False if the connection has ended, or the
+        key is over its rate again.
 
-        Its unread messages would be refused one by one, which delays the key's other connections.
+        A client that has hung up is disconnected: its unread messages would be refused one by one,
+        which would delay the key's other connections.
         """
         self._unpolled_for.discard(THROTTLED)
         if not self._ended and _has_hung_up(self._connection):
             self.disconnect()
-        return not self._ended and not self._is_throttled()
+        return not self._ended and not self._throttle()
 
     def _decode(
         self,
@@ -288,7 +295,7 @@ class PolledConnection(ABC):
 C = TypeVar("C", bound=PolledConnection)
 
 
-def _descriptor() -> BinaryIO:
+def _spare_descriptor() -> BinaryIO:
     return Path(os.devnull).open("rb")
 
 
@@ -307,13 +314,15 @@ class PolledServer(ABC, Generic[C]):
     def __init__(
         self, engine: Engine, limits: MessageLimits, admit: Admit | NoKey, listener: socket.socket
     ) -> None:
-        self.engine, self.limits, self.admit = engine, limits, admit
+        self.engine = engine
+        self.limits = limits
+        self.admit = admit
         self._clients: set[C] = set()
         self._listener = listener
         self._accepting = TokenBucket(_ACCEPTED_PER_S, time.monotonic())
         # Without a free descriptor a client could not even be refused, and the listener would stay
         # readable.
-        self._spare = _descriptor()
+        self._spare = _spare_descriptor()
 
     @abstractmethod
     def _add_client(self, connection: socket.socket) -> None:
@@ -329,10 +338,12 @@ class PolledServer(ABC, Generic[C]):
         each_half_second.remove(self.close_overdue)
         self._listener.close()
         self._spare.close()
+
         clients = list(self._clients)
         reason = "the replica is stopping; connect again"
         for client in clients:
             client.announce_end(reason, _SERVICE_RESTART)
+
         until = time.monotonic() + ANSWERS_S
         for client in clients:
             client.wait_answered(until)
@@ -340,18 +351,20 @@ class PolledServer(ABC, Generic[C]):
             client.release()
 
     def accept(self) -> None:
-        """Accept one client; errors (an aborted connection, EMFILE) never stop the listener, which
-        is readable.
+        """Accept one client; the listener is readable.
 
-        Clients above the rate of `_ACCEPTED_PER_S` wait in the listener's backlog. Connections that
-        their clients have ended do not count: those of one client would fill the backlog, and
-        delay the connections of others by seconds.
+        Errors, such as an aborted connection or EMFILE, never stop the listener. Clients above the
+        rate of `_ACCEPTED_PER_S` wait in the listener's backlog. Connections that their clients
+        have ended do not count: those of one client would fill the backlog, and delay the
+        connections of others by seconds.
         """
-        if (wait_s := self._accepting.take(time.monotonic())) > 0:
+        wait_s = self._accepting.take(time.monotonic())
+        if wait_s > 0:
             poller = self.engine.queue.poller
             poller.unwatch(self._listener)
             poller.call_later(wait_s, self._listen_again)
             return
+
         try:
             connection = accept_open(self._listener)
         except OSError as error:
@@ -361,11 +374,12 @@ class PolledServer(ABC, Generic[C]):
                 self._spare.close()
                 with contextlib.suppress(OSError):
                     self._listener.accept()[0].close()
-                self._spare = _descriptor()
+                self._spare = _spare_descriptor()
             return
         if connection is None:
             self._accepting.give_back()
             return
+
         try:
             connection.setblocking(False)
             self._add_client(connection)
@@ -383,8 +397,10 @@ class PolledServer(ABC, Generic[C]):
         now = time.monotonic()
         refusal = cache(Caller.refusal)  # evaluated once for all connections of a key
         for client in list(self._clients):
-            if (cause := client.overdue(now, refusal)) is not None:
-                client.end(*cause)
+            cause = client.overdue(now, refusal)
+            if cause is not None:
+                reason, code = cause
+                client.end(reason, code)
 
     def remove(self, client: C) -> None:
         """Remove a client whose connection is closed."""
@@ -397,12 +413,11 @@ class PolledServer(ABC, Generic[C]):
         self._clients.add(client)
 
 
-# The time that a message has waited in its socket, which may be seconds if the reading thread is
-# busy.
-
-
 def enable_timestamps(connection: socket.socket) -> None:
-    """Let the kernel record when messages arrive, if it supports that for this kind of socket."""
+    """Let the kernel record when messages arrive, if it supports that for this kind of socket.
+
+    A message may wait in its socket for seconds if the reading thread is busy.
+    """
     with contextlib.suppress(OSError):
         connection.setsockopt(socket.SOL_SOCKET, _TIMESTAMP, 1)
 

@@ -88,22 +88,21 @@ _TIMING = """\
 
 def docs_page(metadata: dict[str, Any]) -> str:
     """Return the page as HTML, from the document of `GET /v1/metadata`, in which dialects and
-    parts have entries.
+    replica parts have entries.
     """
     policy = html.escape(str(metadata["policy"]))
-    dialects = "".join(
-        (
-            f"`{', '.join(one.get('paths') or [one['address']])}`\n    Clients of "
-            f"{one['clients']}. "
-            f"{one['summary']}\n"
-        )
-        for one in (metadata.get("dialects") or {}).values()
-    )
+
+    dialects = ""
+    for dialect in (metadata.get("dialects") or {}).values():
+        addresses = ", ".join(dialect.get("paths") or [dialect["address"]])
+        dialects += f"`{addresses}`\n    Clients of {dialect['clients']}. {dialect['summary']}\n"
+
     parts = "".join(map(_entry_of_part, (metadata.get("parts") or {}).values()))
-    errors = "".join(
-        f"{cls.status} `{code}`\n    {summary_of(cls)}\n"
-        for code, cls in sorted(BY_CODE.items(), key=lambda item: (item[1].status, item[0]))
-    )
+
+    errors = ""
+    for code, error in sorted(BY_CODE.items(), key=lambda item: (item[1].status, item[0])):
+        errors += f"{error.status} `{code}`\n    {summary_of(error)}\n"
+
     return f"""<!doctype html><html lang="en"><head><meta charset="utf-8">
 <meta name="viewport" content="width=device-width"><title>vlagents_ray: {policy}</title>
 <style>{STYLE}</style></head><body>
@@ -146,6 +145,5 @@ def _entry_of_part(facts: Mapping[str, Any]) -> str:
 def _entries(text: str) -> str:
     """Return a list of entries as HTML, from plain text with `code` in backquotes."""
     marked = re.sub(r"`([^`]+)`", r"<code>\1</code>", html.escape(text))
-    return (
-        "<dl>" + re.sub(r"(\S.*)\n((?: {4}.*\n)*)", r"<dt>\1</dt>\n<dd>\2</dd>\n", marked) + "</dl>"
-    )
+    entries = re.sub(r"(\S.*)\n((?: {4}.*\n)*)", r"<dt>\1</dt>\n<dd>\2</dd>\n", marked)
+    return f"<dl>{entries}</dl>"

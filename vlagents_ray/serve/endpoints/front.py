@@ -63,11 +63,13 @@ class FrontMiddleware:
                 )
                 await refused(scope, receive, send)
                 return
+
         if scope["type"] != "websocket":
             await self._app(scope, receive, send)
             return
 
-        async def received() -> Message:
+        async def receive_and_drain() -> Message:
+            """Receive a message; begin to discard bytes if the client's message was too large."""
             message = await receive()
             if (
                 message["type"] == "websocket.disconnect"
@@ -76,13 +78,14 @@ class FrontMiddleware:
                 self._drain(receive)
             return message
 
-        async def sent(message: Message) -> None:
+        async def send_and_open(message: Message) -> None:
+            """Send a message; begin to read frames once the WebSocket is accepted."""
             await send(message)
             if frames is not None and message["type"] == "websocket.accept":
                 frames.open()
 
         frames = IncomingFrames.attach(receive, partial(self._drain, receive))
-        await self._app({**scope, SCOPE_KEY: frames}, received, sent)
+        await self._app({**scope, SCOPE_KEY: frames}, receive_and_drain, send_and_open)
 
     def _drain(self, receive: Receive) -> None:
         """Discard incoming bytes, since closing a socket with unread bytes resets the connection.
@@ -95,6 +98,7 @@ class FrontMiddleware:
         connection = None if transport is None else transport.get_extra_info("socket")
         if connection is None or connection.fileno() < 0:
             return
+
         duplicate = socket.socket(fileno=os.dup(connection.fileno()))
         task = asyncio.get_running_loop().create_task(self._discarder.discard(duplicate))
         self._draining.add(task)  # the loop holds only weak references to tasks
@@ -110,17 +114,20 @@ class _Discarder:
 
     async def discard(self, connection: socket.socket) -> None:
         """Discard until the client has closed the connection, or a limit is reached; close it."""
-        loop, end, left = asyncio.get_running_loop(), time.monotonic() + _DRAINED_S, _DRAINED_BYTES
+        loop = asyncio.get_running_loop()
+        deadline = time.monotonic() + _DRAINED_S
+        bytes_left = _DRAINED_BYTES
         connection.setblocking(False)
         buffer = bytearray(_READ_BYTES)
+
         await asyncio.sleep(0)  # by then uvicorn has stopped reading, and has sent the close code
         with connection, contextlib.suppress(OSError, asyncio.TimeoutError):
             connection.shutdown(socket.SHUT_WR)
-            while left > 0 and (wait_s := end - time.monotonic()) > 0:
+            while bytes_left > 0 and (wait_s := deadline - time.monotonic()) > 0:
                 count = await asyncio.wait_for(loop.sock_recv_into(connection, buffer), wait_s)
                 if not count:
                     return
-                left -= count
+                bytes_left -= count
                 await self._wait_for_rate(count)
 
     async def _wait_for_rate(self, count: int) -> None:

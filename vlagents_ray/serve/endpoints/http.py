@@ -1,7 +1,7 @@
 """The HTTP endpoint: HTTP and WebSocket on one port, as an ASGI application over an engine.
 
     POST /v1/reset, /v1/act, /v1/close   multipart/form-data, application/json, or one binary frame
-    WS   /v1/stream                      sessions that end with the connection; frames or probes
+    WS   /v1/stream                      binary frames or probes; sessions end with the connection
     GET  /healthz, /v1/metadata, /docs
 
 Errors over HTTP are problem+json with a stable code; over WebSocket they are reply frames.
@@ -61,6 +61,7 @@ def build_http_app(
             `vlagents_ray.serve.replica.part`.
     """
     server = _HttpEndpoint(engine, metadata, limits, machine_metadata)
+
     app = Starlette(
         routes=[
             *(Route(f"/v1/{op}", server.endpoint(op), methods=["POST"]) for op in messages.OPS),
@@ -76,7 +77,7 @@ def build_http_app(
         },
     )
     app.router.redirect_slashes = False  # many clients drop the body of a redirected POST
-    app.router.default = partial(_no_such_path, app.router.default)
+    app.router.default = partial(_refuse_path, app.router.default)
     return app
 
 
@@ -97,18 +98,22 @@ class _HttpEndpoint:
             ready = False
         if ready:
             return PlainTextResponse("OK\n")
+
         step = self.engine.models.step
-        loading = f"the policy is loading{step and f' ({step})'}"
+        suffix = f" ({step})" if step else ""
+        loading = f"the policy is loading{suffix}"
         unready = PolicyUnavailable(f"{loading}, or did not load; GET /v1/metadata says which")
         return http_messages.problem_response(unready, http_messages.request_id(http))
 
     async def show_metadata(self, http: HttpRequest) -> Response:
+        """Reply with the metadata, or with those for a caller on the machine that it names."""
         machine = http.headers.get(messages.MACHINE_HEADER)
         if machine and self.machine_metadata is not None and self.engine.ready:
             return JSONResponse(plain_values(await self.machine_metadata(machine)))
         return self._when_ready(http, lambda: JSONResponse(plain_values(self.metadata())))
 
     async def docs(self, http: HttpRequest) -> Response:
+        """Reply with the page that describes this server to its clients."""
         return self._when_ready(
             http, lambda: http_messages.html_response(docs_page(self.metadata()), styles=[STYLE])
         )
@@ -124,8 +129,10 @@ class _HttpEndpoint:
         """Return the handler of `POST /v1/<op>`."""
 
         async def handle(http: HttpRequest) -> Response:
+            """Decode the requests of the body, submit them, and reply with the answers."""
             incoming = IncomingMessage(self.engine.stats, "http", op)
-            name, headers = http_messages.request_id(http), http_messages.headers_of(http.scope)
+            request_id = http_messages.request_id(http)
+            headers = http_messages.headers_of(http.scope)
             try:
                 session_id = http_messages.session_id(http)
                 sender = Sender(
@@ -134,28 +141,33 @@ class _HttpEndpoint:
                 admission = sender.admission(
                     self.limits, priority=headers.get(messages.PRIORITY_HEADER, "robot")
                 )
+
                 decoded = await http_messages.read_requests(
-                    op, _timed(http, incoming), admission, name
+                    op, _timed(http, incoming), admission, request_id
                 )
                 incoming.decoded(decoded)
                 if decoded.requests:
-                    name = decoded.requests[0].request_id
+                    request_id = decoded.requests[0].request_id
+
                 replies = await sender.ask(incoming, decoded, admission)
-                if len(replies) == 1 and (error := replies[0].error) is not None:
+                error = replies[0].error if len(replies) == 1 else None
+                if error is not None:
                     raise error
                 if CONTENT_TYPE in headers.get("accept", "") or len(replies) > 1:
                     return Response(incoming.frame(), media_type=CONTENT_TYPE)
-                step = (
-                    {} if replies[0].step is None else {messages.STEP_HEADER: str(replies[0].step)}
+
+                step = replies[0].step
+                step_header = {} if step is None else {messages.STEP_HEADER: str(step)}
+                return Response(
+                    incoming.document(), headers=step_header, media_type="application/json"
                 )
-                return Response(incoming.document(), headers=step, media_type="application/json")
             except ClientDisconnect:
                 incoming.record_failure("disconnected")
                 return Response(status_code=499)
-            except Exception as error:  # noqa: BLE001 - the error is the reply to the client
-                problem = http_messages.public_problem(error, op, name)
+            except Exception as failure:  # noqa: BLE001 - the error is the reply to the client
+                problem = http_messages.public_problem(failure, op, request_id)
                 incoming.record_failure(problem.code)
-                return http_messages.problem_response(problem, name)
+                return http_messages.problem_response(problem, request_id)
 
         return handle
 
@@ -170,6 +182,7 @@ class _HttpEndpoint:
             await socket.send_bytes(encode_replies([messages.Reply(error=full)]))
             await socket.close(_TRY_AGAIN_LATER, str(full)[:120])
             return
+
         try:
             while not sender.refused_too_often:
                 await sender.wait_unthrottled()
@@ -193,6 +206,7 @@ class _HttpEndpoint:
                 return messages.probe_answer(len(frame))
             except VLAgentsError as error:
                 return encode_replies([messages.Reply(error=error)])
+
         incoming = sender.message()
         admission = sender.admission(self.limits, 0 if frame is None else len(frame))
         try:
@@ -203,8 +217,9 @@ class _HttpEndpoint:
             incoming.decoded(decoded)
             await sender.ask(incoming, decoded, admission)
         except Exception as error:  # noqa: BLE001 - the error is the reply to the client
-            name = "" if isinstance(error, VLAgentsError) else uuid.uuid4().hex
-            incoming.refuse(http_messages.public_problem(error, "stream", name), name)
+            request_id = "" if isinstance(error, VLAgentsError) else uuid.uuid4().hex
+            problem = http_messages.public_problem(error, "stream", request_id)
+            incoming.refuse(problem, request_id)
         return incoming.frame()
 
 
@@ -221,14 +236,14 @@ def _timed(http: HttpRequest, incoming: IncomingMessage) -> HttpRequest:
     return HttpRequest(http.scope, receive)
 
 
-async def _no_such_path(of_http: ASGIApp, scope: Scope, receive: Receive, send: Send) -> None:
+async def _refuse_path(refuse_http: ASGIApp, scope: Scope, receive: Receive, send: Send) -> None:
     """Refuse an unknown path: Starlette would refuse a WebSocket with 403, which means an
     invalid key.
     """
     if scope["type"] == "websocket":
         await http_messages.deny(WebSocket(scope, receive, send), UnknownApp(_NO_PATH))
     else:
-        await of_http(scope, receive, send)
+        await refuse_http(scope, receive, send)
 
 
 async def _http_problem(http: HttpRequest, error: Exception) -> Response:

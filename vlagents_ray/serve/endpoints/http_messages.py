@@ -75,27 +75,30 @@ async def read_requests(
 
     An error that concerns the whole body is raised.
     """
-    headers, limits = headers_of(http.scope), admission.limits
-    kind = headers.get("content-type", "").partition(";")[0].strip().lower()
-    declared = headers.get("content-length", "")
-    if declared.isdigit() and int(declared) > limits.body_bytes:
-        raise MessageTooLarge(f"body: declares {declared} bytes, the limit is {limits.body_bytes}")
-    if kind == "multipart/form-data":
+    headers = headers_of(http.scope)
+    limits = admission.limits
+    content_type = headers.get("content-type", "").partition(";")[0].strip().lower()
+    length = headers.get("content-length", "")
+    if length.isdigit() and int(length) > limits.body_bytes:
+        raise MessageTooLarge(f"body: declares {length} bytes, the limit is {limits.body_bytes}")
+
+    if content_type == "multipart/form-data":
         decoded = Decoded([await _read_form(op, http, admission)], {})
-    elif op == "close" and not kind:
+    elif op == "close" and not content_type:
         decoded = Decoded([Request("close")], {})
     else:
         body = await read_body(http, admission)
-        if kind == CONTENT_TYPE:
+        if content_type == CONTENT_TYPE:
             decoded = await admission.decoded(partial(decode_requests, body))
-        elif kind == "application/json":
+        elif content_type == "application/json":
             read = partial(request_from_parts, op, body, {})
             decoded = Decoded([await admission.decoded(read, long=len(body) > LONG_BYTES)], {})
         else:
             raise MalformedMessage(
-                f"content-type: got {kind or 'none'!r}, want multipart/form-data, application/json "
-                f"or {CONTENT_TYPE}"
+                f"content-type: got {content_type or 'none'!r}, want multipart/form-data, "
+                f"application/json or {CONTENT_TYPE}"
             )
+
     _read_headers(op, decoded.requests, headers, name, limits)
     return decoded
 
@@ -104,34 +107,36 @@ def _read_headers(
     op: Op, requests: list[Request], headers: dict[str, str], name: str, limits: MessageLimits
 ) -> None:
     """Check the requests, and add the deadline, step and priority in the headers to them."""
-    stated = headers.get(REQUEST_ID_HEADER, "")
-    if not is_name(stated):
+    id_header = headers.get(REQUEST_ID_HEADER, "")
+    if not is_name(id_header):
         raise MalformedMessage(
-            f"header {REQUEST_ID_HEADER}: got {stated[:40]!r}, want 1 to 128 visible ASCII "
+            f"header {REQUEST_ID_HEADER}: got {id_header[:40]!r}, want 1 to 128 visible ASCII "
             "characters"
         )
-    deadline, priority, step = (
-        headers.get(DEADLINE_HEADER),
-        headers.get(PRIORITY_HEADER),
-        headers.get(STEP_HEADER),
-    )
-    stated_by_headers: dict[str, Any] = {}
-    for place, request in enumerate(requests):
+
+    deadline = headers.get(DEADLINE_HEADER)
+    priority = headers.get(PRIORITY_HEADER)
+    step = headers.get(STEP_HEADER)
+    fields: dict[str, Any] = {}
+    for index, request in enumerate(requests):
         if request.op != op:
             raise MalformedMessage(f"op: the frame says {request.op!r}, the path says {op!r}")
         if deadline:
-            stated_by_headers["deadline_ms"] = _positive(deadline)
+            fields["deadline_ms"] = _deadline_ms(deadline)
         if step:
-            stated_by_headers["step"] = _whole(step)
+            fields["step"] = _step(step)
         if priority:
-            stated_by_headers["priority"] = priority
-        request_id = request.request_id or ("" if place else name)
-        requests[place] = replace(request, request_id=request_id, **stated_by_headers)
+            fields["priority"] = priority
+
+        default_id = name if index == 0 else ""
+        request_id = request.request_id or default_id
+        requests[index] = replace(request, request_id=request_id, **fields)
         if priority:
-            check_request(requests[place], limits)
+            check_request(requests[index], limits)
 
 
 async def _read_form(op: Op, http: HttpRequest, admission: MessageAdmission) -> Request:
+    """Read the request of a form: the JSON document `obs`, and a file for each camera."""
     _require_uncompressed(http)
     limits = admission.limits
     document: str | bytes | None = None
@@ -142,23 +147,27 @@ async def _read_form(op: Op, http: HttpRequest, admission: MessageAdmission) -> 
             max_fields=limits.cameras + 1,
             max_part_size=limits.body_bytes,
         ) as form:
-            for name, part in form.multi_items():
-                data = part if isinstance(part, str) else await part.read()
+            for name, value in form.multi_items():
+                data = value if isinstance(value, str) else await value.read()
                 camera = name.removeprefix(CAMERA_PREFIX)
-                if (name == "obs" and document is not None) or (name != camera and camera in files):
+                is_document = name == "obs"
+                is_camera = name != camera
+
+                if (is_document and document is not None) or (is_camera and camera in files):
                     raise MalformedMessage(f"form: got the part {name[:80]!r} twice, want it once")
-                if name == "obs":
+                if is_document:
                     document = data
-                elif camera not in ("", name) and isinstance(data, bytes):
+                elif is_camera and camera and isinstance(data, bytes):
                     files[camera] = data
                 else:
-                    raise MalformedMessage(f"form: {_wrong_part(name)}")
+                    raise MalformedMessage(f"form: {_describe_wrong_part(name)}")
     except (MultiPartException, HTTPException) as error:
         for refused in (error, error.__context__):
             if isinstance(refused, _Refused):
                 raise refused.error from None
         text = error.message if isinstance(error, MultiPartException) else error.detail
         raise MalformedMessage(f"form: {text}") from error
+
     if document is None:
         raise MalformedMessage("form: no part 'obs'; send a JSON document, {} at least")
     return await admission.decoded(
@@ -170,9 +179,11 @@ def _limited(http: HttpRequest, admission: MessageAdmission) -> Receive:
     """Return a `receive` that limits the whole body: the parser limits only single parts, and
     files not at all.
     """
-    size, limit = 0, admission.limits.body_bytes
+    size = 0
+    limit = admission.limits.body_bytes
 
     async def receive() -> Message:
+        """Receive a message of the body, and count its bytes."""
         nonlocal size
         message = await http.receive()
         length = len(message.get("body", b""))
@@ -207,7 +218,7 @@ async def read_body(http: HttpRequest, admission: MessageAdmission) -> bytes:
     return body
 
 
-def _wrong_part(name: str) -> str:
+def _describe_wrong_part(name: str) -> str:
     if name == CAMERA_PREFIX:
         return f"the part {name!r} names no camera, want 'cameras.<name>'"
     if name.startswith(CAMERA_PREFIX):
@@ -254,7 +265,7 @@ def session_id(http: HttpRequest) -> str:
     return name
 
 
-def _positive(text: str) -> float:
+def _deadline_ms(text: str) -> float:
     try:
         value = float(text)
     except ValueError:
@@ -267,7 +278,7 @@ def _positive(text: str) -> float:
     return value
 
 
-def _whole(text: str) -> int:
+def _step(text: str) -> int:
     if not text.isdecimal() or len(text) > 19:
         raise MalformedMessage(
             f"header {STEP_HEADER}: got {text[:40]!r}, want what the last answer's header says"
@@ -279,14 +290,14 @@ def request_id(http: HttpRequest) -> str:
     """Return the request id from the caller or, without one, from Serve, which returns it in a
     header.
     """
-    return named(headers_of(http.scope).get(REQUEST_ID_HEADER, ""))
+    return valid_request_id(headers_of(http.scope).get(REQUEST_ID_HEADER, ""))
 
 
-def named(shown: str) -> str:
+def valid_request_id(header: str) -> str:
     """Return the request id of a header, or a new one if the header is empty, invalid, or could
     forge a log line.
     """
-    return shown if shown and is_name(shown) else uuid.uuid4().hex
+    return header if header and is_name(header) else uuid.uuid4().hex
 
 
 async def answer_error(http: HttpRequest, error: Exception) -> Response:
@@ -314,16 +325,17 @@ def html_response(
         scripts: The texts of its script elements; no other script runs.
         more: Further directives of its content security policy.
     """
-    policy = [
-        f"{kind}-src {' '.join(map(_digest, texts))}"
-        for kind, texts in (("style", styles), ("script", scripts))
-        if texts
-    ]
-    policy = ["default-src 'none'", *policy, *filter(None, [more])]
+    policy = ["default-src 'none'"]
+    for kind, texts in (("style", styles), ("script", scripts)):
+        if texts:
+            digests = " ".join(_digest(text) for text in texts)
+            policy.append(f"{kind}-src {digests}")
+    if more:
+        policy.append(more)
+    policy.append("base-uri 'none'; form-action 'none'; frame-ancestors 'none'")
+
     headers = {
-        "content-security-policy": "; ".join(
-            [*policy, "base-uri 'none'; form-action 'none'; frame-ancestors 'none'"]
-        ),
+        "content-security-policy": "; ".join(policy),
         "cache-control": "no-cache",
         "referrer-policy": "no-referrer",
         "x-content-type-options": "nosniff",
@@ -332,14 +344,16 @@ def html_response(
 
 
 def _digest(text: str) -> str:
-    return f"'sha256-{base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()}'"
+    """Return the SHA-256 of a text as a source of a content security policy."""
+    digest = hashlib.sha256(text.encode()).digest()
+    return f"'sha256-{base64.b64encode(digest).decode()}'"
 
 
-def public_problem(error: Exception, what: str, request_id: str) -> VLAgentsError:
+def public_problem(error: Exception, operation: str, request_id: str) -> VLAgentsError:
     """Return the error that a client may see; details of an unexpected error are only logged."""
     if isinstance(error, VLAgentsError):
         return error
-    logger.error("%s failed (request %s)", what, request_id, exc_info=error)
+    logger.error("%s failed (request %s)", operation, request_id, exc_info=error)
     return VLAgentsError("internal error; the server's log has the details")
 
 

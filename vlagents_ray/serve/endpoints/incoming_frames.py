@@ -60,12 +60,15 @@ class IncomingFrames(asyncio.Protocol):
             discard_rest: Discards bytes that still arrive when the connection is closed, so that
                 the client reads the close code.
         """
-        self._protocol, self._transport, self._discard_rest = protocol, transport, discard_rest
+        self._protocol = protocol
+        self._transport = transport
+        self._discard_rest = discard_rest
         self._loop = asyncio.get_running_loop()
+
         self._unparsed = b""  # received bytes that were not passed on: at most those of one read
         self._frame_left = 0  # bytes of the current frame that were not passed on
-        # Whether the current frame is of a message, and whether it is its last.
-        self._is_data = self._is_last = False
+        self._is_data = False  # whether the current frame belongs to a message
+        self._is_last = False  # whether the current frame is the last one of its message
         self._has_message = False  # whether a complete message has arrived
         self._partial_bytes = 0  # size of the received part of a message
         # Sizes of the messages that the application has not read.
@@ -74,10 +77,12 @@ class IncomingFrames(asyncio.Protocol):
         # Time since which a part of a message or frame waits for its rest, s.
         self._arriving_since: float | None = None
         self._ended = False
+
         self._caller: Caller | None = None
-        # None while the key is within its rate.
+        # Ends a pause for the rate of the key; None while there is no such pause.
         self._end_of_throttling: asyncio.TimerHandle | None = None
         self._memory: ArrivingBytes | None = None
+
         transport.pause_reading()
         transport.set_protocol(self)
 
@@ -101,18 +106,20 @@ class IncomingFrames(asyncio.Protocol):
         """Pickle as None: Serve's own proxy sends the scope to another process."""
         return type(None), ()
 
-    # Called by the middleware that identifies the caller, on any thread.
+    # The middleware that identifies the caller calls these methods, on any thread.
 
     def supervise(self, caller: Identity, admission: Admission | None) -> None:
         """Count messages for the key of `caller`, and their bytes as in flight; call this before
         `open`.
         """
-        robot, key = True, None
+        is_robot = True
+        key = None
         if isinstance(caller, Caller):
             self._caller = caller
-            robot, key = caller.priority != "simulation", caller.name
+            is_robot = caller.priority != "simulation"
+            key = caller.name
         if admission is not None:
-            self._memory = ArrivingBytes(admission, key, robot, self._give_up)
+            self._memory = ArrivingBytes(admission, key, is_robot, self._give_up)
 
     def taken(self) -> None:
         """Record that the application has read a message."""
@@ -136,7 +143,7 @@ class IncomingFrames(asyncio.Protocol):
         since = self._arriving_since
         return 0.0 if since is None else time.monotonic() - since
 
-    # Called by the server's own middleware, and by the transport.
+    # The server's own middleware and the transport call these methods.
 
     def open(self) -> None:
         """Begin to read, once the WebSocket is accepted."""
@@ -179,16 +186,16 @@ class IncomingFrames(asyncio.Protocol):
             self._pass_on()
 
     def _is_paused(self) -> bool:
-        """Return whether the server must not read now; a key over its rate is read again when
-        its pause is over.
-        """
-        if self._end_of_throttling is not None or len(self._waiting) >= _WAITING_MESSAGES:
-            return True
-        wait_s = 0.0 if self._caller is None else self._caller.throttled_s()
-        if wait_s <= 0:
-            return False
-        self._end_of_throttling = self._loop.call_later(wait_s, self._unthrottle)
-        return True
+        """Return whether the server must not read now."""
+        return self._end_of_throttling is not None or len(self._waiting) >= _WAITING_MESSAGES
+
+    def _throttle(self) -> None:
+        """Pause the connection if the client's key is over its rate, until it no longer is."""
+        if self._caller is None or self._is_paused():
+            return
+        wait_s = self._caller.throttled_s()
+        if wait_s > 0:
+            self._end_of_throttling = self._loop.call_later(wait_s, self._unthrottle)
 
     def _unthrottle(self) -> None:
         self._end_of_throttling = None
@@ -196,23 +203,29 @@ class IncomingFrames(asyncio.Protocol):
             self._pass_on()
 
     def _pass_on(self) -> None:
-        while self._unparsed and not self._ended and not self._is_paused():
+        """Pass received bytes on to uvicorn, frame by frame, until there are none or a limit is
+        reached.
+        """
+        while self._unparsed and not self._ended:
+            self._throttle()
+            if self._is_paused():
+                break
             if not self._frame_left and not self._begin_frame():
                 break
-            part, self._unparsed = (
-                self._unparsed[: self._frame_left],
-                self._unparsed[self._frame_left :],
-            )
-            self._frame_left -= len(part)
+
+            data = self._unparsed[: self._frame_left]
+            self._unparsed = self._unparsed[self._frame_left :]
+            self._frame_left -= len(data)
             if self._is_data:
-                self._partial_bytes += len(part)
+                self._partial_bytes += len(data)
                 if not self._frame_left and self._is_last:
                     self._waiting.append(self._partial_bytes)
                     self._partial_bytes = 0
                     self._has_message = True
+
             if self._hold_memory():
-                self._protocol.data_received(part)
-            # An invalid frame: uvicorn closes the connection.
+                self._protocol.data_received(data)
+            # After an invalid frame, uvicorn closes the connection.
             if self._protocol.conn.parser_exc is not None:
                 self._charge()
                 self._end_reading()
@@ -224,12 +237,15 @@ class IncomingFrames(asyncio.Protocol):
         size = frame_size(head)
         if size is None:
             return False
-        opcode, self._is_last = head[0] & 0x0F, bool(head[0] & 0x80)
+
+        opcode = head[0] & 0x0F
+        self._is_last = bool(head[0] & 0x80)
         self._is_data = not opcode & _CONTROL_OPCODES
-        is_small_fragment = size < _FRAGMENT_BYTES and (opcode == Opcode.CONT or not self._is_last)
-        if (is_small_fragment or not self._is_data) and self._control_frames.take(
-            time.monotonic()
-        ) > 0:
+
+        is_fragment = opcode == Opcode.CONT or not self._is_last
+        is_small_fragment = is_fragment and size < _FRAGMENT_BYTES
+        is_limited = is_small_fragment or not self._is_data
+        if is_limited and self._control_frames.take(time.monotonic()) > 0:
             self._charge()
             self._end(
                 _POLICY_VIOLATION,
@@ -254,19 +270,22 @@ class IncomingFrames(asyncio.Protocol):
         return True
 
     def _update(self) -> None:
-        """Read from the socket only if the next bytes can be passed on, and note since when a
-        part waits.
+        """Read from the socket only if the next bytes can be passed on, and record since when a
+        part of a message waits for its rest.
         """
         if self._ended or self._transport.is_closing():
             return
         if self._memory is not None:
             self._memory.resize(self._partial_bytes + sum(self._waiting))
+
+        self._throttle()
         is_paused = self._is_paused()
         if is_paused:
             self._transport.pause_reading()
         elif not self._protocol.read_paused:
-            # otherwise uvicorn resumes when its own queue is empty
+            # If uvicorn has paused reading, it resumes when its own queue is empty.
             self._transport.resume_reading()
+
         is_arriving = bool(self._partial_bytes or self._frame_left or self._unparsed)
         if is_paused or not is_arriving:
             self._arriving_since = None
@@ -274,7 +293,7 @@ class IncomingFrames(asyncio.Protocol):
             self._arriving_since = time.monotonic()
 
     def _charge(self) -> None:
-        """Charge a message to the key, as for one that the application refuses."""
+        """Charge a message to the key, as for a message that the application refuses."""
         if self._caller is not None:
             with contextlib.suppress(VLAgentsError):
                 self._caller.admit()
@@ -299,7 +318,9 @@ class IncomingFrames(asyncio.Protocol):
         self._ended = True
         if self._end_of_throttling is not None:
             self._end_of_throttling.cancel()
-        self._unparsed, self._partial_bytes, self._arriving_since = b"", 0, None
+        self._unparsed = b""
+        self._partial_bytes = 0
+        self._arriving_since = None
         self._waiting.clear()
         if self._memory is not None:
             self._memory.release()

@@ -45,8 +45,8 @@ logger = logging.getLogger(__name__)
 # Maximum share of the node's object store; beyond the store's size Ray silently puts channels on
 # disk.
 _SHARE = 0.5
-_LEAST = 64 * 1024  # minimum size of a channel, bytes
-_HEADER = 64  # size of Ray's own metadata, bytes
+_LEAST_BYTES = 64 * 1024  # minimum size of a channel
+_HEADER_BYTES = 64  # size of Ray's own metadata
 _CLAIM_S = 60.0  # time after which an unclaimed lease is ended, since its client is gone
 
 
@@ -62,17 +62,17 @@ class Channel:
         """Return a copy of the frame, (N,) uint8, without waiting; raise `MalformedMessage` if
         there is none.
         """
-        found = self._take()
-        # Ray's parser below trusts its input, as everywhere.
-        if found.metadata != PlasmaAddress.TAG:
+        content = self._take()
+        # Ray's parser below trusts its input, so that a frame of another program is refused here.
+        if content.metadata != PlasmaAddress.TAG:
             raise MalformedMessage(
                 "plasma: what the channel holds is no frame; is this a client of vlagents_ray?"
             )
-        return np.frombuffer(b"".join(private.channel_pieces(found.data)), np.uint8)
+        return np.frombuffer(b"".join(private.channel_pieces(content.data)), np.uint8)
 
-    def intact(self) -> bool:
-        """Discard an unread frame; return False if the writer was killed during a write, which
-        locks the channel.
+    def clear(self) -> bool:
+        """Discard an unread frame; return False if the channel is unusable, since its writer was
+        killed during a write, which locks the channel.
         """
         with contextlib.suppress(MalformedMessage):
             self._take()
@@ -86,7 +86,9 @@ class Channel:
         return True
 
     def _take(self) -> Any:
-        """Return the latest frame in place; it is valid while the caller holds it."""
+        """Return the latest frame, with its metadata, in place; it is valid while it is
+        referenced.
+        """
         try:
             return private.read_channel(self.ref)
         except RayChannelTimeoutError as error:
@@ -103,7 +105,7 @@ class Pool:
         self._lock = threading.Lock()
         self._free: list[Channel] = []
         self._leased: dict[bytes, Channel] = {}
-        self._bytes = 0
+        self._bytes = 0  # size of all channels
 
     def lease(self, length: int) -> tuple[bytes, int]:
         """Lease a channel for frames of `length` bytes to a client; this takes milliseconds.
@@ -114,20 +116,25 @@ class Pool:
         Raises:
             MessageTooLarge: `length` is over `limits.body_bytes`, or the object store is too small.
         """
-        # Includes Ray's framing; the decoder checks the exact limit.
+        # The length includes Ray's framing; the decoder checks the exact limit.
         if length > 2 * self._limits.body_bytes:
             raise MessageTooLarge(
                 f"frame: got {length} bytes, the limit is {self._limits.body_bytes}"
             )
+
         with self._lock:
             oldest = time.monotonic() - _CLAIM_S
             for lost in [key for key, channel in self._leased.items() if channel.leased < oldest]:
                 self._return_channel(self._leased.pop(lost))
-            fitting = [channel for channel in self._free if channel.capacity >= length]
-            if (channel := min(fitting, key=lambda one: one.capacity, default=None)) is not None:
+
+            fitting = [free for free in self._free if free.capacity >= length]
+            channel = min(fitting, key=lambda free: free.capacity, default=None)
+            if channel is not None:
                 self._free.remove(channel)
+
         if channel is None:
-            channel = self._create(max(_LEAST, 1 << (length - 1).bit_length()))
+            next_power_of_two = 1 << (length - 1).bit_length()
+            channel = self._create(max(_LEAST_BYTES, next_power_of_two))
         channel.leased = time.monotonic()
         key: bytes = channel.ref.binary()
         with self._lock:
@@ -148,7 +155,7 @@ class Pool:
             self._return_channel(channel)
 
     def _return_channel(self, channel: Channel) -> None:
-        if channel.intact():
+        if channel.clear():
             self._free.append(channel)
             return
         logger.warning(
@@ -161,23 +168,22 @@ class Pool:
         """Create a channel without the lock, which the policy thread needs: allocation can be
         slow.
         """
-        here = ray.get_runtime_context().get_node_id()
-        store: float = next(
-            one["Resources"]["object_store_memory"] for one in ray.nodes() if one["NodeID"] == here
-        )
+        node_id = ray.get_runtime_context().get_node_id()
+        node = next(node for node in ray.nodes() if node["NodeID"] == node_id)
+        store_bytes: float = node["Resources"]["object_store_memory"]
+
         with self._lock:
-            if self._bytes + capacity > _SHARE * store:
+            if self._bytes + capacity > _SHARE * store_bytes:
                 raise MessageTooLarge(
                     f"plasma: no room for a channel of {capacity} bytes: this node's object store "
-                    f"has {store:.0f}, "
-                    f"a replica's channels may take {_SHARE:.0%} of it and take {self._bytes}; "
-                    "start Ray with a larger "
-                    "object_store_memory (`ray start --object-store-memory BYTES`), or use "
-                    "transport 'shm'"
+                    f"has {store_bytes:.0f}, a replica's channels may take {_SHARE:.0%} of it and "
+                    f"take {self._bytes}; start Ray with a larger object_store_memory (`ray start "
+                    "--object-store-memory BYTES`), or use transport 'shm'"
                 )
             self._bytes += capacity
+
         try:
-            ref = private.create_channel(capacity + _HEADER)
+            ref = private.create_channel(capacity + _HEADER_BYTES)
         except BaseException:
             with self._lock:
                 self._bytes -= capacity
@@ -193,9 +199,9 @@ class PlasmaServer(UnixServer):
     def __init__(self, engine: Engine, limits: MessageLimits) -> None:
         """Prepare the pool and the socket; `limits` are the limits of a frame."""
         self.pool = Pool(limits)
-        super().__init__(
-            engine, NoKey.INSIDE, limits, partial(LeasedChannel, self.pool, engine.admission)
-        )  # the cluster needs no key
+        payload = partial(LeasedChannel, self.pool, engine.admission)
+        super().__init__(engine, NoKey.INSIDE, limits, payload)
+
         folder = private.plasma_folder()
         # The name is no longer than that of the store's socket in the same folder, since socket
         # paths are limited.
@@ -225,7 +231,8 @@ class LeasedChannel:
     """A `Payload`: the channel of one client, which leases a larger one for larger frames."""
 
     def __init__(self, pool: Pool, admission: Admission) -> None:
-        self._pool, self._admission = pool, admission
+        self._pool = pool
+        self._admission = admission
         self._channel: Channel | None = None
 
     def read(

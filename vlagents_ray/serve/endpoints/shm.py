@@ -49,6 +49,7 @@ from vlagents_ray.serve.endpoints.connection import (
     POLICY_VIOLATION,
     STAMP_SPACE,
     Admit,
+    AncillaryData,
     PolledConnection,
     PolledServer,
     ReadBuffer,
@@ -112,7 +113,8 @@ class UnixServer(PolledServer["UnixConnection"]):
         """
         listener = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET | socket.SOCK_NONBLOCK)
         super().__init__(engine, limits, admit, listener)
-        self.payload, self.ops = payload, ops
+        self.payload = payload
+        self.ops = ops
 
     def _add_client(self, connection: socket.socket) -> None:
         pid, uid = peer_process(connection)
@@ -124,6 +126,7 @@ class UnixServer(PolledServer["UnixConnection"]):
             )
             connection.close()
             return
+
         if len(self._clients) >= self.engine.sessions.limit:
             full = PolicyUnavailable(
                 f"this replica has {len(self._clients)} local clients, its limit of sessions"
@@ -132,7 +135,17 @@ class UnixServer(PolledServer["UnixConnection"]):
                 connection.send(LocalAddress.REPLY.pack(0, 0) + encode_replies([Reply(error=full)]))
             connection.close()
             return
+
         self._serve(UnixConnection(self, connection), connection)
+
+
+def _descriptors_in(control: AncillaryData) -> list[int]:
+    """Return the file descriptors in the control data of a message."""
+    descriptors: list[int] = []
+    for _, kind, packed in control:
+        if kind == socket.SCM_RIGHTS:
+            descriptors += array("i", packed[: len(packed) // 4 * 4])
+    return descriptors
 
 
 class UnixConnection(PolledConnection):
@@ -140,22 +153,25 @@ class UnixConnection(PolledConnection):
 
     def __init__(self, server: UnixServer, connection: socket.socket) -> None:
         super().__init__(server, connection)
-        self._admit, self._limits, self._ops = server.admit, server.limits, server.ops
+        self._admit = server.admit
+        self._limits = server.limits
+        self._ops = server.ops
         self._payload = server.payload()
         enable_timestamps(connection)
         self._reader = shm_layout.ShmReader(server.limits)
         self._connected_at = time.monotonic()
         self._key: bytes | None = None  # the key as sent
         self._refused_keys = 0  # number of messages whose key was refused
-        self._unanswered = 0  # number of messages
-        self._paused = False  # whether too many are unanswered
+        self._unanswered = 0  # number of unanswered messages
+        self._paused = False  # whether too many messages are unanswered
         if isinstance(server.admit, NoKey):
             self.caller = server.admit
             self._sender = Sender(server.engine, server.name, caller=server.admit)
 
     def _read(self) -> None:
-        if self._sender is not None and self._sender.rated and self._is_throttled():
+        if self._sender is not None and self._sender.rated and self._throttle():
             return
+
         message = IncomingMessage(self._engine.stats, self._name)
         try:
             data, control = _read_buffer.receive(self._connection, _MESSAGE_BYTES, _CONTROL)
@@ -164,19 +180,16 @@ class UnixConnection(PolledConnection):
         except OSError as error:
             logger.info("local client: %s", error)
             data, control = memoryview(b""), []
-        descriptors = [
-            number
-            for _, kind, packed in control
-            if kind == socket.SCM_RIGHTS
-            for number in array("i", packed[: len(packed) // 4 * 4])
-        ]
+
+        descriptors = _descriptors_in(control)
         try:
             if not data:
                 self.disconnect()
                 return
             with self._sending:
                 self._unanswered += 1
-            if (sender := self._sender or self._authenticate(bytes(data[:_KEY_BYTES]))) is None:
+            sender = self._sender or self._authenticate(bytes(data[:_KEY_BYTES]))
+            if sender is None:
                 with self._sending:
                     self._unanswered -= 1  # a valid key is not answered
             else:
@@ -194,8 +207,9 @@ class UnixConnection(PolledConnection):
         finally:
             for descriptor in descriptors:
                 os.close(descriptor)
+
         if self._sender is not None and self._sender.rated:
-            self._is_throttled()
+            self._throttle()
         with self._sending:
             self._paused = self._unanswered >= MOST_UNANSWERED and not self._ended
         if self._paused:
@@ -209,7 +223,7 @@ class UnixConnection(PolledConnection):
         data: memoryview,
         descriptors: list[int],
     ) -> None:
-        # Only locates the memory; a client's new memory file is kept even if the message is
+        # `read` only locates the memory. A client's new memory file is kept even if the message is
         # refused.
         try:
             memory, compact_form, text = self._payload.read(data, descriptors)
@@ -223,6 +237,7 @@ class UnixConnection(PolledConnection):
                 message, partial(decode_requests, memory.data, ops=self._ops), admission, submit
             )
             return
+
         if sender.rated:
             sender.count_message()
         decoded = Decoded(self._reader.read(text, memory), {})
@@ -243,17 +258,26 @@ class UnixConnection(PolledConnection):
         sender.send(message, decoded, self._write, admission=admission, waited_s=waited_s)
 
     def _authenticate(self, message: bytes) -> Sender | None:
-        """Read the key from the first message; if it is refused, check it again at later ones,
-        `REFUSALS` times.
+        """Identify the client by the key in its first message.
+
+        A refused key is checked again at the next messages, `REFUSALS` times.
+
+        Returns:
+            The sender of this message; None if the message was the key itself.
         """
         if isinstance(self._admit, NoKey):
             raise TypeError(f"a key, although none is asked for: {self._admit.value}")
-        first, self._key = self._key is None, self._key or message
+
+        is_key = self._key is None
+        if self._key is None:
+            self._key = message
         caller = self._admit(self._key.decode(errors="replace"))
         caller.hold()
         caller.note("let in by", self._name)
-        self.caller, self._sender = caller, Sender(self._engine, self._name, caller=caller)
-        return None if first else self._sender
+
+        self.caller = caller
+        self._sender = Sender(self._engine, self._name, caller=caller)
+        return None if is_key else self._sender
 
     def overdue(
         self, now: float, refusal: Callable[[Caller], str | None]
@@ -264,10 +288,10 @@ class UnixConnection(PolledConnection):
         if self._sender is not None:
             return super().overdue(now, refusal)
         with self._sending:
-            late = now - self._connected_at > _KEY_S and not self._ended
-            return (
-                ("no key", POLICY_VIOLATION) if late and not has_unread(self._connection) else None
-            )
+            is_late = now - self._connected_at > _KEY_S and not self._ended
+            if is_late and not has_unread(self._connection):
+                return "no key", POLICY_VIOLATION
+        return None
 
     def _discard(self) -> None:
         self._payload.free()
@@ -295,6 +319,7 @@ class UnixConnection(PolledConnection):
                 self._call_soon(partial(self._resume, BACKLOGGED))
             if self._ended:
                 return
+
             freed = self._payload.freed()
             try:
                 if len(frame) <= _INLINE:
@@ -308,7 +333,7 @@ class UnixConnection(PolledConnection):
                 finally:
                     os.close(descriptor)
             except OSError as error:
-                # the client is gone, or does not read its replies: `ready` handles the end
+                # The client is gone, or does not read its replies. `ready` handles the end.
                 logger.info("local client: %s", error)
                 with contextlib.suppress(OSError):  # the connection is already closed
                     self._connection.shutdown(socket.SHUT_RDWR)
@@ -341,7 +366,8 @@ class MemoryFiles:
     """
 
     def __init__(self, limits: MessageLimits, admission: Admission) -> None:
-        self._limits, self._admission = limits, admission
+        self._limits = limits
+        self._admission = admission
         self._files: dict[int, mmap.mmap] = {}
         # The array over each file, until it is garbage-collected.
         self._views: dict[int, weakref.ref[np.ndarray]] = {}
@@ -360,12 +386,15 @@ class MemoryFiles:
         number, flags, length = LocalAddress.REQUEST.unpack_from(message)
         if descriptors:
             self._add(number, descriptors.pop(0))
+
         file = self._files.get(number)
         if file is None or length > len(file):
             raise MalformedMessage(
                 f"local: {length} bytes in memory file {number}, which is not there or shorter"
             )
-        # The memory in place: the client does not write into it until a reply reports it as freed.
+
+        # The memory is read in place: the client does not write into it until a reply reports it as
+        # freed.
         memory = np.frombuffer(file, np.uint8, length)
         if len(self._views) < _MAX_VIEWS:
             self._views[number] = weakref.ref(memory, partial(self._release, number))
@@ -392,12 +421,11 @@ class MemoryFiles:
     def _add(self, number: int, descriptor: int) -> None:
         try:
             size = os.fstat(descriptor).st_size
-            most_bytes = 2 * self._limits.body_bytes
-            if size > most_bytes:
+            max_bytes = 2 * self._limits.body_bytes
+            if size > max_bytes:
                 raise MessageTooLarge(
-                    f"local: expected a message of at most {most_bytes} bytes, got {size}; send "
-                    "smaller images, or "
-                    f"raise `limits.body_bytes` of the deployment"
+                    f"local: expected a message of at most {max_bytes} bytes, got {size}; send "
+                    "smaller images, or raise `limits.body_bytes` of the deployment"
                 )
             if number >= LocalAddress.FILES:
                 raise MessageTooLarge(

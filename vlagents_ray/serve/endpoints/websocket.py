@@ -130,16 +130,17 @@ class WebSocketServer(PolledServer["WebSocketConnection"]):
             ConfigError: All ports are in use.
         """
         super().__init__(engine, limits, admit, _bind(host, ports))
-        self.slow_s, self.idle_s = slow_s, idle_s
+        self.slow_s = slow_s
+        self.idle_s = idle_s
         self._hosts = hosts
         self.path = messages.STREAM_PATH + secrets.token_urlsafe(24)
-        # Before their handshake, in order of arrival.
+        # Connections before their handshake, in order of arrival.
         self._handshaking: dict[WebSocketConnection, None] = {}
         self.address = messages.StreamAddress(self._listener.getsockname()[1], self.path)
 
     def open(self) -> None:
         """Accept clients; call this before the engine starts."""
-        # Accepted connections inherit it; the kernel enables it after a moment.
+        # Accepted connections inherit the option, which the kernel enables after a moment.
         enable_timestamps(self._listener)
         super().open()
 
@@ -156,6 +157,7 @@ class WebSocketServer(PolledServer["WebSocketConnection"]):
         """
         if not secrets.compare_digest(request.path.encode(), self.path.encode()):
             raise UnknownApp("no such path")
+
         headers = {name.lower(): value for name, value in request.headers.raw_items()}
         caller: Identity
         if isinstance(self.admit, NoKey):
@@ -163,9 +165,10 @@ class WebSocketServer(PolledServer["WebSocketConnection"]):
             caller = self.admit
         else:
             caller = self.admit(token_of(headers))
-        held, limit = len(self._clients) - len(self._handshaking), self.engine.sessions.limit
-        if held >= limit:
-            raise PolicyUnavailable(f"this replica has {held} streams, its limit of sessions")
+
+        streams = len(self._clients) - len(self._handshaking)
+        if streams >= self.engine.sessions.limit:
+            raise PolicyUnavailable(f"this replica has {streams} streams, its limit of sessions")
         if isinstance(caller, Caller):
             caller.require_unthrottled()
             caller.hold()
@@ -184,8 +187,10 @@ class WebSocketServer(PolledServer["WebSocketConnection"]):
         for name, value in _KEEPALIVE:
             if hasattr(socket, name):
                 connection.setsockopt(socket.IPPROTO_TCP, getattr(socket, name), value)
+
         if len(self._handshaking) >= _MAX_HANDSHAKES:
-            next(iter(self._handshaking)).disconnect()
+            oldest = next(iter(self._handshaking))
+            oldest.disconnect()
         client = WebSocketConnection(self, connection)
         self._serve(client, connection)
         self._handshaking[client] = None
@@ -196,30 +201,38 @@ class WebSocketConnection(PolledConnection):
 
     def __init__(self, server: WebSocketServer, connection: socket.socket) -> None:
         super().__init__(server, connection)
-        self._server, self._limits = server, server.limits
-        self._arrived = 0.0  # arrival time of the bytes read last, s
+        self._server = server
+        self._limits = server.limits
         self._protocol = ServerProtocol(max_size=messages.STREAM_BYTES)  # guarded by the lock
+
         self._head = b""  # received part of the handshake
         # Time after which the handshake is no longer over the rate of its key.
         self._refused_for_s = 0.0
+
+        self._arrived = 0.0  # arrival time of the bytes read last, s
         self._frame_head = b""  # received part of a frame's head, until the head is complete
         self._frame_left = 0  # unread bytes of the current frame, once its head is complete
         self._control_frames = TokenBucket(CONTROL_FRAMES_PER_S, time.monotonic(), CONTROL_FRAMES)
         self._received = ReceiveBuffer(messages.STREAM_BYTES)
-        self._out = SendBuffer(connection, self._sending, messages.STREAM_BYTES)
-        self._paused = False  # whether too many messages are unanswered; guarded by the lock
         # Received but unprocessed frames, their arrival times, s, and the admissions of those
         # received in parts.
         self._frames: deque[tuple[Frame, float, MessageAdmission | None]] = deque()
         self._partial: MessageAdmission | None = None  # admission of a partly received message
-        self._arriving: ArrivingBytes | None = None  # its bytes
-        self._unanswered = self._unanswered_bytes = 0  # messages; bytes with the decoded images
-        self._messages = 0  # number received so far
+        self._arriving: ArrivingBytes | None = None  # bytes of a partly received message
+        self._messages = 0  # number of messages received so far
+
+        self._out = SendBuffer(connection, self._sending, messages.STREAM_BYTES)
+        self._unanswered = 0  # number of unanswered messages
+        self._unanswered_bytes = 0  # size of the unanswered messages with their decoded images
+        self._paused = False  # whether too many messages are unanswered; guarded by the lock
+
         self._ending = False  # whether `end` was called, so that arriving bytes are ignored
-        self._discarded = 0  # unread bytes after an invalid message
-        # For `overdue` only: messages at its last call, time of the last change, and arrival of the
-        # current partial message, s.
-        self._seen, self._quiet_since, self._part_since = 0, time.monotonic(), float("inf")
+        self._discarded = 0  # number of bytes that were discarded after an invalid message
+
+        # Only `overdue` uses these.
+        self._messages_before = 0  # number of messages at its last call
+        self._quiet_since = time.monotonic()  # time of the last message or answer, s
+        self._part_since = float("inf")  # arrival time of the current partial message, s
 
     def _read(self) -> None:
         frames = 0
@@ -230,12 +243,13 @@ class WebSocketConnection(PolledConnection):
         """Read the handshake or a part of a frame; return whether more may be read, since a
         frame is complete.
         """
-        if self._sender is not None and self._sender.rated and self._is_throttled():
+        if self._sender is not None and self._sender.rated and self._throttle():
             return False
+
         data: bytes | memoryview
-        closing = self._protocol.state is State.CLOSING
+        is_closing = self._protocol.state is State.CLOSING
         try:
-            size = _DISCARD_BYTES if closing else self._bytes_to_read()
+            size = _DISCARD_BYTES if is_closing else self._bytes_to_read()
             data, control = read_buffer.receive(self._connection, size)
             self._arrived = time.perf_counter() - time_in_socket_s(control)
         except BlockingIOError:
@@ -243,51 +257,60 @@ class WebSocketConnection(PolledConnection):
         except OSError as error:
             logger.info("stream client: %s", error)
             data = b""
-        if closing:
+
+        # After an invalid message bytes are read and discarded: unread bytes would reset the
+        # connection before the client reads the close code.
+        if is_closing:
             self._discarded += len(data)
-        if (
-            self._ending
-            or self._discarded > self._limits.body_bytes
-            or not (data or (self._sender and not closing))
-        ):
+        if self._ending or self._discarded > self._limits.body_bytes:
             self.disconnect()
-        elif self._sender is None:
+            return False
+        if not data and (self._sender is None or is_closing):
+            self.disconnect()
+            return False
+        if self._sender is None:
             self._receive_handshake(data)
-        elif not closing:
-            # unread bytes would reset the connection before the client reads the close code
-            if self._frame_left:
-                self._frame_left -= len(data)
-            self._receive(data)
-            return not self._frame_left and self._polled and not self._ended
-        return False
+            return False
+        if is_closing:
+            return False
+
+        if self._frame_left:
+            self._frame_left -= len(data)
+        self._receive(data)
+        return not self._frame_left and self._polled and not self._ended
 
     def _receive_handshake(self, data: bytes | memoryview) -> None:
         self._head += data
-        complete = self._head.endswith(_END_OF_HEADERS)
-        if not complete and len(self._head) <= _HANDSHAKE_BYTES:
+        is_complete = self._head.endswith(_END_OF_HEADERS)
+        if not is_complete and len(self._head) <= _HANDSHAKE_BYTES:
             return
-        if not complete or not self._handshake(self._head):
+        if not is_complete or not self._accept_handshake(self._head):
             self._refuse_handshake()
         self._head = b""
 
     def _bytes_to_read(self) -> int:
         """Return how many bytes to read now: at most the handshake, and then at most one frame.
 
-        What follows stays in the socket until it is known whether the client may send more. Raises
-        `BlockingIOError` if the socket is empty.
+        The bytes after them stay in the socket until it is known whether the client may send more.
+        If the connection has ended, the number is 1, which reads its end. Raises `BlockingIOError`
+        if the socket is empty.
         """
         if self._sender is None:
-            coming = self._connection.recv(_HANDSHAKE_BYTES, socket.MSG_PEEK)
-            overlap = self._head[1 - len(_END_OF_HEADERS) :]  # the mark may have arrived in parts
-            end = (overlap + coming).find(_END_OF_HEADERS)
-            return len(coming) or 1 if end < 0 else end + len(_END_OF_HEADERS) - len(overlap)
+            peeked = self._connection.recv(_HANDSHAKE_BYTES, socket.MSG_PEEK)
+            # The end of the headers may have arrived in parts.
+            overlap = self._head[1 - len(_END_OF_HEADERS) :]
+            end = (overlap + peeked).find(_END_OF_HEADERS)
+            if end < 0:
+                return len(peeked) or 1
+            return end + len(_END_OF_HEADERS) - len(overlap)
+
         if not self._frame_left:
-            coming = self._connection.recv(HEAD_BYTES - len(self._frame_head), socket.MSG_PEEK)
-            head = self._frame_head + coming
+            peeked = self._connection.recv(HEAD_BYTES - len(self._frame_head), socket.MSG_PEEK)
+            head = self._frame_head + peeked
             size = frame_size(head)
             if size is None:
                 self._frame_head = head
-                return len(coming) or 1  # reads the end of the connection
+                return len(peeked) or 1
             self._frame_left = size - len(self._frame_head)
             self._frame_head = b""
         return min(self._frame_left, _READ_BYTES)
@@ -302,6 +325,7 @@ class WebSocketConnection(PolledConnection):
                 self._protocol.receive_eof()
             events = self._protocol.events_received()
             self._flush()
+
         for event in events:
             if not isinstance(event, Frame):
                 continue
@@ -315,21 +339,22 @@ class WebSocketConnection(PolledConnection):
                 self._charge_abuse()
                 self.end(f"more than {CONTROL_FRAMES} control frames at once")
                 return
+
         if was_open and self._protocol.state is State.CLOSING and self._protocol.close_rcvd is None:
-            # An invalid frame, behind which up to `limits.body_bytes` are discarded.
+            # The frame is invalid; up to `limits.body_bytes` after it are discarded.
             self._charge_abuse()
         self._process_frames()
         if self._received.size and self._sender is not None and not self._ended:
             self._hold_partial(self._sender)
-        if (
-            not data
-            or self._protocol.state is State.CLOSED
-            or self._protocol.close_rcvd is not None
-        ):
+
+        is_closed = self._protocol.state is State.CLOSED or self._protocol.close_rcvd is not None
+        if not data or is_closed:
             self.disconnect()
             return
+
         with self._sending:
-            paused = self._paused = self._is_backlogged() and self._protocol.state is State.OPEN
+            paused = self._is_backlogged() and self._protocol.state is State.OPEN
+            self._paused = paused
         if paused:
             self._pause(BACKLOGGED)
 
@@ -357,7 +382,7 @@ class WebSocketConnection(PolledConnection):
                 self._arriving = ArrivingBytes(self._engine.admission, key, is_robot, self._give_up)
             self._arriving.resize(self._received.size)
         except TooManyRequests:  # the rest stays unread until the key is under its rate
-            self._is_throttled()
+            self._throttle()
             if sender.refused_too_often:
                 self.end(REFUSED)
         except VLAgentsError as error:
@@ -395,14 +420,19 @@ class WebSocketConnection(PolledConnection):
         Time counts against the client only if the server has read all bytes that arrived: a slow
         policy keeps the thread from reading.
         """
-        if (cause := super().overdue(now, refusal)) is not None:
+        cause = super().overdue(now, refusal)
+        if cause is not None:
             return cause
-        if self._messages != self._seen or self._unanswered or not self._polled:
-            self._seen, self._quiet_since, self._part_since = self._messages, now, float("inf")
+
+        if self._messages != self._messages_before or self._unanswered or not self._polled:
+            self._messages_before = self._messages
+            self._quiet_since = now
+            self._part_since = float("inf")
         if not self._received.size:
             self._part_since = float("inf")
         elif self._part_since > now:
             self._part_since = now
+
         if self._protocol.state is not State.OPEN and now - self._quiet_since > _HANDSHAKE_S:
             reason = "no handshake" if self._sender is None else "open long after a wrong message"
             cause = reason, POLICY_VIOLATION
@@ -410,9 +440,12 @@ class WebSocketConnection(PolledConnection):
             cause = f"a message took longer than {self._server.slow_s:g} s", POLICY_VIOLATION
         elif now - self._quiet_since > self._server.idle_s:
             cause = "silent for too long", _GOING_AWAY
+
         with self._sending:
             if cause is not None and not self._ended and has_unread(self._connection):
-                self._quiet_since, self._part_since, cause = now, float("inf"), None
+                self._quiet_since = now
+                self._part_since = float("inf")
+                return None
         return cause
 
     def _send_close(self, code: int, reason: str) -> None:
@@ -425,7 +458,7 @@ class WebSocketConnection(PolledConnection):
         self._out.wait_sent(until)
         wait_delivered(self._connection, until)
 
-    def _handshake(self, head: bytes) -> bool:
+    def _accept_handshake(self, head: bytes) -> bool:
         """Accept the handshake; return False if it is refused, before the refusal is sent."""
         with self._sending:
             self._protocol.receive_data(head)
@@ -442,6 +475,7 @@ class WebSocketConnection(PolledConnection):
                     self._refused_for_s = refused.retry_after_s
             with self._sending:
                 self._protocol.send_response(response)
+
         if self._protocol.state is not State.OPEN or self.caller is None:
             return False
         self._received.attach(self._protocol)
@@ -451,12 +485,14 @@ class WebSocketConnection(PolledConnection):
         return True
 
     def _refuse_handshake(self) -> None:
-        """Refuse the handshake; if the key is over its rate, after a moment, which bounds the
-        rate of refusals.
+        """Refuse the handshake.
+
+        If the key is over its rate, the refusal is delayed, which bounds the rate of refusals.
         """
         self._pause(_REFUSED)
 
         def refuse() -> None:
+            """Send the refusal, and close the connection."""
             with self._sending:
                 if not self._ended:
                     self._flush()
@@ -476,7 +512,7 @@ class WebSocketConnection(PolledConnection):
             self._process(*self._frames.popleft())
 
     def _unthrottle(self) -> None:
-        if not self._may_read_again():
+        if not self._end_throttling():
             return
         if self._received.size and self._partial is None and self._sender is not None:
             self._hold_partial(self._sender)
@@ -497,7 +533,9 @@ class WebSocketConnection(PolledConnection):
                 self._flush()
             self._charge_abuse()
             return
-        sender, message = self._sender, self._sender.message()
+
+        sender = self._sender
+        message = sender.message()
         admission = admission or sender.admission(self._limits)
         admission.size = len(frame.data)
         try:
@@ -516,8 +554,9 @@ class WebSocketConnection(PolledConnection):
             self._write(message)
             if sender.refused_too_often:
                 self.end(REFUSED)
+
         if sender.rated:
-            self._is_throttled()
+            self._throttle()
 
     def _submit(
         self,
@@ -549,9 +588,9 @@ class WebSocketConnection(PolledConnection):
         with self._sending:
             self._unanswered -= 1
             self._unanswered_bytes -= size
-            resume = self._paused and not self._is_backlogged()
-            self._paused = self._paused and not resume
-        if resume:
+            may_resume = self._paused and not self._is_backlogged()
+            self._paused = self._paused and not may_resume
+        if may_resume:
             self._call_soon(partial(self._resume, BACKLOGGED))
         self._write(message)
 
@@ -569,7 +608,8 @@ class WebSocketConnection(PolledConnection):
 
     def _flush(self) -> None:
         """Send the bytes that the protocol has produced; the caller holds the lock."""
-        if pieces := self._protocol.data_to_send():
+        pieces = self._protocol.data_to_send()
+        if pieces:
             self._out.send(b"".join(pieces), last=b"" in pieces)
 
 
@@ -584,11 +624,14 @@ class SendBuffer:
         """Create an empty buffer; a client is cut off if more than `limit` bytes wait, or it
         reads none for 10 s.
         """
-        self._connection, self._lock, self._limit = connection, lock, limit
+        self._connection = connection
+        self._lock = lock
+        self._limit = limit
         self._unsent = bytearray()
-        self._rest: threading.Thread | None = None  # sends the rest to a slow client
-        self._slow = False  # whether a thread is sending the rest
-        self._closed = self._last = False
+        self._thread: threading.Thread | None = None  # sends the rest to a slow client
+        self._slow = False  # whether the thread is sending the rest
+        self._last = False  # whether no bytes may follow the unsent ones
+        self._closed = False
 
     def send(self, data: bytes, *, last: bool = False) -> None:
         """Send as many bytes as the connection accepts now; a thread sends the rest later.
@@ -604,19 +647,19 @@ class SendBuffer:
             self._send_now()
             if self._unsent:
                 self._slow = True
-                self._rest = threading.Thread(
+                self._thread = threading.Thread(
                     target=self._send_rest, name="send-slowly", daemon=True
                 )
-                self._rest.start()
+                self._thread.start()
         elif len(self._unsent) > self._limit:
             self._disconnect()
 
     def wait_sent(self, until: float) -> None:
         """Wait until the kernel has all bytes, but at most until a time of `time.monotonic`, s;
-        without the lock.
+        call this without the lock.
         """
-        if self._rest is not None:
-            self._rest.join(max(0.0, until - time.monotonic()))
+        if self._thread is not None:
+            self._thread.join(max(0.0, until - time.monotonic()))
 
     def close(self) -> None:
         """Stop sending; call this before the connection is closed."""
@@ -632,6 +675,7 @@ class SendBuffer:
             logger.info("client: %s", error)
             sent = len(self._unsent)
         del self._unsent[:sent]
+
         if self._last and not self._unsent:
             with contextlib.suppress(OSError):
                 self._connection.shutdown(socket.SHUT_WR)
@@ -659,9 +703,11 @@ class SendBuffer:
 
 
 def _bind(host: str, ports: tuple[int, int] | None) -> socket.socket:
+    """Return a non-blocking socket that listens at the first free port."""
     first, last = ports or (0, 0)
+    family = socket.AF_INET6 if ":" in host else socket.AF_INET
     for port in range(first, last + 1):
-        listener = socket.socket(socket.AF_INET6 if ":" in host else socket.AF_INET)
+        listener = socket.socket(family)
         try:
             listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
             listener.bind((host, port))
