@@ -80,7 +80,7 @@ def test_what_ray_is_told() -> None:
 def test_the_same_python_and_ray_host_the_replica() -> None:
     found = probe(sys.executable)
     assert found.versions["python"] == platform.python_version()
-    assert found.hosts_replicas() is None
+    assert found.obstacle_to_replicas() is None
     assert with_process(args(python=sys.executable)).process == "replica"
     assert with_process(args(python=sys.executable, process="child")).process == "child"
 

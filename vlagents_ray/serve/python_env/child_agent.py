@@ -41,11 +41,12 @@ from vlagents_ray.weights.safetensors import ValueSpec, read_values, write_value
 from vlagents_ray.weights.shared_values import NotShared, SharedValues
 from vlagents_ray.weights.trainable import portable, require_fit
 
-_FOREVER_S = 1e6  # no limit here: as for any policy, a replica with an overdue call is replaced
+# Calls have no time limit here: as for any policy, Serve replaces a replica with an overdue call.
+_FOREVER_S = 1e6
 _CONNECT_S = 10.0
 _CLOSE_S = 10.0
 _EXIT_S = 2.0
-_LAST_WORDS = 20  # number of lines at the end of the child's error output that an error quotes
+_LAST_LINES = 20  # number of lines at the end of the child's error output that an error quotes
 
 
 class Child:
@@ -60,21 +61,26 @@ class Child:
     """
 
     def __init__(self, python: str, settings: Settings, env_vars: Mapping[str, str]) -> None:
-        # What the process says of the loaded policy: see `child_main`.
+        # The process's description of the loaded policy, see `child_main`.
         self.loaded: dict[str, Any] = {}
         self.sessions: set[str] = set()  # names of the sessions in the child
-        self._python, self._settings, self._env_vars = python, settings, env_vars
+        self._python = python
+        self._settings = settings
+        self._env_vars = env_vars
+
         self._process: subprocess.Popen[bytes] | None = None
         self._spawned: queue.SimpleQueue[subprocess.Popen[bytes] | OSError] = queue.SimpleQueue()
-        self._last_words: deque[str] = deque(maxlen=_LAST_WORDS)
+        self._last_lines: deque[str] = deque(maxlen=_LAST_LINES)  # of the child's error output
         self._transport: ShmTransport | None = None
-        self._lock = threading.Lock()
+        self._lock = threading.Lock()  # held during a call through shared memory
         self._calling = threading.Lock()  # held during a call for the weights
-        self._requests = itertools.count(1)
-        self._names = itertools.count(1)
-        self._free: deque[str] = deque()
-        # sessions, and versions of weights.
-        self._left: queue.SimpleQueue[str | int | None] = queue.SimpleQueue()
+
+        self._requests = itertools.count(1)  # numbers of requests
+        self._names = itertools.count(1)  # numbers of sessions
+        self._free: deque[str] = deque()  # names of closed sessions
+        # Names of the sessions, and of the versions of weights, to close; None ends the thread that
+        # closes them.
+        self._dropped: queue.SimpleQueue[str | int | None] = queue.SimpleQueue()
         self._closed = False
 
     def start(self) -> None:
@@ -86,24 +92,27 @@ class Child:
         """
         # The kernel kills the child when the thread that started it ends; this thread ends after
         # the child.
-        keeper = threading.Thread(target=self._keep, name="policy-process", daemon=True)
-        keeper.start()
-        spawned = self._spawned.get()
-        if isinstance(spawned, OSError):
+        runner = threading.Thread(target=self._run_process, name="policy-process", daemon=True)
+        runner.start()
+        process = self._spawned.get()
+        if isinstance(process, OSError):
             raise ConfigError(
-                f"environment.python: {self._python!r} cannot be started here ({spawned})"
-            ) from spawned
-        self._process = spawned
+                f"environment.python: {self._python!r} cannot be started here ({process})"
+            ) from process
+
+        self._process = process
         try:
-            self.loaded = self._introduced(spawned, keeper)
+            self.loaded = self._wait_until_loaded(process, runner)
             self._transport = ShmTransport(LocalAddress(**self.loaded["local"]))
             self._transport.connect(_CONNECT_S)
         except BaseException:
             self.close()
             raise
-        threading.Thread(
+
+        closer = threading.Thread(
             target=self._close_sessions, name="policy-process-sessions", daemon=True
-        ).start()
+        )
+        closer.start()
 
     def call(self, requests: Sequence[Request]) -> list[Reply]:
         """Send requests in one message and return their replies; raise `ConnectionLost` if the
@@ -113,11 +122,15 @@ class Child:
             raise PolicyUnavailable("the policy's process has not started")
         for request in requests:
             request.request_id = f"{next(self._requests):x}"
+
         with self._lock:
             try:
                 replies = self._transport.call(requests, _FOREVER_S)
             except PolicyUnavailable as error:
-                raise ConnectionLost(f"{self._ended()}; the replica is being replaced") from error
+                raise ConnectionLost(
+                    f"{self._describe_end()}; the replica is being replaced"
+                ) from error
+
         if len(replies) != len(requests):  # a single reply to the whole message
             raise replies[0].error or PolicyFailed(
                 f"got {len(replies)} replies to {len(requests)} requests"
@@ -139,7 +152,7 @@ class Child:
         """Close a session, or drop a version of the weights, soon; the garbage collector may
         call this at any time.
         """
-        self._left.put(name)
+        self._dropped.put(name)
 
     def call_for_weights(self, **call: Any) -> dict[str, Any]:
         """Let the process execute a call (see `child_main`) while it acts, and return the result
@@ -148,13 +161,14 @@ class Child:
         with self._calling:
             process = self._process
             if process is None or process.stdout is None:
-                raise PolicyUnavailable(self._ended())
+                raise PolicyUnavailable(self._describe_end())
             _write(process, json.dumps(call).encode() + b"\n")
             line = process.stdout.readline()
         if not line:
             raise PolicyUnavailable(
-                f"weights: {self._ended()}, so that nothing was changed; push again"
+                f"weights: {self._describe_end()}, so that nothing was changed; push again"
             )
+
         answer: dict[str, Any] = json.loads(line)
         if "code" in answer:
             error = read_error(answer)
@@ -164,20 +178,23 @@ class Child:
     def require_alive(self) -> None:
         """Raise `PolicyUnavailable` if the process has ended."""
         if self._process is None or self._process.poll() is not None:
-            raise PolicyUnavailable(self._ended())
+            raise PolicyUnavailable(self._describe_end())
 
     def close(self) -> None:
         """Close the policy, and end the process."""
-        if (process := self._process) is None or self._closed:
+        process = self._process
+        if process is None or self._closed:
             return
+
         self._closed = True
-        self._left.put(None)
+        self._dropped.put(None)
         _write(process, b"\n")
         try:
             process.wait(_CLOSE_S)
         except subprocess.TimeoutExpired:
             process.kill()
             process.wait()
+
         with self._lock:
             if self._transport is not None:
                 self._transport.close()
@@ -186,8 +203,8 @@ class Child:
                 with contextlib.suppress(BrokenPipeError):
                     pipe.close()
 
-    def _introduced(
-        self, process: subprocess.Popen[bytes], keeper: threading.Thread
+    def _wait_until_loaded(
+        self, process: subprocess.Popen[bytes], runner: threading.Thread
     ) -> dict[str, Any]:
         """Return the document that the process sends when its policy is loaded; raise
         `PolicyFailed` otherwise.
@@ -196,23 +213,23 @@ class Child:
         while True:
             line = b"" if process.stdout is None else process.stdout.readline()
             if not line:
-                keeper.join(_EXIT_S)
-                raise PolicyFailed(
-                    f"{self._ended()}; it said:\n{''.join(self._last_words).strip()}"
-                )
-            said: dict[str, Any] = json.loads(line)
-            if "step" not in said:
+                runner.join(_EXIT_S)
+                output = "".join(self._last_lines).strip()
+                raise PolicyFailed(f"{self._describe_end()}; it said:\n{output}")
+            document: dict[str, Any] = json.loads(line)
+            if "step" not in document:
                 break
-            report_progress(said["step"])
-        if "error" in said:
-            raise PolicyFailed(f"in {self._python}: {said['error']}")
-        for what in said["uncompiled"]:
-            report_uncompiled(what)
-        for device in said["devices"]:
-            report_device(device)
-        return said
+            report_progress(document["step"])
 
-    def _keep(self) -> None:
+        if "error" in document:
+            raise PolicyFailed(f"in {self._python}: {document['error']}")
+        for module in document["uncompiled"]:
+            report_uncompiled(module)
+        for device in document["devices"]:
+            report_device(device)
+        return document
+
+    def _run_process(self) -> None:
         """Start the process, copy its error output to that of this process, and wait until it
         ends.
         """
@@ -232,12 +249,13 @@ class Child:
             with process.stderr as stream:
                 for line in stream:
                     text = line.decode(errors="replace")
-                    self._last_words.append(text)
+                    self._last_lines.append(text)
                     sys.stderr.write(text)
         process.wait()
 
     def _close_sessions(self) -> None:
-        while (name := self._left.get()) is not None:
+        """Close the dropped sessions, and drop versions of the weights, until the process ends."""
+        while (name := self._dropped.get()) is not None:
             try:
                 if isinstance(name, int):
                     self.call([Request("weights", kwargs={"forget": name})])
@@ -248,7 +266,7 @@ class Child:
             self.sessions.discard(name)
             self._free.append(name)
 
-    def _ended(self) -> str:
+    def _describe_end(self) -> str:
         """Return a sentence about the end of the process; its exit status is known shortly after
         its sockets close.
         """
@@ -277,7 +295,11 @@ def make_agent(args: ServerArgs, config: Mapping[str, Any]) -> Agent:
     environment = args.environment
     if environment.python is not None and environment.process == "child":
         settings = Settings(
-            args.policy, dict(config), args.batch.max_size, version_of(args), args.wrappers
+            policy=args.policy,
+            config=dict(config),
+            batch=args.batch.max_size,
+            version=version_of(args),
+            wrappers=args.wrappers,
         )
         return ChildAgent(Child(environment.python, settings, environment.env_vars))
     return build_agent(args.policy, config, args.wrappers)
@@ -331,13 +353,14 @@ class ChildAgent(Agent, HoldsWeights):
         self._ask(Request("observe", obs))
 
     def act_batch(self, obs: Sequence[Obs], sessions: Sequence[Agent]) -> list[Act | Exception]:
-        requests = [
-            Request("act", one, session=session._session or "")
-            for session, one in zip(sessions, obs, strict=True)
-            if isinstance(session, ChildAgent)
-        ]
-        none = PolicyFailed("act: the policy's process answered without an action")
-        return [reply.error or reply.act or none for reply in self._child.call(requests)]
+        """Send the observations in one message; return the action or the error of each."""
+        requests = []
+        for session, session_obs in zip(sessions, obs, strict=True):
+            if isinstance(session, ChildAgent):
+                requests.append(Request("act", session_obs, session=session._session or ""))
+
+        missing = PolicyFailed("act: the policy's process answered without an action")
+        return [reply.error or reply.act or missing for reply in self._child.call(requests)]
 
     @property
     def continues_plans(self) -> bool:
@@ -362,13 +385,15 @@ class ChildAgent(Agent, HoldsWeights):
         return {"child": self._child, "moved": moved}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        self._child, self._session = state["child"], None
+        self._child = state["child"]
+        self._session = None
         if state["moved"] is not None:
             self._session = self._child.open_session()
             self._ask(Request("adopt", kwargs=state["moved"]))
 
     def __del__(self) -> None:
-        if (session := getattr(self, "_session", None)) is not None:
+        session = getattr(self, "_session", None)  # missing if `__init__` did not run
+        if session is not None:
             self._child.drop(session)
 
 
@@ -390,11 +415,14 @@ class ChildWeights(ModelWeights):
         super().__init__(agent, busy, trained.get("fingerprint", digest), model)
         self._child = child
         self._numbers = itertools.count(1)
-        self._names: WeakKeyDictionary[WeightsVersion, int] = WeakKeyDictionary()  # in the child
+        # Names of the versions in the child.
+        self._names: WeakKeyDictionary[WeightsVersion, int] = WeakKeyDictionary()
         if "refusal" in trained:
             self._refusal = NotTrainable(trained["refusal"])
             return
-        self._refusal, self.gpus = None, tuple(trained["gpus"])
+
+        self._refusal = None
+        self.gpus = tuple(trained["gpus"])
         self._name(self.newest, 0)
         self.newest.values = {
             name: ValueSpec(np.dtype("V2" if dtype == "bfloat16" else dtype), tuple(shape))
@@ -408,23 +436,32 @@ class ChildWeights(ModelWeights):
         pushed: Mapping[str, Any] | SharedValues,
         options: PushOptions,
     ) -> WeightsVersion:
-        name, shared = next(self._numbers), None
+        """Make a version in the child from new values, which travel in a file in memory or are
+        shared on the GPU.
+        """
+        name = next(self._numbers)
         if isinstance(pushed, SharedValues):
-            shared, pushed = pushed.to_json(), pushed.others
+            shared = pushed.to_json()
+            copied = pushed.others
         else:
-            # Before anything is copied.
+            shared = None
+            copied = pushed
+            # The values are checked before any of them is copied.
             require_fit(newest.values or {}, pushed, partial=options.partial)
+
         make = {"base": self._names[newest], "number": number, "options": asdict(options)}
-        with _memory() as file:
-            write_values(file, {key: portable(value) for key, value in pushed.items()})
-            call = {"name": name, "values": _path(file), "make": make, "shared": shared}
-            version = WeightsVersion(
-                number, self._child.call_for_weights(**call)["fingerprint"], newest.values
+        with _memory_file() as file:
+            write_values(file, {key: portable(value) for key, value in copied.items()})
+            made = self._child.call_for_weights(
+                name=name, values=_path(file), make=make, shared=shared
             )
+
+        version = WeightsVersion(number, made["fingerprint"], newest.values)
         self._name(version, name)
         return version
 
     def use(self, version: WeightsVersion) -> None:
+        """Make the policy act with a version."""
         if version is not self._live and version in self._names:
             self._live = None
             [reply] = self._child.call([Request("weights", kwargs={"use": self._names[version]})])
@@ -439,7 +476,7 @@ class ChildWeights(ModelWeights):
         self._child.call_for_weights()
 
     def portable_values(self, version: WeightsVersion) -> dict[str, Any]:
-        with _memory() as file:
+        with _memory_file() as file:
             self._child.call_for_weights(name=self._names[version], values=_path(file))
             return dict(read_values(file))
 
@@ -448,7 +485,7 @@ class ChildWeights(ModelWeights):
         finalize(version, self._child.drop, name).atexit = False
 
 
-def _memory() -> BinaryIO:
+def _memory_file() -> BinaryIO:
     """Return a file in memory that is freed when it is closed, however the other process ends."""
     return os.fdopen(os.memfd_create("vlagents_weights"), "w+b")
 

@@ -7,7 +7,7 @@ It needs the light install and pydantic, not Ray. The first line of its standard
 `Settings`, as JSON. It writes a line of JSON for each step of a long load and, when the policy is
 loaded, a line with the contract and the address of its `ShmServer`, which receives all requests; if
 the policy does not load, that line contains the error. Each further line of input is a call for new
-weights (see `_executed`), which is answered with a line of output while the policy acts; an empty
+weights (see `_execute`), which is answered with a line of output while the policy acts; an empty
 line makes it close the policy and end. The end of its input, or the death of its parent, ends it at
 once.
 """
@@ -64,8 +64,8 @@ class Settings:
 
 
 def examine(policy: str, config: dict[str, Any], wrappers: Sequence[Any] = ()) -> dict[str, Any]:
-    """Build the policy without loading it, and return its contract, if it states one already, or
-    the error.
+    """Build the policy without loading it, and return its contract, if it has one already, or the
+    error.
 
     Returns:
         `{"contract": ...}`, as JSON values or None, or `{"code": ..., "error": ...}`.
@@ -89,18 +89,23 @@ def run() -> None:
     answers = own_stdout()  # printed text goes to the replica's log
     logging.basicConfig(level=logging.INFO, format="%(levelname)s %(name)s: %(message)s")
     calls = os.fdopen(0, "rb", closefd=False)
-    if not (line := calls.readline()):
+    line = calls.readline()
+    if not line:
         sys.exit(1)
     settings = Settings(**json.loads(line))
     over = threading.Event()
 
-    def answer(said: dict[str, Any]) -> None:
-        print(json.dumps(said), file=answers, flush=True)
+    def answer(document: dict[str, Any]) -> None:
+        print(json.dumps(document), file=answers, flush=True)
+
+    def report_step(step: str) -> None:
+        answer({"step": step})
 
     def execute(call: dict[str, Any]) -> dict[str, Any]:
-        return _executed(engine.weights, **call)
+        return _execute(engine.weights, **call)
 
     threading.Thread(target=_read_calls, args=[calls, execute, answer, over], daemon=True).start()
+
     try:
         agent = build_agent(settings.policy, settings.config, settings.wrappers)
         engine = Engine(
@@ -115,14 +120,15 @@ def run() -> None:
         )
         server = ShmServer(engine, _NO_LIMITS, NoKey.INSIDE, INNER_OPS)
         server.open()
-        engine.models.on_step = lambda step: answer({"step": step})
+        engine.models.on_step = report_step
         engine.start()
     except Exception as error:
         logging.getLogger(__name__).exception("the policy did not load")
-        # The policy's own error.
+        # The cause of `PolicyFailed` is the policy's own error.
         cause = error.__cause__ if isinstance(error, PolicyFailed) else error
         answer({"error": f"{type(cause).__name__}: {cause}"})
         sys.exit(1)
+
     contract = None if engine.contract is None else engine.contract.to_json()
     models = engine.models
     answer(
@@ -133,9 +139,10 @@ def run() -> None:
             "continues_plans": models.continues_plans,
             "uncompiled": models.uncompiled,
             "devices": models.devices,
-            "trained": _trained(agent, engine.weights),
+            "trained": _describe_trained(agent, engine.weights),
         }
     )
+
     while not over.wait(_CHECK_S):
         try:
             engine.calls.require_device()
@@ -144,21 +151,22 @@ def run() -> None:
                 "the process ends, so that the replica is replaced"
             )
             os._exit(1)
+
     engine.close()
     server.close()
 
 
-def _trained(agent: Agent, updates: WeightUpdates) -> dict[str, Any]:
+def _describe_trained(agent: Agent, updates: WeightUpdates) -> dict[str, Any]:
     """Return types and shapes of the values that a learner trains, by name, or the reason why
     there are none.
     """
+    values = {}
     try:
-        values = {
-            name: [dtype_name(value), list(value.shape)]
-            for name, value in agent.parameters().items()
-        }
+        for name, value in agent.parameters().items():
+            values[name] = [dtype_name(value), list(value.shape)]
     except NotTrainable as error:
         return {"refusal": str(error)}
+
     return {
         "values": values,
         "fingerprint": updates.given(0).fingerprint,
@@ -172,8 +180,8 @@ def _read_calls(
     answer: Callable[[dict[str, Any]], None],
     over: threading.Event,
 ) -> None:
-    """Execute the calls that the replica writes, until it writes an empty line; then only the
-    end of input is left.
+    """Execute the calls that the replica writes, until it writes an empty line; end the process
+    at the end of the input.
     """
     while (line := calls.readline()) and not over.is_set():
         if not line.strip():
@@ -185,17 +193,14 @@ def _read_calls(
             answer({**problem(error), "not_shared": isinstance(error, NotShared)})
         except Exception as error:
             logging.getLogger(__name__).exception("a call for the weights failed")
-            answer(
-                problem(
-                    PolicyFailed(
-                        f"weights: the policy raised {type(error).__name__}; see the server's log"
-                    )
-                )
+            failure = PolicyFailed(
+                f"weights: the policy raised {type(error).__name__}; see the server's log"
             )
+            answer(problem(failure))
     os._exit(1)
 
 
-def _executed(
+def _execute(
     updates: WeightUpdates,
     name: int = 0,
     values: str = "",
@@ -214,17 +219,22 @@ def _executed(
         offload: See `ModelWeights.sleep`; without a file, None lets the policy wake.
     """
     if not values:
-        own = updates.own()
-        own.wake() if offload is None else own.sleep(offload=offload)
+        weights = updates.own()
+        if offload is None:
+            weights.wake()
+        else:
+            weights.sleep(offload=offload)
         return {}
+
     with Path(values).open("r+b") as file:
         if make is None:
             write_values(file, updates.own().portable_values(updates.given(name)))
             return {}
-        pushed = read_values(file)
+        copied = read_values(file)
+
     options = PushOptions(**make.pop("options"))
-    given = pushed if shared is None else SharedValues.from_json(shared, pushed)
-    return {"fingerprint": updates.make(name, pushed=given, options=options, **make)}
+    pushed = copied if shared is None else SharedValues.from_json(shared, copied)
+    return {"fingerprint": updates.make(name, pushed=pushed, options=options, **make)}
 
 
 if __name__ == "__main__":

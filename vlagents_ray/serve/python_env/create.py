@@ -28,12 +28,12 @@ from vlagents_ray.registry import plugin_distributions
 
 Progress = Callable[[str], None]
 
-_US = "vlagents-ray"
+_CORE = "vlagents-ray"  # the distribution of this package
 _FIXES = "vlagents_ray_import_fixes"  # a module and a .pth file in the environments created here
 # Files that an installer writes.
 _NOT_IN_A_WHEEL = {"RECORD", "INSTALLER", "REQUESTED", "direct_url.json"}
 _SHOWN = 2000  # number of characters at the end of uv's output that an error quotes
-_CUDA_12 = "torch<2.11"  # those whose wheels on PyPI are for CUDA 12
+_CUDA_12 = "torch<2.11"  # the versions whose wheels on PyPI are for CUDA 12
 _PYTHON = re.compile(r"^# python: (3\.\d+)\s*$", re.MULTILINE)
 _CUDA = re.compile(r"^ \+ ((?:nvidia|cuda)-\S+)", re.MULTILINE)
 # pip's variables for package sources, and those of uv, which take precedence.
@@ -63,16 +63,16 @@ def create(folder: Path, python: str | None = None, progress: Progress = lambda 
     Raises:
         ConfigError: The folder contains something else, or uv cannot create the environment.
     """
-    found = python_in(folder)
-    if found.exists():
-        return found
+    interpreter = python_in(folder)
+    if interpreter.exists():
+        return interpreter
     if folder.exists() and any(folder.iterdir()):
         raise ConfigError(
             f"{folder}: is there and holds no Python environment; name another folder"
         )
     progress(f"making {folder} with Python {python or platform.python_version()}")
     _uv(["venv", "--quiet", "--python", python or sys.executable, str(folder)])
-    return found
+    return interpreter
 
 
 def find_python(version: str) -> str:
@@ -83,32 +83,28 @@ def find_python(version: str) -> str:
     Raises:
         ConfigError: There is no such interpreter.
     """
-    folders = [Path(folder) for folder in os.environ.get("PATH", "").split(os.pathsep) if folder]
     pyenv = Path(os.environ.get("PYENV_ROOT") or Path.home() / ".pyenv") / "versions"
     uv = Path(os.environ.get("UV_PYTHON_INSTALL_DIR") or Path.home() / ".local/share/uv/python")
-    installed = [
-        *sorted(pyenv.glob(f"{version}.*/bin")),
-        *sorted(uv.glob(f"cpython-{version}.*/bin")),
-    ]
-    for one in [
-        Path(sys.executable),
-        *(folder / f"python{version}" for folder in [*folders, *installed]),
-    ]:
-        if os.access(one, os.X_OK) and _minor(one) == version:
-            return str(one)
+    folders = [Path(folder) for folder in os.environ.get("PATH", "").split(os.pathsep) if folder]
+    folders += sorted(pyenv.glob(f"{version}.*/bin"))
+    folders += sorted(uv.glob(f"cpython-{version}.*/bin"))
+
+    candidates = [Path(sys.executable), *(folder / f"python{version}" for folder in folders)]
+    for interpreter in candidates:
+        if os.access(interpreter, os.X_OK) and _minor(interpreter) == version:
+            return str(interpreter)
     raise ConfigError(
         f"found no Python {version}, which the requirements want: looked for python{version} on "
-        f"PATH, in {pyenv} "
-        f"and in {uv}; install it (`uv python install {version}`), or name one: --python "
-        f"/path/to/python{version}"
+        f"PATH, in {pyenv} and in {uv}; install it (`uv python install {version}`), or name one: "
+        f"--python /path/to/python{version}"
     )
 
 
-def install(python: Path, wanted: Sequence[str]) -> None:
-    """Install `wanted`, arguments of `uv pip install`, for `python`; raise `ConfigError` with
-    uv's output.
+def install(python: Path, arguments: Sequence[str]) -> None:
+    """Run `uv pip install` with these arguments for `python`; raise `ConfigError` with uv's
+    output.
     """
-    _uv(["pip", "install", "--quiet", "--python", str(python), *wanted])
+    _uv(["pip", "install", "--quiet", "--python", str(python), *arguments])
 
 
 def make_environment(
@@ -154,51 +150,58 @@ def make_environment(
             raise ConfigError(
                 f"{file}: expected a requirements file, such as needs.txt, got a module of Python"
             )
-    if (
-        python is None
-        and not python_in(folder).exists()
-        and (wanted := _PYTHON.search(requirements.read_text()))
-    ):
-        python = find_python(wanted[1])
+
     is_new = not python_in(folder).exists()
-    made = create(folder, python, progress)
+    if python is None and is_new:
+        version = _PYTHON.search(requirements.read_text())
+        if version is not None:
+            python = find_python(version[1])
+
+    interpreter = create(folder, python, progress)
     try:
-        _fill(made, files, light=light, cuda=cuda, progress=progress)
+        _fill(interpreter, files, light=light, cuda=cuda, progress=progress)
     except BaseException:
         if is_new:  # otherwise it would later be taken for a complete environment
             shutil.rmtree(folder)
         raise
-    return made
+    return interpreter
 
 
 def _fill(
-    made: Path, files: Sequence[Path], *, light: bool, cuda: bool, progress: Progress
+    python: Path, files: Sequence[Path], *, light: bool, cuda: bool, progress: Progress
 ) -> None:
     """Install this package, the plug-ins and the requirements in `files` for a Python; see
     `make_environment`.
     """
-    if not light and (theirs := _minor(made)) != (ours := _minor(Path(sys.executable))):
-        progress(f"Python {theirs} is not this one's {ours}: without Ray, for a child process")
-        light = True
-    with tempfile.TemporaryDirectory() as scratch:
-        asked = [*_ourselves(light, Path(scratch))]
-        asked += [word for file in files for word in ("--requirement", str(file))]
+    if not light:
+        theirs = _minor(python)
+        ours = _minor(Path(sys.executable))
+        if theirs != ours:
+            progress(f"Python {theirs} is not this one's {ours}: without Ray, for a child process")
+            light = True
+
+    with tempfile.TemporaryDirectory() as name:
+        scratch = Path(name)
+        arguments = _core(light, scratch)
+        for file in files:
+            arguments += ["--requirement", str(file)]
         if has_gpu():
-            asked += _for_driver(Path(scratch), progress)
+            arguments += _constraints_of_driver(scratch, progress)
         else:
-            for override in _overrides(files[0], Path(scratch)):
-                asked += ["--override", str(override)]
+            for override in _overrides(files[0], scratch):
+                arguments += ["--override", str(override)]
             if not cuda:
-                require_no_cuda(made, asked)
-        progress(f"installing {_US} {importlib.metadata.version(_US)} and {files[0]}")
-        install(made, asked)
-        plugins = _plugins(Path(scratch))
+                require_no_cuda(python, arguments)
+
+        progress(f"installing {_CORE} {importlib.metadata.version(_CORE)} and {files[0]}")
+        install(python, arguments)
+        plugins = _plugins(scratch)
         if plugins:
-            install(made, ["--no-deps", *plugins])
-    _install_import_fixes(made)
+            install(python, ["--no-deps", *plugins])
+    _install_import_fixes(python)
 
 
-def _ourselves(light: bool, scratch: Path) -> list[str]:
+def _core(light: bool, scratch: Path) -> list[str]:
     """Return uv's arguments for this package as it is installed here, with the same Ray, or
     pydantic if `light`.
 
@@ -207,13 +210,16 @@ def _ourselves(light: bool, scratch: Path) -> list[str]:
     extra = "" if light else "[serve]"
     source = Path(vlagents_ray.__file__).parents[1]
     if (source / "pyproject.toml").is_file():
-        us = ["--editable", f"{source}{extra}"]
+        arguments = ["--editable", f"{source}{extra}"]
     else:
-        us = [f"{_US}{extra} @ {installed_wheel(scratch).as_uri()}"]
+        arguments = [f"{_CORE}{extra} @ {installed_wheel(scratch).as_uri()}"]
+
     if not light:
-        return [*us, f"ray=={importlib.metadata.version('ray')}"]
-    needed = importlib.metadata.requires(_US) or []
-    return [*us, *(one.partition(";")[0].strip() for one in needed if one.startswith("pydantic"))]
+        return [*arguments, f"ray=={importlib.metadata.version('ray')}"]
+    for requirement in importlib.metadata.requires(_CORE) or []:
+        if requirement.startswith("pydantic"):
+            arguments.append(requirement.partition(";")[0].strip())
+    return arguments
 
 
 def _plugins(scratch: Path) -> list[str]:
@@ -239,9 +245,10 @@ def _editable_source(installed: importlib.metadata.Distribution) -> Path | None:
     See https://packaging.python.org/en/latest/specifications/direct-url.
     """
     checkout = Path(str(installed.locate_file("")))
-    # On the path of modules: its metadata are not an installation's.
+    # A checkout on the path of modules has metadata that are not an installation's.
     if (checkout / "pyproject.toml").is_file():
         return checkout
+
     text = installed.read_text("direct_url.json")
     origin = json.loads(text) if text else {}
     if not origin.get("dir_info", {}).get("editable"):
@@ -249,51 +256,53 @@ def _editable_source(installed: importlib.metadata.Distribution) -> Path | None:
     return Path(url2pathname(urlparse(origin["url"]).path))
 
 
-def installed_wheel(folder: Path, distribution: str = _US) -> Path:
+def installed_wheel(folder: Path, distribution: str = _CORE) -> Path:
     """Write a wheel of a distribution, from its installed files, into `folder`, and return its
     path.
 
     The wheel contains the files and a list of them, see
     https://packaging.python.org/en/latest/specifications/binary-distribution-format.
     """
-    here = importlib.metadata.distribution(distribution)
-    kept = [
-        file
-        for file in here.files or ()
-        if ".." not in file.parts
-        and "__pycache__" not in file.parts
-        and file.name not in _NOT_IN_A_WHEEL
-    ]
-    made = folder / f"{distribution.replace('-', '_')}-{here.version}-py3-none-any.whl"
-    record = next(str(file.parent / "RECORD") for file in kept if file.name == "METADATA")
-    with zipfile.ZipFile(made, "w", zipfile.ZIP_DEFLATED) as wheel:
-        for file in kept:
+    installed = importlib.metadata.distribution(distribution)
+    files = [file for file in installed.files or () if _is_in_wheel(file)]
+    path = folder / f"{distribution.replace('-', '_')}-{installed.version}-py3-none-any.whl"
+    record = next(str(file.parent / "RECORD") for file in files if file.name == "METADATA")
+
+    entries = ""
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as wheel:
+        for file in files:
             wheel.write(file.locate(), str(file))
-        listed = "".join(
-            f"{file},{file.hash.mode}={file.hash.value},{file.size}\n" for file in kept if file.hash
-        )
-        wheel.writestr(record, f"{listed}{record},,\n")
-    return made
+            if file.hash:
+                entries += f"{file},{file.hash.mode}={file.hash.value},{file.size}\n"
+        wheel.writestr(record, f"{entries}{record},,\n")
+    return path
+
+
+def _is_in_wheel(file: importlib.metadata.PackagePath) -> bool:
+    """Return whether a wheel contains this file of an installed distribution."""
+    is_inside = ".." not in file.parts and "__pycache__" not in file.parts
+    return is_inside and file.name not in _NOT_IN_A_WHEEL
 
 
 def _overrides(requirements: Path, scratch: Path) -> list[Path]:
     """Return files with replacements of requirements for a machine without a GPU."""
-    found = []
-    theirs = requirements.with_suffix(f".cpu{requirements.suffix}")
-    if theirs.is_file():
-        found.append(theirs)
+    overrides = []
+    cpu_builds = requirements.with_suffix(f".cpu{requirements.suffix}")
+    if cpu_builds.is_file():
+        overrides.append(cpu_builds)
+
     try:
-        torch = importlib.metadata.version("torch")
+        torch_version = importlib.metadata.version("torch")
     except importlib.metadata.PackageNotFoundError:
-        return found
-    if not found or not re.search(r"(?mi)^torch\b(?!-)", theirs.read_text()):
-        ours = scratch / "torch.txt"
-        ours.write_text(f"torch=={torch}\n")
-        found.append(ours)
-    return found
+        return overrides
+    if not overrides or not re.search(r"(?mi)^torch\b(?!-)", cpu_builds.read_text()):
+        torch = scratch / "torch.txt"
+        torch.write_text(f"torch=={torch_version}\n")
+        overrides.append(torch)
+    return overrides
 
 
-def _for_driver(scratch: Path, progress: Progress) -> list[str]:
+def _constraints_of_driver(scratch: Path, progress: Progress) -> list[str]:
     """Return uv's arguments for a torch that runs with this machine's driver, unless uv's own
     variable chooses one.
     """
@@ -304,6 +313,7 @@ def _for_driver(scratch: Path, progress: Progress) -> list[str]:
         or int(driver.partition(".")[0]) >= OLDEST_DRIVERS[13]
     ):
         return []
+
     progress(
         f"the driver, {driver}, is older than {OLDEST_DRIVERS[13]}, the first for CUDA 13: taking "
         f"{_CUDA_12}"
@@ -313,16 +323,16 @@ def _for_driver(scratch: Path, progress: Progress) -> list[str]:
     return ["--constraint", str(constraints)]
 
 
-def require_no_cuda(python: Path, wanted: Sequence[str]) -> None:
-    plan = _uv(["pip", "install", "--dry-run", "--python", str(python), *wanted])
-    if found := _CUDA.findall(plan):
+def require_no_cuda(python: Path, arguments: Sequence[str]) -> None:
+    """Raise `ConfigError` if `uv pip install` with these arguments would install CUDA packages."""
+    plan = _uv(["pip", "install", "--dry-run", "--python", str(python), *arguments])
+    cuda_packages = _CUDA.findall(plan)
+    if cuda_packages:
         raise ConfigError(
             "stopped before downloading several GB: the requirements bring CUDA packages "
-            f"({', '.join(found[:3])}, …), "
-            "but this machine shows no NVIDIA GPU; name CPU builds in a file NAME.cpu.txt beside "
-            "NAME.txt, and where "
-            "they are with PIP_FIND_LINKS or PIP_INDEX_URL, or take these, --cuda: they run on a "
-            "CPU, too"
+            f"({', '.join(cuda_packages[:3])}, …), but this machine shows no NVIDIA GPU; name CPU "
+            "builds in a file NAME.cpu.txt beside NAME.txt, and where they are with PIP_FIND_LINKS "
+            "or PIP_INDEX_URL, or take these, --cuda: they run on a CPU, too"
         )
 
 
@@ -331,9 +341,8 @@ def _install_import_fixes(python: Path) -> None:
     fit this machine.
     """
     command = [str(python), "-c", "import sysconfig; print(sysconfig.get_path('purelib'))"]
-    folder = Path(
-        subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()  # noqa: S603
-    )
+    done = subprocess.run(command, capture_output=True, text=True, check=True)  # noqa: S603
+    folder = Path(done.stdout.strip())
     shutil.copyfile(str(import_fixes.__file__), folder / f"{_FIXES}.py")
     (folder / f"{_FIXES}.pth").write_text(f"import {_FIXES}; {_FIXES}.install()\n")
 
@@ -343,10 +352,9 @@ def has_gpu() -> bool:
     does not support.
     """
     # WSL2 has no /dev/nvidia0.
-    on_wsl = Path("/dev/dxg").exists() and shutil.which("nvidia-smi") is not None
-    return (on_wsl or any(Path("/dev").glob("nvidia[0-9]*"))) and not Path(
-        "/etc/nv_tegra_release"
-    ).exists()
+    is_wsl = Path("/dev/dxg").exists() and shutil.which("nvidia-smi") is not None
+    is_jetson = Path("/etc/nv_tegra_release").exists()
+    return (is_wsl or any(Path("/dev").glob("nvidia[0-9]*"))) and not is_jetson
 
 
 def _minor(python: Path) -> str:
@@ -362,25 +370,27 @@ def _uv(arguments: Sequence[str]) -> str:
     if importlib.util.find_spec("uv") is not None:
         command = [sys.executable, "-m", "uv"]
     else:
-        beside = f"{Path(sys.executable).parent}{os.pathsep}{os.environ.get('PATH', '')}"
-        if (binary := shutil.which("uv", path=beside)) is None:
+        folders = f"{Path(sys.executable).parent}{os.pathsep}{os.environ.get('PATH', '')}"
+        binary = shutil.which("uv", path=folders)
+        if binary is None:
             raise MissingDependency("'uv' is not installed; pip install 'vlagents-ray[serve]'")
         command = [binary]
+
     done = subprocess.run(  # noqa: S603 - uv, as installed with this package
         [*command, *arguments],
         capture_output=True,
         text=True,
         check=False,
-        env={**_places(), **os.environ},
+        env={**_package_sources(), **os.environ},
     )
     if done.returncode != 0:
         raise ConfigError(f"uv {arguments[0]} failed:\n{done.stderr.strip()[-_SHOWN:]}")
     return done.stderr
 
 
-def _places() -> dict[str, str]:
+def _package_sources() -> dict[str, str]:
     """Return pip's package sources as variables of uv."""
-    places = {uv: os.environ[pip] for pip, uv in _PIP_VARIABLES.items() if pip in os.environ}
-    if "UV_FIND_LINKS" in places:
-        places["UV_FIND_LINKS"] = ",".join(places["UV_FIND_LINKS"].split())
-    return places
+    sources = {uv: os.environ[pip] for pip, uv in _PIP_VARIABLES.items() if pip in os.environ}
+    if "UV_FIND_LINKS" in sources:
+        sources["UV_FIND_LINKS"] = ",".join(sources["UV_FIND_LINKS"].split())
+    return sources

@@ -50,19 +50,21 @@ class EnvironmentProbe:
     versions: dict[str, str]
     policy: dict[str, Any] | None = None  # result of `child_main.examine`, if it was requested
 
-    def hosts_replicas(self) -> str | None:
+    def obstacle_to_replicas(self) -> str | None:
         """Return the reason why a replica of this process's cluster cannot run there; None if it
         can.
         """
-        ours, theirs = platform.python_version(), self.versions["python"]
+        ours = platform.python_version()
+        theirs = self.versions["python"]
         if _minor(ours) != _minor(theirs):
             return f"it is Python {theirs}, the cluster's is {ours}"
-        cluster, there = importlib.metadata.version("ray"), self.versions.get("ray")
-        return (
-            None
-            if there == cluster
-            else f"it has {f'Ray {there}' if there else 'no Ray'}, the cluster has {cluster}"
-        )
+
+        our_ray = importlib.metadata.version("ray")
+        their_ray = self.versions.get("ray")
+        if their_ray == our_ray:
+            return None
+        described = f"Ray {their_ray}" if their_ray else "no Ray"
+        return f"it has {described}, the cluster has {our_ray}"
 
 
 def probe(
@@ -80,17 +82,19 @@ def probe(
     """
     if not Path(python).is_file():
         inside = Path(python) / "bin" / "python"
-        cure = (
-            f"did you mean {inside}?" if inside.is_file() else f"make one with `{_making(python)}`"
-        )
+        if inside.is_file():
+            cure = f"did you mean {inside}?"
+        else:
+            cure = f"make one with `{_command_for(python)}`"
         raise ConfigError(
             f"environment.python: no such file, got {python!r}, want an interpreter; {cure}"
         )
+
     version = importlib.metadata.version("vlagents-ray")
     try:
         done = subprocess.run(  # noqa: S603 - the deployment's own interpreter
             [python, "-c", _PROBE, *_PACKAGES],
-            # Not as an argument, which every user of the machine could read.
+            # The settings are no argument, as every user of the machine could read that.
             input=json.dumps({"policy": policy, "version": version}),
             capture_output=True,
             text=True,
@@ -98,40 +102,43 @@ def probe(
             check=False,
             env={**os.environ, **(env_vars or {})},
         )
-    except (OSError, subprocess.TimeoutExpired) as error:
-        why = (
-            error
-            if isinstance(error, OSError)
-            else f"no answer in {_TIMEOUT_S} s; is the machine busy?"
-        )
+    except subprocess.TimeoutExpired as error:
         raise ConfigError(
-            f"environment.python: {python!r} is no Python interpreter that runs here ({why})"
+            f"environment.python: {python!r} is no Python interpreter that runs here (no answer in "
+            f"{_TIMEOUT_S} s; is the machine busy?)"
         ) from error
-    last = done.stdout.strip().rpartition("\n")[2]
-    if not last.startswith("VLA{"):
-        words = (done.stderr or done.stdout).strip()[-500:] or "it said nothing"
+    except OSError as error:
         raise ConfigError(
-            f"environment.python: {python!r} is no Python interpreter, or a broken one: {words}"
+            f"environment.python: {python!r} is no Python interpreter that runs here ({error})"
+        ) from error
+
+    last_line = done.stdout.strip().rpartition("\n")[2]
+    if not last_line.startswith("VLA{"):
+        output = (done.stderr or done.stdout).strip()[-500:] or "it said nothing"
+        raise ConfigError(
+            f"environment.python: {python!r} is no Python interpreter, or a broken one: {output}"
         )
-    said: dict[str, Any] = json.loads(last[3:])
-    examined = said.pop("policy", None)
-    if _minor(said["python"]) < OLDEST:
+
+    versions: dict[str, Any] = json.loads(last_line[3:])
+    examined = versions.pop("policy", None)
+    if _minor(versions["python"]) < OLDEST:
         oldest = ".".join(map(str, OLDEST))
         raise ConfigError(
-            f"environment.python: {python} is Python {said['python']}, want {oldest} or newer"
+            f"environment.python: {python} is Python {versions['python']}, want {oldest} or newer"
         )
-    if (theirs := said.get("vlagents-ray")) != version:
+    theirs = versions.get("vlagents-ray")
+    if theirs != version:
+        installed = f"vlagents-ray {theirs}" if theirs else "no vlagents-ray"
         raise ConfigError(
-            f"environment.python: {python} has "
-            f"{f'vlagents-ray {theirs}' if theirs else 'no vlagents-ray'}, want "
-            f"{version} as here; install it there, or make the environment with `{_making(python)}`"
+            f"environment.python: {python} has {installed}, want {version} as here; install it "
+            f"there, or make the environment with `{_command_for(python)}`"
         )
-    return EnvironmentProbe(said, examined)
+    return EnvironmentProbe(versions, examined)
 
 
-def _making(python: str) -> str:
-    """Return the command that creates an interpreter's environment: .venv-NAME is that of the
-    family's NAME.
+def _command_for(python: str) -> str:
+    """Return the command that creates an interpreter's environment: the folder .venv-NAME is for
+    the requirements NAME.
     """
     folder = Path(python).parent.parent
     prefix, _, name = folder.name.partition(".venv-")
@@ -146,9 +153,8 @@ def with_process(environment: EnvironmentArgs) -> EnvironmentArgs:
     """
     if environment.python is None:
         return environment
-    return environment.model_copy(
-        update={"process": _process(environment, probe(environment.python))}
-    )
+    process = _process(environment, probe(environment.python))
+    return environment.model_copy(update={"process": process})
 
 
 def check_policy(
@@ -165,26 +171,30 @@ def check_policy(
     """
     if environment.python is None:
         raise ConfigError("environment: names no interpreter to ask")
-    asked = {"policy": policy, "config": dict(config), "wrappers": list(wrappers)}
-    found = probe(environment.python, asked, environment.env_vars)
-    _process(environment, found)
-    said = found.policy or {}
-    if "error" in said:
-        raise from_code(said["code"], f"in {environment.python}: {said['error']}")
-    contract = said.get("contract")
+
+    arguments = {"policy": policy, "config": dict(config), "wrappers": list(wrappers)}
+    interpreter = probe(environment.python, arguments, environment.env_vars)
+    _process(environment, interpreter)
+
+    examined = interpreter.policy or {}
+    if "error" in examined:
+        raise from_code(examined["code"], f"in {environment.python}: {examined['error']}")
+    contract = examined.get("contract")
     return None if contract is None else Contract.from_json(contract)
 
 
-def _process(environment: EnvironmentArgs, found: EnvironmentProbe) -> Literal["replica", "child"]:
+def _process(
+    environment: EnvironmentArgs, interpreter: EnvironmentProbe
+) -> Literal["replica", "child"]:
+    """Return where the policy runs; raise `ConfigError` if it cannot run where `process` says."""
     if environment.process == "child":
         return "child"
-    obstacle = found.hosts_replicas()
+    obstacle = interpreter.obstacle_to_replicas()
     if obstacle is not None and environment.process == "replica":
         raise ConfigError(
             f"environment.process: got 'replica', which cannot run in {environment.python}: "
-            f"{obstacle}; "
-            "use process 'child' (or 'auto'), or make the environment anew with `vlagents-ray env "
-            "make`"
+            f"{obstacle}; use process 'child' (or 'auto'), or make the environment anew with "
+            "`vlagents-ray env make`"
         )
     return "child" if obstacle else "replica"
 
