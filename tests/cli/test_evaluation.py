@@ -255,7 +255,7 @@ def test_each_option_that_is_a_setting_is_one_of_a_single_model() -> None:
         for option in inspect.signature(command.evaluate_command).parameters
     }
     of_the_run_itself = {
-        "what",
+        "targets",
         "watch",
         "until",
         "settle_s",

@@ -12,7 +12,7 @@ import yaml
 from eval_fakes import LINE
 
 from vlagents_ray.cli import evaluation as run
-from vlagents_ray.cli.evaluation import _watched, watch_training
+from vlagents_ray.cli.evaluation import _trained_policy, watch_training
 from vlagents_ray.cli.policies import resolve_policies
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.evaluate import EvalConfig, Progress, Results, Summary
@@ -120,7 +120,7 @@ def test_a_step_is_not_missed_before_the_first_checkpoint_is_there_and_its_first
     family: str, tmp_path: Path
 ) -> None:
     config = swept(family, tmp_path, "evaluation")
-    assert _watched(config) == (0, "/runs/{step}/pretrained_model")
+    assert _trained_policy(config) == (0, "/runs/{step}/pretrained_model")
     policies = [config.policies[0].model_copy(update={"steps": [30, 60]})]
     _, parts = resolve_policies(config.model_copy(update={"policies": policies}))
     assert own_settings(parts["swept"].applications[0])["checkpoint_step"] == 30
@@ -131,11 +131,11 @@ def test_of_the_settings_only_a_step_that_is_swept_may_be_missing(
     place: str, tmp_path: Path
 ) -> None:
     with pytest.raises(ConfigError, match="chekpoint_dir"):
-        _watched(swept("pi0", tmp_path, place, chekpoint_dir="/runs"))
+        _trained_policy(swept("pi0", tmp_path, place, chekpoint_dir="/runs"))
     with pytest.raises(ConfigError, match="max_rows"):
-        _watched(swept("pi0", tmp_path, place, max_rows=0))
+        _trained_policy(swept("pi0", tmp_path, place, max_rows=0))
     config = swept("pi0", tmp_path, place)
-    assert _watched(config) == (0, "/runs/{step}/pretrained_model")
+    assert _trained_policy(config) == (0, "/runs/{step}/pretrained_model")
     with pytest.raises(ConfigError, match="checkpoint_step None: give both"):
         resolve_policies(config)
     if place == "deployment":

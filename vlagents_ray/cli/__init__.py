@@ -14,8 +14,9 @@ from vlagents_ray.naming import did_you_mean
 
 def main() -> None:
     """Run the console script; name the packages to install if only the light install is there."""
-    # Until a command has its own: `cli.console.errors`.
+    # This handler applies until a command has its own, see `cli.console.errors`.
     default = signal.signal(signal.SIGINT, _end_at_once)
+
     if sys.argv[1:2] == ["robot"]:  # the light install has it, and Ctrl-C in it stops the robot
         from vlagents_ray.cli.robot import main as robot
 
@@ -26,6 +27,7 @@ def main() -> None:
         except KeyboardInterrupt:
             sys.stderr.write("error interrupted\n")
             sys.exit(130)
+
     try:
         from vlagents_ray.cli.main import app
     except ModuleNotFoundError as error:
@@ -36,10 +38,10 @@ def main() -> None:
             f"vlagents-ray: {error.name!r} is not installed; this is the light install of a "
             f"robot's computer{guess}\n"
             "It has `vlagents-ray robot`. For the other commands: pip install "
-            "'vlagents-ray[serve]', and "
-            "'vlagents-ray[sim]' to evaluate.\n"
+            "'vlagents-ray[serve]', and 'vlagents-ray[sim]' to evaluate.\n"
         )
         sys.exit(1)
+
     find_modules_here()
     atexit.register(gc.freeze)  # else Python collects all of Ray at its end, for half a second
     app()
@@ -57,8 +59,8 @@ def find_modules_here() -> None:
     if getattr(sys.flags, "safe_path", False):  # Python 3.10 has no such flag
         return
     try:
-        here = os.getcwd()
+        folder = os.getcwd()
     except FileNotFoundError:  # it was removed
         return
-    if here not in sys.path:
-        sys.path.insert(0, here)
+    if folder not in sys.path:
+        sys.path.insert(0, folder)

@@ -16,25 +16,31 @@ from vlagents_ray.naming import did_you_mean
 def number(
     kind: type[float] | type[int] = float,
     *,
-    least: float = 0,
+    minimum: float = 0,
     above: bool = False,
-    most: float = 1e9,
+    maximum: float = 1e9,
 ) -> Callable[[str], float]:
-    """Return a function with which argparse reads a number not below `least`, or above it, and
-    up to `most`.
+    """Return a function with which argparse reads a number.
+
+    Args:
+        kind: The type of the number.
+        minimum: The smallest number.
+        above: Whether `minimum` itself is excluded.
+        maximum: The largest number.
     """
 
     def read(text: str) -> float:
+        """Read the number; raise `ArgumentTypeError` if it is out of range."""
         with contextlib.suppress(ValueError):
             value = kind(text)
-            if (value > least or (value == least and not above)) and value > most:
-                raise argparse.ArgumentTypeError(f"got {text!r}, want at most {most:g}")
-            if value > least or (value == least and not above):
+            if value > minimum or (value == minimum and not above):
+                if value > maximum:
+                    raise argparse.ArgumentTypeError(f"got {text!r}, want at most {maximum:g}")
                 return value
-        what = "a whole number" if kind is int else "a number"
-        raise argparse.ArgumentTypeError(
-            f"got {text!r}, want {what} {'above' if above else 'from'} {least:g}"
-        )
+
+        noun = "a whole number" if kind is int else "a number"
+        bound = "above" if above else "from"
+        raise argparse.ArgumentTypeError(f"got {text!r}, want {noun} {bound} {minimum:g}")
 
     return read
 
@@ -45,6 +51,7 @@ def one_of(*names: str) -> dict[str, Any]:
     """
 
     def read(text: str) -> str:
+        """Read a name; raise `ArgumentTypeError` for an unknown one."""
         if text not in names:
             raise argparse.ArgumentTypeError(
                 f"got {text!r}, want one of {list(names)}{did_you_mean(text, names)}"
@@ -62,19 +69,29 @@ def parse_all(
     """Parse the arguments; the process ends with status 2 and a suggestion if one of them is
     unknown.
 
-    `cures` are those of options that users expect and that do not exist.
+    Args:
+        parser: The parser.
+        arguments: The arguments.
+        cures: The messages for options that users expect and that do not exist, by option.
     """
     options, unknown = parser.parse_known_args(arguments)
+    for argument in unknown:
+        name = argument.partition("=")[0]
+        if name in cures:
+            parser.error(cures[name])
     if unknown:
-        names = (word.partition("=")[0] for word in unknown)
-        cure = next((cures[name] for name in names if name in cures), None)
-        if cure is not None:
-            parser.error(cure)
-        words = parser.format_help().replace(",", " ").split()
-        known = [word.removeprefix("--") for word in words if word.startswith("--")]
-        meant = [word.lstrip("-").partition("=")[0] for word in unknown if word.startswith("-")]
-        guesses = "".join(did_you_mean(word, known) for word in meant).replace("mean '", "mean '--")
-        parser.error(
-            f"unrecognized arguments: {' '.join(unknown)}{guesses or '; --help lists the options'}"
-        )
+        hint = _guesses(parser, unknown) or "; --help lists the options"
+        parser.error(f"unrecognized arguments: {' '.join(unknown)}{hint}")
     return options
+
+
+def _guesses(parser: argparse.ArgumentParser, unknown: Sequence[str]) -> str:
+    """Return the options that the user may have meant by unknown ones."""
+    words = parser.format_help().replace(",", " ").split()
+    known = [word.removeprefix("--") for word in words if word.startswith("--")]
+    guesses = ""
+    for argument in unknown:
+        if argument.startswith("-"):
+            name = argument.lstrip("-").partition("=")[0]
+            guesses += did_you_mean(name, known).replace("mean '", "mean '--")
+    return guesses

@@ -62,10 +62,10 @@ def _without_controls(text: str) -> str:
 
 def table(*columns: str, **options: Any) -> Table:
     """Make an empty table that cuts nothing off."""
-    made = Table(**options)
+    empty = Table(**options)
     for column in columns:
-        made.add_column(column, overflow="fold")
-    return made
+        empty.add_column(column, overflow="fold")
+    return empty
 
 
 out = PlainConsole()
@@ -90,14 +90,14 @@ def errors(*settings: type[BaseModel]) -> Iterator[None]:
         from vlagents_ray.evaluate import EvalConfig
 
         models: tuple[type[BaseModel], ...] = (EvalConfig, *settings)
-        known = next((model for model in models if model.__name__ == error.title), None)
-        fail(f"wrong settings: {wrong_settings(error, known)}", 2)
+        model = next((model for model in models if model.__name__ == error.title), None)
+        fail(f"wrong settings: {wrong_settings(error, model)}", 2)
     except ConfigError as error:
         fail(str(error), 2)
     except ClusterLost as error:
-        with open(os.dup(2), "w") as last, open(os.devnull, "w") as nowhere:
+        with open(os.dup(2), "w") as stderr, open(os.devnull, "w") as nowhere:
             os.dup2(nowhere.fileno(), 2)  # Ray's native threads log there until the process ends
-            say_error(f"{type(error).__name__}: {error}", PlainConsole(file=last))
+            say_error(f"{type(error).__name__}: {error}", PlainConsole(file=stderr))
         raise typer.Exit(1) from error
     except VLAgentsError as error:
         fail(f"{type(error).__name__}: {error}", 1)
@@ -135,14 +135,17 @@ def fresh(folder: Path) -> Path:
     """
     if folder.is_file():
         raise ConfigError(f"{folder}: expected a folder, got a file; choose another name")
+    if not folder.exists():
+        return folder
     numbered = (folder.with_name(f"{folder.name}-{number}") for number in itertools.count(2))
-    return next(one for one in itertools.chain([folder], numbered) if not one.exists())
+    return next(candidate for candidate in numbered if not candidate.exists())
 
 
 def print_json(document: Any) -> None:
-    """Print what `--json` of a command wants, and nothing else, on stdout."""
+    """Print the JSON document of a command with `--json`, and nothing else, on stdout."""
     out.print(json.dumps(document, indent=2, default=str))
 
 
 def progress(text: str) -> None:
+    """Print a line about a step of a long task."""
     out.print(text)

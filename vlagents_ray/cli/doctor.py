@@ -45,7 +45,7 @@ _FIRST_FREE = 1024  # ports below are root's
 _WIDTH = 120  # columns of the table in a file or a pipe
 _STYLE = {"ok": "green", "warn": "yellow", "fail": "bold red"}
 # Prints the versions of torch and JAX in an interpreter, their CUDA, and the GPU that they use or
-# what prevents it.
+# the reason why they use none.
 _LIBRARIES = """
 import json, os, sysconfig
 from importlib.metadata import distributions
@@ -162,15 +162,17 @@ def judge_temp_dir(path: str, total: float, free: float) -> Check:
 
 def open_files() -> Check:
     """Check that one process may hold as many sockets and files as a server needs."""
-    limits = resource.getrlimit(resource.RLIMIT_NOFILE)
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    unlimited = resource.RLIM_INFINITY
     return judge_open_files(
-        *(sys.maxsize if one == resource.RLIM_INFINITY else one for one in limits)
+        sys.maxsize if soft == unlimited else soft, sys.maxsize if hard == unlimited else hard
     )
 
 
 def judge_open_files(soft: int, hard: int) -> Check:
     """Judge the limits; Ray raises the soft one by itself, up to the hard one or 65536."""
-    if (effective := max(soft, min(hard, _FILES_RAISED_TO))) >= _FILES_ENOUGH:
+    effective = max(soft, min(hard, _FILES_RAISED_TO))
+    if effective >= _FILES_ENOUGH:
         return Check("ok", f"{soft} a process, {effective} under Ray")
     cure = (
         f"ulimit -Hn {_FILES_WANTED} as root, or LimitNOFILE={_FILES_WANTED} in the service's "
@@ -213,32 +215,30 @@ def run(
     for interpreter in pythons:
         _require_program(interpreter)
     with console.status("looking around; rendering a frame takes some seconds"):
-        found = list(checks(port, pythons))
+        results = list(checks(port, pythons))
+
     if as_json:
-        print_json([{"check": name, **asdict(check)} for name, check in found])
+        print_json([{"check": name, **asdict(check)} for name, check in results])
     else:
         rows = table("check", "", "found", "cure", box=None, header_style="bold", pad_edge=False)
-        for name, check in found:
+        for name, check in results:
             rows.add_row(
                 name, Text(check.status, _STYLE[check.status]), Text(check.detail), Text(check.cure)
             )
         console.print(rows, width=None if console.is_terminal else _WIDTH)
-    return int(any(check.status == "fail" for _, check in found))
+    return int(any(check.status == "fail" for _, check in results))
 
 
 def _require_program(interpreter: Path) -> None:
+    """Raise `ConfigError` if `interpreter` is no program."""
     if interpreter.is_file() and os.access(interpreter, os.X_OK):
         return
-    what = "a folder" if interpreter.is_dir() else "no program"
-    cure = (
-        f"; did you mean {interpreter / 'bin/python'}?"
-        if (interpreter / "bin/python").exists()
-        else ""
-    )
+    kind = "a folder" if interpreter.is_dir() else "no program"
+    inside = interpreter / "bin/python"
+    cure = f"; did you mean {inside}?" if inside.exists() else ""
     raise ConfigError(
         "--python: expected the interpreter of an environment, such as .venv-lerobot/bin/python, "
-        f"got {interpreter}, "
-        f"which is {what}{cure}"
+        f"got {interpreter}, which is {kind}{cure}"
     )
 
 
@@ -261,8 +261,9 @@ def checks(port: int = DEFAULT_PORT, pythons: Sequence[Path] = ()) -> Iterator[t
     ]
     for name, check in todo:
         yield name, guarded(check)
-    made = [*sorted(Path().glob(".venv-*/bin/python")), *Path("/opt/family/bin").glob("python")]
+
     yield from libraries(Path(sys.executable))
+    made = [*sorted(Path().glob(".venv-*/bin/python")), *Path("/opt/family/bin").glob("python")]
     for interpreter in pythons or made:
         yield from libraries(interpreter, status="fail" if pythons else "warn")
 
@@ -272,8 +273,8 @@ def guarded(check: Callable[[], Check]) -> Check:
     try:
         return check()
     except MissingDependency as error:
-        found, _, cure = str(error).partition("; ")
-        return Check("warn", found, cure)
+        detail, _, cure = str(error).partition("; ")
+        return Check("warn", detail, cure)
     except Exception as error:  # noqa: BLE001 - drivers and codecs raise anything; the other rows still matter
         return Check(
             "warn", f"the check itself broke: {type(error).__name__}: {error}", "please report this"
@@ -292,21 +293,27 @@ def ray() -> Check:
         return Check(
             "fail", "not installed: robots can do without, servers and evaluations cannot", cure
         )
-    needed = map(Requirement, importlib.metadata.requires("vlagents-ray") or [])
-    wanted = next((one.specifier for one in needed if one.name == "ray"), SpecifierSet())
-    if version not in wanted:
-        return Check("warn", f"{version}; this package is tested with {wanted}", cure)
+
+    tested = SpecifierSet()
+    for text in importlib.metadata.requires("vlagents-ray") or []:
+        requirement = Requirement(text)
+        if requirement.name == "ray":
+            tested = requirement.specifier
+            break
+    if version not in tested:
+        return Check("warn", f"{version}; this package is tested with {tested}", cure)
     return Check("ok", version)
 
 
 def plugins() -> Check:
     """List the installed plug-ins, and those of the project that are not installed."""
-    missing = sorted(
-        {distribution for kind in published() for distribution in not_installed(kind).values()}
-    )
+    missing: set[str] = set()
+    for kind in published():
+        missing.update(not_installed(kind).values())
+
     detail = ", ".join(plugin_distributions()) or "none"
     if missing:
-        detail += f"; not installed: {', '.join(missing)}"
+        detail += f"; not installed: {', '.join(sorted(missing))}"
     return Check("ok", detail)
 
 
@@ -327,7 +334,8 @@ def haproxy() -> Check:
 
 def gpu() -> Check:
     """List NVIDIA GPUs."""
-    if (smi := shutil.which("nvidia-smi")) is None:
+    smi = shutil.which("nvidia-smi")
+    if smi is None:
         return Check(
             "warn",
             "no nvidia-smi: policies run on the CPU",
@@ -347,14 +355,14 @@ def gpu() -> Check:
 
 def python_version() -> Check:
     """Check that this is the version of Python for which a server is supported."""
-    found = f"{platform.python_version()} at {sys.executable}"
+    detail = f"{platform.python_version()} at {sys.executable}"
     if sys.version_info[:2] == SUPPORTED:
-        return Check("ok", found)
-    wanted = ".".join(map(str, SUPPORTED))
+        return Check("ok", detail)
+    supported = ".".join(map(str, SUPPORTED))
     return Check(
         "warn",
-        f"{found}; servers are tested with Python {wanted}",
-        f"make an environment of Python {wanted}",
+        f"{detail}; servers are tested with Python {supported}",
+        f"make an environment of Python {supported}",
     )
 
 
@@ -374,21 +382,30 @@ def libraries(
             Check(status, _last_line(answer.stderr), "make it again: vlagents-ray env make"),
         )
         return
-    found = json.loads(_last_line(answer.stdout))
+
+    document = json.loads(_last_line(answer.stdout))
     driver = driver_version() if has_gpu() else None
-    for name, library in found["libraries"].items():
+    for name, library in document["libraries"].items():
         yield f"{name}{where}", judge_library(name, driver, **library)
-    if found["libraries"].get("torch", {}).get("cuda") is not None:
-        yield f"C compiler for Triton{where}", triton_compiler(Path(found["headers"]))
+    if document["libraries"].get("torch", {}).get("cuda") is not None:
+        yield f"C compiler for Triton{where}", triton_compiler(Path(document["headers"]))
 
 
 def judge_library(
     name: str, driver: str | None, version: str, cuda: str | None, device: str | None, why: str
 ) -> Check:
-    """Judge torch or jax: its version, its CUDA or None, its GPU or why it has none; `driver` is
-    None without a GPU.
+    """Judge an installed library.
+
+    Args:
+        name: "torch" or "jax".
+        driver: The version of NVIDIA's driver; None without a GPU.
+        version: The version of the library.
+        cuda: The version of CUDA that it was built for; None for CPUs only.
+        device: The name of the GPU that it uses; None if it uses none.
+        why: The reason why it uses no GPU.
     """
-    detail = f"{version}, {f'for CUDA {cuda}' if cuda else 'for CPUs only'}"
+    build = f"for CUDA {cuda}" if cuda else "for CPUs only"
+    detail = f"{version}, {build}"
     if device is not None:
         return Check("ok", f"{detail}, uses {device}")
     if driver is None:
@@ -398,12 +415,11 @@ def judge_library(
         return Check(
             "warn", detail, f"uv pip install {package} there, without an index of CPU-only wheels"
         )
-    if int(driver.partition(".")[0]) < (
-        oldest := OLDEST_DRIVERS.get(int(cuda.partition(".")[0]), 0)
-    ):
+
+    oldest = OLDEST_DRIVERS.get(int(cuda.partition(".")[0]), 0)
+    if int(driver.partition(".")[0]) < oldest:
         cure = (
-            "update the driver, or make the environment again: env make takes torch for CUDA "
-            "12 "
+            "update the driver, or make the environment again: env make takes torch for CUDA 12 "
             "with one from 525 on"
         )
         return Check("warn", f"{detail}, which needs driver {oldest} or newer; got {driver}", cure)
@@ -418,7 +434,8 @@ def triton_compiler(headers: Path) -> Check:
     """Check that Triton finds a C compiler and Python's headers, with which it builds a program
     that starts kernels.
     """
-    if (compiler := os.environ.get("CC") or shutil.which("gcc") or shutil.which("clang")) is None:
+    compiler = os.environ.get("CC") or shutil.which("gcc") or shutil.which("clang")
+    if compiler is None:
         return Check(
             "warn", "none, which torch.compile needs on a GPU", "apt-get install gcc libc6-dev"
         )
@@ -443,16 +460,17 @@ def egl() -> Check:
     from vlagents_ray.envs.graphics import SHARE, egl_probe, fitting
 
     probe = egl_probe()
-    found = _rendered("MuJoCo", probe)
+    rendered = _rendered("MuJoCo", probe)
     if not probe.ok or fitting(probe.devices, gpu=False) is not None:
-        return found
+        return rendered
     cure = f"apt-get install libegl1 libgl1-mesa-dri; or {SHARE}"
     return Check(
-        "warn", f"{found.detail}; no device renders in software, for workers without a GPU", cure
+        "warn", f"{rendered.detail}; no device renders in software, for workers without a GPU", cure
     )
 
 
 def _rendered(simulator: str, probe: RenderProbe) -> Check:
+    """Judge the attempt to render a frame."""
     if probe.ok:
         return Check(
             "ok", f"a frame in {probe.seconds:.1f} s on {probe.device or 'an unnamed device'}"

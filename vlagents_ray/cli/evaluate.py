@@ -49,7 +49,7 @@ class EvalOptions:
     name here.
     """
 
-    what: Annotated[
+    targets: Annotated[
         list[str],
         typer.Argument(
             metavar="FILE | ENV...",
@@ -201,20 +201,21 @@ class EvalOptions:
     live_at: LiveAt = None
 
     def given(self, *names: str) -> list[str]:
-        """Return the set options among `names`, as the command line writes them; 0 counts as
-        set, False does not.
+        """Return the options among `names` that are set, as the command line writes them; 0 counts
+        as set, False does not.
         """
-        values = {name: getattr(self, name) for name in names}
-        return [
-            f"--{name.replace('_', '-')}"
-            for name, one in values.items()
-            if one or (one == 0 and one is not False)
-        ]
+        options = []
+        for name in names:
+            value = getattr(self, name)
+            if value or (value == 0 and value is not False):
+                options.append(f"--{name.replace('_', '-')}")
+        return options
 
     def require_together(self, *, on_robot: bool) -> None:
         """Raise `ConfigError` for options that need another one, or that exclude one another."""
-        if self.watch is None and (needing := self.given("until", "settle_s", "marker")):
-            raise ConfigError(f"got {needing} without --watch")
+        of_watch = self.given("until", "settle_s", "marker")
+        if self.watch is None and of_watch:
+            raise ConfigError(f"got {of_watch} without --watch")
         if self.dry_run and self.watch is not None:
             raise ConfigError(
                 "--dry-run and --watch exclude each other: the steps of the training are not known "
@@ -232,11 +233,12 @@ class EvalOptions:
             raise ConfigError(
                 "--dry-run and --live exclude each other: nothing is played that could be watched"
             )
-        if not on_robot and (needing := self.given("operator", "unblind")):
-            raise ConfigError(f"got {needing} without --robot")
-        if on_robot and (
-            excluded := self.given("watch", "dry_run", "end_at", "track", "live", "live_at")
-        ):
+
+        of_robot = self.given("operator", "unblind")
+        if not on_robot and of_robot:
+            raise ConfigError(f"got {of_robot} without --robot")
+        excluded = self.given("watch", "dry_run", "end_at", "track", "live", "live_at")
+        if on_robot and excluded:
             raise ConfigError(f"--robot and {excluded} exclude each other")
         if self.operator not in (None, "page", "terminal"):
             raise ConfigError(f"--operator: got {self.operator!r}, want page or terminal")
@@ -266,10 +268,8 @@ def evaluate_command(options: EvalOptions) -> None:
             watch_training,
         )
 
-        address, page = (
-            options.address,
-            live_address(options.live_at) if options.live or options.live_at else None,
-        )
+        address = options.address
+        page = live_address(options.live_at) if options.live or options.live_at else None
         if on_robot:
             run_on_robot(
                 config, address, operator=options.operator or "page", unblinded=options.unblind
@@ -299,7 +299,7 @@ def config_from_options(options: EvalOptions) -> EvalConfig:
     """Build the configuration of an evaluation from the options of `vlagents-ray eval`."""
     from vlagents_ray.evaluate import EvalConfig, PolicyConfig, SuiteConfig, WorkerConfig
 
-    what = options.what
+    targets = options.targets
     parsed = {
         **vars(options),
         "track": parse_list(options.track),
@@ -308,67 +308,71 @@ def config_from_options(options: EvalOptions) -> EvalConfig:
         "env_options": parse_settings(options.env_options, "--env-set"),
         "seeds": None if options.seeds is None else [options.seeds],
     }
-    run, policy, suite, worker = (
-        _given(parsed, model) for model in (EvalConfig, PolicyConfig, SuiteConfig, WorkerConfig)
-    )
-    if what[0].endswith(YAML_SUFFIXES):
-        if beside := [*what[1:], *policy, *suite]:
+    run = _given(parsed, EvalConfig)
+    policy = _given(parsed, PolicyConfig)
+    suite = _given(parsed, SuiteConfig)
+    worker = _given(parsed, WorkerConfig)
+
+    if targets[0].endswith(YAML_SUFFIXES):
+        excess = [*targets[1:], *policy, *suite]
+        if excess:
             raise ConfigError(
-                f"{what[0]} says what is evaluated; got {beside} beside it: write that there"
+                f"{targets[0]} says what is evaluated; got {excess} beside it: write that there"
             )
-        fields = read_run(Path(what[0])) | run
+        fields = read_run(Path(targets[0])) | run
     else:
-        missing = [
-            option
-            for option, there in (("--policy", "source" in policy), ("--out", "out" in run))
-            if not there
-        ]
+        missing = []
+        if "source" not in policy:
+            missing.append("--policy")
+        if "out" not in run:
+            missing.append("--out")
         if missing:
             raise ConfigError(
                 f"got no {' and no '.join(missing)}, want {' and '.join(missing)}; or a file of "
                 "runs (.yaml)"
             )
-        fields = {"policies": [policy], "suites": [{"envs": list(what)} | suite], **run}
+        fields = {"policies": [policy], "suites": [{"envs": list(targets)} | suite], **run}
     if options.arm is not None:
         fields["robot"] = {**(fields.get("robot") or {}), "arm": options.arm}
     config = EvalConfig.model_validate(fields)
 
-    for one in config.policies:
-        if one.source is not None and one.url is not None:
+    for configured in config.policies:
+        if configured.source is not None and configured.url is not None:
             raise ConfigError(
-                f"policy {one.name!r}: expected `source`, a policy to serve, or the `url` of a "
-                "server, got both; "
-                f"leave one of them out"
+                f"policy {configured.name!r}: expected `source`, a policy to serve, or the `url` "
+                "of a server, got both; leave one of them out"
             )
+    return _with_worker(config, worker) if worker else config
 
-    # With the resources that are not in the configuration.
-    def filled(of: WorkerConfig) -> WorkerConfig:
-        return of.model_copy(
-            update={
-                name: value for name, value in worker.items() if name not in of.model_fields_set
-            }
-        )
 
-    suites = [
-        one if one.worker is None else one.model_copy(update={"worker": filled(one.worker)})
-        for one in config.suites
-    ]
-    return (
-        config.model_copy(update={"worker": filled(config.worker), "suites": suites})
-        if worker
-        else config
-    )
+def _with_worker(config: EvalConfig, options: dict[str, Any]) -> EvalConfig:
+    """Return the configuration, with the options of workers that it does not set."""
+
+    def fill(worker: WorkerConfig) -> WorkerConfig:
+        """Return the settings of a worker, with the options that they lack."""
+        missing = {
+            name: value for name, value in options.items() if name not in worker.model_fields_set
+        }
+        return worker.model_copy(update=missing)
+
+    suites = []
+    for suite in config.suites:
+        if suite.worker is None:
+            suites.append(suite)
+        else:
+            suites.append(suite.model_copy(update={"worker": fill(suite.worker)}))
+    return config.model_copy(update={"worker": fill(config.worker), "suites": suites})
 
 
 def _given(options: dict[str, Any], model: type[BaseModel]) -> dict[str, Any]:
-    """Select the options that are fields of `model` and were given."""
-    found = {name: options[name] for name in model.model_fields if name in options}
-    # 0 was given, though it equals False.
-    return {
-        name: value
-        for name, value in found.items()
-        if value not in (None, {}, []) and value is not False
-    }
+    """Select the options that are fields of `model` and are set."""
+    selected = {}
+    for name in model.model_fields:
+        value = options.get(name)
+        # 0 is a value, although it equals False.
+        if value not in (None, {}, []) and value is not False:
+            selected[name] = value
+    return selected
 
 
 def read_run(file: Path) -> dict[str, Any]:

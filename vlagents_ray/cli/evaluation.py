@@ -40,6 +40,7 @@ from vlagents_ray.evaluate import (
     progress_for,
 )
 from vlagents_ray.evaluate.checkpoint_watcher import CheckpointWatcher, rounds
+from vlagents_ray.evaluate.episode.records import EpisodeResult
 from vlagents_ray.evaluate.plan.cases import EvalCase, plan_cases
 from vlagents_ray.evaluate.report.evaluation_page import EvaluationPage
 from vlagents_ray.evaluate.report.results_document import ProgressDocument, ResultsDocument
@@ -95,7 +96,7 @@ def shown_progress(
         yield progress
         return
     document = ProgressDocument(config.out, progress, goes_on=goes_on)
-    urls = [str(one.url) for one in config.policies]
+    urls = [str(policy.url) for policy in config.policies]
     apps = [url.removeprefix("serve://") for url in urls if url.startswith("serve://")]
     with _page(document, apps if node_of_this_process() is not None else [], live):
         try:
@@ -120,6 +121,7 @@ def follow(results: Path, address: tuple[str, int]) -> None:
 def _page(
     document: ResultsDocument, apps: Sequence[str], address: tuple[str, int]
 ) -> Iterator[None]:
+    """Serve the live page for the length of the context, and print its URL."""
     page: EvaluationPage = registered_class("pages", _PAGE)()
     with page.serve(document, apps, address, load_keys()) as url:
         out.print(f"live: {url}")
@@ -140,6 +142,7 @@ def run_evaluation(
     """
     if live is not None and config.workers is None:  # the page also shows the sessions of replicas
         config = config.model_copy(update={"workers": 1})
+
     with contextlib.ExitStack() as stack:
         try:
             ready, agents = stack.enter_context(
@@ -152,6 +155,7 @@ def run_evaluation(
             ) from error
         progress = stack.enter_context(shown_progress(ready, live))
         summary = evaluate_and_print(ready, progress, end_at, agents)
+
     require_results(ready, summary)
 
 
@@ -195,29 +199,34 @@ def require_results(config: EvalConfig, summary: Summary) -> None:
 
     The status is 1 if infrastructure lost an episode.
     """
-    wanted = {case.fingerprint for case in plan_cases(config)}
-    mine = [case for case in summary.results.cases if case.case_id in wanted]
-    if failing := failing_cases(summary.results.among(mine)):
+    planned = {case.fingerprint for case in plan_cases(config)}
+    results = [case for case in summary.results.cases if case.case_id in planned]
+
+    failing = failing_cases(summary.results.among(results))
+    if failing:
         (_, _, error), _ = errors_of_policies(summary.results.among(failing))[0]
-        where = ", ".join(f"{case.contender} in {case.task}" for case in failing)
+        names = ", ".join(f"{case.contender} in {case.task}" for case in failing)
         fail(
-            f"every episode ended by an error of the policy: {where}; the first one: "
+            f"every episode ended by an error of the policy: {names}; the first one: "
             f"{error.strip()}",
             POLICY_ERRORS,
         )
-    if not (missing := sum(case.missing for case in mine)):
+
+    missing = sum(case.missing for case in results)
+    if not missing:
         return
-    lost = [attempt for case in mine for attempt in case.attempts if not attempt.retried]
-    last = max(lost, key=lambda attempt: attempt.at, default=None)
-    why = (
-        ""
-        if last is None
-        else f", the last one to {last.code}: {last.error.strip().partition(chr(10))[0]}"
-    )
+    lost = []
+    for case in results:
+        lost += [attempt for attempt in case.attempts if not attempt.retried]
+    reason = ""
+    if lost:
+        last = max(lost, key=lambda attempt: attempt.at)
+        first_line = last.error.strip().partition("\n")[0]
+        reason = f", the last one to {last.code}: {first_line}"
     fail(
-        f"{missing} of {sum(case.planned for case in mine)} episodes have no result: lost to "
-        f"infrastructure{why}; "
-        f"the report lists every attempt under Errors, --resume tries them again",
+        f"{missing} of {sum(case.planned for case in results)} episodes have no result: lost to "
+        f"infrastructure{reason}; the report lists every attempt under Errors, --resume tries them "
+        "again",
         1,
     )
 
@@ -232,95 +241,103 @@ def watch_training(
     marker: str | None = None,
     live: tuple[str, int] | None = None,
 ) -> None:
-    """Evaluate each step of the one policy whose checkpoint holds `{step}` once it is whole.
+    """Evaluate each step of the one policy whose checkpoint contains `{step}`, once the step's
+    checkpoint is complete.
 
     All results go into one folder, and one server stays up. Policies without `{step}` are evaluated
     in the first round. `live` is the address of the live page, as for `shown_progress`. Ends as
     `rounds` does, or by Ctrl-C; resume to continue. An episode without a result ends the command
     with status 1, after the last round.
     """
-    place, pattern = _watched(config)
-    # Raised now, not at the first checkpoint.
+    trained, pattern = _trained_policy(config)
+    # These errors are raised now, not at the first checkpoint.
     if (config.out / FILE).is_file() and not config.resume:
         raise ConfigError(
             f"{config.out} already has results: resume them (--resume), or choose another out "
             "folder"
         )
     if address is None:
-        for part in resolve_policies(_at(config, place, [0]), ask=False)[1].values():
-            require_packages(part)
+        _, deployments = resolve_policies(_with_steps(config, trained, [0]), ask=False)
+        for deployment in deployments.values():
+            require_packages(deployment)
+
     watcher = CheckpointWatcher(pattern, folder, settle_s=settle_s, marker=marker)
-    shown: dict[int, str] = {}
+    printed: dict[int, str] = {}  # the last printed reason for waiting, by step
 
     def pause() -> None:
-        for step, why in watcher.waiting().items():
-            if shown.get(step) != why:
-                shown[step] = why
-                out.print(f"step {step}: not yet: {why}")
+        """Print why steps are not evaluated yet, and wait until the folder is read again."""
+        for step, reason in watcher.waiting().items():
+            if printed.get(step) != reason:
+                printed[step] = reason
+                out.print(f"step {step}: not yet: {reason}")
         threading.Event().wait(LOOK_S)
 
-    out.print(
-        f"watching {watcher.folder}{'' if watcher.folder.is_dir() else ', which is not there yet'}"
-    )
-    found = rounds(watcher, until, pause)
-    if (first := next(found, None)) is None:
+    suffix = "" if watcher.folder.is_dir() else ", which is not there yet"
+    out.print(f"watching {watcher.folder}{suffix}")
+    rounds_of_steps = rounds(watcher, until, pause)
+    first = next(rounds_of_steps, None)
+    if first is None:
         raise ConfigError(
             f"{watcher.folder}: watching ended without a checkpoint; still waiting: "
             f"{watcher.waiting()}"
         )
+
     workers = 1 if config.workers is None else config.workers  # a training is long
-    planned = _at(config, place, first).model_copy(update={"workers": workers})
+    planned = _with_steps(config, trained, first).model_copy(update={"workers": workers})
     with contextlib.ExitStack() as stack:
         ready, agents = stack.enter_context(served(planned, address))
         if ready.workers:
             from vlagents_ray.evaluate.workers.cluster import ray_cluster
 
             stack.enter_context(ray_cluster(ready))
+
         progress = stack.enter_context(shown_progress(ready, live, goes_on=True))
         summary = evaluate_and_print(ready, progress, agents=agents)
-        every = [*first]
-        for steps in found:
-            every += steps
-            later = _at(ready, place, steps).model_copy(update={"resume": True})
+        all_steps = [*first]
+        for steps in rounds_of_steps:
+            all_steps += steps
+            later = _with_steps(ready, trained, steps).model_copy(update={"resume": True})
             summary = evaluate_and_print(later, progress, agents=agents)
-    require_results(_at(ready, place, every), summary)
+
+    require_results(_with_steps(ready, trained, all_steps), summary)
 
 
-def _watched(config: EvalConfig) -> tuple[int, str]:
+def _trained_policy(config: EvalConfig) -> tuple[int, str]:
     """Find the index of the policy that is trained, and the pattern of its checkpoints."""
-    found = {}
-    for place, policy in enumerate(config.policies):
+    patterns = {}
+    for index, policy in enumerate(config.policies):
         settings: dict[str, Any] = {CHOICE: policy.checkpoint}
         if policy.source is not None and "://" not in policy.source:
-            settings |= own_settings(
-                policy_deployment(policy, policy.source, step_follows=True).applications[0]
-            )
-        if isinstance(pattern := settings[CHOICE], str) and STEP in pattern:
-            found[place] = pattern
-    if len(found) != 1:
+            deployment = policy_deployment(policy, policy.source, step_follows=True)
+            settings |= own_settings(deployment.applications[0])
+        checkpoint = settings[CHOICE]
+        if isinstance(checkpoint, str) and STEP in checkpoint:
+            patterns[index] = checkpoint
+
+    if len(patterns) != 1:
         raise ConfigError(
-            f"--watch: got {STEP} in the checkpoints of {len(found)} policies, want it in that of "
-            "one, such as "
-            f"checkpoint: /runs/a/{STEP}"
+            f"--watch: got {STEP} in the checkpoints of {len(patterns)} policies, want it in that "
+            f"of one, such as checkpoint: /runs/a/{STEP}"
         )
-    [(place, pattern)] = found.items()
-    if config.policies[place].steps:
+    [(index, pattern)] = patterns.items()
+    if config.policies[index].steps:
         raise ConfigError(
-            f"policy {config.policies[place].name!r}: --watch finds its steps; leave `steps` out"
+            f"policy {config.policies[index].name!r}: --watch finds its steps; leave `steps` out"
         )
-    return place, pattern
+    return index, pattern
 
 
-def _at(config: EvalConfig, place: int, steps: list[int]) -> EvalConfig:
+def _with_steps(config: EvalConfig, index: int, steps: list[int]) -> EvalConfig:
+    """Return the evaluation, with these checkpoint steps of the policy at `index`."""
     policies = list(config.policies)
-    policies[place] = policies[place].model_copy(update={"steps": steps})
+    policies[index] = policies[index].model_copy(update={"steps": steps})
     return config.model_copy(update={"policies": policies})
 
 
 def run_on_robot(
     config: EvalConfig, address: str | None, *, operator: str, unblinded: bool
 ) -> None:
-    """Serve the policies that are not at a URL, play the trials, print the table."""
+    """Serve the policies that are not at a URL, run the trials, print the table."""
     from vlagents_ray.evaluate.robot import (
         PageOperator,
         TerminalOperator,
@@ -330,18 +347,17 @@ def run_on_robot(
     )
 
     if unblinded:
-        print_summary(
-            out, unblind(config.out, config.robot.key if config.robot is not None else None)
-        )
+        key = None if config.robot is None else config.robot.key
+        print_summary(out, unblind(config.out, key))
         return
+
     plan_robot_cases(config)  # raises before anything starts
     with served(config, address) as (ready, _), contextlib.ExitStack() as stack:
-        person = (
-            TerminalOperator()
-            if operator == "terminal"
-            else stack.enter_context(PageOperator(out.print))
-        )
-        summary = evaluate_on_robot(ready, person)
+        if operator == "terminal":
+            summary = evaluate_on_robot(ready, TerminalOperator())
+        else:
+            page = stack.enter_context(PageOperator(out.print))
+            summary = evaluate_on_robot(ready, page)
     print_summary(out, summary)
 
 
@@ -350,86 +366,110 @@ class Forecast:
     """The episodes that one case has left, and the time that one of them takes."""
 
     case: EvalCase
-    finished: int  # episodes, among those that are planned
-    left: int  # episodes to play; fewer than the rest if the case has stopped early
-    seconds: float | None  # mean time of its policy's episodes in its env; None: not known
+    finished: int  # number of planned episodes that are finished
+    left: int  # number of episodes to play; 0 if the case has stopped early
+    seconds: float | None  # mean time of the policy's episodes in the env; None if unknown
 
 
 def print_plan(config: EvalConfig, address: str | None = None) -> None:
     """Print a row for each case, and the sum. Nothing is served, played or written."""
     for tracker in config.track:
         registered_class("trackers", tracker)  # raises an error for an unknown name
-    stated = config
-    config, parts = resolve_policies(stated, ask=False)
-    workers = planned_workers(stated, parts, address)
-    results = Results.load(config.out) if (config.out / FILE).is_file() else None
-    found = forecasts(plan_cases(config), results)
-    shown = Table(box=SIMPLE_HEAD, padding=0, pad_edge=False)
-    for title in ("policy", "env"):
-        shown.add_column(title, overflow="fold")
-    for title in ("seeds", "episodes", "finished", "to play", "s each", "time"):
-        shown.add_column(title, justify="right", no_wrap=True)
-    for one in found:
-        shown.add_row(
-            one.case.contender,
-            " ".join(filter(None, one.case.name[1:])),
-            str(len(one.case.suite.seeds)),
-            str(one.case.planned),
-            str(one.finished),
-            str(one.left),
-            *(
-                ("?", "?")
-                if one.seconds is None
-                else (f"{one.seconds:.3g}", _time(one.left * one.seconds))
-            ),
-        )
-    out.print(shown)
-    cases = [one.case for one in found]
-    policies, envs = (
-        len({case.contender for case in cases}),
-        len({(case.suite.name, case.env) for case in cases}),
-    )
-    planned, finished = sum(case.planned for case in cases), sum(one.finished for one in found)
-    left = sum(one.left for one in found)
-    # Workers share one queue, so that at most one episode's time is lost at the end.
-    seconds = sum(one.left * (one.seconds or 0.0) for one in found) / max(1, min(workers, left))
-    unknown = sum(one.seconds is None for one in found)
-    beside = f"; not played yet: {unknown} of {counted(len(found), 'case')}" if unknown else ""
+
+    resolved, deployments = resolve_policies(config, ask=False)
+    workers = planned_workers(config, deployments, address)
+    results = Results.load(resolved.out) if (resolved.out / FILE).is_file() else None
+    forecast = forecasts(plan_cases(resolved), results)
+    out.print(_forecast_table(forecast))
+
+    cases = [row.case for row in forecast]
+    policies = len({case.contender for case in cases})
+    envs = len({(case.suite.name, case.env) for case in cases})
     factors = (
         f"{counted(policies, 'policy', 'policies')} at each checkpoint x "
         f"{counted(envs, 'environment')} of suites"
     )
-    out.print(f"{counted(len(found), 'case')}: {factors}")
+    out.print(f"{counted(len(forecast), 'case')}: {factors}")
+
+    planned = sum(case.planned for case in cases)
+    finished = sum(row.finished for row in forecast)
+    left = sum(row.left for row in forecast)
     out.print(
-        f"{counted(planned, 'episode')}, {finished} of them finished in {config.out}, {left} to "
+        f"{counted(planned, 'episode')}, {finished} of them finished in {resolved.out}, {left} to "
         "play"
     )
+
+    # Workers share one queue, so that at most one episode's time is lost at the end.
+    total_s = sum(row.left * (row.seconds or 0.0) for row in forecast)
+    seconds = total_s / max(1, min(workers, left))
+    unknown = sum(row.seconds is None for row in forecast)
+    time = f"{_time(seconds)} as by earlier episodes"
+    if unknown == len(forecast):
+        time = "unknown time"
     where = f"with {counted(workers, 'worker')}" if workers else "in one process, without Ray"
-    time = "unknown time" if unknown == len(found) else f"{_time(seconds)} as by earlier episodes"
-    out.print(f"{time} {where}{beside}")
+    cases_text = counted(len(forecast), "case")
+    unplayed = f"; not played yet: {unknown} of {cases_text}" if unknown else ""
+    out.print(f"{time} {where}{unplayed}")
+
+
+def _forecast_table(forecast: Sequence[Forecast]) -> Table:
+    """Return a table with a row for each case."""
+    rows = Table(box=SIMPLE_HEAD, padding=0, pad_edge=False)
+    for title in ("policy", "env"):
+        rows.add_column(title, overflow="fold")
+    for title in ("seeds", "episodes", "finished", "to play", "s each", "time"):
+        rows.add_column(title, justify="right", no_wrap=True)
+
+    for row in forecast:
+        each, time = "?", "?"
+        if row.seconds is not None:
+            each, time = f"{row.seconds:.3g}", _time(row.left * row.seconds)
+        rows.add_row(
+            row.case.contender,
+            " ".join(filter(None, row.case.name[1:])),
+            str(len(row.case.suite.seeds)),
+            str(row.case.planned),
+            str(row.finished),
+            str(row.left),
+            each,
+            time,
+        )
+    return rows
 
 
 def forecasts(planned: Sequence[EvalCase], results: Results | None) -> list[Forecast]:
     """Return the forecast of each case, in their order, from the episodes in `results`."""
-    earlier = results.cases if results is not None else ()
-    found = []
+    earlier = [] if results is None else results.cases
+    names = [(recorded.contender, recorded.suite, recorded.env) for recorded in earlier]
+    forecast = []
     for case in planned:
-        same = next(
-            (one for one in earlier if (one.contender, one.suite, one.env) == case.name), None
-        )
-        recorded = [] if same is None else [one.result for one in same.episodes]
-        done = {(one.key.episode, one.key.seed) for one in recorded if one.status != "infra_failed"}
-        planned_seeds = set(case.suite.seeds)
-        finished = sum(
-            episode < case.suite.episodes and seed - episode in planned_seeds
-            for episode, seed in done
-        )
-        has_stopped = same is not None and same.stopped_at is not None
-        alike = [one for one in earlier if (one.policy, one.env) == (case.policy.name, case.env)]
-        seconds = [episode.seconds for one in alike for episode in one.counted]
-        mean = sum(seconds) / len(seconds) if seconds else None
-        found.append(Forecast(case, finished, 0 if has_stopped else case.planned - finished, mean))
-    return found
+        finished = 0
+        has_stopped = False
+        if case.name in names:
+            same = earlier[names.index(case.name)]
+            finished = _finished(case, [episode.result for episode in same.episodes])
+            has_stopped = same.stopped_at is not None
+
+        seconds: list[float] = []
+        for recorded in earlier:
+            if (recorded.policy, recorded.env) == (case.policy.name, case.env):
+                seconds += [episode.seconds for episode in recorded.counted]
+
+        left = 0 if has_stopped else case.planned - finished
+        mean_s = sum(seconds) / len(seconds) if seconds else None
+        forecast.append(Forecast(case, finished, left, mean_s))
+    return forecast
+
+
+def _finished(case: EvalCase, results: Sequence[EpisodeResult]) -> int:
+    """Return the number of a case's planned episodes that have a result."""
+    keys = {
+        (result.key.episode, result.key.seed)
+        for result in results
+        if result.status != "infra_failed"
+    }
+    seeds = set(case.suite.seeds)
+    return sum(episode < case.suite.episodes and seed - episode in seeds for episode, seed in keys)
 
 
 def counted(number: int, noun: str, plural: str | None = None) -> str:

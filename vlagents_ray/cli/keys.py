@@ -14,7 +14,7 @@ from vlagents_ray.cli.console import err, errors, out, table
 from vlagents_ray.cli.options import finite
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.serve.access.api_keys import FILE_VARIABLE
-from vlagents_ray.serve.access.key_store import new_key, read_keys, revoke
+from vlagents_ray.serve.access.key_store import Key, new_key, read_keys, revoke
 
 keys = typer.Typer(
     no_args_is_help=True, help="The API keys of a server: make, list and revoke them."
@@ -65,7 +65,7 @@ def new(
     """Make a key. It is shown this once; the file keeps its hash."""
     with errors():
         expires = None if days is None else time.time() + days * 86_400
-        place = _file(file)
+        path = _path(file)
         allowed = {
             "apps": tuple(app),
             "rate": rate,
@@ -73,8 +73,9 @@ def new(
             "priority": priority,
             "scopes": tuple(scope),
         }
-        token = new_key(place, name, expires=expires, **allowed)
-        err.print(f"key {name} added to {place}; it is not shown again:")
+        token = new_key(path, name, expires=expires, **allowed)
+
+        err.print(f"key {name} added to {path}; it is not shown again:")
         out.print(token)
 
 
@@ -84,16 +85,15 @@ def list_(file: File = None) -> None:
     with errors():
         listed = table("name", "for", "requests/s", "sessions", "priority", "may also", "state")
         for key in read_keys(_existing(file)):
-            limits = (
-                "any" if value is None else f"{value:g}" for value in (key.rate, key.sessions)
+            listed.add_row(
+                key.name,
+                ", ".join(key.apps) or "all",
+                "any" if key.rate is None else f"{key.rate:g}",
+                "any" if key.sessions is None else f"{key.sessions:g}",
+                key.priority or "any",
+                ", ".join(key.scopes),
+                _state(key),
             )
-            apps, scopes = ", ".join(key.apps) or "all", ", ".join(key.scopes)
-            state = Text("revoked", "red") if key.revoked else Text("valid", "green")
-            if key.expires is not None and not key.revoked:
-                date = time.strftime("%Y-%m-%d %H:%M UTC", time.gmtime(key.expires))
-                over = key.expires <= time.time()
-                state = Text(f"expired {date}", "red") if over else Text(f"until {date}", "green")
-            listed.add_row(key.name, apps, *limits, key.priority or "any", scopes, state)
         out.print(listed)
 
 
@@ -107,21 +107,34 @@ def revoke_(name: Name, file: File = None) -> None:
         out.print(f"key {name} revoked")
 
 
-def _file(file: Path | None) -> Path:
-    place = file or Path(os.environ.get(FILE_VARIABLE) or "keys.json")
-    if place.is_dir():
+def _state(key: Key) -> Text:
+    """Return whether a key is valid, and until when."""
+    if key.revoked:
+        return Text("revoked", "red")
+    if key.expires is None:
+        return Text("valid", "green")
+    date = time.strftime("%Y-%m-%d %H:%M UTC", time.gmtime(key.expires))
+    if key.expires <= time.time():
+        return Text(f"expired {date}", "red")
+    return Text(f"until {date}", "green")
+
+
+def _path(file: Path | None) -> Path:
+    """Return the path of the key file; raise `ConfigError` if it is a folder."""
+    path = file or Path(os.environ.get(FILE_VARIABLE) or "keys.json")
+    if path.is_dir():
         raise ConfigError(
-            f"--keys: expected a key file, got the folder {place}; add its name, as "
-            f"{place / 'keys.json'}"
+            f"--keys: expected a key file, got the folder {path}; add its name, as "
+            f"{path / 'keys.json'}"
         )
-    return place
+    return path
 
 
 def _existing(file: Path | None) -> Path:
-    place = _file(file)
-    if not place.is_file():
+    """Return the path of the key file; raise `ConfigError` if there is none."""
+    path = _path(file)
+    if not path.is_file():
         raise ConfigError(
-            f"keys file {place} does not exist; `vlagents-ray keys new NAME --keys {place}` makes "
-            "it"
+            f"keys file {path} does not exist; `vlagents-ray keys new NAME --keys {path}` makes it"
         )
-    return place
+    return path

@@ -32,11 +32,13 @@ if TYPE_CHECKING:
     from vlagents_ray.serve.launch.deployment_file import Deployment
 
 
-_SHORT = 5  # most ranges of tasks that a line of the listing names
+_SHORT = 5  # maximum number of ranges of tasks that a line of the listing names
 
 
 @dataclass(frozen=True)
 class Listed:
+    """One entry of a listing."""
+
     kind: str  # "policy", "wrapper" or "environment"
     name: str  # as registered
     what: str  # a description, or an environment's tasks, in one line
@@ -68,7 +70,8 @@ def policies_and_wrappers() -> Iterator[Listed]:
                 yield Listed(kind, name, "cannot be loaded", str(error), [])
                 continue
             missing = missing_packages(name) if kind == "policy" else None
-            yield Listed(kind, name, _what(registered, name), missing, list(settings_of(cls)))
+            settings = list(settings_of(cls))
+            yield Listed(kind, name, _what(registered, name), missing, settings)
         yield from _in_other_plugins(kind, registered)
 
 
@@ -87,17 +90,21 @@ def environments() -> Iterator[Listed]:
     for name in sorted(names("envs")):
         try:
             cls = env_class(name)
-            missing, tasks = cls.missing(), cls.tasks()
+            missing = cls.missing()
+            tasks = cls.tasks()
         except VLAgentsError as error:
-            missing, tasks = str(error), []
-        shown = list(ranges(tasks))
-        short = shown if len(shown) <= _SHORT else [shown[0], "…", shown[-1]]
-        what = (
-            f"{len(tasks)} task{'s' * (len(tasks) != 1)}: {', '.join(short)}"
-            if tasks
-            else "any task of the simulator"
-        )
-        yield Listed("environment", name, what, missing, shown)
+            missing = str(error)
+            tasks = []
+
+        task_ranges = list(ranges(tasks))
+        short = task_ranges
+        if len(task_ranges) > _SHORT:
+            short = [task_ranges[0], "…", task_ranges[-1]]
+        description = "any task of the simulator"
+        if tasks:
+            plural = "" if len(tasks) == 1 else "s"
+            description = f"{len(tasks)} task{plural}: {', '.join(short)}"
+        yield Listed("environment", name, description, missing, task_ranges)
     yield from _in_other_plugins("environment", "envs")
 
 
@@ -112,24 +119,28 @@ def installing(listed: Sequence[Listed]) -> Iterator[str]:
     """Yield a line for each way to install missing packages: a command and the policies that need
     it, or an environment's cure.
     """
-    wanted: dict[str, list[str]] = {}
-    for one in listed:
-        modules, sources, requirements = (
-            _lacking(one.name) if one.kind != "environment" else ([], [], "")
-        )
-        by_environment = bool(requirements) and bool(modules or sources)
-        if by_environment:
-            wanted.setdefault(f"vlagents-ray env make {requirements}  # {{}}", []).append(one.name)
+    names_by_line: dict[str, list[str]] = {}  # a line has {} for the names
+    for entry in listed:
+        modules: list[str] = []
+        sources: list[str] = []
+        requirements = ""
+        if entry.kind != "environment":
+            modules, sources, requirements = _lacking(entry.name)
+
+        lines = []
+        is_by_environment = bool(requirements) and bool(modules or sources)
+        if is_by_environment:
+            lines.append(f"vlagents-ray env make {requirements}  # {{}}")
         if sources:
-            wanted.setdefault(f"export {sources[0]}=FOLDER  # a checkout, for {{}}", []).append(
-                one.name
-            )
-        if one.missing is not None and not by_environment:
-            wanted.setdefault(
-                f"{{}}: {one.missing.replace('{', '{{').replace('}', '}}')}", []
-            ).append(one.name)
-    for line, of in wanted.items():
-        yield line.format(", ".join(of))
+            lines.append(f"export {sources[0]}=FOLDER  # a checkout, for {{}}")
+        if entry.missing is not None and not is_by_environment:
+            escaped = entry.missing.replace("{", "{{").replace("}", "}}")
+            lines.append(f"{{}}: {escaped}")
+        for line in lines:
+            names_by_line.setdefault(line, []).append(entry.name)
+
+    for line, entry_names in names_by_line.items():
+        yield line.format(", ".join(entry_names))
 
 
 def require_packages(config: Deployment) -> None:
@@ -138,12 +149,11 @@ def require_packages(config: Deployment) -> None:
     A checkout of its source is not required, as a setting may name one.
     """
     for app in config.applications:
-        name, environment = str(app.args.get("policy")), app.args.get("environment")
-        if (
-            not environment
-            and not app.runtime_env
-            and (missing := missing_packages(name, checkout=False)) is not None
-        ):
+        if app.args.get("environment") or app.runtime_env:
+            continue
+        name = str(app.args.get("policy"))
+        missing = missing_packages(name, checkout=False)
+        if missing is not None:
             raise MissingDependency(f"policy {name!r}: {missing}")
 
 
@@ -161,16 +171,15 @@ def missing_packages(name: str, *, checkout: bool = True) -> str | None:
     if not requirements:
         cure = "; ".join(install_alone(module) for module in modules)
         return f"not in this environment ({', '.join(modules)}): {cure}"
-    cures = [
-        (
-            f"`vlagents-ray env make {requirements}`, and that Python in `environment` of its "
-            "deployment"
-        )
-    ]
+
+    cure = (
+        f"`vlagents-ray env make {requirements}`, and that Python in `environment` of its "
+        "deployment"
+    )
     if sources:
-        cures.append(f"{' or '.join(sources)}=FOLDER of a checkout")
+        cure += f"; {' or '.join(sources)}=FOLDER of a checkout"
         modules = [*modules, "its source"]
-    return f"not in this environment ({', '.join(modules)}): {'; '.join(cures)}"
+    return f"not in this environment ({', '.join(modules)}): {cure}"
 
 
 def _lacking(name: str) -> tuple[list[str], list[str], str]:
@@ -180,14 +189,16 @@ def _lacking(name: str) -> tuple[list[str], list[str], str]:
     entry = find_entry("policies", name)
     if entry is None or entry.extra:
         return [], [], ""
+
+    # The first of the needed modules is in the checkout, if there is one.
     has_checkout = any(os.environ.get(variable) for variable in entry.checkouts)
-    lacking = [
-        module for module in entry.needs[has_checkout:] if importlib.util.find_spec(module) is None
-    ]
-    no_source = bool(entry.checkouts) and not has_checkout and entry.needs[0] in lacking
-    sources = list(entry.checkouts) if no_source else []
+    needed = entry.needs[1:] if has_checkout else entry.needs
+    lacking = [module for module in needed if importlib.util.find_spec(module) is None]
+    lacks_source = bool(entry.checkouts) and not has_checkout and entry.needs[0] in lacking
     requirements = entry.requirements[0] if entry.requirements else ""
-    return lacking[no_source:], sources, requirements
+    if lacks_source:
+        return lacking[1:], list(entry.checkouts), requirements
+    return lacking, [], requirements
 
 
 def settings_of(cls: type) -> Iterator[str]:
@@ -195,12 +206,12 @@ def settings_of(cls: type) -> Iterator[str]:
     fields: Mapping[str, Any] | None = getattr(getattr(cls, "Config", None), "model_fields", None)
     if fields is not None:
         for name, field in fields.items():
-            yield (
-                name
-                if field.is_required()
-                else f"{name}={field.get_default(call_default_factory=True)!r}"
-            )
+            if field.is_required():
+                yield name
+            else:
+                yield f"{name}={field.get_default(call_default_factory=True)!r}"
         return
+
     for parameter in inspect.signature(cls).parameters.values():
         if parameter.kind in (parameter.POSITIONAL_OR_KEYWORD, parameter.KEYWORD_ONLY):
             required = parameter.default is parameter.empty
@@ -211,17 +222,19 @@ def ranges(tasks: list[str]) -> Iterator[str]:
     """Join numbered names of one kind: "libero_spatial/0" to "libero_spatial/9" as
     "libero_spatial/0..9".
     """
-    split = [re.fullmatch(r"(.*/)(\d+)", task) for task in tasks]
-    for stem, group in groupby(
-        zip(tasks, split, strict=True), lambda one: None if one[1] is None else one[1][1]
-    ):
+    for stem, group in groupby(tasks, _stem):
         members = list(group)
-        numbers = [int(found[2]) for _, found in members if found is not None]
-        if (
-            stem is not None
-            and len(numbers) > 1
-            and numbers == list(range(numbers[0], numbers[-1] + 1))
-        ):
+        if stem is None or len(members) == 1:
+            yield from members
+            continue
+        numbers = [int(task.removeprefix(stem)) for task in members]
+        if numbers == list(range(numbers[0], numbers[-1] + 1)):
             yield f"{stem}{numbers[0]}..{numbers[-1]}"
         else:
-            yield from (task for task, _ in members)
+            yield from members
+
+
+def _stem(task: str) -> str | None:
+    """Return the name of a numbered task up to its number; None for a task without a number."""
+    numbered = re.fullmatch(r"(.*/)\d+", task)
+    return None if numbered is None else numbered[1]

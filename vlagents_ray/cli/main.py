@@ -40,8 +40,8 @@ app = typer.Typer(
 )
 
 
-def _print_version(wanted: bool) -> None:
-    if wanted:
+def _print_version(requested: bool) -> None:
+    if requested:
         out.print(f"vlagents-ray {importlib.metadata.version('vlagents-ray')}")
         raise typer.Exit
 
@@ -95,17 +95,20 @@ def demo(
     from vlagents_ray.cli.evaluation import run_evaluation
     from vlagents_ray.evaluate import EvalConfig, PolicyConfig, SuiteConfig
 
-    policy = PolicyConfig(name="scripted", source="scripted")
-    if (rates := Path("examples/reference/checkpoint/rates.json")).is_file():
-        solved, episodes = map(
-            sum, zip(*json.loads(rates.read_text())["tabletop"].values(), strict=True)
+    rates = Path("examples/reference/checkpoint/rates.json")
+    if rates.is_file():
+        counts = json.loads(rates.read_text())["tabletop"].values()
+        successes = sum(count[0] for count in counts)
+        episodes = sum(count[1] for count in counts)
+        out.print(
+            "The policy was learned from demonstrations, and solves "
+            f"{100 * successes / episodes:.0f} % of {episodes} such episodes; its card is "
+            f"{rates.parent}/README.md."
         )
-        said = (
-            f"solves {100 * solved / episodes:.0f} % of {episodes} such episodes; its card is "
-            f"{rates.parent}/README.md"
-        )
-        out.print(f"The policy was learned from demonstrations, and {said}.")
         policy = PolicyConfig(name="reference", source="deployments/reference.yaml")
+    else:
+        policy = PolicyConfig(name="scripted", source="scripted")
+
     tasks = ["tabletop/pick_place", "tabletop/slide", "tabletop/stack", "tabletop/lift"]
     suite = SuiteConfig(
         envs=tasks,
@@ -140,7 +143,7 @@ def doctor(
     raise typer.Exit(status)
 
 
-# With lines that fit into 80 columns, so that all commands are on one screen.
+# The short lines fit into 80 columns, so that all commands are on one screen.
 for _command, _name, _line in (
     (results.report_command, "report", "Write the report of an evaluation again."),
     (results.export_command, "export", "Write episodes as JSON, CSV, Parquet or a LeRobotDataset."),
@@ -163,7 +166,8 @@ def _add_commands_of_plugins() -> None:
         if "." in name:  # a subcommand, which `cli.robot` runs
             continue
         try:
-            command, entry = registered_function("commands", name), find_entry("commands", name)
+            command = registered_function("commands", name)
+            entry = find_entry("commands", name)
         except VLAgentsError as error:
             _add_failing(name, "It cannot be loaded.", str(error))
             continue
@@ -172,6 +176,7 @@ def _add_commands_of_plugins() -> None:
             app.add_typer(command, name=name, short_help=about, rich_help_panel=_MORE)
         else:
             app.command(name, short_help=about, rich_help_panel=_MORE)(command)
+
     for name, distribution in not_installed("commands").items():
         if "." in name:
             continue
@@ -221,25 +226,33 @@ def _list(listed: Sequence[Listed], name: str | None, *, as_json: bool) -> None:
     """
     from vlagents_ray.cli.listing import installing
 
-    if not (chosen := [one for one in listed if name in (None, one.name)]):
-        known = [one.name for one in listed]
+    chosen = [entry for entry in listed if name in (None, entry.name)]
+    if not chosen:
+        known = [entry.name for entry in listed]
         cure = did_you_mean(str(name), known) or f"; there are {', '.join(known)}"
         fail(f"{name!r} is not registered{cure}", 2)
+
     if as_json:
-        print_json([asdict(one) for one in chosen])
+        print_json([asdict(entry) for entry in chosen])
         return
     if name is not None:
         for line in chosen[0].lines():
             out.print(line)
         return
-    kinds = len({one.kind for one in chosen}) > 1
-    rows = table("name", *(["kind"] * kinds), "here", "what", box=None)
-    for one in chosen:
-        rows.add_row(one.name, *([one.kind] * kinds), "no" if one.missing else "yes", one.what)
+
+    has_kinds = len({entry.kind for entry in chosen}) > 1
+    columns = ["name", "kind", "here", "what"] if has_kinds else ["name", "here", "what"]
+    rows = table(*columns, box=None)
+    for entry in chosen:
+        kind = [entry.kind] if has_kinds else []
+        rows.add_row(entry.name, *kind, "no" if entry.missing else "yes", entry.what)
     out.print(rows)
-    if cures := list(installing(chosen)):
-        made = any("env make" in line and line.startswith("vlagents-ray") for line in cures)
-        out.print(f"\nfor the rest{', whose Python a deployment names as `environment`' * made}:")
+
+    cures = list(installing(chosen))
+    if cures:
+        makes_env = any("env make" in line and line.startswith("vlagents-ray") for line in cures)
+        hint = ", whose Python a deployment names as `environment`" if makes_env else ""
+        out.print(f"\nfor the rest{hint}:")
     for line in cures:
         out.print(f"  {line}")
 
@@ -275,7 +288,7 @@ def make(
     with errors():
         file = requirements_file(requirements.name) if is_name else requirements
         folder = out_dir or Path(f".venv-{file.stem}")
-        made = make_environment(
+        interpreter = make_environment(
             file, folder, more=more, python=python, light=light, cuda=cuda, progress=progress
         )
-    out.print(f"ready; in a deployment file, under args:\n\nenvironment:\n  python: {made}")
+    out.print(f"ready; in a deployment file, under args:\n\nenvironment:\n  python: {interpreter}")

@@ -28,7 +28,7 @@ from vlagents_ray.registry import names
 new = typer.Typer(
     no_args_is_help=True, help="Write a working skeleton, with its test, into the current folder."
 )
-# Of each kind, the files that are written, with $name for the name, and their templates in
+# The files that are written for each kind, with $name for the name, and their templates in
 # skeletons/KIND.
 _MODULE = {"$name.py": "module.py", "test_$name.py": "test.py", "$name.yaml": "run.yaml"}
 _FILES = {
@@ -111,7 +111,8 @@ def plugin(name: Name, context: typer.Context) -> None:
                     f"NAME: {name!r} is the name of a {kind} already; choose another one"
                 )
         _write(name, "plugin")
-        command, python = as_typed("vlagents-ray"), as_typed("python")
+        command = as_typed("vlagents-ray")
+        python = as_typed("python")
         _print_steps(
             (f"cd {name}", "the folder of the plug-in"),
             (f"{python} -m pip install --editable .", "registers it in this environment"),
@@ -141,16 +142,19 @@ def _write(name: str, kind: Kind) -> None:
         raise ConfigError(
             f"NAME: got {name!r}, want the name of a Python module in lower case, such as my_policy"
         )
+
     texts = render(name, kind)
-    if there := [str(path) for path in texts if path.exists()]:
+    existing = [str(path) for path in texts if path.exists()]
+    if existing:
         raise ConfigError(
-            f"{', '.join(there)}: there already, and nothing was written; choose another NAME"
+            f"{', '.join(existing)}: there already, and nothing was written; choose another NAME"
         )
     if importlib.util.find_spec(name) is not None:
         raise ConfigError(
             f"NAME: {name!r} is a module that is installed, and yours would hide it; choose "
             "another one"
         )
+
     created: list[Path] = []  # files and folders, in order
     try:
         for path, text in texts.items():
@@ -168,6 +172,7 @@ def _write(name: str, kind: Kind) -> None:
             else:
                 path.unlink()
         raise
+
     out.print(f"wrote {', '.join(map(str, texts))}. Next:")
     if kind != "plugin":
         _print_steps((f"{as_typed('python')} test_{name}.py", "checks it; so does pytest"))
@@ -181,9 +186,9 @@ def as_typed(program: str) -> str:
     on_path = shutil.which(program)
     if on_path is not None and Path(on_path).absolute() == path:
         return program
-    return shlex.quote(
-        str(path.relative_to(Path.cwd()) if path.is_relative_to(Path.cwd()) else path)
-    )
+    if path.is_relative_to(Path.cwd()):
+        path = path.relative_to(Path.cwd())
+    return shlex.quote(str(path))
 
 
 def _print_steps(*steps: tuple[str, str]) -> None:

@@ -69,22 +69,31 @@ def command_of(
     """
     hints = get_type_hints(options, include_extras=True)
     parameters = []
-    for one in dataclasses.fields(options):  # type: ignore[arg-type]
-        made = one.default if one.default_factory is dataclasses.MISSING else one.default_factory()
-        default = inspect.Parameter.empty if made is dataclasses.MISSING else made
-        kind = inspect.Parameter.KEYWORD_ONLY
-        parameters.append(
-            inspect.Parameter(one.name, kind, default=default, annotation=hints[one.name])
+    for field in dataclasses.fields(options):  # type: ignore[arg-type]
+        if field.default_factory is not dataclasses.MISSING:
+            default = field.default_factory()
+        elif field.default is not dataclasses.MISSING:
+            default = field.default
+        else:
+            default = inspect.Parameter.empty
+        parameter = inspect.Parameter(
+            field.name,
+            inspect.Parameter.KEYWORD_ONLY,
+            default=default,
+            annotation=hints[field.name],
         )
+        parameters.append(parameter)
 
     def decorate(command: Callable[[_Options], None]) -> Callable[..., None]:
-        @functools.wraps(command)
-        def called(**given: Any) -> None:
-            command(options(**given))
+        """Return the command as a function that takes each option as an argument."""
 
-        called.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
-        called.__annotations__ = {}
-        return called
+        @functools.wraps(command)
+        def run(**values: Any) -> None:
+            command(options(**values))
+
+        run.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
+        run.__annotations__ = {}
+        return run
 
     return decorate
 
@@ -93,6 +102,7 @@ class Commands(TyperGroup):
     """The group of all commands, whose errors name the value of an option that cannot be read."""
 
     def invoke(self, ctx: Any) -> Any:
+        """Run a command, as Typer does."""
         try:
             return super().invoke(ctx)
         except typer.BadParameter as error:
@@ -111,7 +121,7 @@ def finite(value: float | None) -> float | None:
 
 
 def parse_settings(texts: Iterable[str], option: str) -> dict[str, Any]:
-    """Parse `a.b=1` and the like to nested settings; the value is YAML, so `[1, 2]` and `true`
+    """Parse texts such as `a.b=1` to nested settings; the value is YAML, so `[1, 2]` and `true`
     work.
 
     A value that is not YAML, such as `@handle`, is text, unless it begins like a list, a mapping or
@@ -123,18 +133,20 @@ def parse_settings(texts: Iterable[str], option: str) -> dict[str, Any]:
         path = key.strip().split(".")
         if not equals or not all(path):
             raise ConfigError(f"{option}: got {text!r}, want KEY=VALUE, as in batch.max_size=8")
-        place = settings
+
+        section = settings
         for name in path[:-1]:
-            place = place.setdefault(name, {})
-            if not isinstance(place, dict):
+            section = section.setdefault(name, {})
+            if not isinstance(section, dict):
                 raise ConfigError(
                     f"{option}: {key!r} goes below {name!r}, which has a value already"
                 )
+
         try:
-            place[path[-1]] = load_yaml(value)
+            section[path[-1]] = load_yaml(value)
         except ValueError as error:
             if not value.lstrip().startswith(("[", "{", '"', "'")):
-                place[path[-1]] = value
+                section[path[-1]] = value
                 continue
             raise ConfigError(f"{option}: the value of {key!r} is not YAML ({error})") from error
     return settings
@@ -151,8 +163,8 @@ def parse_dims(texts: Iterable[str], option: str) -> dict[str, int]:
 
 
 def parse_list(text: str) -> list[str]:
-    """Split at commas; empty parts are left out."""
-    return [one.strip() for one in text.split(",") if one.strip()]
+    """Split at commas; empty items are left out."""
+    return [item.strip() for item in text.split(",") if item.strip()]
 
 
 def parse_time(text: str, option: str) -> float:

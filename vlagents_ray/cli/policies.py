@@ -40,7 +40,7 @@ from vlagents_ray.serve.launch.deployment_file import (
 from vlagents_ray.serve.local_agent import LocalPolicy
 from vlagents_ray.serve.models.checkpoints import STEP, resolved
 
-Agents = Mapping[str, Callable[[], Agent]]  # of policies that are played in this process, by name
+Agents = Mapping[str, Callable[[], Agent]]  # policies that run in this process, by name
 _STARTING_S = 30.0  # time limit for a server at a URL
 
 
@@ -48,8 +48,8 @@ _STARTING_S = 30.0  # time limit for a server at a URL
 def served(
     config: EvalConfig, address: str | None = None, *, replica_per_gpu: bool = False
 ) -> Iterator[tuple[EvalConfig, Agents]]:
-    """Serve the policies that are not at a URL for the length of the context, or let this process
-    play them.
+    """Serve the policies that are not at a URL for the length of the context, or run them in this
+    process.
 
     Yields:
         The evaluation with its number of workers and the URLs of its policies; and, without
@@ -60,40 +60,51 @@ def served(
         on_ray = address is not None or config.real_robot is not None or chosen_workers(config) > 0
         if on_ray:
             _enter_ray(stack, address)
-        ready, parts = resolve_policies(config)
-        local = None if on_ray else _local_policies(parts, config.workers)
+
+        ready, deployments = resolve_policies(config)
+        local = None if on_ray else _local_policies(deployments, config.workers)
         if not on_ray and local is None:
             _enter_ray(stack)
-        # Raise errors before anything starts.
+
+        # Errors are raised before anything starts.
         if address is None:
-            _require_resources(ready, parts)
-        _require_fit(ready, parts)
+            _require_resources(ready, deployments)
+        _require_fit(ready, deployments)
         check(ready)
+
         if local is not None:
             if config.workers is None:
                 out.print(
                     "a short evaluation, in this process without Ray (--workers 1 plays it in a "
                     "worker of Ray)"
                 )
-            yield _play_here(stack, ready, local)
+            yield _run_in_process(stack, ready, local)
             return
+
         ready = ready.model_copy(update={"workers": config.workers or 1})
-        if parts:
-            stack.enter_context(_on_ray(ready, parts, address, replica_per_gpu=replica_per_gpu))
+        if deployments:
+            stack.enter_context(
+                _serve_on_ray(ready, deployments, address, replica_per_gpu=replica_per_gpu)
+            )
         yield ready, {}
 
 
 def planned_workers(
-    config: EvalConfig, parts: Mapping[str, Deployment], address: str | None = None
+    config: EvalConfig, deployments: Mapping[str, Deployment], address: str | None = None
 ) -> int:
-    """Return the number of workers with which `served` would play `config`, whose policies became
-    `parts`.
+    """Return the number of workers with which `served` would run an evaluation.
 
-    Raises `ConfigError` where `served` does: `workers` is 0, and something needs Ray.
+    Args:
+        config: The evaluation.
+        deployments: The deployments of its policies, from `resolve_policies`.
+        address: As in `served`.
+
+    Raises:
+        ConfigError: `workers` is 0, and something needs Ray, as in `served`.
     """
     _require_cluster_workers(config, address)
     workers = chosen_workers(config)
-    if workers or address is not None or _local_policies(parts, config.workers) is None:
+    if workers or address is not None or _local_policies(deployments, config.workers) is None:
         return workers or 1
     return 0
 
@@ -105,55 +116,60 @@ def _require_cluster_workers(config: EvalConfig, address: str | None) -> None:
         )
 
 
-def _require_resources(config: EvalConfig, parts: Mapping[str, Deployment]) -> None:
+def _require_resources(config: EvalConfig, deployments: Mapping[str, Deployment]) -> None:
     """Raise `ConfigError` or `MissingDependency` unless this machine has the GPUs and packages."""
-    wanted = max(case.worker.gpus for case in plan_cases(config))
-    if wanted and wanted > (here := gpus_here()):  # Ray would never start these workers here
+    needed = max(case.worker.gpus for case in plan_cases(config))
+    available = gpus_here() if needed else 0.0
+    if needed > available:  # Ray would never start these workers here
         raise ConfigError(
-            f"worker.gpus: a worker wants {wanted:g} GPUs, this machine has {here:g}; want less (0 "
-            "draws in "
-            f"software), or the --address of a cluster that has them"
+            f"worker.gpus: a worker wants {needed:g} GPUs, this machine has {available:g}; want "
+            "less (0 draws in software), or the --address of a cluster that has them"
         )
-    for part in parts.values():
-        require_packages(part)
+    for deployment in deployments.values():
+        require_packages(deployment)
 
 
-def _require_fit(config: EvalConfig, parts: Mapping[str, Deployment]) -> None:
+def _require_fit(config: EvalConfig, deployments: Mapping[str, Deployment]) -> None:
     """Raise `ContractMismatch` unless the policies that will be served fit their simulations."""
-    policy_contract = cache(lambda application: stated_contract(parts[application]))
-    for case in plan_cases(config) if config.real_robot is None else ():
+    if config.real_robot is not None:
+        return
+    policy_contract = cache(lambda application: stated_contract(deployments[application]))
+    for case in plan_cases(config):
         application = str(case.policy.url).removeprefix("serve://")
-        if (
-            application in parts
-            and (env := known_contract(case.env, case.suite.env_options)) is not None
-        ):
-            require_match(
-                policy_contract(application), env, f"{case.policy.name!r} in {case.env!r}: "
-            )
+        if application not in deployments:
+            continue
+        env_contract = known_contract(case.env, case.suite.env_options)
+        if env_contract is not None:
+            name = f"{case.policy.name!r} in {case.env!r}: "
+            require_match(policy_contract(application), env_contract, name)
 
 
-def _play_here(
+def _run_in_process(
     stack: contextlib.ExitStack, config: EvalConfig, local: Mapping[str, partial[LocalPolicy]]
 ) -> tuple[EvalConfig, Agents]:
-    """Prepare this process to play the policies, with the variables of workers and replicas, for
+    """Prepare this process to run the policies, with the variables of workers and replicas, for
     the same results.
     """
-    hidden = {} if any(one.args[0].resources.num_gpus for one in local.values()) else {VISIBLE: ""}
-    stack.enter_context(
-        variables(dict.fromkeys(THREAD_VARIABLES, str(config.worker.threads)) | hidden)
-    )
-    apps = {one.name: str(one.url).removeprefix("serve://") for one in config.policies}
-    agents = {name: local[app] for name, app in apps.items() if app in local}
-    own = [
-        one.model_copy(update={"url": None}) if one.name in agents else one
-        for one in config.policies
-    ]
-    return config.model_copy(update={"policies": own, "workers": 0}), agents
+    environment = dict.fromkeys(THREAD_VARIABLES, str(config.worker.threads))
+    if not any(policy.args[0].resources.num_gpus for policy in local.values()):
+        environment[VISIBLE] = ""  # hides the GPUs
+    stack.enter_context(variables(environment))
+
+    agents = {}
+    policies = []
+    for policy in config.policies:
+        application = str(policy.url).removeprefix("serve://")
+        if application in local:
+            agents[policy.name] = local[application]
+            policies.append(policy.model_copy(update={"url": None}))
+        else:
+            policies.append(policy)
+    return config.model_copy(update={"policies": policies, "workers": 0}), agents
 
 
-def _on_ray(
+def _serve_on_ray(
     config: EvalConfig,
-    parts: Mapping[str, Deployment],
+    deployments: Mapping[str, Deployment],
     address: str | None,
     *,
     replica_per_gpu: bool,
@@ -164,13 +180,16 @@ def _on_ray(
 
     workers = config.workers or 1
     if replica_per_gpu:
-        parts = spread_over_gpus(parts, kept=workers * most_gpus(config))
+        deployments = spread_over_gpus(deployments, reserved=workers * most_gpus(config))
     # Ray's CPUs are logical here: the requested number of workers must fit.
     cpus = max(os.cpu_count() or 1, math.ceil(workers * most_cpus(config)))
-    return running_server(together(parts), address=address, num_cpus=cpus, ingress=False)
+    return running_server(together(deployments), address=address, num_cpus=cpus, ingress=False)
 
 
 def _enter_ray(stack: contextlib.ExitStack, address: str | None = None) -> None:
+    """Keep Ray's logs off the terminal, and join the cluster at `address`, for the length of
+    `stack`.
+    """
     stack.enter_context(quiet_ray(None))
     stack.enter_context(exit_if_ray_is_lost(RESUME))
     if address is not None:
@@ -178,32 +197,30 @@ def _enter_ray(stack: contextlib.ExitStack, address: str | None = None) -> None:
 
 
 def _local_policies(
-    parts: Mapping[str, Deployment], workers: int | None
+    deployments: Mapping[str, Deployment], workers: int | None
 ) -> dict[str, partial[LocalPolicy]] | None:
-    """Return the policies for this process by application; None if Ray is to play them.
+    """Return the policies for this process by application; None if they need Ray.
 
-    Raises `ConfigError` if `workers` is 0 and Ray would have to.
+    Raises `ConfigError` if `workers` is 0 and a policy needs Ray.
     """
-    found = {}
-    for name, part in parts.items():
-        app = only_application(name, part)
-        args = (
-            ServerArgs(**app.args)
-            if app.import_path == IMPORT_PATH and not app.runtime_env
-            else None
-        )
-        if workers == 0 and (args is None or args.environment.python):
-            need = (
-                "a runtime_env, or another import_path" if args is None else args.environment.python
-            )
+    local = {}
+    for name, deployment in deployments.items():
+        app = only_application(name, deployment)
+        args: ServerArgs | None = None
+        obstacle: str | None = "a runtime_env, or another import_path"
+        if app.import_path == IMPORT_PATH and not app.runtime_env:
+            args = ServerArgs(**app.args)
+            obstacle = args.environment.python
+
+        if workers == 0 and obstacle:
             raise ConfigError(
-                f"workers: got 0, which plays in this Python, but {name!r} has {need}; want 1 or "
-                "more"
+                f"workers: got 0, which plays in this Python, but {name!r} has {obstacle}; want 1 "
+                "or more"
             )
-        if args is None or args.environment.python or (args.resources.num_gpus and workers is None):
+        if args is None or obstacle or (args.resources.num_gpus and workers is None):
             return None
-        found[name] = partial(LocalPolicy, args, own_settings(app))
-    return found
+        local[name] = partial(LocalPolicy, args, own_settings(app))
+    return local
 
 
 def resolve_policies(
@@ -212,58 +229,72 @@ def resolve_policies(
     """Return the evaluation with names and URLs of its policies, and the deployments to start,
     by application.
     """
-    parts: dict[str, Deployment] = {}
-    policies = [_resolve_policy(policy, parts, ask=ask) for policy in config.policies]
-    return type(config).model_validate(
-        config.model_dump(exclude_unset=True) | {"policies": policies}
-    ), parts
+    deployments: dict[str, Deployment] = {}
+    policies = [_resolve_policy(policy, deployments, ask=ask) for policy in config.policies]
+    fields = config.model_dump(exclude_unset=True) | {"policies": policies}
+    return type(config).model_validate(fields), deployments
 
 
 def _resolve_policy(
-    policy: PolicyConfig, parts: dict[str, Deployment], *, ask: bool
+    policy: PolicyConfig, deployments: dict[str, Deployment], *, ask: bool
 ) -> PolicyConfig:
-    """Add name and URL to `policy`; add its deployment to `parts` unless a server has it."""
+    """Return the policy with its name and URL; add its deployment to `deployments` unless a
+    server has it.
+    """
     url = policy.source if policy.source is not None and "://" in policy.source else policy.url
     if url is not None:
-        found: dict[str, Any] = {"url": url, "source": None}
-        if ask:  # a result belongs to the served policy, not to an address
-            if policy.config:
-                names = sorted(policy.config)
-                raise ConfigError(
-                    f"policy {policy.name!r}: got {names}, but {url} has its settings already"
-                )
-            # Its server may be starting.
-            with RemoteAgent(url, connect_timeout_s=_STARTING_S) as agent:
-                said = agent.metadata
-            name = policy.name if "name" in policy.model_fields_set else said["policy"]
-            found |= {
-                "name": name,
-                "config": said.get("config", {}),
-                "checkpoint": said.get("checkpoint"),
-            }
-        return policy.model_copy(update=found)
+        return _policy_at(url, policy, ask=ask)
     if policy.source is None:
         raise ConfigError(
             f"policy {policy.name!r}: want `source`, a policy to serve, or the `url` of a server"
         )
-    part = policy_deployment(policy, policy.source, step_follows=bool(policy.steps))
-    own = own_settings(part.applications[0])
-    name = (
-        policy.name
-        if "name" in policy.model_fields_set
-        else str(part.applications[0].args["policy"])
-    )
+
+    deployment = policy_deployment(policy, policy.source, step_follows=bool(policy.steps))
+    settings = own_settings(deployment.applications[0])
+    name = policy.name
+    if "name" not in policy.model_fields_set:
+        name = str(deployment.applications[0].args["policy"])
     application = re.sub(r"\W+", "-", name.rpartition(":")[2])
-    if policy.steps and own.get(STEP) is None:  # record the pattern, not the deployment's own step
-        part = with_settings(part, {STEP: policy.steps[0]}, steps=True)
-    parts[application] = part
-    found = {
-        "name": name,
-        "url": f"serve://{application}",
-        "config": own,
-        "checkpoint": resolved(own),
+
+    # The results record the pattern of the checkpoints, not the step in this deployment.
+    if policy.steps and settings.get(STEP) is None:
+        deployment = with_settings(deployment, {STEP: policy.steps[0]}, steps=True)
+    deployments[application] = deployment
+    return policy.model_copy(
+        update={
+            "name": name,
+            "url": f"serve://{application}",
+            "config": settings,
+            "checkpoint": resolved(settings),
+        }
+    )
+
+
+def _policy_at(url: str, policy: PolicyConfig, *, ask: bool) -> PolicyConfig:
+    """Return the policy of a server.
+
+    With `ask`, it gets the name, the settings and the checkpoint that the server has, since a
+    result belongs to the served policy, not to an address.
+    """
+    fields: dict[str, Any] = {"url": url, "source": None}
+    if not ask:
+        return policy.model_copy(update=fields)
+
+    if policy.config:
+        names = sorted(policy.config)
+        raise ConfigError(
+            f"policy {policy.name!r}: got {names}, but {url} has its settings already"
+        )
+    # The server may be starting.
+    with RemoteAgent(url, connect_timeout_s=_STARTING_S) as agent:
+        metadata = agent.metadata
+    has_name = "name" in policy.model_fields_set
+    fields |= {
+        "name": policy.name if has_name else metadata["policy"],
+        "config": metadata.get("config", {}),
+        "checkpoint": metadata.get("checkpoint"),
     }
-    return policy.model_copy(update=found)
+    return policy.model_copy(update=fields)
 
 
 def policy_deployment(
@@ -272,8 +303,10 @@ def policy_deployment(
     """Read the deployment of `source` with the settings of `policy`; `step_follows` as in
     `read_deployment`.
     """
-    of_name = (
-        {"config": policy.config} if policy.config and not source.endswith(YAML_SUFFIXES) else None
+    args = None
+    if policy.config and not source.endswith(YAML_SUFFIXES):
+        args = {"config": policy.config}
+    deployment = read_deployment(source, args, step_follows=step_follows)
+    return with_settings(
+        deployment, policy.config, steps=bool(policy.steps), step_follows=step_follows
     )
-    read = read_deployment(source, of_name, step_follows=step_follows)
-    return with_settings(read, policy.config, steps=bool(policy.steps), step_follows=step_follows)

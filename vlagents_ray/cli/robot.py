@@ -476,7 +476,7 @@ def command_parser() -> tuple[
     of_env: list[argparse.Action] = []
     add = parser.add_argument
     seconds = number(above=True)
-    rows = number(int, least=1)
+    rows = number(int, minimum=1)
 
     def real(*names: str, **settings: Any) -> None:
         of_robot.append(groups[0].add_argument(*names, **settings))
@@ -491,7 +491,7 @@ def command_parser() -> tuple[
     )
     add(
         "--hz",
-        type=number(above=True, most=_MOST_HZ),
+        type=number(above=True, maximum=_MOST_HZ),
         help=f"control rate (default: {_HZ:g}, or the environment's)",
     )
     real("--seconds", type=seconds, default=60.0, help="how long (%(default)s)")

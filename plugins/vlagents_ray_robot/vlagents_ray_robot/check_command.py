@@ -110,12 +110,12 @@ def command_parser() -> argparse.ArgumentParser:
     )
     add(
         "--hz",
-        type=number(above=True, most=10_000.0),
+        type=number(above=True, maximum=10_000.0),
         help="control rate (default: the contract's, or 50)",
     )
     add(
         "--latency-ms",
-        type=number(most=60_000.0),
+        type=number(maximum=60_000.0),
         default=400.0,
         help="longest time from command to motion (%(default)s)",
     )

@@ -324,10 +324,10 @@ def test_what_uv_says_is_shown(tmp_path: Path) -> None:
 def test_uv_looks_where_pip_was_told_to(monkeypatch: pytest.MonkeyPatch) -> None:
     for name in making._PIP_VARIABLES:
         monkeypatch.delenv(name, raising=False)
-    assert making._places() == {}
+    assert making._package_sources() == {}
     monkeypatch.setenv("PIP_FIND_LINKS", "/wheels /other")
     monkeypatch.setenv("PIP_INDEX_URL", "file:///simple")
-    assert making._places() == {
+    assert making._package_sources() == {
         "UV_FIND_LINKS": "/wheels,/other",
         "UV_DEFAULT_INDEX": "file:///simple",
     }

@@ -354,13 +354,14 @@ def _ray(
 
 
 def spread_over_gpus(
-    parts: Mapping[str, Deployment], *, kept: float = 0.0
+    deployments: Mapping[str, Deployment], *, reserved: float = 0.0
 ) -> dict[str, Deployment]:
-    """Return deployments that share the GPUs of the connected cluster equally, except for `kept`
-    GPUs.
+    """Return deployments that share the GPUs of the connected cluster equally, except for the
+    `reserved` number of GPUs.
     """
-    share = max(0.0, ray.cluster_resources().get("GPU", 0.0) - kept) / len(parts)
-    return {name: with_replicas_on(part, share) for name, part in parts.items()}
+    gpus = max(0.0, ray.cluster_resources().get("GPU", 0.0) - reserved)
+    share = gpus / len(deployments)
+    return {name: with_replicas_on(deployment, share) for name, deployment in deployments.items()}
 
 
 @contextlib.contextmanager
