@@ -23,8 +23,9 @@ from vlagents_ray.ray_tools.signals import is_interrupted, raise_dropped_interru
 
 log = logging.getLogger(__name__)
 
-_LEAVE_S = 10.0  # for a command to end in order
-_EXIT_S = 3.0  # for its process to end then: Ray's shutdown may wait for lost processes
+_LEAVE_S = 10.0  # time limit for a command to end in order
+# Time limit for the process to end then: Ray's shutdown may wait for lost processes.
+_EXIT_S = 3.0
 _LOOK_S = 1.0  # period of the check for an interrupt that Python dropped
 _END_S = 90.0  # from Ctrl-C to the end: a third for Serve, the rest for Ray's shutdown
 RESTART = "start it again"
@@ -42,12 +43,12 @@ _LOAD_FAILURES = (
     "Failed to update the deployments",
     "the policy did not load",
 )
+# The beginning of each line of Serve's processes.
 _SERVES_LINE = re.compile(r"[A-Z]+ \d{4}-\d\d-\d\d \d\d:")
-# Begin of each line of Serve's processes.
 _SERVES_INFO = re.compile(r"(INFO|DEBUG) \d{4}-\d\d-\d\d \d\d:")
 # Warnings about intended settings of `own_ray`: it is on loopback, has a token and does not handle
 # signals.
-_MEANT = (
+_INTENDED = (
     "won't accept connections from HAProxy on other nodes",
     "Token authentication is enabled",
     "SIGTERM handler is not set",
@@ -69,21 +70,26 @@ def quiet_ray(name: str | None, started: threading.Event | None = None) -> Itera
         The log file, which stays unless it is empty and which this user alone can read; None
         without one.
     """
-    file = kept = None
+    file = None
+    handler = None
     if name is not None:
         descriptor, path = tempfile.mkstemp(prefix=f"{name}-", suffix=".log")
         os.close(descriptor)
-        file, kept = Path(path), RotatingFileHandler(path, maxBytes=_FILE_BYTES, backupCount=1)
-    terminal = _Terminal(kept, started)
-    loggers = [logging.getLogger(one) for one in LOGGERS]
+        file = Path(path)
+        handler = RotatingFileHandler(path, maxBytes=_FILE_BYTES, backupCount=1)
+
+    terminal = _Terminal(handler, started)
+    loggers = [logging.getLogger(logger_name) for logger_name in LOGGERS]
     for logger in loggers:
-        logger.addFilter(terminal.is_shown)
+        logger.addFilter(terminal.keep_problem)
+
     ended = threading.Event()
     follower = threading.Thread(
         target=_follow, args=(terminal, ended), name="ray-logs", daemon=True
     )
     if name is not None:
         follower.start()
+
     try:
         yield file
     except ConfigError:
@@ -92,49 +98,60 @@ def quiet_ray(name: str | None, started: threading.Event | None = None) -> Itera
         raise
     finally:
         for logger in loggers:
-            logger.removeFilter(terminal.is_shown)
+            logger.removeFilter(terminal.keep_problem)
         ended.set()
-        if file is not None and kept is not None:
+        if file is not None and handler is not None:
             follower.join()
-            kept.close()
+            handler.close()
             if file.stat().st_size == 0:  # as when the port is taken
                 file.unlink()
 
 
 class _Terminal:
-    """The lines of the logs of Ray and Serve that go to the terminal; `kept` gets the rest."""
+    """The lines of the logs of Ray and Serve that go to the terminal; the log file gets the
+    others.
+    """
 
-    def __init__(self, kept: logging.Handler | None, started: threading.Event | None) -> None:
+    def __init__(self, log_file: logging.Handler | None, started: threading.Event | None) -> None:
         self.failing: set[str] = set()  # processes in the middle of a policy's traceback
-        self._kept, self._started = kept, started
+        self._log_file = log_file
+        self._started = started
 
-    def is_shown(self, record: logging.LogRecord) -> bool:
-        """Return whether a record of this process is a problem; for `logging`."""
+    def keep_problem(self, record: logging.LogRecord) -> bool:
+        """Filter a record of this process, for `logging`: one that is no problem goes to the log
+        file.
+        """
         text = record.getMessage()
-        if not (shown := _is_problem(text, record.levelno)):
-            self._note(text)
-        return shown
+        if _is_problem(text, record.levelno):
+            return True
+        self._write_log(text)
+        return False
 
     def print_line(self, actor: str, process: str, line: str) -> None:
-        """Print a line of another process, or keep it."""
+        """Print a line of another process if it is a problem; otherwise write it to the log
+        file.
+        """
         level = logging.INFO if _SERVES_INFO.match(line) else logging.WARNING
         text = f"({actor} pid={process}) {line}"
-        if any(one in line for one in _LOAD_FAILURES):
+        if any(failure in line for failure in _LOAD_FAILURES):
             self.failing.add(process)
         elif _SERVES_LINE.match(line):
             self.failing.discard(process)
-        starting = self._started is not None and not self._started.is_set()
+
+        is_starting = self._started is not None and not self._started.is_set()
+        is_traceback = is_starting and process in self.failing
         # A signal to the whole process group also ends Ray's daemon, which then guesses at
         # causes, and HAProxy, of which Serve's actors then print that it crashed.
         is_consequence = is_interrupted() and (process == _DAEMON or actor in _OF_SERVE)
-        if is_consequence or (starting and process in self.failing) or not _is_problem(line, level):
-            self._note(text)
+        if is_consequence or is_traceback or not _is_problem(line, level):
+            self._write_log(text)
         else:
             sys.stderr.write(f"{text}\n")
 
-    def _note(self, text: str) -> None:
-        if self._kept is not None:
-            self._kept.emit(logging.LogRecord("ray", logging.INFO, "", 0, text, None, None))
+    def _write_log(self, text: str) -> None:
+        """Write a line to the log file, if there is one."""
+        if self._log_file is not None:
+            self._log_file.emit(logging.LogRecord("ray", logging.INFO, "", 0, text, None, None))
 
 
 def _follow(terminal: _Terminal, ended: threading.Event) -> None:
@@ -149,10 +166,10 @@ def _follow(terminal: _Terminal, ended: threading.Event) -> None:
         node = node_of_this_process()
         if node is not None and started_here():
             folder = Path(node.get_logs_dir_path())
-            for path in (
-                one for pattern in _LOG_FILES for one in folder.glob(pattern) if one not in files
-            ):
-                files[path] = _LogFile(path)
+            for pattern in _LOG_FILES:
+                for path in folder.glob(pattern):
+                    if path not in files:
+                        files[path] = _LogFile(path)
         for file in files.values():
             for line in file.new_lines():
                 terminal.print_line(file.actor, file.process, line)
@@ -189,15 +206,17 @@ class _LogFile:
 
 
 def _is_problem(text: str, level: int) -> bool:
-    return level >= logging.WARNING and not any(one in text for one in _MEANT)
+    return level >= logging.WARNING and not any(intended in text for intended in _INTENDED)
 
 
 @contextlib.contextmanager
 def exit_if_ray_is_lost(cure: str) -> Iterator[RayLoss]:
-    """End the process with status 1 if its Ray is lost within the context, in order if that
+    """End the process with status 1 if its Ray is lost within the context; in order, if that
     takes at most 10 s.
     """
-    import ray  # noqa: F401 - before the thread does: one that two threads import at once is seen half made
+    # Ray is imported before the thread starts: a module that two threads import at once is
+    # incomplete in one of them.
+    import ray  # noqa: F401
 
     loss = RayLoss(cure)
     threading.Thread(target=loss.watch, name="ray-lost", daemon=True).start()
@@ -229,7 +248,7 @@ class RayLoss:
         self._known = threading.Event()
 
     def wait(self) -> None:
-        """Block until Ray is lost and raise `ClusterLost`; an interrupt has the command end
+        """Block until Ray is lost and raise `ClusterLost`; after an interrupt the command ends
         within `_END_S`.
         """
         try:
@@ -237,7 +256,7 @@ class RayLoss:
                 raise_dropped_interrupt()
         except KeyboardInterrupt:
             self.left.set()
-            # And prints the stacks of all threads.
+            # This also prints the stacks of all threads.
             faulthandler.dump_traceback_later(_END_S, exit=True)
             raise
         if self.error is not None:
@@ -251,14 +270,15 @@ class RayLoss:
             self._watch_ray()
         if self.error is None:
             return
+
         self._known.set()
-        said = f"{type(self.error).__name__}: {self.error}"
+        message = f"{type(self.error).__name__}: {self.error}"
         if self.left.wait(_LEAVE_S):
             if self.interrupted:
                 return
             time.sleep(_EXIT_S)
         else:
-            say_error(said)
+            say_error(message)
         sys.stdout.flush()
         sys.stderr.flush()
         os._exit(1)  # the reaper ends all other processes

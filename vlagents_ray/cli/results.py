@@ -73,6 +73,7 @@ def report_command(
 
 
 def _described_formats() -> Iterator[str]:
+    """Yield each format with its description."""
     for name, entry in entries("exports").items():
         yield f"{name}: {entry.about}"
 
@@ -102,10 +103,10 @@ def export_command(
 
     with errors():
         export = registered_function("exports", to)
-        chosen = settings_of_export(to, export, settings)
+        parsed = settings_of_export(to, export, settings)
         results = Results.load(folder).only(policy, env)
         with storing(path.parent):
-            number = export(results, path, **chosen)
+            number = export(results, path, **parsed)
     out.print(f"wrote {number} episodes to {path}")
 
 
@@ -126,12 +127,12 @@ def settings_of_export(
             fields[parameter.name] = (parameter.annotation, default)
     model = create_model(name, __config__=ConfigDict(extra="forbid"), **fields)
     try:
-        read = model.model_validate(parse_settings(texts, "--set"))
+        parsed = model.model_validate(parse_settings(texts, "--set"))
     except ValidationError as error:
         raise ConfigError(
             f"--set, for --to {name}: {wrong_settings(error, model, '--set')}"
         ) from error
-    return {field: getattr(read, field) for field in read.model_fields_set}
+    return {field: getattr(parsed, field) for field in parsed.model_fields_set}
 
 
 def _require_no_dataset(folder: Path) -> None:
@@ -164,25 +165,24 @@ def replay_command(
 
         _require_no_dataset(folder)
         recorded = find(Results.load(folder), episode)
-        other: dict[str, Any] | None = (
-            None
-            if policy is None
-            else {"source": policy, "url": None, "config": {}, "checkpoint": None}
-        )
-        into = out_dir or fresh(folder / "replays" / "replay")
-        summary = play_one(recorded.config(into, policy=other), address, recorded.number_and_seed)
-        found = compare(recorded, summary.results)
-        difference = actions_difference(recorded, summary.results)
+        other: dict[str, Any] | None = None
+        if policy is not None:
+            other = {"source": policy, "url": None, "config": {}, "checkpoint": None}
+        replay_folder = out_dir or fresh(folder / "replays" / "replay")
+        config = recorded.config(replay_folder, policy=other)
+        summary = play_one(config, address, recorded.number_and_seed)
+
+        differences = compare(recorded, summary.results)
+        rounding = actions_difference(recorded, summary.results)
         steps = recorded.episode.result.steps
         same = f"the same: {steps} actions byte for byte, and what came of them"
-        if difference is not None:
+        if rounding is not None:
             same = (
                 f"the same up to rounding: {steps} actions, and what came of them; the first to "
-                "differ is that of step "
-                f"{difference.step}, by {difference.at_first:.2g}, as in batches of another size, "
-                "later ones differ by "
-                f"at most {difference.largest:.2g}"
+                f"differ is that of step {rounding.step}, by {rounding.at_first:.2g}, as in "
+                "batches of another size, later ones differ by at most "
+                f"{rounding.largest:.2g}"
             )
-        for line in [*(found or [same]), f"replay: {into}"]:
+        for line in [*(differences or [same]), f"replay: {replay_folder}"]:
             out.print(line)
-    raise typer.Exit(bool(found))
+    raise typer.Exit(bool(differences))

@@ -29,6 +29,7 @@ from vlagents_ray.chunking.player import ChunkPlayer, PlayerSettings
 from vlagents_ray.cli.arguments import number, one_of, parse_all
 from vlagents_ray.client.agent import RemoteAgent
 from vlagents_ray.client.commands import CommandInbox
+from vlagents_ray.contract import Contract
 from vlagents_ray.errors import ConfigError, VLAgentsError, printable
 from vlagents_ray.interface import Agent
 from vlagents_ray.naming import did_you_mean
@@ -65,8 +66,8 @@ KEYS = (
     "stop the robot; "
     "c or Enter restarts it after a stop"
 )
-# Of options that other programs have. An option with a key would be readable in the list of
-# processes.
+# Messages for options that other programs have. An option with a key would be readable in the list
+# of processes.
 _OF_KEYS = "the API key is read from a variable: export VLAGENTS_RAY_API_KEY=vlr_..."
 _OF_CAS = "the file of your CA is read from a variable: export SSL_CERT_FILE=ca.pem"
 _CURES = {
@@ -122,10 +123,15 @@ def parse(arguments: Sequence[str]) -> argparse.Namespace:
     parser, of_robot, of_env = command_parser()
     options = parse_all(parser, arguments, _CURES)
     in_env = options.env is not None
-    refused = of_robot if in_env else of_env
-    given = [one.option_strings[0] for one in refused if getattr(options, one.dest) != one.default]
-    if given:
-        parser.error(f"got {', '.join(given)} with{'' if in_env else 'out'} --env; leave them out")
+    refused = [
+        action.option_strings[0]
+        for action in (of_robot if in_env else of_env)
+        if getattr(options, action.dest) != action.default
+    ]
+    if refused:
+        condition = "with" if in_env else "without"
+        parser.error(f"got {', '.join(refused)} {condition} --env; leave them out")
+
     if not in_env and options.policy is None:
         parser.error("got neither a URL nor --env, want one of them")
     if options.robot_set and options.robot is None:
@@ -133,6 +139,7 @@ def parse(arguments: Sequence[str]) -> argparse.Namespace:
             "got --robot-set without --robot; name the robot with --robot NAME:ARGUMENT or "
             "MODULE:CLASS"
         )
+
     if options.mode is None:
         options.mode = "open_loop" if in_env else "async"
     if options.mode != "async" and (options.merge != "newest" or options.rtc):
@@ -149,6 +156,7 @@ def _ended_by_signals() -> Iterator[None]:
     """
 
     def end(number: int, _: object) -> None:
+        """Raise the exception that ends the loop."""
         signal.signal(number, signal.SIG_IGN)  # a second signal would interrupt the stop
         if number == signal.SIGINT:
             raise KeyboardInterrupt
@@ -157,21 +165,24 @@ def _ended_by_signals() -> Iterator[None]:
     with contextlib.ExitStack() as undo:
         if threading.current_thread() is threading.main_thread():
             for number in (signal.SIGTERM, signal.SIGHUP, signal.SIGINT):
-                # Else it is ignored, as SIGHUP by nohup, or the caller has its own handler.
+                # Another signal is ignored, as SIGHUP by nohup, or the caller has its own handler.
                 if signal.getsignal(number) in (signal.SIG_DFL, signal.default_int_handler):
                     undo.callback(signal.signal, number, signal.signal(number, end))
         yield
 
 
+def _say(line: str) -> None:
+    """Print a line at once."""
+    print(printable(line), flush=True)  # noqa: T201
+
+
 def _run(options: argparse.Namespace) -> LoopReport:
-    say: Callable[[str], None] = lambda line: print(printable(line), flush=True)  # noqa: E731, T201
+    """Connect to the policy, open the robot, run the control loop, and print the report."""
+    say = _say
     hz = options.hz or _HZ
-    deadline_s = 0.0 if options.mode == "async" else WAIT_S
-    if options.deadline_ms is not None:
-        deadline_s = options.deadline_ms / 1e3
-    make_robot = (
-        robot_factory("--robot", options.robot, options.robot_set) if options.robot else None
-    )
+    make_robot = None
+    if options.robot:
+        make_robot = robot_factory("--robot", options.robot, options.robot_set)
     open_leader = leader_named("--leader", options.leader) if options.leader else None
     ended: BaseException | None = None
     report = LoopReport(hz)
@@ -189,22 +200,12 @@ def _run(options: argparse.Namespace) -> LoopReport:
         if open_leader is not None:
             measure = measured_state(options.measure)
             leader = stack.enter_context(open_leader(contract, step=options.step, measure=measure))
-            explained = getattr(leader, "help", "")
-            if explained:
-                say(explained)
-        stated = contract is not None and contract.action.relative is not None
-        if options.safe == "auto" and not options.robot and not stated:
-            options.safe = "hold"  # the simulated robot uses such actions as absolute targets
-        settings = PlayerSettings(
-            options.mode,
-            options.execute,
-            merge=options.merge,
-            horizon=options.horizon,
-            safe=options.safe,
-            max_age_s=options.max_age_s,
-            deadline_s=deadline_s,
-            real_time_chunking=options.rtc,
-        )
+            help_text = getattr(leader, "help", "")
+            if help_text:
+                say(help_text)
+
+        deadline_s = _deadline_s(options)
+        settings = _player_settings(options, contract, deadline_s)
         guard = Guard(
             contract,
             max_step=options.max_step,
@@ -215,30 +216,32 @@ def _run(options: argparse.Namespace) -> LoopReport:
         )
         player = stack.enter_context(ChunkPlayer(agent, settings, check=guard, override=leader))
         player.initialize()  # refuses unfit settings before anything is timed or moves
+
         make_robot = make_robot or partial(SimulatedRobot, contract)
         robot = stack.enter_context(opened(make_robot))
         _require_part(options.measure, robot)
         fit = _require_fit(options, agent, robot, guard.limits, say)
+
         recorder = None
         if options.record:
             recorder = stack.enter_context(
                 Recorder(options.record, hz, interventions=leader is not None)
             )
         viewer = None if options.rerun is None else stack.enter_context(open_viewer(options.rerun))
-        hangs_s = max(0.2, 5 / hz) + deadline_s
 
         def stop(reason: str) -> None:
             robot.stop()
             say(f"stopped by the watchdog: {reason}")
 
-        watchdog = robot_watchdog(robot, stop, {"server": options.silent_s, "loop": hangs_s})
+        hanging_s = max(0.2, 5 / hz) + deadline_s
+        watchdog = robot_watchdog(robot, stop, {"server": options.silent_s, "loop": hanging_s})
         keys = _RunKeys(recorder, say)
         has_terminal = stack.enter_context(_restarting(watchdog, say, keys.press))
-        say(
-            KEYS
-            if has_terminal
-            else "keys: none, as there is no terminal; SIGTERM ends the run, SIGUSR1 restarts it"
-        )
+        if has_terminal:
+            say(KEYS)
+        else:
+            say("keys: none, as there is no terminal; SIGTERM ends the run, SIGUSR1 restarts it")
+
         try:
             run_loop(
                 robot,
@@ -258,12 +261,14 @@ def _run(options: argparse.Namespace) -> LoopReport:
             )
         except BaseException as error:  # noqa: BLE001 - raised again below, after the report
             ended = error
+
         if report.outcome:
             say(f"marked as a {report.outcome}")
         if report.jitter:
             _say_table(report, f"{options.mode}, {agent.transport}", say)
             _say_outcome(report, say, led=leader is not None)
-    if recorder is not None:  # closed: everything is written
+
+    if recorder is not None:  # it is closed, so that everything is written
         say(
             f"recorded: {recorder.episodes} episodes in {options.record}, {recorder.dropped} "
             "frames dropped"
@@ -275,17 +280,45 @@ def _run(options: argparse.Namespace) -> LoopReport:
     return report
 
 
-def _require_part(part: str | None, robot: Robot) -> None:
+def _deadline_s(options: argparse.Namespace) -> float:
+    """Return the time for which a tick waits for an action, s."""
+    if options.deadline_ms is not None:
+        return float(options.deadline_ms / 1e3)
+    return 0.0 if options.mode == "async" else WAIT_S
+
+
+def _player_settings(
+    options: argparse.Namespace, contract: Contract | None, deadline_s: float
+) -> PlayerSettings:
+    """Return the settings of the chunk player for a policy with this contract."""
+    safe = options.safe
+    is_relative_known = contract is not None and contract.action.relative is not None
+    if safe == "auto" and not options.robot and not is_relative_known:
+        safe = "hold"  # the simulated robot uses such actions as absolute targets
+
+    return PlayerSettings(
+        options.mode,
+        options.execute,
+        merge=options.merge,
+        horizon=options.horizon,
+        safe=safe,
+        max_age_s=options.max_age_s,
+        deadline_s=deadline_s,
+        real_time_chunking=options.rtc,
+    )
+
+
+def _require_part(name: str | None, robot: Robot) -> None:
     """Raise `ConfigError`, before the robot moves, if --measure names a part that its state does
     not have.
     """
-    if part is None:
+    if name is None:
         return
     state = robot.observe().state
-    if part not in state:
+    if name not in state:
         raise ConfigError(
-            f"--measure: got {part!r}, want a part of the robot's state, one of {sorted(state)}"
-            f"{did_you_mean(part, state)}"
+            f"--measure: got {name!r}, want a part of the robot's state, one of {sorted(state)}"
+            f"{did_you_mean(name, state)}"
         )
 
 
@@ -301,15 +334,16 @@ def _require_fit(
     """
     trained = None if options.trained_on is None else Trained.read(options.trained_on)
     fit = fit_of(agent, robot, limits, trained=trained, accept=options.accept_misfit)
+
     is_default = options.robot is None
     if fit.trained == Trained() and not is_default:
         text = (
             "the policy states no ranges of its training, so this arm's pose and the first chunk "
-            "are not compared with "
-            "them; --trained-on FILE names them"
+            "are not compared with them; --trained-on FILE names them"
         )
         say(text)
         logger.info("%s", text)
+
     if fit.compares and not (is_default and trained is None):
         obs = robot.observe()
         agent.reset(obs, options.instruction)
@@ -322,6 +356,7 @@ def _require_fit(
 
 
 def _say_table(report: LoopReport, name: str, say: Callable[[str], None]) -> None:
+    """Print the table of the loop's jitter."""
     jitter = report.jitter
     numbers = [
         f"{jitter['ticks']:.0f}",
@@ -334,6 +369,9 @@ def _say_table(report: LoopReport, name: str, say: Callable[[str], None]) -> Non
 
 
 def _say_outcome(report: LoopReport, say: Callable[[str], None], *, led: bool) -> None:
+    """Print the delays, the ticks without an action of the policy, and the stops; `led` is whether
+    an operator could move the robot.
+    """
     say(
         f"from a tick until its action is applied: p50 {report.work_p50_ms:.2f} ms, p99 "
         f"{report.work_p99_ms:.2f} ms"
@@ -348,7 +386,7 @@ def _say_outcome(report: LoopReport, say: Callable[[str], None], *, led: bool) -
         f"{report.jitter['ticks']:.0f}"
     )
     causes = {**report.safe, "waiting": report.waiting}
-    for cause, ticks in sorted(causes.items(), key=lambda one: -one[1]):
+    for cause, ticks in sorted(causes.items(), key=lambda item: -item[1]):
         if ticks:
             say(f"  {ticks} x {cause}, first: {report.reasons[cause]}")
     if report.mostly_safe is not None:  # `run_loop` has logged the reason and the cure
@@ -371,7 +409,7 @@ class _RunKeys:
         self._say = say
 
     def press(self, key: str, control: RobotControl) -> bool:
-        """Do what a key means; return whether it has a meaning."""
+        """Handle a key; return whether it has a meaning."""
         if key == "p" and control.reason is None:
             control.pause()
             self._say("paused; p continues")
@@ -402,29 +440,34 @@ def _restarting(
     Other keys are passed to `press`. Yields whether there is a terminal.
     """
 
-    def restarted() -> bool:
+    def restart() -> bool:
+        """Restart motion; return False if a signal that the watchdog needs is still missing."""
         if not watchdog.restart():
             return False
         watchdog.control.resume()
         return True
 
-    def typed(key: str) -> bool:
+    def handle_key(key: str) -> bool:
+        """Handle a key of the terminal; return whether it has a meaning."""
         if key not in RESTART_KEYS:
             return press(key, watchdog.control)
-        stood = watchdog.control.stopped or watchdog.control.reason is not None
-        if not restarted():
+        was_standing = watchdog.control.stopped or watchdog.control.reason is not None
+        if not restart():
             say(
                 "not restarted: still no signal from the "
                 f"{' and the '.join(watchdog.control.silent)}"
             )
-        elif stood:
+        elif was_standing:
             say("restarted")
         return True
 
+    def handle_signal(*_: object) -> None:
+        restart()
+
     with contextlib.ExitStack() as undo:
-        has_terminal = undo.enter_context(typed_keys(typed))
+        has_terminal = undo.enter_context(typed_keys(handle_key))
         if threading.current_thread() is threading.main_thread() and hasattr(signal, "SIGUSR1"):
-            before = signal.signal(signal.SIGUSR1, lambda *_: restarted() and None)
+            before = signal.signal(signal.SIGUSR1, handle_signal)
             undo.callback(signal.signal, signal.SIGUSR1, before)
         yield has_terminal
 
@@ -442,7 +485,8 @@ def _names_of_plugins() -> str:
         lines.append(f"{title}:")
         for name, entry in entries(kind).items():
             if name.startswith(prefix):
-                shown = name.removeprefix(prefix) + (entry.tasks if kind == "robots" else "")
+                suffix = entry.tasks if kind == "robots" else ""
+                shown = name.removeprefix(prefix) + suffix
                 lines.append(f"  {shown:<21} {entry.about}")
         for name, distribution in not_installed(kind).items():
             if name.startswith(prefix):
@@ -456,6 +500,7 @@ class _RobotParser(argparse.ArgumentParser):
     """A parser whose help ends with the names of plug-ins, which are read only then."""
 
     def format_help(self) -> str:
+        """Return the help, with the names of plug-ins at its end."""
         self.epilog = _names_of_plugins()
         return super().format_help()
 
@@ -469,7 +514,7 @@ def command_parser() -> tuple[
         description=__doc__,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    # Else each error lists all options.
+    # By default, each error would list all options.
     parser.usage = "vlagents-ray robot [http://HOST:PORT] [OPTION ...]"
     groups = parser.add_argument_group("a robot"), parser.add_argument_group("a simulation")
     of_robot: list[argparse.Action] = []

@@ -26,6 +26,8 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class ServeOptions:
+    """The options of `vlagents-ray serve`."""
+
     source: Annotated[
         str,
         typer.Argument(help="A registered policy, 'module:Class', or a deployment file (.yaml)."),
@@ -74,7 +76,7 @@ class ServeOptions:
     ] = None
 
     def server_args(self) -> dict[str, Any]:
-        """Return the settings below `args` of the deployment that the options state.
+        """Return the settings below `args` of the deployment that the options set.
 
         Raises:
             ConfigError: An option cannot be parsed, or --serve-set has settings of the policy.
@@ -109,31 +111,31 @@ def serve_command(options: ServeOptions) -> None:
     from vlagents_ray.serve.launch.server import running_server
 
     with errors():
-        address, keys, insecure = options.address, options.keys, options.insecure
+        address = options.address
+        keys = options.keys
+        insecure = options.insecure
         config = read_deployment(options.source, options.server_args())
         if options.vlagents_port is not None:
             config = with_dialect(config, "vlagents", {"port": options.vlagents_port})
         if address is None:
             require_packages(config)
-        host, port = (
-            options.host or config.http_options.host,
-            options.port or config.http_options.port,
-        )
+        host = options.host or config.http_options.host
+        port = options.port or config.http_options.port
         access: dict[str, Any] = {
             "keys_file": keys,
             "insecure": insecure,
             "plain_http": options.plain_http,
             "tls": options.tls(),
         }
+        started = threading.Event()
         with (
-            quiet_ray(f"vlagents-ray-serve-{port}", started := threading.Event()) as log,
+            quiet_ray(f"vlagents-ray-serve-{port}", started) as log,
             exit_if_ray_is_lost(RESTART) as loss,
             running_server(config, host=host, port=port, address=address, **access) as server,
         ):
             started.set()
-            for line in connection_lines(
-                with_gateways_at(config, host), server.apps, host, keys, insecure=insecure
-            ):
+            deployed = with_gateways_at(config, host)
+            for line in connection_lines(deployed, server.apps, host, keys, insecure=insecure):
                 out.print(line)
             out.print(f"metrics for Prometheus: {', '.join(server.metrics)}")
             if address is None:
@@ -166,27 +168,35 @@ def connection_lines(
             yield f"  from other machines: {url.replace(LOOPBACK, socket.gethostname(), 1)}"
         if app.import_path != IMPORT_PATH:
             continue
+
         args = ServerArgs(**app.args)
         settings = ", ".join(f"{name}={value!r}" for name, value in own_settings(app).items())
         yield f"  policy: {args.policy}" + (f" ({settings})" if settings else "")
-        keyed = not insecure
-        if keyed and keys is None:
+
+        needs_key = not insecure
+        if needs_key and keys is None:
             with contextlib.suppress(ConfigError):  # the keys are on the cluster's machines
-                keyed = args.access.keys() is not None
-        ca = "--cacert CA.pem " if keyed and url.startswith("https") else ""
-        curl = f'curl {ca}-H "Authorization: Bearer $VLAGENTS_RAY_API_KEY" ' if keyed else ""
+                needs_key = args.access.keys() is not None
+        ca = "--cacert CA.pem " if needs_key and url.startswith("https") else ""
+        curl = f'curl {ca}-H "Authorization: Bearer $VLAGENTS_RAY_API_KEY" ' if needs_key else ""
         yield f"  API: {curl}{url}/docs"
+
         if not (insecure or args.access.insecure):  # --insecure shows no live page
-            for part in args.parts.on():
-                for title, path in registered_class("replica", part).pages.items():
+            for name in args.parts.on():
+                for title, path in registered_class("replica", name).pages.items():
                     yield f"  {title}: {url}{path}"
-        for name, one in args.dialects.describe().items():
-            places = [one["address"]] if "address" in one else []
-            for path in () if places else one["paths"]:  # such as "WS /openpi"
-                method, _, place = path.partition(" ")
-                places.append(
-                    f"ws{url.removeprefix('http')}{place}"
-                    if method == "WS"
-                    else f"{method} {url}{place}"
-                )
-            yield f"  {name}: {', '.join(places)}"
+
+        for name, dialect in args.dialects.describe().items():
+            if "address" in dialect:
+                addresses = [dialect["address"]]
+            else:
+                addresses = [_address(url, path) for path in dialect["paths"]]
+            yield f"  {name}: {', '.join(addresses)}"
+
+
+def _address(url: str, path: str) -> str:
+    """Return the address of a dialect's path, such as "WS /openpi" or "POST /act"."""
+    method, _, location = path.partition(" ")
+    if method == "WS":
+        return f"ws{url.removeprefix('http')}{location}"
+    return f"{method} {url}{location}"

@@ -54,25 +54,27 @@ class EnvPolicy(Wrapper):
 
     @property
     def contract(self) -> Contract:
-        """The policy's contract, or the environment's if that states no actions."""
-        own = self.agent.contract
-        return self._env if own is None or own.action.relative is None else own
+        """The policy's contract, or the environment's if that has no actions."""
+        contract = self.agent.contract
+        if contract is None or contract.action.relative is None:
+            return self._env
+        return contract
 
 
 def drive(options: argparse.Namespace) -> int:
-    """Play by the options of `vlagents-ray robot --env`, and return the command's exit status."""
+    """Run episodes by the options of `vlagents-ray robot --env`, and return the command's exit
+    status.
+    """
     try:
         with errors():
             run = RobotRun(options)
             try:
                 run.play(range(options.seed, options.seed + options.episodes))
             except KeyboardInterrupt:
-                kept = (
-                    ""
-                    if run.recorder is None
-                    else f"; {run.recorder.episodes} episodes are in {options.record}"
-                )
-                raise KeyboardInterrupt(f"interrupted{kept}") from None
+                recorded = ""
+                if run.recorder is not None:
+                    recorded = f"; {run.recorder.episodes} episodes are in {options.record}"
+                raise KeyboardInterrupt(f"interrupted{recorded}") from None
     except typer.Exit as ended:
         return ended.exit_code
     return 0
@@ -90,10 +92,10 @@ class RobotRun:
         self.recorder: Recorder | None = None
         self._control: RobotControl | None = None
         self._viewer: EpisodeViewer | None = None
-        self._said: str | None = None  # the printed source of motion
+        self._printed: str | None = None  # the printed source of motion
 
     def play(self, seeds: Iterable[int]) -> None:
-        """Play an episode for each seed, and print its outcome.
+        """Run an episode for each seed, and print its outcome.
 
         Raises:
             ConfigError: The settings are inconsistent.
@@ -103,13 +105,12 @@ class RobotRun:
             env = stack.enter_context(make_env(self.options.env, **self._env_options))
             hz = self.options.hz or env.contract.control_hz or _HZ
             leader = self._leader(env.contract, stack)
-            limits, soft_start_s = self.options.limits, self.options.soft_start_s
             guard = Guard(
                 env.contract,
                 max_step=self.options.max_step,
-                limits=limits,
+                limits=self.options.limits,
                 hz=hz,
-                soft_start_s=soft_start_s,
+                soft_start_s=self.options.soft_start_s,
             )
             agent = stack.enter_context(self._agent(env.contract, leader, guard))
             self._control = agent.control
@@ -118,28 +119,37 @@ class RobotRun:
                 self.recorder = stack.enter_context(opened)
             if self.options.rerun is not None:
                 self._viewer = stack.enter_context(open_viewer(self.options.rerun))
+
             for seed in seeds:
                 if self.over:
                     break
                 self._play(env, agent, seed, hz, guard)
-        if self.recorder is not None:  # closed, so everything is written
-            kept = f"{self.recorder.episodes} episodes in {self.options.record}"
-            out.print(f"recorded: {kept}, {self.recorder.dropped} frames dropped")
+
+        if self.recorder is not None:  # it is closed, so that everything is written
+            out.print(
+                f"recorded: {self.recorder.episodes} episodes in {self.options.record}, "
+                f"{self.recorder.dropped} frames dropped"
+            )
         if self._viewer is not None:
             out.print(self._viewer.report())
 
     def _play(self, env: EvalEnv, agent: Agent, seed: int, hz: float, guard: Guard) -> None:
-        self.verdict, recorder = None, self.recorder
+        """Run one episode, and print its outcome."""
+        self.verdict = None
+        recorder = self.recorder
         robot = EnvRobot(env, seed, endless=self.options.leader is not None)
         out.print(f"seed {seed}: {env.instruction}")
 
         def label() -> Label:
             return self.verdict or ("success" if robot.success else "failure")
 
-        def ended() -> bool:
+        def check_end() -> bool:
+            """Label the episode so far, print what moves the robot, and return whether the episode
+            has ended.
+            """
             if recorder is not None and (recorder.interventions or self.over):
                 recorder.label(label())
-            self._say_who_moves(begun=robot.steps > 0)
+            self._print_source_of_motion(has_begun=robot.steps > 0)
             return robot.ended or self.verdict is not None
 
         options = {} if self.options.policy is None else {"seed": seed, "env": self.options.env}
@@ -152,29 +162,29 @@ class RobotRun:
             guard=guard if self.options.policy is None else None,
             recorder=recorder,
             viewer=self._viewer,
-            until=ended,
+            until=check_end,
         )
-        counts = (
-            f"{robot.steps} steps, {report.interventions} by the operator; paused for "
+        out.print(
+            f"  {label()}: {robot.steps} steps, {report.interventions} by the operator; paused for "
             f"{report.paused} ticks"
         )
-        out.print(f"  {label()}: {counts}")
 
     def _leader(self, contract: Contract, stack: contextlib.ExitStack) -> Leader | None:
+        """Open the operator's device, if the options name one."""
         if self.options.leader is None:
             return None
         has_terminal = stack.enter_context(typed_keys(self._press))
         open_leader = leader_named("--leader", self.options.leader)
         leader = stack.enter_context(open_leader(contract, step=self.options.step, measure=None))
-        explained = getattr(leader, "help", "")
-        if explained:
-            out.print(explained)
+        help_text = getattr(leader, "help", "")
+        if help_text:
+            out.print(help_text)
         if has_terminal:
             out.print(KEYS)
         return leader
 
     def _press(self, key: str) -> bool:
-        """Do what a key of the terminal means; return whether it has a meaning."""
+        """Handle a key of the terminal; return whether it has a meaning."""
         if key in _LABELS:
             self.verdict = _LABELS[key]
         elif key == "p":
@@ -186,23 +196,26 @@ class RobotRun:
         return True
 
     def _agent(self, contract: Contract, leader: Leader | None, guard: Guard) -> Agent:
+        """Build the agent: the operator alone, or a policy that the operator may override."""
         if self.options.policy is None:
             if leader is None:
                 raise ConfigError(
                     "robot: got neither a policy nor --leader, want one of them, or both"
                 )
             return TeleoperatedAgent(leader, contract)
-        remote = "://" in self.options.policy
-        if remote and self._settings:
+
+        is_remote = "://" in self.options.policy
+        if is_remote and self._settings:
             raise ConfigError(
                 f"--set: got {sorted(self._settings)}, but {self.options.policy} has its settings "
                 "already"
             )
-        inner = (
-            RemoteAgent(self.options.policy)
-            if remote
-            else build_agent(self.options.policy, self._settings)
-        )
+        inner: Agent
+        if is_remote:
+            inner = RemoteAgent(self.options.policy)
+        else:
+            inner = build_agent(self.options.policy, self._settings)
+
         policy = EnvPolicy(inner, contract)
         policy.initialize()
         require_match(inner.contract, contract)
@@ -210,6 +223,7 @@ class RobotRun:
         return ChunkPlayer(policy, settings, check=guard, override=leader)
 
     def _pause(self) -> None:
+        """Pause motion, or continue it."""
         if self._control is None:
             return
         if self._control.reason is None:
@@ -217,17 +231,25 @@ class RobotRun:
         else:
             self._control.resume()
 
-    def _say_who_moves(self, begun: bool) -> None:
-        reason = None if self._control is None else self._control.reason
-        if self._control is None or not (begun or reason):
+    def _print_source_of_motion(self, has_begun: bool) -> None:
+        """Print what moves the robot, or why it is paused, if that has changed."""
+        if self._control is None:
             return
-        moves = _MOVES.get(self._control.state, "the robot is stopped")
-        now = moves if reason is None else f"{reason}; p continues"
-        if now != self._said:
+        reason = self._control.reason
+        if not (has_begun or reason):
+            return
+
+        if reason is None:
+            line = _MOVES.get(self._control.state, "the robot is stopped")
+        else:
+            line = f"{reason}; p continues"
+        if line != self._printed:
             if reason is not None:
                 out.bell()
-            out.print(f"  {now}")
-        self._said = now
+            out.print(f"  {line}")
+        self._printed = line
 
     def _quit(self) -> None:
-        self.verdict, self.over = "discard", True
+        """End the run, and discard the running episode."""
+        self.verdict = "discard"
+        self.over = True
