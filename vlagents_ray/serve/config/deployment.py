@@ -33,7 +33,7 @@ AbsolutePath = Annotated[
 
 
 class _DeploymentModel(BaseModel):
-    # Errors are logged; inputs may be secret.
+    # Errors are logged, so they contain no inputs, which may be secret.
     model_config = ConfigDict(extra="forbid", hide_input_in_errors=True)
 
 
@@ -74,12 +74,10 @@ class EnvironmentArgs(_DeploymentModel):
         """Return Ray's `runtime_env` of the replica; empty if the policy runs in a child
         process.
         """
-        stated = {"py_executable": self.python, "env_vars": self.env_vars}
-        return (
-            {}
-            if self.process == "child"
-            else {name: value for name, value in stated.items() if value}
-        )
+        if self.process == "child":
+            return {}
+        options = {"py_executable": self.python, "env_vars": self.env_vars}
+        return {name: value for name, value in options.items() if value}
 
 
 class BatchArgs(_DeploymentModel):
@@ -152,8 +150,7 @@ class CheckpointArgs(_DeploymentModel):
             ):
                 raise ValueError(
                     f"{name}: got {settings}, want {{{ADAPTER}: FOLDER or org/name@COMMIT}} alone; "
-                    "it is used with the "
-                    f"settings in `config`"
+                    "it is used with the settings in `config`"
                 )
         return choices
 
@@ -375,15 +372,15 @@ class AutoscalingArgs(_DeploymentModel):
 
     def options(self) -> dict[str, Any]:
         """Return Serve's `autoscaling_config`."""
-        chosen = {"target_utilisation", "target_waiting", "target_sessions"}
+        targets = {"target_utilisation", "target_waiting", "target_sessions"}
         return {
-            **self.model_dump(exclude_none=True, exclude=chosen | {"look_back_s"}),
+            **self.model_dump(exclude_none=True, exclude=targets | {"look_back_s"}),
             "look_back_period_s": self.look_back_s,
             # A replica reports at each measurement; Serve's own default is every 10 s.
             "metrics_interval_s": min(2.0, self.look_back_s / 5),
             "policy": {
                 "policy_function": "vlagents_ray.serve.scaling.autoscaling:MeasuredLoad",
-                "policy_kwargs": self.model_dump(include=chosen),
+                "policy_kwargs": self.model_dump(include=targets),
             },
         }
 
@@ -447,13 +444,12 @@ class ServerArgs(_DeploymentModel):
         of its wrappers.
         """
         policy = target_of("policies", self.policy)
-        wrappers = [
-            name for one in self.wrappers for name in ([one] if isinstance(one, str) else one)
-        ]
-        classes = [policy, *(target_of("wrappers", name) for name in wrappers)]
-        return code_of(policy), {
-            name: of for one in classes for name, of in loaded_code(one).items()
-        }
+        program = dict(loaded_code(policy))
+        for wrapper in self.wrappers:
+            names = [wrapper] if isinstance(wrapper, str) else list(wrapper)
+            for name in names:
+                program.update(loaded_code(target_of("wrappers", name)))
+        return code_of(policy), program
 
     @model_validator(mode="after")
     def _one_scaling(self) -> ServerArgs:

@@ -84,16 +84,18 @@ class DialectArgs(RegisteredArgs):
 
     @model_validator(mode="after")
     def _ports_of_their_own(self) -> DialectArgs:
-        ports = {name: one.port for name, one in self.gateways().items()}
-        for port, times in Counter(ports.values()).items():
-            if times > 1:
-                shared = " and ".join(name for name, one in ports.items() if one == port)
-                raise ValueError(f"{shared} share port {port}; each needs one of its own")
+        ports = {name: config.port for name, config in self.gateways().items()}
+        for port, number in Counter(ports.values()).items():
+            if number > 1:
+                sharing = " and ".join(name for name in ports if ports[name] == port)
+                raise ValueError(f"{sharing} share port {port}; each needs one of its own")
         return self
 
     def gateways(self) -> dict[str, PortConfig]:
         """Return the settings of the dialects that have their own port, by name."""
-        return {name: one for name, one in self.on().items() if isinstance(one, PortConfig)}
+        return {
+            name: config for name, config in self.on().items() if isinstance(config, PortConfig)
+        }
 
     def at_root(self) -> list[str]:
         """Return the dialects at the root: the first one that has a root, and others with the
@@ -107,30 +109,30 @@ class DialectArgs(RegisteredArgs):
         """Describe the enabled dialects for the metadata: addresses, clients and mapping by
         name.
         """
-        found: dict[str, Any] = {}
+        descriptions: dict[str, Any] = {}
         for name, config in self.on().items():
-            cls, mapping = dialect_class(name), config.keys()
-            found[name] = {
+            cls = dialect_class(name)
+            mapping = config.keys()
+            descriptions[name] = {
                 **cls.places(config),
                 "clients": cls.clients,
                 "summary": cls.summary,
                 "mapping": None if mapping is None else mapping.to_json(),
             }
         for name in self.at_root():
-            found[name]["paths"].insert(0, "WS /")
-        return found
+            descriptions[name]["paths"].insert(0, "WS /")
+        return descriptions
 
     def require_fit(self, contract: Contract | None) -> None:
         """Raise `ConfigError` if the policy needs a part of the observation that a dialect's
         mapping lacks.
         """
-        found = [
-            f"- dialects.{name}: {line}"
-            for name, config in self.on().items()
-            for line in dialect_class(name).lacks(config, contract)
-        ]
-        if found:
-            raise ConfigError("dialects and policy do not fit:\n" + "\n".join(found))
+        misfits = []
+        for name, config in self.on().items():
+            for sentence in dialect_class(name).lacks(config, contract):
+                misfits.append(f"- dialects.{name}: {sentence}")
+        if misfits:
+            raise ConfigError("dialects and policy do not fit:\n" + "\n".join(misfits))
 
     def require_packages(self) -> None:
         """Raise `MissingDependency` if an enabled dialect needs a package that is not installed."""
@@ -162,16 +164,18 @@ def read_mapping(value: str | Mapping[str, Any]) -> KeyMapping:
 @cache
 def presets() -> dict[str, KeyMapping]:
     """Return the presets of all registered dialects, by name."""
-    found = {}
-    for of_dialect in _presets_by_dialect():
-        found.update({name: KeyMapping.from_json(mapping) for name, mapping in of_dialect.items()})
-    return found
+    mappings = {}
+    for dialect_presets in _presets_by_dialect():
+        for name, preset in dialect_presets.items():
+            mappings[name] = KeyMapping.from_json(preset)
+    return mappings
 
 
 def _preset(name: object) -> Mapping[str, Any]:
-    for of_dialect in _presets_by_dialect():
-        if isinstance(name, str) and name in of_dialect:
-            return of_dialect[name]
+    """Return a preset as it is written in its dialect; raise `ConfigError` for an unknown name."""
+    for dialect_presets in _presets_by_dialect():
+        if isinstance(name, str) and name in dialect_presets:
+            return dialect_presets[name]
     known = presets()
     meant = did_you_mean(str(name), known)
     raise ConfigError(

@@ -19,9 +19,9 @@ class RegisteredArgs(BaseModel, extra="allow"):
     A class whose value is null is off.
     """
 
-    kind: ClassVar[str]  # of names, as in `registry.names`
-    base: ClassVar[str]  # "module.Class" that the classes derive from, for messages
-    config_base: ClassVar[type[BaseModel]]  # that each `Config` derives from
+    kind: ClassVar[str]  # the kind of the names, as in `registry.names`
+    base: ClassVar[str]  # the "module.Class" that the classes derive from, for messages
+    config_base: ClassVar[type[BaseModel]]  # the class that each `Config` derives from
 
     @model_validator(mode="before")
     @classmethod
@@ -32,21 +32,21 @@ class RegisteredArgs(BaseModel, extra="allow"):
         fields: dict[str, Any] = {
             str(name): (cls.config_of(str(name)) | None, None) for name in data
         }
-        read = create_model("_Registered", **fields).model_validate(data)
-        settings = {name: getattr(read, name) for name in fields}
+        checked = create_model("_Registered", **fields).model_validate(data)
+        settings = {name: getattr(checked, name) for name in fields}
+
         in_order = dict.fromkeys((*names(cls.kind), *settings))
         return {name: settings[name] for name in in_order if name in settings}
 
     @classmethod
     def config_of(cls, name: str) -> type[BaseModel]:
         """Return the model of the settings of one class; raises `ConfigError` if it has none."""
-        named = registered_class(cls.kind, name)
-        config = getattr(named, "Config", None)
+        registered = registered_class(cls.kind, name)
+        config = getattr(registered, "Config", None)
         if not (isinstance(config, type) and issubclass(config, cls.config_base)):
             raise ConfigError(
-                f"{name}: {named.__module__}.{named.__qualname__} has no Config; want a subclass "
-                f"of {cls.base}, whose "
-                f"Config is a {cls.config_base.__name__}"
+                f"{name}: {registered.__module__}.{registered.__qualname__} has no Config; want a "
+                f"subclass of {cls.base}, whose Config is a {cls.config_base.__name__}"
             )
         return config
 

@@ -111,8 +111,8 @@ logger = logging.getLogger(__name__)
 
 Connect = Callable[[str | None, PriorityName | None], RemoteAgent]
 """Connects to the application for one client, with its API key and the most urgent class that the
-key allows; None
-stands for no key, and for any class."""
+key allows; None stands for no key, and for any class.
+"""
 
 # WebSocket close codes
 POLICY_VIOLATION, INTERNAL_ERROR, SERVICE_RESTART, TRY_AGAIN_LATER = 1008, 1011, 1012, 1013
@@ -165,7 +165,9 @@ class Dialect(abc.ABC):
     def __init__(
         self, name: str, config: DialectConfig, context: ReplicaContext | GatewayContext
     ) -> None:
-        self.name, self.config, self.context = name, config, context
+        self.name = name
+        self.config = config
+        self.context = context
         self.mapping = config.keys() or read_mapping(_OUR_NAMES)
 
     @classmethod
@@ -209,17 +211,20 @@ class RouteDialect(Dialect):
 
     @classmethod
     def places(cls, config: DialectConfig) -> dict[str, Any]:  # noqa: ARG003 - overrides
+        """Return the `paths` at which clients connect."""
         return {"paths": list(cls.paths)}
 
     def routes(self) -> list[BaseRoute]:
         """Return the routes of the dialect's paths, without the root."""
-        served = ((*path.split(), getattr(self, name)) for path, name in self.paths.items())
-        return [
-            WebSocketRoute(path, handler)
-            if method == "WS"
-            else Route(path, handler, methods=[method])
-            for method, path, handler in served
-        ]
+        routes: list[BaseRoute] = []
+        for method_and_path, name in self.paths.items():
+            method, path = method_and_path.split()
+            handler = getattr(self, name)
+            if method == "WS":
+                routes.append(WebSocketRoute(path, handler))
+            else:
+                routes.append(Route(path, handler, methods=[method]))
+        return routes
 
     def at_root(self, sharing: Sequence[Any]) -> Stream:
         """Serve WebSockets at the server's root for all dialects with this protocol there,
@@ -232,13 +237,12 @@ class RouteDialect(Dialect):
 
         The sender does not count requests for the key, as `decoded` has counted them.
         """
-        caller, connected = current_caller(), not session_id
         return Sender(
             self.context.engine,
             self.name,
             session_id,
-            caller=caller,
-            connected=connected,
+            caller=current_caller(),
+            connected=not session_id,
             counted=True,
         )
 
@@ -275,9 +279,8 @@ class RouteDialect(Dialect):
         if event["type"] == "websocket.disconnect":
             return None
         data = event.get("bytes")
-        return data, gate.admission(
-            self.context.limits, 0 if data is None else len(data), self.config.priority
-        )
+        size = 0 if data is None else len(data)
+        return data, gate.admission(self.context.limits, size, self.config.priority)
 
     def arrived(self) -> IncomingMessage:
         """Create the `IncomingMessage` of an observation that has just arrived."""
@@ -298,13 +301,15 @@ class PortDialect(Dialect):
         ):
             raise ConfigError(
                 f"dialects.{name}: the server requires API keys, and this protocol has none; "
-                "remove the dialect, or "
-                "accept all clients that reach its port, with without_key: true"
+                "remove the dialect, or accept all clients that reach its port, with without_key: "
+                "true"
             )
 
     @classmethod
     def places(cls, config: DialectConfig) -> dict[str, Any]:
-        host, port = getattr(config, "host", None), getattr(config, "port", None)
+        """Return the `address` at which clients connect."""
+        host = getattr(config, "host", None)
+        port = getattr(config, "port", None)
         return {"address": f"{cls.scheme}://{host or LOOPBACK}:{port}"}
 
     @abc.abstractmethod
@@ -339,13 +344,16 @@ class Root(WebSocketRoute):
 
 def dialect_routes(args: DialectArgs, context: ReplicaContext) -> list[BaseRoute]:
     """Return the routes of the dialects on the server's own port."""
-    dialects: dict[str, RouteDialect] = {
-        name: dialect_class(name)(name, config, context)
-        for name, config in args.on().items()
-        if name not in args.gateways()
-    }
-    routes = [route for dialect in dialects.values() for route in dialect.routes()]
-    if sharing := [dialects[name] for name in args.at_root()]:
+    gateways = args.gateways()
+    dialects: dict[str, RouteDialect] = {}
+    routes: list[BaseRoute] = []
+    for name, config in args.on().items():
+        if name not in gateways:
+            dialects[name] = dialect_class(name)(name, config, context)
+            routes += dialects[name].routes()
+
+    sharing = [dialects[name] for name in args.at_root()]
+    if sharing:
         routes.append(Root("/", sharing[0].at_root(sharing)))
     return routes
 
@@ -414,7 +422,8 @@ class ImplicitEpisode:
 
     def began(self, instruction: str | None) -> None:
         """Record that the session was reset with that instruction."""
-        self.begun, self.instruction = True, instruction
+        self.begun = True
+        self.instruction = instruction
 
     def end(self) -> None:
         """Make the next observation begin an episode."""
@@ -429,7 +438,10 @@ class ImplicitSession:
 
     def __init__(self, engine: Engine, sender: Sender, priority: PriorityName, name: str) -> None:
         self.episode = ImplicitEpisode()
-        self._engine, self._sender, self._priority, self._name = engine, sender, priority, name
+        self._engine = engine
+        self._sender = sender
+        self._priority = priority
+        self._name = name
 
     async def act(
         self, message: IncomingMessage, obs: Obs, instruction: str | None, request_id: str
@@ -440,9 +452,8 @@ class ImplicitSession:
 
     async def close(self) -> None:
         """End the session."""
-        await self._sender.ask(
-            self._sender.message("close"), Decoded([self._request("close", None, None, "")], {})
-        )
+        request = self._request("close", None, None, "")
+        await self._sender.ask(self._sender.message("close"), Decoded([request], {}))
 
     def _request(
         self, op: Op, obs: Obs | None, instruction: str | None, request_id: str
@@ -461,7 +472,7 @@ class SessionObs(NamedTuple):
 
 
 async def act_together(
-    message: IncomingMessage, seen: Sequence[SessionObs], request_id: str
+    message: IncomingMessage, observations: Sequence[SessionObs], request_id: str
 ) -> list[Reply]:
     """Return the policy's reply to each observation in a client's message; their acts are queued
     together.
@@ -472,67 +483,80 @@ async def act_together(
     Raises:
         VLAgentsError: The first error among the replies.
     """
-    await _reset([one for one in seen if one.session.episode.begins(one.instruction)], request_id)
-    replies = await _ask(message, "act", seen, [None] * len(seen), request_id)
-    if forgotten := [
-        i for i, reply in enumerate(replies) if isinstance(reply.error, UnknownSession)
-    ]:
+    beginning = [
+        session_obs
+        for session_obs in observations
+        if session_obs.session.episode.begins(session_obs.instruction)
+    ]
+    await _reset(beginning, request_id)
+    replies = await _ask(message, "act", observations, [None] * len(observations), request_id)
+
+    forgotten = [
+        index for index, reply in enumerate(replies) if isinstance(reply.error, UnknownSession)
+    ]
+    if forgotten:
         logger.info(
             "%s: a session was forgotten; it begins again (request %s)",
             message.transport,
             request_id,
         )
-        again = [seen[i] for i in forgotten]
+        again = [observations[index] for index in forgotten]
         await _reset(again, request_id)
-        repeated = await _ask(
-            seen[0].session._sender.message(), "act", again, [None] * len(again), request_id
-        )
-        for i, reply in zip(forgotten, repeated, strict=True):
-            replies[i] = reply
+        acts = observations[0].session._sender.message()
+        repeated = await _ask(acts, "act", again, [None] * len(again), request_id)
+        for index, reply in zip(forgotten, repeated, strict=True):
+            replies[index] = reply
+
     raise_first(reply.error for reply in replies)
     return replies
 
 
-async def _reset(seen: Sequence[SessionObs], request_id: str) -> None:
-    if not seen:
+async def _reset(observations: Sequence[SessionObs], request_id: str) -> None:
+    """Reset the sessions of these observations, whose episodes begin with them."""
+    if not observations:
         return
-    openings = [
-        one.session.episode.opening(one.instruction, one.session._engine.contract) for one in seen
-    ]
-    for session, _, _ in seen:
+
+    openings = []
+    for session, _, instruction in observations:
+        openings.append(session.episode.opening(instruction, session._engine.contract))
+    for session, _, _ in observations:
         session.episode.end()
-    resets = seen[0].session._sender.message("reset", seen[0].session._priority)
-    resets.decoded_alike(len(seen))
-    replies = await _ask(resets, "reset", seen, openings, request_id)
+
+    first = observations[0].session
+    resets = first._sender.message("reset", first._priority)
+    resets.decoded_alike(len(observations))
+    replies = await _ask(resets, "reset", observations, openings, request_id)
     resets.written(lambda: None)
-    for one, opening, reply in zip(seen, openings, replies, strict=True):
+
+    for (session, _, _), opening, reply in zip(observations, openings, replies, strict=True):
         if reply.error is None:
-            one.session.episode.began(opening)
+            session.episode.began(opening)
     raise_first(reply.error for reply in replies)
 
 
 async def _ask(
     message: IncomingMessage,
     op: Op,
-    seen: Sequence[SessionObs],
+    observations: Sequence[SessionObs],
     instructions: Sequence[str | None],
     request_id: str,
 ) -> list[Reply]:
-    names = (
-        [request_id] if len(seen) == 1 else [f"{request_id}-{place}" for place in range(len(seen))]
-    )
-    requests = [
-        one.session._request(op, one.obs, instruction, name)
-        for one, instruction, name in zip(seen, instructions, names, strict=True)
-    ]
-    return await seen[0].session._sender.ask(message, Decoded(requests, {}))
+    """Send a request for each observation, together; of several requests, each has a number at the
+    end of its id.
+    """
+    requests = []
+    pairs = zip(observations, instructions, strict=True)
+    for index, ((session, obs, _), instruction) in enumerate(pairs):
+        name = request_id if len(observations) == 1 else f"{request_id}-{index}"
+        requests.append(session._request(op, obs, instruction, name))
+    return await observations[0].session._sender.ask(message, Decoded(requests, {}))
 
 
 def raise_first(results: Iterable[object]) -> None:
     """Raise the first error among the results."""
-    for one in results:
-        if isinstance(one, Exception):
-            raise one
+    for result in results:
+        if isinstance(result, Exception):
+            raise result
 
 
 class HttpDialect(RouteDialect):
@@ -547,7 +571,7 @@ class HttpDialect(RouteDialect):
         super().__init__(name, config, context)
         # Sessions by caller and session id in the engine. A new key with the name of a revoked one
         # continues the sessions of that name, but not with the revoked key.
-        self._kept: dict[tuple[Identity, str], ImplicitSession] = {}
+        self._sessions: dict[tuple[Identity, str], ImplicitSession] = {}
 
     async def answer(
         self,
@@ -558,9 +582,13 @@ class HttpDialect(RouteDialect):
     ) -> Response:
         """Answer one request.
 
-        `read` decodes the body to the client's observation, within a budget; it may run on another
-        thread. `write` encodes the action, (H, D) float32 in the client's convention, as the body
-        of the reply.
+        Args:
+            http: The request.
+            read: Decodes the body to the client's observation, within a budget; may run on another
+                thread.
+            write: Encodes the action, (H, D) float32 in the client's convention, as the body of
+                the reply.
+            media_type: The media type of the reply.
         """
         name = request_id(http)
         message = self.arrived()
@@ -574,11 +602,10 @@ class HttpDialect(RouteDialect):
             theirs = await decoded(read, body, admission)
             obs, instruction = self.read(theirs)
             message.decoded_alike()
-            session = (
-                await self._kept_session(session_id(http))
-                if SESSION_HEADER in http.headers
-                else None
-            )
+
+            session: ImplicitSession | None = None
+            if SESSION_HEADER in http.headers:
+                session = await self._client_session(session_id(http))
             if session is None or not session.episode.begun:
                 self.mapping.warn_of_unread_cameras(theirs, self.name)
             if session is not None:
@@ -589,7 +616,9 @@ class HttpDialect(RouteDialect):
                     reply = await self.session(sender).act(message, obs, instruction, name)
                 finally:
                     sender.release(for_good=True)
-            return Response(message.written(lambda: write(self.rows(reply))), media_type=media_type)
+
+            body = message.written(lambda: write(self.rows(reply)))
+            return Response(body, media_type=media_type)
         except ClientDisconnect:
             message.record_failure("disconnected")
             return Response(status_code=499)
@@ -604,27 +633,33 @@ class HttpDialect(RouteDialect):
         """Answer `{}`, and make the next observation of the session in the header begin an
         episode.
         """
-        (await self._kept_session(session_id(http))).episode.end()
+        session = await self._client_session(session_id(http))
+        session.episode.end()
         return Response(b"{}", media_type="application/json")
 
-    async def _kept_session(self, name: str) -> ImplicitSession:
+    async def _client_session(self, name: str) -> ImplicitSession:
         """Return the session that a client names, which exists as long as it exists in an
         engine.
         """
         sessions = self.context.engine.sessions
-        if len(self._kept) > 2 * len(sessions) + 16:
-            self._kept = {kept: one for kept, one in self._kept.items() if kept[1] in sessions}
+        if len(self._sessions) > 2 * len(sessions) + 16:
+            # Sessions that the engine no longer has are forgotten.
+            self._sessions = {
+                key: session for key, session in self._sessions.items() if key[1] in sessions
+            }
+
         sender = self.sender(name)
-        known = (current_caller(), sender.session_id)
-        if known not in self._kept or known[1] not in sessions:
+        session_name = sender.session_id
+        key = (current_caller(), session_name)
+        if key not in self._sessions or session_name not in sessions:
             session = self.session(sender)
             finder = self.context.engine.finder
-            # Another replica has served it so far.
-            if finder is not None and known[1] not in sessions:
+            # A session that is not here may have been served by another replica.
+            if finder is not None and session_name not in sessions:
                 over: asyncio.Future[None] = asyncio.get_running_loop().create_future()
-                if finder.fetch(known[1], partial(settle, over, None), caller_name()):
+                if finder.fetch(session_name, partial(settle, over, None), caller_name()):
                     await over
-            if sessions.held([known[1]]):
-                session.episode.began(sessions.get(known[1]).instruction)
-            self._kept[known] = session
-        return self._kept[known]
+            if sessions.held([session_name]):
+                session.episode.began(sessions.get(session_name).instruction)
+            self._sessions[key] = session
+        return self._sessions[key]

@@ -38,24 +38,29 @@ class Gateway:
         await asyncio.to_thread(self._open, settings)
 
     def _open(self, args: ServerArgs) -> None:
-        wanted = args.dialects.gateways()
-        if (keys := args.access.keys()) is not None:
+        """Reserve the ports, wait for the policy, and begin to accept clients."""
+        configs = args.dialects.gateways()
+        keys = args.access.keys()
+        if keys is not None:
             write_audit()
-        for one in wanted.values():
-            require_access(one.host or LOOPBACK, keys, args.access.insecure)
+        for config in configs.values():
+            require_access(config.host or LOOPBACK, keys, args.access.insecure)
         listeners = {
-            name: reserve(name, one.host or LOOPBACK, one.port) for name, one in wanted.items()
+            name: reserve(name, config.host or LOOPBACK, config.port)
+            for name, config in configs.items()
         }
+
         try:
             app = serve.get_replica_context().app_name
             contract = wait_for_policy(app)
             args.dialects.require_fit(contract)
+
             limits = args.limits.limits()
             admission = Admission(limits.in_flight_bytes)
-            for name, one in wanted.items():
+            for name, config in configs.items():
                 context = GatewayContext(
                     app=app,
-                    connect=partial(_connect, app, one.priority, keys is not None),
+                    connect=partial(_connect, app, config.priority, keys is not None),
                     limits=limits,
                     sessions=args.sessions.limit,
                     idle_s=args.sessions.idle_s,
@@ -63,7 +68,8 @@ class Gateway:
                     check=NoKey.OPEN if keys is None else partial(keys.check, app=app),
                     admission=admission,
                 )
-                self._dialects.append(dialect_class(name)(name, one, context))
+                self._dialects.append(dialect_class(name)(name, config, context))
+
             for dialect in self._dialects:
                 dialect.serve(listeners[dialect.name])
         except BaseException:
@@ -81,7 +87,8 @@ class Gateway:
         """Raise an error if a dialect no longer accepts clients; Serve calls this, and then
         replaces the gateway.
         """
-        if failed := [dialect.name for dialect in self._dialects if not dialect.alive()]:
+        failed = [dialect.name for dialect in self._dialects if not dialect.alive()]
+        if failed:
             raise PolicyUnavailable(
                 f"the gateway no longer accepts clients of {failed}; its log has the details"
             )
@@ -100,9 +107,12 @@ def wait_for_policy(app: str) -> Contract | None:
 def _connect(
     app: str, priority: PriorityName, keyed: bool, key: str | None, allowed: PriorityName | None
 ) -> RemoteAgent:
-    # The gateway itself enforces the permissions of the key, in `GatewaySessions`, as not every
-    # transport to a replica contains the key. Shared memory of a replica requires a key, which some
-    # clients lack; the handle does not.
+    """Connect to the application for one client.
+
+    The gateway itself enforces the permissions of the key, in `GatewaySessions`, as not every
+    transport to a replica contains the key. Shared memory of a replica requires a key, which some
+    clients lack; the handle does not.
+    """
     return RemoteAgent(
         f"serve://{app}",
         transport="handle" if keyed and key is None else "auto",
