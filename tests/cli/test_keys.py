@@ -13,7 +13,7 @@ from vlagents_ray.cli.main import app
 from vlagents_ray.serve.access.api_keys import Keys
 from vlagents_ray.serve.config.deployment import AccessArgs
 from vlagents_ray.serve.launch.deployment_file import deployment
-from vlagents_ray.serve.launch.server import _access
+from vlagents_ray.serve.launch.server import _with_access
 
 
 def keys(*words: str) -> Result:
@@ -116,6 +116,6 @@ def test_the_command_line_overrules_what_the_file_says_of_keys_and_no_more(
     stated: dict[str, Any], options: tuple[Path | None, bool, bool], found: dict[str, Any] | None
 ) -> None:
     config = deployment("noop", **({"access": stated} if stated else {}))
-    [app] = _access(config, *options).applications
+    [app] = _with_access(config, *options).applications
     assert app.args.get("access") == found
     AccessArgs(**(found or {}))

@@ -41,7 +41,7 @@ class Listed:
 
     kind: str  # "policy", "wrapper" or "environment"
     name: str  # as registered
-    what: str  # a description, or an environment's tasks, in one line
+    what: str  # a description, or an environment's tasks, in one line; a key of the JSON document
     # The reason why it cannot run in this Python, with the cure; None if it is ready.
     missing: str | None
     # The settings of a policy or wrapper as `name=default`, the tasks of an environment.

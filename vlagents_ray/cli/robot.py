@@ -385,6 +385,7 @@ def _say_outcome(report: LoopReport, say: Callable[[str], None], *, led: bool) -
         f"ticks without an action of the policy: {report.safe_ticks} of "
         f"{report.jitter['ticks']:.0f}"
     )
+
     causes = {**report.safe, "waiting": report.waiting}
     for cause, ticks in sorted(causes.items(), key=lambda item: -item[1]):
         if ticks:

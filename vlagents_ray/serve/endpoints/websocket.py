@@ -130,10 +130,12 @@ class WebSocketServer(PolledServer["WebSocketConnection"]):
             ConfigError: All ports are in use.
         """
         super().__init__(engine, limits, admit, _bind(host, ports))
+
         self.slow_s = slow_s
         self.idle_s = idle_s
         self._hosts = hosts
         self.path = messages.STREAM_PATH + secrets.token_urlsafe(24)
+
         # Connections before their handshake, in order of arrival.
         self._handshaking: dict[WebSocketConnection, None] = {}
         self.address = messages.StreamAddress(self._listener.getsockname()[1], self.path)

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from ray.serve.schema import ServeDeploySchema
 
 IMPORT_PATH = "vlagents_ray.serve.app:build"
-# Without those that Serve must apply.
+# The keys of an application that Serve need not apply.
 _OUR_APP_KEYS = {"name", "route_prefix", "import_path", "args"}
 
 
@@ -54,8 +54,8 @@ class Application(BaseModel, extra="allow"):
 
 
 class Deployment(BaseModel, extra="allow"):
-    """A deployment file: what this package reads of Serve's schema, which is read without
-    importing Ray.
+    """A deployment file: the parts of Serve's schema that this package reads, without importing
+    Ray.
     """
 
     applications: list[Application] = Field(min_length=1)
@@ -65,12 +65,13 @@ class Deployment(BaseModel, extra="allow"):
     @property
     def plain(self) -> bool:
         """Whether all applications are of this package, without settings that Serve must apply."""
-        beside = self.model_extra or self.http_options.model_extra
-        stated = [app.model_dump(exclude_defaults=True).keys() for app in self.applications]
-        return (
-            not beside
-            and our_apps(self) == self.applications
-            and all(keys <= _OUR_APP_KEYS for keys in stated)
+        if self.model_extra or self.http_options.model_extra:
+            return False
+        if our_apps(self) != self.applications:
+            return False
+        return all(
+            app.model_dump(exclude_defaults=True).keys() <= _OUR_APP_KEYS
+            for app in self.applications
         )
 
     def for_serve(self) -> ServeDeploySchema:
@@ -86,12 +87,13 @@ def deployment(policy: str, *, step_follows: bool = False, **args: Any) -> Deplo
     """Return the deployment of one policy, as if read from a file by `read_deployment`; `args`
     are of `ServerArgs`.
     """
-    app = {"name": policy.rpartition(":")[2], "route_prefix": "/", "import_path": IMPORT_PATH}
-    return _checked(
-        {"applications": [app | {"args": {"policy": policy, **args}}]},
-        f"policy {policy!r}",
-        step_follows,
-    )
+    app = {
+        "name": policy.rpartition(":")[2],
+        "route_prefix": "/",
+        "import_path": IMPORT_PATH,
+        "args": {"policy": policy, **args},
+    }
+    return _checked({"applications": [app]}, f"policy {policy!r}", step_follows)
 
 
 def read_deployment(
@@ -111,38 +113,43 @@ def read_deployment(
     path = Path(source)
     if path.suffix in (".yaml", ".yml"):
         if not path.is_file():
-            meant = (
-                did_you_mean(source, map(str, path.parent.glob("*.y*ml")))
-                or "; a checkout has deployments/"
-            )
-            raise ConfigError(f"deployment file {path.absolute()} does not exist{meant}")
+            files = [str(file) for file in path.parent.glob("*.y*ml")]
+            hint = did_you_mean(source, files) or "; a checkout has deployments/"
+            raise ConfigError(f"deployment file {path.absolute()} does not exist{hint}")
         if overrides:
             raise ConfigError(
                 f"{source!r} holds the settings; edit it instead of giving {sorted(overrides)}"
             )
         return _checked(read_yaml(path), source, step_follows)
+
     entry = find_entry("policies", source)
     if ":" not in source and entry is None:
-        module = ".".join(path.parts).removesuffix(".py")
-        if path.name and path.with_suffix(".py").is_file():
-            raise UnknownPolicy(
-                f"policy: expected a class, such as '{module}:MyPolicy', got the module {source!r}"
-            )
-        if "/" in source:
-            raise UnknownPolicy(
-                f"policy: got {source!r}, want a policy or a deployment file; for a checkpoint, "
-                "give the file of its "
-                f"family, as in deployments/lerobot.yaml --set checkpoint={source}"
-            )
-        if path.is_dir():
-            raise UnknownPolicy(
-                f"policy: expected a policy or a deployment file (.yaml), got the folder {source!r}"
-            )
-        policy_class(source)  # raises an error with the list of choices
+        _refuse_unknown(source, path)
+
     args = dict(overrides or {})
     if entry is not None and entry.weights and "checkpoint" not in args.get("config", {}):
         args["config"] = _settings_of_checkout(source) | args.get("config", {})
     return deployment(source, step_follows=step_follows, **args)
+
+
+def _refuse_unknown(source: str, path: Path) -> None:
+    """Raise `UnknownPolicy` for a source that is no registered name, with the likely mistake."""
+    if path.name and path.with_suffix(".py").is_file():
+        module = ".".join(path.parts).removesuffix(".py")
+        raise UnknownPolicy(
+            f"policy: expected a class, such as '{module}:MyPolicy', got the module {source!r}"
+        )
+    if "/" in source:
+        raise UnknownPolicy(
+            f"policy: got {source!r}, want a policy or a deployment file; for a checkpoint, give "
+            "the file of its family, as in deployments/lerobot.yaml --set "
+            f"checkpoint={source}"
+        )
+    if path.is_dir():
+        raise UnknownPolicy(
+            f"policy: expected a policy or a deployment file (.yaml), got the folder {source!r}"
+        )
+    policy_class(source)  # raises an error with the list of choices
 
 
 def _settings_of_checkout(policy: str) -> dict[str, Any]:
@@ -161,14 +168,17 @@ def policy_application(source: str, app: str | None = None) -> Application:
     """Return one application of a deployment that serves a policy: the one named `app`, or the
     only one.
     """
-    ours: dict[str, Application] = {one.name: one for one in our_apps(read_deployment(source))}
-    if app is None and len(ours) == 1:
-        [app] = ours
-    if app not in ours:
+    applications = {
+        application.name: application for application in our_apps(read_deployment(source))
+    }
+    if app is None and len(applications) == 1:
+        [app] = applications
+    if app is None or app not in applications:
         raise ConfigError(
-            f"{source}: holds the policies {sorted(ours)}, got {app!r}; name one of them as the app"
+            f"{source}: holds the policies {sorted(applications)}, got {app!r}; name one of them "
+            "as the app"
         )
-    return ours[app]
+    return applications[app]
 
 
 def with_gateways_at(config: Deployment, host: str) -> Deployment:
@@ -187,28 +197,29 @@ def with_dialect(config: Deployment, name: str, settings: Mapping[str, Any]) -> 
     file's.
     """
     changed = config.model_copy(deep=True)
-    if len(our_apps(changed)) != 1:
+    apps = our_apps(changed)
+    if len(apps) != 1:
         raise ConfigError(
-            f"--{name}-port: the file holds {len(our_apps(changed))} policies, want one; write it "
-            "there"
+            f"--{name}-port: the file holds {len(apps)} policies, want one; write it there"
         )
-    args = our_apps(changed)[0].args
+
+    args = apps[0].args
     dialects = args.setdefault("dialects", {})
     dialects[name] = {**(dialects.get(name) or {}), **settings}
     ServerArgs(**args)
     return changed
 
 
-def only_application(name: str, part: Deployment) -> Application:
+def only_application(name: str, config: Deployment) -> Application:
     """Return the application of a deployment for the policy `name`; raises `ConfigError` if it
-    holds several.
+    has several.
     """
-    if len(part.applications) != 1:
-        found = [one.name for one in part.applications]
+    if len(config.applications) != 1:
+        names = [app.name for app in config.applications]
         raise ConfigError(
-            f"{name}: holds {found}, want one application; serve it and give the URL of one of them"
+            f"{name}: holds {names}, want one application; serve it and give the URL of one of them"
         )
-    return part.applications[0]
+    return config.applications[0]
 
 
 def together(policies: Mapping[str, Deployment]) -> Deployment:
@@ -216,11 +227,11 @@ def together(policies: Mapping[str, Deployment]) -> Deployment:
     dialects.
 
     Raises:
-        ConfigError: A part contains more than one application.
+        ConfigError: One of the deployments contains more than one application.
     """
     applications = []
-    for name, part in policies.items():
-        app = only_application(name, part).model_dump(exclude_unset=True)
+    for name, config in policies.items():
+        app = only_application(name, config).model_dump(exclude_unset=True)
         app.get("args", {}).pop("dialects", None)
         applications.append(app | {"name": name, "route_prefix": f"/{name}"})
     return _checked({"applications": applications}, ", ".join(policies))
@@ -240,7 +251,11 @@ def with_settings(
     changed = config.model_copy(deep=True)
     for app in our_apps(changed):
         app.args["config"] = own_settings(app) | dict(settings)
-        app.deployments = [one for one in app.deployments if one.get("name") != POLICY]
+        app.deployments = [
+            settings_of_serve
+            for settings_of_serve in app.deployments
+            if settings_of_serve.get("name") != POLICY
+        ]
         if steps:
             app.args["checkpoints"] = (app.args.get("checkpoints") or {}) | {"steps": True}
     return _checked(changed.model_dump(exclude_unset=True), "settings", step_follows)
@@ -265,10 +280,12 @@ def own_settings(app: Application) -> dict[str, Any]:
     """Return the policy's settings: `config`, and `user_config`, which may change while the
     policy runs.
     """
-    beside = next(
-        (one.get("user_config") for one in app.deployments if one.get("name") == POLICY), None
-    )
-    return {**app.args.get("config", {}), **(beside or {})}
+    settings = dict(app.args.get("config", {}))
+    for settings_of_serve in app.deployments:
+        if settings_of_serve.get("name") == POLICY:
+            settings.update(settings_of_serve.get("user_config") or {})
+            break
+    return settings
 
 
 def stated_contract(config: Deployment) -> Contract | None:
@@ -278,14 +295,14 @@ def stated_contract(config: Deployment) -> Contract | None:
         The contract; None if the policy has none before it is loaded, cannot be built here, or is
         one of several.
     """
-    app, *others = config.applications
-    if others or app.import_path != IMPORT_PATH or app.runtime_env:
+    app = config.applications[0]
+    if len(config.applications) > 1 or app.import_path != IMPORT_PATH or app.runtime_env:
         return None
+
     args = ServerArgs(**app.args)
-    offered = args.checkpoints.of(
-        partial(build_agent, args.policy, wrappers=args.wrappers), own_settings(app)
-    )
-    return _contract(args, offered, offered.settings(DEFAULT, offered.config))
+    make = partial(build_agent, args.policy, wrappers=args.wrappers)
+    checkpoints = args.checkpoints.of(make, own_settings(app))
+    return _contract(args, checkpoints, checkpoints.settings(DEFAULT, checkpoints.config))
 
 
 def our_apps(config: Deployment) -> list[Application]:
@@ -301,16 +318,19 @@ def _checked(document: object, source: str, step_follows: bool = False) -> Deplo
         config = Deployment.model_validate(document)
         if not config.plain or len(config.applications) > 1:
             config.for_serve()
-        for one in config.applications:
-            require_no_secrets(one.runtime_env)
-            for stated in one.deployments:
-                require_no_secrets((stated.get("ray_actor_options") or {}).get("runtime_env") or {})
+
+        for app in config.applications:
+            require_no_secrets(app.runtime_env)
+            for settings_of_serve in app.deployments:
+                options = settings_of_serve.get("ray_actor_options") or {}
+                require_no_secrets(options.get("runtime_env") or {})
         for app in config.applications:
             meant = did_you_mean(app.import_path, [IMPORT_PATH])
             if app.import_path != IMPORT_PATH and meant:
                 raise ConfigError(
                     f"{source}: {app.name}: import_path: got {app.import_path!r}{meant}"
                 )
+
         for app in our_apps(config):
             args = ServerArgs(**app.args)
             # Relative paths refer to this process's folder, so Ray gets absolute ones.
@@ -328,13 +348,19 @@ def _checked(document: object, source: str, step_follows: bool = False) -> Deplo
 
 
 def _require_policy(
-    args: ServerArgs, own: dict[str, Any], *, installed: bool, step_follows: bool
+    args: ServerArgs, config: dict[str, Any], *, installed: bool, step_follows: bool
 ) -> None:
     """Build the policy in its environment, with each kind of settings, and check that the dialects
     fit its contract.
 
-    A replica repeats the check. If the policy's packages are not `installed` here, the
-    application's `runtime_env` adds them. With `step_follows`, a missing step is set later.
+    A replica repeats the check.
+
+    Args:
+        args: The settings of the server.
+        config: The policy's own settings.
+        installed: Whether the policy's packages are installed here; otherwise the application's
+            `runtime_env` adds them.
+        step_follows: Whether a missing checkpoint step is set later.
     """
     if not installed:
         if args.environment.python is None:
@@ -342,19 +368,23 @@ def _require_policy(
         else:
             with_process(args.environment)
         return
+
     args.dialects.require_packages()
-    offered = args.checkpoints.of(partial(build_agent, args.policy, wrappers=args.wrappers), own)
-    for choice in offered.examples():
-        settings = offered.settings(choice, offered.config)
+    make = partial(build_agent, args.policy, wrappers=args.wrappers)
+    checkpoints = args.checkpoints.of(make, config)
+    for choice in checkpoints.examples():
+        settings = checkpoints.settings(choice, checkpoints.config)
         if step_follows and STEP_PLACE in str(settings.get(CHOICE)) and settings.get(STEP) is None:
             settings |= {STEP: 0}
-        args.dialects.require_fit(_contract(args, offered, settings))
+        args.dialects.require_fit(_contract(args, checkpoints, settings))
 
 
-def _contract(args: ServerArgs, offered: Checkpoints, settings: dict[str, Any]) -> Contract | None:
+def _contract(
+    args: ServerArgs, checkpoints: Checkpoints, settings: dict[str, Any]
+) -> Contract | None:
     """Build the policy in its environment with these settings, and return its contract, if it
     has one already.
     """
     if args.environment.python is not None:
         return check_policy(args.environment, args.policy, settings, args.wrappers)
-    return unloaded_contract(offered.make(settings))
+    return unloaded_contract(checkpoints.make(settings))

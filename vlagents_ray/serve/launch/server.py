@@ -45,9 +45,9 @@ log = logging.getLogger(__name__)
 _SHUTDOWN_S = 30.0
 # Time for Serve's proxies to listen; on a busy node, several are replaced before one does.
 _PROXIES_S = 180.0
-_LOOK_S = 0.2  # interval of the checks which proxies Serve has
-# Time for a policy to become ready: here; on a cluster that may add a machine first.
-_START_S, _GROW_S = 600.0, 3600.0
+_LOOK_S = 0.2  # interval at which Serve's proxies, and its end, are checked
+_START_S = 600.0  # time for a policy to become ready on this machine
+_GROW_S = 3600.0  # time for a policy to become ready on a cluster that may add a machine first
 _REMIND_S = 30.0
 
 
@@ -84,9 +84,10 @@ def shut_down(client: Any) -> None:
     for poll in private.long_polls(client):
         poll.stop()
     client.shutdown_cached_handles()
-    last = private.end_controller(client)
+
+    ending = private.end_controller(client)
     deadline = time.monotonic() + _SHUTDOWN_S
-    while not ray.wait([last], timeout=_LOOK_S)[0] and not head_monitor.head_is_gone():
+    while not ray.wait([ending], timeout=_LOOK_S)[0] and not head_monitor.head_is_gone():
         if time.monotonic() > deadline:
             log.warning("Serve has not ended within %g s and is left behind", _SHUTDOWN_S)
             break
@@ -146,60 +147,74 @@ def running_server(
             "machine"
         )
     config = with_gateways_at(config, host)
-    config = _access(config, keys_file, insecure, plain_http)
+    config = _with_access(config, keys_file, insecure, plain_http)
     if address is None:  # otherwise each replica checks and warns on its own machine
         _check_access(config, host, insecure, tls)
     if tls is not None:
         tls.check()
+
     for app in our_apps(config):
-        keep(*(one.port for one in ServerArgs(**app.args).dialects.gateways().values()))
-    own = address is None and not ray.is_initialized()
-    if own:
+        for gateway in ServerArgs(**app.args).dialects.gateways().values():
+            keep(gateway.port)
+    is_own_ray = address is None and not ray.is_initialized()
+    if is_own_ray:
         _require_gpus(config, private.gpus_here())
+
     with contextlib.ExitStack() as stack:
-        ingress = ingress or not own or len(our_apps(config)) < len(config.applications)
-        public = port or free_port(host)
+        ingress = ingress or not is_own_ray or len(our_apps(config)) < len(config.applications)
+        public_port = port or free_port(host)
         begins_empty = not all(map(_begins_with_replicas, config.applications))
         http = stack.enter_context(
-            _ray(address, host, public, tls, num_cpus, ingress, begins_empty)
+            _ray(address, host, public_port, tls, num_cpus, ingress, begins_empty)
         )
-        location = "Disabled" if not ingress else "HeadOnly" if address is None else "EveryNode"
-        client, proxies = private.start_serve(http, location)
-        if running := sorted(serve.status().applications):
+        client, proxies = private.start_serve(http, _proxy_location(ingress, address))
+        running = sorted(serve.status().applications)
+        if running:
             raise ConfigError(
                 f"Serve runs {running} on this cluster already; use their URL "
-                f"(serve://{running[0]} inside the "
-                f"cluster), or `serve deploy` one file that holds those and yours"
+                f"(serve://{running[0]} inside the cluster), or `serve deploy` one file that holds "
+                "those and yours"
             )
         stack.push(session.unless_lost(lambda: shut_down(client)))
+
         _require_gpus(config)
-        deploy(client, config, own=own, ingress=ingress)
-        scheme = "http" if tls is None else "https"
-        url = f"{scheme}://{LOOPBACK if host == EVERYWHERE else host}:{public}"
-        paths = {app.name: (app.route_prefix or "").rstrip("/") for app in config.applications}
+        deploy(client, config, own=is_own_ray, ingress=ingress)
+
         if timeout_s is None:
             timeout_s = _START_S if address is None else _GROW_S
         deadline = time.monotonic() + timeout_s
-        inside = "https" if http.get("ssl_certfile") else "http"
-        inside += f"://{LOOPBACK if http['host'] == EVERYWHERE else http['host']}:{http['port']}"
+        paths = {app.name: (app.route_prefix or "").rstrip("/") for app in config.applications}
+        inside_scheme = "https" if http.get("ssl_certfile") else "http"
+        inside = _url(inside_scheme, http["host"], http["port"])
+        inside_urls = {name: inside + path if ingress else None for name, path in paths.items()}
         ours = {app.name for app in our_apps(config)}
-        urls = {name: inside + path if ingress else None for name, path in paths.items()}
         wait_for_proxies(proxies, lambda: private.proxies_now(client))
-        wait_until_ready(serve, urls, ours, deadline, functools.partial(_missing_gpus, config))
-        if (
-            ingress
-            and address is None
-            and (stats_port := os.environ.get("RAY_SERVE_HAPROXY_STATS_PORT"))
-        ):
+        missing = functools.partial(_missing_gpus, config)
+        wait_until_ready(serve, inside_urls, ours, deadline, missing)
+        stats_port = os.environ.get("RAY_SERVE_HAPROXY_STATS_PORT")
+        if ingress and address is None and stats_port:
             haproxy.wait_for_haproxy(serve, paths, int(stats_port), deadline)
-        if own and ingress:
+
+        url = _url("http" if tls is None else "https", host, public_port)
+        if is_own_ray and ingress:
             session.announce(url, paths, ray.get_runtime_context().gcs_address)
-        yield Server(
-            url, {name: url + path for name, path in paths.items()}, session.metrics_urls()
-        )
+        urls = {name: url + path for name, path in paths.items()}
+        yield Server(url, urls, session.metrics_urls())
 
 
-def _access(
+def _proxy_location(ingress: bool, address: str | None) -> str:
+    """Return on which nodes Serve has proxies."""
+    if not ingress:
+        return "Disabled"
+    return "HeadOnly" if address is None else "EveryNode"
+
+
+def _url(scheme: str, host: str, port: int) -> str:
+    """Return a URL at which this machine reaches a server that listens at `host`."""
+    return f"{scheme}://{LOOPBACK if host == EVERYWHERE else host}:{port}"
+
+
+def _with_access(
     config: Deployment, keys_file: Path | None, insecure: bool, plain_http: bool
 ) -> Deployment:
     """Return the deployment with the access settings of the command line, if any."""
@@ -234,43 +249,44 @@ def deploy(client: Any, config: Deployment, *, own: bool, ingress: bool) -> None
     if not config.plain or not own:
         client.deploy_apps(config.for_serve())
         return
-    targets = [
-        serve.RunTarget(
-            application(ServerArgs(**app.args), drains=ingress), app.name, app.route_prefix
-        )
-        for app in config.applications
-    ]
+
+    targets = []
+    for app in config.applications:
+        built = application(ServerArgs(**app.args), drains=ingress)
+        targets.append(serve.RunTarget(built, app.name, app.route_prefix))
     serve.run_many(
         targets, wait_for_ingress_deployment_creation=False, wait_for_applications_running=False
     )
 
 
-def _require_gpus(config: Deployment, here: float | None = None) -> None:
+def _require_gpus(config: Deployment, local_gpus: float | None = None) -> None:
     """Raise `ConfigError` if the replicas need more GPUs than a Ray started here has, since they
     would wait forever.
 
-    `here` is the number of GPUs that a new local Ray would have. An existing cluster may grow:
-    there, missing GPUs cause a warning, which is repeated while the replicas wait.
+    `local_gpus` is the number of GPUs that a new local Ray would have. An existing cluster may
+    grow: there, missing GPUs cause a warning, which is repeated while the replicas wait.
     """
-    if here is None and not session.started_here():
+    if local_gpus is None and not session.started_here():
         return
-    if (missing := _missing_gpus(config, here)) is not None:
+    missing = _missing_gpus(config, local_gpus)
+    if missing is not None:
         raise ConfigError(f"{missing}; where there are more, see `vlagents-ray doctor`")
 
 
-def _missing_gpus(config: Deployment, here: float | None = None) -> str | None:
+def _missing_gpus(config: Deployment, local_gpus: float | None = None) -> str | None:
     """Return a sentence about the GPUs that this machine, or the running cluster, lacks; None if
     it has enough.
     """
-    wanted = {app.name: _gpus(ServerArgs(**app.args)) for app in our_apps(config)}
-    there = ray.cluster_resources().get("GPU", 0.0) if here is None else here
-    if sum(wanted.values()) <= there:
+    needed = {app.name: _gpus(ServerArgs(**app.args)) for app in our_apps(config)}
+    total = sum(needed.values())
+    available = ray.cluster_resources().get("GPU", 0.0) if local_gpus is None else local_gpus
+    if total <= available:
         return None
-    where = "this machine" if here is not None or session.started_here() else "this cluster"
+    is_local = local_gpus is not None or session.started_here()
+    where = "this machine" if is_local else "this cluster"
     return (
-        f"resources.num_gpus: the replicas of {wanted} need {sum(wanted.values()):g} GPUs, {where} "
-        f"has {there:g}; "
-        f"want less (0 runs on the CPU), or add a machine that has them"
+        f"resources.num_gpus: the replicas of {needed} need {total:g} GPUs, {where} has "
+        f"{available:g}; want less (0 runs on the CPU), or add a machine that has them"
     )
 
 
@@ -292,16 +308,20 @@ def _check_access(config: Deployment, host: str, insecure: bool, tls: haproxy.Tl
     Raises:
         ConfigError: An application accepts other machines without keys, or its keys cannot be read.
     """
-    ours, plain = our_apps(config), False
-    for app in config.applications:  # applications of other packages require no keys
-        access = (
-            AccessArgs(**app.args.get("access", {}))
-            if app in ours
-            else AccessArgs(insecure=insecure)
-        )
-        require_access(host, keys := access.keys() if app in ours else None, access.insecure)
-        plain = plain or (keys is not None and not access.plain_http)
-    if plain and tls is None:
+    ours = our_apps(config)
+    has_plain_keys = False
+    for app in config.applications:
+        if app in ours:
+            access = AccessArgs(**app.args.get("access", {}))
+            keys = access.keys()
+        else:  # applications of other packages require no keys
+            access = AccessArgs(insecure=insecure)
+            keys = None
+        require_access(host, keys, access.insecure)
+        if keys is not None and not access.plain_http:
+            has_plain_keys = True
+
+    if has_plain_keys and tls is None:
         warn_of_plain_http(host)
 
 
@@ -337,14 +357,15 @@ def _ray(
                     "'vlagents-ray[serve]'"
                 )
         return
+
     if tls is not None:
         raise ConfigError(
             "TLS on a cluster that runs already: end it before Serve, in the cluster's load "
-            "balancer, or name "
-            "ssl_certfile and ssl_keyfile under http_options in the deployment file"
+            "balancer, or name ssl_certfile and ssl_keyfile under http_options in the deployment "
+            "file"
         )
-    bare = host in (LOOPBACK, "localhost", EVERYWHERE)
-    if os.environ.get("RAY_SERVE_ENABLE_HA_PROXY") == "1" and address is None and not bare:
+    has_haproxy = os.environ.get("RAY_SERVE_ENABLE_HA_PROXY") == "1"
+    if has_haproxy and address is None and host not in (LOOPBACK, "localhost", EVERYWHERE):
         raise ConfigError(
             f"host {host}: with HAProxy Serve would find no replica at a single address; "
             f"use {EVERYWHERE} (or {LOOPBACK}), or leave ray.init() to this function"
@@ -391,54 +412,69 @@ def own_ray(
     if os.environ.get(session.MODE, "token").lower() != "token":
         raise ConfigError(
             f"{session.MODE}={os.environ[session.MODE]}: a port of each replica, which runs "
-            "whatever it is sent, "
-            f"would be open to other machines without Ray's token; unset it"
+            "whatever it is sent, would be open to other machines without Ray's token; unset it"
         )
     if not is_free(host, port):
         raise ConfigError(
             f"cannot listen on {host}:{port}: it is taken; choose another --port or --host"
         )
     keep(port)
+
     with session.ray_folder() as folder, contextlib.ExitStack() as stack:
         # By default Ray starts workers with a low priority, so that a policy would wait for all
         # other processes. Proxies start while policies load: on a slow machine Serve would replace
         # them after three times its 5 s.
         environment = {"RAY_worker_niceness": "0", "RAY_SERVE_PROXY_READY_CHECK_TIMEOUT_S": "60"}
-        # The address at which replicas listen for WebSockets: loopback if only TLS may cross the
-        # network.
-        ours = {MARK: str(folder), session.ALONE: "0", HOST: host if tls is None else LOOPBACK}
+        # These variables replace the user's. At `HOST` the replicas listen for WebSockets: on
+        # loopback if only TLS may cross the network.
+        fixed = {MARK: str(folder), session.ALONE: "0", HOST: host if tls is None else LOOPBACK}
+
         listener = None
+        binary = haproxy.haproxy_binary() if ingress else None
         if not ingress:
-            ours["RAY_SERVE_ENABLE_HA_PROXY"] = "0"
-        elif (binary := haproxy.haproxy_binary()) is not None:
+            fixed["RAY_SERVE_ENABLE_HA_PROXY"] = "0"
+        elif binary is not None:
             if tls is not None or host not in (LOOPBACK, "localhost"):
-                bundle = None if tls is None else tls.bundle(folder)
-                client_ca = (
-                    None if tls is None or tls.client_ca is None else tls.client_ca.absolute()
-                )
-                listener = haproxy.PublicListener(host, port, free_port(), bundle, client_ca)
+                listener = _public_listener(host, port, tls, folder)
             settings = haproxy.ingress_environment(folder, binary, listener)
             if begins_empty:
                 haproxy.open_port(folder)
             # HAProxy's files and admin socket are in the folder, regardless of the user's settings
             # for clusters.
-            ours |= {key: value for key, value in settings.items() if value.startswith(str(folder))}
+            for name, value in settings.items():
+                if value.startswith(str(folder)):
+                    fixed[name] = value
             environment |= settings
+
         # If another server's process started this one, it has inherited that server's files and
         # ports, which are replaced. Otherwise the user's values are kept, unless they are in
-        # `ours`.
-        inherited = MARK in os.environ
-        new = {
-            key: value for key, value in environment.items() if inherited or key not in os.environ
+        # `fixed`.
+        is_inherited = MARK in os.environ
+        unset = {
+            name: value
+            for name, value in environment.items()
+            if is_inherited or name not in os.environ
         }
-        stack.enter_context(session.variables(new | ours | session.token_variables(folder)))
-        # `ALONE` was read when Ray was imported.
+        stack.enter_context(session.variables(unset | fixed | session.token_variables(folder)))
+
+        # Ray has read the variable `ALONE` when it was imported, so its setting is also changed.
         stack.callback(private.use_loopback, private.use_loopback(True))
         if listener is not None:
             listener.require()
         session.start_ray(folder, num_cpus=num_cpus, logging_level="WARNING")
         stack.push(session.unless_lost(session.leave_ray))
         yield listener
+
+
+def _public_listener(
+    host: str, port: int, tls: haproxy.Tls | None, folder: Path
+) -> haproxy.PublicListener:
+    """Return HAProxy's listener for clients, with the certificate in a private `folder`."""
+    bundle = None if tls is None else tls.bundle(folder)
+    client_ca = None
+    if tls is not None and tls.client_ca is not None:
+        client_ca = tls.client_ca.absolute()
+    return haproxy.PublicListener(host, port, free_port(), bundle, client_ca)
 
 
 def wait_until_ready(
@@ -468,28 +504,21 @@ def wait_until_ready(
         for name in apps:
             app = status.get(name)
             if app is not None and app.status in ("DEPLOY_FAILED", "UNHEALTHY"):
-                # The last line of Serve's message is the error below its traceback.
-                texts = [app.message, *(d.message for d in app.deployments.values())]
-                lines = [
-                    line.strip()
-                    for text in texts
-                    for line in (text or "").splitlines()
-                    if line.strip()
-                ]
-                reason = lines[-1] if lines else "Serve gives no reason"
-                raise ConfigError(f"application {name!r} failed to deploy: {reason}")
+                raise ConfigError(f"application {name!r} failed to deploy: {_deploy_failure(app)}")
         if all(name in status and status[name].status == "RUNNING" for name in apps):
             break
+
         if time.monotonic() > deadline:
-            states = {n: str(status[n].status) for n in apps if n in status}
-            raise PolicyUnavailable(
-                "; ".join(filter(None, [f"not running in time: {states}", missing()]))
-            )
+            states = {name: str(status[name].status) for name in apps if name in status}
+            causes = [f"not running in time: {states}", missing()]
+            raise PolicyUnavailable("; ".join(filter(None, causes)))
         if time.monotonic() >= remind_at:
             remind_at = time.monotonic() + _REMIND_S
-            if (what := missing()) is not None:
-                log.warning("waiting: %s", what)
+            obstacle = missing()
+            if obstacle is not None:
+                log.warning("waiting: %s", obstacle)
         time.sleep(0.1)
+
     for name, url in apps.items():
         while (refusal := _unready_reason(serve, name, url, ours)) is not None:
             if "did not load" in refusal:
@@ -497,6 +526,15 @@ def wait_until_ready(
             if time.monotonic() > deadline:
                 raise PolicyUnavailable(f"application {name!r} is not ready: {refusal}")
             time.sleep(0.05)
+
+
+def _deploy_failure(app: Any) -> str:
+    """Return the reason why an application failed to deploy, from Serve's status of it."""
+    lines: list[str] = []
+    for text in (app.message, *(deployment.message for deployment in app.deployments.values())):
+        lines += [line.strip() for line in (text or "").splitlines() if line.strip()]
+    # The last line of Serve's message is the error below its traceback.
+    return lines[-1] if lines else "Serve gives no reason"
 
 
 def _unready_reason(serve: Any, app: str, url: str | None, ours: Collection[str]) -> str | None:
@@ -508,10 +546,10 @@ def _unready_reason(serve: Any, app: str, url: str | None, ours: Collection[str]
     if app not in ours or (url is not None and refusal is None):
         return refusal
     try:
-        said: str | None = serve.get_app_handle(app).refusal.remote().result(timeout_s=5)
+        reason: str | None = serve.get_app_handle(app).refusal.remote().result(timeout_s=5)
     except (ray.exceptions.RayError, RayServeException, TimeoutError) as error:
-        said = str(error) or type(error).__name__
-    return said or refusal
+        reason = str(error) or type(error).__name__
+    return reason or refusal
 
 
 def _http_reason(url: str) -> str | None:
