@@ -76,17 +76,18 @@ def _code(top: str) -> GitState | None:
 
 def _git(folder: Path, *words: str) -> bytes | None:
     """Return the output of git; None if it fails."""
-    if (git := shutil.which("git")) is None:
+    git = shutil.which("git")
+    if git is None:
         return None
-    quiet = os.environ | {"GIT_OPTIONAL_LOCKS": "0"}
+    environment = os.environ | {"GIT_OPTIONAL_LOCKS": "0"}
     try:
-        asked = subprocess.run(  # noqa: S603 - words of ours, and a folder
+        done = subprocess.run(  # noqa: S603 - words of ours, and a folder
             [git, "-C", str(folder), *words],
             capture_output=True,
             timeout=_TIMEOUT_S,
-            env=quiet,
+            env=environment,
             check=False,
         )
     except (OSError, subprocess.TimeoutExpired):
         return None
-    return asked.stdout if asked.returncode == 0 else None
+    return done.stdout if done.returncode == 0 else None

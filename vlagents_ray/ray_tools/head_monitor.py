@@ -41,18 +41,23 @@ class HeadMonitor:
         cluster is lost.
         """
         self.node = node_of_this_process()
-        self._address = host, port = _address()
+        self._address = _address()
+        host, port = self._address
         self._name = f"the head of the Ray cluster, {host}:{port},"
         self._cure = cure
+
         self._timeout_s = _SHARE * float(os.environ.get(_RAY_TIMEOUT) or _RAY_TIMEOUT_S)
         if started_here():
-            # Nothing replaces a head of this process.
+            # Nothing replaces a head that this process has started.
             self._timeout_s = min(self._timeout_s, PERIOD_S)
+
+        # The socket of the local daemon; None if the system does not list its sockets.
         self._daemon = None if self.node is None else str(self.node.raylet_socket_name)
-        # The system does not list its sockets.
         if self._daemon is not None and not _exists(self._daemon):
             self._daemon = None
-        self._looked = self._answered = monotonic()
+
+        self._checked = monotonic()  # time of the last check, s
+        self._answered = self._checked  # time of the last check that the head answered, s
 
     def answers(self) -> bool:
         """Return whether the head answered the last check, which is repeated every `PERIOD_S`.
@@ -61,27 +66,33 @@ class HeadMonitor:
             ClusterLost: The head has not answered for too long, or the daemon on this machine has
                 ended.
         """
-        if monotonic() - self._looked > PERIOD_S:
-            if self._daemon is not None and not _exists(self._daemon):
-                raise ClusterLost(
-                    f"Ray's daemon on this machine, the raylet, has ended; {self._cure}"
-                )
-            try:
-                socket.create_connection(self._address, ANSWER_S).close()
-            except OSError as error:
-                if self._looked == self._answered and self._timeout_s > PERIOD_S:
-                    log.warning(
-                        "%s does not answer (%s): no worker is started until it does; this ends "
-                        "after %.0f s",
-                        self._name, error, self._timeout_s,
-                    )  # fmt: skip
-                self._looked = monotonic()
-            else:
-                self._looked = self._answered = monotonic()
-        silent_s = self._looked - self._answered
+        if monotonic() - self._checked > PERIOD_S:
+            self._check()
+        silent_s = self._checked - self._answered
         if silent_s > self._timeout_s:
             raise ClusterLost(f"{self._name} has not answered for {silent_s:.0f} s; {self._cure}")
         return silent_s == 0.0
+
+    def _check(self) -> None:
+        """Check the local daemon and the head once; raise `ClusterLost` if the daemon has ended."""
+        if self._daemon is not None and not _exists(self._daemon):
+            raise ClusterLost(f"Ray's daemon on this machine, the raylet, has ended; {self._cure}")
+
+        try:
+            socket.create_connection(self._address, ANSWER_S).close()
+        except OSError as error:
+            if self._checked == self._answered and self._timeout_s > PERIOD_S:
+                log.warning(
+                    "%s does not answer (%s): no worker is started until it does; this ends after "
+                    "%.0f s",
+                    self._name,
+                    error,
+                    self._timeout_s,
+                )
+            self._checked = monotonic()
+        else:
+            self._checked = monotonic()
+            self._answered = self._checked
 
 
 def head_is_gone() -> bool:

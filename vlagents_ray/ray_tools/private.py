@@ -37,9 +37,9 @@ def node_of_this_process() -> Any:
     Ray from another thread would then start a second cluster.
     """
     worker: Any = sys.modules.get("ray._private.worker")
-    return (
-        None if worker is None or not worker.global_worker.connected else worker.global_worker.node
-    )
+    if worker is None or not worker.global_worker.connected:
+        return None
+    return worker.global_worker.node
 
 
 def use_loopback(on: bool) -> bool:
@@ -117,8 +117,8 @@ def start_head(temp_dir: str, dashboard_port: int, **params: Any) -> Any:
         no_monitor=True,
         **params,
     )
-    # `ray_init_cluster`: started by a driver, not by `ray start`, so that nothing else joins it by
-    # default.
+    # `ray_init_cluster` means that a driver starts the cluster, not `ray start`, so that nothing
+    # else joins it by default.
     return Node(
         ray_params, head=True, shutdown_at_exit=False, spawn_reaper=True, ray_init_cluster=True
     )
@@ -131,8 +131,11 @@ def node_that_failed(error: BaseException) -> Any:
     """
     from ray._private.node import Node
 
-    found = (frame.f_locals.get("self") for frame, _ in traceback.walk_tb(error.__traceback__))
-    return next((one for one in found if isinstance(one, Node)), None)
+    for frame, _ in traceback.walk_tb(error.__traceback__):
+        node = frame.f_locals.get("self")
+        if isinstance(node, Node):
+            return node
+    return None
 
 
 def gpus_here() -> float:
@@ -141,12 +144,13 @@ def gpus_here() -> float:
     """
     from ray._private.accelerators import get_accelerator_manager_for_resource
 
-    if (manager := get_accelerator_manager_for_resource("GPU")) is None:
+    manager = get_accelerator_manager_for_resource("GPU")
+    if manager is None:
         return 0.0
-    # From CUDA_VISIBLE_DEVICES and similar variables.
+    number = manager.get_current_node_num_accelerators()
+    # CUDA_VISIBLE_DEVICES and similar variables name the visible ones.
     visible = manager.get_current_process_visible_accelerator_ids()
-    found = manager.get_current_node_num_accelerators()
-    return float(found if visible is None else min(found, len(visible)))
+    return float(number if visible is None else min(number, len(visible)))
 
 
 # Channels: mutable objects in plasma, on which Ray's `Channel` is built.
@@ -194,8 +198,8 @@ def write_channel(channel: Any, content: Any, wait_ms: int) -> str | None:
 
 
 def read_channel(channel: Any) -> Any:
-    """Return the newest content, with `metadata` and `data`, in place: it is valid while the caller
-    holds it.
+    """Return the newest content, with `metadata` and `data`, in place; it is valid while it is
+    referenced.
 
     Raises:
         ray.exceptions.RayChannelTimeoutError: Nothing was written since the last call.
@@ -280,11 +284,13 @@ def long_polls(client: Any) -> Iterator[Any]:
     from ray.serve._private.router import SharedRouterLongPollClient
 
     for handle in client.handle_cache.values():
-        if (router := getattr(handle._router, "_asyncio_router", None)) is not None:
+        router = getattr(handle._router, "_asyncio_router", None)
+        if router is not None:
             yield router.long_poll_client
-            yield SharedRouterLongPollClient.get_or_create(
+            shared = SharedRouterLongPollClient.get_or_create(
                 client._controller, router._event_loop
-            ).long_poll_client
+            )
+            yield shared.long_poll_client
 
 
 def end_controller(client: Any) -> Any:
@@ -320,8 +326,8 @@ def replica_is_ending() -> bool:
 
 
 def replica_is_initialized(replica: Any) -> Any:
-    """Ask a replica's actor whether it has made its callable; Ray before 2.60 does not say, and
-    counts as true.
+    """Ask a replica's actor whether it has made its callable; with Ray before 2.60, which does not
+    report it, the answer is true.
 
     Returns:
         An awaitable of a bool.

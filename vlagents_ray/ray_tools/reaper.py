@@ -62,16 +62,17 @@ def marked(folder: str) -> list[int]:
     continue.
     """
     mark = f"{MARK}={folder}".encode()
-    found = []
+    pids = []
     for process in Path("/proc").glob("[0-9]*"):
         try:
-            ours = mark in (process / "environ").read_bytes().split(b"\0")
-            ours = ours or (is_titled(process) and has_open_files(process, folder))
-            if ours and int(process.name) != os.getpid():
-                found.append(int(process.name))
+            is_marked = mark in (process / "environ").read_bytes().split(b"\0")
+            if not is_marked and is_titled(process):
+                is_marked = has_open_files(process, folder)
         except OSError:  # the process has ended, or belongs to another user
             continue
-    return found
+        if is_marked and int(process.name) != os.getpid():
+            pids.append(int(process.name))
+    return pids
 
 
 def is_titled(process: Path) -> bool:
@@ -96,13 +97,13 @@ def about(folder: str) -> list[int]:
     """List the marked processes that no user started: their command line names the folder, or is
     a title set by Ray.
     """
-    found = []
+    pids = []
     for pid in marked(folder):
         with suppress(OSError):
             process = Path(f"/proc/{pid}")
             if is_titled(process) or f"{folder}/".encode() in (process / "cmdline").read_bytes():
-                found.append(pid)
-    return found
+                pids.append(pid)
+    return pids
 
 
 def main() -> None:
@@ -110,21 +111,24 @@ def main() -> None:
     # Systemd and Slurm signal every process of a service.
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, signal.SIG_IGN)
+
     folder = sys.argv[1]
-    orderly = os.read(0, 1) == _ORDERLY
-    if not orderly:
+    is_orderly = os.read(0, 1) == _ORDERLY
+    if not is_orderly:
         time.sleep(_GRACE_S)
-    quiet = 0
+
+    quiet_sweeps = 0
     for _ in range(_SWEEPS):  # a process may have started another one before it was killed
-        left = about(folder) if orderly else marked(folder)
-        quiet = 0 if left else quiet + 1
-        if quiet == _QUIET_SWEEPS:
+        pids = about(folder) if is_orderly else marked(folder)
+        quiet_sweeps = 0 if pids else quiet_sweeps + 1
+        if quiet_sweeps == _QUIET_SWEEPS:
             break
-        for pid in left:
+        for pid in pids:
             with suppress(ProcessLookupError):
                 os.kill(pid, signal.SIGKILL)
         time.sleep(0.05)
-    if not orderly:  # otherwise the driver removes it
+
+    if not is_orderly:  # otherwise the driver removes it
         shutil.rmtree(folder, ignore_errors=True)
 
 

@@ -23,34 +23,32 @@ def require_no_secrets(runtime_env: Mapping[str, Any]) -> None:
     contains a password.
     """
     variables = runtime_env.get("env_vars") or {}
-    named = (
-        sorted(name for name in variables if _SECRET.search(name))
-        if isinstance(variables, Mapping)
-        else []
-    )
-    if named:
+    secrets: list[str] = []
+    if isinstance(variables, Mapping):
+        secrets = sorted(name for name in variables if _SECRET.search(name))
+    if secrets:
         raise ConfigError(
-            f"env_vars: got {named}, want no secrets: Ray logs them where every user of the "
-            "machine can read them. Set "
-            "them in the environment in which Ray is started on each node (by `ray start`, "
-            "`vlagents-ray serve`), or "
-            f"in a file that only you can read, and replace the secrets that were given here before"
+            f"env_vars: got {secrets}, want no secrets: Ray logs them where every user of the "
+            "machine can read them. Set them in the environment in which Ray is started on each "
+            "node (by `ray start`, `vlagents-ray serve`), or in a file that only you can read, and "
+            "replace the secrets that were given here before"
         )
+
     if any(_PASSWORD_IN_URL.search(text) for text in _texts(runtime_env)):
         raise ConfigError(
             "runtime environment: got a URL with a password, want none: Ray logs it where every "
-            "user of the machine "
-            "can read it. Put the password into ~/.netrc, or write ${NAME} for a variable that the "
-            "nodes have"
+            "user of the machine can read it. Put the password into ~/.netrc, or write ${NAME} for "
+            "a variable that the nodes have"
         )
 
 
 def _texts(value: object) -> Iterator[str]:
+    """Yield the texts in a value, also those in its mappings and lists; keys are left out."""
     if isinstance(value, str):
         yield value
     elif isinstance(value, Mapping):
-        for one in value.values():
-            yield from _texts(one)
+        for item in value.values():
+            yield from _texts(item)
     elif isinstance(value, (list, tuple)):
-        for one in value:
-            yield from _texts(one)
+        for item in value:
+            yield from _texts(item)

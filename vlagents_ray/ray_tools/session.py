@@ -74,6 +74,7 @@ def joined(address: str | None = None, **options: Any) -> Iterator[None]:
     if ray.is_initialized():
         yield
         return
+
     options = {"log_to_driver": False, "logging_level": "WARNING"} | options
     where = address or os.environ.get("RAY_ADDRESS")
     url = where if where is not None and urlsplit(where).scheme in ("http", "https") else None
@@ -97,8 +98,8 @@ def joined(address: str | None = None, **options: Any) -> Iterator[None]:
         except (ConnectionError, ray.exceptions.AuthenticationError) as error:
             raise ConfigError(
                 f"cannot connect to a Ray cluster at {where!r}: {error}. Start Ray on this "
-                "machine, or join it to a "
-                f"cluster (`ray start`); the page docs/cluster/index.md shows how"
+                "machine, or join it to a cluster (`ray start`); the page docs/cluster/index.md "
+                "shows how"
             ) from error
         stack.push(unless_lost(leave_ray))
         yield
@@ -202,7 +203,7 @@ def start_ray(folder: Path, **options: Any) -> None:
                 ray.init(node.gcs_address, **({"log_to_driver": False} | options))
         except Exception as error:  # Ray raises a plain Exception
             node = node or private.node_that_failed(error)
-            # Nothing was started, so time is not the cause.
+            # If nothing was started, time is not the cause.
             if node is None or not node.all_processes:
                 raise
             node.kill_all_processes(check_alive=False, wait=True)  # Ray does not end them itself
@@ -212,10 +213,8 @@ def start_ray(folder: Path, **options: Any) -> None:
             if attempt == _ATTEMPTS:
                 raise ConfigError(
                     f"Ray did not start on this machine in {_ATTEMPTS} attempts: {reason}. If the "
-                    "machine is busy, run "
-                    "less on it; if Python's modules are on a slow disk, copy the environment to "
-                    "a local one. Logs: "
-                    f"{_kept_logs(node)}"
+                    "machine is busy, run less on it; if Python's modules are on a slow disk, copy "
+                    f"the environment to a local one. Logs: {_copy_logs(node)}"
                 ) from error
             log.warning(
                 "Ray did not start, trying again (attempt %d of %d): %s",
@@ -241,7 +240,7 @@ def leave_ray() -> None:
 def started_here() -> bool:
     """Return whether this process is in a cluster that it started itself."""
     node = private.node_of_this_process()
-    return node is not None and any(one.gcs_address == node.gcs_address for one in _started)
+    return node is not None and any(started.gcs_address == node.gcs_address for started in _started)
 
 
 @contextlib.contextmanager
@@ -268,15 +267,15 @@ def _taken_port() -> Iterator[int]:
             logger.removeFilter(is_shown)
 
 
-def _kept_logs(node: Any) -> Path:
+def _copy_logs(node: Any) -> Path:
     """Copy a node's logs to a folder of this user, as the cluster's folder is about to be
-    removed.
+    removed; return the folder.
     """
-    kept = Path(tempfile.mkdtemp(prefix="vlr-logs-"))
-    # shutil.Error is an OSError; the other files have been copied.
+    folder = Path(tempfile.mkdtemp(prefix="vlr-logs-"))
+    # After `shutil.Error`, which is an OSError, the other files have been copied.
     with contextlib.suppress(OSError):
-        shutil.copytree(node.get_logs_dir_path(), kept, dirs_exist_ok=True)
-    return kept
+        shutil.copytree(node.get_logs_dir_path(), folder, dirs_exist_ok=True)
+    return folder
 
 
 def _daemon_error(node: Any) -> str:
@@ -339,14 +338,14 @@ def join(server: str | None = None, **options: Any) -> LocalServer:
     """
     import ray
 
-    chosen = _chosen(server)
+    chosen = _choose(server)
     if ray.is_initialized():
         if ray.get_runtime_context().gcs_address == chosen.ray_address:
             return chosen
         raise ConfigError(
             f"got a process in another Ray cluster, {ray.get_runtime_context().gcs_address}; want "
-            "it in that of "
-            f"{chosen.url}: call ray.shutdown() before, or join() in place of ray.init()"
+            f"it in that of {chosen.url}: call ray.shutdown() before, or join() in place of "
+            "ray.init()"
         )
     if os.environ.get(MODE, "token").lower() != "token":
         raise ConfigError(
@@ -388,29 +387,31 @@ def metrics_urls() -> tuple[str, ...]:
     )
 
 
-def _chosen(wanted: str | None) -> LocalServer:
-    """Return the server whose URL or application is `wanted`."""
+def _choose(url_or_app: str | None) -> LocalServer:
+    """Return the server with this URL or application; the only server for None."""
     servers = local_servers()
-    url = None if wanted is None else wanted.rstrip("/").replace("://localhost:", "://127.0.0.1:")
-    fitting = [
-        server for server in servers if wanted is None or url == server.url or wanted in server.apps
-    ]
+    fitting = servers
+    if url_or_app is not None:
+        url = url_or_app.rstrip("/").replace("://localhost:", "://127.0.0.1:")
+        fitting = [server for server in servers if url == server.url or url_or_app in server.apps]
     if len(fitting) == 1:
         return fitting[0]
-    there = ", ".join(f"{server.url} ({', '.join(server.apps)})" for server in servers)
+
+    running = ", ".join(f"{server.url} ({', '.join(server.apps)})" for server in servers)
     if fitting:
         raise ConfigError(
-            f"got {len(fitting)} servers on this machine, {there}; say which: "
+            f"got {len(fitting)} servers on this machine, {running}; say which: "
             f"join('{servers[0].url}')"
         )
     if servers:
         raise ConfigError(
-            f"got {wanted!r}, want the URL or an application of a server on this machine: {there}"
+            f"got {url_or_app!r}, want the URL or an application of a server on this machine: "
+            f"{running}"
         )
     raise ConfigError(
         "no server of this user is ready on this machine; start one with `vlagents-ray serve "
-        "POLICY`. Those of other "
-        "users, and on other machines, are reached at their URL: RemoteAgent('http://HOST:8000')"
+        "POLICY`. Those of other users, and on other machines, are reached at their URL: "
+        "RemoteAgent('http://HOST:8000')"
     )
 
 
@@ -421,13 +422,15 @@ def _running_servers() -> Iterator[LocalServer]:
             words = (process / "cmdline").read_bytes().split(b"\0")
             if Path(os.fsdecode(words[0])).name != "raylet" or process.stat().st_uid != os.getuid():
                 continue
-            pairs = (one.partition(b"=") for one in (process / "environ").read_bytes().split(b"\0"))
-            environment = {os.fsdecode(key): os.fsdecode(value) for key, _, value in pairs}
+            environment = {}
+            for variable in (process / "environ").read_bytes().split(b"\0"):
+                name, _, value = variable.partition(b"=")
+                environment[os.fsdecode(name)] = os.fsdecode(value)
             content = json.loads((Path(environment[MARK]) / _FILE).read_text())
             server = LocalServer(**{**content, "apps": tuple(content["apps"])})
             address = f"--gcs-address={server.ray_address}"
         except (OSError, KeyError, ValueError, TypeError):
-            # it has ended, is another user's, or is not announced
+            # The process has ended, is another user's, or its server is not announced.
             continue
         # A killed cluster may have left the folder, and another cluster may use it now.
         if any(address in os.fsdecode(word) for word in words):

