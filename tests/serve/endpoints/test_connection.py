@@ -106,3 +106,13 @@ def test_connections_that_their_clients_have_ended_neither_count_nor_delay_the_n
         for _ in range(300 // _ENDED_AT_ONCE + 1):
             endpoint.accept()
         assert [each.getpeername() for each in endpoint.clients] == [client.getsockname()]
+
+
+def test_a_client_that_leaves_before_it_is_let_in_is_not_logged(
+    endpoint: Endpoint, caplog: pytest.LogCaptureFixture
+) -> None:
+    endpoint._listener.setblocking(False)
+    endpoint.connect().close()
+    endpoint.accept()
+    assert not endpoint.clients
+    assert not caplog.records

@@ -367,6 +367,9 @@ class PolledServer(ABC, Generic[C]):
 
         try:
             connection = accept_open(self._listener)
+        except BlockingIOError:  # the clients have ended their connections, and no other waits
+            self._accepting.give_back()
+            return
         except OSError as error:
             self._accepting.give_back()
             logger.warning("a client was not let in: %s", error)
