@@ -108,7 +108,7 @@ def test_a_skeleton_of_a_plugin_passes_its_own_test_once_it_is_installed(folder:
         check=True, cwd=plugin, env=environment, capture_output=True, text=True, timeout=60,
     )  # fmt: skip
     assert (
-        "my_plugin: The policy MyPlugin: moves each joint towards zero.\n  ready" in listed.stdout
+        "my_plugin: moves each joint towards zero.\n  ready" in listed.stdout
     )
     assert "Print how many calls a server's policy has answered" in listed.stdout
 
