@@ -105,11 +105,14 @@ def test_a_skeleton_of_a_plugin_passes_its_own_test_once_it_is_installed(folder:
     assert done.returncode == 0, done.stdout + done.stderr
     listed = subprocess.run(
         ["sh", "-c", "vlagents-ray policies my_plugin && vlagents-ray my_plugin --help"],
-        check=True, cwd=plugin, env=environment, capture_output=True, text=True, timeout=60,
-    )  # fmt: skip
-    assert (
-        "my_plugin: moves each joint towards zero.\n  ready" in listed.stdout
+        check=True,
+        cwd=plugin,
+        env=environment,
+        capture_output=True,
+        text=True,
+        timeout=60,
     )
+    assert "my_plugin: moves each joint towards zero\n  ready" in listed.stdout
     assert "Print how many calls a server's policy has answered" in listed.stdout
 
 
