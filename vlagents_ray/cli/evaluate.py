@@ -111,7 +111,8 @@ class EvalOptions:
         bool,
         typer.Option(
             "--accept-changes",
-            help="With --resume: although files or weights changed; the report says so.",
+            help="With --resume: continue although files or weights have changed; the report "
+            "says so.",
         ),
     ] = False
     execute: Annotated[

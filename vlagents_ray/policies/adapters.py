@@ -39,8 +39,8 @@ class LoraAdapter:
     """The adapter of a session; by default, no adapter."""
 
     source: str = ""  # path or hub id, as in the settings
-    weights: str = ""  # digest of the base's files and the adapter's
-    # The beginning of that digest; empty: the session acts with the base alone.
+    weights: str = ""  # SHA-256 of the base's files and the adapter's
+    # The first digits of `weights`; empty if the session acts with the base alone.
     fingerprint: str = ""
     revision: str | None = None  # the hub's commit of the adapter
 

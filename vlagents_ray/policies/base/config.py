@@ -154,9 +154,7 @@ class ModelConfig(BaseModel, extra="forbid"):
         return sizes
 
     def compile_on(self, device: str) -> CompileMode:
-        """Return `compile` for a model on a kind of device, such as "cuda", in the place of
-        "auto".
-        """
+        """Return the setting `compile` for a kind of device, such as "cuda"; "auto" is resolved."""
         graphs: CompileMode = "graphs" if device == "cuda" and not self.adapters else False
         return graphs if self.compile == "auto" else self.compile
 

@@ -73,8 +73,8 @@ from vlagents_ray.weights.trainable import from_host, named_values, to_host
 
 logger = logging.getLogger(__name__)
 
-# Share of one pass's time that several may take: what they save has to exceed what measurements
-# vary by.
+# A batch is divided into several passes if these take less than this share of the time of one pass:
+# a smaller saving is within the spread of the measurements.
 _FASTER = 0.9
 
 T = TypeVar("T")

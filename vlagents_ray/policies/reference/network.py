@@ -1,8 +1,8 @@
 """The network of the reference policy."""
 
 # mypy: disable-error-code="misc"
-# torch's own types are not read, so that its classes are of type Any, which mypy would not have
-# subclassed.
+# mypy does not read torch's types (pyproject.toml). It therefore takes torch's classes for `Any`,
+# and its check of subclasses of `Any` is disabled here.
 
 from __future__ import annotations
 

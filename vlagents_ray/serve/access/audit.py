@@ -83,8 +83,11 @@ class Audit:
             logger.warning("key %s: refused: %s%s", name or "(none)", reason, suffix)
 
     def _count(self, name: str, event: str) -> str | None:
-        """Count an event; return the suffix of its line, or None if such an event was logged within
-        `_EVERY_S`.
+        """Count an event, and decide whether it is logged.
+
+        Returns:
+            The end of the event's line in the log, which states the number of omitted events; None
+            if such an event was logged within `_EVERY_S`.
         """
         now = time.monotonic()
         with self._lock:

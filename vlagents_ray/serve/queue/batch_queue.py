@@ -46,8 +46,8 @@ class BatchQueue:
     """The waiting requests, and the watched files that deliver new ones.
 
     One thread, the policy's, calls `bind`, then in turns `next`, `begin` and `end`, at last
-    `poller.close`. It waits on file descriptors, so that a local client's socket can be one: its
-    request then reaches the policy without a thread switch. While batches take milliseconds and are
+    `poller.close`. The thread waits on file descriptors, among them the sockets of local clients,
+    whose requests reach the policy without a thread switch. While batches take milliseconds and are
     not all for one session, a second thread polls these files, so that the next batch is already
     decoded when the current one ends.
 
