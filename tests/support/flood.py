@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import fcntl
+import functools
 import hashlib
 import itertools
 import json
@@ -786,8 +787,9 @@ def _bytes_of_an_observation(repetition: int) -> bytes:
     return _part_of_an_observation(repetition) if repetition < 2 else _http2_frame(0, 0, 3, b"x")
 
 
+@functools.cache  # otherwise most of the attack is work of the attacker, on the robot's own machine
 def _cancelled(repetition: int) -> bytes:
-    """Fifty requests that are cancelled at once."""
+    """Return fifty requests that are cancelled at once."""
     streams = range(100 * repetition + 1, 100 * repetition + 101, 2)
     return b"".join(
         _grpc_head(stream, _READY) + _http2_frame(3, 0, stream, bytes(3) + b"\x08")

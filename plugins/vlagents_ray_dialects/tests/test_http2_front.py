@@ -101,6 +101,17 @@ def test_more_frames_at_once_than_a_robot_sends_end_the_connection(connect: Conn
         assert len(answers) < 2000 * len(SETTINGS)
 
 
+def test_a_connection_with_too_many_frames_stays_open_so_that_its_client_does_not_return_at_once(
+    connect: Connect, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(http2_front, "_UNREAD_S", 0.5)
+    begun = time.monotonic()
+    with connect() as connection:
+        connection.sendall(PREFACE + SETTINGS * 1000)
+        read_to_the_end(connection)
+    assert 0.4 < time.monotonic() - begun < 5
+
+
 def test_frames_above_the_rate_wait(connect: Connect, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(http2_front, "_FRAMES_PER_S", 1e-6)
     monkeypatch.setattr(http2_front, "_FRAMES_AT_ONCE", 10)

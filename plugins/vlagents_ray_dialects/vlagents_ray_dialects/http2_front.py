@@ -36,6 +36,9 @@ _READ_BYTES = 64 * 1024
 # requests for each observation, it sends 270 in a second.
 _FRAMES_PER_S = 300.0
 _FRAMES_AT_ONCE = 150
+# Time for which a connection with more frames stays open, unread, s. If it ended at once, its
+# client would connect again, which costs the server more than the frames.
+_UNREAD_S = 1.0
 _STRANGERS = 64  # maximum number of connections that are no clients; a further one ends the oldest
 
 
@@ -194,6 +197,7 @@ class ForwardedConnection:
         while data := self._client.recv(_READ_BYTES):
             frames = self._frames.count(data)
             if frames > _FRAMES_AT_ONCE:
+                self._ended.wait(_UNREAD_S)
                 raise MalformedMessage(
                     f"expected at most {_FRAMES_AT_ONCE} small frames at once, got {frames}"
                 )
