@@ -41,11 +41,11 @@ from vlagents_ray_dialects.messages.gr00t import PRESETS, GR00TRequest, Observat
 logger = logging.getLogger(__name__)
 
 _FOLDER = re.compile(r"^(video|state|language)\.")
-# The parts of a message before its payload. A REQ socket adds an empty one, a DEALER socket those
-# of its program.
+# The parts of a message before its payload. A REQ socket adds an empty part, and a DEALER socket
+# adds the parts of its program.
 Envelope = tuple[bytes, ...]
-_ENVELOPES: tuple[Envelope, ...] = ((), (b"",))  # those of clients that are connected directly
-# Of an envelope that is answered with an error; others end the connection.
+_ENVELOPES: tuple[Envelope, ...] = ((), (b"",))  # the envelopes of directly connected clients
+# An envelope up to these sizes is answered with an error; a larger one ends the connection.
 _MOST_PARTS, _MOST_PART_BYTES = 4, 256
 _HANDSHAKE_S = 5.0
 _MESSAGE_S = 30.0  # maximum time of a message, from its first byte to its last
@@ -72,7 +72,7 @@ class GR00TConnection(GatewayClient):
     def __init__(self, dialect: GR00TDialect, connection: socket.socket) -> None:
         super().__init__(dialect.context)
         self._dialect, self._connection = dialect, connection
-        # flat: whether the client's last keys were N1.5's
+        # `_flat` is whether the client's last keys were N1.5's.
         self._mapping, self._flat = nested_mapping(dialect.mapping)
         self._is_robot = dialect.config.priority == "robot"
         self._share = share_of(connection)  # whose share of the bytes in flight its messages take
@@ -186,6 +186,7 @@ class GR00TConnection(GatewayClient):
                 continue
             if first is None:
                 return None
+
             deadline = min(deadline, time.monotonic() + _MESSAGE_S)
             flags = zmtp.read_flags(first[0])
             if flags.is_command:
@@ -193,6 +194,7 @@ class GR00TConnection(GatewayClient):
                 if not envelope:
                     deadline = float("inf")
                 continue
+
             size = zmtp.read_size(self._read(flags.size_bytes, _MESSAGE_S, deadline))
             if not flags.has_more:
                 if size > self._context.limits.body_bytes:
@@ -201,6 +203,7 @@ class GR00TConnection(GatewayClient):
                         f"{self._context.limits.body_bytes}"
                     )
                 return tuple(envelope), size, deadline
+
             if len(envelope) == _MOST_PARTS or sum(map(len, envelope)) + size > _MOST_PART_BYTES:
                 raise MalformedMessage(
                     f"gr00t: expected an envelope of at most {_MOST_PARTS} parts and "
@@ -336,21 +339,34 @@ class GR00TConnection(GatewayClient):
     def _act(self, asked: Observations) -> Any:
         mapping, contract = self._mapping, self._context.contract
         self._flat = asked.flat
-        seen = [
-            mapping.obs(gr00t.newest(one), self._context.limits, contract) for one in asked.each
-        ]
+
+        observations = []
+        instructions = []
+        for observation in asked.each:
+            obs, instruction = mapping.obs(
+                gr00t.newest(observation), self._context.limits, contract
+            )
+            observations.append(obs)
+            instructions.append(instruction)
+
         if not self.sessions.begun:
             mapping.warn_of_unread_cameras(gr00t.newest(asked.each[0]), "gr00t")
-        acts = self.sessions.act_batch([obs for obs, _ in seen], [text for _, text in seen])
+        acts = self.sessions.act_batch(observations, instructions)
+
         spec = None if contract is None else contract.action
-        info = {"done": [act.done for act in acts]} | {"timing": acts[0].info.get("timing", {})}
-        return gr00t.write_actions([mapping.actions(act.action, spec) for act in acts], asked, info)
+        info = {"done": [act.done for act in acts], "timing": acts[0].info.get("timing", {})}
+        actions = [mapping.actions(act.action, spec) for act in acts]
+        return gr00t.write_actions(actions, asked, info)
 
     def _modalities(self) -> dict[str, tuple[list[str], list[int]]]:
         mapping, contract = self._mapping, self._context.contract
         contract = contract or Contract()
+
         cameras = [(name, camera.key) for name, camera in mapping.cameras.items()]
-        state = [(name, part.key) for name, parts in mapping.state.items() for part in parts]
+        state = []
+        for name, state_keys in mapping.state.items():
+            state += [(name, state_key.key) for state_key in state_keys]
+
         chunk = contract.chunk or 1
         return {
             "video": (_theirs(cameras, contract.cameras or {}), [0]),
@@ -372,11 +388,13 @@ def _theirs(entries: Iterable[tuple[str, str]], needed: Iterable[str]) -> list[s
     """Return the client's names of the policy's cameras or states; `*` in the mapping keeps the
     policy's names.
     """
-    found: dict[str, None] = {}
+    client_names: dict[str, None] = {}  # an ordered set
     for ours, key in entries:
-        names = needed if "*" in key else [key.rpartition("/")[2]]
-        found |= dict.fromkeys(name for name in names if "*" not in key or matches(name, ours))
-    return list(found)
+        if "*" in key:
+            client_names |= dict.fromkeys(name for name in needed if matches(name, ours))
+        else:
+            client_names[key.rpartition("/")[2]] = None
+    return list(client_names)
 
 
 def nested_mapping(mapping: KeyMapping) -> tuple[KeyMapping, bool]:
@@ -385,18 +403,26 @@ def nested_mapping(mapping: KeyMapping) -> tuple[KeyMapping, bool]:
     """
 
     def folders(key: str) -> str:
-        return "|".join(_FOLDER.sub(r"\1/", one) for one in key.split("|"))
+        return "|".join(_FOLDER.sub(r"\1/", alternative) for alternative in key.split("|"))
 
+    cameras = {}
+    for name, camera in mapping.cameras.items():
+        cameras[name] = replace(camera, key=folders(camera.key))
+
+    state = {}
+    for name, state_keys in mapping.state.items():
+        state[name] = tuple(
+            replace(state_key, key=folders(state_key.key)) for state_key in state_keys
+        )
+
+    action = {name.removeprefix("action."): columns for name, columns in mapping.action.items()}
     nested = replace(
         mapping,
-        cameras={name: replace(one, key=folders(one.key)) for name, one in mapping.cameras.items()},
-        state={
-            name: tuple(replace(one, key=folders(one.key)) for one in of)
-            for name, of in mapping.state.items()
-        },
+        cameras=cameras,
+        state=state,
         gripper=mapping.gripper and replace(mapping.gripper, key=folders(mapping.gripper.key)),
         instruction=mapping.instruction and f"language/{gr00t.TEXT_KEY}",
-        action={name.removeprefix("action."): one for name, one in mapping.action.items()},
+        action=action,
     )
     return nested, nested.cameras != mapping.cameras or nested.state != mapping.state
 
@@ -422,8 +448,8 @@ class GR00TDialect(PortDialect):
 
     def __init__(self, name: str, config: GR00TDialectConfig, context: GatewayContext) -> None:
         super().__init__(name, config, context)
-        # Bytes of strangers' incomplete messages. One address may take half, which is the largest
-        # message.
+        # Limits the bytes of strangers' incomplete messages. One address may take half of them,
+        # which is the size of the largest message.
         self.of_strangers = Admission(2 * context.limits.body_bytes)
         self._clients: GatewayClients[int, GR00TConnection] = GatewayClients(context)  # by `id`
         self._lock = threading.Lock()  # guards the next two fields
@@ -447,8 +473,13 @@ class GR00TDialect(PortDialect):
         return self._acceptor is not None and self._acceptor.alive()
 
     def close(self) -> None:
-        # A client of this protocol waits for ever for an answer that does not come.
+        """Answer the requests that have arrived, reject later ones, and end all connections.
+
+        Each request needs an answer: a client of this protocol waits for ever for an answer that
+        does not come.
+        """
         self._stopping.set()
+
         until = time.monotonic() + _END_S
         with self._lock:
             connections = list(self._connections)
@@ -457,12 +488,14 @@ class GR00TDialect(PortDialect):
         for connection in connections:
             with contextlib.suppress(OSError):  # the client has disconnected
                 connection.refuse_waiting(_stopping())
+
         if self._acceptor is not None:
             self._acceptor.close()
         with self._lock:
             connections = list(self._connections)
         for connection in connections:
             connection.stop_reading()
+
         until = time.monotonic() + _LINGER_S
         for connection in connections:
             connection.thread.join(max(0.0, until - time.monotonic()))
@@ -472,8 +505,8 @@ class GR00TDialect(PortDialect):
     def read_key(self, payload: memoryview, *, of_client: bool) -> str | None:
         """Return the API key in a message; None if it has none.
 
-        Those of strangers are read on one thread: each thread's heap would keep the memory of the
-        largest message.
+        The keys of strangers are read on one thread, since each thread's heap would keep the memory
+        of the largest message.
         """
         if of_client:
             return gr00t.read_token(payload, self.context.limits)

@@ -62,6 +62,7 @@ def read_token(payload: bytes | memoryview, limits: MessageLimits) -> str | None
         raise MessageTooLarge(
             f"gr00t: a message of {len(payload)} bytes, the limit is {limits.body_bytes}"
         )
+
     package = require("msgpack")
     reader = package.Unpacker(
         max_buffer_size=limits.body_bytes,
@@ -78,6 +79,7 @@ def read_token(payload: bytes | memoryview, limits: MessageLimits) -> str | None
             token = reader.unpack()
             if token is not None and not isinstance(token, str):
                 raise MalformedMessage(f"gr00t: api_token: got {type(token).__name__}, want text")
+
             return token
     except (package.exceptions.UnpackException, ValueError, TypeError) as error:
         if isinstance(error, MalformedMessage):
@@ -102,11 +104,10 @@ def read_request(payload: bytes | memoryview, limits: MessageLimits) -> GR00TReq
     document = msgpack.unpack(payload, limits, array, text=limits.text)
     if not isinstance(document, dict):
         raise MalformedMessage(f"gr00t: got {type(document).__name__}, want a map")
-    endpoint, data, token = (
-        document.get("endpoint", "get_action"),
-        document.get("data"),
-        document.get("api_token"),
-    )
+
+    endpoint = document.get("endpoint", "get_action")
+    data = document.get("data")
+    token = document.get("api_token")
     if not isinstance(endpoint, str) or endpoint not in ENDPOINTS:
         raise MalformedMessage(
             f"gr00t: unknown endpoint {shown(endpoint)}, want one of {list(ENDPOINTS)}"
@@ -125,43 +126,42 @@ def read_observations(data: Mapping[str, Any]) -> Observations:
     paired = isinstance(data.get("observation"), dict)
     observation = data["observation"] if paired else data
     flat = is_flat(observation)
-    named = nested(observation) if flat else observation
-    groups = {kind: _arrays(named.get(kind), kind) for kind in _ARRAYS}
-    axes = {
-        array.ndim - usual
-        for kind, usual in (("video", 4), ("state", 2))
-        for array in groups[kind].values()
-    }
-    if axes not in ({0}, {1}):
-        shapes = {
-            name: array.shape
-            for name, array in list((groups["video"] | groups["state"]).items())[:8]
-        }
+    by_modality = nested(observation) if flat else observation
+    groups = {kind: _arrays(by_modality.get(kind), kind) for kind in _ARRAYS}
+
+    batch_axes = {array.ndim - 4 for array in groups["video"].values()}
+    batch_axes |= {array.ndim - 2 for array in groups["state"].values()}
+    if batch_axes not in ({0}, {1}):
+        first_arrays = list((groups["video"] | groups["state"]).items())[:8]
+        shapes = {name: array.shape for name, array in first_arrays}
         raise InvalidObservation(
             f"observation: got {shapes}, want videos (B, T, H, W, 3) and states (B, T, D)"
         )
-    batched = axes == {1}
+    batched = batch_axes == {1}
     if not batched:
-        groups = {
-            kind: {name: array[None] for name, array in group.items()}
-            for kind, group in groups.items()
-        }
-    arrays = [array for group in groups.values() for array in group.values()]
+        for kind in _ARRAYS:
+            groups[kind] = {name: array[None] for name, array in groups[kind].items()}
+
+    arrays = [*groups["video"].values(), *groups["state"].values()]
     sizes = {array.shape[0] for array in arrays}
     if len(sizes) != 1 or not 0 < min(sizes) <= _BATCH:
         raise InvalidObservation(
             f"observation: got batches of {sorted(sizes)}, want the same, 1 to {_BATCH}, in all"
         )
+
     number = sizes.pop()
-    texts = _texts(named.get("language"), number)
+    texts = _texts(by_modality.get("language"), number)
     if any(array.shape[1] == 0 for array in arrays):
         raise InvalidObservation("observation: got no moment (T = 0), want one at least")
-    each = tuple(
-        {kind: {name: array[i] for name, array in group.items()} for kind, group in groups.items()}
-        | {"language": {} if texts[i] is None else {TEXT_KEY: texts[i]}}
-        for i in range(number)
-    )
-    return Observations(each, batched, flat, paired)
+
+    each = []
+    for i in range(number):
+        single: dict[str, Any] = {}
+        for kind, group in groups.items():
+            single[kind] = {name: array[i] for name, array in group.items()}
+        single["language"] = {} if texts[i] is None else {TEXT_KEY: texts[i]}
+        each.append(single)
+    return Observations(tuple(each), batched, flat, paired)
 
 
 def is_flat(observation: Mapping[str, Any]) -> bool:
@@ -173,24 +173,25 @@ def nested(flat: Mapping[str, Any]) -> dict[str, Any]:
     """Return {"video": {"front": …}} for {"video.front": …}; keys other than video and state
     become language.
     """
-    found: dict[str, Any] = {kind: {} for kind in _MODALITIES}
+    by_modality: dict[str, Any] = {kind: {} for kind in _MODALITIES}
     for key, value in flat.items():
         kind, _, name = key.partition(".") if isinstance(key, str) else ("", "", "")
         if kind in _ARRAYS:
-            found[kind][name] = value
+            by_modality[kind][name] = value
         else:
-            found["language"][key] = value
-    return found
+            by_modality["language"][key] = value
+    return by_modality
 
 
 def newest(observation: Mapping[str, Any]) -> dict[str, Any]:
     """Return an observation's last time step: {"video": {name: (H, W, 3)}, "state": {name:
     (D,)}, "language": ...}.
     """
-    arrays = {
-        kind: {name: array[-1] for name, array in observation[kind].items()} for kind in _ARRAYS
-    }
-    return arrays | {"language": observation["language"]}
+    last_step: dict[str, Any] = {}
+    for kind in _ARRAYS:
+        last_step[kind] = {name: array[-1] for name, array in observation[kind].items()}
+    last_step["language"] = observation["language"]
+    return last_step
 
 
 def write_actions(
@@ -202,14 +203,14 @@ def write_actions(
     If the request `asked` has no batch dimension, the reply has none. `info` is only sent to N1.6
     and newer.
     """
-    shapes = {name: {one[name].shape for one in actions} for name in actions[0]}
-    if any(len(found) > 1 for found in shapes.values()):
+    columns = {name: [action[name] for action in actions] for name in actions[0]}
+    shapes = {name: {array.shape for array in arrays} for name, arrays in columns.items()}
+    if any(len(shapes_of_name) > 1 for shapes_of_name in shapes.values()):
         raise InvalidObservation(
             f"the batch's actions differ in length ({shapes}); send its observations one by one"
         )
-    joined = {
-        name: np.stack([one[name] for one in actions]).astype(np.float32) for name in actions[0]
-    }
+
+    joined = {name: np.stack(arrays).astype(np.float32) for name, arrays in columns.items()}
     if not asked.batched:
         joined = {name: array[0] for name, array in joined.items()}
     if asked.flat:
@@ -230,12 +231,15 @@ def modality_config(
     for name, (keys, steps) in modalities.items():
         if not keys:
             continue
-        named = (
-            [_FLAT_TEXT_KEY if name == "language" else _flat(name, key) for key in keys]
-            if flat
-            else list(keys)
-        )
-        config = {"delta_indices": list(steps), "modality_keys": named}
+
+        if not flat:
+            client_keys = list(keys)
+        elif name == "language":
+            client_keys = [_FLAT_TEXT_KEY] * len(keys)
+        else:
+            client_keys = [_flat(name, key) for key in keys]
+
+        config = {"delta_indices": list(steps), "modality_keys": client_keys}
         answer[name] = {
             "__ModalityConfig_class__": True,
             "as_json": json.dumps(config) if flat else config,
@@ -284,7 +288,7 @@ def _texts(language: Any, number: int) -> list[str | None]:
         raise InvalidObservation(
             f"{shown(key)}: want {number} instructions, one for each observation"
         )
-    return [_text(key, one) for one in texts]
+    return [_text(key, text) for text in texts]
 
 
 def _text(key: Any, value: Any) -> str:
@@ -317,14 +321,18 @@ def read_npy(data: Any, limits: MessageLimits) -> Any:
     """
     if not isinstance(data, bytes) or not data.startswith(_NPY) or len(data) < 12:
         raise MalformedMessage("gr00t: as_npy: not an .npy file")
+
+    # Version 1 of the format has a header length of two bytes, later versions one of four.
     start = 12 if data[6] > 1 else 10
     length = int.from_bytes(data[8:start], "little")
     header = _HEADER.fullmatch(data[start : start + length]) if length < 1000 else None
     if header is None:
         raise MalformedMessage("gr00t: as_npy: want a plain array of numbers or text")
+
     dtype, by_columns = header[1].decode(), header[2] == b"True"
     shape = [int(n) for n in header[3].replace(b" ", b"").split(b",") if n]
     content = memoryview(data)[start + length :]
+
     if _TEXT_DTYPE.fullmatch(dtype):
         count = len(content) // max(1, 4 * int(dtype[2:]))
         if count > limits.items or len(content) > 4 * limits.text or len(shape) > 2:
@@ -333,11 +341,10 @@ def read_npy(data: Any, limits: MessageLimits) -> Any:
             return np.frombuffer(content, dtype).reshape(shape).tolist()
         except (ValueError, SystemError) as error:
             raise MalformedMessage("gr00t: an array of text that is none") from error
-    return (
-        read_array(content, dtype, shape[::-1]).T
-        if by_columns
-        else read_array(content, dtype, shape)
-    )
+
+    if by_columns:
+        return read_array(content, dtype, shape[::-1]).T
+    return read_array(content, dtype, shape)
 
 
 def _array(node: dict[Any, Any], limits: MessageLimits) -> Any:
@@ -363,7 +370,7 @@ PRESETS: dict[str, dict[str, Any]] = {
     # N1.6 and newer: {"video": {k: (1, T, H, W, 3)}, "state": {k: (1, T, D)}, "language": {"task":
     # [[text]]}}
     "gr00t": {"cameras": {"*": "video/*"}, "state": {"*": "state/*"}, "instruction": "language/*"},
-    # N1.5 has the same content with flat keys
+    # N1.5 sends the same content with flat keys.
     "gr00t-n1.5": {
         "cameras": {"*": "video.*"},
         "state": {"*": "state.*"},
@@ -399,33 +406,50 @@ def batch(observations: Sequence[Mapping[str, Any]], text_key: str) -> dict[str,
         ValueError: The observations have different keys or shapes, and cannot be one batch.
     """
     first = observations[0]
-    kinds = {kind: list(first.get(kind, {})) for kind in _ARRAYS}
-    if any(
-        list(one.get(kind, {})) != names for one in observations for kind, names in kinds.items()
-    ):
-        raise ValueError("the observations have different keys")
-    joined: dict[str, Any] = {
-        kind: {name: np.stack([one[kind][name] for one in observations])[:, None] for name in names}
-        for kind, names in kinds.items()
-    }
-    texts = [next(iter(one.get("language", {}).values()), "") for one in observations]
-    return joined | {"language": {text_key: [[text] for text in texts]}}
+    names_by_kind = {kind: list(first.get(kind, {})) for kind in _ARRAYS}
+    for observation in observations:
+        for kind, names in names_by_kind.items():
+            if list(observation.get(kind, {})) != names:
+                raise ValueError("the observations have different keys")
+
+    joined: dict[str, Any] = {kind: {} for kind in names_by_kind}
+    for kind, names in names_by_kind.items():
+        for name in names:
+            arrays = [observation[kind][name] for observation in observations]
+            joined[kind][name] = np.stack(arrays)[:, None]
+
+    texts = []
+    for observation in observations:
+        language = observation.get("language", {})
+        texts.append([next(iter(language.values()), "")])
+    joined["language"] = {text_key: texts}
+    return joined
 
 
 def flat(batched: Mapping[str, Any]) -> dict[str, Any]:
     """Convert a batch to flat keys: `video.NAME`, `state.NAME`, and the instruction's own key
     with B texts.
     """
-    named = {f"{kind}.{name}": array for kind in _ARRAYS for name, array in batched[kind].items()}
-    return named | {key: [text for [text] in texts] for key, texts in batched["language"].items()}
+    flat_batch: dict[str, Any] = {}
+    for kind in _ARRAYS:
+        for name, array in batched[kind].items():
+            flat_batch[f"{kind}.{name}"] = array
+
+    for key, texts in batched["language"].items():
+        flat_batch[key] = [text for [text] in texts]
+    return flat_batch
 
 
 def write(endpoint: str, data: Any, api_token: str | None, *, packed: bool = False) -> bytes:
     """Return the message of a request; `data` is omitted if it is None; `packed` is the result
     of `reads_packed`.
     """
-    message = {"endpoint": endpoint} | ({} if data is None else {"data": data})
-    return pack(message | ({"api_token": api_token} if api_token else {}), packed=packed)
+    message: dict[str, Any] = {"endpoint": endpoint}
+    if data is not None:
+        message["data"] = data
+    if api_token:
+        message["api_token"] = api_token
+    return pack(message, packed=packed)
 
 
 def read(payload: bytes, limits: MessageLimits = DEFAULT_LIMITS) -> Any:
@@ -450,13 +474,15 @@ def read_actions(reply: Any, number: int) -> list[dict[str, np.ndarray]]:
             raise MalformedMessage(
                 f"gr00t: action {shown(name)}: got {described(array)}, want ({number}, H, D)"
             )
-    return [
-        {
-            name.removeprefix("action."): array[i] if array.ndim == 3 else array[i][:, np.newaxis]
-            for name, array in actions.items()
-        }
-        for i in range(number)
-    ]
+
+    split: list[dict[str, np.ndarray]] = []
+    for i in range(number):
+        action: dict[str, np.ndarray] = {}
+        for name, array in actions.items():
+            rows = array[i] if array.ndim == 3 else array[i][:, np.newaxis]
+            action[name.removeprefix("action.")] = rows
+        split.append(action)
+    return split
 
 
 def reads_packed(reply: Any) -> bool:
@@ -464,7 +490,7 @@ def reads_packed(reply: Any) -> bool:
     `msgpack_numpy`.
     """
     return isinstance(reply, dict) and any(
-        isinstance(one, dict) and _PACKED in one for one in reply.values()
+        isinstance(config, dict) and _PACKED in config for config in reply.values()
     )
 
 
@@ -474,10 +500,9 @@ def read_modalities(reply: Any) -> dict[str, dict[str, list[Any]]]:
     """
     if not isinstance(reply, dict):
         raise MalformedMessage(f"gr00t: got {type(reply).__name__} for modalities, want a map")
-    return {
-        str(name): _modality(str(name), value)
-        for name, value in list(reply.items())[:_KEYS_AT_MOST]
-    }
+
+    first_modalities = list(reply.items())[:_KEYS_AT_MOST]
+    return {str(name): _modality(str(name), value) for name, value in first_modalities}
 
 
 def _modality(name: str, value: Any) -> dict[str, list[Any]]:
@@ -487,18 +512,21 @@ def _modality(name: str, value: Any) -> dict[str, list[Any]]:
             config = json.loads(config)
         except (ValueError, RecursionError) as error:
             raise MalformedMessage(f"gr00t: modality {name[:40]!r}: no JSON ({error})") from error
+
     keys = config.get("modality_keys") if isinstance(config, dict) else None
     steps = config.get("delta_indices") if isinstance(config, dict) else None
     if not isinstance(keys, list) or not isinstance(steps, list):
         raise MalformedMessage(
             f"gr00t: modality {name[:40]!r}: want lists modality_keys and delta_indices"
         )
-    if not all(isinstance(key, str) for key in keys) or not all(
-        type(step) is int for step in steps
-    ):
+
+    are_texts = all(isinstance(key, str) for key in keys)
+    are_integers = all(type(step) is int for step in steps)
+    if not are_texts or not are_integers:
         raise MalformedMessage(
             f"gr00t: modality {name[:40]!r}: want texts and whole numbers in its lists"
         )
+
     if name != "language":
         keys = [key.removeprefix(f"{name}.") for key in keys]
     return {"keys": keys[:_KEYS_AT_MOST], "steps": steps}

@@ -43,8 +43,9 @@ class Outgoing:
     text_key: str = "task"  # the replacement of `*` in the instruction's key
 
     def __post_init__(self) -> None:
-        for name, parts in self.mapping.state.items():
-            if (open_ended := sum(part.stop is None for part in parts)) > 1:
+        for name, state_keys in self.mapping.state.items():
+            open_ended = sum(state_key.stop is None for state_key in state_keys)
+            if open_ended > 1:
                 raise ConfigError(
                     f"mapping.state.{name}: got {open_ended} parts without `stop`, want one at most"
                 )
@@ -56,19 +57,21 @@ class Outgoing:
         theirs: dict[str, Any] = {}
         for name, camera in self.mapping.cameras.items():
             for key, image in _matching(name, camera.key, obs.cameras, self.mapping.cameras):
-                self._put(
-                    theirs, key, image.transpose(2, 0, 1) if camera.layout == "chw" else image
-                )
+                converted = image.transpose(2, 0, 1) if camera.layout == "chw" else image
+                self._put(theirs, key, converted)
             if "*" not in name and name not in obs.cameras and not camera.optional:
                 raise MissingCamera(name, have=obs.cameras)
+
         for key, vector in self._vectors(obs).items():
             self._put(theirs, key, vector)
+
         if self.mapping.instruction is not None and instruction is not None:
-            self._put(
-                theirs, _first(self.mapping.instruction).replace("*", self.text_key), instruction
-            )
+            text_key = _first(self.mapping.instruction).replace("*", self.text_key)
+            self._put(theirs, text_key, instruction)
+
         for name, key in self.mapping.info.items():
-            if (value := obs.info.get(name)) is not None:
+            value = obs.info.get(name)
+            if value is not None:
                 self._put(theirs, key, value)
         return theirs
 
@@ -78,93 +81,110 @@ class Outgoing:
         """
         if not isinstance(theirs, Mapping):
             return _numbers("action", theirs)
-        named = {name: _numbers(name, value) for name, value in theirs.items()}
-        if not (ranges := self.mapping.action):
-            if len(named) == 1:
-                return next(iter(named.values()))
+
+        arrays = {name: _numbers(name, value) for name, value in theirs.items()}
+        ranges = self.mapping.action
+        if not ranges:
+            if len(arrays) == 1:
+                return next(iter(arrays.values()))
             raise InvalidAction(
-                f"action: got {sorted(named)[:16]}, want one array; say in mapping.action which "
+                f"action: got {sorted(arrays)[:16]}, want one array; say in mapping.action which "
                 "columns each is"
             )
-        if absent := [name for name in ranges if name not in named]:
+
+        absent = [name for name in ranges if name not in arrays]
+        if absent:
             raise InvalidAction(
-                f"action: got {sorted(named)[:16]}, which lacks {absent}; change mapping.action"
+                f"action: got {sorted(arrays)[:16]}, which lacks {absent}; change mapping.action"
             )
-        if len({named[name].shape[:-1] for name in ranges}) != 1:
-            shapes = {name: named[name].shape for name in ranges}
+        if len({arrays[name].shape[:-1] for name in ranges}) != 1:
+            shapes = {name: arrays[name].shape for name in ranges}
             raise InvalidAction(f"action: got {shapes}, want the same number of rows in all")
-        taken = {name: (one.start or 0, named[name]) for name, one in ranges.items()}
-        for name, (start, part) in taken.items():
-            if (stop := ranges[name].stop) is not None and part.shape[-1] != stop - start:
+
+        pieces = []
+        for name, columns in ranges.items():
+            start, stop = columns.start or 0, columns.stop
+            width = arrays[name].shape[-1]
+            if stop is not None and width != stop - start:
                 raise InvalidAction(
-                    f"action {name!r}: got {part.shape[-1]} columns, mapping.action says "
+                    f"action {name!r}: got {width} columns, mapping.action says "
                     f"{stop - start}, {start} to {stop}; change it"
                 )
-        return _joined("action", list(taken.values()), InvalidAction)
+            pieces.append((start, arrays[name]))
+        return _joined("action", pieces, InvalidAction)
 
     def contract(self) -> Contract:
         """Return the contract that follows from the mapping: the policy's inputs and the
         commands of its gripper.
         """
         mapping = self.mapping
-        grippers = {(one.open, one.closed) for one in mapping.action_gripper}
-        opened, closed = grippers.pop() if len(grippers) == 1 else (None, None)
-        stops = [one.stop for one in mapping.action.values()]
-        return Contract(
-            cameras={
-                name: CameraSpec()
-                for name, one in mapping.cameras.items()
-                if "*" not in name and not one.optional
-            },
-            state={
-                name: StateSpec(dim=_width(parts))
-                for name, parts in mapping.state.items()
-                if "*" not in name and not all(part.optional for part in parts)
-            },
-            gripper=(
-                self._own_gripper() and mapping.gripper is not None and not mapping.gripper.optional
-            )
-            or None,
-            instruction=True if mapping.instruction is not None else None,
-            action=ActionSpec(
-                dim=max((stop for stop in stops if stop is not None), default=None)
-                if None not in stops
-                else None,
-                gripper_open=opened,
-                gripper_closed=closed,
-            ),
+
+        cameras = {}
+        for name, camera in mapping.cameras.items():
+            if "*" not in name and not camera.optional:
+                cameras[name] = CameraSpec()
+
+        state = {}
+        for name, state_keys in mapping.state.items():
+            is_optional = all(state_key.optional for state_key in state_keys)
+            if "*" not in name and not is_optional:
+                state[name] = StateSpec(dim=_width(state_keys))
+
+        needs_gripper = (
+            self._has_separate_gripper()
+            and mapping.gripper is not None
+            and not mapping.gripper.optional
         )
 
-    def _own_gripper(self) -> bool:
+        commands = {(command.open, command.closed) for command in mapping.action_gripper}
+        opened, closed = commands.pop() if len(commands) == 1 else (None, None)
+        stops = [columns.stop for columns in mapping.action.values()]
+        known_stops = [stop for stop in stops if stop is not None]
+        action_dim = max(known_stops, default=None) if len(known_stops) == len(stops) else None
+
+        return Contract(
+            cameras=cameras,
+            state=state,
+            gripper=needs_gripper or None,
+            instruction=True if mapping.instruction is not None else None,
+            action=ActionSpec(dim=action_dim, gripper_open=opened, gripper_closed=closed),
+        )
+
+    def _has_separate_gripper(self) -> bool:
         """Return whether the gripper has its own number; if not, the number is part of a state,
         which then sets it.
         """
         gripper = self.mapping.gripper
-        return gripper is not None and not any(
-            _first(part.key) == _first(gripper.key)
-            and (part.start or 0) <= gripper.index
-            and (part.stop is None or gripper.index < part.stop)
-            for parts in self.mapping.state.values()
-            for part in parts
-        )
+        if gripper is None:
+            return False
+
+        for state_keys in self.mapping.state.values():
+            for state_key in state_keys:
+                is_same_key = _first(state_key.key) == _first(gripper.key)
+                begins_before = (state_key.start or 0) <= gripper.index
+                ends_after = state_key.stop is None or gripper.index < state_key.stop
+                if is_same_key and begins_before and ends_after:
+                    return False
+        return True
 
     def _vectors(self, obs: Obs) -> dict[str, np.ndarray]:
-        pieces: dict[str, list[tuple[int, np.ndarray]]] = {}
-        for name, parts in self.mapping.state.items():
+        """Return the vectors of the state and the gripper by their keys."""
+        pieces: dict[str, list[tuple[int, np.ndarray]]] = {}  # (start, values) by key
+        for name, state_keys in self.mapping.state.items():
             for matched, vector in _matching(name, name, obs.state, self.mapping.state):
-                keys = [
-                    (_first(part.key).replace("*", _rest(matched, name)), part) for part in parts
-                ]
-                for key, part, values in _split(matched, vector, keys):
-                    pieces.setdefault(key, []).append((part.start or 0, values))
-            if (
-                "*" not in name
-                and name not in obs.state
-                and not all(part.optional for part in parts)
-            ):
+                keys = []
+                for state_key in state_keys:
+                    key = _first(state_key.key).replace("*", _rest(matched, name))
+                    keys.append((key, state_key))
+                for key, state_key, values in _split(matched, vector, keys):
+                    pieces.setdefault(key, []).append((state_key.start or 0, values))
+
+            is_optional = all(state_key.optional for state_key in state_keys)
+            if "*" not in name and name not in obs.state and not is_optional:
                 raise MissingState(name, have=obs.state)
+
         gripper = self.mapping.gripper
-        if gripper is not None and self._own_gripper():
+        if gripper is not None and self._has_separate_gripper():
             if obs.gripper is not None:
                 reading = gripper.closed + obs.gripper * (gripper.open - gripper.closed)
                 pieces.setdefault(_first(gripper.key), []).append(
@@ -172,20 +192,24 @@ class Outgoing:
                 )
             elif not gripper.optional:
                 raise MissingState("gripper", have=obs.state)
-        return {
-            key: found[0][1]
-            if len(found) == 1 and found[0][0] == 0
-            else _joined(key, found, InvalidObservation)
-            for key, found in pieces.items()
-        }
+
+        vectors = {}
+        for key, pieces_of_key in pieces.items():
+            first_start, first_values = pieces_of_key[0]
+            if len(pieces_of_key) == 1 and first_start == 0:
+                vectors[key] = first_values
+            else:
+                vectors[key] = _joined(key, pieces_of_key, InvalidObservation)
+        return vectors
 
     def _put(self, theirs: dict[str, Any], key: str, value: Any) -> None:
-        key, into = _first(key), theirs
+        """Set a value in `theirs`, or in its map that a nested key names."""
+        key, target = _first(key), theirs
         if self.is_nested(key):
             *folders, key = key.split("/")
             for folder in folders:
-                into = into.setdefault(folder, {})
-        into[key] = value
+                target = target.setdefault(folder, {})
+        target[key] = value
 
 
 def _first(key: str) -> str:
@@ -204,37 +228,43 @@ def _matching(
     """
     if "*" not in name:
         return [(key, values[name])] if name in values else []
-    return [
-        (key.replace("*", _rest(one, name)), value)
-        for one, value in values.items()
-        if one not in entries and one.startswith(name[:-1])
-    ]
+
+    matches = []
+    for value_name, value in values.items():
+        if value_name not in entries and value_name.startswith(name[:-1]):
+            matches.append((key.replace("*", _rest(value_name, name)), value))
+    return matches
 
 
-def _width(parts: tuple[StateKey, ...]) -> int | None:
-    """Return the length of a state; None if the mapping does not state it."""
-    widths = [None if part.stop is None else part.stop - (part.start or 0) for part in parts]
-    known = [width for width in widths if width is not None]
-    return sum(known) if len(known) == len(widths) else None
+def _width(state_keys: tuple[StateKey, ...]) -> int | None:
+    """Return the length of a state; None if the mapping does not contain it."""
+    width = 0
+    for state_key in state_keys:
+        if state_key.stop is None:
+            return None
+        width += state_key.stop - (state_key.start or 0)
+    return width
 
 
 def _split(
     name: str, vector: np.ndarray, keys: list[tuple[str, StateKey]]
 ) -> list[tuple[str, StateKey, np.ndarray]]:
     """Split a state's vector into its parts; the part without `stop` receives the rest."""
-    widths = [_width((part,)) for _, part in keys]
+    widths = [_width((state_key,)) for _, state_key in keys]
     known = sum(width for width in widths if width is not None)
-    if (vector.size < known) if None in widths else (vector.size != known):
+    is_mismatch = vector.size < known if None in widths else vector.size != known
+    if is_mismatch:
         raise InvalidObservation(
             f"state {name!r}: got {vector.size} numbers, the mapping says {known}; change one of "
             "them"
         )
-    found, at = [], 0
-    for (key, part), width in zip(keys, widths, strict=True):
+
+    pieces, at = [], 0
+    for (key, state_key), width in zip(keys, widths, strict=True):
         end = at + (vector.size - known if width is None else width)
-        found.append((key, part, vector[at:end]))
+        pieces.append((key, state_key, vector[at:end]))
         at = end
-    return found
+    return pieces
 
 
 def _joined(
@@ -248,11 +278,13 @@ def _joined(
         raise ConfigError(
             f"mapping: {key!r}: got places up to {end}, want 0 to {_MOST}, counted from the front"
         )
+
     whole = np.empty((*pieces[0][1].shape[:-1], end), np.float32)
     filled = np.zeros(end, bool)
     for start, piece in pieces:
         whole[..., start : start + piece.shape[-1]] = piece
         filled[start : start + piece.shape[-1]] = True
+
     if not filled.all():
         missing = np.flatnonzero(~filled)[:8].tolist()
         raise error(f"{key!r}: nothing in the mapping fills the numbers at {missing}; add them")
