@@ -69,13 +69,13 @@ def read_instructions(data: Buffer, limits: MessageLimits) -> PolicyInstructions
     """Return the policy instructions in a pickle; raises `InvalidObservation` for features that
     are not served.
     """
-    stated = _pickled_fields(data, limits, SETUP)
-    policy_type, checkpoint = (
-        _text(stated, name) for name in ("policy_type", "pretrained_name_or_path")
-    )
-    rows, features, renames = (
-        stated[name] for name in ("actions_per_chunk", "lerobot_features", "rename_map")
-    )
+    fields = _pickled_fields(data, limits, SETUP)
+    policy_type = _text(fields, "policy_type")
+    checkpoint = _text(fields, "pretrained_name_or_path")
+    rows = fields["actions_per_chunk"]
+    features = fields["lerobot_features"]
+    renames = fields["rename_map"]
+
     if type(rows) is not int or rows < 1:
         raise MalformedMessage(
             f"actions_per_chunk: got {_shown(rows)}, want an integer of 1 or more"
@@ -88,6 +88,7 @@ def read_instructions(data: Buffer, limits: MessageLimits) -> PolicyInstructions
         raise InvalidObservation(
             "rename_map: got names, want none; rename them in dialects.lerobot.mapping"
         )
+
     state: tuple[str, ...] = ()
     for name, feature in features.items():
         if not isinstance(feature, dict):
@@ -102,6 +103,7 @@ def read_instructions(data: Buffer, limits: MessageLimits) -> PolicyInstructions
                 f"lerobot_features: got {name[:_SHOWN]!r} of {kind[:_SHOWN]!r}, want {STATE!r} of "
                 f"float32, and images {IMAGES + 'NAME'!r}"
             )
+
     cameras = tuple(name.removeprefix(IMAGES) for name in features if name != STATE)
     if len(cameras) > limits.cameras or len(state) > limits.state_values:
         raise MessageTooLarge(
@@ -115,8 +117,9 @@ def read_observation(data: Buffer, budget: Budget) -> RobotObservation:
     """Return the observation in a pickle; its arrays are views of the pickle, and count in
     `budget`.
     """
-    stated = _pickled_fields(data, budget.limits, OBSERVATION)
-    timestamp, timestep, values, must_go = (stated[name] for name in _REQUESTS[OBSERVATION])
+    fields = _pickled_fields(data, budget.limits, OBSERVATION)
+    timestamp, timestep, values, must_go = (fields[name] for name in _REQUESTS[OBSERVATION])
+
     if not is_number(timestamp) or not math.isfinite(timestamp):
         raise MalformedMessage(f"timestamp: got {_shown(timestamp)}, want a finite number")
     if type(timestep) is not int or not 0 <= timestep < _STEPS:
@@ -125,6 +128,7 @@ def read_observation(data: Buffer, budget: Budget) -> RobotObservation:
         raise MalformedMessage(f"must_go: got {_shown(must_go)}, want a bool")
     if not isinstance(values, dict):
         raise MalformedMessage(f"observation: got {_shown(values)}, want a dict")
+
     for name, value in values.items():
         if isinstance(value, np.ndarray):
             budget.count(value.nbytes)
@@ -151,7 +155,8 @@ def frame(observation: RobotObservation, robot: PolicyInstructions) -> dict[str,
     """
     values = observation.values
     have = [name[:_SHOWN] for name in values][:_SHOWN]
-    found: dict[str, Any] = {}
+    frame_values: dict[str, Any] = {}
+
     if robot.state:
         numbers = []
         for name in robot.state:
@@ -164,14 +169,16 @@ def frame(observation: RobotObservation, robot: PolicyInstructions) -> dict[str,
                 raise InvalidObservation(f"{name[:_SHOWN]!r}: got {_shown(value)}, want a number")
             numbers.append(value)
         with np.errstate(over="ignore"):  # becomes infinite, as in LeRobot's own server
-            found[STATE] = np.array(numbers, np.float64).astype(np.float32)
+            frame_values[STATE] = np.array(numbers, np.float64).astype(np.float32)
+
     for name in robot.cameras:
         if name not in values:
             raise MissingCamera(name[:_SHOWN], have=have)
-        found[IMAGES + name] = values[name]
+        frame_values[IMAGES + name] = values[name]
+
     if TASK in values:
-        found[TASK] = values[TASK]
-    return found
+        frame_values[TASK] = values[TASK]
+    return frame_values
 
 
 def write_chunk(rows: np.ndarray, timestamp: float, timestep: int, period_s: float) -> bytes:
@@ -191,6 +198,7 @@ def write_chunk(rows: np.ndarray, timestamp: float, timestep: int, period_s: flo
         raise InvalidObservation(
             f"timestep: got {timestep}, which leaves no numbers for {len(rows)} actions"
         )
+
     parts = [b"\x80\x02", _global(0, HELPERS, "TimedAction"), _global(1, "torch", "tensor"), b"]("]
     for number, row in enumerate(rows):
         values = b"".join(b"G" + struct.pack(">d", value) for value in row.tolist())
@@ -214,12 +222,12 @@ def _global(memo: int, module: str, name: str) -> bytes:
     return f"c{module}\n{name}\n".encode() + bytes([ord("q"), memo, ord("0")])
 
 
-def _pickled_fields(data: Buffer, limits: MessageLimits, wanted: Name) -> dict[str, Any]:
-    return fields_of(read_pickle(data, limits, _REQUESTS, NUMPY_CALLS), wanted)
+def _pickled_fields(data: Buffer, limits: MessageLimits, class_name: Name) -> dict[str, Any]:
+    return fields_of(read_pickle(data, limits, _REQUESTS, NUMPY_CALLS), class_name)
 
 
-def _text(stated: Mapping[str, Any], name: str) -> str:
-    value = stated.get(name)
+def _text(fields: Mapping[str, Any], name: str) -> str:
+    value = fields.get(name)
     if not isinstance(value, str):
         raise MalformedMessage(f"{name}: got {_shown(value)}, want text")
     return value
@@ -319,12 +327,12 @@ def _protobuf_fields(message: bytes) -> Iterator[tuple[int, int | memoryview]]:
 
 
 def _varint(view: memoryview, at: int) -> tuple[int, int]:
-    """Return the number at `at`, and the place after it."""
+    """Return the number at `at`, and the index of the byte after it."""
     number = 0
-    for place, byte in enumerate(view[at : at + _VARINT_BYTES]):
-        number |= (byte & 0x7F) << (7 * place)
+    for index, byte in enumerate(view[at : at + _VARINT_BYTES]):
+        number |= (byte & 0x7F) << (7 * index)
         if byte < 0x80:
-            return number, at + place + 1
+            return number, at + index + 1
     raise MalformedMessage("protobuf: a number that ends too early")
 
 

@@ -105,13 +105,15 @@ def read_reset(
     document = json_numpy.loads(text, budget.limits, _LEVELS)
     if not (isinstance(document, list) and len(document) == 3):
         raise MalformedMessage("reset: want [observation, instruction, options]")
-    seen = _read(document[0], budget, segments)
+
+    request = _read(document[0], budget, segments)
     kwargs = _mapping(document[2], "reset: options")
-    if taken := kwargs.keys() & _TAKEN:
+    taken = kwargs.keys() & _TAKEN
+    if taken:
         raise MalformedMessage(f"reset: got the options {sorted(taken)}, which are no options")
-    return ObservationRequest(
-        seen.obs, _instruction(document[1], budget.limits), seen.robots
-    ), kwargs
+
+    instruction = _instruction(document[1], budget.limits)
+    return ObservationRequest(request.obs, instruction, request.robots), kwargs
 
 
 def write_act(act: Act, robots: Sequence[str], parts: Mapping[str, Part] | None = None) -> str:
@@ -120,20 +122,22 @@ def write_act(act: Act, robots: Sequence[str], parts: Mapping[str, Part] | None 
     """
     if not robots:
         return json_numpy.dumps({"action": act.action, "done": act.done, "info": act.info})
+
     rows = act.rows()
-    found = []
+    parts_by_robot = parts or dict.fromkeys(robots, Part())
+    steps = []
     for number, row in enumerate(rows):
         step = {}
-        for robot, part in (parts or dict.fromkeys(robots, Part())).items():
-            action, gripper = part.split(row)
+        for robot, columns in parts_by_robot.items():
+            action, gripper = columns.split(row)
             step[robot] = {
                 "action": action,
                 "gripper": gripper,
                 "done": act.done and number == len(rows) - 1,
                 "info": act.info if number == 0 else {},
             }
-        found.append(step)
-    return json_numpy.dumps({"acts": found})
+        steps.append(step)
+    return json_numpy.dumps({"acts": steps})
 
 
 def _read(document: Any, budget: Budget, segments: Segments) -> ObservationRequest:
@@ -142,32 +146,40 @@ def _read(document: Any, budget: Budget, segments: Segments) -> ObservationReque
     if "obs" not in top:
         _require_known(top, _ROBOT_2, "observation")
         return ObservationRequest(_robot(top, "", budget, segments), None, ())
+
     _require_known(top, _TOP_3, "observation")
-    if not (robots := _mapping(top["obs"], "observation.obs")):
+    robots = _mapping(top["obs"], "observation.obs")
+    if not robots:
         raise InvalidObservation("observation.obs: got no robot, want one or more")
     if len(robots) > limits.cameras:
         raise MessageTooLarge(
             f"observation.obs: got {len(robots)} robots, the limit is {limits.cameras}"
         )
-    views = [part.get("cameras") for part in robots.values() if isinstance(part, dict)]
+
+    # The cameras of all robots are counted before the first image is decoded.
+    views = [robot.get("cameras") for robot in robots.values() if isinstance(robot, dict)]
     cameras = sum(len(view) for view in views if isinstance(view, dict))
-    if cameras > limits.cameras:  # counts the cameras of all robots before decoding any
+    if cameras > limits.cameras:
         raise MessageTooLarge(f"cameras: got {cameras}, the limit is {limits.cameras}")
-    whole = Obs()
-    for name, part in robots.items():
-        robot = _mapping(part, f"observation.obs[{name[:40]!r}]")
+
+    obs = Obs()
+    for name, fields in robots.items():
+        robot = _mapping(fields, f"observation.obs[{name[:40]!r}]")
         _require_known(robot, _ROBOT_3, f"observation.obs[{name[:40]!r}]")
-        one = _robot(robot, "" if len(robots) == 1 else f"{name}/", budget, segments)
-        whole.cameras |= one.cameras
-        whole.state |= one.state
-        whole.info |= one.info
-        whole.gripper = one.gripper
-    if (goal := top.get("goal_image")) is not None:
+        prefix = "" if len(robots) == 1 else f"{name}/"
+        robot_obs = _robot(robot, prefix, budget, segments)
+        obs.cameras |= robot_obs.cameras
+        obs.state |= robot_obs.state
+        obs.info |= robot_obs.info
+        obs.gripper = robot_obs.gripper
+
+    goal = top.get("goal_image")
+    if goal is not None:
         kind = top.get("goal_image_data_type", RAW)
-        whole.info[GOAL_IMAGE] = _image(goal, kind, GOAL_IMAGE, budget, segments)
-    return ObservationRequest(
-        whole, _instruction(top.get("language_instruction"), limits), tuple(robots)
-    )
+        obs.info[GOAL_IMAGE] = _image(goal, kind, GOAL_IMAGE, budget, segments)
+
+    instruction = _instruction(top.get("language_instruction"), limits)
+    return ObservationRequest(obs, instruction, tuple(robots))
 
 
 def _robot(robot: Mapping[str, Any], prefix: str, budget: Budget, segments: Segments) -> Obs:
@@ -178,21 +190,20 @@ def _robot(robot: Mapping[str, Any], prefix: str, budget: Budget, segments: Segm
     cameras = _mapping(robot.get("cameras") or {}, "cameras")
     if len(cameras) > limits.cameras:
         raise MessageTooLarge(f"cameras: got {len(cameras)}, the limit is {limits.cameras}")
+
     kind = robot.get("camera_data_type", RAW)
-    obs = Obs(
-        {
-            prefix + name: _image(image, kind, name, budget, segments)
-            for name, image in cameras.items()
-        },
-        info={
-            prefix + name: value
-            for name, value in _mapping(robot.get("info") or {}, "info").items()
-        },
-    )
+    obs = Obs()
+    for name, image in cameras.items():
+        obs.cameras[prefix + name] = _image(image, kind, name, budget, segments)
+    for name, value in _mapping(robot.get("info") or {}, "info").items():
+        obs.info[prefix + name] = value
     for name in _PARTS:
-        if (part := robot.get(name)) is not None:
-            obs.state[prefix + name] = _part(part, name, limits)
-    if (gripper := robot.get("gripper")) is not None:
+        vector = robot.get(name)
+        if vector is not None:
+            obs.state[prefix + name] = _vector(vector, name, limits)
+
+    gripper = robot.get("gripper")
+    if gripper is not None:
         if isinstance(gripper, np.ndarray) and gripper.size == 1:
             gripper = gripper.item()
         if not is_number(gripper):
@@ -206,46 +217,49 @@ def _robot(robot: Mapping[str, Any], prefix: str, budget: Budget, segments: Segm
     return obs
 
 
-def _part(part: Any, name: str, limits: MessageLimits) -> np.ndarray:
-    if isinstance(part, list) and all(is_number(x) for x in part):
-        part = np.asarray(part, np.float32)
-    if not isinstance(part, np.ndarray) or part.dtype.kind not in "fiu":
-        raise InvalidObservation(f"{name}: got {type(part).__name__}, want (D,) float32")
-    if part.size > limits.state_values:
-        raise MessageTooLarge(f"{name}: got {part.size} values, the limit is {limits.state_values}")
-    return part.astype(np.float32).reshape(-1)
+def _vector(value: Any, name: str, limits: MessageLimits) -> np.ndarray:
+    """Return a part of the state, a list or an array of numbers, as (D,) float32."""
+    if isinstance(value, list) and all(is_number(x) for x in value):
+        value = np.asarray(value, np.float32)
+    if not isinstance(value, np.ndarray) or value.dtype.kind not in "fiu":
+        raise InvalidObservation(f"{name}: got {type(value).__name__}, want (D,) float32")
+    if value.size > limits.state_values:
+        raise MessageTooLarge(
+            f"{name}: got {value.size} values, the limit is {limits.state_values}"
+        )
+    return value.astype(np.float32).reshape(-1)
 
 
 def _image(image: Any, kind: Any, name: str, budget: Budget, segments: Segments) -> np.ndarray:
     """Return a camera's image, (H, W, 3) uint8; of several frames, (N, H, W, 3), the last one."""
     limits = budget.limits
     if kind == JPEG:
-        [found] = decode_files(
-            [json_numpy.decode_base64(image, f"camera {name[:40]!r}")], budget, [name]
-        )
+        file = json_numpy.decode_base64(image, f"camera {name[:40]!r}")
+        [frame] = decode_files([file], budget, [name])
     elif kind == SHARED:
-        found = _shared(_mapping(image, f"camera {name[:40]!r}"), budget, segments)
+        frame = _shared(_mapping(image, f"camera {name[:40]!r}"), budget, segments)
     elif kind == RAW:
         if not isinstance(image, np.ndarray):
             raise InvalidObservation(
                 f"camera {name[:40]!r}: got {type(image).__name__}, want an array"
             )
-        found = image
+        frame = image
     else:
         raise MalformedMessage(
             f"camera_data_type: got {shown(kind)}, want {RAW!r}, {JPEG!r} or {SHARED!r}"
         )
-    if found.ndim == 4 and len(found):
-        found = found[-1]
-    if found.ndim != 3 or found.shape[2] != 3 or found.dtype != np.uint8:
+
+    if frame.ndim == 4 and len(frame):
+        frame = frame[-1]
+    if frame.ndim != 3 or frame.shape[2] != 3 or frame.dtype != np.uint8:
         raise InvalidObservation(
-            f"camera {name[:40]!r}: got {found.shape} {found.dtype}, want (H, W, 3) uint8 RGB"
+            f"camera {name[:40]!r}: got {frame.shape} {frame.dtype}, want (H, W, 3) uint8 RGB"
         )
-    if found.shape[0] * found.shape[1] > limits.pixels:
+    if frame.shape[0] * frame.shape[1] > limits.pixels:
         raise MessageTooLarge(
-            f"camera {name[:40]!r}: got {found.shape[:2]} pixels, the limit is {limits.pixels}"
+            f"camera {name[:40]!r}: got {frame.shape[:2]} pixels, the limit is {limits.pixels}"
         )
-    return found
+    return frame
 
 
 def _shared(payload: Mapping[str, Any], budget: Budget, segments: Segments) -> np.ndarray:
@@ -259,7 +273,9 @@ def _shared(payload: Mapping[str, Any], budget: Budget, segments: Segments) -> n
         and all(type(n) is int and n > 0 for n in shape)
     ):
         raise MalformedMessage(f"shared memory: got the shape {shown(shape)}, want (H, W, 3)")
-    if (size := math.prod(shape)) > budget.limits.body_bytes:
+
+    size = math.prod(shape)
+    if size > budget.limits.body_bytes:
         raise MessageTooLarge(
             f"shared memory: got {size} bytes, the limit is {budget.limits.body_bytes}"
         )
@@ -277,16 +293,17 @@ def _instruction(value: Any, limits: MessageLimits) -> str | None:
     return value
 
 
-def _mapping(value: Any, what: str) -> dict[str, Any]:
+def _mapping(value: Any, path: str) -> dict[str, Any]:
     if not isinstance(value, dict):
-        raise MalformedMessage(f"{what}: got {type(value).__name__}, want an object")
+        raise MalformedMessage(f"{path}: got {type(value).__name__}, want an object")
     return value
 
 
-def _require_known(value: Mapping[str, Any], known: set[str], what: str) -> None:
-    if unknown := value.keys() - known:
+def _require_known(value: Mapping[str, Any], known: set[str], path: str) -> None:
+    unknown = value.keys() - known
+    if unknown:
         raise MalformedMessage(
-            f"{what}: unknown keys {shown(sorted(unknown))}, want some of {sorted(known)}"
+            f"{path}: unknown keys {shown(sorted(unknown))}, want some of {sorted(known)}"
         )
 
 
@@ -322,13 +339,14 @@ def read_result(body: bytes | bytearray, compressed: bool, limit: int) -> tuple[
     """Return a reply's sequence number, and its value or `RemoteError`; None if the message is
     not a reply.
     """
-    if (message := rpyc.read_reply(body, compressed, limit)) is None:
+    message = rpyc.read_reply(body, compressed, limit)
+    if message is None:
         return None
+
     sequence, ok, content = message
     if not ok:
-        return sequence, RemoteError(
-            content[:_ERROR] if isinstance(content, str) else shown(content, _ERROR)
-        )
+        text = content[:_ERROR] if isinstance(content, str) else shown(content, _ERROR)
+        return sequence, RemoteError(text)
     if not (isinstance(content, tuple) and len(content) == 2):
         raise MalformedMessage("rpyc: want (label, value)")
     return sequence, content[1]
@@ -339,16 +357,20 @@ def write_observation(observation: Mapping[str, Any]) -> str:
     gripper, (1,).
     """
     robots = {}
-    for name, one in observation.items():
-        if isinstance(one, Mapping):
-            gripper = one.get("gripper")
-            robots[name] = {
-                "cameras": dict(one.get("cameras", {})),
-                "camera_data_type": "raw",
-                "gripper": float(gripper[0]) if isinstance(gripper, np.ndarray) else gripper,
-                **{part: one.get(part) for part in ("joints", "xyzrpy", "tquat")},
-                "info": dict(one.get("info", {})),
-            }
+    for name, robot in observation.items():
+        if not isinstance(robot, Mapping):
+            continue
+
+        gripper = robot.get("gripper")
+        robots[name] = {
+            "cameras": dict(robot.get("cameras", {})),
+            "camera_data_type": "raw",
+            "gripper": float(gripper[0]) if isinstance(gripper, np.ndarray) else gripper,
+            "joints": robot.get("joints"),
+            "xyzrpy": robot.get("xyzrpy"),
+            "tquat": robot.get("tquat"),
+            "info": dict(robot.get("info", {})),
+        }
     return json_numpy.dumps(
         {
             "obs": robots,
@@ -375,12 +397,16 @@ def read_actions(text: str, limits: MessageLimits = DEFAULT_LIMITS) -> dict[str,
         )
     if any(step.keys() != steps[0].keys() for step in steps):
         raise MalformedMessage("vlagents: want the same robots in each step of `acts`")
+
+    actions = {}
     try:
-        return {robot: np.stack([_row(robot, step[robot]) for step in steps]) for robot in steps[0]}
+        for robot in steps[0]:
+            actions[robot] = np.stack([_row(robot, step[robot]) for step in steps])
     except ValueError as error:
         if isinstance(error, MalformedMessage):
             raise
         raise MalformedMessage(f"vlagents: steps of different lengths ({error})") from error
+    return actions
 
 
 def _row(robot: str, act: Any) -> np.ndarray:
@@ -389,7 +415,9 @@ def _row(robot: str, act: Any) -> np.ndarray:
         action = np.asarray(action)
     if not isinstance(action, np.ndarray) or action.ndim != 1 or action.dtype.kind not in "fiu":
         raise MalformedMessage(f"vlagents: action of {robot[:40]!r}: want (D,) numbers")
-    if (gripper := act.get("gripper")) is None:
+
+    gripper = act.get("gripper")
+    if gripper is None:
         return action
     if isinstance(gripper, np.ndarray) and gripper.size == 1:
         gripper = gripper.item()
