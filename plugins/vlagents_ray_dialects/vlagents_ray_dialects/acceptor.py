@@ -68,9 +68,12 @@ class Acceptor:
                 if now - checked_at >= TICK_S:
                     checked_at = now
                     self._check_clients()
-                if (wait_s := accepting.take(now)) > 0:
+
+                wait_s = accepting.take(now)
+                if wait_s > 0:
                     time.sleep(wait_s)
                     continue
+
                 try:
                     connection = accept_open(self._listener)
                 except TimeoutError:
@@ -83,6 +86,7 @@ class Acceptor:
                         # Other connections must end first if descriptors are exhausted.
                         time.sleep(0.1)
                     continue
+
                 if connection is None:
                     accepting.give_back()
                 else:

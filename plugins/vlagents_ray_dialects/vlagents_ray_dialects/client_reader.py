@@ -94,22 +94,26 @@ class ClientReader:
                 mmap.mmap(-1, length) if length > _MAPPED_BYTES else bytearray(length)
             )
             self._received, self._is_given_up = 0, False
+
         left = length
         try:
             while left:
                 wait_s = min(silent_s, deadline - time.monotonic())
                 if wait_s <= 0:
                     raise MessageTooLarge("a message took longer than a client may take")
+
                 self._connection.settimeout(wait_s)
                 received = self._connection.recv(min(left, _READ_BYTES))
                 if not received:
                     if left < length:
                         raise ConnectionResetError("the client disconnected within a message")
                     return None
+
                 left -= len(received)
                 self._keep(received)
         finally:
             self._arriving.release()
+
         with self._lock:
             data, self._data = self._data, memoryview(b"")
             if self._is_given_up:

@@ -41,7 +41,7 @@ class GatewaySessions:
         self._priority: PriorityName | None = None
         # Number of requests of the current message that were counted before it was read.
         self._counted = 0
-        self._held = 0  # number of sessions that are counted for the key
+        self._counted_sessions = 0  # number of sessions that are counted for the key
         self._agents: list[RemoteAgent] = []
         self._episodes: list[ImplicitEpisode] = []  # the episode of each of `_agents`
 
@@ -84,10 +84,12 @@ class GatewaySessions:
         """
         agents = self._sessions(len(obs))
         self._admit(len(obs))
+
         texts = [episode.instruction for episode in self._episodes]
         fresh = [i for i, text in enumerate(instructions) if self._episodes[i].begins(text)]
         for i in fresh:
             texts[i] = self._episodes[i].opening(instructions[i], self._contract)
+
         self.restart()  # undone below, once all sessions have replied
         if fresh:
             if isinstance(self._caller, Caller):
@@ -96,6 +98,7 @@ class GatewaySessions:
                 [obs[i] for i in fresh], [texts[i] for i in fresh], [agents[i] for i in fresh]
             )
             raise_first(infos)
+
         acts = agents[0].act_batch(obs, agents)
         for episode, text in zip(self._episodes, texts, strict=True):
             episode.began(text)
@@ -147,14 +150,16 @@ class GatewaySessions:
         if self._caller is None:
             raise TypeError("a session without a client: call show() first")
         # Counts sessions before they exist, and until they have ended.
-        self._hold(max(number, self._held))
+        self._hold(max(number, self._counted_sessions))
         if not self._agents:
             self._agents = [self._connect(self._key, self._priority)]
         for agent in self._agents[number:]:
             agent.close()
         del self._agents[number:]
         self._hold(number)
-        if missing := number - len(self._agents):
+
+        missing = number - len(self._agents)
+        if missing:
             self._agents += self._agents[0].sessions(missing)
         self._episodes = [
             *self._episodes[:number],
@@ -166,9 +171,9 @@ class GatewaySessions:
         """Set the number of sessions that count for the key; raise `TooManyRequests` over its
         limit.
         """
-        if isinstance(self._caller, Caller) and number != self._held:
-            self._caller.hold(number - self._held)
-        self._held = number
+        if isinstance(self._caller, Caller) and number != self._counted_sessions:
+            self._caller.hold(number - self._counted_sessions)
+        self._counted_sessions = number
 
     def _admit(self, number: int) -> None:
         """Count requests for the key; raise `TooManyRequests` over its rate, before any of them
@@ -239,7 +244,8 @@ class GatewayClients(Generic[K, C]):
         removed = []
         try:
             with self._lock:
-                if (earlier := self._clients.pop(key, None)) is not None:
+                earlier = self._clients.pop(key, None)
+                if earlier is not None:
                     removed.append(earlier)
                 if len(self._clients) >= self._context.sessions:
                     removed.append(self._clients.pop(self._idlest()))
@@ -277,17 +283,18 @@ class GatewayClients(Generic[K, C]):
     def _idlest(self) -> K:
         """Return the key of the client without a session that has been idle for the longest."""
         now = time.monotonic()
-        idle = [
-            (client.quiet_s(now), key)
-            for key, client in self._clients.items()
-            if not client.sessions.begun
-        ]
-        quiet_s, key = max(idle, key=lambda one: one[0], default=(0.0, None))
-        if key is None or quiet_s <= 0:
+        longest_s = 0.0
+        idlest: K | None = None
+        for key, client in self._clients.items():
+            quiet_s = client.quiet_s(now)
+            if not client.sessions.begun and quiet_s > longest_s:
+                longest_s, idlest = quiet_s, key
+
+        if idlest is None:
             raise PolicyUnavailable(
                 f"{len(self._clients)} clients are connected, the limit; try again later"
             )
-        return key
+        return idlest
 
 
 def _end(clients: list[C]) -> list[C]:

@@ -1,8 +1,8 @@
-"""What stands between the clients of a gRPC dialect and gRPC's server: a bound of connections and
-of frames.
+"""A proxy between the clients of a gRPC dialect and gRPC's server, which limits the connections and
+the frames.
 
-gRPC's library accepts and answers on native threads, as fast as a client sends: eight strangers who
-connect and send pings take both cores of a small machine. The front accepts at a bounded rate,
+gRPC's library accepts and answers on native threads, as fast as a client sends: eight strangers
+that connect and send pings take both cores of a small machine. The front accepts at a bounded rate,
 forwards no connection before its HTTP/2 preface, and reads no further from one that sends more
 small frames than a robot needs.
 """
@@ -27,7 +27,8 @@ from vlagents_ray_dialects.messages.http2 import PREFACE, FrameCounter
 
 logger = logging.getLogger(__name__)
 
-_SHORT_FOLDER = "/tmp"  # noqa: S108 - a name of a socket has 107 bytes; the folder in it is for this user only
+# The name of a socket has at most 107 bytes. Only this user can read the folder that is made in it.
+_SHORT_FOLDER = "/tmp"  # noqa: S108
 _HANDSHAKE_S = 5.0
 _SEND_S = 10.0  # maximum time for a client to accept a part of an answer
 _END_S = 3.0
@@ -72,12 +73,12 @@ class Http2Front:
         """
         connection = ForwardedConnection(self, client)
         with self._lock:
-            strangers = [
-                other
-                for other in self._connections
-                if other.is_open and not self._is_client(other.peer)
-            ]
+            strangers = []
+            for other in self._connections:
+                if other.is_open and not self._is_client(other.peer):
+                    strangers.append(other)
             self._connections[connection] = None
+
         if len(strangers) >= _STRANGERS:
             strangers[0].end()
         connection.thread.start()
@@ -107,10 +108,11 @@ class Http2Front:
         """
         with self._lock:
             connections = list(self._connections)
+
         deadline = time.monotonic() + _END_S
         clients = [connection for connection in connections if self._is_client(connection.peer)]
         for connection in connections:
-            if connection not in clients:  # a stranger delays no stop
+            if connection not in clients:  # A stranger must not delay the stop.
                 connection.end()
         for connection in clients:
             connection.wait_answered(deadline)
@@ -194,16 +196,24 @@ class ForwardedConnection:
         set_keep_alive(self._client)
 
     def _forward_requests(self) -> None:
-        while data := self._client.recv(_READ_BYTES):
+        while True:
+            data = self._client.recv(_READ_BYTES)
+            if not data:
+                return
+
             frames = self._frames.count(data)
             if frames > _FRAMES_AT_ONCE:
                 self._ended.wait(_UNREAD_S)
                 raise MalformedMessage(
                     f"expected at most {_FRAMES_AT_ONCE} small frames at once, got {frames}"
                 )
-            while (wait_s := self._allowed_frames.take(time.monotonic(), frames)) > 0:
+
+            wait_s = self._allowed_frames.take(time.monotonic(), frames)
+            while wait_s > 0:
                 if self._ended.wait(wait_s):
                     return
+                wait_s = self._allowed_frames.take(time.monotonic(), frames)
+
             # After the end of gRPC's server, its last answers are still forwarded.
             with contextlib.suppress(BrokenPipeError, ConnectionResetError):
                 self._server.sendall(data)
@@ -213,7 +223,7 @@ class ForwardedConnection:
             while data := self._server.recv(_READ_BYTES):
                 self._client.sendall(data)
         except OSError as error:
-            # a server that ends with unread requests resets the connection after its answers
+            # A server that ends with unread requests resets the connection after its answers.
             logger.info("%s: disconnected a client: %s", self._front.name, error)
         finally:
             wait_delivered(self._client, time.monotonic() + ANSWERS_S)

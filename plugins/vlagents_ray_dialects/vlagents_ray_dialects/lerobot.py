@@ -54,8 +54,8 @@ _REQUESTS = 4  # maximum number of concurrent requests of one client; LeRobot's 
 _HEARTBEAT_MS = 10_000
 # Maximum number of characters of an error, which gRPC sends in a header of 8 KiB at most.
 _DETAILS = 500
-# HTTP status -> name of gRPC's; clients repeat a request by themselves after UNAVAILABLE or
-# DEADLINE_EXCEEDED
+# The names of gRPC's status codes by HTTP status. Clients repeat a request by themselves after
+# UNAVAILABLE or DEADLINE_EXCEEDED.
 _STATUS = {
     400: "INVALID_ARGUMENT",
     403: "PERMISSION_DENIED",
@@ -73,9 +73,9 @@ _STATUS = {
 class _Waiting:
     """An observation that the policy has not received yet."""
 
-    seen: RobotObservation
+    observation: RobotObservation
     robot: PolicyInstructions
-    obs: Obs
+    obs: Obs  # the same observation, with the policy's names
     instruction: str | None
     admission: MessageAdmission
 
@@ -136,18 +136,18 @@ class LeRobotConnection(GatewayClient):
         if self._robot is None:
             raise NotReset("SendPolicyInstructions: got none since Ready; start the client again")
         admission.begin("act")
-        seen = lerobot.read_observation(data, admission)
-        if seen.timestep <= self._acted and not seen.must_go:
+        observation = lerobot.read_observation(data, admission)
+        if observation.timestep <= self._acted and not observation.must_go:
             return
-        theirs = lerobot.frame(seen, self._robot)
+
+        theirs = lerobot.frame(observation, self._robot)
         obs, instruction = self._mapping.obs(theirs, self._context.limits, self._context.contract)
         if not self.sessions.begun:
             self._mapping.warn_of_unread_cameras(theirs, "lerobot")
+
+        waiting = _Waiting(observation, self._robot, obs, instruction, admission)
         with self._arrival:
-            earlier, self._waiting = (
-                self._waiting,
-                _Waiting(seen, self._robot, obs, instruction, admission),
-            )
+            earlier, self._waiting = self._waiting, waiting
             self._arrival.notify()
         if earlier is not None:
             earlier.admission.release()
@@ -172,6 +172,9 @@ class LeRobotConnection(GatewayClient):
                 self.end()
 
     def end(self) -> None:
+        """Drop the waiting observation, and end the session; after a current action, if there is
+        one.
+        """
         with self._arrival:
             self._ended = True
             self._waiting = None
@@ -185,8 +188,8 @@ class LeRobotConnection(GatewayClient):
                 self._acting.release()
 
     def _act(self, waiting: _Waiting) -> bytes:
-        contract, seen = self._context.contract, waiting.seen
-        before, self._acted = self._acted, max(self._acted, seen.timestep)
+        contract, observation = self._context.contract, waiting.observation
+        before, self._acted = self._acted, max(self._acted, observation.timestep)
         try:
             act = self.sessions.act(waiting.obs, waiting.instruction)
         except BaseException:
@@ -195,13 +198,12 @@ class LeRobotConnection(GatewayClient):
             raise
         finally:
             waiting.admission.release()
-        rows: np.ndarray = self._mapping.rows(
-            act.action, None if contract is None else contract.action
-        )
+
+        spec = None if contract is None else contract.action
+        rows: np.ndarray = self._mapping.rows(act.action, spec)
+        chunk = rows[: waiting.robot.actions_per_chunk]
         hz = (contract and contract.control_hz) or _HZ
-        return lerobot.write_chunk(
-            rows[: waiting.robot.actions_per_chunk], seen.timestamp, seen.timestep, 1 / hz
-        )
+        return lerobot.write_chunk(chunk, observation.timestamp, observation.timestep, 1 / hz)
 
 
 class LeRobotDialectConfig(KeylessPortConfig):
@@ -212,8 +214,7 @@ class LeRobotDialectConfig(KeylessPortConfig):
     checkpoint: str | None = Field(
         default=None,
         description="the `pretrained_name_or_path` that clients must state; unset: any, as it is "
-        "not loaded: the "
-        "policy of the deployment acts",
+        "not loaded: the policy of the deployment acts",
     )
 
 
@@ -237,7 +238,7 @@ class LeRobotDialect(PortDialect):
     def __init__(self, name: str, config: LeRobotDialectConfig, context: GatewayContext) -> None:
         super().__init__(name, config, context)
         self._clients: GatewayClients[str, LeRobotConnection] = GatewayClients(context)
-        # gRPC's context of each observation that is being received -> its start.
+        # The time at which each observation that is being received began, by gRPC's context, s.
         self._uploads: dict[Any, float] = {}
         self._server: Any = None
         self._front: Http2Front | None = None
@@ -245,17 +246,21 @@ class LeRobotDialect(PortDialect):
         self._closing = threading.Event()
 
     def serve(self, listener: socket.socket) -> None:
+        """Start gRPC's server, and accept the connections of clients at `listener`."""
         grpc = require("grpc")
-        most = _REQUESTS * self.context.sessions
+
+        # The methods read and write plain bytes.
         unary, stream = grpc.unary_unary_rpc_method_handler, grpc.stream_unary_rpc_method_handler
-        methods = {  # over plain bytes
+        methods = {
             "Ready": unary(partial(self._answer, grpc, self._ready)),
             "SendPolicyInstructions": unary(partial(self._answer, grpc, self._set_up)),
             "SendObservations": stream(partial(self._answer, grpc, self._observe)),
             "GetActions": unary(partial(self._answer, grpc, self._act)),
         }
+
+        max_requests = _REQUESTS * self.context.sessions
         self._server = grpc.server(
-            ThreadPoolExecutor(most, "lerobot-client"),
+            ThreadPoolExecutor(max_requests, "lerobot-client"),
             handlers=[grpc.method_handlers_generic_handler(lerobot.SERVICE, methods)],
             options=[
                 ("grpc.max_concurrent_streams", _REQUESTS),
@@ -263,11 +268,12 @@ class LeRobotDialect(PortDialect):
                 ("grpc.server_handshake_timeout_ms", _HEARTBEAT_MS),
                 ("grpc.keepalive_time_ms", _HEARTBEAT_MS),
                 ("grpc.keepalive_timeout_ms", _HEARTBEAT_MS),
-                # a compressed message would be decompressed regardless of its size
+                # A compressed message would be decompressed regardless of its size.
                 ("grpc.compression_enabled_algorithms_bitset", 1),
             ],
-            maximum_concurrent_rpcs=most,
+            maximum_concurrent_rpcs=max_requests,
         )
+
         self._front = Http2Front(self.name, lambda peer: self._clients.get(peer) is not None)
         self._server.add_insecure_port(self._front.address)
         self._server.start()
@@ -281,7 +287,8 @@ class LeRobotDialect(PortDialect):
         self._closing.set()
         if self._acceptor is not None:
             self._acceptor.close()
-        # Then it ends the remaining requests.
+
+        # gRPC's server ends the requests that remain after `_END_S`.
         stopped = None if self._server is None else self._server.stop(_END_S)
         self._clients.end_all()
         if stopped is not None:
@@ -312,7 +319,8 @@ class LeRobotDialect(PortDialect):
 
     def _set_up(self, message: bytes, context: Any) -> None:
         with self._request(context) as client:
-            if (data := lerobot.read_data(message)) is None:
+            data = lerobot.read_data(message)
+            if data is None:
                 raise MalformedMessage("policy instructions: got none")
             client.set_up(lerobot.read_instructions(data, self.context.limits))
 
@@ -347,7 +355,8 @@ class LeRobotDialect(PortDialect):
 
     def _request(self, context: Any) -> AbstractContextManager[LeRobotConnection]:
         """Return the context of a request, with its client, identified by its connection."""
-        if (client := self._clients.get(context.peer())) is None:
+        client = self._clients.get(context.peer())
+        if client is None:
             raise NotReset(
                 "Ready: got none over this connection, or it was idle for too long; start the "
                 "client again"
