@@ -85,17 +85,22 @@ class MapDialect(base.RouteDialect):
         infer_ms = max(reply.timing["queue_ms"] + reply.timing["inference_ms"] for reply in replies)
         rows = [self.rows(reply) for reply in replies]
         actions = _stacked(rows) if batched else rows[0]
-        return (self.mapping.columns(actions) or {"actions": actions}) | {
-            "policy_timing": {"infer_ms": inference_ms}
-            | ({"batch_size": len(rows)} if batched else {}),
-            "server_timing": {"infer_ms": infer_ms}
-            | ({} if before_ms is None else {"prev_total_ms": before_ms}),
-        }
+
+        policy_timing: dict[str, Any] = {"infer_ms": inference_ms}
+        if batched:
+            policy_timing["batch_size"] = len(rows)
+        server_timing = {"infer_ms": infer_ms}
+        if before_ms is not None:
+            server_timing["prev_total_ms"] = before_ms
+
+        columns = self.mapping.columns(actions) or {"actions": actions}
+        return columns | {"policy_timing": policy_timing, "server_timing": server_timing}
 
 
 def _stacked(chunks: Sequence[np.ndarray]) -> np.ndarray:
     """Stack the chunks of a batch to (B, H, D)."""
-    if len(shapes := {chunk.shape for chunk in chunks}) > 1:
+    shapes = {chunk.shape for chunk in chunks}
+    if len(shapes) > 1:
         raise VLAgentsError(
             f"batch: got chunks of the shapes {sorted(shapes)}, and its reply is one array; send "
             "each by itself"
@@ -136,15 +141,16 @@ class OpenPiDialect(MapDialect):
     config: OpenPiDialectConfig
 
     def first(self) -> dict[str, Any]:
-        known = self.context.metadata()
-        return {
-            key: known.get(key) for key in ("policy", "checkpoint", "version")
-        } | self.config.metadata
+        """Return the policy's metadata, and the metadata in the dialect's settings."""
+        metadata = self.context.metadata()
+        message = {key: metadata.get(key) for key in ("policy", "checkpoint", "version")}
+        return message | self.config.metadata
 
     def speaks(self, message: dict[str, Any]) -> bool:
         return "endpoint" not in message
 
     def begins(self, message: dict[str, Any], connection: MapConnection) -> bytes | str | None:
+        """End the episodes of the connection if the message is a reset, and return its reply."""
         if message.keys() != {"reset"}:
             return None
         if message["reset"] is not True:
@@ -153,6 +159,7 @@ class OpenPiDialect(MapDialect):
         return openpi.encode(message) if self.config.answer_reset else b""
 
     def batch(self, message: dict[str, Any]) -> list[Any] | None:
+        """Return the observations of a batch; None if the message is one observation."""
         if message.keys() != {"batch"}:
             return None
         batch = message["batch"]
@@ -204,28 +211,30 @@ class RoboArenaDialect(MapDialect):
         return "endpoint" in message
 
     def begins(self, message: dict[str, Any], connection: MapConnection) -> bytes | str | None:
+        """End the episode at a reset or another `session_id`; return the reply to a reset."""
         endpoint = message.get("endpoint", "infer")
         if not isinstance(endpoint, str) or endpoint not in ("infer", "reset"):
             raise MalformedMessage(f"endpoint: got {shown(endpoint)}, want 'infer' or 'reset'")
         if endpoint == "reset":
             connection.end_episodes()
             return "reset successful"
-        if (named := message.get("session_id")) is not None:
+
+        session_id = message.get("session_id")
+        if session_id is not None:
             # The client sends a text, or an array with one text.
-            if isinstance(named, np.ndarray) and named.size == 1:
-                named = named.item()
-            episode = shown(named, NAME_CHARACTERS)
+            if isinstance(session_id, np.ndarray) and session_id.size == 1:
+                session_id = session_id.item()
+            episode = shown(session_id, NAME_CHARACTERS)
             if connection.episode not in (None, episode):
                 connection.end_episodes()
             connection.episode = episode
         return None
 
     def answer(self, replies: Sequence[Reply], before_ms: float | None, *, batched: bool) -> Any:
-        return (
-            self.rows(replies[0])
-            if self.config.bare
-            else super().answer(replies, before_ms, batched=batched)
-        )
+        """Encode the reply as a map, or as the array itself for older clients."""
+        if self.config.bare:
+            return self.rows(replies[0])
+        return super().answer(replies, before_ms, batched=batched)
 
 
 class MapConnection:
@@ -251,18 +260,25 @@ class MapConnection:
         first for the key.
         """
         dialect = self.dialect
-        if (answer := dialect.begins(message, self)) is not None:
+        answer = dialect.begins(message, self)
+        if answer is not None:
             return answer
+
         batch = dialect.batch(message)
         observations = [message] if batch is None else batch
         gate.count(len(observations) - 1)
-        read = [dialect.read(one) for one in observations]
+        inputs = [dialect.read(observation) for observation in observations]
+
         sessions = [self.session] if batch is None else await self._of_batch(len(batch))
         if not sessions[0].episode.begun:
             dialect.mapping.warn_of_unread_cameras(observations[0], dialect.name)
-        seen = [base.SessionObs(session, *one) for session, one in zip(sessions, read, strict=True)]
+        session_inputs = []
+        for session, (obs, instruction) in zip(sessions, inputs, strict=True):
+            session_inputs.append(base.SessionObs(session, obs, instruction))
+
         incoming.decoded_alike(len(observations))
-        replies = await base.act_together(incoming, seen, request_id)
+        replies = await base.act_together(incoming, session_inputs, request_id)
+
         before_ms, batched = self._before_ms, batch is not None
         data = incoming.written(
             lambda: openpi.encode(dialect.answer(replies, before_ms, batched=batched))
@@ -295,8 +311,12 @@ async def _stream(dialects: Sequence[MapDialect], socket: WebSocket) -> None:
     gate = dialects[0].gate()
     try:
         await socket.send_bytes(openpi.encode(dialects[-1].first()))
-        while (received := await dialects[0].receive(socket, gate)) is not None:
-            if not await _answer(dialects, socket, *received, connections, gate):
+        while True:
+            received = await dialects[0].receive(socket, gate)
+            if received is None:
+                return
+            data, admission = received
+            if not await _answer(dialects, socket, data, admission, connections, gate):
                 return
     except WebSocketDisconnect:
         return
@@ -319,6 +339,7 @@ async def _answer(
         message = await base.decoded(
             lambda data, budget: openpi.decode(data, budget.limits), data, admission
         )
+
         dialect = next((dialect for dialect in dialects if dialect.speaks(message)), dialects[0])
         arrived, incoming = incoming.arrived, dialect.arrived()
         incoming.arrived = arrived
@@ -330,11 +351,13 @@ async def _answer(
         problem = public_problem(error, incoming.transport, request_id)
         incoming.record_failure(problem.code)
         await socket.send_text(f"{problem} (request {request_id})")
+
         # The connection stays open, as nothing was acted on.
         if isinstance(problem, TooManyRequests):
             if gate.refused_too_often:
                 await socket.close(base.POLICY_VIOLATION, REFUSED)
             return not gate.refused_too_often
+
         if isinstance(problem, PolicyUnavailable):
             await socket.close(base.SERVICE_RESTART, str(problem)[:120])
         else:
@@ -342,6 +365,7 @@ async def _answer(
         return False
     finally:
         admission.release()
+
     if isinstance(answer, str):
         await socket.send_text(answer)
     elif answer:

@@ -93,9 +93,14 @@ class VlaEvalDialect(base.RouteDialect):
         inbox = _Inbox()
         reading = asyncio.ensure_future(inbox.fill(socket, gate, self))
         try:
-            while (received := await inbox.next()) is not None:
-                if (answer := await self._answer(received, session, chunk)) is not None:
+            while True:
+                received = await inbox.next()
+                if received is None:
+                    break
+                answer = await self._answer(received, session, chunk)
+                if answer is not None:
                     await socket.send_bytes(vla_eval.encode(answer))
+
             if inbox.end is not None:
                 await socket.close(base.POLICY_VIOLATION, inbox.end)
         except WebSocketDisconnect:
@@ -129,11 +134,12 @@ class VlaEvalDialect(base.RouteDialect):
                 f"protocol_version: got {shown(version, 20)}, want {vla_eval.PROTOCOL_VERSION}"
             )
             return _error(error, message.seq, uuid.uuid4().hex)
-        known = self.context.metadata()
+
+        metadata = self.context.metadata()
         payload: dict[str, Any] = {
-            "harness_version": f"vlagents-ray {known.get('version')}",
+            "harness_version": f"vlagents-ray {metadata.get('version')}",
             "protocol_version": vla_eval.PROTOCOL_VERSION,
-            "model_server": known.get("policy"),
+            "model_server": metadata.get("policy"),
             "capabilities": {},
         }
         if self.config.observation_params:
@@ -150,8 +156,8 @@ class VlaEvalDialect(base.RouteDialect):
         incoming = self.arrived()
         request_id = uuid.uuid4().hex
         try:
-            # Some benchmarks render only the observations that begin a chunk: those of its other
-            # rows are not read.
+            # Some benchmarks render only the observations that begin a chunk, so the observations
+            # of its other rows are not read.
             text = self.mapping.read_instruction(
                 message.payload, self.context.limits, self.context.contract
             )
@@ -160,11 +166,14 @@ class VlaEvalDialect(base.RouteDialect):
                 obs, instruction = self.read(payload)
                 if not session.episode.begun:
                     self.mapping.warn_of_unread_cameras(payload, self.name)
+
                 incoming.decoded_alike()
                 reply = await session.act(incoming, obs, instruction, request_id)
                 rows = incoming.written(lambda: self.rows(reply))
                 chunk.replace(rows[: self.config.execute])
-            return vla_eval.VlaEvalMessage("action", {"actions": chunk.take().action}, message.seq)
+
+            actions = {"actions": chunk.take().action}
+            return vla_eval.VlaEvalMessage("action", actions, message.seq)
         except Exception as error:  # noqa: BLE001 - the error is the reply to the client
             problem = public_problem(error, self.name, request_id)
             incoming.record_failure(problem.code)
@@ -192,14 +201,14 @@ class _Inbox:
 
     def __init__(self) -> None:
         self._messages: deque[_Received | None] = deque()
-        self._there = asyncio.Event()
+        self._arrival = asyncio.Event()
         self.end: str | None = None  # the reason why the server ends the connection
 
     async def next(self) -> _Received | None:
         """Wait for the oldest message and return it; None if the client is gone."""
         while not self._messages:
-            self._there.clear()
-            await self._there.wait()
+            self._arrival.clear()
+            await self._arrival.wait()
         return self._messages.popleft()
 
     async def fill(self, socket: WebSocket, gate: Sender, dialect: VlaEvalDialect) -> None:
@@ -208,7 +217,8 @@ class _Inbox:
         """
         try:
             while not gate.refused_too_often:
-                if (received := await dialect.receive(socket, gate)) is None:
+                received = await dialect.receive(socket, gate)
+                if received is None:
                     return
                 data, admission = received
                 if len(self._messages) >= _WAITING:
@@ -245,7 +255,7 @@ class _Inbox:
         ):
             self._messages.pop()
         self._messages.append(received)
-        self._there.set()
+        self._arrival.set()
 
 
 def _error(error: VLAgentsError, seq: int, request_id: str) -> vla_eval.VlaEvalMessage:

@@ -39,6 +39,7 @@ def unpack(
     """
     if len(data) > limits.body_bytes:
         raise MessageTooLarge(f"message: got {len(data)} bytes, the limit is {limits.body_bytes}")
+
     msgpack = require("msgpack")
     count = 0
 
@@ -53,11 +54,13 @@ def unpack(
 
     def hooked(values: dict[Any, Any]) -> Any:
         counted(values)
-        found = hook(values)
-        for texts in [found, *found] if isinstance(found, list) else ():
-            if isinstance(texts, list):
-                counted(texts)
-        return found
+        replacement = hook(values)
+        if isinstance(replacement, list):
+            counted(replacement)
+            for texts in replacement:
+                if isinstance(texts, list):
+                    counted(texts)
+        return replacement
 
     try:
         value = msgpack.unpackb(
@@ -78,6 +81,7 @@ def unpack(
         raise MalformedMessage(
             f"message: no msgpack ({type(error).__name__}: {str(error)[:100]})"
         ) from error
+
     require_plain(value, limits.depth)
     return value
 
@@ -103,15 +107,17 @@ def is_packed(node: Mapping[Any, Any]) -> bool:
 
 def read_packed(node: Mapping[Any, Any]) -> np.ndarray:
     """Return the array in a map of `msgpack_numpy` as a read-only view."""
-    found = {
-        (key.decode(errors="replace") if isinstance(key, bytes) else key): item
-        for key, item in node.items()
-    }
-    dtype, shape, data = found.get("type"), found.get("shape"), found.get("data")
-    if not isinstance(data, bytes) or found.get("kind") not in (None, "", b""):
+    fields = {}
+    for key, value in node.items():
+        name = key.decode(errors="replace") if isinstance(key, bytes) else key
+        fields[name] = value
+
+    dtype, shape, data = fields.get("type"), fields.get("shape"), fields.get("data")
+    if not isinstance(data, bytes) or fields.get("kind") not in (None, "", b""):
         raise MalformedMessage("array: nd: want bytes of a plain array")
+
     dtype = dtype.decode(errors="replace") if isinstance(dtype, bytes) else dtype
-    if found["nd"] is not True:
+    if fields["nd"] is not True:
         shape = []
     return read_array(data, dtype, list(shape) if isinstance(shape, (list, tuple)) else shape)
 

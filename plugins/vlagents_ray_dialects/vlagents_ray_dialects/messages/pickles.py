@@ -89,12 +89,14 @@ def read_pickle(
     return _StackMachine(data, limits, records, calls).whole()
 
 
-def fields_of(value: Any, wanted: Name) -> dict[str, Any]:
+def fields_of(value: Any, class_name: Name) -> dict[str, Any]:
     """Return the fields of an object of a data class; raise `MalformedMessage` for anything
     else.
     """
-    if not isinstance(value, Record) or value.name != wanted or value.fields is None:
-        raise MalformedMessage(f"pickle: got {_kind(value)}, want a {wanted.name} with its fields")
+    if not isinstance(value, Record) or value.name != class_name or value.fields is None:
+        raise MalformedMessage(
+            f"pickle: got {_kind(value)}, want a {class_name.name} with its fields"
+        )
     return value.fields
 
 
@@ -117,27 +119,34 @@ class _StackMachine:
         self._memo: list[_StackValue] = []
 
     def whole(self) -> Any:
+        """Execute all opcodes, and return the object that remains on the stack."""
         if self.take(1)[0] != _PROTO or self.take(1)[0] not in _PROTOCOLS:
             raise MalformedMessage(
                 f"pickle: want one of protocol {_PROTOCOLS[0]} or {_PROTOCOLS[1]}"
             )
-        while (opcode := self.take(1)[0]) != _STOP:
+
+        opcode = self.take(1)[0]
+        while opcode != _STOP:
             self._count(1)
-            if (read := _OPCODES.get(opcode)) is None:
+            execute = _OPCODES.get(opcode)
+            if execute is None:
                 raise MalformedMessage(f"pickle: got opcode {opcode:#04x}, which is not read here")
-            read(self)
+            execute(self)
+            opcode = self.take(1)[0]
+
         root = _finished(self.pop())
         if self._stack or self._below or self._at != len(self._data):
             raise MalformedMessage("pickle: more than one object in a message")
         return root
 
     def take(self, length: int) -> memoryview:
+        """Return the next bytes of the pickle as a view."""
         end = self._at + length
         if end > len(self._data):
             raise MalformedMessage("pickle: a message that ends too early")
-        found = self._data[self._at : end]
+        data = self._data[self._at : end]
         self._at = end
-        return found
+        return data
 
     def push(self, value: Any, depth: int = 0, items: int = 1) -> None:
         if depth > self._limits.depth:
@@ -148,6 +157,7 @@ class _StackMachine:
         return self._entry().value
 
     def text(self, length: int) -> None:
+        """Push the text in the next `length` bytes."""
         if length > self._limits.text:
             raise MessageTooLarge(
                 f"pickle: a text of {length} bytes, the limit is {self._limits.text}"
@@ -158,7 +168,8 @@ class _StackMachine:
             raise MalformedMessage(f"pickle: a text that is not UTF-8 ({error.reason})") from error
 
     def integer(self) -> None:
-        if (length := self.take(1)[0]) > _INTEGER:
+        length = self.take(1)[0]
+        if length > _INTEGER:
             raise MessageTooLarge(f"pickle: an integer of {length} bytes, the limit is {_INTEGER}")
         self.push(int.from_bytes(self.take(length), "little", signed=True))
 
@@ -185,16 +196,16 @@ class _StackMachine:
         self._stack.append(entry)
 
     def tuple_of(self, entries: Sequence[_StackValue]) -> None:
-        self.push(
-            tuple(_finished(entry.value) for entry in entries),
-            _above(entries),
-            1 + sum(entry.items for entry in entries),
-        )
+        """Push a tuple of the values of entries."""
+        values = tuple(_finished(entry.value) for entry in entries)
+        items = 1 + sum(entry.items for entry in entries)
+        self.push(values, _above(entries), items)
 
     def extend(self, entries: Sequence[_StackValue]) -> None:
         self._into(list, entries).extend(_finished(entry.value) for entry in entries)
 
     def update(self, entries: Sequence[_StackValue]) -> None:
+        """Add keys and values, which alternate in `entries`, to the dict below them."""
         keys = [entry.value for entry in entries[::2]]
         if len(entries) % 2 or not all(type(key) is str for key in keys):
             raise MalformedMessage("pickle: want a dict with texts as keys")
@@ -202,6 +213,7 @@ class _StackMachine:
         self._into(dict, entries).update(zip(keys, values, strict=True))
 
     def last(self, number: int | None) -> list[_StackValue]:
+        """Pop the last entries in order: `number` of them, or all above the last mark if None."""
         if number is not None:
             return [self._entry() for _ in range(number)][::-1]
         if not self._below:
@@ -214,15 +226,16 @@ class _StackMachine:
         name, module = self.pop(), self.pop()
         if not (type(module) is str and type(name) is str):
             raise MalformedMessage("pickle: a name that is no text")
-        found = Name(module, name)
-        if found not in self._calls and found not in self._records:
+        full_name = Name(module, name)
+        if full_name not in self._calls and full_name not in self._records:
             raise MalformedMessage(
                 f"pickle: names {module[:_SHOWN]!r} {name[:_SHOWN]!r}, which is not read here; "
                 "send numbers, texts and numpy arrays of numbers"
             )
-        self.push(found)
+        self.push(full_name)
 
     def reduce(self) -> None:
+        """Replace a listed function and its arguments by the result of our replacement."""
         arguments, name = self.pop(), self.pop()
         read = self._calls.get(name) if isinstance(name, Name) else None
         if read is None or type(arguments) is not tuple:
@@ -232,6 +245,7 @@ class _StackMachine:
         self.push(read(arguments))
 
     def new(self) -> None:
+        """Replace the name of a data class by an object of it without fields."""
         arguments, name = self.pop(), self.pop()
         if arguments != () or not isinstance(name, Name) or name not in self._records:
             raise MalformedMessage(
@@ -240,14 +254,15 @@ class _StackMachine:
         self.push(Record(name))
 
     def build(self) -> None:
+        """Set the fields of an object, or the state of a result, from the value above it."""
         state = self._entry()
         target = self._top().value
         if isinstance(target, Record) and target.fields is None and type(state.value) is dict:
             fields = self._records[target.name]
             if state.value.keys() != set(fields):
-                got = shown(list(state.value))
+                field_names = shown(list(state.value))
                 raise MalformedMessage(
-                    f"pickle: {target.name.name}: got the fields {got}, want {list(fields)}"
+                    f"pickle: {target.name.name}: got the fields {field_names}, want {list(fields)}"
                 )
             target.fields = state.value
             self._stack[-1] = _StackValue(target, state.depth + 1)
