@@ -75,8 +75,12 @@ class VlagentsConnection:
         """
         try:
             self._connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-            while not self._dialect.closing and (frame := self._receive()) is not None:
-                if not self._handle(*frame):
+            while not self._dialect.closing:
+                frame = self._receive()
+                if frame is None:
+                    return
+                body, compressed = frame
+                if not self._handle(body, compressed):
                     return
         except (VLAgentsError, OSError, ValueError) as error:
             logger.info("vlagents: disconnected a client: %s", error)
@@ -120,7 +124,8 @@ class VlagentsConnection:
     def end(self) -> None:
         """Answer the current request with an error, and end the connection. From any thread."""
         error = PolicyUnavailable("the server is stopping; connect again")
-        # Else the client may be reading an answer slowly, with the lock held.
+        # Without a request there is nothing to answer, and the lock may be held for a client that
+        # reads an answer slowly.
         if self._unanswered is not None:
             with self._sending:
                 sequence, self._unanswered = self._unanswered, None
@@ -139,10 +144,11 @@ class VlagentsConnection:
                 return rpyc.reference_reply(call.sequence, _number(call.args))
             return rpyc.reply(call.sequence, self._value(call))
         except VLAgentsError as error:
-            kind = next(
-                (one.__name__ for one in (TimeoutError, ValueError) if isinstance(error, one)),
-                "RuntimeError",
-            )
+            kind = "RuntimeError"
+            if isinstance(error, TimeoutError):
+                kind = "TimeoutError"
+            elif isinstance(error, ValueError):
+                kind = "ValueError"
             return rpyc.exception(call.sequence, kind, f"{error.code}: {error}")
         except Exception:  # noqa: BLE001 - logged, and answered
             return rpyc.exception(call.sequence, "RuntimeError", internal_error("vlagents"))
@@ -169,24 +175,28 @@ class VlagentsConnection:
 
     def _act(self, text: str | bytes) -> str:
         admission = self._admission(text)
-        seen = vlagents.read_act(text, admission, self._segments)
-        obs = self._ours(seen.obs)
-        act = self._session.act(obs, seen.instruction) if seen.robots else self._session.act_on(obs)
+        request = vlagents.read_act(text, admission, self._segments)
+        obs = self._ours(request.obs)
+        if request.robots:
+            act = self._session.act(obs, request.instruction)
+        else:
+            act = self._session.act_on(obs)
         admission.release()
+
         parts = self._dialect.parts
         if isinstance(parts, vlagents.Part):
-            if len(seen.robots) > 1:
+            if len(request.robots) > 1:
                 raise InvalidInput(
-                    f"got the robots {list(seen.robots)[:8]}; state their columns in "
+                    f"got the robots {list(request.robots)[:8]}; state their columns in "
                     "dialects.vlagents.robots"
                 )
-            parts = dict.fromkeys(seen.robots, parts)
-        return vlagents.write_act(act, seen.robots, parts)
+            parts = dict.fromkeys(request.robots, parts)
+        return vlagents.write_act(act, request.robots, parts)
 
     def _reset(self, text: str | bytes) -> str:
         admission = self._admission(text)
-        seen, options = vlagents.read_reset(text, admission, self._segments)
-        info = self._session.reset(self._ours(seen.obs), seen.instruction, **options)
+        request, options = vlagents.read_reset(text, admission, self._segments)
+        info = self._session.reset(self._ours(request.obs), request.instruction, **options)
         admission.release()
         return json_numpy.dumps(info)
 
@@ -206,8 +216,10 @@ class VlagentsConnection:
         """Return the observation under the policy's names, converted if the deployment has a
         mapping.
         """
-        if (mapping := self._dialect.stated_mapping) is None:
+        mapping = self._dialect.stated_mapping
+        if mapping is None:
             return obs
+
         theirs: dict[str, Any] = {"cameras": obs.cameras, "state": obs.state, "info": obs.info}
         if obs.gripper is not None:
             theirs["gripper"] = obs.gripper
@@ -228,7 +240,8 @@ class VlagentsConnection:
         if header is None:
             return None
         length, compressed = rpyc.read_header(bytes(header), self._context.limits.body_bytes)
-        if (body := self._reader.read(length, _FRAME_S, time.monotonic() + _FRAME_S)) is None:
+        body = self._reader.read(length, _FRAME_S, time.monotonic() + _FRAME_S)
+        if body is None:
             raise ConnectionResetError("the client disconnected within a message")
         return bytearray(body), compressed
 
@@ -315,13 +328,14 @@ class SharedMemory:
                 f"shared memory {name[:40]!r}: shorter than the {size} bytes of its shape"
             )
         data = bytearray(size)
-        got = 0
-        while got < size:
-            if (more := os.preadv(descriptor, [memoryview(data)[got:]], got)) == 0:
+        filled = 0  # number of bytes that have been read
+        while filled < size:
+            count = os.preadv(descriptor, [memoryview(data)[filled:]], filled)
+            if count == 0:
                 raise InvalidObservation(
                     f"shared memory {name[:40]!r}: became shorter while it was read"
                 )
-            got += more
+            filled += count
         return data
 
     def close(self) -> None:
@@ -331,12 +345,16 @@ class SharedMemory:
         self._open.clear()
 
     def _descriptor(self, name: str) -> int:
-        if (match := _NAME.fullmatch(name)) is None:
+        match = _NAME.fullmatch(name)
+        if match is None:
             raise InvalidObservation(
                 f"shared memory: got the name {name[:40]!r}, want one like 'psm_01234567'"
             )
-        if (known := self._open.get(match[1])) is not None:
+
+        known = self._open.get(match[1])
+        if known is not None:
             return known
+
         try:
             descriptor = os.open(
                 f"{_FOLDER}/{match[1]}", os.O_RDONLY | os.O_NOFOLLOW | os.O_CLOEXEC | os.O_NONBLOCK

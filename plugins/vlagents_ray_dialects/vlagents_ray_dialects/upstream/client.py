@@ -96,24 +96,28 @@ class UpstreamClient(abc.ABC):
         cure.
 
         SGLang ignores a camera that is not in its `image_keys`, and acts as if the robot had none.
-        One of them that the mapping lacks may be missing on purpose.
+        A camera of `image_keys` that the mapping lacks may be missing on purpose.
         """
-        stated = metadata.get("input")
-        keys = stated.get("image_keys") if isinstance(stated, Mapping) else None
+        upstream_input = metadata.get("input")
+        keys = upstream_input.get("image_keys") if isinstance(upstream_input, Mapping) else None
         if not isinstance(keys, list):
             return []
-        known = {
-            f"{prefix}{key}" for key in keys for prefix in ("", "images/", "observation.images.")
-        }
-        given = [camera.key.partition("|")[0] for camera in outgoing.mapping.cameras.values()]
-        if wrong := [key for key in given if not any(matches(one, key) for one in known)]:
-            return [
-                (
-                    f"cameras: the upstream reads {keys}, the mapping gives {wrong}; change "
-                    "mapping.cameras"
-                )
-            ]
-        return []
+
+        known = set()
+        for key in keys:
+            known |= {f"{key}", f"images/{key}", f"observation.images.{key}"}
+
+        wrong = []
+        for camera in outgoing.mapping.cameras.values():
+            sent_key = camera.key.partition("|")[0]
+            if not any(matches(known_key, sent_key) for known_key in known):
+                wrong.append(sent_key)
+
+        if not wrong:
+            return []
+        return [
+            f"cameras: the upstream reads {keys}, the mapping gives {wrong}; change mapping.cameras"
+        ]
 
     def chunk(self, metadata: Mapping[str, Any]) -> int | None:
         """Return the number of rows of the upstream's actions, if its metadata states it, in

@@ -57,22 +57,25 @@ class GR00TClient(UpstreamClient):
         except (zmq.ZMQError, VLAgentsError) as error:
             self.close()
             raise self.unreachable(error) from error
-        if (language := modalities.get("language")) is not None and language["keys"]:
+
+        language = modalities.get("language")
+        if language is not None and language["keys"]:
             self._text_key = language["keys"][0]
         return modalities
 
     def ask(self, observations: Sequence[Mapping[str, Any]]) -> list[Answer]:
         flat = is_flat(observations[0])
+        if flat:
+            observations = [nested(observation) for observation in observations]
         try:
-            batched = wire.batch(
-                [nested(one) for one in observations] if flat else observations, self._text_key
-            )
+            batched = wire.batch(observations, self._text_key)
         except ValueError as error:
             raise InvalidObservation(
                 f"gr00t: {error}; all sessions of a deployment must send the same"
             ) from error
-        named = wire.flat(batched) if self._flat or flat else batched
-        data = named if self._flat else {"observation": named, "options": None}
+
+        content = wire.flat(batched) if self._flat or flat else batched
+        data = content if self._flat else {"observation": content, "options": None}
         reply = self._call("get_action", data, self.options.timeout_s)
         return list(wire.read_actions(reply, len(observations)))
 
@@ -90,41 +93,54 @@ class GR00TClient(UpstreamClient):
             self._context = None
 
     def differences(self, metadata: Mapping[str, Any], outgoing: Outgoing) -> list[str]:
-        found = []
+        """Compare the upstream's modalities with the mapping: the keys of videos, states and
+        actions, and the number of moments.
+        """
+        differences = []
         mapping = outgoing.mapping
+        camera_keys = [camera.key for camera in mapping.cameras.values()]
+        state_keys = []
+        for state_entries in mapping.state.values():
+            state_keys += [entry.key for entry in state_entries]
+
         for kind, field, keys in (
-            ("video", "cameras", [camera.key for camera in mapping.cameras.values()]),
-            ("state", "state", [part.key for parts in mapping.state.values() for part in parts]),
+            ("video", "cameras", camera_keys),
+            ("state", "state", state_keys),
         ):
-            stated = metadata.get(kind, {"keys": [], "steps": []})
-            given = [
-                one.removeprefix(f"{kind}/").removeprefix(f"{kind}.")
-                for key in keys
-                for one in key.split("|")
-            ]
-            if lacks := [
-                key for key in stated["keys"] if not any(matches(key, one) for one in given)
-            ]:
-                found.append(
-                    f"{kind}: the upstream needs {lacks}, the mapping gives {given}; add them to "
+            modality = metadata.get(kind, {"keys": [], "steps": []})
+            sent = []
+            for key in keys:
+                for alternative in key.split("|"):
+                    sent.append(alternative.removeprefix(f"{kind}/").removeprefix(f"{kind}."))
+
+            lacks = []
+            for key in modality["keys"]:
+                if not any(matches(key, sent_key) for sent_key in sent):
+                    lacks.append(key)
+
+            if lacks:
+                differences.append(
+                    f"{kind}: the upstream needs {lacks}, the mapping gives {sent}; add them to "
                     f"mapping.{field}"
                 )
-            if len(stated["steps"]) > 1:
-                found.append(
-                    f"{kind}: the upstream needs the moments {stated['steps']}, and only the "
+            if len(modality["steps"]) > 1:
+                differences.append(
+                    f"{kind}: the upstream needs the moments {modality['steps']}, and only the "
                     "newest is sent; serve a model that needs one"
                 )
+
         names = metadata.get("action", {"keys": []})["keys"]
-        if names and (wrong := [name for name in mapping.action if name not in names]):
-            found.append(
+        wrong = [name for name in mapping.action if name not in names]
+        if names and wrong:
+            differences.append(
                 f"action: the upstream gives {names}, mapping.action reads {wrong}; change it"
             )
         if len(names) > 1 and not mapping.action:
-            found.append(
+            differences.append(
                 f"action: the upstream gives {names}; say in mapping.action which columns of ours "
                 "each is"
             )
-        return found
+        return differences
 
     def chunk(self, metadata: Mapping[str, Any]) -> int | None:
         return len(metadata.get("action", {}).get("steps", ())) or None
@@ -147,7 +163,7 @@ class GR00TClient(UpstreamClient):
             raise self.failed(reply["error"])
         return reply
 
-    def _wait(self, event: int, deadline: float, what: str) -> None:
+    def _wait(self, event: int, deadline: float, failure: str) -> None:
         """Wait until the socket can be written or read; raise `ConnectionLost` if its connection
         ends first.
         """
@@ -160,7 +176,7 @@ class GR00TClient(UpstreamClient):
             return
         ended = self._monitor in ready
         raise self.lost(
-            "the connection ended" if ended else f"{what} within {deadline - begun:.3g} s"
+            "the connection ended" if ended else f"{failure} within {deadline - begun:.3g} s"
         )
 
 

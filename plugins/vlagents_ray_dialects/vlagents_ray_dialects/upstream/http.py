@@ -187,20 +187,25 @@ class FlashRTClient(HttpClient):
     takes_key: ClassVar[bool] = False
 
     def differences(self, metadata: Mapping[str, Any], outgoing: Outgoing) -> list[str]:
-        cameras, found = outgoing.mapping.cameras, []
-        unfit = [
-            name
-            for name, one in cameras.items()
-            if one.optional or not re.fullmatch(r"images/[^/|*]+", one.key)
-        ]
+        """Return the entries of the mapping that FlashRT cannot read, each with its cure."""
+        cameras = outgoing.mapping.cameras
+        unfit = []
+        for name, camera in cameras.items():
+            if camera.optional or not re.fullmatch(r"images/[^/|*]+", camera.key):
+                unfit.append(name)
+
+        differences = []
         if unfit or not cameras:
-            found.append(
+            differences.append(
                 f"cameras: got {unfit}, want images/NAME for each, none optional; change "
                 "mapping.cameras"
             )
-        if (text := outgoing.mapping.instruction) != "prompt":
-            found.append(f"instruction: got {text!r}, want 'prompt'; change mapping.instruction")
-        return found
+        instruction = outgoing.mapping.instruction
+        if instruction != "prompt":
+            differences.append(
+                f"instruction: got {instruction!r}, want 'prompt'; change mapping.instruction"
+            )
+        return differences
 
     def encode(self, observation: Mapping[str, Any]) -> bytes:
         images = list(observation["images"].values())

@@ -187,11 +187,13 @@ class Upstream(Agent):
         mapping.
         """
         config, key = self.config, None
-        if (name := config.key_env) is not None and not (key := os.environ.get(name)):
-            raise ConfigError(
-                f"key_env: the environment variable {name!r} is not set; set it where the replica "
-                "runs"
-            )
+        if config.key_env is not None:
+            key = os.environ.get(config.key_env)
+            if not key:
+                raise ConfigError(
+                    f"key_env: the environment variable {config.key_env!r} is not set; set it "
+                    "where the replica runs"
+                )
 
         def make(url: str) -> UpstreamClient:
             return config.client(ClientOptions(url, config.timeout_s, key))
@@ -256,14 +258,17 @@ class Upstream(Agent):
         return list(self._lanes.ask(observations))
 
     def _check(self, client: UpstreamClient, metadata: Mapping[str, Any]) -> None:
-        found = client.differences(metadata, self._outgoing)
-        stated, chunk = self.config.contract.get("chunk"), client.chunk(metadata)
-        if stated is not None and chunk is not None and stated != chunk:
-            found.append(
-                f"chunk: the upstream gives {chunk} rows, contract.chunk says {stated}; change it"
+        differences = client.differences(metadata, self._outgoing)
+        chunk = client.chunk(metadata)
+        configured = self.config.contract.get("chunk")
+        if configured is not None and chunk is not None and configured != chunk:
+            differences.append(
+                f"chunk: the upstream gives {chunk} rows, contract.chunk says {configured}; "
+                "change it"
             )
-        if found:
-            lines = "\n".join(f"- {line}" for line in found)
+
+        if differences:
+            lines = "\n".join(f"- {line}" for line in differences)
             raise ContractMismatch(
                 f"upstream {client.options.url} and the deployment's mapping do not fit:\n{lines}"
             )
@@ -271,8 +276,9 @@ class Upstream(Agent):
             self._state["contract"] = replace(self.contract, chunk=chunk)
 
 
-def _contract(mapped: Contract, stated: Mapping[str, Any]) -> Contract:
+def _contract(mapped: Contract, configured: Mapping[str, Any]) -> Contract:
     """Return the contract of a mapping, overridden by the one in the deployment file."""
-    own = {name: value for name, value in stated.items() if value is not None}
-    found: dict[str, Any] = mapped.to_json()
-    return Contract.from_json(found | own | {"action": found["action"] | own.get("action", {})})
+    overrides = {name: value for name, value in configured.items() if value is not None}
+    fields: dict[str, Any] = mapped.to_json()
+    action = fields["action"] | overrides.get("action", {})
+    return Contract.from_json(fields | overrides | {"action": action})

@@ -80,7 +80,8 @@ class VlagentsClient(UpstreamClient):
         return value
 
     def _call(self, frame: bytes, deadline: float) -> Any:
-        if (connection := self._socket) is None:
+        connection = self._socket
+        if connection is None:
             raise self.closed()
         try:
             connection.settimeout(_left(deadline))
@@ -91,9 +92,12 @@ class VlagentsClient(UpstreamClient):
                     self.options.limits.body_bytes,
                 )
                 body = self._receive(connection, length, deadline)
-                found = wire.read_result(body, compressed, self.options.limits.body_bytes)
-                if found is not None and found[0] == self._sequence:
-                    return found[1]
+                result = wire.read_result(body, compressed, self.options.limits.body_bytes)
+                if result is None:
+                    continue
+                sequence, value = result
+                if sequence == self._sequence:
+                    return value
         except OSError as error:
             raise self.lost(error) from error
         except VLAgentsError:
@@ -105,9 +109,10 @@ class VlagentsClient(UpstreamClient):
         view, at = memoryview(data), 0
         while at < count:
             connection.settimeout(_left(deadline))
-            if not (got := connection.recv_into(view[at:])):
+            received = connection.recv_into(view[at:])
+            if not received:
                 raise ConnectionResetError("the connection ended")
-            at += got
+            at += received
         return data
 
 

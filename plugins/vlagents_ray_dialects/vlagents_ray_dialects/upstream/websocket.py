@@ -206,29 +206,31 @@ class RoboArenaClient(OpenPiClient):
     def begin(self) -> None:
         self._session = uuid.uuid4().hex
         self.send(openpi.encode({"endpoint": "reset"}))
-        if (answer := self.recv()) != _RESET:
+        answer = self.recv()
+        if answer != _RESET:
             # vLLM-Omni answers with a map; any text other than `_RESET` is an error.
             self._read(answer)
 
     def differences(self, metadata: Mapping[str, Any], outgoing: Outgoing) -> list[str]:
+        """Return the cameras that the upstream needs and the mapping lacks, each with its cure."""
+        differences = []
         cameras = [camera.key.partition("|")[0] for camera in outgoing.mapping.cameras.values()]
-        found = []
+        wrist_cameras = [key for key in cameras if "wrist" in key]
+
+        # vLLM-Omni's π0 has no key with "exterior", so all cameras but the wrist's are external.
+        have = len(cameras) - len(wrist_cameras)
         external = metadata.get("n_external_cameras")
-        # vLLM-Omni's π0 has no key with "exterior".
-        have = sum("wrist" not in key for key in cameras)
         if isinstance(external, int) and external > have:
-            found.append(
+            differences.append(
                 f"cameras: the upstream needs {external} external ones, the mapping has {have}; "
                 f"add them to mapping.cameras"
             )
-        if metadata.get("needs_wrist_camera") is True and not any(
-            "wrist" in key for key in cameras
-        ):
-            found.append(
+        if metadata.get("needs_wrist_camera") is True and not wrist_cameras:
+            differences.append(
                 "cameras: the upstream needs one at the wrist, the mapping has none; add it to "
                 "mapping.cameras"
             )
-        return found
+        return differences
 
     def _read(self, data: bytes | str) -> Any:
         """Return a map, or the array that older servers and vLLM-Omni send."""
@@ -272,7 +274,9 @@ class VlaEvalClient(WebSocketClient):
         except VLAgentsError as error:
             self.close()
             raise PolicyUnavailable(f"{error}; it did not answer `hello`") from error
-        if (theirs := hello.get("protocol_version")) != vla_eval.PROTOCOL_VERSION:
+
+        theirs = hello.get("protocol_version")
+        if theirs != vla_eval.PROTOCOL_VERSION:
             self.close()
             raise PolicyUnavailable(
                 f"upstream {self.options.url}: got protocol version {shown(theirs, 20)}, "
@@ -290,11 +294,8 @@ class VlaEvalClient(WebSocketClient):
         payload = self._answer("action", self.options.timeout_s)
         actions = payload.get("actions", payload.get("action"))
         if isinstance(actions, list):
-            actions = (
-                np.asarray(actions, np.float32)
-                if all(isinstance(one, int | float) for one in actions)
-                else None
-            )
+            are_numbers = all(isinstance(value, int | float) for value in actions)
+            actions = np.asarray(actions, np.float32) if are_numbers else None
         if not isinstance(actions, np.ndarray):
             raise self.unreadable(
                 sorted(map(str, payload))[:8], "a payload with an array `actions`"
