@@ -125,28 +125,36 @@ class ReplicaView:
         self.live.renew()
         answers = self.live.answers(since)
         snapshot = Snapshot(answers[-1].number if answers else since, {})
-        last = {one.session: one for one in answers if one.op in live.SHOWN_OPS}
+        last_answers = {answer.session: answer for answer in answers if answer.op in live.SHOWN_OPS}
+
         ids = engine.sessions.ids()
         self.live.forget_others(ids)
         self.commands.forget_others(ids)
-        held = sorted(engine.sessions.all(), key=lambda one: one.id)[:_SESSIONS]
-        sessions = {one.id: _session(one, last.get(one.id)) for one in held}
+
+        ordered_sessions = sorted(engine.sessions.all(), key=lambda session: session.id)
+        sessions = {}
+        for session in ordered_sessions[:_SESSIONS]:
+            sessions[session.id] = _session(session, last_answers.get(session.id))
+
+        # The sessions are read in the order of their pictures' age, the oldest first.
         begun = time.thread_time()
         self._pictured = {name: self._pictured.get(name, 0) for name in sessions}
-        # The session first whose pictures are the oldest.
         for name in sorted(sessions, key=self._pictured.__getitem__):
-            kept, described = self.live.observation(name), sessions[name]
+            observation, described = self.live.observation(name), sessions[name]
             described["commands"] = self.commands.of(name)
-            if kept is None or kept.number <= since:
+            if observation is None or observation.number <= since:
                 continue
-            snapshot.number = max(snapshot.number, kept.number)
+
+            snapshot.number = max(snapshot.number, observation.number)
             described["state"] = {
-                part: _numbers(values[: live.VALUES]) for part, values in kept.state.items()
+                state_name: _numbers(values[: live.VALUES])
+                for state_name, values in observation.state.items()
             }
             if name in shown and time.thread_time() - begun < live.ENCODING_SHARE / live.RATE:
-                described["pictures"] = _pictures(kept, snapshot.files)
+                described["pictures"] = _pictures(observation, snapshot.files)
                 if described["pictures"]:
-                    self._pictured[name] = kept.number
+                    self._pictured[name] = observation.number
+
         snapshot.document = {
             **self._about,
             **self._state(),
@@ -204,51 +212,58 @@ def _session(session: Session[LoadedModel], last: live.Answer | None) -> dict[st
         "version": None if weights is None else weights.number,
         "pictures": {},
     }
-    return (
-        described if last is None else described | {"priority": last.priority, "last": _act(last)}
-    )
+    if last is None:
+        return described
+    return described | {"priority": last.priority, "last": _act(last)}
 
 
-def _pictures(kept: live.KeptObservation, files: list[bytes]) -> dict[str, int]:
+def _pictures(observation: live.KeptObservation, files: list[bytes]) -> dict[str, int]:
     """Add the pictures of an observation to `files`, encoding raw pixels; return their indices."""
-    found = kept.pictures()
-    if sum(map(len, files)) + sum(map(len, found.values())) > PICTURES:
+    pictures = observation.pictures()
+    if sum(map(len, files)) + sum(map(len, pictures.values())) > PICTURES:
         return {}
-    files += found.values()
-    return dict(zip(found, range(len(files) - len(found), len(files)), strict=True))
+
+    first = len(files)
+    files += pictures.values()
+    return {camera: first + number for number, camera in enumerate(pictures)}
 
 
 def _act(answer: live.Answer) -> dict[str, Any]:
+    """Describe an answer for viewers."""
     ms = {name: round(value, 3) for name, value in answer.timing.items()}
-    found: dict[str, Any] = {"n": answer.number, "op": answer.op, "ms": ms}
+    described: dict[str, Any] = {"n": answer.number, "op": answer.op, "ms": ms}
     if answer.error:
-        return found | {"error": answer.error, "detail": answer.detail}
+        return described | {"error": answer.error, "detail": answer.detail}
+
     if answer.action is not None:
-        found |= {"rows": answer.rows, "action": _numbers(answer.action), "done": answer.done}
-        found["info"] = plain_values(answer.info)
-    return found
+        described["rows"] = answer.rows
+        described["action"] = _numbers(answer.action)
+        described["done"] = answer.done
+        described["info"] = plain_values(answer.info)
+    return described
 
 
 def _numbers(values: np.ndarray) -> list[Any]:
     """Return the values, rounded to the precision that a page shows."""
-    found: list[Any] = plain_values(np.round(values.astype(float), 4))
-    return found
+    rounded: list[Any] = plain_values(np.round(values.astype(float), 4))
+    return rounded
 
 
 def _counted(answers: list[live.Answer]) -> dict[str, Any]:
     """Return the numbers of acts and errors among the answers, the batch sizes of the acts, and
     their times, ms.
     """
-    acts = [one.timing for one in answers if one.op == "act" and not one.error]
-    sample = acts[:: max(1, len(acts) // SAMPLE)]
+    timings = [answer.timing for answer in answers if answer.op == "act" and not answer.error]
+    sample = timings[:: max(1, len(timings) // SAMPLE)]
+    times_ms = {}
+    for name in (*STAGES, "total"):
+        times_ms[name] = [round(timing.get(f"{name}_ms", 0.0), 3) for timing in sample]
+
     return {
-        "acts": len(acts),
-        "errors": dict(Counter(one.error for one in answers if one.error)),
+        "acts": len(timings),
+        "errors": dict(Counter(answer.error for answer in answers if answer.error)),
         "batch_sizes": [int(timing.get("batch_size", 1)) for timing in sample],
-        "ms": {
-            name: [round(timing.get(f"{name}_ms", 0.0), 3) for timing in sample]
-            for name in (*STAGES, "total")
-        },
+        "ms": times_ms,
     }
 
 
@@ -297,10 +312,13 @@ class Viewer:
         await self._came.wait()
         self._came.clear()
         gathered, self._waiting = self._waiting, deque()
+
         files: list[bytes] = []
-        replicas = [
-            _with_files(one, files, self.shown) for snapshots in gathered for one in snapshots
-        ]
+        replicas = []
+        for snapshots in gathered:
+            for snapshot in snapshots:
+                replicas.append(_with_files(snapshot, files, self.shown))
+
         document = {"time": time.time(), "replicas": replicas}
         if self._more is not self._sent:
             self._sent = self._more
@@ -308,9 +326,12 @@ class Viewer:
         return document, files
 
     def _waiting_bytes(self) -> int:
-        return sum(
-            len(file) for snapshots in self._waiting for one in snapshots for file in one.files
-        )
+        """Return the size of the files of the waiting snapshots."""
+        size = 0
+        for snapshots in self._waiting:
+            for snapshot in snapshots:
+                size += sum(map(len, snapshot.files))
+        return size
 
 
 class Fleet:
@@ -375,27 +396,32 @@ class Fleet:
 
     async def _snapshots(self) -> list[Snapshot]:
         shown = frozenset[str]().union(*(viewer.shown for viewer in self.viewers))
-        readers: dict[str, SnapshotReader] = (
-            {} if self._others is None else dict(await self._others.views())
-        )
-        if (own := self._own) is not None:
-            readers[""] = lambda since, shown: asyncio.to_thread(own.read, since, shown)
+        readers: dict[str, SnapshotReader] = {}
+        if self._others is not None:
+            readers |= await self._others.views()
+        view = self._own
+        if view is not None:
+            readers[""] = lambda since, shown: asyncio.to_thread(view.read, since, shown)
+
         results = await asyncio.gather(
             *(read(self._read.get(name, 0), shown) for name, read in readers.items()),
             return_exceptions=True,
         )
-        found = {
-            name: one
-            for name, one in zip(readers, results, strict=True)
-            if isinstance(one, Snapshot)
-        }
-        self._read = {
-            name: found[name].number if name in found else self._read.get(name, 0)
-            for name in readers
-        }
-        if own is not None and isinstance(error := results[-1], BaseException):
-            raise error
-        return list(found.values())
+        snapshots = []
+        last_numbers = {}
+        for name, result in zip(readers, results, strict=True):
+            if isinstance(result, Snapshot):
+                snapshots.append(result)
+                last_numbers[name] = result.number
+            else:
+                last_numbers[name] = self._read.get(name, 0)
+        self._read = last_numbers
+
+        if view is not None:
+            own_result = results[-1]
+            if isinstance(own_result, BaseException):
+                raise own_result
+        return snapshots
 
 
 def _with_files(snapshot: Snapshot, files: list[bytes], shown: Collection[str]) -> dict[str, Any]:

@@ -235,17 +235,16 @@ class SessionRecorder(Observer):
         request = pending.request
         if self.ended is not None or request.op not in ("act", "reset", "close"):
             return
+
         obs, size = None, 0
         if request.op == "act" and request.obs is not None:
             obs = request.obs
-            size = (
-                _OTHER_BYTES
-                + sum(image.nbytes for image in obs.cameras.values())
-                + _bytes_in(obs.info)
-            )
+            picture_bytes = sum(image.nbytes for image in obs.cameras.values())
+            size = _OTHER_BYTES + picture_bytes + _bytes_in(obs.info)
             if not self._hold(size):
                 self.dropped += 1
                 return
+
         recorded = pending.observer_data[self] = _Recorded(
             self,
             pending.session_id,
@@ -260,7 +259,8 @@ class SessionRecorder(Observer):
 
     def on_answer(self, pending: PendingRequest, reply: Reply) -> None:
         """Record the frame of the answered request."""
-        if (recorded := pending.observer_data.pop(self, None)) is not None and reply.error is None:
+        recorded = pending.observer_data.pop(self, None)
+        if recorded is not None and reply.error is None:
             self._write_later(partial(self._handle, recorded, reply))
 
     def close(self) -> None:
@@ -287,7 +287,8 @@ class SessionRecorder(Observer):
         """Copy the data that may be in the client's memory."""
         try:
             recorded.options = to_text(recorded.options) if recorded.op == "reset" else ""
-            if (obs := recorded.obs) is not None:
+            obs = recorded.obs
+            if obs is not None:
                 info = dict(obs.info)
                 captured = info.pop(CAPTURED, None)
                 recorded.info = to_text(info) if info else ""
@@ -318,7 +319,9 @@ class SessionRecorder(Observer):
             self._writer.close()
 
     def _handle(self, recorded: _Recorded, reply: Reply) -> None:
+        """Begin, continue or end the episode of a session."""
         session, op = recorded.session, recorded.op
+
         try:
             if op == "reset":
                 self._first[session] = reply.step if random.random() < self._share else None
@@ -332,11 +335,11 @@ class SessionRecorder(Observer):
                 self._writer.end(session)
             elif recorded.obs is not None and self._records(session):
                 if session in self._writer:
-                    self._writer.add(
-                        session, _frame(recorded, recorded.obs, reply, self._first[session] or 0)
-                    )
+                    first = self._first[session] or 0
+                    self._writer.add(session, _frame(recorded, recorded.obs, reply, first))
                 else:  # too many sessions at once
                     self.dropped += 1
+
         except (OSError, RecordingEnded):
             raise
         except UnknownSession:  # the session has ended, and its episode with it
@@ -353,9 +356,9 @@ class SessionRecorder(Observer):
         if session not in self._first:
             self._first[session] = None
             if random.random() < self._share:
-                found = self._sessions.get(session)
-                self._first[session] = found.first
-                self._writer.begin(session, found.instruction)
+                current = self._sessions.get(session)
+                self._first[session] = current.first
+                self._writer.begin(session, current.instruction)
         return self._first[session] is not None
 
     def _look(self) -> None:
@@ -364,10 +367,10 @@ class SessionRecorder(Observer):
             self._looking = True
             self._write_later(partial(self._end_others, frozenset(self._sessions.ids())))
 
-    def _end_others(self, held: frozenset[str]) -> None:
+    def _end_others(self, current: frozenset[str]) -> None:
         """End the episodes of ended sessions; a new session may be missing once."""
         self._looking = False
-        missing = self._first.keys() - held
+        missing = self._first.keys() - current
         for session in missing & self._missing:
             del self._first[session]
             self._writer.end(session)
@@ -388,6 +391,7 @@ def open_recorder(
     """
     for module in ("av", "pyarrow"):
         require(module)
+
     folder = Path(args.folder)
     try:
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
@@ -396,6 +400,7 @@ def open_recorder(
         raise ConfigError(
             f"parts.record.folder: {folder} cannot be written to ({error})"
         ) from error
+
     name = re.sub(r"[^A-Za-z0-9]+", "-", replica.removeprefix("SERVE_REPLICA::"))
     writer = EpisodeWriter(
         folder,
@@ -409,8 +414,10 @@ def open_recorder(
 
 
 def _frame(recorded: _Recorded, obs: Obs, reply: Reply, first: int) -> RecordedAct:
-    if (act := reply.act) is None:
+    act = reply.act
+    if act is None:
         raise PolicyFailed("the answer has no action")
+
     info = {key: value for key, value in act.info.items() if key != "timing"}
     version = info.get(POLICY) or {}
     columns: dict[str, Any] = {

@@ -63,11 +63,10 @@ class LiveConfig(PartConfig):
     @model_validator(mode="after")
     def _with_a_folder(self) -> LiveConfig:
         if self.folder is None:
-            changed = [
-                name
-                for name, field in type(self).model_fields.items()
-                if getattr(self, name) != field.default
-            ]
+            changed = []
+            for name, field in type(self).model_fields.items():
+                if getattr(self, name) != field.default:
+                    changed.append(name)
             if changed:
                 raise ValueError(
                     f"got {', '.join(changed)} without `folder`, so that nothing is kept; name a "
@@ -119,22 +118,25 @@ class Ring:
         many.
         """
         self._live.renew()
-        held = self._sessions.ids()
-        self._live.forget_others(held)
+        session_ids = self._sessions.ids()
+        self._live.forget_others(session_ids)
+
         begun = time.thread_time()
-        longest_without = sorted(held, key=self._newest)
-        for name in longest_without:
-            kept = self._live.observation(name)
-            if kept is None or kept.action is None or kept.number == self._newest(name):
+        longest_without = sorted(session_ids, key=self._newest)
+        for session_id in longest_without:
+            frame = self._live.observation(session_id)
+            if frame is None or frame.action is None or frame.number == self._newest(session_id):
                 continue
-            if kept.cameras and time.thread_time() - begun >= ENCODING_SHARE / RATE:
+            if frame.cameras and time.thread_time() - begun >= ENCODING_SHARE / RATE:
                 continue
-            kept.pictures()
+
+            frame.pictures()
             with self._lock:
-                self._frames.setdefault(name, deque()).append(kept)
-                self.bytes += kept.size
+                self._frames.setdefault(session_id, deque()).append(frame)
+                self.bytes += frame.size
+
         with self._lock:
-            self._drop(held)
+            self._drop(session_ids)
 
     def save(self, session: str) -> str:
         """Write the session's frames as an episode, and return the path of its dataset.
@@ -146,6 +148,7 @@ class Ring:
         """
         if not self._saving.acquire(blocking=False):
             raise Overloaded("save: another session is being saved; press again when that is done")
+
         try:
             self._writer.require_room()
             with self._lock:
@@ -154,8 +157,14 @@ class Ring:
                 raise InvalidInput(
                     f"session {session!r}: nothing to save yet; it has acted on nothing"
                 )
-            found = next((one for one in self._sessions.all() if one.id == session), None)
-            self._writer.begin(session, "" if found is None else found.instruction)
+
+            instruction = ""
+            for candidate in self._sessions.all():
+                if candidate.id == session:
+                    instruction = candidate.instruction
+                    break
+
+            self._writer.begin(session, instruction)
             while frames:
                 self._writer.add(session, _recorded(frames.popleft()))
             return str(self._writer.end(session))
@@ -169,16 +178,18 @@ class Ring:
         frames = self._frames.get(session)
         return frames[-1].number if frames else 0
 
-    def _drop(self, held: list[str]) -> None:
+    def _drop(self, session_ids: list[str]) -> None:
         """Drop ended sessions, old frames, and the oldest ones over the memory limit; the caller
         holds the lock.
         """
-        for name in self._frames.keys() - set(held):
-            self.bytes -= sum(frame.size for frame in self._frames.pop(name))
+        for session_id in self._frames.keys() - set(session_ids):
+            self.bytes -= sum(frame.size for frame in self._frames.pop(session_id))
+
         oldest = time.monotonic() - self._settings.ring_s
         for frames in self._frames.values():
             while frames and frames[0].time < oldest:
                 self.bytes -= frames.popleft().size
+
         while self.bytes > self._settings.memory_mb * 1e6:
             first = min(
                 (frames for frames in self._frames.values() if frames),

@@ -59,11 +59,11 @@ class RequestSpans(Observer):
         """Store the start of the request."""
         if pending.request.op in _OPS:
             obs = pending.request.obs
-            stated = "" if obs is None else obs.info.get(tracing.TRACEPARENT, "")  # untrusted
-            pending.observer_data[self] = (
-                stated[:_TEXT] if isinstance(stated, str) else "",
-                time.time_ns(),
-            )
+            # The client's value is untrusted.
+            traceparent = "" if obs is None else obs.info.get(tracing.TRACEPARENT, "")
+            if not isinstance(traceparent, str):
+                traceparent = ""
+            pending.observer_data[self] = traceparent[:_TEXT], time.time_ns()
 
     def on_answer(self, pending: PendingRequest, reply: Reply) -> None:
         """Export the span of the answered request."""
@@ -80,38 +80,44 @@ class RequestSpans(Observer):
         while self._answered:
             self._make(self._answered.popleft())
 
-    def _make(self, one: _ServedRequest) -> None:
-        timing = one.timing
-        begun_ns = one.decoded_ns - _ns(timing.get("decode_ms", 0.0))
-        about: dict[str, str | int] = {
+    def _make(self, served: _ServedRequest) -> None:
+        """Create the span of a request, and within it the spans of its stages."""
+        timing = served.timing
+        begun_ns = served.decoded_ns - _ns(timing.get("decode_ms", 0.0))
+        attributes: dict[str, str | int] = {
             "replica": self._replica,
-            "session": one.session,
-            "priority": one.priority,
+            "session": served.session,
+            "priority": served.priority,
         }
         if "batch_size" in timing:
-            about["batch_size"] = int(timing["batch_size"])
-        parent = (
-            self._propagator.extract({tracing.TRACEPARENT: one.traceparent})
-            if one.traceparent
-            else None
+            attributes["batch_size"] = int(timing["batch_size"])
+
+        parent = None
+        if served.traceparent:
+            parent = self._propagator.extract({tracing.TRACEPARENT: served.traceparent})
+
+        request_span = self._tracer.start_span(
+            f"vlagents {served.op}",
+            parent,
+            kind=self._trace.SpanKind.SERVER,
+            attributes=attributes,
+            start_time=begun_ns,
         )
-        name, kind = f"vlagents {one.op}", self._trace.SpanKind.SERVER
-        whole = self._tracer.start_span(
-            name, parent, kind=kind, attributes=about, start_time=begun_ns
-        )
-        if one.error:
-            whole.set_status(self._trace.StatusCode.ERROR, one.error)
-        inside = self._trace.set_span_in_context(whole, parent)
-        self._stage("decode", inside, begun_ns, one.decoded_ns)
-        at_ns = one.decoded_ns
+        if served.error:
+            request_span.set_status(self._trace.StatusCode.ERROR, served.error)
+
+        inside = self._trace.set_span_in_context(request_span, parent)
+        self._stage("decode", inside, begun_ns, served.decoded_ns)
+        at_ns = served.decoded_ns
         for stage, span in _STAGES.items():
             if f"{stage}_ms" in timing:
                 ended_ns = at_ns + _ns(timing[f"{stage}_ms"])
                 self._stage(span, inside, at_ns, ended_ns)
                 at_ns = ended_ns
-        encoded_ns = one.answered_ns + _ns(timing.get("encode_ms", 0.0))
-        self._stage("encode", inside, one.answered_ns, encoded_ns)
-        whole.end(encoded_ns)
+
+        encoded_ns = served.answered_ns + _ns(timing.get("encode_ms", 0.0))
+        self._stage("encode", inside, served.answered_ns, encoded_ns)
+        request_span.end(encoded_ns)
 
     def _stage(self, name: str, inside: Any, begun_ns: int, ended_ns: int) -> None:
         self._tracer.start_span(name, inside, start_time=begun_ns).end(ended_ns)
