@@ -363,7 +363,7 @@ class GR00TConnection(GatewayClient):
         contract = contract or Contract()
 
         cameras = [(name, camera.key) for name, camera in mapping.cameras.items()]
-        state = []
+        state: list[tuple[str, str]] = []
         for name, state_keys in mapping.state.items():
             state += [(name, state_key.key) for state_key in state_keys]
 

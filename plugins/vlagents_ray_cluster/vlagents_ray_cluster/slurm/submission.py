@@ -95,21 +95,24 @@ def split(
     """Return a command's own arguments, and sbatch's options by their long names, None for those
     without a value.
     """
-    own: list[str] = []
+    arguments: list[str] = []
     sbatch: dict[str, str | None] = {}
     waiting = iter(words)
     for word in waiting:
         name, equals, value = word.partition("=")
         if not word.startswith("-") or word == "-":
-            own.append(word)
+            arguments.append(word)
         elif name in known:
-            own.append(word)
+            arguments.append(word)
             if known[name] and not equals:
-                own.append(_next(waiting, name))
+                arguments.append(_next(waiting, name))
         else:
-            option, attached = name[2:], value if equals else None
-            if is_short := not word.startswith("--"):
+            is_short = not word.startswith("--")
+            if is_short:
                 option, attached = _SHORT.get(word[1], word[1]), word[2:] or None
+            else:
+                option, attached = name[2:], value if equals else None
+
             if option in _OURS:
                 raise ConfigError(
                     f"{word}: got an option that does not fit one Ray process on each node; want "
@@ -122,23 +125,26 @@ def split(
                 )
             if not re.fullmatch(r"[a-z][a-z0-9-]*", option):
                 raise ConfigError(f"{word}: got an invalid option name, want --NAME=VALUE")
+
             if option not in _ALONE and attached is None:
                 attached = _next(waiting, f"--{option}")
             sbatch[option] = attached
-    return own, sbatch
+    return arguments, sbatch
 
 
 def _next(words: Iterable[str], option: str) -> str:
-    if (value := next(iter(words), None)) is None:
+    value = next(iter(words), None)
+    if value is None:
         raise ConfigError(f"{option}: got no value; want {option}=VALUE")
     return value
 
 
 def first_index(array: str) -> str:
     """Return the first task of an `--array`: 4 of "4-9%2"."""
-    if (found := re.match(r"\d+", array)) is None:
+    match = re.match(r"\d+", array)
+    if match is None:
         raise ConfigError(f"--array: got {array!r}, want numbers, as in 0-15, 1,3,7 or 0-99%4")
-    return found[0]
+    return match[0]
 
 
 @dataclass(frozen=True, slots=True)
@@ -173,6 +179,7 @@ class Script:
             "open-mode": "append",
             **({} if "no-requeue" in self.options else {"requeue": None}),
         }
+
         words = []
         for option, value in (defaults | dict(self.options)).items():
             spaced = value is not None and any(sign.isspace() for sign in value)
@@ -180,14 +187,21 @@ class Script:
                 raise ConfigError(
                     f"slurm: got the option {value[:200]!r}, want no quotes in a value with spaces"
                 )
-            given = f'="{value}"' if spaced else f"={value}"
-            words.append(f"--{option}{'' if value is None else given}")
+
+            if value is None:
+                words.append(f"--{option}")
+            elif spaced:
+                words.append(f'--{option}="{value}"')
+            else:
+                words.append(f"--{option}={value}")
+
         for word in (self.name, str(self.folder), *words):
             if any(ord(sign) < ord(" ") or sign in _LINE_ENDS for sign in word):
                 raise ConfigError(
                     f"slurm: got {word[:200]!r}, want no control characters, such as line feeds, "
                     "in it"
                 )
+
         settings = {
             "python": sys.executable,
             "folder": str(self.folder.absolute()),
@@ -220,6 +234,7 @@ def submit(script: Script) -> str:
     file.parent.mkdir(parents=True, exist_ok=True)
     file.write_text(script.text())
     file.chmod(0o700)
+
     try:
         done = subprocess.run(  # noqa: S603 - the user's own arguments
             ["sbatch", "--parsable", str(file)],  # noqa: S607 - found by PATH
@@ -238,6 +253,7 @@ def submit(script: Script) -> str:
         raise SubmissionFailed(
             f"sbatch {file}: no answer in {_SBATCH_S:g} s; look with `squeue --me`"
         ) from error
+
     if done.returncode:
         raise SubmissionFailed(f"sbatch {file}: {done.stderr.strip() or done.stdout.strip()}")
     return done.stdout.strip().partition(";")[0]
@@ -249,8 +265,8 @@ def outside_of_jobs(environ: Mapping[str, str]) -> dict[str, str]:
     sbatch passes its environment on, and steps of the new job would read these variables as their
     options.
     """
-    return {
-        name: value
-        for name, value in environ.items()
-        if not name.startswith("SLURM_") or name in _KEPT
-    }
+    environment = {}
+    for name, value in environ.items():
+        if not name.startswith("SLURM_") or name in _KEPT:
+            environment[name] = value
+    return environment

@@ -126,22 +126,25 @@ def choose(points: Sequence[MeasuredPoint], goal: TuningGoal) -> MeasuredPoint:
     if not reaching and not points:
         raise GoalMissed("no settings could be measured")
     if not reaching:
-        found = min(points, key=lambda point: point.p99_ms)
+        closest = min(points, key=lambda point: point.p99_ms)
         raise GoalMissed(
-            f"--p99-ms: got {goal.p99_ms}; the shortest p99 of a round trip was {found.p99_ms:.1f} "
-            f"ms, with {sessions(found.sessions)} and {found.variant.name}; raise --p99-ms, or use "
-            "a faster machine or model"
+            f"--p99-ms: got {goal.p99_ms}; the shortest p99 of a round trip was "
+            f"{closest.p99_ms:.1f} ms, with {sessions(closest.sessions)} and "
+            f"{closest.variant.name}; raise --p99-ms, or use a faster machine or model"
         )
-    variants = sorted(
-        {point.variant.name: point.variant for point in reaching}.values(),
-        key=lambda v: len(v.changes),
-    )
-    reached = lambda point: point.actions_per_s if goal.kind == "throughput" else point.sessions  # noqa: E731
-    best, *others = (
-        max((one for one in reaching if one.variant is variant), key=reached)
-        for variant in variants
-    )
-    for other in others:
+
+    def score(point: MeasuredPoint) -> float:
+        return point.actions_per_s if goal.kind == "throughput" else point.sessions
+
+    # The best point of each variant, those with the fewest changes first.
+    variants = {point.variant.name: point.variant for point in reaching}
+    best_points = []
+    for variant in sorted(variants.values(), key=lambda variant: len(variant.changes)):
+        points_of_variant = [point for point in reaching if point.variant is variant]
+        best_points.append(max(points_of_variant, key=score))
+
+    best = best_points[0]
+    for other in best_points[1:]:
         is_better = other.actions_per_s > _BETTER * best.actions_per_s
         if goal.kind == "robots":
             is_better = (other.sessions, 0.0) > (
@@ -158,12 +161,14 @@ def default_point(
     """Return the figures of the unchanged file; None if they were not measured, or miss the
     goal.
     """
-    own = [point for point in points if not point.variant.changes and point.sessions <= max_size]
-    if goal.kind == "throughput":
-        own = [point for point in own if point.sessions == max_size]
-    return max(
-        (one for one in own if one.reaches(goal)), key=lambda point: point.sessions, default=None
-    )
+    candidates = []
+    for point in points:
+        if point.variant.changes or point.sessions > max_size or not point.reaches(goal):
+            continue
+        if goal.kind == "throughput" and point.sessions != max_size:
+            continue
+        candidates.append(point)
+    return max(candidates, key=lambda point: point.sessions, default=None)
 
 
 def chosen_settings(
@@ -173,10 +178,8 @@ def chosen_settings(
     config, queue = dict(chosen.variant.changes), dict[str, Any]()
     sizes = chosen.variant.changes.get("batch_sizes", fixed)
     if sizes and sizes[-1] > chosen.sessions:
-        config["batch_sizes"] = [
-            *(size for size in sizes if size < chosen.sessions),
-            chosen.sessions,
-        ]
+        smaller = [size for size in sizes if size < chosen.sessions]
+        config["batch_sizes"] = [*smaller, chosen.sessions]
     if chosen.sessions != batch.max_size and batch.sizes is not None:
         queue["sizes"] = [size for size in batch.sizes if size <= chosen.sessions]
     elif chosen.sessions != batch.max_size:
@@ -197,14 +200,18 @@ def figures(points: Sequence[MeasuredPoint]) -> list[list[str]]:
             "actions off by",
         ]
     ]
-    for one in points:
-        numbers = [
-            f"{one.actions_per_s:.1f}",
-            f"{one.round_trip_ms:.1f}",
-            f"{one.p99_ms:.1f}",
-            f"{one.peak_mib:.0f}",
-        ]
-        rows.append([one.variant.name, str(one.sessions), *numbers, f"{one.difference:.3%}"])
+    for point in points:
+        rows.append(
+            [
+                point.variant.name,
+                str(point.sessions),
+                f"{point.actions_per_s:.1f}",
+                f"{point.round_trip_ms:.1f}",
+                f"{point.p99_ms:.1f}",
+                f"{point.peak_mib:.0f}",
+                f"{point.difference:.3%}",
+            ]
+        )
     return rows
 
 
@@ -212,7 +219,8 @@ def figures(points: Sequence[MeasuredPoint]) -> list[list[str]]:
 _RISING = 1.05
 _TURNS = 3
 _END_S = 2.0  # time for a process to end before it is killed
-# Of a number of the action, as a share of its largest magnitude: it may hardly move.
+# The smallest range of a number of the action, as a share of its largest magnitude, since the
+# number may hardly move.
 _SMALLEST_RANGE = 0.1
 
 
@@ -263,18 +271,18 @@ class Tuner:
             if self._plan.frames is not None:
                 frames = Path(folder) / "frames"
                 save_observations(recorded_observations(self._plan.frames, FRAMES), frames)
+
             ready = self._measure_own(frames)
             rates = {point.sessions: point.actions_per_s for point in self._points}
-            most = (
-                max(rates, key=rates.__getitem__)
-                if self._plan.goal.kind == "throughput"
-                else max(rates)
-            )
-            variants = self._variants(ready, sorted(size for size in rates if size <= most))
+            if self._plan.goal.kind == "throughput":
+                largest_size = max(rates, key=rates.__getitem__)
+            else:
+                largest_size = max(rates)
+
+            variants = self._variants(ready, sorted(size for size in rates if size <= largest_size))
             for number, variant in enumerate(variants):
-                if any(
-                    failed.changes.items() <= variant.changes.items() for failed in self._failed
-                ):
+                changes = variant.changes.items()
+                if any(failed.changes.items() <= changes for failed in self._failed):
                     continue
                 if time.monotonic() >= self._end:
                     self.left_out.append(f"{variant.name}: no time was left")
@@ -286,11 +294,10 @@ class Tuner:
                 )
                 try:
                     with self._loaded(variant, frames) as (process, ready):
-                        for what in ready["uncompiled"]:
-                            self.left_out.append(f"{variant.name}: not compiled: {what}")
-                        if variant.changes.get("compile") and len(ready["uncompiled"]) == len(
-                            sizes
-                        ):
+                        uncompiled = ready["uncompiled"]
+                        for reason in uncompiled:
+                            self.left_out.append(f"{variant.name}: not compiled: {reason}")
+                        if variant.changes.get("compile") and len(uncompiled) == len(sizes):
                             raise VariantFailed("no size could be compiled")
                         self._sweep(process, variant, sizes, parts=len(variants) - number)
                 except VariantFailed as error:
@@ -300,9 +307,9 @@ class Tuner:
 
     def _measure_own(self, frames: Path | None) -> Mapping[str, Any]:
         """Measure the file's own settings; return the report of their process."""
-        own, ready = Variant(), None
+        unchanged, ready = Variant(), None
         try:
-            with self._loaded(own, frames) as (process, ready):
+            with self._loaded(unchanged, frames) as (process, ready):
                 self.device, self.fixed = ready["device"], ready["settings"].get("batch_sizes")
                 if self._plan.dtypes and "dtype" not in ready["settings"]:
                     raise ConfigError(
@@ -310,50 +317,55 @@ class Tuner:
                     )
                 sizes = self._candidates()
                 self._wanted = self._actions(process, sizes[0])[:FRAMES]
-                self._sweep(process, own, sizes, parts=len(self._variants(ready, ())) + 1)
+                parts = len(self._variants(ready, ())) + 1
+                self._sweep(process, unchanged, sizes, parts=parts)
         except VariantFailed as error:
             if ready is None or not self._points:
                 raise VariantFailed(f"the file's own settings: {error}") from error
-            self.left_out.append(f"{own.name}: {error}")
+            self.left_out.append(f"{unchanged.name}: {error}")
         return ready
 
     def _candidates(self) -> list[int]:
         """Return the batch sizes to measure, ascending: the fixed ones, or else 1, 2, 4, …"""
         fixed = self._plan.args.batch.sizes or self.fixed
         sizes = fixed or [2**power for power in range(self._plan.max_batch.bit_length())]
-        if not (found := [size for size in sizes if size <= self._plan.max_batch]):
+        candidates = [size for size in sizes if size <= self._plan.max_batch]
+        if not candidates:
             raise ConfigError(
                 f"--max-batch: got {self._plan.max_batch}, the file's smallest fixed size is "
                 f"{sizes[0]}"
             )
-        return found
+        return candidates
 
     def _variants(self, ready: Mapping[str, Any], sizes: Sequence[int]) -> list[Variant]:
         """Return the variants other than the file's own settings; compiled ones use `sizes`
         unless the file sets it.
         """
-        has = ready["settings"]
-        wanted = ready["dtypes"] if self._plan.dtypes is None else self._plan.dtypes
-        named = [
-            {"quantization" if one in get_args(Quantization) else "dtype": one} for one in wanted
-        ]
-        dtypes = [
-            change
-            for change in named
-            if change.keys() <= has.keys() and not change.items() <= has.items()
-        ]
-        own = has.get("compile", True)  # what "auto" means here
-        modes = (
-            []
-            if own is True or own == "require"
-            else [mode for mode in ready["modes"] if mode != own]
-        )
-        free = "batch_sizes" in has and self._plan.args.config.get("batch_sizes") is None
-        compiled = [
-            {"compile": mode} | ({"batch_sizes": list(sizes)} if mode and free else {})
-            for mode in modes
-        ]
-        both = [one | other for other in compiled for one in dtypes]
+        settings = ready["settings"]
+
+        names = ready["dtypes"] if self._plan.dtypes is None else self._plan.dtypes
+        dtypes: list[dict[str, Any]] = []
+        for name in names:
+            setting = "quantization" if name in get_args(Quantization) else "dtype"
+            if setting in settings and settings[setting] != name:
+                dtypes.append({setting: name})
+
+        current_mode = settings.get("compile", True)  # the mode that "auto" selects
+        modes: list[Any] = []
+        if current_mode is not True and current_mode != "require":
+            modes = [mode for mode in ready["modes"] if mode != current_mode]
+
+        is_free = "batch_sizes" in settings and self._plan.args.config.get("batch_sizes") is None
+        compiled: list[dict[str, Any]] = []
+        for mode in modes:
+            changes: dict[str, Any] = {"compile": mode}
+            if mode and is_free:
+                changes["batch_sizes"] = list(sizes)
+            compiled.append(changes)
+
+        both: list[dict[str, Any]] = []
+        for compile_changes in compiled:
+            both += [dtype_changes | compile_changes for dtype_changes in dtypes]
         return [Variant(changes) for changes in [*dtypes, *compiled, *both]]
 
     @contextmanager
@@ -362,33 +374,40 @@ class Tuner:
     ) -> Iterator[tuple[LineProcess, Mapping[str, Any]]]:
         """Yield the process of a loaded variant, and its report."""
         args, environment = self._plan.args, self._plan.args.environment
+        if args.batch.sizes:
+            max_size = args.batch.sizes[-1]
+        else:
+            max_size = max(self._plan.max_batch, args.batch.max_size)
+
         settings = ProcessSettings(
             policy=args.policy,
             config=args.config | dict(variant.changes),
             wrappers=args.wrappers,
-            max_size=args.batch.sizes[-1]
-            if args.batch.sizes
-            else max(self._plan.max_batch, args.batch.max_size),
+            max_size=max_size,
             patience=args.batch.patience,
             batch_sizes=args.batch.sizes or (),
             frames=None if frames is None else str(frames),
             side=self._plan.side,
             dims=self._plan.dims,
         )
-        found = our_environment() if environment.python is None else {}
+
+        variables = our_environment() if environment.python is None else {}
+        variables = variables | environment.env_vars
         command = [
             environment.python or sys.executable,
             "-m",
             "vlagents_ray_cluster.tune.measured_policy",
         ]
-        with LineProcess("tune", command, found | environment.env_vars, end_s=_END_S) as process:
+        with LineProcess("tune", command, variables, end_s=_END_S) as process:
             process.send(json.dumps(asdict(settings)))
-            said = self._answer(process)
-            while "step" in said:
-                self._progress(f"{variant.name}: {said['step']}")
-                said = self._answer(process)
-            self._progress(f"{variant.name}: loaded in {said['load_s']:.1f} s on {said['device']}")
-            yield process, said
+            report = self._answer(process)
+            while "step" in report:
+                self._progress(f"{variant.name}: {report['step']}")
+                report = self._answer(process)
+
+            load_s, device = report["load_s"], report["device"]
+            self._progress(f"{variant.name}: loaded in {load_s:.1f} s on {device}")
+            yield process, report
 
     def _sweep(
         self, process: LineProcess, variant: Variant, sizes: Sequence[int], parts: int
@@ -398,31 +417,33 @@ class Tuner:
         """
         now = time.monotonic()
         until = now + (self._end - now) / parts
-        found: list[MeasuredPoint] = []
+        points: list[MeasuredPoint] = []
         for size in sizes:
-            if not self._worth_more(found) or not self._add(process, variant, size, found, until):
+            if not self._worth_more(points):
                 break
+            if not self._add(process, variant, size, points, until):
+                break
+
         default = self._plan.args.batch.max_size
-        if (
-            self._plan.goal.kind == "throughput"
-            and not variant.changes
-            and default not in [s.sessions for s in found]
-        ):
-            self._add(process, variant, default, found, (time.monotonic() + self._end) / 2)
-        turn_s = sum(measured.took_s for measured in found)
+        is_measured = default in [point.sessions for point in points]
+        if self._plan.goal.kind == "throughput" and not variant.changes and not is_measured:
+            self._add(process, variant, default, points, (time.monotonic() + self._end) / 2)
+
+        turn_s = sum(point.took_s for point in points)
         for _ in range(_TURNS - 1):
             if time.monotonic() + turn_s > until:
                 break
-            for measured in found:
-                measured.add(self._turn(process, measured.sessions))
+            for point in points:
+                point.add(self._turn(process, point.sessions))
 
-    def _worth_more(self, found: Sequence[MeasuredPoint]) -> bool:
+    def _worth_more(self, points: Sequence[MeasuredPoint]) -> bool:
         """Return whether a larger batch may serve the goal better than the measured ones,
         ascending.
         """
-        if found and self._plan.goal.p99_ms is not None:
-            return found[-1].round_trip_ms <= self._plan.goal.p99_ms
-        rates = [measured.rates[0] for measured in found]
+        if points and self._plan.goal.p99_ms is not None:
+            return points[-1].round_trip_ms <= self._plan.goal.p99_ms
+
+        rates = [point.rates[0] for point in points]
         # One measurement may have been disturbed.
         return len(rates) < 3 or max(rates[-2:]) >= _RISING * max(rates[:-2])
 
@@ -431,16 +452,17 @@ class Tuner:
         process: LineProcess,
         variant: Variant,
         size: int,
-        found: list[MeasuredPoint],
+        points: list[MeasuredPoint],
         until: float,
     ) -> bool:
         """Compare the actions of a batch size, and measure it once; return False, with a report,
         if it is skipped.
         """
         began = time.monotonic()
-        if found and began + found[-1].took_s * size / found[-1].sessions > until:
+        if points and began + points[-1].took_s * size / points[-1].sessions > until:
             self.left_out.append(f"{variant.name}, {sessions(size)}: no time was left")
             return False
+
         try:
             difference = largest_difference(self._actions(process, size), self._wanted)
             if difference > self._plan.tolerance:
@@ -448,24 +470,26 @@ class Tuner:
                     f"actions differ by {difference:.2%} of their range, want at most "
                     f"{self._plan.tolerance:.2%}"
                 )
-                if variant.changes or found:
+                if variant.changes or points:
                     raise VariantFailed(f"refused, as {off}")
                 raise VariantFailed(
                     f"{off}, for the same observations and seeds, so that nothing can be compared "
                     "with them; let the seed of `reset` determine what is random in the policy, or "
                     "raise --tolerance"
                 )
-            measured = MeasuredPoint(variant, size, difference)
-            measured.add(self._turn(process, size))
+
+            point = MeasuredPoint(variant, size, difference)
+            point.add(self._turn(process, size))
         except VariantFailed as error:
-            if not found:
+            if not points:
                 raise
             self.left_out.append(f"{variant.name}, {sessions(size)}: {error}")
             return False
-        measured.took_s = time.monotonic() - began
-        found.append(measured)
-        self._points.append(measured)
-        self._progress(f"{variant.name}, {sessions(size)}: {measured.rates[0]:.1f} actions/s")
+
+        point.took_s = time.monotonic() - began
+        points.append(point)
+        self._points.append(point)
+        self._progress(f"{variant.name}, {sessions(size)}: {point.rates[0]:.1f} actions/s")
         return True
 
     def _actions(self, process: LineProcess, size: int) -> list[np.ndarray]:
@@ -484,7 +508,7 @@ class Tuner:
         time-out.
         """
         try:
-            said: dict[str, Any] = process.read(max(0.0, self._end - time.monotonic()))
+            answer: dict[str, Any] = process.read(max(0.0, self._end - time.monotonic()))
         except ProcessFailed as error:
             if time.monotonic() >= self._end:
                 raise VariantFailed(
@@ -492,9 +516,10 @@ class Tuner:
                 ) from error
             first, *more = str(error).partition(": ")[2].splitlines()
             raise VariantFailed(". ".join([first, *more[-1:]])) from error
-        if "failed" in said:
-            raise VariantFailed(said["failed"])
-        return said
+
+        if "failed" in answer:
+            raise VariantFailed(answer["failed"])
+        return answer
 
 
 def largest_difference(actions: Sequence[np.ndarray], wanted: Sequence[np.ndarray]) -> float:
@@ -508,7 +533,7 @@ def largest_difference(actions: Sequence[np.ndarray], wanted: Sequence[np.ndarra
     Returns:
         The difference; infinity if shapes differ, or if a value is not finite.
     """
-    rows = np.concatenate([np.atleast_2d(one) for one in wanted]).astype(np.float64)
+    rows = np.concatenate([np.atleast_2d(action) for action in wanted]).astype(np.float64)
     span = np.maximum(np.ptp(rows, axis=0), _SMALLEST_RANGE * np.abs(rows).max(axis=0))
     largest = 0.0
     for i, action in enumerate(actions):
@@ -525,42 +550,43 @@ def recorded_observations(folder: Path, count: int) -> list[Obs]:
     """Read observations, spread evenly over the trajectories below a folder and over their
     steps.
     """
-    if not (files := sorted(folder.rglob("*.npz"))):
+    files = sorted(folder.rglob("*.npz"))
+    if not files:
         raise ConfigError(
             f"--frames {folder}: holds no trajectory (.npz), want a folder of them, as evaluations "
             "save"
         )
+
     used = files[:: max(1, len(files) // count)][:count]
-    found: list[Obs] = []
+    observations: list[Obs] = []
     for number, file in enumerate(used):
         share, trajectory = len(range(number, count, len(used))), Trajectory.load(file)
         steps = np.linspace(0, len(trajectory.actions), share, dtype=int).tolist()
-        images = {
-            camera: _images(video, steps)
-            for camera, video in videos_of(file, trajectory.cameras).items()
-        }
-        found += [
-            Obs(
-                cameras={camera: images[camera][step] for camera in trajectory.cameras},
-                gripper=None if trajectory.gripper is None else float(trajectory.gripper[step]),
-                state={part: values[step] for part, values in trajectory.state.items()},
-            )
-            for step in steps
-        ]
-    return found
+        images = {}
+        for camera, video in videos_of(file, trajectory.cameras).items():
+            images[camera] = _images(video, steps)
+
+        for step in steps:
+            cameras = {camera: images[camera][step] for camera in trajectory.cameras}
+            gripper = None if trajectory.gripper is None else float(trajectory.gripper[step])
+            state = {name: values[step] for name, values in trajectory.state.items()}
+            observations.append(Obs(cameras=cameras, gripper=gripper, state=state))
+    return observations
 
 
 def _images(video: Path, steps: list[int]) -> dict[int, np.ndarray]:
     """Return the images of these steps, (H, W, 3) uint8 RGB."""
     av = require("av")
-    found: dict[int, np.ndarray] = {}
+    images: dict[int, np.ndarray] = {}
     try:
         with av.open(str(video)) as container:
             for number, frame in enumerate(container.decode(video=0)):
                 if number in steps:
-                    found[number] = frame.to_ndarray(format="rgb24")
+                    images[number] = frame.to_ndarray(format="rgb24")
     except (OSError, ValueError) as error:  # PyAV's errors for broken files are of these types
         raise ConfigError(f"--frames: {video} cannot be read ({error})") from error
-    if missing := sorted(set(steps) - set(found)):
+
+    missing = sorted(set(steps) - set(images))
+    if missing:
         raise ConfigError(f"--frames: {video} has no frames {missing}, which its trajectory has")
-    return found
+    return images

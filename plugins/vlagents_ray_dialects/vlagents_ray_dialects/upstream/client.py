@@ -103,7 +103,7 @@ class UpstreamClient(abc.ABC):
         if not isinstance(keys, list):
             return []
 
-        known = set()
+        known: set[str] = set()
         for key in keys:
             known |= {f"{key}", f"images/{key}", f"observation.images.{key}"}
 

@@ -99,7 +99,7 @@ class GR00TClient(UpstreamClient):
         differences = []
         mapping = outgoing.mapping
         camera_keys = [camera.key for camera in mapping.cameras.values()]
-        state_keys = []
+        state_keys: list[str] = []
         for state_entries in mapping.state.values():
             state_keys += [entry.key for entry in state_entries]
 
