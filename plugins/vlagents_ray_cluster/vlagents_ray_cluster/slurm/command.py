@@ -71,10 +71,8 @@ def eval_(
     with errors():
         words, options = split(context.args, _options(evaluate_command))
         index = first_index(options.get("array") or "0")
-        config, other = (
-            _evaluation([word.replace(_TASK, one) for word in words])
-            for one in (index, f"{index}0")
-        )
+        config = _evaluation([word.replace(_TASK, index) for word in words])
+        other = _evaluation([word.replace(_TASK, f"{index}0") for word in words])
         for tracker in config.track:
             registered_class("trackers", tracker)  # raises an error for an unknown name
         if "array" in options and config.out == other.out:
@@ -82,8 +80,10 @@ def eval_(
                 f"--array: its tasks write to one folder; want {_TASK} in it, as in --out "
                 f"runs/x/{_TASK}"
             )
+
+        # Without --workers the workers fill the job. The number of GPUs that policies need is not
+        # known.
         fill = []
-        # They fill the job; how many GPUs policies need is not known.
         if "workers" not in config.model_fields_set:
             if most_gpus(config):
                 raise ConfigError(
@@ -91,7 +91,8 @@ def eval_(
                     "the GPUs left over"
                 )
             fill = [f"--fill={max(1.0, most_cpus(config)):g}"]
-        # Of an array: above its tasks.
+
+        # The folder of an array is above the folders of its tasks.
         folder = Path(os.path.commonpath([config.out, other.out])) / "slurm"
         arguments = ["eval", *fill, f"--closing-s={closing_s:g}", "--", *words]
         _submit(Script("eval", folder, arguments, options, resubmit, setup), dry_run, parsable)
@@ -173,13 +174,13 @@ def _submit(script: Script, dry_run: bool, parsable: bool) -> None:
 
 def _options(command: Callable[..., None]) -> dict[str, bool]:
     """Return the options of a command, and whether each takes a value."""
-    found = _click(command)
-    return {
-        name: not param.is_flag
-        for param in found.params
-        if hasattr(param, "is_flag")
-        for name in param.opts
-    }
+    takes_value = {}
+    for param in _click(command).params:
+        if not hasattr(param, "is_flag"):  # a positional argument
+            continue
+        for name in param.opts:
+            takes_value[name] = not param.is_flag
+    return takes_value
 
 
 def _parsed(name: str, command: Callable[..., None], words: list[str]) -> dict[str, Any]:
@@ -196,9 +197,11 @@ def _click(command: Callable[..., None]) -> Any:
     return typer.main.get_command(app)
 
 
-def _refuse(given: dict[str, Any], why: str, *names: str) -> None:
-    if said := [f"--{name.replace('_', '-')}" for name in names if given[name]]:
-        raise ConfigError(f"{', '.join(said)}: not for a job: {why}; leave it out")
+def _refuse(params: dict[str, Any], why: str, *names: str) -> None:
+    """Raise `ConfigError` if one of these options is set."""
+    options = [f"--{name.replace('_', '-')}" for name in names if params[name]]
+    if options:
+        raise ConfigError(f"{', '.join(options)}: not for a job: {why}; leave it out")
 
 
 def _evaluation(words: list[str]) -> EvalConfig:

@@ -256,13 +256,17 @@ def wait_for_nodes(address: str, number: int) -> int:
             if time.monotonic() > deadline:
                 sys.exit(f"no Ray at {address} in {_NODES_S:g} s: {error}")
     try:
-        while len(alive := [node for node in ray.nodes() if node["Alive"]]) < number:
+        while True:
+            alive = [node for node in ray.nodes() if node["Alive"]]
+            if len(alive) >= number:
+                break
             if time.monotonic() > deadline:
                 sys.exit(
                     f"{len(alive)} of {number} nodes joined Ray in {_NODES_S:g} s: "
                     f"{_names(alive)}; see the logs"
                 )
             time.sleep(_POLL_S)
+
         sys.stdout.write(f"Ray runs on {_names(alive)}\n")
         sys.stdout.flush()
         return int(ray.cluster_resources().get("CPU", 1))
@@ -271,27 +275,27 @@ def wait_for_nodes(address: str, number: int) -> int:
 
 
 def _names(nodes: list[dict[str, Any]]) -> str:
-    found = sorted(
-        ((one["NodeManagerHostname"], one["Resources"]) for one in nodes), key=lambda one: one[0]
-    )
-    return ", ".join(
-        f"{name} ({has.get('CPU', 0):g} CPUs, {has.get('GPU', 0):g} GPUs)" for name, has in found
-    )
+    descriptions = []
+    for node in sorted(nodes, key=lambda node: node["NodeManagerHostname"]):
+        name, resources = node["NodeManagerHostname"], node["Resources"]
+        cpus, gpus = resources.get("CPU", 0), resources.get("GPU", 0)
+        descriptions.append(f"{name} ({cpus:g} CPUs, {gpus:g} GPUs)")
+    return ", ".join(descriptions)
 
 
 def end_of_job(job: int) -> float | None:
     """Return the time at which Slurm ends the job, s since 1970; None if never. Newer versions
     set a variable.
     """
-    if (variable := os.environ.get("SLURM_JOB_END_TIME")) is not None:
+    variable = os.environ.get("SLURM_JOB_END_TIME")
+    if variable is not None:
         return float(variable)
+
     command = ["squeue", "--noheader", f"--jobs={job}", "--format=%e"]
     end = subprocess.run(command, check=True, capture_output=True, text=True).stdout.strip()  # noqa: S603
-    return (
-        None
-        if end in ("NONE", "Unknown", "N/A")
-        else datetime.datetime.fromisoformat(end).timestamp()
-    )
+    if end in ("NONE", "Unknown", "N/A"):
+        return None
+    return datetime.datetime.fromisoformat(end).timestamp()
 
 
 def announce(words: Sequence[str]) -> None:
@@ -306,9 +310,10 @@ def announce(words: Sequence[str]) -> None:
         if time.monotonic() > deadline or os.getppid() != server:
             return
         time.sleep(_POLL_S)
-    found = connection_info(apps, port, os.environ)
-    write(folder / FILE, found)
-    sys.stdout.write(as_text(found, folder / FILE))
+
+    info = connection_info(apps, port, os.environ)
+    write(folder / FILE, info)
+    sys.stdout.write(as_text(info, folder / FILE))
     sys.stdout.flush()
 
 
@@ -349,10 +354,10 @@ def as_text(found: Mapping[str, Any], file: Path) -> str:
 
 def write(file: Path, found: Mapping[str, Any]) -> None:
     """Write the file, which contains a key, atomically and readable only by its owner."""
-    part = file.with_suffix(".part")
-    part.touch(mode=0o600)
-    part.write_text(json.dumps(found, indent=2) + "\n")
-    part.replace(file)
+    unfinished = file.with_suffix(".part")
+    unfinished.touch(mode=0o600)
+    unfinished.write_text(json.dumps(found, indent=2) + "\n")
+    unfinished.replace(file)
 
 
 def _answers(url: str) -> bool:

@@ -107,11 +107,11 @@ class MeasuredPolicy:
             At least `count` actions, (D,) or (H, D) float32; the one at i belongs to episode i
             modulo `count`.
         """
-        found: list[np.ndarray] = []
-        while len(found) < count:
-            episodes = [i % count for i in range(len(found), len(found) + size)]
-            found += [act.action for act in self.batch(episodes)()]
-        return found
+        actions: list[np.ndarray] = []
+        while len(actions) < count:
+            episodes = [i % count for i in range(len(actions), len(actions) + size)]
+            actions += [act.action for act in self.batch(episodes)()]
+        return actions
 
     def batch(self, episodes: Sequence[int]) -> Callable[[], list[Act]]:
         """Return a function that acts once with new sessions of these episodes, in one batch."""
@@ -121,12 +121,12 @@ class MeasuredPolicy:
             session.reset(view, INSTRUCTION, seed=i)
 
         def act() -> list[Act]:
-            found = []
-            for one in self.agent.act_batch(views, sessions):
-                if isinstance(one, Exception):
-                    raise one
-                found.append(one)
-            return found
+            acts = []
+            for result in self.agent.act_batch(views, sessions):
+                if isinstance(result, Exception):
+                    raise result
+                acts.append(result)
+            return acts
 
         return act
 
@@ -136,41 +136,44 @@ class MeasuredPolicy:
         """
         views = [self._view(self.engine.contract, i) for i in range(size)]
         answers: queue.SimpleQueue[tuple[int, Reply]] = queue.SimpleQueue()
-        asked = [0.0] * size
+        sent_at = [0.0] * size
 
-        def ask(i: int, op: Any, **given: Any) -> None:
-            asked[i] = time.perf_counter()
-            request = Request(op, views[i], priority=priority, **given)
+        def send(i: int, op: Any, **fields: Any) -> None:
+            sent_at[i] = time.perf_counter()
+            request = Request(op, views[i], priority=priority, **fields)
             done = lambda reply: answers.put((i, reply))  # noqa: E731 - of this request
             self.engine.submit([PendingRequest(f"bench-{i}", request, done, PRIORITIES[priority])])
 
-        def answer() -> tuple[int, Reply, float]:
+        def receive() -> tuple[int, Reply, float]:
             i, reply = answers.get(timeout=_LATE_S)
             if reply.error is not None:
                 raise reply.error
             return i, reply, time.perf_counter()
 
         for i in range(size):
-            ask(i, "reset", instruction=INSTRUCTION, kwargs={"seed": i})
+            send(i, "reset", instruction=INSTRUCTION, kwargs={"seed": i})
         for _ in range(size):
-            answer()
+            receive()
+
         for i in range(size):
-            ask(i, "act")
-        calls: list[tuple[float, float, float]] = []
+            send(i, "act")
+        calls: list[tuple[float, float, float]] = []  # end (s), round trip (s), batch size
         waiting, first = size, WARM * size
         while waiting:
-            i, reply, now = answer()
-            calls.append((now, now - asked[i], reply.timing["batch_size"]))
+            i, reply, now = receive()
+            calls.append((now, now - sent_at[i], reply.timing["batch_size"]))
             waiting -= 1
             if len(calls) <= first or now - calls[first][0] < seconds:
                 waiting += 1
-                ask(i, "act")
+                send(i, "act")
+
         for i in range(size):
-            ask(i, "close")
-            answer()
+            send(i, "close")
+            receive()
+
+        # A batch is counted once for each of its calls, so the mean size of the batches is the
+        # harmonic mean over the calls.
         calls = calls[first:]
-        # Each call counts its batch once for each of the batch's members: the harmonic mean is the
-        # batches' own.
         mean_batch = len(calls) / sum(1 / call[2] for call in calls)
         return QueuedTurn(rate_of([calls]), mean_batch, [call[1] * 1e3 for call in calls])
 
@@ -184,7 +187,11 @@ def rate_of(calls: Sequence[Sequence[tuple[float, ...]]]) -> float:
     Args:
         calls: The calls of each client; the first number of a call is its end, s.
     """
-    ends = np.sort([call[0] for one in calls for call in one])
+    ends_of_calls: list[float] = []
+    for calls_of_client in calls:
+        ends_of_calls += [call[0] for call in calls_of_client]
+
+    ends = np.sort(ends_of_calls)
     if len(ends) < 2 or ends[0] == ends[-1]:
         return 0.0
     return float(np.polyfit(ends - ends[0], np.arange(len(ends)), 1)[0])
@@ -193,11 +200,9 @@ def rate_of(calls: Sequence[Sequence[tuple[float, ...]]]) -> float:
 def cuda() -> Any:
     """Return `torch.cuda` if this process uses it, else None."""
     torch = sys.modules.get("torch")
-    return (
-        torch.cuda
-        if torch is not None and torch.cuda.is_available() and torch.cuda.is_initialized()
-        else None
-    )
+    if torch is not None and torch.cuda.is_available() and torch.cuda.is_initialized():
+        return torch.cuda
+    return None
 
 
 def jax_device() -> Any:
@@ -209,7 +214,8 @@ def jax_device() -> Any:
 
 def forget_peak() -> None:
     """Reset `peak_mib`, if the accelerator supports it."""
-    if (used := cuda()) is not None:
+    used = cuda()
+    if used is not None:
         used.reset_peak_memory_stats()
 
 
@@ -217,18 +223,24 @@ def peak_mib() -> float:
     """Return the peak memory, MiB, of the accelerator, with torch since `forget_peak`; else of
     this process.
     """
-    if (used := cuda()) is not None:
+    used = cuda()
+    if used is not None:
         return float(used.max_memory_allocated()) / 2**20
-    if (device := jax_device()) is not None:
+
+    device = jax_device()
+    if device is not None:
         return float((device.memory_stats() or {}).get("peak_bytes_in_use", 0)) / 2**20
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**10
 
 
 def device_name() -> str:
     """Return the name of the policy's accelerator, or "cpu"."""
-    if (used := cuda()) is not None:
+    used = cuda()
+    if used is not None:
         return str(used.get_device_name())
-    return "cpu" if (device := jax_device()) is None else str(device.device_kind)
+
+    device = jax_device()
+    return "cpu" if device is None else str(device.device_kind)
 
 
 @dataclass(frozen=True, slots=True)
@@ -265,8 +277,8 @@ def main() -> None:
     die_with_parent()
     out = own_stdout()
 
-    def answer(said: Mapping[str, Any]) -> None:
-        print(json.dumps(said), file=out, flush=True)
+    def answer(message: Mapping[str, Any]) -> None:
+        print(json.dumps(message), file=out, flush=True)
 
     try:
         _serve(ProcessSettings(**json.loads(sys.stdin.readline())), answer)
