@@ -98,11 +98,11 @@ class Operator:
         and quaternion xyzw.
         """
         x, y, z, *quaternion = np.round(pose, 2).tolist()
-        place = (
+        pose_text = (
             f"{x} m in front of the base, {y} m to its left, {z} m above it, with the "
             f"quaternion xyzw {quaternion}"
         )
-        return _asked(f"Is the hand of arm {arm + 1} there: {place}?")
+        return _asked(f"Is the hand of arm {arm + 1} there: {pose_text}?")
 
 
 def _asked(question: str) -> bool | None:
@@ -129,6 +129,8 @@ class Finding:
 
 @dataclass
 class RobotReport:
+    """The result of a check: findings, passed and skipped checks, figures and pictures."""
+
     findings: list[Finding] = field(default_factory=list)
     passed: list[str] = field(default_factory=list)  # keys of CHECKS
     skipped: dict[str, str] = field(default_factory=dict)  # check: the reason
@@ -160,6 +162,7 @@ class RobotReport:
         reasons: dict[str, list[str]] = {}
         for name, reason in self.skipped.items():
             reasons.setdefault(reason, []).append(name)
+
         return [
             *(f"FOUND {finding}" for finding in self.findings),
             *(f"ok {name}: {CHECKS[name]}" for name in self.passed),
@@ -171,20 +174,28 @@ class RobotReport:
     def write(self, file: str | Path) -> None:
         """Write the report with its pictures as one HTML page, which needs no network."""
         date = time.strftime("%Y-%m-%d %H:%M", time.localtime(self.at))
-        colour = "#b00020" if self.findings else "#8a5a00" if self.undeclared else "#1b6e1b"
+        if self.findings:
+            colour = "#b00020"  # red
+        elif self.undeclared:
+            colour = "#8a5a00"  # amber
+        else:
+            colour = "#1b6e1b"  # green
         style = "body{font:16px/1.5 sans-serif;max-width:60em;margin:2em auto;padding:0 1em}"
         style += f"h2{{color:{colour}}}figure{{display:inline-block;margin:8px}}img{{height:240px}}"
+
         page = (
             f"<!doctype html><meta charset=utf-8><title>Check of {html.escape(self.robot)}</title>"
         )
         page += f"<style>{style}</style><h1>Check of {html.escape(self.robot)}</h1>"
         page += f"<h2>{html.escape(self.verdict)}</h2><p>{date}</p>"
         page += f"<ul>{''.join(f'<li>{html.escape(line)}</li>' for line in self.lines()[:-1])}</ul>"
+
         for title, picture in self.pictures.items():
             url = data_url("image/jpeg", encode_jpeg(picture))
             page += (
                 f'<figure><img src="{url}"><figcaption>{html.escape(title)}</figcaption></figure>'
             )
+
         Path(file).write_text(page, encoding="utf-8")
 
 
@@ -215,10 +226,10 @@ def examine(
         The findings, and which checks passed or were not made.
     """
     contract = contract or contract_of(robot)
+    period_s = 1 / (hz or contract.control_hz or 50.0)
     report = RobotReport(robot=type(robot).__name__)
-    suite = _Suite(
-        robot, contract, operator, 1 / (hz or contract.control_hz or 50.0), latency_s, clock, report
-    )
+    suite = _Suite(robot, contract, operator, period_s, latency_s, clock, report)
+
     try:
         suite.at_rest()
         suite.in_motion()
@@ -234,6 +245,7 @@ def examine(
         )
     finally:
         robot.stop()
+
     suite.skip_others(
         "an earlier check found something" if suite.report.findings else "nothing moved"
     )
@@ -272,14 +284,15 @@ class _Suite:
 
     def at_rest(self) -> None:
         """Run the checks that move nothing."""
-        first = self._observe()
-        self._layout = _Layout.find(self._robot, self._contract, first)
-        check_observation(first, self._contract)
+        first_obs = self._observe()
+        self._layout = _Layout.find(self._robot, self._contract, first_obs)
+        check_observation(first_obs, self._contract)
         if self._layout is None or self._contract.action.relative is None:
             self.report.undeclared = _undeclared(self._contract)
         if self._contract == Contract():
             self.report.skipped["observation"] = _DECLARE
         self._passes("observation")
+
         names = getattr(self._robot, "joint_names", ())
         for number, ours, theirs in reordered(names, self._contract.action.names or ())[:1]:
             cure = "give actions and state the contract's order of joints"
@@ -289,14 +302,17 @@ class _Suite:
                 f"{theirs!r}, as the contract states",
                 cure,
             )
-        last = first
+
+        last_obs = first_obs
         for _ in range(20):
             self._clock.sleep(self._period_s)
-            last = self._observe()
+            last_obs = self._observe()
         if self._stamped:
             self._passes("clock")
-        median_ms, most_ms = (1e3 * float(np.quantile(self._observe_s, q)) for q in (0.5, 0.99))
-        self.report.figures |= {"observe p50, ms": median_ms, "observe p99, ms": most_ms}
+
+        median_ms = 1e3 * float(np.quantile(self._observe_s, 0.5))
+        p99_ms = 1e3 * float(np.quantile(self._observe_s, 0.99))
+        self.report.figures |= {"observe p50, ms": median_ms, "observe p99, ms": p99_ms}
         if median_ms > 500 * self._period_s:
             limit = f"at most {500 * self._period_s:.3g} ms, half of a tick"
             self.find(
@@ -305,12 +321,13 @@ class _Suite:
                 limit,
                 "read cameras and bus in threads of their own",
             )
-        self._check_units(last)
-        self._check_limits(last)
+
+        self._check_units(last_obs)
+        self._check_limits(last_obs)
         self._check_stop()
         self._check_new_pictures()
         self._check_cameras()
-        self._check_place(last)
+        self._check_place(last_obs)
 
     def in_motion(self) -> None:
         """Move one joint at a time, then the grippers, unless there is a finding or a reason
@@ -324,8 +341,10 @@ class _Suite:
             return
         if not self._agreed("the command of the present pose, at which nothing should move"):
             return
+
         self._check_meaning(layout)
         self._passes("meaning", "blocking")
+
         for joint, name in enumerate(layout.names):
             if not self._agreed(f"a move of {name} by {layout.step:g} {layout.unit} and back"):
                 return
@@ -333,6 +352,7 @@ class _Suite:
             if joint == 0:
                 self._check_single_commands(layout, name)
                 self._check_stop_in_motion(layout, name)
+
         self._passes("order", "sign", "size", "latency", "rate", "pose", "commands", "stop")
         self.report.figures["command to measured motion, ms"] = 1e3 * float(np.median(self._lags_s))
         self._check_grippers(layout)
@@ -345,37 +365,39 @@ class _Suite:
                 self.report.skipped.setdefault(name, reason)
 
     def _agreed(self, motion: str) -> bool:
-        self._when = motion if self._operator is not None and self._operator.agrees(motion) else ""
-        if not self._when:
-            refused = f"the operator did not agree to {motion}"
-            self.skip_others(
-                "no operator agreed to a motion" if self._operator is None else refused
-            )
-        return bool(self._when)
+        agrees = self._operator is not None and self._operator.agrees(motion)
+        self._when = motion if agrees else ""
+        if self._operator is None:
+            self.skip_others("no operator agreed to a motion")
+        elif not agrees:
+            self.skip_others(f"the operator did not agree to {motion}")
+        return agrees
 
     def _passes(self, *checks: str) -> None:
-        found = {finding.check for finding in self.report.findings} | self.report.skipped.keys()
-        self.report.passed += [
-            one for one in checks if one not in found and one not in self.report.passed
-        ]
+        not_passed = {finding.check for finding in self.report.findings}
+        not_passed |= self.report.skipped.keys()
+        for check in checks:
+            if check not in not_passed and check not in self.report.passed:
+                self.report.passed.append(check)
 
     def _observe(self) -> Obs:
         began_s = self._clock.monotonic()
         obs = self._robot.observe()
         self._observe_s.append(self._clock.monotonic() - began_s)
+
         stamp_s = obs.info.get(CAPTURED)
         if stamp_s is None:
             self.report.skipped.setdefault("clock", f"observations have no {CAPTURED!r}")
         elif self._stamped:
             ahead_s = stamp_s - self._clock.time()
-            back_s, self._stamp_s = self._stamp_s - stamp_s, stamp_s
+            back_s = self._stamp_s - stamp_s
+            self._stamp_s = stamp_s
             if back_s > 0 or not _SKEW_S[0] <= ahead_s <= _SKEW_S[1]:
                 self._stamped = False
-                got = (
-                    f"a time stamp {back_s:.3g} s before the last one"
-                    if back_s > 0
-                    else f"one {ahead_s:+.3g} s off"
-                )
+                if back_s > 0:
+                    got = f"a time stamp {back_s:.3g} s before the last one"
+                else:
+                    got = f"one {ahead_s:+.3g} s off"
                 cure = (
                     "use time.time() of this machine when the first sensor is read, or "
                     "synchronize the clocks"
@@ -389,30 +411,36 @@ class _Suite:
         self._robot.apply(action.astype(np.float32))
         took_s = self._clock.monotonic() - began_s
         self._apply_s.append(took_s)
+
         if np.median(self._apply_s) > max(0.005, self._period_s / 4):
             limit = f"at most {1e3 * max(0.005, self._period_s / 4):.3g} ms"
             cure = "send the command and return; do not wait until the arm is there"
             self.find("blocking", f"{1e3 * took_s:.3g} ms for apply", limit, cure)
 
     def _check_units(self, obs: Obs) -> None:
-        for name, part in obs.state.items():
+        for name, values in obs.state.items():
             spec = (self._contract.state or {}).get(name)
-            unit, kind = spec.unit if spec else None, name.rpartition("/")[2]
-            if kind == "joints" and unit in (None, "rad") and np.abs(part).max() > 2.1 * np.pi:
-                got = f"{np.abs(part).max():.4g} in {name!r}, more than a full turn"
+            unit = spec.unit if spec else None
+            kind = name.rpartition("/")[2]
+
+            if kind == "joints" and unit in (None, "rad") and np.abs(values).max() > 2.1 * np.pi:
+                got = f"{np.abs(values).max():.4g} in {name!r}, more than a full turn"
                 self.find(
                     "units", got, "rad", "convert degrees by np.deg2rad, in observe and in apply"
                 )
-            if kind in ("tquat", "xyzrpy") and np.abs(part[:3]).max() > _MOST_M:
+
+            if kind in ("tquat", "xyzrpy") and np.abs(values[:3]).max() > _MOST_M:
                 self.find(
                     "units",
-                    f"{np.abs(part[:3]).max():.4g} in {name!r}",
+                    f"{np.abs(values[:3]).max():.4g} in {name!r}",
                     "m",
                     "divide millimetres by 1000",
                 )
-            if kind == "tquat" and abs(np.linalg.norm(part[3:]) - 1) > 0.01:
-                got = f"a quaternion of length {np.linalg.norm(part[3:]):.3g} in {name!r}"
+
+            if kind == "tquat" and abs(np.linalg.norm(values[3:]) - 1) > 0.01:
+                got = f"a quaternion of length {np.linalg.norm(values[3:]):.3g} in {name!r}"
                 self.find("units", got, "1", "give position and then quaternion xyzw")
+
         if obs.gripper is not None and not 0 <= obs.gripper <= 1:
             self.find(
                 "units",
@@ -420,6 +448,7 @@ class _Suite:
                 "[0, 1], 1 = open",
                 "scale it by its closed and open",
             )
+
         self._passes("units")
 
     def _check_limits(self, obs: Obs) -> None:
@@ -431,18 +460,19 @@ class _Suite:
                 "the robot has no `joint_limits`, or no state of its joints"
             )
             return
+
         for name, measured, (low, high) in zip(
             layout.names, layout.measured(obs), layout.limits, strict=True
         ):
             if not low <= measured <= high:
-                got, want = f"{name} at {measured:.4g}", f"[{low:.4g}, {high:.4g}]"
                 self.find(
                     "limits",
-                    got,
-                    want,
+                    f"{name} at {measured:.4g}",
+                    f"[{low:.4g}, {high:.4g}]",
                     "give the limits of this arm, in the order and unit of its joints",
                 )
                 break
+
         self._passes("limits")
 
     def _check_stop(self) -> None:
@@ -450,26 +480,29 @@ class _Suite:
             with ThreadPoolExecutor(1) as thread:
                 thread.submit(self._robot.stop).result()
 
-        for place, call in (
+        calls = (
             ("", self._robot.stop),
             (" again", self._robot.stop),
             (" from a thread", in_thread),
-        ):
+        )
+        for occasion, call in calls:
             began_s = self._clock.monotonic()
             try:
                 call()
             except Exception as error:  # noqa: BLE001 - any error of the robot is a finding
                 self.find(
                     "stop",
-                    f"{error!r} from stop{place}",
+                    f"{error!r} from stop{occasion}",
                     "no error in any state",
                     "make stop safe to repeat",
                 )
                 return
-            if (took_s := self._clock.monotonic() - began_s) > _STOP_S:
+
+            took_s = self._clock.monotonic() - began_s
+            if took_s > _STOP_S:
                 self.find(
                     "stop",
-                    f"{took_s:.3g} s for stop{place}",
+                    f"{took_s:.3g} s for stop{occasion}",
                     f"at most {_STOP_S} s",
                     "send it and return",
                 )
@@ -484,17 +517,18 @@ class _Suite:
         if getattr(self._robot, "dates_pictures", False):
             self._check_new_dates()
             return
+
         first = {name: picture.copy() for name, picture in self._observe().cameras.items()}
-        began_s, still = self._clock.monotonic(), set(first)
-        while still and self._clock.monotonic() - began_s < _FROZEN_S:
+        unchanged = set(first)  # names of cameras
+        began_s = self._clock.monotonic()
+        while unchanged and self._clock.monotonic() - began_s < _FROZEN_S:
             self._clock.sleep(self._period_s)
             pictures = self._observe().cameras
-            still = {
-                name
-                for name in still
-                if name in pictures and np.array_equal(pictures[name], first[name])
-            }
-        for name in sorted(still):
+            for name in tuple(unchanged):
+                if name not in pictures or not np.array_equal(pictures[name], first[name]):
+                    unchanged.remove(name)
+
+        for name in sorted(unchanged):
             got = f"the same picture of {name!r}, to the bit, for {_FROZEN_S:g} s"
             cure = (
                 "the camera hangs, or observe returns a stored picture: restart it, and read each "
@@ -523,33 +557,40 @@ class _Suite:
     def _check_cameras(self) -> None:
         if any(finding.check == "cameras" for finding in self.report.findings):
             return
+
         before = self._observe().cameras
         self.report.pictures |= before
         for camera in before:
             if self._operator is None or not self._operator.holds_card(camera):
                 self.report.skipped["cameras"] = "nobody could hold the red card"
                 return
+
             self._clock.sleep(0.3)
-            seen = self._observe().cameras
-            self.report.pictures[f"{camera}, with the red card in the upper left"] = seen[camera]
-            self._judge_card(camera, {name: _card(before[name], seen[name]) for name in before})
+            after = self._observe().cameras
+            self.report.pictures[f"{camera}, with the red card in the upper left"] = after[camera]
+            self._judge_card(camera, {name: _card(before[name], after[name]) for name in before})
+
         if not before:
             self.report.skipped["cameras"] = "there is none"
         elif self._operator is not None:
             self._operator.holds_card(None)
+
         self._passes("cameras")
 
-    def _judge_card(self, camera: str, found: dict[str, _Card | None]) -> None:
-        card, want = found[camera], f"the card, red, in the upper left of {camera!r}"
-        others = [
-            name
-            for name, other in found.items()
-            if name != camera and other is not None and other.share > 0.004
-        ]
-        if card is None and others:
+    def _judge_card(self, camera: str, cards: dict[str, _Card | None]) -> None:
+        """Check the card in the picture of one camera; `cards` are those of all cameras."""
+        card = cards[camera]
+        want = f"the card, red, in the upper left of {camera!r}"
+
+        other_cameras = []
+        for name, other_card in cards.items():
+            if name != camera and other_card is not None and other_card.share > 0.004:
+                other_cameras.append(name)
+
+        if card is None and other_cameras:
             self.find(
                 "cameras",
-                f"the card of {camera!r} in {others[0]!r}",
+                f"the card of {camera!r} in {other_cameras[0]!r}",
                 want,
                 "exchange the names of the cameras",
             )
@@ -564,13 +605,13 @@ class _Suite:
                 "give RGB: image[..., ::-1] of OpenCV's BGR",
             )
         elif card.x > 0.5 or card.y > 0.5:
-            side = (
+            got = (
                 f"the card at {100 * card.x:.0f} % from the left and {100 * card.y:.0f} % from "
                 f"the top of {camera!r}"
             )
             self.find(
                 "cameras",
-                side,
+                got,
                 want,
                 "rotate or flip the picture in observe: it must be upright, not mirrored",
             )
@@ -578,11 +619,10 @@ class _Suite:
     def _check_place(self, obs: Obs) -> None:
         for number, arm in enumerate(self._contract.action.arms or ("",)):
             pose = obs.state.get(arm_part(arm, "tquat"))
-            sees = (
-                None
-                if pose is None or self._operator is None
-                else self._operator.sees_hand(pose, number)
-            )
+            sees: bool | None = None
+            if pose is not None and self._operator is not None:
+                sees = self._operator.sees_hand(pose, number)
+
             if pose is None or sees is None:
                 self.report.skipped["place"] = (
                     "observations have no 'tquat', or the operator cannot tell"
@@ -597,6 +637,7 @@ class _Suite:
                     "quaternion as xyzw"
                 )
                 self.find("place", got, "the pose that the operator sees", cure)
+
         self._passes("place")
 
     def _hold_command(self, layout: _Layout, obs: Obs) -> np.ndarray:
@@ -604,12 +645,14 @@ class _Suite:
         action = np.zeros(len(layout.joints) + len(layout.grippers))
         if not layout.relative:
             action[layout.joints] = layout.measured(obs)
+
         spec = self._contract.action
         if layout.grippers and spec.gripper_open is not None and spec.gripper_closed is not None:
             opening = 1.0 if obs.gripper is None else obs.gripper
             action[layout.grippers] = spec.gripper_closed + opening * (
                 spec.gripper_open - spec.gripper_closed
             )
+
         return action
 
     def _check_meaning(self, layout: _Layout) -> None:
@@ -620,8 +663,8 @@ class _Suite:
             self._clock.sleep(0.01)
             moved = layout.measured(self._observe()) - start
             if np.abs(moved).max() > _RUNAWAY * layout.step:
-                most = int(np.argmax(np.abs(moved)))
-                got = f"a motion of {layout.names[most]} by {moved[most]:+.3g} and more"
+                joint = int(np.argmax(np.abs(moved)))
+                got = f"a motion of {layout.names[joint]} by {moved[joint]:+.3g} and more"
                 kind = "absolute targets" if layout.relative else "deltas"
                 cure = (
                     f"the arm takes {kind}, or other units: correct apply, or action.delta of "
@@ -635,31 +678,35 @@ class _Suite:
         """
         base = layout.measured(self._observe())
         ticks = max(1, round(_RAMP_S / self._period_s))
-        seen = []
+
+        readings = []
         for tick in range(1, ticks + round(_HOLD_S / self._period_s) + 1):
             if tick <= ticks:
                 self._apply(layout.changed(self._command, joint, change / ticks))
             self._clock.sleep(self._period_s)
             measured = layout.measured(self._observe())
-            seen.append((self._clock.monotonic(), measured))
+            readings.append((self._clock.monotonic(), measured))
             if np.abs(measured - base).max() > _RUNAWAY * layout.step:
                 self._judge_move(layout, joint, change, measured - base)
-        return seen
+        return readings
 
     def _move(self, layout: _Layout, joint: int, name: str) -> None:
+        """Move a joint by a small step and back, and check its motion."""
         before = self._observe()
-        base, began_s = layout.measured(before), self._clock.monotonic()
-        room = base[joint] + 2 * layout.step < layout.limits[joint][1]
-        change = layout.step if room else -layout.step
-        seen = self._ramp(layout, joint, change)
+        base = layout.measured(before)
+        began_s = self._clock.monotonic()
+
+        # Move to the positive side unless the upper limit is too close.
+        has_room = base[joint] + 2 * layout.step < layout.limits[joint][1]
+        change = layout.step if has_room else -layout.step
+        readings = self._ramp(layout, joint, change)
         after = self._observe()
         moved = layout.measured(after) - base
         self._judge_move(layout, joint, change, moved)
-        saw = (
-            self._operator.saw_joint(name, 1 if room else -1)
-            if self._operator is not None
-            else None
-        )
+
+        saw: bool | None = None
+        if self._operator is not None:
+            saw = self._operator.saw_joint(name, 1 if has_room else -1)
         if saw is None:
             reason = (
                 f"command and reading agree, but the operator could not tell whether {name} moved"
@@ -669,42 +716,54 @@ class _Suite:
             cure = "correct the order or the sign of the joints, in observe and in apply"
             got = f"another joint, or another side, when {name} was commanded"
             self.find("order", got, f"{name} alone, {change:+g}", cure)
-        half = [at for at, measured in seen if (measured[joint] - base[joint]) / change >= 0.5]
-        self._lags_s.append((half[0] if half else np.inf) - began_s - _RAMP_S / 2)
-        if self._lags_s[-1] > self._latency_s:
-            got = f"{self._lags_s[-1]:.3g} s from the command of {name} to its measured motion"
+
+        # The joint's lag: from the middle of the commanded ramp to half of the measured change.
+        half_way_s = np.inf
+        for time_s, measured in readings:
+            if (measured[joint] - base[joint]) / change >= 0.5:
+                half_way_s = time_s
+                break
+        lag_s = half_way_s - began_s - _RAMP_S / 2
+        self._lags_s.append(lag_s)
+        if lag_s > self._latency_s:
+            got = f"{lag_s:.3g} s from the command of {name} to its measured motion"
             cure = (
                 "read the newest state, without a queue; if the arm itself is slow, give latency_s"
             )
             self.find("latency", got, f"at most {self._latency_s} s", cure)
-        values = [measured[joint] for _, measured in seen]
+
+        positions = [measured[joint] for _, measured in readings]
         ticks = round(_RAMP_S / self._period_s)
-        fresh = int(np.count_nonzero(np.abs(np.diff(values)) > 1e-3 * layout.step))
-        if fresh < ticks / 2:
-            got = f"{fresh} new readings of {name} in a move of {ticks} ticks"
+        changes = int(np.count_nonzero(np.abs(np.diff(positions)) > 1e-3 * layout.step))
+        if changes < ticks / 2:
+            got = f"{changes} new readings of {name} in a move of {ticks} ticks"
             cure = (
                 "run the arm's own loop, and read it, at the control rate, or lower the rate (hz)"
             )
             self.find("rate", got, f"one a tick, {1 / self._period_s:.3g} Hz", cure)
+
         self._judge_pose(layout, joint, before, after)
+
         self._ramp(layout, joint, -change)
-        left = layout.measured(self._observe()) - base
-        if np.abs(left).max() > layout.step / 2:
-            got = f"{np.abs(left).max():.3g} off after the way back of {name}"
+        deviation = layout.measured(self._observe()) - base
+        if np.abs(deviation).max() > layout.step / 2:
+            got = f"{np.abs(deviation).max():.3g} off after the way back of {name}"
             self.find("size", got, "the pose before", "check the arm's controller")
 
     def _judge_move(self, layout: _Layout, joint: int, change: float, moved: np.ndarray) -> None:
         """Compare the measured changes of all joints, (D,), with the commanded change of one."""
-        most, name, ratio = (
-            int(np.argmax(np.abs(moved))),
-            layout.names[joint],
-            float(moved[joint] / change),
-        )
+        name = layout.names[joint]
+        moved_most = int(np.argmax(np.abs(moved)))
+        ratio = float(moved[joint] / change)
+
         if np.abs(moved).max() < 0.3 * layout.step:
             cure = "check that torque is on, and that apply sends each command"
             self.find("size", f"no motion of any joint for {name}", f"{change:+g}", cure)
-        elif most != joint:
-            got = f"{layout.names[most]} moved by {moved[most]:+.3g} when {name} was commanded"
+        elif moved_most != joint:
+            got = (
+                f"{layout.names[moved_most]} moved by {moved[moved_most]:+.3g} when {name} was "
+                "commanded"
+            )
             self.find(
                 "order", got, f"{name} alone", "give actions and state the same order of joints"
             )
@@ -729,16 +788,16 @@ class _Suite:
         if key is None or layout.unit not in ("rad", "deg"):
             self.report.skipped["pose"] = "observations have no 'tquat', the pose of the hand"
             return
-        (p0, q0), (p1, q1) = (
-            (obs.state[key][:3], obs.state[key][3:].astype(float)) for obs in (before, after)
-        )
+
+        p0, q0 = before.state[key][:3], before.state[key][3:].astype(float)
+        p1, q1 = after.state[key][:3], after.state[key][3:].astype(float)
         # The quaternion of the turn: q1 times the inverse of q0.
         axis = q0[3] * q1[:3] - q1[3] * q0[:3] - np.cross(q1[:3], q0[:3])
         sine = np.linalg.norm(axis)
         angle = 2 * np.arctan2(sine, abs(q1 @ q0))
         change = abs(layout.measured(after)[joint] - layout.measured(before)[joint])
-        change = np.deg2rad(change) if layout.unit == "deg" else change
-        along = abs(float((p1 - p0) @ axis)) / max(1e-9, float(sine))
+        if layout.unit == "deg":
+            change = np.deg2rad(change)
         if abs(angle - change) > 0.3 * change + 0.01:
             got = (
                 f"the hand turned by {angle:.3g} rad for {change:.3g} rad of {layout.names[joint]}"
@@ -749,7 +808,9 @@ class _Suite:
                 "the same angle",
                 "correct the rotation of the pose, or the unit of the joints",
             )
-        # The tolerance is for what other joints give way: 1 mm, and a sixth of the hand's way.
+
+        # The other joints may give way by 1 mm and a sixth of the hand's path.
+        along = abs(float((p1 - p0) @ axis)) / max(1e-9, float(sine))
         if along > 0.001 + float(np.linalg.norm(p1 - p0)) / 6:
             got = f"a hand that moved {1e3 * along:.2g} mm along the axis about which it turned"
             self.find(
@@ -763,7 +824,8 @@ class _Suite:
         half = layout.step / 2
         for number in range(6):
             before = layout.measured(self._observe())[0]
-            self._apply(layout.changed(self._command, 0, half if number % 2 == 0 else -half))
+            change = half if number % 2 == 0 else -half
+            self._apply(layout.changed(self._command, 0, change))
             self._clock.sleep(2 * self._latency_s)
             if abs(layout.measured(self._observe())[0] - before) < 0.4 * half:
                 got = f"no motion of {name} at command {number + 1} of 6 single ones"
@@ -779,6 +841,7 @@ class _Suite:
         self._apply(layout.changed(self._command, 0, layout.step))
         self._robot.stop()
         self._clock.sleep(2 * self._latency_s)
+
         moved = abs(layout.measured(self._observe())[0] - before)
         if moved > layout.step / 2:
             got = f"{name} went on by {moved:.3g} after stop"
@@ -788,24 +851,30 @@ class _Suite:
                 "rest at once",
                 "make the measured pose the target in stop, and drop commands",
             )
+
         self._command = self._hold_command(layout, self._observe())
 
     def _check_grippers(self, layout: _Layout) -> None:
-        spec, obs = self._contract.action, self._observe()
+        spec = self._contract.action
+        obs = self._observe()
         if not layout.grippers or obs.gripper is None or spec.gripper_closed is None:
             self.report.skipped["gripper"] = "the contract states no gripper"
             return
         if not self._agreed("closing and opening the gripper"):
             return
+
         action = self._hold_command(layout, obs)
 
-        def opening(goal: float | None) -> float:
+        def opening_after(goal: float | None) -> float:
+            """Command an opening, and return the measured one."""
             action[layout.grippers] = goal
             self._apply(action)
             self._clock.sleep(2.0)
             return self._observe().gripper or 0.0
 
-        before, after = opening(spec.gripper_open), opening(spec.gripper_closed)
+        before = opening_after(spec.gripper_open)
+        after = opening_after(spec.gripper_closed)
+
         saw = None if self._operator is None else self._operator.saw_closing()
         if saw is None:
             self.report.skipped["gripper"] = "the operator could not tell whether it closed"
@@ -816,7 +885,8 @@ class _Suite:
                 "in observe"
             )
             self.find("gripper", got, "a gripper that closes, and a smaller opening", cure)
-        opening(spec.gripper_open)
+
+        opening_after(spec.gripper_open)
         self._passes("gripper")
 
 
@@ -825,11 +895,11 @@ def _undeclared(contract: Contract) -> str:
     action = contract.action
     missing = [name for name in ("dim", "space", "delta") if getattr(action, name) is None]
     if missing:
-        what = f"its `action` has no {', '.join(missing)}"
+        reason = f"its `action` has no {', '.join(missing)}"
     else:
-        what = "its state has no `joints` of the size of an action, or its actions are not joints"
+        reason = "its state has no `joints` of the size of an action, or its actions are not joints"
     return (
-        f"the motion cannot be checked, as {what}. Give the class a `contract`, such as "
+        f"the motion cannot be checked, as {reason}. Give the class a `contract`, such as "
         "Contract(state={'joints': StateSpec(6, 'rad')}, action=ActionSpec(dim=6, space='joint', "
         "delta=False)), or check by the contract of a policy (--policy URL); topics of ROS state "
         "only targets, by a measured pose as their `stop`; see docs/arms.md"
@@ -855,35 +925,40 @@ class _Layout:
         action: ActionSpec = contract.action
         if action.space not in (None, "joint") or action.dim is None:
             return None
-        parts = [
-            key for arm in action.arms or ("",) if (key := arm_part(arm, "joints")) in obs.state
-        ]
-        counts = [len(obs.state[part]) for part in parts]
-        each = (action.dim - sum(counts)) // max(1, len(parts))
-        if not parts or each not in (0, 1) or sum(counts) + each * len(parts) != action.dim:
+
+        keys = [arm_part(arm, "joints") for arm in action.arms or ("",)]
+        parts = [key for key in keys if key in obs.state]
+        counts = [len(obs.state[key]) for key in parts]
+        grippers_per_arm = (action.dim - sum(counts)) // max(1, len(parts))
+        dim = sum(counts) + grippers_per_arm * len(parts)
+        if not parts or grippers_per_arm not in (0, 1) or dim != action.dim:
             return None
-        grippers = (
-            [int(end) - 1 for end in np.cumsum(counts) + each * np.arange(1, len(parts) + 1)]
-            if each
-            else []
-        )
+
+        grippers: list[int] = []
+        if grippers_per_arm:
+            # The gripper is the last number of its arm.
+            arm_ends = np.cumsum(counts) + np.arange(1, len(parts) + 1)
+            grippers = [int(arm_end) - 1 for arm_end in arm_ends]
         joints = [number for number in range(action.dim) if number not in grippers]
-        hands = [
-            pose if (pose := part.replace("joints", "tquat")) in obs.state else None
-            for part in parts
-        ]
-        poses = [hand for hand, count in zip(hands, counts, strict=True) for _ in range(count)]
+
+        pose_of: list[str | None] = []
+        for key, count in zip(parts, counts, strict=True):
+            pose_key = key.replace("joints", "tquat")
+            pose_of += [pose_key if pose_key in obs.state else None] * count
+
         names = list(getattr(robot, "joint_names", ()))
         if len(names) != len(joints):
             names = [f"joint {number}" for number in range(len(joints))]
+
         limits = np.asarray(getattr(robot, "joint_limits", [(-np.inf, np.inf)] * len(joints)))
         if limits.shape != (len(joints), 2):
             raise ConfigError(
                 f"joint_limits: got {limits.shape}, want ({len(joints)}, 2), a low and a high for "
                 "each"
             )
+
         unit = ((contract.state or {}).get(parts[0]) or StateSpec()).unit or "rad"
-        return cls(names, limits, joints, grippers, parts, poses, unit, bool(action.relative))
+        return cls(names, limits, joints, grippers, parts, pose_of, unit, bool(action.relative))
 
     @property
     def step(self) -> float:
@@ -921,17 +996,19 @@ def _card(before: np.ndarray, after: np.ndarray) -> _Card | None:
     """
     red, green, blue = np.moveaxis(after.astype(int), -1, 0)
     changed = np.abs(after.astype(int) - before).max(-1) > _RED
-    masks = [
-        changed & (one - np.maximum(green, other) > _RED)
-        for one, other in ((red, blue), (blue, red))
-    ]
-    larger = max(masks, key=np.count_nonzero)
+    became_red = changed & (red - np.maximum(green, blue) > _RED)
+    became_blue = changed & (blue - np.maximum(green, red) > _RED)
+    larger = max([became_red, became_blue], key=np.count_nonzero)
     if np.count_nonzero(larger) < 1e-3 * larger.size:
         return None
+
     rows, columns = np.nonzero(larger)
     height, width = larger.shape
     return _Card(
-        larger is masks[0], columns.mean() / width, rows.mean() / height, len(rows) / larger.size
+        red=larger is became_red,
+        x=columns.mean() / width,
+        y=rows.mean() / height,
+        share=len(rows) / larger.size,
     )
 
 

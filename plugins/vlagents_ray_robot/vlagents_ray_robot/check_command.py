@@ -33,6 +33,7 @@ def main(arguments: Sequence[str]) -> int:
     """Run the command, and return its exit status."""
     parser = command_parser()
     options = parse_all(parser, arguments, {"--report": "the page is written by --out FILE"})
+
     try:
         with contextlib.ExitStack() as stack:
             # Standard output is for the document alone, without the questions to the operator.
@@ -43,6 +44,7 @@ def main(arguments: Sequence[str]) -> int:
     except VLAgentsError as error:
         print(f"{type(error).__name__}: {error}", file=sys.stderr)  # noqa: T201
         return 2
+
     if options.json:
         document = {
             "ok": report.ok,
@@ -52,9 +54,11 @@ def main(arguments: Sequence[str]) -> int:
         print(json.dumps(document, indent=2))  # noqa: T201
     else:
         print("\n".join(report.lines()))  # noqa: T201
+
     if options.out:
         report.write(options.out)
         print(f"report: {options.out}", file=sys.stderr)  # noqa: T201
+
     if report.findings:
         return 1
     return 0 if report.ok else UNDECLARED
@@ -65,32 +69,37 @@ def _checked(options: argparse.Namespace, stack: contextlib.ExitStack) -> RobotR
     if options.robot.startswith("mujoco:"):
         make = partial(make, clock=SimulatedClock())
     robot = stack.enter_context(opened(make))
+
     contract = None
     if options.policy is not None:
         with RemoteAgent(options.policy) as agent:
             contract = agent.contract
-    operator, clock = (
-        getattr(robot, "operator", None) or Operator(move=options.move),
-        getattr(robot, "clock", time),
-    )
-    latency_s = options.latency_ms / 1e3
+
     return examine(
-        robot, contract=contract, operator=operator, hz=options.hz, latency_s=latency_s, clock=clock
+        robot,
+        contract=contract,
+        operator=getattr(robot, "operator", None) or Operator(move=options.move),
+        hz=options.hz,
+        latency_s=options.latency_ms / 1e3,
+        clock=getattr(robot, "clock", time),
     )
 
 
 def command_parser() -> argparse.ArgumentParser:
+    """Return the parser of the command's arguments."""
     parser = argparse.ArgumentParser(
         prog="vlagents-ray robot check",
         description=__doc__,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     add = parser.add_argument
+
     names = (
         "my_arm:MyArm, lerobot:so101_follower, mujoco:so101, mujoco:PATH of an MJCF or URDF "
         "file, or ros:FILE"
     )
     add("robot", help=names)
+
     add(
         "--robot-set",
         metavar="KEY=VALUE",
@@ -119,6 +128,7 @@ def command_parser() -> argparse.ArgumentParser:
         default=400.0,
         help="longest time from command to motion (%(default)s)",
     )
+
     add("--out", metavar="FILE", help="write the report with pictures as an HTML page")
     add("--json", action="store_true", help="as JSON, for programs")
     return parser

@@ -79,12 +79,14 @@ class LeRobotRobot:
                 "lerobot`, or run `vlagents-ray env make lerobot` and then this command as "
                 "`.venv-lerobot/bin/vlagents-ray ...`"
             ) from error
+
         for folder in (package, require("lerobot.cameras")):
             for module in pkgutil.iter_modules(folder.__path__):
-                with contextlib.suppress(ImportError):  # of a robot whose driver is not installed
-                    # Registers its configurations.
+                # The import registers the module's configurations; it fails without the driver.
+                with contextlib.suppress(ImportError):
                     importlib.import_module(f"{folder.__name__}.{module.name}")
         require("lerobot.utils.import_utils").register_third_party_plugins()
+
         try:
             config = importlib.import_module("draccus").decode(
                 package.RobotConfig, {"type": kind, **settings}
@@ -95,11 +97,13 @@ class LeRobotRobot:
             raise ConfigError(
                 f"lerobot:{kind}: LeRobot refuses the settings {settings} ({error}){near}"
             ) from error
-        others = [name for name in self._robot.action_features if not name.endswith(".pos")]
-        if others:
+
+        not_positions = [name for name in self._robot.action_features if not name.endswith(".pos")]
+        if not_positions:
             raise ConfigError(
-                f"lerobot:{kind}: got actions {others}, want positions of joints, NAME.pos"
+                f"lerobot:{kind}: got actions {not_positions}, want positions of joints, NAME.pos"
             )
+
         self._robot.connect(calibrate=False)
         if not self._robot.is_calibrated:
             self._robot.disconnect()
@@ -107,6 +111,7 @@ class LeRobotRobot:
                 f"lerobot:{kind}: not calibrated; run lerobot-calibrate --robot.type={kind} with "
                 "its id"
             )
+
         self._unit = unit or ("deg" if getattr(config, "use_degrees", False) else "%")
         self._keys = list(self._robot.action_features)
         self._lock_buses()
@@ -114,9 +119,9 @@ class LeRobotRobot:
     def _lock_buses(self) -> None:
         """Let the methods of the robot's buses run one at a time."""
         # A robot with two arms has a bus in each of them.
-        for part in (self._robot, *vars(self._robot).values()):
-            if hasattr(part, "bus"):
-                part.bus = OneAtATime(part.bus)
+        for arm in (self._robot, *vars(self._robot).values()):
+            if hasattr(arm, "bus"):
+                arm.bus = OneAtATime(arm.bus)
 
     @property
     def joint_names(self) -> list[str]:
@@ -131,25 +136,23 @@ class LeRobotRobot:
         return np.array([self._limits_of(name) for name in self.joint_names])
 
     def _limits_of(self, name: str) -> tuple[float, float]:
-        if name in (
-            stated := getattr(getattr(self._robot, "config", None), "joint_limits", None) or {}
-        ):
-            return stated[name]  # type: ignore[no-any-return]
+        config = getattr(self._robot, "config", None)
+        configured = getattr(config, "joint_limits", None) or {}
+        if name in configured:
+            return configured[name]  # type: ignore[no-any-return]
+
         bus: Any = getattr(self._robot, "bus", None)
-        motor: Any
-        ends: Any
-        motor, ends = (getattr(bus, table, {}).get(name) for table in ("motors", "calibration"))
+        motor: Any = getattr(bus, "motors", {}).get(name)
+        calibration: Any = getattr(bus, "calibration", {}).get(name)
         mode = getattr(getattr(motor, "norm_mode", None), "name", "")
-        if mode == "DEGREES" and ends is not None and hasattr(bus, "model_resolution_table"):
-            half = (
-                180
-                * (ends.range_max - ends.range_min)
-                / (bus.model_resolution_table[motor.model] - 1)
-            )
+
+        if mode == "DEGREES" and calibration is not None and hasattr(bus, "model_resolution_table"):
+            counts = calibration.range_max - calibration.range_min
+            half = 180 * counts / (bus.model_resolution_table[motor.model] - 1)
             return -half, half
-        return {"RANGE_M100_100": (-100.0, 100.0), "RANGE_0_100": (0.0, 100.0)}.get(
-            mode, (-np.inf, np.inf)
-        )
+
+        limits_by_mode = {"RANGE_M100_100": (-100.0, 100.0), "RANGE_0_100": (0.0, 100.0)}
+        return limits_by_mode.get(mode, (-np.inf, np.inf))
 
     @property
     def contract(self) -> Contract:
@@ -169,12 +172,13 @@ class LeRobotRobot:
 
     def observe(self) -> Obs:
         """Return what LeRobot reads; the first reading begins now."""
-        at = time.time()
-        seen = self._robot.get_observation()
-        joints = np.array([seen[key] for key in self._keys], np.float32)
+        captured_at = time.time()
+        readings = self._robot.get_observation()
+
+        joints = np.array([readings[key] for key in self._keys], np.float32)
         self._measured = joints.copy()
-        images = {name: np.asarray(seen[name]) for name in self.contract.cameras or {}}
-        return Obs(images, None, {"joints": joints}, {CAPTURED: at})
+        images = {name: np.asarray(readings[name]) for name in self.contract.cameras or {}}
+        return Obs(images, None, {"joints": joints}, {CAPTURED: captured_at})
 
     def apply(self, action: np.ndarray) -> None:
         """Send the goal positions."""
@@ -196,7 +200,7 @@ class LeRobotRobot:
                 known.
         """
         try:
-            held = self._present().copy()
+            positions = self._present().copy()
         except Exception as error:
             if self._goal is not None:
                 raise
@@ -206,10 +210,12 @@ class LeRobotRobot:
                 error,
             )
             return
+
         if self._goal is not None:
             grippers = ["gripper" in name for name in self.joint_names]
-            held[grippers] = self._goal[grippers]
-        goals = dict(zip(self._keys, map(float, held), strict=True))
+            positions[grippers] = self._goal[grippers]
+        goals = dict(zip(self._keys, map(float, positions), strict=True))
+
         try:
             self._robot.send_action(goals)
         except Exception:
@@ -235,6 +241,7 @@ class LeRobotRobot:
                     "stop: the motors' positions cannot be read (%s); the last ones are the goal",
                     error,
                 )
+
         if self._measured is None:
             return self.observe().state["joints"]
         return self._measured

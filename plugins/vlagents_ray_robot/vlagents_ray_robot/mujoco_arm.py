@@ -23,7 +23,8 @@ from vlagents_ray.registry import require
 from vlagents_ray_robot import DISTRIBUTION
 from vlagents_ray_robot.check import Operator, arm_part
 
-if not os.environ.get("DISPLAY"):  # here, as packages of models import mujoco, which then reads it
+# Set this before any import of mujoco, which reads it; packages of models import mujoco.
+if not os.environ.get("DISPLAY"):
     os.environ.setdefault("MUJOCO_GL", "egl")
 _SETTLING_S = 1.0
 _GRIPPER = re.compile(r"gripper|finger|knuckle|jaw|fingers_actuator")
@@ -134,10 +135,15 @@ class MujocoArm:
         clock: Any = time,
     ) -> None:
         self._mujoco = mujoco = require("mujoco", extra="arms", distribution=DISTRIBUTION)
-        stated = ARMS.get(like or str(model), ArmModel(str(model)))
-        self.clock, self.delta, self.speed = clock, delta, speed
-        self.arms = stated.arms or ("",)
-        self._latency_s, self._size, self._frame_s = latency_s, size, 1 / fps
+        arm_model = ARMS.get(like or str(model), ArmModel(str(model)))
+        self.clock = clock
+        self.delta = delta
+        self.speed = speed
+        self.arms = arm_model.arms or ("",)
+        self._latency_s = latency_s
+        self._size = size
+        self._frame_s = 1 / fps
+
         self._queue: deque[tuple[float, np.ndarray]] = deque()
         # The commanded targets, and those on the way to them at `speed`.
         self._goal = self._target = np.zeros(0)
@@ -145,34 +151,38 @@ class MujocoArm:
         self._pictures: dict[str, np.ndarray] = {}
         self._card: str | None = None  # the camera before which the operator holds the red card
         self._pictures_s = -np.inf
-        spec = _read(mujoco, stated, str(model))
+
+        spec = _read(mujoco, arm_model, str(model))
         _add_actuators(mujoco, spec)
-        self._compile(spec, stated)
-        self._add_scene(spec, cameras)  # by the places of the hands at rest
-        self._compile(spec, stated)
+        # The scene depends on the poses of the hands at rest, so the model is compiled twice.
+        self._compile(spec, arm_model)
+        self._add_scene(spec, cameras)
+        self._compile(spec, arm_model)
         self._cameras = {name: self.model.camera(_PREFIX + name).id for name in cameras}
         self._begun_s = clock.monotonic() - self.data.time
+
         joints = [drive for drive in self._flat if not drive.gripper]
         self.joint_names = [drive.name for drive in joints]
         self.joint_limits = np.array([(drive.low[0], drive.high[0]) for drive in joints])
         self.operator = SimulatedOperator(self)
+
         state = {}
         for arm, drives in zip(self.arms, self._drives, strict=True):
-            state[arm_part(arm, "joints")] = StateSpec(
-                sum(not drive.gripper for drive in drives), "rad"
-            )
+            joint_count = sum(not drive.gripper for drive in drives)
+            state[arm_part(arm, "joints")] = StateSpec(joint_count, "rad")
             state[arm_part(arm, "tquat")] = StateSpec(7, "m+quat_xyzw")
-        grips = len(joints) < len(self._flat)
+
+        has_gripper = len(joints) < len(self._flat)
         self.contract = Contract(
             cameras={name: CameraSpec(*size) for name in cameras},
             state=state,
-            gripper=grips,
+            gripper=has_gripper,
             action=ActionSpec(
                 dim=len(self._flat),
                 space="joint",
                 delta=delta,
-                gripper_open=1.0 if grips else None,
-                gripper_closed=0.0 if grips else None,
+                gripper_open=1.0 if has_gripper else None,
+                gripper_closed=0.0 if has_gripper else None,
                 arms=self.arms if self.arms != ("",) else None,
             ),
         )
@@ -182,13 +192,17 @@ class MujocoArm:
         self._advance()
         now_s = self.clock.monotonic()
         if now_s - self._pictures_s >= self._frame_s:
-            self._pictures, self._pictures_s = self.render(), now_s
-        state, openings = {}, []
+            self._pictures = self.render()
+            self._pictures_s = now_s
+
+        state: dict[str, np.ndarray] = {}
+        openings: list[float] = []
         for number, (arm, drives) in enumerate(zip(self.arms, self._drives, strict=True)):
             measured = [self._measured(drive) for drive in drives if not drive.gripper]
             state[arm_part(arm, "joints")] = np.array(measured, np.float32)
             state[arm_part(arm, "tquat")] = self.hand_pose(number)
             openings += [self._measured(drive) for drive in drives if drive.gripper]
+
         opening = float(np.clip(np.mean(openings), 0, 1)) if openings else None
         images = {name: picture.copy() for name, picture in self._pictures.items()}
         return Obs(images, opening, state, {CAPTURED: self.clock.time()})
@@ -200,6 +214,7 @@ class MujocoArm:
             raise InvalidAction(
                 f"action: got {action.shape}, want ({len(self._flat)},); see the contract"
             )
+
         self._advance()
         self._queue.append((self._now() + self._latency_s, action))
 
@@ -207,13 +222,14 @@ class MujocoArm:
         """Make the measured positions the targets; the gripper keeps its grasp."""
         self._advance()
         self._queue.clear()
-        held = [
+        targets = [
             self._goal[i] if drive.gripper else self._measured(drive)
             for i, drive in enumerate(self._flat)
         ]
-        self._goal = self._target = np.array(held)
+        self._goal = self._target = np.array(targets)
 
     def close(self) -> None:
+        """Release the renderer of the cameras."""
         if self._renderer is not None:
             self._renderer.close()
             self._renderer = None
@@ -226,30 +242,31 @@ class MujocoArm:
     def opening(self) -> float:
         """Return the true opening of the grippers in [0, 1]."""
         self._advance()
-        return float(
-            np.mean([self._measured(drive) for drive in self._flat if drive.gripper] or [1.0])
-        )
+        openings = [self._measured(drive) for drive in self._flat if drive.gripper]
+        return float(np.mean(openings or [1.0]))
 
     def hand_pose(self, number: int = 0) -> np.ndarray:
         """Return the pose of an arm's hand in the frame of its base, (7,) m and quaternion xyzw."""
         position, rotation = self._pose(self._hands[number])
-        base, turned = self._pose(self._bases[number])
-        quaternion = np.zeros(4)
-        self._mujoco.mju_mat2Quat(quaternion, (turned.T @ rotation).ravel())
-        return np.array(
-            [*(turned.T @ (position - base)), *quaternion[1:], quaternion[0]], np.float32
-        )
+        base_position, base_rotation = self._pose(self._bases[number])
+
+        position_in_base = base_rotation.T @ (position - base_position)
+        quaternion = np.zeros(4)  # wxyz, as MuJoCo writes it
+        self._mujoco.mju_mat2Quat(quaternion, (base_rotation.T @ rotation).ravel())
+        return np.array([*position_in_base, *quaternion[1:], quaternion[0]], np.float32)
 
     def hold_card(self, camera: str | None) -> None:
         """Show something red in the upper left of what a camera sees; None takes it away."""
-        self._card, self._pictures_s = camera, -np.inf
+        self._card = camera
+        self._pictures_s = -np.inf  # so that the next observation has new pictures
 
     def render(self) -> dict[str, np.ndarray]:
         """Return the present pictures of all cameras, (H, W, 3) uint8 RGB."""
         if self._renderer is None and self._cameras:
             self._renderer = self._mujoco.Renderer(self.model, *self._size)
-            # Half of the time of a picture.
+            # Shadows would double the time of a picture.
             self._renderer.scene.flags[self._mujoco.mjtRndFlag.mjRND_SHADOW] = False
+
         pictures = {}
         for name, index in self._cameras.items():
             self._renderer.update_scene(self.data, index)
@@ -264,19 +281,22 @@ class MujocoArm:
 
     def _advance(self) -> None:
         """Step the physics up to the present."""
-        now_s, step_s = self._now(), self.model.opt.timestep
+        now_s = self._now()
+        step_s = self.model.opt.timestep
         while self.data.time + step_s <= now_s:
             while self._queue and self._queue[0][0] <= self.data.time:
                 _, action = self._queue.popleft()
                 relative = [self.delta and not drive.gripper for drive in self._flat]
                 goal = np.where(relative, self._goal + action, action)
-                ends = [
+                limits = [
                     (0.0, 1.0) if drive.gripper else (drive.low[0], drive.high[0])
                     for drive in self._flat
                 ]
-                self._goal = np.clip(goal, *np.transpose(ends))
-            most = self.speed * step_s
-            self._target = self._target + np.clip(self._goal - self._target, -most, most)
+                self._goal = np.clip(goal, *np.transpose(limits))
+
+            max_change = self.speed * step_s
+            change = np.clip(self._goal - self._target, -max_change, max_change)
+            self._target = self._target + change
             self._control(self._target)
             self._mujoco.mj_step(self.model, self.data)
 
@@ -295,45 +315,58 @@ class MujocoArm:
         )
         return (control - low) / (high - low)
 
-    def _compile(self, spec: Any, stated: ArmModel) -> None:
+    def _compile(self, spec: Any, arm_model: ArmModel) -> None:
         self.model = spec.compile()
         self.data = self._mujoco.MjData(self.model)
-        self._drives = self._read_drives(stated)
-        self._flat = [drive for drives in self._drives for drive in drives]
-        if not all(any(not drive.gripper for drive in drives) for drives in self._drives):
-            raise ConfigError(
-                f"{stated.menagerie}: got an arm without joints that move, want the file of an arm"
-            )
-        last = [[drive for drive in drives if not drive.gripper][-1] for drives in self._drives]
-        joints = [int(self.model.actuator_trnid[drive.actuators[0], 0]) for drive in last]
-        self._hands = [int(self.model.jnt_bodyid[joint]) for joint in joints]
+        self._drives = self._read_drives(arm_model)
+        self._flat: list[_Drive] = []
+        for drives in self._drives:
+            self._flat += drives
+
+        self._hands: list[int] = []
+        for drives in self._drives:
+            joint_drives = [drive for drive in drives if not drive.gripper]
+            if not joint_drives:
+                raise ConfigError(
+                    f"{arm_model.menagerie}: got an arm without joints that move, want the file of "
+                    "an arm"
+                )
+            # The hand is the body that the arm's last joint moves.
+            last_joint = int(self.model.actuator_trnid[joint_drives[-1].actuators[0], 0])
+            self._hands.append(int(self.model.jnt_bodyid[last_joint]))
         self._bases = [int(self.model.body_rootid[hand]) for hand in self._hands]
-        self._rest(stated)
+
+        self._rest(arm_model)
 
     def _add_scene(self, spec: Any, cameras: Sequence[str]) -> None:
         """Add a floor, a light and the cameras: "front" in the world, the others on the hands."""
-        spec.stat.extent, spec.visual.map.znear = 1.0, 0.01  # what is 1 cm from a camera is drawn
+        # Everything farther than 1 cm from a camera is drawn.
+        spec.stat.extent = 1.0
+        spec.visual.map.znear = 0.01
+
         world = spec.worldbody
         world.add_light(pos=[0, 0, 3], dir=[0.2, 0.1, -1])
         # The floor touches nothing; with 0, URDF files lose it as a visual.
         floor = {"size": [3, 3, 0.1], "pos": [0, 0, -0.01], "contype": 1 << 20, "conaffinity": 0}
         world.add_geom(type=self._mujoco.mjtGeom.mjGEOM_PLANE, rgba=[0.45, 0.45, 0.42, 1], **floor)
+
         hands = [self._pose(hand) for hand in self._hands]
-        centre = np.mean(
-            [position for position, _ in hands] + [self.data.xpos[base] for base in self._bases],
-            axis=0,
-        )
+        hand_positions = [position for position, _ in hands]
+        base_positions = [self.data.xpos[base] for base in self._bases]
+        centre = np.mean(hand_positions + base_positions, axis=0)
         reach = max(
-            np.linalg.norm(p - self.data.xpos[b])
-            for (p, _), b in zip(hands, self._bases, strict=True)
+            np.linalg.norm(hand - base)
+            for hand, base in zip(hand_positions, base_positions, strict=True)
         )
-        number = 0
+
+        number = 0  # of the arm that gets the next camera on its hand
         for name in cameras:
             if name == "front":
                 away = np.array([1.5, 1.0, 1.0]) * reach
                 camera = {"pos": centre + away, "quat": self._looking(-away, np.eye(3))}
                 world.add_camera(name=_PREFIX + name, fovy=60, **camera)
                 continue
+
             hand, base = self._hands[number], self._bases[number]
             number = (number + 1) % len(hands)
             position, rotation = self._pose(hand)
@@ -350,32 +383,35 @@ class MujocoArm:
         back = -view / np.linalg.norm(view)
         right = np.cross([0.0, 0.0, 1.0], back)
         right /= np.linalg.norm(right)
+        rotation = np.stack([right, np.cross(back, right), back], 1)
+
         quaternion = np.zeros(4)
-        self._mujoco.mju_mat2Quat(
-            quaternion, (frame.T @ np.stack([right, np.cross(back, right), back], 1)).ravel()
-        )
+        self._mujoco.mju_mat2Quat(quaternion, (frame.T @ rotation).ravel())
         return quaternion
 
-    def _rest(self, stated: ArmModel) -> None:
+    def _rest(self, arm_model: ArmModel) -> None:
         """Begin at the rest pose with open grippers, and let the arm settle."""
         if self.model.nkey:
             self._mujoco.mj_resetDataKeyframe(self.model, self.data, 0)
-        rest = iter(stated.rest)
+        rest = iter(arm_model.rest)
         self._mujoco.mj_forward(self.model, self.data)
         goal = [1.0 if drive.gripper else next(rest, self._measured(drive)) for drive in self._flat]
+
         for drive, target in zip(self._flat, goal, strict=True):
             joint = int(self.model.actuator_trnid[drive.actuators[0], 0])
             if not drive.gripper:
                 self.data.qpos[self.model.jnt_qposadr[joint]] = target
+
         self._goal = self._target = np.array(goal)
         self._control(self._goal)
         while self.data.time < _SETTLING_S:
             self._mujoco.mj_step(self.model, self.data)
 
-    def _read_drives(self, stated: ArmModel) -> list[list[_Drive]]:
+    def _read_drives(self, arm_model: ArmModel) -> list[list[_Drive]]:
         """Group the actuators by arm and by number of an action."""
         arms: list[list[_Drive]] = [[] for _ in self.arms]
         grippers = [_Drive("gripper", gripper=True) for _ in self.arms]
+
         for index in range(self.model.nu):
             of_joint = self.model.actuator_trntype[index] == self._mujoco.mjtTrn.mjTRN_JOINT
             joint = (
@@ -387,20 +423,21 @@ class MujocoArm:
             )
             if self.model.actuator_biasprm[index, 1] == 0:
                 raise ConfigError(
-                    f"{stated.menagerie}: actuator {name!r} has no position controller, want one "
-                    "each"
+                    f"{arm_model.menagerie}: actuator {name!r} has no position controller, "
+                    "want one each"
                 )
-            low, high = (float(end) for end in self.model.actuator_ctrlrange[index])
+
+            low, high = map(float, self.model.actuator_ctrlrange[index])
             if of_joint and low >= high:  # not limited
                 joint_range = self.model.jnt_range[self.model.actuator_trnid[index, 0]]
-                low, high = map(
-                    float,
-                    joint_range if joint_range[0] < joint_range[1] else (-2 * np.pi, 2 * np.pi),
-                )
+                if joint_range[0] >= joint_range[1]:
+                    joint_range = (-2 * np.pi, 2 * np.pi)
+                low, high = map(float, joint_range)
+
             if _GRIPPER.search(name) or _GRIPPER.search(joint) or not of_joint:
                 # Of two fingers that move against each other, one has its open end where its number
                 # is small.
-                rising = stated.open_high if abs(high) >= abs(low) else not stated.open_high
+                rising = arm_model.open_high if abs(high) >= abs(low) else not arm_model.open_high
                 drive = grippers[number]
                 drive.low.append(low if rising else high)
                 drive.high.append(high if rising else low)
@@ -408,6 +445,7 @@ class MujocoArm:
                 drive = _Drive(name, low=[low], high=[high])
                 arms[number].append(drive)
             drive.actuators.append(index)
+
         return [
             [*drives, *([grip] if grip.actuators else [])]
             for drives, grip in zip(arms, grippers, strict=True)
@@ -417,18 +455,19 @@ class MujocoArm:
         return self.data.xpos[body], self.data.xmat[body].reshape(3, 3)
 
 
-def _read(mujoco: Any, stated: ArmModel, model: str) -> Any:
+def _read(mujoco: Any, arm_model: ArmModel, model: str) -> Any:
     """Return the specification of a model file, which MuJoCo can compile."""
     file = Path(model)
     if file.suffix not in (".xml", ".mjcf", ".urdf"):
         menagerie = require("mujoco_menagerie", extra="arms", distribution=DISTRIBUTION)
         known = menagerie.names()
-        if stated.menagerie not in known:
+        if arm_model.menagerie not in known:
             raise ConfigError(
                 f"arm: got {model!r}, want one of {list(ARMS)}, a model of the MuJoCo Menagerie, "
                 f"or the path of an MJCF or URDF file{did_you_mean(model, [*ARMS, *known])}"
             )
-        robot = menagerie.get(stated.menagerie)
+
+        robot = menagerie.get(arm_model.menagerie)
         try:
             return robot.spec(robot.default_model)
         except menagerie.MenagerieError as error:
@@ -439,10 +478,12 @@ def _read(mujoco: Any, stated: ArmModel, model: str) -> Any:
             raise ConfigError(
                 f"arm {model!r}: the MuJoCo Menagerie has no file of it here ({error}); {cure}"
             ) from error
+
     if not file.is_file():
         raise ConfigError(f"arm: got {model!r}, want a file that exists")
     if file.suffix != ".urdf":
         return mujoco.MjSpec.from_file(str(file))
+
     compiler = (
         f'<compiler meshdir="{file.absolute().parent}" strippath="false" fusestatic="false"/>'
     )
@@ -456,6 +497,7 @@ def _add_actuators(mujoco: Any, spec: Any) -> None:
     """
     if spec.actuators:
         return
+
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     for body in spec.bodies:
         body.gravcomp = 1
@@ -490,8 +532,8 @@ class SimulatedOperator(Operator):
 
     def saw_joint(self, name: str, side: int) -> bool | None:
         moved = self._arm.joints() - self._before
-        most = int(np.argmax(np.abs(moved)))
-        return self._arm.joint_names[most] == name and bool(moved[most] * side > 0)
+        joint = int(np.argmax(np.abs(moved)))
+        return self._arm.joint_names[joint] == name and bool(moved[joint] * side > 0)
 
     def saw_closing(self) -> bool | None:
         return self._arm.opening() < 0.5

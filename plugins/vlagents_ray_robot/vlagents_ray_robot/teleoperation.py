@@ -117,6 +117,7 @@ class AxesLeader:
                 "(whether actions are relative): state them in the policy's contract; with noop, "
                 "serve it with `--set delta=false`"
             )
+
         if step is None and spec.relative and spec.low is not None and spec.high is not None:
             step = min(abs(spec.low), abs(spec.high)) / 2
         if step is None or not step > 0:
@@ -124,8 +125,12 @@ class AxesLeader:
                 f"step: got {step}, want the change of a number at a tick, above 0; the contract "
                 "has no bounds of relative actions to compute it from"
             )
-        self._spec, self._device, self._step = spec, device, step
+
+        self._spec = spec
+        self._device = device
+        self._step = step
         self._dim = spec.dim
+
         self._grippers = spec.gripper_columns(spec.dim)
         if len(self._grippers) > 1:
             raise ConfigError(
@@ -139,6 +144,7 @@ class AxesLeader:
                 f"contract's action, got {spec.gripper_open} and {spec.gripper_closed}; state both "
                 "in the policy's contract"
             )
+
         self._measure = measure
         self._engaged = False
         self._closed: bool | None = None  # None: as at the takeover
@@ -167,30 +173,36 @@ class AxesLeader:
 
     def action(self, obs: Obs) -> np.ndarray:
         """Return the action of the axes as read last, (D,) float32."""
-        spec, axes = self._spec, self._device.axes()
+        spec = self._spec
+        axes = self._device.axes()
         moved = np.zeros(self._dim, np.float32)
         n = min(self._dim - len(self._grippers), len(axes))
         moved[:n] = self._step * axes[:n]
-        command = None
+
+        command: float | None = None
         if self._grippers:
             if self._closed is None:
                 self._closed = obs.gripper is not None and obs.gripper < _FULLY_OPEN
             if self._device.gripper_presses() % 2:
                 self._closed = not self._closed
             command = float((spec.gripper_closed if self._closed else spec.gripper_open) or 0.0)
+
         if not spec.relative:
             if self._target is None and self._measure is not None:
                 self._target = np.array(self._measure(obs), np.float32)
             elif self._target is None:
                 if "joints" not in obs.state:
                     raise MissingState("joints", obs.state)
-                self._target = np.array(
-                    [*obs.state["joints"], *([] if command is None else [command])], np.float32
-                )
+                target = [*obs.state["joints"]]
+                if command is not None:
+                    target.append(command)
+                self._target = np.array(target, np.float32)
+
             moved = self._target + moved
             if spec.low is not None or spec.high is not None:
                 moved = np.clip(moved, spec.low, spec.high)
             self._target = moved
+
         if command is not None:
             moved[self._grippers] = command
         return moved.astype(np.float32)
@@ -231,7 +243,8 @@ class Keyboard(AxesDevice):
         self, keys: Mapping[str, Callable[[], object]] | None = None, *, terminal: int | None = None
     ) -> None:
         self._keys = dict(keys or {})
-        if taken := sorted(self._keys.keys() & {*AXES, GRIPPER, TAKE}):
+        taken = sorted(self._keys.keys() & {*AXES, GRIPPER, TAKE})
+        if taken:
             raise ConfigError(f"keyboard: {taken} move the robot, so they cannot do something else")
         self._terminal = Terminal(terminal)
         # S of `time.monotonic`: until when a key counts, for each axis and direction.
@@ -262,8 +275,9 @@ class Keyboard(AxesDevice):
     def _press(self, key: str) -> bool:
         if key in AXES:
             axis, sign = AXES[key]
-            side = 0 if sign > 0 else 1
-            self._until[axis, side], self._until[axis, 1 - side] = time.monotonic() + HOLD_S, 0.0
+            direction = 0 if sign > 0 else 1
+            self._until[axis, direction] = time.monotonic() + HOLD_S
+            self._until[axis, 1 - direction] = 0.0
             self._taken = True
         elif key == GRIPPER:
             self._presses += 1
@@ -312,19 +326,23 @@ class SpaceMouse(AxesDevice):
         self._device.close()
 
     def engaged(self) -> bool:
-        read = None
+        """Read the device's reports, and return whether the operator moves the robot."""
+        last_report = None
         for _ in range(_REPORTS):
             state = self._device.read()
-            if state.t == read:
+            if state.t == last_report:
                 break
-            read = state.t
-            before, self._buttons = self._buttons or [0] * len(state.buttons), list(state.buttons)
+            last_report = state.t
+
+            before = self._buttons or [0] * len(state.buttons)
+            self._buttons = list(state.buttons)
             pressed = [now > then for now, then in zip(self._buttons, before, strict=True)]
             if pressed and pressed[0]:
                 self._presses += 1
                 self._taken = True
             if len(pressed) > 1 and pressed[-1]:
                 self._taken = not self._taken
+
         axes = np.array([state.x, state.y, state.z, state.roll, state.pitch, state.yaw], np.float32)
         self._axes = np.where(np.abs(axes) < _DEAD, 0, np.clip(axes, -1, 1)).astype(np.float32)
         self._taken = self._taken or bool(self._axes.any())

@@ -74,9 +74,10 @@ class Ros2:
         self._node.create_subscription(message_class(kind), topic, take, newest)
 
     def advertise(self, topic: str, kind: str) -> None:
-        """Say that messages of this type will be published; before `open`."""
-        made = message_class(kind)
-        self._publishers[topic] = self._node.create_publisher(made, topic, 1), made
+        """Announce that messages of this type will be published; call it before `open`."""
+        message_type = message_class(kind)
+        publisher = self._node.create_publisher(message_type, topic, 1)
+        self._publishers[topic] = publisher, message_type
 
     def open(self) -> None:
         """Begin to receive messages."""
@@ -87,11 +88,12 @@ class Ros2:
 
     def publish(self, topic: str, message: Mapping[str, Any]) -> bool:
         """Publish a message; returns True."""
-        publisher, made = self._publishers[topic]
-        publisher.publish(filled(made(), message))
+        publisher, message_type = self._publishers[topic]
+        publisher.publish(filled(message_type(), message))
         return True
 
     def close(self) -> None:
+        """End the thread and the node."""
         self._context.try_shutdown()
         if self._thread is not None:
             self._thread.join()
@@ -108,13 +110,13 @@ def message_class(kind: str) -> type[Any]:
     """
     package, _, name = kind.split("/")
     try:
-        found: type[Any] = getattr(import_module(f"{package}.msg"), name)
+        message_type: type[Any] = getattr(import_module(f"{package}.msg"), name)
     except (ImportError, AttributeError) as error:
         raise ConfigError(
             f"{kind}: ROS has no such message here ({error}); install the package {package} of "
             "this ROS"
         ) from error
-    return found
+    return message_type
 
 
 def filled(instance: Any, message: Mapping[str, Any]) -> Any:
@@ -126,11 +128,11 @@ def filled(instance: Any, message: Mapping[str, Any]) -> Any:
         if isinstance(value, Mapping):
             filled(getattr(instance, name), value)
         elif isinstance(value, list) and value and isinstance(value[0], Mapping):
-            # "sequence<trajectory_msgs/JointTrajectoryPoint>"
+            # The type reads as "sequence<trajectory_msgs/JointTrajectoryPoint>".
             kind = instance.get_fields_and_field_types()[name].partition("<")[2].removesuffix(">")
-            package, part = kind.partition(",")[0].split("/")
-            made = message_class(f"{package}/msg/{part}")
-            setattr(instance, name, [filled(made(), one) for one in value])
+            package, type_name = kind.partition(",")[0].split("/")
+            item_type = message_class(f"{package}/msg/{type_name}")
+            setattr(instance, name, [filled(item_type(), item) for item in value])
         else:
             setattr(instance, name, value)
     return instance
@@ -148,7 +150,7 @@ class Rosbridge:
         self._url = url
         self._take: dict[str, Callable[[Any], None]] = {}
         self._types: dict[str, str] = {}
-        # By topic: when its last message came, or it was subscribed to, s of `time.monotonic`.
+        # By topic: the time of its last message or subscription, s of `time.monotonic`.
         self._heard: dict[str, float] = {}
         self._outlets: dict[str, str] = {}
         self._socket: ClientConnection | None = None
@@ -167,7 +169,7 @@ class Rosbridge:
         self._heard[topic] = 0.0
 
     def advertise(self, topic: str, kind: str) -> None:
-        """Say that messages of this type will be published; before `open`."""
+        """Announce that messages of this type will be published; call it before `open`."""
         self._outlets[topic] = kind
 
     def open(self) -> None:
@@ -198,10 +200,12 @@ class Rosbridge:
         return True
 
     def close(self) -> None:
+        """End the thread and the connection."""
         self._closing.set()
         socket, self._socket = self._socket, None
         if socket is not None:
-            socket.close()  # with the closing handshake, so that the last messages arrive
+            # The closing handshake lets the last messages arrive.
+            socket.close()
         if self._thread is not None:
             self._thread.join()
         self._open.close()
@@ -236,12 +240,13 @@ class Rosbridge:
                 try:
                     self._receive(socket.recv(_SILENT_S))
                 except TimeoutError:
-                    # Its other end is gone, as after a power failure.
+                    # Without an answer, the server is gone, as after a power failure.
                     if not socket.ping().wait(_SILENT_S):
                         self._lose(socket)
                         continue
-                for topic, at in self._heard.items():
-                    if time.monotonic() - at > _SILENT_S:
+
+                for topic, heard_s in self._heard.items():
+                    if time.monotonic() - heard_s > _SILENT_S:
                         socket.send(json.dumps({"op": "unsubscribe", "topic": topic}))
                         self._ask_for(topic, socket)
             except (ConnectionClosed, OSError):
@@ -259,8 +264,11 @@ class Rosbridge:
         except ConnectionLost:
             self._closing.wait(0.5)
             return
-        if self._closing.is_set() and (socket := self._socket) is not None:
-            self._lose(socket)  # since `close` may have run before it was connected
+
+        # `close` may have run before the connection was up.
+        socket = self._socket
+        if self._closing.is_set() and socket is not None:
+            self._lose(socket)
             return
         logger.warning("%s: connected again", self._url)
 
@@ -275,17 +283,19 @@ class Rosbridge:
 
     def _receive(self, frame: str | bytes) -> None:
         try:
-            came = decoded(frame)
+            message = decoded(frame)
         except VLAgentsError as error:
             logger.warning("%s: sent what is left out: %s", self._url, error)
             return
-        if came.get("op") == "publish":
-            topic = str(came.get("topic"))
-            if (take := self._take.get(topic)) is not None:
+
+        if message.get("op") == "publish":
+            topic = str(message.get("topic"))
+            take = self._take.get(topic)
+            if take is not None:
                 self._heard[topic] = time.monotonic()
-                take(came.get("msg"))
-        elif came.get("op") == "status":
-            logger.warning("%s: %s: %s", self._url, came.get("level"), came.get("msg"))
+                take(message.get("msg"))
+        elif message.get("op") == "status":
+            logger.warning("%s: %s: %s", self._url, message.get("level"), message.get("msg"))
 
 
 Link = Ros2 | Rosbridge

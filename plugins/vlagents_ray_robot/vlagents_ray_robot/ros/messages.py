@@ -76,9 +76,10 @@ def image(message: Any) -> np.ndarray:
             f"image: got the encoding {shown(encoding)}, want one of {list(_PIXEL)}; "
             f"have the camera's driver publish rgb8, and take no topic of depth for a camera"
         )
-    height, width, step = (
-        _whole(name, field(message, name)) for name in ("height", "width", "step")
-    )
+
+    height = _whole("height", field(message, "height"))
+    width = _whole("width", field(message, "width"))
+    step = _whole("step", field(message, "step"))
     data = _bytes("image", field(message, "data"))
     if not (height > 0 and width > 0):
         raise MalformedMessage(
@@ -86,19 +87,23 @@ def image(message: Any) -> np.ndarray:
         )
     if height * width > MAX_PIXELS:
         raise MessageTooLarge(f"image: got {height} x {width} pixels, want at most {MAX_PIXELS}")
+
     used = width * _PIXEL[encoding]
     if step < used or len(data) < step * height:
         raise MalformedMessage(
             f"image: got {len(data)} bytes in rows of {step}, want {height} rows of {used} or more "
             f"for {width} pixels of {encoding}"
         )
+
     rows = np.frombuffer(data, np.uint8, step * height).reshape(height, step)[:, :used]
     pixels = rows.reshape(height, width, _PIXEL[encoding])
     if encoding == "mono16":
         pixels = pixels[..., :1] if field(message, "is_bigendian") else pixels[..., 1:]
     if encoding.startswith("mono"):
         return np.repeat(pixels, 3, axis=2)
-    return (pixels[..., 2::-1] if encoding.startswith("bgr") else pixels[..., :3]).copy()
+
+    rgb = pixels[..., 2::-1] if encoding.startswith("bgr") else pixels[..., :3]
+    return rgb.copy()
 
 
 def compressed_image(message: Any) -> np.ndarray:
@@ -121,22 +126,28 @@ def joints(message: Any, names: Sequence[str] = (), values: Values = "position")
         MissingState: The message lacks one of the joints.
         MalformedMessage: Names and numbers differ in count, or a number is not finite.
     """
-    came = field(message, "name")
-    if not isinstance(came, Sequence) or not all(isinstance(name, str) for name in came):
+    received_names = field(message, "name")
+    is_sequence = isinstance(received_names, Sequence)
+    if not is_sequence or not all(isinstance(name, str) for name in received_names):
         raise MalformedMessage(
-            f"name: got {shown(came)}, want a list of names; is the topic's type right?"
+            f"name: got {shown(received_names)}, want a list of names; is the topic's type right?"
         )
+
     numbers = _numbers(values, field(message, values))
-    if len(numbers) != len(came):
+    if len(numbers) != len(received_names):
         raise MalformedMessage(
-            f"joint state: got {len(numbers)} numbers in {values!r} for {len(came)} names, want as "
-            "many"
+            f"joint state: got {len(numbers)} numbers in {values!r} for {len(received_names)} "
+            "names, want as many"
         )
-    place = {name: i for i, name in enumerate(came)}
+
+    index_of = {name: i for i, name in enumerate(received_names)}
     for name in names:
-        if name not in place:
-            raise MissingState(name, came)
-    return _finite(values, numbers[[place[name] for name in names]] if names else numbers)
+        if name not in index_of:
+            raise MissingState(name, received_names)
+
+    if names:
+        numbers = numbers[[index_of[name] for name in names]]
+    return _finite(values, numbers)
 
 
 def pose(message: Any, rotation: PoseRotation = "quat_xyzw") -> np.ndarray:
@@ -152,6 +163,7 @@ def pose(message: Any, rotation: PoseRotation = "quat_xyzw") -> np.ndarray:
     position = _numbers("pose", [field(at, f"position.{axis}") for axis in "xyz"])
     if rotation == "none":
         return _finite("pose", position)
+
     quaternion = _numbers("pose", [field(at, f"orientation.{axis}") for axis in "xyzw"])
     length = float(np.linalg.norm(quaternion))
     if not length > 1e-6:
@@ -159,9 +171,11 @@ def pose(message: Any, rotation: PoseRotation = "quat_xyzw") -> np.ndarray:
             f"pose: got the quaternion {quaternion.tolist()}, want one of unit length; is the "
             "field unset?"
         )
+
     quaternion = quaternion / length
     if rotation == "quat_wxyz":
         quaternion = quaternion[[3, 0, 1, 2]]
+
     if rotation == "euler_xyz":
         x, y, z, w = quaternion.tolist()
         roll = math.atan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
@@ -197,10 +211,13 @@ def twist(row: np.ndarray, fields: Sequence[str] = TWIST) -> dict[str, Any]:
     """Return a `geometry_msgs/msg/Twist` with numbers at these of its fields, m/s and rad/s; the
     others are 0.
     """
-    message: dict[str, Any] = {part: dict.fromkeys("xyz", 0.0) for part in ("linear", "angular")}
+    message: dict[str, Any] = {
+        "linear": dict.fromkeys("xyz", 0.0),
+        "angular": dict.fromkeys("xyz", 0.0),
+    }
     for path, number in zip(fields, row.astype(np.float64).tolist(), strict=True):
-        part, axis = path.split(".")
-        message[part][axis] = number
+        vector, axis = path.split(".")
+        message[vector][axis] = number
     return message
 
 
@@ -244,12 +261,12 @@ def _bytes(name: str, value: Any) -> bytes | memoryview:
 
 def _numbers(name: str, values: Any) -> np.ndarray:
     try:
-        found = np.asarray(values if isinstance(values, np.ndarray) else list(values), np.float64)
+        array = np.asarray(values if isinstance(values, np.ndarray) else list(values), np.float64)
     except (TypeError, ValueError) as error:
         raise MalformedMessage(f"{name}: got {shown(values)}, want an array of numbers") from error
-    if found.ndim != 1:
-        raise MalformedMessage(f"{name}: got an array of shape {found.shape}, want (D,)")
-    return found
+    if array.ndim != 1:
+        raise MalformedMessage(f"{name}: got an array of shape {array.shape}, want (D,)")
+    return array
 
 
 def _finite(name: str, values: np.ndarray) -> np.ndarray:
@@ -257,9 +274,9 @@ def _finite(name: str, values: np.ndarray) -> np.ndarray:
     NaN.
     """
     with np.errstate(over="ignore"):
-        found = values.astype(np.float32)
-    if not np.isfinite(found).all():
+        numbers = values.astype(np.float32)
+    if not np.isfinite(numbers).all():
         raise MalformedMessage(
             f"{name}: got {values.tolist()}, want finite numbers; is the sensor broken?"
         )
-    return found
+    return numbers
