@@ -16,12 +16,12 @@ from vlagents_ray.policies.base.checkpoint_files import unfinished
 
 FINISHED = "training_finished"  # a file of this name in the folder means that no checkpoint follows
 
-# (path, size in bytes, time of change in ns) of each file.
+# The path, the size in bytes and the time of change in ns of each file.
 Snapshot = frozenset[tuple[str, int, int]]
 
 
 @dataclass(slots=True)
-class _SeenFile:
+class _IncompleteCheckpoint:
     """The state of a checkpoint since its last change, until it is complete."""
 
     snapshot: Snapshot
@@ -53,33 +53,40 @@ class CheckpointWatcher:
             settle_s: Seconds without a change.
             marker: The name of a file that the trainer writes last, if it does.
         """
-        parts = PurePath(pattern).parts
-        if (place := next((i for i, part in enumerate(parts) if STEP in part), None)) is None:
+        names = PurePath(pattern).parts
+        step_index = next((i for i, name in enumerate(names) if STEP in name), None)
+        if step_index is None:
             raise ConfigError(
                 f"checkpoint {pattern!r}: has no {STEP} in it; write one where the step stands"
             )
-        self.folder = Path(*parts[:place]) if folder is None else folder
-        self._below = parts[place + 1 :]
-        self._name = re.compile(re.escape(parts[place]).replace(re.escape(STEP), r"(\d+)", 1))
-        self._settle_s, self._marker = settle_s, marker
-        self._seen: dict[int, _SeenFile] = {}
+
+        self.folder = Path(*names[:step_index]) if folder is None else folder
+        self._below = names[step_index + 1 :]
+        step_name = re.escape(names[step_index])
+        self._name = re.compile(step_name.replace(re.escape(STEP), r"(\d+)", 1))
+        self._settle_s = settle_s
+        self._marker = marker
+        self._incomplete: dict[int, _IncompleteCheckpoint] = {}
         self._complete: set[int] = set()
 
     def scan(self, now: float) -> list[int]:
         """Return the steps completed since the last call, ascending; `now` is in s, of any
         clock.
         """
-        found = self._found()
-        self._seen = {step: seen for step, seen in self._seen.items() if step in found}
-        new = [
-            step
-            for step in sorted(found.keys() - self._complete)
-            if self._is_complete(step, found[step], now)
-        ]
-        self._complete.update(new)
-        for step in new:
-            del self._seen[step]
-        return new
+        paths_by_step = self._paths_by_step()
+        for step in self._incomplete.keys() - paths_by_step.keys():
+            del self._incomplete[step]
+
+        completed_steps = []
+        for step in sorted(paths_by_step.keys() - self._complete):
+            entry, checkpoint = paths_by_step[step]
+            if self._is_complete(step, entry, checkpoint, now):
+                completed_steps.append(step)
+
+        self._complete.update(completed_steps)
+        for step in completed_steps:
+            del self._incomplete[step]
+        return completed_steps
 
     @property
     def finished(self) -> bool:
@@ -88,46 +95,48 @@ class CheckpointWatcher:
 
     def is_settled(self, now: float) -> bool:
         """Return whether no unfinished checkpoint has changed for `settle_s` seconds."""
-        return all(now - seen.since >= self._settle_s for seen in self._seen.values())
+        checkpoints = self._incomplete.values()
+        return all(now - checkpoint.since >= self._settle_s for checkpoint in checkpoints)
 
     def waiting(self) -> dict[int, str]:
         """Return the steps that are not complete, each with the reason."""
-        return {step: seen.why for step, seen in sorted(self._seen.items())}
+        return {step: checkpoint.why for step, checkpoint in sorted(self._incomplete.items())}
 
-    def _found(self) -> dict[int, tuple[Path, Path]]:
+    def _paths_by_step(self) -> dict[int, tuple[Path, Path]]:
         """Return by step the entry of the folder, and the path that the policy loads: the entry,
         or one in it.
         """
-        found: dict[int, tuple[Path, Path]] = {}
+        paths: dict[int, tuple[Path, Path]] = {}
         for entry in self.folder.iterdir() if self.folder.is_dir() else ():
             match = self._name.fullmatch(entry.name)
             step = int(match[1]) if match else -1
-            # As `find_checkpoint` accepts it.
+            # `find_checkpoint` accepts these two forms of the step.
             if match is None or match[1] not in (str(step), f"{step:06d}"):
                 continue
-            if step not in found or match[1] == str(step):  # the policy looks for this name first
-                found[step] = (
-                    entry,
-                    entry.joinpath(*(at_step(part, match[1]) for part in self._below)),
-                )
-        return found
+            if step not in paths or match[1] == str(step):  # the policy looks for this name first
+                names_below = [at_step(name, match[1]) for name in self._below]
+                paths[step] = (entry, entry.joinpath(*names_below))
+        return paths
 
-    def _is_complete(self, step: int, found: tuple[Path, Path], now: float) -> bool:
-        entry, checkpoint = found
+    def _is_complete(self, step: int, entry: Path, checkpoint: Path, now: float) -> bool:
         snapshot = _snapshot(entry)
-        seen = self._seen.get(step)
-        if seen is None or seen.snapshot != snapshot:
-            seen = self._seen[step] = _SeenFile(snapshot, now)
-        if seen.examined:
+        state = self._incomplete.get(step)
+        if state is None or state.snapshot != snapshot:
+            state = self._incomplete[step] = _IncompleteCheckpoint(snapshot, now)
+        if state.examined:
             return False
+
         if self._marker is not None:
-            seen.why = "" if (entry / self._marker).exists() else f"has no {self._marker}"
+            state.why = "" if (entry / self._marker).exists() else f"has no {self._marker}"
         else:
-            seen.why = "" if now - seen.since >= self._settle_s else "is too new, or changes"
-        if seen.why:
+            state.why = "" if now - state.since >= self._settle_s else "is too new, or changes"
+        if state.why:
             return False
-        seen.why, seen.examined = unfinished(checkpoint) or "", True
-        return not seen.why and _snapshot(entry) == snapshot  # it passed, and has not changed since
+
+        state.why = unfinished(checkpoint) or ""
+        state.examined = True
+        # The files passed; they may have changed while they were examined.
+        return not state.why and _snapshot(entry) == snapshot
 
 
 def rounds(
@@ -141,11 +150,13 @@ def rounds(
     It ends when a step at or after `until` is complete, or when the training has announced its end.
     """
     while True:
-        # Read before the scan, which then finds all checkpoints.
+        # The announcement is read before the scan, which then finds all checkpoints.
         now, finished = clock(), watcher.finished
         steps = watcher.scan(now)
-        if wanted := [step for step in steps if until is None or step <= until]:
-            yield wanted
+        steps_to_evaluate = [step for step in steps if until is None or step <= until]
+        if steps_to_evaluate:
+            yield steps_to_evaluate
+
         if until is not None and any(step >= until for step in steps):
             return
         if finished and not steps and watcher.is_settled(now):
@@ -154,10 +165,17 @@ def rounds(
 
 
 def _snapshot(entry: Path) -> Snapshot:
-    names = [Path(folder, name) for folder, _, files in os.walk(entry) for name in files]
-    found = set()
-    for path in names if entry.is_dir() else [entry]:
+    """Return the paths, sizes and times of a checkpoint's files."""
+    if entry.is_dir():
+        paths = []
+        for folder, _, names in os.walk(entry):
+            paths += [Path(folder, name) for name in names]
+    else:
+        paths = [entry]
+
+    files = set()
+    for path in paths:
         with contextlib.suppress(FileNotFoundError):  # it has been renamed
             state = path.stat()
-            found.add((str(path), state.st_size, state.st_mtime_ns))
-    return frozenset(found)
+            files.add((str(path), state.st_size, state.st_mtime_ns))
+    return frozenset(files)

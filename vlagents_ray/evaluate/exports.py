@@ -136,7 +136,7 @@ COLUMNS = (
         "finished",
         "time",
         "when it was recorded",
-        lambda _, one: datetime.fromtimestamp(one.finished, timezone.utc),
+        lambda _, episode: datetime.fromtimestamp(episode.finished, timezone.utc),
     ),
     _of_episode("videos", "json", "paths in the folder of results"),
     _of_episode("trajectory", "string", "path in the folder of results"),

@@ -55,39 +55,48 @@ class Recorded:
         return self.episode.result.key.episode, self.episode.result.key.seed
 
     def config(self, out: Path, *, policy: dict[str, Any] | None = None) -> EvalConfig:
-        """Settings of an evaluation of this episode's case alone into `out`, with video and
-        trajectory.
+        """Return the settings of an evaluation of this episode's case alone, with video and
+        trajectory. The other settings are those of the episode's run.
 
-        They are those of its run. `policy` replaces settings of the policy.
+        Args:
+            out: The folder of results.
+            policy: Replaces settings of the policy.
+
+        Raises:
+            ConfigError: The settings of the run have no such case.
         """
         run = next(run for run in self.results.runs if run.run == self.episode.run)
         config = EvalConfig.model_validate(run.config)
-        # By its settings: `merge` may have taken the suite's name from another folder.
-        case = next(
-            (one for one in plan_cases(config) if one.fingerprint == self.case.case_id), None
-        )
+        # Find the case by its settings: `merge` may have taken the suite's name from another
+        # folder.
+        cases = plan_cases(config)
+        case = next((case for case in cases if case.fingerprint == self.case.case_id), None)
         if case is None:
             raise ConfigError(
                 f"{self.results.out}: the settings of run {run.run} have no such case as that of "
                 f"{self.episode.result.key}; replay it in the folder in which it was played"
             )
-        given = case.policy.model_dump() | {"steps": [case.step] if case.policy.steps else []}
+
+        policy_settings = case.policy.model_dump()
+        policy_settings["steps"] = [case.step] if case.policy.steps else []
         if case.policy.source is None:
-            given |= {"config": {}}  # the server has its own configuration
+            policy_settings["config"] = {}  # the server has its own configuration
         else:
-            given |= {"url": None}  # it was served for that run, and is served again
+            policy_settings["url"] = None  # it was served for that run, and is served again
         if policy is not None:
-            given = {name: value for name, value in given.items() if name != "name"} | policy
+            policy_settings.pop("name", None)
+            policy_settings |= policy
+
         suite = case.suite.model_dump() | {"envs": [case.env], "worker": case.worker.model_dump()}
-        alone = {
-            "policies": [given],
+        this_case_alone = {
+            "policies": [policy_settings],
             "suites": [suite],
             "out": out,
             "workers": None,
             "resume": False,
         }
         return EvalConfig.model_validate(
-            config.model_dump() | alone | {"video": "all", "record": "all", "track": []}
+            config.model_dump() | this_case_alone | {"video": "all", "record": "all", "track": []}
         )
 
 
@@ -109,6 +118,7 @@ def find(results: Results, name: str | None) -> Recorded:
         examples = [episode.result.full_key for episode in results.episodes[:_FEW]]
         problem = "got no episode" if name is None else f"has no episode {name!r}"
         raise ConfigError(f"{results.out}: {problem}, want a key as {examples}, or ENV#NUMBER")
+
     if len(matching) > 1:
         keys = [
             f"{recorded.episode.result.full_key} ({recorded.case.contender})"
@@ -117,6 +127,7 @@ def find(results: Results, name: str | None) -> Recorded:
         raise ConfigError(
             f"{name!r} stands for {len(matching)} episodes; want one of the keys {keys}"
         )
+
     [recorded] = matching
     if recorded.episode.result.status == "infra_failed":
         raise ConfigError(f"{name!r} was never played to its end: {recorded.episode.result.error}")
@@ -127,35 +138,44 @@ def compare(recorded: Recorded, replayed: Results) -> list[str]:
     """Return the differences of the replay, a sentence each; empty if it is the same episode up to
     rounding.
 
-    Actions that differ in their bytes are the same if that `is_rounding` (see
-    `actions_difference`), and so are then returns that differ by no more than `DRIFT`. Durations
-    are not compared. Raises `ConfigError` if infrastructure failed the replay.
+    Actions that differ in their bytes count as the same if the difference `is_rounding` (see
+    `actions_difference`). In that case, returns that differ by no more than `DRIFT` also count as
+    the same. Durations are not compared. Raises `ConfigError` if infrastructure failed the replay.
     """
-    [[again]] = [case.episodes for case in replayed.cases]
-    if again.result.status == "infra_failed":
+    [[replay]] = [case.episodes for case in replayed.cases]
+    if replay.result.status == "infra_failed":
         raise ConfigError(
-            f"the replay did not end, so that there is nothing to compare: {again.result.error}"
+            f"the replay did not end, so that there is nothing to compare: {replay.result.error}"
         )
-    before, now = recorded.episode.result.outcome, again.result.outcome
+
+    recorded_outcome = recorded.episode.result.outcome
+    replayed_outcome = replay.result.outcome
     difference = actions_difference(recorded, replayed)
     is_rounding = difference is not None and difference.is_rounding
-    returns = before["episode_return"], now["episode_return"]
+    returns = recorded_outcome["episode_return"], replayed_outcome["episode_return"]
     if is_rounding and math.isclose(*returns, rel_tol=DRIFT, abs_tol=DRIFT):
-        now = now | {"episode_return": before["episode_return"]}
-    found = [
-        f"{name}: {before[name]!r} was recorded, now it is {now[name]!r}"
-        for name in before
-        if before[name] != now[name] and name not in ("key", "actions_sha256")
-    ]
-    if before["actions_sha256"] != now["actions_sha256"] and not is_rounding:
-        found.insert(0, _actions(recorded, replayed.file(str(again.trajectory))))
-    weights = [one.result.weights for one in (recorded.episode, again)]
-    if found and None not in weights and weights[0] != weights[1]:
-        found.append(
-            f"weights: {weights[0]} played it, now it is {weights[1]}: another checkpoint, or "
-            "other files in it"
+        replayed_outcome = replayed_outcome | {"episode_return": returns[0]}
+
+    differences = []
+    if recorded_outcome["actions_sha256"] != replayed_outcome["actions_sha256"] and not is_rounding:
+        replayed_trajectory = replayed.file(str(replay.trajectory))
+        differences.append(_describe_actions(recorded, replayed_trajectory))
+    for name, recorded_value in recorded_outcome.items():
+        replayed_value = replayed_outcome[name]
+        if recorded_value != replayed_value and name not in ("key", "actions_sha256"):
+            differences.append(
+                f"{name}: {recorded_value!r} was recorded, now it is {replayed_value!r}"
+            )
+
+    recorded_weights = recorded.episode.result.weights
+    replayed_weights = replay.result.weights
+    are_known = recorded_weights is not None and replayed_weights is not None
+    if differences and are_known and recorded_weights != replayed_weights:
+        differences.append(
+            f"weights: {recorded_weights} played it, now it is {replayed_weights}: another "
+            "checkpoint, or other files in it"
         )
-    return found
+    return differences
 
 
 def actions_difference(recorded: Recorded, replayed: Results) -> ActionsDifference | None:
@@ -165,52 +185,66 @@ def actions_difference(recorded: Recorded, replayed: Results) -> ActionsDifferen
         None if they are equal byte for byte, if their numbers differ, or if a trajectory is
         missing.
     """
-    [[again]] = [case.episodes for case in replayed.cases]
-    if recorded.episode.result.actions_sha256 == again.result.actions_sha256:
+    [[replay]] = [case.episodes for case in replayed.cases]
+    if recorded.episode.result.actions_sha256 == replay.result.actions_sha256:
         return None
-    paths = [
-        None if one.trajectory is None else results.file(one.trajectory)
-        for results, one in ((recorded.results, recorded.episode), (replayed, again))
-    ]
-    if not all(path is not None and path.is_file() for path in paths):
+
+    recorded_file = _trajectory_file(recorded.results, recorded.episode)
+    replayed_file = _trajectory_file(replayed, replay)
+    if recorded_file is None or replayed_file is None:
         return None
-    before, now = (
-        Trajectory.load(path).actions.astype(np.float64) for path in paths if path is not None
-    )
-    if before.shape != now.shape:
+
+    recorded_actions = Trajectory.load(recorded_file).actions.astype(np.float64)
+    replayed_actions = Trajectory.load(replayed_file).actions.astype(np.float64)
+    if recorded_actions.shape != replayed_actions.shape:
         return None
-    by_step = np.max(np.abs(before - now) / np.maximum(1.0, np.abs(before)), axis=1)
+
+    absolute = np.abs(recorded_actions - replayed_actions)
+    by_step = np.max(absolute / np.maximum(1.0, np.abs(recorded_actions)), axis=1)
     step = int(np.argmax(by_step > 0))
     return ActionsDifference(step, float(by_step[step]), float(by_step.max()))
 
 
-def _actions(recorded: Recorded, replayed: Path) -> str:
-    if (path := recorded.episode.trajectory) is None:
+def _trajectory_file(results: Results, episode: Episode) -> Path | None:
+    """Return the file of an episode's trajectory, or None if it was not recorded or is missing."""
+    if episode.trajectory is None:
+        return None
+    file = results.file(episode.trajectory)
+    return file if file.is_file() else None
+
+
+def _describe_actions(recorded: Recorded, replayed: Path) -> str:
+    """Return a sentence about the actions, from the recorded and the replayed trajectory."""
+    path = recorded.episode.trajectory
+    if path is None:
         return (
             "actions: they differ; from which step on is not known, nor whether by more than "
             "rounding, as no trajectory was recorded (eval --record all, or `record: all` in its "
             "file); the size of a batch, which several episodes share, changes the last digits of "
             "an action, about 1e-7"
         )
+
     file = recorded.results.file(path)
     if not file.is_file():
         return (
             f"actions: they differ; from which step on is not known, as {file}, the recorded "
             "trajectory, is gone"
         )
-    before = Trajectory.load(file).actions
-    now = Trajectory.load(replayed).actions
-    rows = zip(before, now, strict=False)
-    step = next((i for i, (a, b) in enumerate(rows) if a.tobytes() != b.tobytes()), None)
-    if step is None:
-        same = min(len(before), len(now))
-        return (
-            f"actions: {len(before)} were recorded, now they are {len(now)}; the first {same} "
-            "are the same"
-        )
+
+    recorded_actions = Trajectory.load(file).actions
+    replayed_actions = Trajectory.load(replayed).actions
+    pairs = zip(recorded_actions, replayed_actions, strict=False)
+    for step, (recorded_action, replayed_action) in enumerate(pairs):
+        if recorded_action.tobytes() != replayed_action.tobytes():
+            return (
+                f"actions: they differ from step {step} on: {_row(recorded_action)} was recorded, "
+                f"now it is {_row(replayed_action)}"
+            )
+
+    same = min(len(recorded_actions), len(replayed_actions))
     return (
-        f"actions: they differ from step {step} on: {_row(before[step])} was recorded, now it "
-        f"is {_row(now[step])}"
+        f"actions: {len(recorded_actions)} were recorded, now they are {len(replayed_actions)}; "
+        f"the first {same} are the same"
     )
 
 

@@ -128,6 +128,7 @@ def evaluate(
     factory = agents(config, agent_factory)
     tracking = TrackerFeed(config)
     require_envs(config)
+
     with Store(config) as store:
         with storing(config.out):
             store.begin_run(config, versions())
@@ -138,10 +139,11 @@ def evaluate(
                 run = _Run(config, store, progress or Progress(), tracking, only, end_at, local)
                 state, summary = run.play(factory)
         except BaseException:
-            # Probably the same disk error; report the first one.
+            # A second error of the disk probably has the same cause; the first one is reported.
             with contextlib.suppress(StorageFailed):
                 conclude(config, store, "stopped")
             raise
+
     for stopped in (EvaluationInterrupted, OutOfTime):
         if state == stopped.why:
             raise stopped(summary)
@@ -226,6 +228,7 @@ class _Run:
         """
         if not len(self._queue):
             return "complete", conclude(self.config, self.store, "complete")
+
         with contextlib.ExitStack() as stack:
             pool_of = workers_class(self.config, stack)
             stop = stack.enter_context(stop_signals())
@@ -251,6 +254,7 @@ class _Run:
                             "a part of the evaluation that the signal ended, too, reported: %s",
                             error,
                         )
+
                     state = OutOfTime.why if len(self._queue) or pool.busy else "complete"
                     if stop.is_set():
                         state = EvaluationInterrupted.why
@@ -345,9 +349,10 @@ class _Run:
         self._attempts.note_policy_error(result.error or "")
         return True
 
-    def _record(self, job: Job, result: EpisodeResult, kept: Artifacts) -> None:
-        # Files first: a crash in between repeats the episode, and they are overwritten.
-        videos, trajectory = save(self.config.out, job.case, result, kept)
+    def _record(self, job: Job, result: EpisodeResult, artifacts: Artifacts) -> None:
+        # The files are written first: a crash in between repeats the episode, and they are
+        # overwritten.
+        videos, trajectory = save(self.config.out, job.case, result, artifacts)
         self.store.record(result, job.attempt, videos, trajectory)
         self.progress.episode(job.case, result)
         self._left[job.key.settings] -= 1

@@ -35,7 +35,8 @@ class TrackedPolicy:
     group: str
     name: str  # of the policy
     id: str  # is kept when an evaluation resumes this folder
-    # `evaluation`: its settings; `served`: the policy's identity; `code`: git states.
+    # The keys are `evaluation`, its settings; `served`, the policy's identity; and `code`, the git
+    # states.
     config: dict[str, Any]
     diffs: Sequence[Path]  # of the working trees from their commits
 
@@ -117,7 +118,7 @@ class TrackerFeed:
         while not over:
             self._updated.wait()
             self._updated.clear()
-            # Read before the results, so that all cases complete by then are logged.
+            # The flag is read before the results, so that all cases complete by then are logged.
             over = self._closing
             for tracker in list(self._working):
                 try:
@@ -137,23 +138,25 @@ class TrackerFeed:
                 log.warning("%s: %s: %s", name, type(error).__name__, error)
 
     def _log_to(self, name: str, results: Results) -> None:
-        """Log the complete cases, and then the complete policies, of which the tracker has other
-        numbers or none.
+        """Log the complete cases, and then the complete policies, unless the tracker already has
+        their numbers.
         """
         summary = summarize(results)
-        groups = [
-            (case.case_id, [case], group)
-            for case, group in zip(results.cases, summary.cases, strict=True)
-        ]
+        groups = []
+        for case, group in zip(results.cases, summary.cases, strict=True):
+            groups.append((case.case_id, [case], group))
         for policy, total in zip(results.contenders, summary.totals, strict=True):
             groups.append((policy, results.of(policy), total))
+
         with closing(sqlite3.connect(self._config.out / FILE, timeout=WAIT_S)) as db:
             logged = dict(
                 db.execute("SELECT what, episodes FROM tracked WHERE tracker = ?", (name,))
             )
             for identity, cases, group in groups:
-                if not all(map(_is_complete, cases)) or logged.get(identity) == group.episodes:
+                is_logged = logged.get(identity) == group.episodes
+                if is_logged or not all(map(_is_complete, cases)):
                     continue
+
                 run = self._run_of(name, results, cases[0].policy)
                 label = "/".join(filter(None, (group.suite, group.env)))
                 run.log(_metrics(label, group), cases[0].step)
@@ -161,6 +164,7 @@ class TrackerFeed:
                     videos = self._videos(cases[0])
                     if videos:
                         run.videos(label, videos, cases[0].step)
+
                 with db:
                     db.execute(
                         "INSERT OR REPLACE INTO tracked VALUES (?, ?, ?)",
@@ -176,7 +180,10 @@ class TrackerFeed:
     def _videos(self, case: CaseResults) -> list[Path]:
         """Return the first videos of a case that are shown, failures first."""
         ordered = sorted(case.episodes, key=lambda episode: bool(episode.result.success_once))
-        videos = [self._config.out / path for episode in ordered for path in episode.videos[:1]]
+        videos = []
+        for episode in ordered:
+            if episode.videos:
+                videos.append(self._config.out / episode.videos[0])
         return videos[: self._config.tracking.videos]
 
     def _subject(self, results: Results, policy: str) -> TrackedPolicy:
@@ -201,7 +208,7 @@ def _is_complete(case: CaseResults) -> bool:
 
 
 def _metrics(label: str, group: Group) -> dict[str, float]:
-    """Return what is known of a group by the names of its curves."""
+    """Return the values of a group that are known, by the names of their curves."""
     values = {
         "success_once": group.success_once.rate,
         "success_at_end": group.success_at_end.rate,

@@ -66,7 +66,9 @@ class Manifest(BaseModel):
 
 
 def digest_of(path: Path) -> FileDigest:
-    sha256, size = hashlib.sha256(), 0
+    """Return the SHA-256 and the size of a file, which is read in pieces."""
+    sha256 = hashlib.sha256()
+    size = 0
     with path.open("rb") as file:
         while chunk := file.read(_CHUNK):
             sha256.update(chunk)
@@ -83,42 +85,46 @@ def pack(folder: Path, archive: Path) -> str:
     """
     paths = sorted(path for path in folder.rglob("*") if path.is_file())
     names = {path.relative_to(folder).as_posix(): path for path in paths}
-    if unknown := [name for name in names if not _KNOWN.fullmatch(name) or name == MANIFEST]:
+    unknown = [name for name in names if not _KNOWN.fullmatch(name) or name == MANIFEST]
+    if unknown:
         raise ConfigError(
             f"{folder}: got the files {unknown[:5]}, which a bundle may not hold; rename or remove "
             "them"
         )
+
     manifest = Manifest(files={name: digest_of(path) for name, path in names.items()})
     text = (manifest.model_dump_json(indent=1) + "\n").encode()
-    with storage.whole(archive) as part, zipfile.ZipFile(part, "w", zipfile.ZIP_DEFLATED) as file:
+    with (
+        storage.whole(archive) as unfinished_path,
+        zipfile.ZipFile(unfinished_path, "w", zipfile.ZIP_DEFLATED) as file,
+    ):
         file.writestr(_member(MANIFEST), text, zipfile.ZIP_DEFLATED)
         for name, path in names.items():
-            # Already compressed.
-            how = zipfile.ZIP_STORED if path.suffix in (".mp4", ".npz") else zipfile.ZIP_DEFLATED
-            with (
-                path.open("rb") as source,
-                file.open(_member(name, how), "w", force_zip64=True) as target,
-            ):
+            is_compressed = path.suffix in (".mp4", ".npz")
+            member = _member(name, zipfile.ZIP_STORED if is_compressed else zipfile.ZIP_DEFLATED)
+            with path.open("rb") as source, file.open(member, "w", force_zip64=True) as target:
                 shutil.copyfileobj(source, target, _CHUNK)
     return hashlib.sha256(text).hexdigest()
 
 
-def _member(name: str, how: int = zipfile.ZIP_DEFLATED) -> zipfile.ZipInfo:
+def _member(name: str, compression: int = zipfile.ZIP_DEFLATED) -> zipfile.ZipInfo:
     member = zipfile.ZipInfo(name)  # of 1980: the time is not part of the results
-    member.compress_type, member.external_attr = how, (stat.S_IFREG | 0o644) << 16
+    member.compress_type = compression
+    member.external_attr = (stat.S_IFREG | 0o644) << 16
     return member
 
 
 def require_file(archive: Path) -> None:
+    """Raise `ConfigError` unless `archive` is a file."""
     if (archive / DATABASE).is_file():
         raise ConfigError(
             f"{archive}: expected a bundle, got a folder of results; `vlagents-ray bundle "
             f"{archive}` writes its bundle"
         )
     if not archive.is_file():
-        what = "a folder" if archive.is_dir() else "no file"
+        actual = "a folder" if archive.is_dir() else "no file"
         raise ConfigError(
-            f"{archive}: expected a bundle, a file that `vlagents-ray bundle` wrote, got {what}"
+            f"{archive}: expected a bundle, a file that `vlagents-ray bundle` wrote, got {actual}"
         )
 
 
@@ -140,6 +146,7 @@ def unpack(
         with zipfile.ZipFile(archive) as file:
             members = _checked(archive, file, most_bytes)
             manifest, sha256 = _manifest(archive, file, members.pop(MANIFEST, None))
+
             digests: dict[str, FileDigest] = {}
             for name, member in members.items():
                 target = folder / name
@@ -152,24 +159,24 @@ def unpack(
         raise ConfigError(
             f"{archive}: cannot be read as a bundle ({error}); copy it again from its source"
         ) from error
+
     listed = manifest.files
     differences = [f"{name} is not in the bundle" for name in listed.keys() - digests.keys()]
     differences += [f"{name} is not in the manifest" for name in digests.keys() - listed.keys()]
-    differences += [
-        f"{name} has another digest"
-        for name in listed.keys() & digests.keys()
-        if listed[name] != digests[name]
-    ]
+    for name in listed.keys() & digests.keys():
+        if listed[name] != digests[name]:
+            differences.append(f"{name} has another digest")
     return manifest, sha256, sorted(differences)
 
 
 def _checked(archive: Path, file: zipfile.ZipFile, most_bytes: int) -> dict[str, zipfile.ZipInfo]:
-    """Return the members by their names, after all checks that need not read them."""
+    """Return the members by their names, after all checks that do not need their content."""
     listed = file.infolist()
     if len(listed) > _MOST_MEMBERS:
         raise ConfigError(
             f"{archive}: got {len(listed)} files, want at most {_MOST_MEMBERS}; {_DISTRUST}"
         )
+
     members: dict[str, zipfile.ZipInfo] = {}
     for member in listed:
         name = member.orig_filename
@@ -182,16 +189,16 @@ def _checked(archive: Path, file: zipfile.ZipFile, most_bytes: int) -> dict[str,
             raise ConfigError(f"{archive}: got {name!r} twice; {_DISTRUST}")
         if kind not in (0, stat.S_IFREG):
             raise ConfigError(f"{archive}: {name!r} is a link or another special file; {_DISTRUST}")
-        if member.flag_bits & 0x1 or member.compress_type not in (
-            zipfile.ZIP_STORED,
-            zipfile.ZIP_DEFLATED,
-        ):
+        is_encrypted = member.flag_bits & 0x1
+        if is_encrypted or member.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
             raise ConfigError(
                 f"{archive}: {name!r} is encrypted, or packed in another way than a bundle; "
                 f"{_DISTRUST}"
             )
         members[name] = member
-    if (total := sum(member.file_size for member in listed)) > most_bytes:
+
+    total = sum(member.file_size for member in listed)
+    if total > most_bytes:
         raise ConfigError(
             f"{archive}: unpacks to {total} bytes, want at most {most_bytes}; allow more with "
             "--max-gb if you trust it"
@@ -202,6 +209,7 @@ def _checked(archive: Path, file: zipfile.ZipFile, most_bytes: int) -> dict[str,
 def _manifest(
     archive: Path, file: zipfile.ZipFile, member: zipfile.ZipInfo | None
 ) -> tuple[Manifest, str]:
+    """Return the manifest and its SHA-256."""
     if member is None:
         raise ConfigError(
             f"{archive}: has no {MANIFEST}, want a bundle that `vlagents-ray bundle` wrote"
@@ -210,6 +218,7 @@ def _manifest(
         raise ConfigError(
             f"{archive}: {MANIFEST} has {member.file_size} bytes, want at most {_MOST_MANIFEST}"
         )
+
     with file.open(member) as opened:
         text = opened.read(_MOST_MANIFEST + 1)
     try:
@@ -226,7 +235,9 @@ def _manifest(
 def _copy(
     archive: Path, source: IO[bytes], target: IO[bytes], member: zipfile.ZipInfo
 ) -> FileDigest:
-    sha256, size = hashlib.sha256(), 0
+    """Copy a member of the bundle, and return its digest."""
+    sha256 = hashlib.sha256()
+    size = 0
     while chunk := source.read(_CHUNK):
         size += len(chunk)
         if size > member.file_size:
@@ -264,42 +275,41 @@ def write_bundle(folder: Path, archive: Path, *, videos: bool = False) -> str:
             prefix=f"{archive.name}.part-", dir=archive.parent
         ) as temporary:
             stage = Path(temporary)
-            # One consistent state, even while an evaluation writes to it.
+            # The copy is one consistent state, even while an evaluation writes to the database.
             with reading(folder) as source, closing(sqlite3.connect(stage / DATABASE)) as target:
                 source.backup(target)
+
             _link_files(folder, stage, Results.load(stage), videos=videos)
-            # Remove the names of files that are not in the bundle.
-            with closing(sqlite3.connect(stage / DATABASE)) as db, db:
-                for key, shown, numbers in db.execute(
-                    "SELECT key, videos, trajectory FROM episodes"
-                ).fetchall():
-                    there = [path for path in json.loads(shown) if (stage / path).is_file()]
-                    values = (
-                        canonical(there),
-                        numbers if numbers and (stage / numbers).is_file() else None,
-                        key,
-                    )
-                    db.execute(
-                        "UPDATE episodes SET videos = ?, trajectory = ? WHERE key = ?", values
-                    )
+            _forget_missing_files(stage)
             return pack(stage, archive)
 
 
+def _forget_missing_files(stage: Path) -> None:
+    """Remove the names of files that are not in the folder from its database."""
+    with closing(sqlite3.connect(stage / DATABASE)) as db, db:
+        rows = db.execute("SELECT key, videos, trajectory FROM episodes").fetchall()
+        for key, videos, trajectory in rows:
+            present_videos = [path for path in json.loads(videos) if (stage / path).is_file()]
+            has_trajectory = trajectory and (stage / trajectory).is_file()
+            values = (canonical(present_videos), trajectory if has_trajectory else None, key)
+            db.execute("UPDATE episodes SET videos = ?, trajectory = ? WHERE key = ?", values)
+
+
 def _link_files(folder: Path, stage: Path, results: Results, *, videos: bool) -> None:
+    """Link the files of the episodes and of the commits' differences into the folder `stage`."""
     paths: list[str] = []
     for case in results.cases:
         for episode in case.episodes:
             if videos:
                 paths += episode.videos
             if episode.trajectory is not None:
-                paths += [
-                    episode.trajectory,
-                    *(storage.trajectory_videos(folder, episode.trajectory) if videos else ()),
-                ]
-    paths += [
-        f"{storage.PROVENANCE}/{path.name}"
-        for path in sorted((folder / storage.PROVENANCE).glob("*.diff"))
-    ]
+                paths.append(episode.trajectory)
+                if videos:
+                    paths += storage.trajectory_videos(folder, episode.trajectory)
+
+    diffs = sorted((folder / storage.PROVENANCE).glob("*.diff"))
+    paths += [f"{storage.PROVENANCE}/{diff.name}" for diff in diffs]
+
     for path in dict.fromkeys(paths):
         source = storage.inside(folder, path)
         if source.is_file():  # a folder that was copied without its videos can be bundled

@@ -113,11 +113,12 @@ def verify_command(
             for finding in verification.findings:
                 rows.add_row(finding.subject, finding.verdict, finding.detail)
             out.print(rows)
-            unchecked = [
-                finding.subject
-                for finding in verification.findings
-                if finding.verdict == "not checked"
-            ]
+
+            unchecked = []
+            for finding in verification.findings:
+                if finding.verdict == "not checked":
+                    unchecked.append(finding.subject)
+
             verdict = "is contradicted" if not verification.holds else "holds"
             if unchecked:
                 verdict += f"; not checked: {', '.join(unchecked)}"

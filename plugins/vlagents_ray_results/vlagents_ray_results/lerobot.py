@@ -101,6 +101,7 @@ def to_lerobot(
             f"{results.out}: has no trajectories; evaluate with --record all (`record: all` in its "
             "file)"
         )
+
     if successes:
         solved = [(case, episode) for case, episode in recorded if episode.result.success_once]
         if not solved:
@@ -109,6 +110,7 @@ def to_lerobot(
                 "solved"
             )
         recorded = solved
+
     if path.exists() and any(path.iterdir()):
         raise ConfigError(f"{path}: is there, and not empty; export into a new folder")
     rates = {_fps(case) for case, _ in recorded}
@@ -116,9 +118,11 @@ def to_lerobot(
         raise ConfigError(
             f"the envs run at {sorted(rates)} Hz, and a dataset has one rate; {_CURE}"
         )
+
     with_versions = any(episode.result.policy_version is not None for _, episode in recorded)
     selection = _Selection(results, cameras, state, environment_state, cut_idle, with_versions)
     angles = _angles(selection.demonstrations(recorded))
+
     with _new_folder(path) as root:
         dataset = Dataset(root, rates.pop(), durable=False)
         for demonstration in selection.demonstrations(recorded):
@@ -133,11 +137,13 @@ def to_lerobot(
                     f"{env}: has other features than envs before ({', '.join(differing)}); {_CURE}"
                 )
             dataset.save(finished)
+
         if not dataset.episodes:
             raise ConfigError(
                 f"{results.out}: in none of the {len(recorded)} recorded episodes did the policy "
                 "act"
             )
+
         shutil.rmtree(root / UNFINISHED_FOLDER, ignore_errors=True)
         return dataset.episodes
 
@@ -192,10 +198,12 @@ class _Selection:
         path = str(episode.trajectory)
         trajectory = Trajectory.load(self.results.file(path))
         parts = parts_of(trajectory.state, trajectory.gripper is not None)
-        numbers = [part for part in parts if part != GRIPPER or trajectory.gripper is None]
-        environment = _chosen("environment_state", self.environment_state, numbers, case.env)
-        others = [part for part in parts if part not in environment]
-        chosen = _chosen("state", others if self.state is None else self.state, parts, case.env)
+        vectors = [name for name in parts if name != GRIPPER or trajectory.gripper is None]
+        environment = _chosen("environment_state", self.environment_state, vectors, case.env)
+        state_option = self.state
+        if state_option is None:
+            state_option = [name for name in parts if name not in environment]
+        chosen = _chosen("state", state_option, parts, case.env)
         cameras = _chosen("cameras", self.cameras, trajectory.cameras, case.env)
         videos = videos_of(Path(path), trajectory.cameras)
 
@@ -203,7 +211,8 @@ class _Selection:
         in_state = {*chosen, *environment}
         if gripper is not None:
             in_state.remove(GRIPPER)
-        state = {part: values for part, values in trajectory.state.items() if part in in_state}
+        state = {name: values for name, values in trajectory.state.items() if name in in_state}
+
         frames = len(trajectory.actions)
         if self.cut_idle:
             moving = [trajectory.actions, *state.values()]
@@ -220,7 +229,7 @@ class _Selection:
             trajectory.success[:frames],
             tuple(chosen),
             tuple(environment),
-            {part: values[:frames] for part, values in state.items()},
+            {name: values[:frames] for name, values in state.items()},
             None if gripper is None else gripper[:frames],
             trajectory.versions[:frames] if self.with_versions else None,
             {camera: require_there(self.results.file(str(videos[camera]))) for camera in cameras},
@@ -248,17 +257,24 @@ def _fps(case: CaseResults) -> float:
     return float(case.contract.get("control_hz") or DEFAULT_FPS)
 
 
-def _chosen(option: str, named: Sequence[str] | None, known: Sequence[str], env: str) -> list[str]:
-    if named is None:
+def _chosen(option: str, names: Sequence[str] | None, known: Sequence[str], env: str) -> list[str]:
+    """Return the names that an option chooses, by default all known ones.
+
+    Raises:
+        ConfigError: A name is unknown, or occurs twice.
+    """
+    if names is None:
         return list(known)
-    if unknown := [name for name in named if name not in known]:
+
+    unknown = [name for name in names if name not in known]
+    if unknown:
         raise ConfigError(
             f"{option}: {env} has no {', '.join(map(repr, unknown))}, want some of {sorted(known)}"
             f"{did_you_mean(unknown[0], known)}"
         )
-    if len(set(named)) < len(named):
-        raise ConfigError(f"{option}: got {list(named)}, want each of them once")
-    return list(named)
+    if len(set(names)) < len(names):
+        raise ConfigError(f"{option}: got {list(names)}, want each of them once")
+    return list(names)
 
 
 def _frames_until_rest(success: np.ndarray, moving: Sequence[np.ndarray]) -> int:
@@ -270,6 +286,7 @@ def _frames_until_rest(success: np.ndarray, moving: Sequence[np.ndarray]) -> int
     frames = len(success)
     if not success.any():
         return frames
+
     last = int(success.argmax())  # the frame whose action solved it
     for values in moving:
         steps = np.abs(np.diff(values, axis=0)).max(axis=1, initial=0)
@@ -282,20 +299,22 @@ def _angles(demonstrations: Iterable[_Demonstration]) -> dict[int, Centre]:
     """Return the indices in `observation.state` of angles and rotation vectors that jump, with
     their centres.
     """
-    angles: dict[int, list[np.ndarray]] = {}  # by place; each (N,)
-    vectors: dict[int, list[np.ndarray]] = {}  # by their first place; each (N, 3)
+    angles: dict[int, list[np.ndarray]] = {}  # by index; each (N,)
+    vectors: dict[int, list[np.ndarray]] = {}  # by the index of the first number; each (N, 3)
     for demonstration in demonstrations:
         index = 0
-        for part in demonstration.parts:
-            values = demonstration.state.get(part)  # None: the gripper, which is one number
-            spec = (demonstration.contract.state or {}).get(part)
+        for name in demonstration.parts:
+            values = demonstration.state.get(name)  # None: the gripper, which is one number
+            spec = (demonstration.contract.state or {}).get(name)
             if values is not None and spec is not None:
                 dim = values.shape[1]
-                for i in angles_in(part, spec.unit, dim):
+                for i in angles_in(name, spec.unit, dim):
                     angles.setdefault(index + i, []).append(values[:, i])
-                if (first := rotation_vector_in(part, spec.unit, dim)) is not None:
+                first = rotation_vector_in(name, spec.unit, dim)
+                if first is not None:
                     vectors.setdefault(index + first, []).append(values[:, first : first + 3])
             index += 1 if values is None else values.shape[1]
+
     centres: dict[int, Centre | None] = {
         index: centre_of(episodes) for index, episodes in angles.items()
     }
@@ -309,22 +328,27 @@ def _finished(
     """Return the episode in the dataset's form, after putting its videos into `folder`."""
     keys = camera_keys(demonstration.videos)
     names = {key: camera for camera, key in keys.items()}
-    env, specs = demonstration.contract, demonstration.contract.state or {}
-    # Of a policy that is trained on the dataset: its actions are the env's, without bounds.
+    env = demonstration.contract
+
+    cameras = {}
+    for camera in demonstration.videos:
+        cameras[camera] = (env.cameras or {}).get(camera, CameraSpec())
+    state = {}
+    for name, values in demonstration.state.items():
+        spec = (env.state or {}).get(name, StateSpec())
+        state[name] = replace(spec, dim=values.shape[1])
+    # The contract of a policy that is trained on the dataset: its actions are those of the env,
+    # without bounds.
     contract = Contract(
-        cameras={
-            camera: (env.cameras or {}).get(camera, CameraSpec()) for camera in demonstration.videos
-        },
-        state={
-            part: replace(specs.get(part, StateSpec()), dim=values.shape[1])
-            for part, values in demonstration.state.items()
-        },
+        cameras=cameras,
+        state=state,
         gripper=demonstration.gripper is not None,
         action=replace(env.action, dim=demonstration.actions.shape[1], low=None, high=None),
         control_hz=env.control_hz,
     )
     about = DatasetContract(contract, demonstration.parts, names, angles, demonstration.environment)
     rows, features = _numbers(demonstration, about)
+
     images: dict[str, Stats] = {}
     videos: dict[str, Path] = {}
     for camera, video in demonstration.videos.items():
@@ -339,6 +363,7 @@ def _finished(
             features[key] = video_feature(stream.height, stream.width, _fps(demonstration.case))
         videos[key] = folder / f"{key}.mp4"
         link_or_copy(video, videos[key])
+
     return FinishedEpisode(
         demonstration.episode.result.instruction, features, rows, images, videos, about
     )
@@ -363,7 +388,8 @@ def _numbers(
     }
     features[ACTION]["spec"] = demonstration.case.contract.get("action")
     if names:
-        rows[STATE], features[STATE] = together, vector_feature(names)
+        rows[STATE] = together
+        features[STATE] = vector_feature(names)
     if demonstration.environment:
         rows[ENVIRONMENT], names = state_vector(
             demonstration.state, None, demonstration.environment
@@ -372,22 +398,22 @@ def _numbers(
     if demonstration.versions is not None:
         rows[VERSION] = demonstration.versions
         features |= number_features({VERSION: "int64"})
-    keys = distinct(
-        [part for part in demonstration.parts if part in demonstration.state], without_slash
-    )
+
+    vectors = [name for name in demonstration.parts if name in demonstration.state]
+    keys = distinct(vectors, without_slash)
+    specs = demonstration.contract.state or {}
     index = 0
-    for part in demonstration.parts:
-        if part not in demonstration.state:
+    for name in demonstration.parts:
+        if name not in demonstration.state:
             rows[GRIPPER_FEATURE] = demonstration.gripper
             features |= number_features({GRIPPER_FEATURE: "float32"})
             index += 1
             continue
-        width = demonstration.state[part].shape[1]
-        key = f"{STATE}.{keys[part]}"
+
+        width = demonstration.state[name].shape[1]
+        key = f"{STATE}.{keys[name]}"
         rows[key] = together[:, index : index + width]
-        features[key] = vector_feature([f"{part}_{i}" for i in range(width)])
-        features[key]["unit"] = getattr(
-            (demonstration.contract.state or {}).get(part), "unit", None
-        )
+        features[key] = vector_feature([f"{name}_{i}" for i in range(width)])
+        features[key]["unit"] = getattr(specs.get(name), "unit", None)
         index += width
     return rows, features

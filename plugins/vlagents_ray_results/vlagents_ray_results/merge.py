@@ -78,6 +78,7 @@ def merge(
             "merged"
         )
     require_distinct(folders)
+
     merged = _Merged()
     conflicts: list[str] = []
     for folder in folders:
@@ -89,11 +90,14 @@ def merge(
                     f"it:\n{listed(changes)}\n"
                     f"merge them apart, or mix them and have the report say so (--accept-changes)"
                 )
+
             conflicts += _add_episodes(merged, folder, db)
             if changes:
-                last = merged.runs[-1]
-                earlier = json.loads(last["changes"] or "[]")
-                last["changes"] = canonical([*earlier, *(asdict(change) for change in changes)])
+                last_run = merged.runs[-1]
+                changes_of_run = json.loads(last_run["changes"] or "[]")
+                changes_of_run += [asdict(change) for change in changes]
+                last_run["changes"] = canonical(changes_of_run)
+
     _require_one_checkpoint(merged, weights_may_differ=accept_changes)
     if conflicts and not keep_first:
         shown = "\n".join(f"- {text}" for text in conflicts[:_SHOWN])
@@ -102,6 +106,7 @@ def merge(
             "find out why (vlagents-ray replay), or keep those of the folders named first "
             "(--keep-first)"
         )
+
     with storage.storing(out):
         _link_files(merged, out, folders)
         tables = {
@@ -115,8 +120,10 @@ def merge(
         with storage.whole(out / FILE) as unfinished, closing(sqlite3.connect(unfinished)) as db:
             create(db)
             with db:
-                for name, row in ((name, row) for name, rows in tables.items() for row in rows):
-                    insert(db, name, row)
+                for name, rows in tables.items():
+                    for row in rows:
+                        insert(db, name, row)
+
         summary = summarize(Results.load(out))
         write_summary(summary)
     write_report(summary.results, out / REPORT)
@@ -124,37 +131,39 @@ def merge(
 
 
 def _add_policies(merged: _Merged, folder: Path, db: sqlite3.Connection) -> list[Change]:
+    """Add the policies of a folder; return the changes since the folders before it."""
     changes = []
-    swept = {
-        name for (name,) in db.execute("SELECT DISTINCT policy FROM cases WHERE step IS NOT NULL")
-    }
+    swept_rows = db.execute("SELECT DISTINCT policy FROM cases WHERE step IS NOT NULL")
+    swept = {name for (name,) in swept_rows}
     for row in table(db, "policies"):
         known = merged.policies.setdefault(row["name"], row)
-        before, now = json.loads(known["metadata"]), json.loads(row["metadata"])
+        before = json.loads(known["metadata"])
+        now = json.loads(row["metadata"])
         is_swept = row["name"] in swept
         changes += policy_changes(f"policy {row['name']}", before, now, swept=is_swept)
-        if (what := changed(before, now, swept=is_swept)) in ("policy", "checkpoint"):
+        difference = changed(before, now, swept=is_swept)
+        if difference in ("policy", "checkpoint"):
             raise ConfigError(
-                f"{folder}: policy {row['name']!r} has {what} {now.get(what)!r}, that of the "
-                f"folders before it {before.get(what)!r}; give one of them another name in its "
-                "evaluation"
+                f"{folder}: policy {row['name']!r} has {difference} {now.get(difference)!r}, that "
+                f"of the folders before it {before.get(difference)!r}; give one of them another "
+                "name in its evaluation"
             )
     return changes
 
 
 def _add_cases(merged: _Merged, folder: Path, db: sqlite3.Connection) -> list[Change]:
+    """Add the cases of a folder; return the changes since the folders before it."""
     changes: dict[Change, None] = {}
     names = {_name(row): row for row in merged.cases.values()}
     for row in table(db, "cases"):
         # A suite may have a new name.
         known = merged.cases.get(row["case_id"]) or names.setdefault(_name(row), row)
         if known["case_id"] != row["case_id"]:
-            before, now = json.loads(known["settings"]), json.loads(row["settings"])
-            differing = [
-                f"{k}: {before.get(k)!r} and {now.get(k)!r}"
-                for k in now
-                if before.get(k) != now.get(k)
-            ]
+            before = json.loads(known["settings"])
+            differing = []
+            for name, value in json.loads(row["settings"]).items():
+                if before.get(name) != value:
+                    differing.append(f"{name}: {before.get(name)!r} and {value!r}")
             raise ConfigError(
                 f"{folder}: {' '.join(filter(None, _name(row)))} has other settings: "
                 f"{'; '.join(differing)}"
@@ -167,18 +176,17 @@ def _add_cases(merged: _Merged, folder: Path, db: sqlite3.Connection) -> list[Ch
             raise ConfigError(
                 f"{folder}: {where} stops early by {row['stop']}, that before it by {known['stop']}"
             )
-        programs = [
-            None if case["program"] is None else json.loads(case["program"])
-            for case in (known, row)
-        ]
+
+        programs = []
+        statements = []
+        for case in (known, row):
+            programs.append(None if case["program"] is None else json.loads(case["program"]))
+            described = json.loads(case["described"] or "{}")
+            contract = json.loads(case["contract"] or "{}")
+            statements.append(EnvStatement(described, contract))
         changes |= dict.fromkeys(program_changes(f"env {row['env']}", *programs))
-        statements = [
-            EnvStatement(
-                json.loads(case["described"] or "{}"), json.loads(case["contract"] or "{}")
-            )
-            for case in (known, row)
-        ]
         changes |= dict.fromkeys(env_changes(row["env"], *statements))
+
         for name in ("described", "contract", "code", "program"):
             known[name] = known[name] or row[name]
         _extend(known, row, folder)
@@ -208,7 +216,7 @@ def _extend(case: Row, other: Row, folder: Path) -> None:
 
 
 def _add_episodes(merged: _Merged, folder: Path, db: sqlite3.Connection) -> list[str]:
-    """Add episodes, runs, attempts and workers under new numbers; returns contradictions to
+    """Add episodes, runs, attempts and workers under new numbers; return the contradictions to
     earlier folders.
     """
     offset = len(merged.runs)
@@ -216,19 +224,21 @@ def _add_episodes(merged: _Merged, folder: Path, db: sqlite3.Connection) -> list
     merged.runs += [row | {"run": runs[row["run"]]} for row in table(db, "runs")]
     merged.attempts += [row | {"run": runs[row["run"]]} for row in table(db, "attempts")]
     merged.workers += [row | {"run": runs[row["run"]]} for row in table(db, "workers")]
+
     conflicts = []
     for row in table(db, "episodes"):
         row["run"] = runs[row["run"]]
         known = merged.episodes.get(row["key"])
         if known is None or (known["status"] == "infra_failed" and row["status"] != "infra_failed"):
-            merged.episodes[row["key"]], merged.home[row["key"]] = row, folder
+            merged.episodes[row["key"]] = row
+            merged.home[row["key"]] = folder
         elif row["status"] != "infra_failed":
-            before, now = (episode_of(dict(episode)).result.outcome for episode in (known, row))
-            differing = [
-                f"{name} is {before[name]!r} and {now[name]!r}"
-                for name in before
-                if before[name] != now[name]
-            ]
+            before = episode_of(dict(known)).result.outcome
+            now = episode_of(dict(row)).result.outcome
+            differing = []
+            for name in before:
+                if before[name] != now[name]:
+                    differing.append(f"{name} is {before[name]!r} and {now[name]!r}")
             if differing:
                 conflicts.append(
                     f"{row['key']}: {', '.join(differing)} in {merged.home[row['key']]} and "
@@ -241,34 +251,38 @@ def _require_one_checkpoint(merged: _Merged, *, weights_may_differ: bool) -> Non
     """Raise `ConfigError` for a case of several checkpoints, or a policy's checkpoint of several
     weights.
     """
-    checkpoints: dict[str, dict[str, str]] = {}  # the key of an episode of each, by case
-    # By policy, step and checkpoint.
+    # The key of one episode of each checkpoint, by case.
+    checkpoints: dict[str, dict[str, str]] = {}
+    # The key of one episode of each version of the weights, by policy, step and checkpoint.
     weights: dict[tuple[str, int | None, str | None], dict[str, str]] = {}
     for row in merged.episodes.values():
-        case, checkpoint = merged.cases[row["case_id"]], row["checkpoint"]
+        case = merged.cases[row["case_id"]]
+        checkpoint = row["checkpoint"]
         if checkpoint is not None:
-            checkpoints.setdefault(row["case_id"], {}).setdefault(checkpoint, row["key"])
-        if (found := row["weights"]) is not None:
-            weights.setdefault((case["policy"], case["step"], checkpoint), {}).setdefault(
-                found, row["key"]
-            )
-    several = [
-        (merged.cases[case]["env"], "checkpoints", found) for case, found in checkpoints.items()
-    ]
-    named = {} if weights_may_differ else weights
-    several += [
-        (f"{policy} {name!r}", "weights under one name", found)
-        for (policy, _, name), found in named.items()
-    ]
-    for where, what, found_keys in several:
-        if len(found_keys) > 1:
-            raise ConfigError(
-                f"{where}: was played by several {what}: {found_keys}; merge those apart, or give "
-                "one of them another policy's `name` in its evaluation"
-            )
+            keys_by_checkpoint = checkpoints.setdefault(row["case_id"], {})
+            keys_by_checkpoint.setdefault(checkpoint, row["key"])
+        if row["weights"] is not None:
+            keys_by_weights = weights.setdefault((case["policy"], case["step"], checkpoint), {})
+            keys_by_weights.setdefault(row["weights"], row["key"])
+
+    for case_id, keys in checkpoints.items():
+        _require_one(merged.cases[case_id]["env"], "checkpoints", keys)
+    if not weights_may_differ:
+        for (policy, _, checkpoint), keys in weights.items():
+            _require_one(f"{policy} {checkpoint!r}", "weights under one name", keys)
+
+
+def _require_one(subject: str, kind: str, keys: dict[str, str]) -> None:
+    """Raise `ConfigError` if there are several; `keys` has the key of an episode of each."""
+    if len(keys) > 1:
+        raise ConfigError(
+            f"{subject}: was played by several {kind}: {keys}; merge those apart, or give "
+            "one of them another policy's `name` in its evaluation"
+        )
 
 
 def _link_files(merged: _Merged, out: Path, folders: Sequence[Path]) -> None:
+    """Link the files of all episodes into `out`."""
     sources: dict[Path, Path] = {}
     for key, row in merged.episodes.items():
         home = merged.home[key]
@@ -277,9 +291,12 @@ def _link_files(merged: _Merged, out: Path, folders: Sequence[Path]) -> None:
             paths += [*storage.trajectory_videos(home, row["trajectory"]), row["trajectory"]]
         for path in paths:
             sources[out / path] = storage.require_there(storage.inside(home, path))
+
     for folder in folders:
         for diff in sorted((folder / storage.PROVENANCE).glob("*.diff")):
             name = f"{storage.PROVENANCE}/{diff.name}"
             sources[out / name] = storage.inside(folder, name)
-    for target, source in sources.items():  # check that all exist before anything is written
+
+    # All files were checked above, before anything is written.
+    for target, source in sources.items():
         storage.link_or_copy(source, target)

@@ -46,14 +46,16 @@ class WandbRun:
             self._artifact("code", "code", subject.diffs)
 
     def log(self, metrics: Mapping[str, float], step: int | None) -> None:
+        """Log values at a training step, or without one as the run's summary."""
         if step is None:
             self._run.summary.update(dict(metrics))
         else:
             self._run.log({STEP: step, **metrics})
 
     def videos(self, label: str, paths: Sequence[Path], step: int | None) -> None:
-        at = "" if step is None else f"-{step}"
-        self._artifact(f"videos-{plain(label.replace('/', '_'))}{at}", "videos", paths)
+        """Upload the videos as an artifact."""
+        suffix = "" if step is None else f"-{step}"
+        self._artifact(f"videos-{plain(label.replace('/', '_'))}{suffix}", "videos", paths)
 
     def finish(self) -> None:
         self._run.finish()
@@ -107,31 +109,28 @@ class TensorboardRun:
         self._text("config", json.dumps(subject.config, indent=1, default=str), 0)
 
     def log(self, metrics: Mapping[str, float], step: int | None) -> None:
+        """Log values as scalars at a training step; without one at 0."""
         values = [
             self._summary.Value(tag=name, simple_value=value) for name, value in metrics.items()
         ]
         self._add(values, step or 0)
 
     def videos(self, label: str, paths: Sequence[Path], step: int | None) -> None:
-        self._text(
-            f"{label}/videos",
-            "\n".join(str(path.relative_to(self._out)) for path in paths),
-            step or 0,
-        )
+        """Log the paths of the videos, relative to the folder of results."""
+        lines = [str(path.relative_to(self._out)) for path in paths]
+        self._text(f"{label}/videos", "\n".join(lines), step or 0)
 
     def finish(self) -> None:
         self._writer.close()
 
     def _text(self, tag: str, text: str, step: int) -> None:
-        # Markdown for preformatted text.
+        # Indented lines are preformatted text in Markdown.
         indented = "\n".join(f"    {line}" for line in text.splitlines())
         tensor = self._tensor(
             dtype="DT_STRING", string_val=[indented.encode()], tensor_shape={"dim": [{"size": 1}]}
         )  # fmt: skip
-        self._add(
-            [self._summary.Value(tag=tag, metadata=self._text_metadata(tag, ""), tensor=tensor)],
-            step,
-        )
+        metadata = self._text_metadata(tag, "")
+        self._add([self._summary.Value(tag=tag, metadata=metadata, tensor=tensor)], step)
 
     def _add(self, values: Sequence[Any], step: int) -> None:
         event = self._event(step=step, wall_time=time.time(), summary=self._summary(value=values))

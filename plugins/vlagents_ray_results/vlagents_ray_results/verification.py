@@ -112,6 +112,7 @@ def verify(
     require_file(bundle)
     if seed is None:
         seed = secrets.randbits(32)
+
     parent = None if into is None else into.absolute().parent
     with storage.storing(parent or Path(tempfile.gettempdir())):
         if parent is not None:
@@ -119,9 +120,11 @@ def verify(
         with tempfile.TemporaryDirectory(prefix="bundle.part-", dir=parent) as temporary:
             folder = Path(temporary) / (into or bundle).name  # the name is in the report
             folder.mkdir()
+
             manifest, digest, differences = unpack(bundle, folder, most_bytes=most_bytes)
             fine = f"{len(manifest.files)} files have the SHA-256 that {MANIFEST} states"
             findings = [_finding("digests", differences, fine)]
+
             try:
                 findings += _check(folder, replay, seed, trust=trust)
             except (VLAgentsError, sqlite3.Error):
@@ -138,6 +141,7 @@ def verify(
                     f"{bundle}: its database holds values that no evaluation writes "
                     f"({type(error).__name__}: {error}); do not trust its author"
                 ) from error
+
             if into is not None:
                 os.replace(folder, into)
     return Verification(digest, findings, seed)
@@ -152,6 +156,7 @@ def _check(folder: Path, replay: int, seed: int, *, trust: bool) -> Iterator[Fin
     results = Results.load(folder)
     if not results.runs or not results.cases:
         raise ConfigError(f"{DATABASE}: has no run, or no case; want the results of an evaluation")
+
     yield _check_cases(results)
     yield _check_episodes(results)
     write_summary(summarize(results))
@@ -161,15 +166,24 @@ def _check(folder: Path, replay: int, seed: int, *, trust: bool) -> Iterator[Fin
     if not replay:
         yield Finding("replay", "not checked", "was not asked for (--replay 0)")
         return
-    drawn = ((*pair, _recorded(results, pair[1])) for pair in _drawn(results, seed))
-    chosen = list(islice((candidate for candidate in drawn if candidate[2] is not None), replay))
+
+    chosen = list(islice(_drawn_recordings(results, seed), replay))
     if not chosen:
         yield Finding(
             "replay", "not checked", "no finished episode has a recording (eval --record all)"
         )
     for case, episode, trajectory in chosen:
+        yield _replay(case, episode, trajectory, trust=trust)
+
+
+def _drawn_recordings(
+    results: Results, seed: int
+) -> Iterator[tuple[CaseResults, Episode, Trajectory]]:
+    """Yield the drawn episodes that have a recording."""
+    for case, episode in _drawn(results, seed):
+        trajectory = _recorded(results, episode)
         if trajectory is not None:
-            yield _replay(case, episode, trajectory, trust=trust)
+            yield case, episode, trajectory
 
 
 def _drawn(results: Results, seed: int) -> Iterator[tuple[CaseResults, Episode]]:
@@ -177,10 +191,11 @@ def _drawn(results: Results, seed: int) -> Iterator[tuple[CaseResults, Episode]]
     case is checked.
     """
     draw = random.Random(seed)
-    cases = [
-        [(case, episode) for episode in case.episodes if episode.result.status == "done"]
-        for case in results.cases
-    ]
+    cases = []
+    for case in results.cases:
+        done = [episode for episode in case.episodes if episode.result.status == "done"]
+        cases.append([(case, episode) for episode in done])
+
     draw.shuffle(cases)
     for episodes in cases:
         draw.shuffle(episodes)
@@ -193,27 +208,31 @@ def _check_cases(results: Results) -> Finding:
     mixed or left out.
     """
     contradictions = []
+    known_keys: set[str] = set()
     rules = {json.dumps(run.config.get("stop"), sort_keys=True) for run in results.runs}
     for case in results.cases:
         name = f"{case.contender} in {case.task}"
-        named = case.settings.get("env"), case.settings.get("policy")
-        if fingerprint(case.settings) != case.case_id or named != (case.env, case.policy):
+        env_and_policy = case.settings.get("env"), case.settings.get("policy")
+        has_fingerprint = fingerprint(case.settings) == case.case_id
+        if not has_fingerprint or env_and_policy != (case.env, case.policy):
             contradictions.append(f"{name}: its settings are not those of its key")
         rule = None if case.stop is None else case.stop.model_dump(mode="json")
         if json.dumps(rule, sort_keys=True) not in rules:
             contradictions.append(f"{name}: no run stopped early by its rule")
-        keys_of_case = [episode.result.key for episode in case.episodes]
-        contradictions += [
-            f"{key}: is of another case or env" for key in keys_of_case if key.env != case.env
-        ]
+        for episode in case.episodes:
+            key = episode.result.key
+            known_keys.add(str(key))
+            if key.env != case.env:
+                contradictions.append(f"{key}: is of another case or env")
         contradictions += [f"{name}: {text}" for text in _mixtures(results, case)]
-    known_keys = {str(episode.result.key) for case in results.cases for episode in case.episodes}
+
     with reading(results.out) as db:
         keys = {row["key"] for row in table(db, "episodes")}
-    contradictions += [
-        f"{key}: its key does not match its columns, or it has no case"
-        for key in sorted(keys - known_keys)
-    ]
+    for unknown_key in sorted(keys - known_keys):
+        contradictions.append(
+            f"{unknown_key}: its key does not match its columns, or it has no case"
+        )
+
     return _finding(
         "database",
         contradictions,
@@ -221,14 +240,14 @@ def _check_cases(results: Results) -> Finding:
     )
 
 
-# Of all episodes of a case. A run whose change was accepted may have added another one; checkpoints
-# are never mixed.
+# All episodes of a case have the same value in each of these columns. A run whose change was
+# accepted may have added another value, but no other checkpoint.
 _ONE_OF_A_CASE = ("checkpoint", "weights", "env_program", "policy_program")
 
 
 def _mixtures(results: Results, case: CaseResults) -> Iterator[str]:
-    """Yield what the episodes of a case do not have in common, although an evaluation would have
-    refused to add it.
+    """Yield the differences between the episodes of a case with which no evaluation would have
+    added them.
     """
     for column in _ONE_OF_A_CASE:
         if results.accepted_changes and column != "checkpoint":
@@ -242,21 +261,20 @@ def _mixtures(results: Results, case: CaseResults) -> Iterator[str]:
                 f"its episodes have {len(values)} values of {column}, and no accepted change "
                 "says so"
             )
-    fingerprints: dict[int, set[str]] = {}
+
+    fingerprints_by_version: dict[int, set[str]] = {}
     for episode in case.episodes:
-        if (
-            episode.result.policy_version is not None
-            and episode.result.policy_fingerprint is not None
-        ):
-            fingerprints.setdefault(episode.result.policy_version, set()).add(
-                episode.result.policy_fingerprint
-            )
-    for version, several in fingerprints.items():
-        if len(several) > 1:
-            yield f"version {version} of the weights has {len(several)} fingerprints"
-    if any(episode.unplanned for episode in case.episodes) and not any(
-        change.subject == "plan" for change in results.accepted_changes
-    ):
+        result = episode.result
+        if result.policy_version is not None and result.policy_fingerprint is not None:
+            fingerprints = fingerprints_by_version.setdefault(result.policy_version, set())
+            fingerprints.add(result.policy_fingerprint)
+    for version, fingerprints in fingerprints_by_version.items():
+        if len(fingerprints) > 1:
+            yield f"version {version} of the weights has {len(fingerprints)} fingerprints"
+
+    has_unplanned = any(episode.unplanned for episode in case.episodes)
+    plan_changed = any(change.subject == "plan" for change in results.accepted_changes)
+    if has_unplanned and not plan_changed:
         yield (
             "it has episodes beyond its plan, in no rate, and no accepted change says that the "
             "plan became smaller"
@@ -267,7 +285,7 @@ def _check_episodes(results: Results) -> Finding:
     """Check that the columns of each episode do not contradict each other."""
     contradictions: list[str] = []
     runs = {run.run for run in results.runs}
-    recordings: dict[str, int] = {}
+    recordings: dict[str, int] = {}  # the number of episodes, by path
     number = 0
     for case in results.cases:
         for episode in case.episodes:
@@ -278,20 +296,16 @@ def _check_episodes(results: Results) -> Finding:
             contradictions += [f"{episode.result.key}: {text}" for text in texts]
             if episode.trajectory is not None:
                 recordings[episode.trajectory] = recordings.get(episode.trajectory, 0) + 1
-    contradictions += [
-        f"{path}: is the recording of {times} episodes"
-        for path, times in recordings.items()
-        if times > 1
-    ]
-    there = (
-        path.relative_to(results.out)
-        for path in (results.out / storage.TRAJECTORIES).rglob("*.npz")
-    )
-    contradictions += [
-        f"{path}: is the recording of no episode"
-        for path in sorted(map(str, there))
-        if path not in recordings
-    ]
+
+    for recording, times in recordings.items():
+        if times > 1:
+            contradictions.append(f"{recording}: is the recording of {times} episodes")
+
+    files = (results.out / storage.TRAJECTORIES).rglob("*.npz")
+    for name in sorted(str(file.relative_to(results.out)) for file in files):
+        if name not in recordings:
+            contradictions.append(f"{name}: is the recording of no episode")
+
     return _finding("episodes", contradictions, f"{number} have outcomes without contradiction")
 
 
@@ -304,9 +318,8 @@ def _inconsistencies(case: CaseResults, episode: Episode) -> Iterator[str]:
             f"got the status {result.status!r} and the ending {result.ending!r}, which no "
             "evaluation writes"
         )
-    if (result.status == "done") != (result.error is None) or (result.status == "done") != (
-        result.ending != "error"
-    ):
+    is_done = result.status == "done"
+    if is_done != (result.error is None) or is_done != (result.ending != "error"):
         yield f"its error or ending ({result.ending}) contradicts its status {result.status!r}"
     if result.status == "infra_failed":
         if outcome != (None, None, None) or result.steps or result.actions_sha256 is not None:
@@ -314,8 +327,10 @@ def _inconsistencies(case: CaseResults, episode: Episode) -> Iterator[str]:
         if episode.trajectory is not None:
             yield "it failed by infrastructure, but has a recording"
         return
+
     if result.status == "policy_error" and outcome != (False, False, None):
         yield "an error of the policy ended it, but it was solved"
+
     solved_after = result.first_success
     if None in outcome[:2] or result.success_once != (solved_after is not None):
         yield "success_once contradicts first_success"
@@ -325,6 +340,7 @@ def _inconsistencies(case: CaseResults, episode: Episode) -> Iterator[str]:
         solved_after is not None and solved_after == result.steps and not result.success_at_end
     ):
         yield "success_at_end contradicts first_success"
+
     pushed = case.settings.get("pushed_weights")
     acted = (result.first_policy_version, result.policy_version, result.policy_fingerprint)
     if pushed and result.policy_version is not None:
@@ -334,6 +350,7 @@ def _inconsistencies(case: CaseResults, episode: Episode) -> Iterator[str]:
                 f"versions {acted[0]} to {acted[1]} ({acted[2]}) acted, not {expected[0]} "
                 f"({expected[2]})"
             )
+
     waited = (result.ticks_waited, result.ticks_held, result.latency_ms)
     if case.settings.get("clock") is None and waited != (0, 0, None):
         yield "it waited for answers, but its environment stood still meanwhile"
@@ -354,37 +371,38 @@ def _check_trajectories(results: Results) -> Finding:
         for episode in case.episodes:
             if episode.result.status == "infra_failed":
                 continue
-            if (trajectory := _recorded(results, episode)) is None:
+            trajectory = _recorded(results, episode)
+            if trajectory is None:
                 missing += 1
                 continue
+
             checked += 1
             synchronous = case.settings.get("clock") is None
-            contradictions += [
-                f"{episode.result.key}: {text}"
-                for text in _contradictions(episode, trajectory, synchronous=synchronous)
-            ]
+            texts = _contradictions(episode, trajectory, synchronous=synchronous)
+            contradictions += [f"{episode.result.key}: {text}" for text in texts]
+
     if not checked and not contradictions:
         return Finding(
             "trajectories",
             "not checked",
             f"the bundle has none of {missing} episodes (eval --record all)",
         )
-    rest = (
-        f"; {missing} others have none, so that their outcomes are only stated" if missing else ""
-    )
-    return _finding(
-        "trajectories",
-        contradictions,
-        f"{checked} have the actions, rewards and outcomes of the table{rest}",
-    )
+    fine = f"{checked} have the actions, rewards and outcomes of the table"
+    if missing:
+        fine += f"; {missing} others have none, so that their outcomes are only stated"
+    return _finding("trajectories", contradictions, fine)
 
 
 def _recorded(results: Results, episode: Episode) -> Trajectory | None:
     """Return the recording of an episode; None if the bundle has none. Raises `ConfigError` if
     it cannot be read.
     """
-    if episode.trajectory is None or not (path := results.file(episode.trajectory)).is_file():
+    if episode.trajectory is None:
         return None
+    path = results.file(episode.trajectory)
+    if not path.is_file():
+        return None
+
     try:
         with zipfile.ZipFile(path) as file:
             size = sum(member.file_size for member in file.infolist())
@@ -396,6 +414,7 @@ def _recorded(results: Results, episode: Episode) -> Trajectory | None:
         raise ConfigError(
             f"{episode.trajectory}: unpacks to {size} bytes, want at most {MOST_TRAJECTORY}"
         )
+
     try:
         return Trajectory.load(path)
     except MemoryError as error:  # its header states a wrong size
@@ -407,19 +426,21 @@ def _recorded(results: Results, episode: Episode) -> Trajectory | None:
 def _contradictions(
     episode: Episode, trajectory: Trajectory, *, synchronous: bool
 ) -> Iterator[str]:
-    result, steps = episode.result, len(trajectory.actions)
+    """Yield the contradictions between a recording and its episode in the table."""
+    result = episode.result
+    steps = len(trajectory.actions)
     if not _has_one_length(trajectory) or result.steps != steps:
         yield f"{result.steps} steps in the table, other lengths in the recording"
         return
-    if (
-        hashlib.sha256(np.ascontiguousarray(trajectory.actions, "<f4").tobytes()).hexdigest()
-        != result.actions_sha256
-    ):
+
+    actions = np.ascontiguousarray(trajectory.actions, "<f4").tobytes()
+    if hashlib.sha256(actions).hexdigest() != result.actions_sha256:
         yield "the recorded actions are not those of the table's digest"
     total = float(sum(trajectory.rewards.tolist()))
     if not math.isclose(total, result.episode_return, rel_tol=_TOLERANCE, abs_tol=1e-12):
         yield "the recorded rewards have another sum"
-    # An error of the policy ended it: it counts as no success, whatever was recorded.
+
+    # An episode that an error of the policy ended counts as no success, whatever was recorded.
     if result.status != "done":
         return
     outcome = (result.success_once, result.success_at_end, result.first_success)
@@ -427,7 +448,7 @@ def _contradictions(
         yield "the recorded success is not that of the table"
     versions = [int(version) for version in trajectory.versions if version != NO_VERSION]
     acted = (versions[0], versions[-1]) if versions else (None, None)
-    # Else an answer may be unused.
+    # In real-time mode, an answer may be unused.
     if synchronous and acted != (result.first_policy_version, result.policy_version):
         yield "the recorded versions of the weights are not those of the table"
 
@@ -455,6 +476,7 @@ def _outcome(success: list[bool]) -> tuple[bool, bool, int | None]:
 
 
 def _finding(subject: str, contradictions: list[str], fine: str) -> Finding:
+    """Return the finding of a check: the first contradictions, or `fine` if there are none."""
     if not contradictions:
         return Finding(subject, "equal", fine)
     more = f"; and {len(contradictions) - _SHOWN} more" if len(contradictions) > _SHOWN else ""
@@ -462,20 +484,24 @@ def _finding(subject: str, contradictions: list[str], fine: str) -> Finding:
 
 
 def _check_versions(results: Results) -> Finding:
-    """Compare the software of the last run with that here."""
-    there, here = results.runs[-1].versions, storage.versions()
-    compared = {
-        name: (there.get(name), version) for name, version in here.items() if name != "code"
-    }
-    compared |= {"commit": (_commit(there), _commit(here))}
-    differences = [
-        f"{name} {was} there, {now} here" for name, (was, now) in compared.items() if was != now
-    ]
+    """Compare the software of the last run with the software of this machine."""
+    run_versions = results.runs[-1].versions
+    local_versions = storage.versions()
+    pairs = {}
+    for name, version in local_versions.items():
+        if name != "code":
+            pairs[name] = (run_versions.get(name), version)
+    pairs["commit"] = (_commit(run_versions), _commit(local_versions))
+
+    differences = []
+    for name, (run_version, local_version) in pairs.items():
+        if run_version != local_version:
+            differences.append(f"{name} {run_version} there, {local_version} here")
     if differences:
         return Finding("versions", "other here", "; ".join(differences))
-    return Finding(
-        "versions", "equal", ", ".join(f"{name} {now}" for name, (_, now) in compared.items())
-    )
+
+    texts = [f"{name} {version}" for name, (_, version) in pairs.items()]
+    return Finding("versions", "equal", ", ".join(texts))
 
 
 def _commit(versions: Mapping[str, Any]) -> str:
@@ -498,7 +524,7 @@ class Replayed:
     success: list[bool]  # after each step
     ending: Ending
     instruction: str  # several are joined with semicolons
-    # By the step that differs, 0 is the reset: the largest of a number.
+    # The largest difference of a number, by the step that differs; 0 is the reset.
     differences: dict[int, float]
     described: Mapping[str, Any]  # by the environment here
 
@@ -509,26 +535,28 @@ def _difference(recorded: Trajectory, number: int, obs: Obs, step: EnvStep | Non
 
     It is infinite if there are other numbers, and 0 if only the success differs.
     """
-    if obs.state.keys() != recorded.state.keys() or (obs.gripper is None) != (
-        recorded.gripper is None
-    ):
+    if obs.state.keys() != recorded.state.keys():
         return float("inf")
-    pairs = [
-        (recorded.state[part][number], np.asarray(values, np.float32))
-        for part, values in obs.state.items()
-    ]
+    if (obs.gripper is None) != (recorded.gripper is None):
+        return float("inf")
+
+    pairs = []
+    for name, values in obs.state.items():
+        pairs.append((recorded.state[name][number], np.asarray(values, np.float32)))
     if recorded.gripper is not None:
         pairs.append((recorded.gripper[number], np.asarray(obs.gripper, np.float32)))
     if step is not None:
         pairs.append((recorded.rewards[number - 1], np.asarray(step.reward, np.float64)))
+
     differences = []
-    for then, now in pairs:
-        if then.shape != now.shape:
+    for recorded_values, replayed_values in pairs:
+        if recorded_values.shape != replayed_values.shape:
             differences.append(float("inf"))
-        elif then.tobytes() != now.tobytes():
-            differences.append(
-                float(np.max(np.abs(np.asarray(then, np.float64) - np.asarray(now, np.float64))))
+        elif recorded_values.tobytes() != replayed_values.tobytes():
+            change = np.asarray(replayed_values, np.float64) - np.asarray(
+                recorded_values, np.float64
             )
+            differences.append(float(np.max(np.abs(change))))
     if step is not None and bool(recorded.success[number - 1]) != step.success:
         differences.append(0.0)
     return max(differences, default=None)
@@ -546,12 +574,10 @@ def require_harmless(case: CaseResults) -> None:
             f"{case.env}: is no registered environment; --trust makes it, and runs its code"
         )
     for kind in ("env_options", "reset_options"):
-        options = case.settings.get(kind) or {}
-        risky = {
-            name: value
-            for name, value in options.items()
-            if _CODE.fullmatch(name) or not _is_plain(value)
-        }
+        risky = {}
+        for name, value in (case.settings.get(kind) or {}).items():
+            if _CODE.fullmatch(name) or not _is_plain(value):
+                risky[name] = value
         if risky:
             raise ConfigError(
                 f"{case.env}: got the {kind} {risky}, which could name files or code; --trust "
@@ -575,17 +601,20 @@ def replay_actions(case: CaseResults, episode: Episode, trajectory: Trajectory) 
     try:
         with env_side("reset"):
             begin = options_of_reset(env, key.episode, case.settings.get("reset_options"))
+
         success: list[bool] = []
         instructions: list[str] = []
         differences: dict[int, float] = {}
         last: EnvStep | None = None
-        for number, (obs, step) in enumerate(
-            play_actions(env, key.seed, begin, trajectory.actions, images=False)
-        ):
-            if (largest := _difference(trajectory, number, obs, step)) is not None:
-                differences[number] = largest
+        played = play_actions(env, key.seed, begin, trajectory.actions, images=False)
+        for number, (obs, step) in enumerate(played):
+            difference = _difference(trajectory, number, obs, step)
+            if difference is not None:
+                differences[number] = difference
             last = step
-            success += [] if step is None else [step.success]
+            if step is not None:
+                success.append(step.success)
+
             with env_side("step"):
                 [instruction] = env.instructions
             is_over = number == len(trajectory.actions)
@@ -593,6 +622,7 @@ def replay_actions(case: CaseResults, episode: Episode, trajectory: Trajectory) 
                 env.several_tasks and not is_over and instruction != instructions[-1]
             ):
                 instructions.append(instruction)
+
         ending = _ending(last, len(success), env.max_steps)
         with env_side("describe"):
             return Replayed(success, ending, "; ".join(instructions), differences, env.describe())
@@ -628,48 +658,52 @@ def _replay(case: CaseResults, episode: Episode, trajectory: Trajectory, *, trus
             "differs",
             "its recording has actions and observations of different numbers of steps",
         )
+
     try:
         if not trust:
             require_harmless(case)
         played = replay_actions(case, episode, trajectory)
     except VLAgentsError as error:
         return Finding(subject, "not checked", str(error))
-    result, outcome, steps = episode.result, _outcome(played.success), len(played.success)
-    first, largest = (
-        min(played.differences, default=None),
-        max(played.differences.values(), default=0.0),
-    )
+
+    result = episode.result
+    outcome = _outcome(played.success)
+    steps = len(played.success)
+    first = min(played.differences, default=None)
+    largest = max(played.differences.values(), default=0.0)
     differs = f"the numbers differ from step {first} of {steps} on, by at most {largest:.3g}"
     if first is None:
         differs = "every number is equal to the bit"
-    compared = {
+
+    texts = {
         "ending": (played.ending, result.ending),
         "instruction": (played.instruction, result.instruction),
     }
-    for name, (here, there) in compared.items():
-        if here != there:
+    for name, (replayed, recorded) in texts.items():
+        if replayed != recorded:
             return Finding(
                 subject,
                 "differs",
-                f"its {name} is {here[:_LENGTH]!r} here, {there[:_LENGTH]!r} there",
+                f"its {name} is {replayed[:_LENGTH]!r} here, {recorded[:_LENGTH]!r} there",
             )
+
     if outcome != (result.success_once, result.success_at_end, result.first_success):
-        now, then = (
-            "solved" if solved else "not solved" for solved in (outcome[0], result.success_once)
-        )
-        return Finding(subject, "differs", f"{now} here, {then} there; {differs}")
+        solved_here = "solved" if outcome[0] else "not solved"
+        solved_there = "solved" if result.success_once else "not solved"
+        return Finding(subject, "differs", f"{solved_here} here, {solved_there} there; {differs}")
+
     detail = f"{steps} actions, every state, reward and success to the bit"
     if first is not None:
         detail = f"the same outcome, other numbers; {differs}"
-    described, described_here = case.described, played.described
-    differing = [
-        (
-            f"{name} {str(described_here.get(name))[:_LENGTH]}, there "
-            f"{str(described.get(name))[:_LENGTH]}"
-        )
-        for name in sorted(described.keys() | described_here.keys())
-        if described.get(name) != described_here.get(name)
-    ]
+
+    differing = []
+    for name in sorted(case.described.keys() | played.described.keys()):
+        description = case.described.get(name)
+        description_here = played.described.get(name)
+        if description != description_here:
+            differing.append(
+                f"{name} {str(description_here)[:_LENGTH]}, there {str(description)[:_LENGTH]}"
+            )
     if differing:
         detail += f"; the environment says of itself here: {'; '.join(differing)}"
     return Finding(subject, "equal" if first is None else "other here", detail)

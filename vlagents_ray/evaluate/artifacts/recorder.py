@@ -59,8 +59,10 @@ class VideoRecorder(EpisodeObserver):
         return dict(sorted(videos.items()))
 
     def close(self) -> None:
+        """Drop the videos that are not finished."""
         while self._tracks:
-            self._tracks.popitem()[1][1].abandon()
+            _, (_, track) = self._tracks.popitem()
+            track.abandon()
 
 
 def save_videos(
@@ -75,11 +77,14 @@ def save_videos(
     Each file is complete once it has its name. Files of an earlier attempt at the episode are
     removed.
     """
-    folder, names, written = _folder_for(out, storage.VIDEOS, case, result), distinct(videos), []
+    folder = _folder_for(out, storage.VIDEOS, case, result)
+    names = distinct(videos)
+
+    written = []
     for camera, data in videos.items():
         path = folder / f"{_stem(result)}_{storage.outcome(result)}_{names[camera]}.mp4"
-        with storage.whole(path) as part:
-            part.write_bytes(data)
+        with storage.whole(path) as unfinished_path:
+            unfinished_path.write_bytes(data)
         written.append(str(path.relative_to(out)))
     return written
 
@@ -88,9 +93,10 @@ def _folder_for(out: Path, kind: str, case: EvalCase, result: EpisodeResult) -> 
     """Return `out/KIND/POLICY/SUITE/ENV`, without the files of an earlier attempt at the
     episode.
     """
-    folder = out.joinpath(kind, *(plain(part) for part in case.name if part))
-    for old in folder.glob(f"{_stem(result)}[_.]*"):
-        old.unlink()
+    subfolders = [plain(name) for name in case.name if name]
+    folder = out.joinpath(kind, *subfolders)
+    for earlier_file in folder.glob(f"{_stem(result)}[_.]*"):
+        earlier_file.unlink()
     return folder
 
 
@@ -99,9 +105,9 @@ def _stem(result: EpisodeResult) -> str:
     return f"ep{result.key.episode:04d}_seed{result.key.seed}"
 
 
-# Of a policy that names none, and of steps before its first answer in real-time mode.
+# The version of a policy that names none, and of steps before its first answer in real-time mode.
 NO_VERSION = -1
-_STATE = "state/"
+_STATE = "state/"  # prefix of the state's arrays in the .npz file
 
 
 @dataclass(frozen=True, slots=True)
@@ -123,10 +129,11 @@ class Trajectory:
         """Encode the trajectory as an .npz file, in which nothing is pickled."""
         arrays: dict[str, Any] = {"cameras": np.array(self.cameras, str)}
         arrays |= {"actions": self.actions, "rewards": self.rewards, "success": self.success}
-        arrays |= {_STATE + part: values for part, values in self.state.items()}
-        arrays |= {"versions": self.versions} | (
-            {} if self.gripper is None else {"gripper": self.gripper}
-        )
+        arrays |= {_STATE + name: values for name, values in self.state.items()}
+        arrays["versions"] = self.versions
+        if self.gripper is not None:
+            arrays["gripper"] = self.gripper
+
         file = io.BytesIO()
         np.savez_compressed(file, **arrays)
         return file.getvalue()
@@ -140,15 +147,16 @@ class Trajectory:
         """
         storage.require_there(path)
         try:
-            # Opened here: np.load leaves the file of a broken archive open.
+            # The file is opened here, since np.load leaves the file of a broken archive open.
             with path.open("rb") as opened, np.load(opened, allow_pickle=False) as file:
-                state = {
-                    name.removeprefix(_STATE): file[name]
-                    for name in file.files
-                    if name.startswith(_STATE)
-                }
+                state = {}
+                for name in file.files:
+                    if name.startswith(_STATE):
+                        state[name.removeprefix(_STATE)] = file[name]
+
                 gripper = file["gripper"] if "gripper" in file.files else None
                 cameras = tuple(map(str, file["cameras"]))
+
                 return cls(
                     file["actions"],
                     file["rewards"],
@@ -166,41 +174,50 @@ class TrajectoryRecorder(EpisodeObserver):
     """Collects the numbers of one episode."""
 
     def __init__(self) -> None:
-        self._seen: list[dict[str, np.ndarray]] = []
-        self._grippers: list[float | None] = []
-        # action, reward, success, version.
+        self._states: list[dict[str, np.ndarray]] = []  # of each observation
+        self._grippers: list[float | None] = []  # of each observation
+        # The action, reward, success and version of each step.
         self._steps: list[tuple[np.ndarray, float, bool, int]] = []
         self._cameras: tuple[str, ...] = ()
         self._version = NO_VERSION
-        # Steps until the next version, and that version.
+        # The number of steps until the next version, and that version.
         self._next: tuple[int, int] = (0, NO_VERSION)
 
     def add_observation(self, obs: Obs) -> None:
-        """Add an observation. Raises `EnvFailed` if its parts differ from those of the first."""
-        state = {part: np.array(values, np.float32) for part, values in obs.state.items()}
-        if self._seen and _shapes(state) != _shapes(self._seen[0]):
+        """Add an observation.
+
+        Raises:
+            EnvFailed: The state has other parts or shapes than in the first observation, or only
+                one of the two has a gripper.
+        """
+        state = {name: np.array(values, np.float32) for name, values in obs.state.items()}
+        if self._states and _shapes(state) != _shapes(self._states[0]):
             raise EnvFailed(
-                f"env step: got the state {_shapes(state)}, want {_shapes(self._seen[0])} as after "
-                "reset"
+                f"env step: got the state {_shapes(state)}, want {_shapes(self._states[0])} as "
+                "after reset"
             )
+
         if self._grippers and (obs.gripper is None) != (self._grippers[0] is None):
             raise EnvFailed(
                 "env step: an observation has a gripper, another of the same episode has none"
             )
-        # Those of the reset; a later one may lack them.
+
+        # The cameras are those of the reset; a later observation may lack them.
         self._cameras = self._cameras or tuple(sorted(obs.cameras))
-        self._seen.append(state)
+        self._states.append(state)
         self._grippers.append(obs.gripper)
 
     def add_act(self, act: Act, ticks_waited: int = 0) -> None:
+        """Use the version of this answer after `ticks_waited` further actions."""
         version = version_of(act)
         self._next = ticks_waited, NO_VERSION if version is None else version
 
     def add_action(self, action: np.ndarray, reward: float, success: bool) -> None:
-        after, version = self._next
-        if after == 0:
+        """Add an executed action, (D,), with the version of the weights that chose it."""
+        steps_until_next, version = self._next
+        if steps_until_next == 0:
             self._version = version
-        self._next = after - 1, version
+        self._next = steps_until_next - 1, version
         self._steps.append((np.array(action, np.float32), reward, success, self._version))
 
     def finish(self) -> Trajectory:
@@ -208,12 +225,18 @@ class TrajectoryRecorder(EpisodeObserver):
         actions, rewards, success, versions = (
             zip(*self._steps, strict=True) if self._steps else ((), (), (), ())
         )
+
+        states = {}
+        for name in self._states[0]:
+            states[name] = np.stack([state[name] for state in self._states])
+
+        has_gripper = self._grippers[0] is not None
         return Trajectory(
             np.stack(actions) if actions else np.zeros((0, 0), np.float32),
             np.array(rewards, np.float64),
             np.array(success, np.bool_),
-            {part: np.stack([state[part] for state in self._seen]) for part in self._seen[0]},
-            None if self._grippers[0] is None else np.array(self._grippers, np.float32),
+            states,
+            np.array(self._grippers, np.float32) if has_gripper else None,
             self._cameras,
             np.array(versions, np.int64),
         )
@@ -230,7 +253,7 @@ def videos_of(trajectory: Path, cameras: Iterable[str]) -> dict[str, Path]:
 
 
 def _shapes(state: Mapping[str, np.ndarray]) -> dict[str, tuple[int, ...]]:
-    return {part: values.shape for part, values in sorted(state.items())}
+    return {name: values.shape for name, values in sorted(state.items())}
 
 
 @dataclass(frozen=True, slots=True)
@@ -241,7 +264,7 @@ class Artifacts:
     """
 
     shown: dict[str, bytes] = field(default_factory=dict)  # MP4s for people, by camera
-    seen: dict[str, bytes] = field(default_factory=dict)  # those of the trajectory
+    seen: dict[str, bytes] = field(default_factory=dict)  # MP4s of the policy's images, by camera
     trajectory: bytes | None = None  # a `Trajectory` as .npz
     transitions: Any = None  # a pyarrow.RecordBatch, for a learner
     not_repeatable: str | None = None  # reason for images that the second pass did not render
@@ -265,7 +288,7 @@ class EpisodeRecorder(EpisodeObserver):
         """Free the recorder's resources."""
 
 
-# Called with the env's control_hz.
+# Called with the settings and with the env's control_hz.
 RecorderFactory = Callable[[EvalConfig, float | None], EpisodeRecorder]
 
 
@@ -273,19 +296,27 @@ class Recording(EpisodeRecorder):
     """Records one episode by the settings `video` and `record`."""
 
     def __init__(self, config: EvalConfig, fps: float | None) -> None:
-        self._wants_video, self._wants_trajectory = config.video, config.record
+        self._wants_video = config.video
+        self._wants_trajectory = config.record
         self._video = VideoRecorder(fps)
-        self._trajectory, self._played = TrajectoryRecorder(), PlayedEpisode()
-        self._observers: list[EpisodeObserver] = (
-            [self._video] if self.wants_images != "none" else []
-        )
-        self._observers += [self._played] if self.wants_images == "failures" else []
-        self._observers += [self._trajectory] if self._wants_trajectory != "none" else []
+        self._trajectory = TrajectoryRecorder()
+        self._played = PlayedEpisode()
+
+        self._observers: list[EpisodeObserver] = []
+        if self.wants_images != "none":
+            self._observers.append(self._video)
+        if self.wants_images == "failures":
+            self._observers.append(self._played)
+        if self._wants_trajectory != "none":
+            self._observers.append(self._trajectory)
 
     @property
     def wants_images(self) -> EpisodeChoice:
-        wanted = {self._wants_video, self._wants_trajectory}
-        return "all" if "all" in wanted else "failures" if "failures" in wanted else "none"
+        """The episodes that need the images of every step, for a video or a trajectory."""
+        choices = (self._wants_video, self._wants_trajectory)
+        if "all" in choices:
+            return "all"
+        return "failures" if "failures" in choices else "none"
 
     def add_observation(self, obs: Obs) -> None:
         for observer in self._observers:
@@ -300,26 +331,30 @@ class Recording(EpisodeRecorder):
             observer.add_action(action, reward, success)
 
     def finish(self, result: EpisodeResult, second_pass: SecondPass) -> Artifacts:
-        video, trajectory = (
-            _wanted(self._wants_video, result),
-            _wanted(self._wants_trajectory, result),
-        )
-        if not video and not trajectory:
+        """Return the video and the trajectory of the episode, if the settings choose it."""
+        wants_video = _is_chosen(self._wants_video, result)
+        wants_trajectory = _is_chosen(self._wants_trajectory, result)
+        if not wants_video and not wants_trajectory:
             return Artifacts()
+
         if self._played.lacks_images:
             self._video.close()
-            if (reason := second_pass(self._played, self._video.add_observation)) is not None:
+            reason = second_pass(self._played, self._video.add_observation)
+            if reason is not None:
                 return Artifacts(not_repeatable=reason)
+
         videos = self._video.finish()
-        numbers = self._trajectory.finish().to_bytes() if trajectory else None
-        return Artifacts(videos if video else {}, videos if trajectory else {}, numbers)
+        trajectory = self._trajectory.finish().to_bytes() if wants_trajectory else None
+        return Artifacts(
+            videos if wants_video else {}, videos if wants_trajectory else {}, trajectory
+        )
 
     def close(self) -> None:
         self._video.close()
 
 
 def save(
-    out: Path, case: EvalCase, result: EpisodeResult, kept: Artifacts
+    out: Path, case: EvalCase, result: EpisodeResult, artifacts: Artifacts
 ) -> tuple[list[str], str | None]:
     """Write the files of an episode below `out`; returns the paths of its videos and its
     trajectory, relative to it.
@@ -328,21 +363,24 @@ def save(
     videos that are also shown are links, and the .npz is written last: if it exists, the other
     files do.
     """
-    videos = save_videos(out, case, result, kept.shown)
+    videos = save_videos(out, case, result, artifacts.shown)
     folder = _folder_for(out, storage.TRAJECTORIES, case, result)
-    if kept.trajectory is None:
+    if artifacts.trajectory is None:
         return videos, None
-    path, saved = folder / f"{_stem(result)}.npz", dict(zip(kept.shown, videos, strict=True))
-    for camera, file in videos_of(path, kept.seen).items():
-        if camera in saved:
-            storage.link_or_copy(out / saved[camera], file)
+
+    path = folder / f"{_stem(result)}.npz"
+    video_of_camera = dict(zip(artifacts.shown, videos, strict=True))
+    for camera, file in videos_of(path, artifacts.seen).items():
+        if camera in video_of_camera:
+            storage.link_or_copy(out / video_of_camera[camera], file)
         else:
-            with storage.whole(file) as part:
-                part.write_bytes(kept.seen[camera])
-    with storage.whole(path) as part:
-        part.write_bytes(kept.trajectory)
+            with storage.whole(file) as unfinished_path:
+                unfinished_path.write_bytes(artifacts.seen[camera])
+
+    with storage.whole(path) as unfinished_path:
+        unfinished_path.write_bytes(artifacts.trajectory)
     return videos, str(path.relative_to(out))
 
 
-def _wanted(which: EpisodeChoice, result: EpisodeResult) -> bool:
-    return which == "all" or (which == "failures" and not result.success_once)
+def _is_chosen(choice: EpisodeChoice, result: EpisodeResult) -> bool:
+    return choice == "all" or (choice == "failures" and not result.success_once)

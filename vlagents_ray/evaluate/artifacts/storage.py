@@ -72,22 +72,20 @@ def inside(home: Path, path: str) -> Path:
     Raises `ConfigError` if it leads out of that folder, also by a symbolic link: its target is
     neither read, copied nor published.
     """
-    found = (home / require_below(path)).resolve()
-    if not found.is_relative_to(home.resolve()):
+    resolved_path = (home / require_below(path)).resolve()
+    if not resolved_path.is_relative_to(home.resolve()):
         raise ConfigError(
             f"{home / path}: is a symbolic link out of the folder of results; if you trust it, "
             "copy what it leads to into the folder in its place"
         )
-    return found
+    return resolved_path
 
 
 def trajectory_videos(home: Path, trajectory: str) -> list[str]:
     """Return the MP4s of a trajectory's images, relative to the folder of results `home`."""
-    numbers = home / require_below(trajectory)
-    return [
-        str(path.relative_to(home))
-        for path in sorted(numbers.parent.glob(f"{escape(numbers.stem)}_*.mp4"))
-    ]
+    npz_file = home / require_below(trajectory)
+    videos = sorted(npz_file.parent.glob(f"{escape(npz_file.stem)}_*.mp4"))
+    return [str(video.relative_to(home)) for video in videos]
 
 
 def require_there(path: Path) -> Path:
@@ -134,26 +132,27 @@ def whole(path: Path) -> Iterator[Path]:
     """Yield a path for writing, which is renamed to `path` when the file is complete; make missing
     folders.
 
-    If writing fails, the file is removed: others need the room on a full disk.
+    If writing fails, the unfinished file is removed, since other files need the room on a full
+    disk.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
-    part = path.with_name(path.name + ".part")
-    part.unlink(missing_ok=True)
+    unfinished_path = path.with_name(path.name + ".part")
+    unfinished_path.unlink(missing_ok=True)
     try:
-        yield part
-        os.replace(part, path)
+        yield unfinished_path
+        os.replace(unfinished_path, path)
     except BaseException:
-        part.unlink(missing_ok=True)
+        unfinished_path.unlink(missing_ok=True)
         raise
 
 
 def link_or_copy(source: Path, target: Path) -> None:
     """Make `target` a hard link to `source`, or a copy where the file system has no hard links."""
-    with whole(target) as part:
+    with whole(target) as unfinished_path:
         try:
-            os.link(source, part)
+            os.link(source, unfinished_path)
         except OSError:  # another file system, or one without hard links
-            shutil.copyfile(source, part)
+            shutil.copyfile(source, unfinished_path)
 
 
 @contextmanager
@@ -165,16 +164,17 @@ def storing(folder: Path) -> Iterator[None]:
     try:
         yield
     except (OSError, sqlite3.OperationalError) as error:
-        found = error.errno if isinstance(error, OSError) else _SQLITE.get(str(error))
-        if isinstance(error, sqlite3.OperationalError) and found == errno.EACCES:
-            disk = os.statvfs(
-                next(one for one in (folder, *folder.absolute().parents) if one.exists())
-            )
-            found = errno.EROFS if disk.f_flag & os.ST_RDONLY else found
-        if found not in _CURES:
+        number = error.errno if isinstance(error, OSError) else _SQLITE.get(str(error))
+        if isinstance(error, sqlite3.OperationalError) and number == errno.EACCES:
+            folders = (folder, *folder.absolute().parents)
+            disk = os.statvfs(next(path for path in folders if path.exists()))
+            if disk.f_flag & os.ST_RDONLY:
+                number = errno.EROFS
+
+        if number not in _CURES:
             raise
-        what, cure = _CURES[found]
-        raise StorageFailed(f"{folder}: {what} ({error}); {cure}") from error
+        cause, cure = _CURES[number]
+        raise StorageFailed(f"{folder}: {cause} ({error}); {cure}") from error
 
 
 def driver_code() -> dict[str, GitState | None]:
@@ -194,7 +194,11 @@ def versions() -> dict[str, Any]:
             packages[name] = version(name)
         except PackageNotFoundError:
             packages[name] = "not installed"
-    code = {name: None if one is None else one.to_json() for name, one in driver_code().items()}
+
+    code = {}
+    for name, git_state in driver_code().items():
+        code[name] = None if git_state is None else git_state.to_json()
+
     return {
         "python": platform.python_version(),
         "platform": platform.platform(),
@@ -208,16 +212,20 @@ def policy_code(metadata: dict[str, Any]) -> GitState | None:
     server; else None.
     """
     policy = metadata.get("policy")
-    here = code_of(target_of("policies", policy)) if isinstance(policy, str) else None
-    return here if here is not None and here.to_json() == metadata.get("code") else None
+    if not isinstance(policy, str):
+        return None
+    local_code = code_of(target_of("policies", policy))
+    if local_code is None or local_code.to_json() != metadata.get("code"):
+        return None
+    return local_code
 
 
-def save_diffs(out: Path, found: Iterable[GitState | None]) -> None:
+def save_diffs(out: Path, git_states: Iterable[GitState | None]) -> None:
     """Write the diff of each git state from its commit to `out/provenance/SHA256.diff`, once."""
-    for code in found:
+    for code in git_states:
         if code is None or code.diff_sha256 is None:
             continue
         path = out / PROVENANCE / f"{code.diff_sha256}.diff"
         if not path.exists():
-            with whole(path) as part:
-                part.write_bytes(code.diff)
+            with whole(path) as unfinished_path:
+                unfinished_path.write_bytes(code.diff)

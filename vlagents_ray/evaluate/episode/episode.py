@@ -85,9 +85,9 @@ class EpisodeStats:
 
     def began(self, info: object) -> None:
         """Record the checkpoint and the weights that the policy's reset named."""
-        named = info if isinstance(info, dict) else {}
+        fields_of_info = info if isinstance(info, dict) else {}
         for name in ("checkpoint", "weights", "revision"):
-            value = named.get(name)
+            value = fields_of_info.get(name)
             setattr(self, name, value if isinstance(value, str) else None)
 
     def acted(self, act: Act, seconds: float, latency_s: float | None) -> None:
@@ -121,6 +121,7 @@ class EpisodeStats:
         medians_ms = {
             stage: float(np.median(times)) for stage, times in sorted(self.timing_ms.items())
         }
+
         result = EpisodeResult(
             **common,
             status="done",
@@ -142,6 +143,7 @@ class EpisodeStats:
         )
         if failed is None:
             return result
+
         return replace(
             result,
             status="policy_error",

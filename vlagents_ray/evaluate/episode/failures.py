@@ -234,6 +234,7 @@ def checked_step(
         raise errors.EnvFailed(
             f"env step: got {description}, want 'success' among it; see EvalEnv.step"
         )
+
     return EnvStep(
         checked_obs(obs, contract, "step", images=images),
         _number(reward),

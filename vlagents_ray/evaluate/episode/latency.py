@@ -58,10 +58,12 @@ class ChunkExecutor:
                 "clock: got no hz, and the env's contract states no control_hz; give clock.hz, in "
                 "1/s"
             )
+
         self._spec = env.action
         self._still: str = self._clock.meanwhile
         if self._still == "chunk":
             self._still = stopping(env.action)
+
         needs_neutral = self._clock.latency != 0 and stopping(env.action) != "zero"
         if needs_neutral and self._clock.neutral is None:
             raise ConfigError(
@@ -69,6 +71,7 @@ class ChunkExecutor:
                 "zeros may be a pose to go to; give clock.neutral, the action that is executed "
                 "before the first answer comes"
             )
+
         self._plan = ChunkBuffer()
         self._last: np.ndarray | None = None  # (D,) action
         self._delay = DelayEstimate()

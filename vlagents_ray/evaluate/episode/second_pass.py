@@ -43,6 +43,7 @@ def play_actions(
         [first] = env.reset(seeds=[seed], options=[options])
         obs = checked_obs(first, contract, "reset", images=images)
     yield obs, None
+
     for number, action in enumerate(actions):
         watch("env step", number)
         with env_side("step"):
@@ -102,6 +103,7 @@ class PlayedEpisode(EpisodeObserver):
                     outcome = (step.reward, step.success)
                     if outcome != self._outcomes[number - 1]:
                         difference = "reward or success"
+
                 if difference is not None:
                     is_last = number == len(self._actions)
                     steps = "the last step" if is_last else f"{number} steps"
@@ -124,6 +126,7 @@ class _Digests:
 
     @classmethod
     def from_obs(cls, obs: Obs) -> _Digests:
+        """Return the digests of an observation."""
         numbers: dict[str, Any] = {}
         for name, values in obs.state.items():
             numbers[f"state {name!r}"] = values.tobytes()

@@ -47,7 +47,7 @@ Hertz = Annotated[float, Field(gt=0, le=10_000)]
 
 
 class _PlanModel(BaseModel):
-    # Errors are logged.
+    # Errors are logged, and so they must not show the input.
     model_config = ConfigDict(extra="forbid", frozen=True, hide_input_in_errors=True)
 
 
@@ -70,10 +70,10 @@ class PolicyConfig(_PlanModel):
     """A policy, its source or address, and the checkpoints to evaluate."""
 
     name: Name = "policy"  # in the results; two policies of one evaluation have different names
-    # A registered policy or a deployment file, which `vlagents-ray eval` serves for the length of
-    # the run.
+    # A registered policy or a deployment file; `vlagents-ray eval` serves it for the length of the
+    # run.
     source: str | None = None
-    # Of a running server: "http://gpu-box:8000", or "serve://NAME" in this cluster.
+    # The URL of a running server: "http://gpu-box:8000", or "serve://NAME" in this cluster.
     url: str | None = None
     config: dict[str, JsonValue] = {}  # settings of the policy, over a deployment file's own
     options: dict[str, JsonValue] = {}  # passed to every `reset` of the policy
@@ -96,18 +96,21 @@ class PolicyConfig(_PlanModel):
     def _range(cls, steps: object) -> object:
         if not isinstance(steps, dict):
             return steps
-        given = StepRange.model_validate(steps)
-        steps_named = range(given.first, given.last + 1, given.every)
-        if len(steps_named) > MOST_STEPS_NAMED:
+
+        bounds = StepRange.model_validate(steps)
+        steps_in_range = range(bounds.first, bounds.last + 1, bounds.every)
+        if len(steps_in_range) > MOST_STEPS_NAMED:
             raise ValueError(
-                f"expected at most {MOST_STEPS_NAMED} steps, got {len(steps_named)}; raise `every`"
+                f"expected at most {MOST_STEPS_NAMED} steps, got {len(steps_in_range)}; raise "
+                "`every`"
             )
-        return list(steps_named)
+        return list(steps_in_range)
 
     @field_validator("steps")
     @classmethod
     def _once(cls, steps: list[int]) -> list[int]:
-        if repeated := sorted({step for step in steps if steps.count(step) > 1}):
+        repeated = sorted({step for step in steps if steps.count(step) > 1})
+        if repeated:
             raise ValueError(f"{repeated} named twice; name each step once")
         return steps
 
@@ -118,9 +121,13 @@ class PolicyConfig(_PlanModel):
                 "got steps and pushed_weights, want one of them: each names checkpoints in the "
                 "results"
             )
-        ours = {"seed", "env", "contract"} | ({"checkpoint_step"} if self.steps else set())
-        if taken := sorted(ours & self.options.keys()):
-            raise ValueError(f"options: {taken} are set episode by episode; leave them out")
+
+        reserved = {"seed", "env", "contract"}
+        if self.steps:
+            reserved.add("checkpoint_step")
+        conflicts = sorted(reserved & self.options.keys())
+        if conflicts:
+            raise ValueError(f"options: {conflicts} are set episode by episode; leave them out")
         return self
 
 
@@ -130,9 +137,9 @@ class WorkerConfig(_PlanModel):
     cpus: Resources = 0.5  # low, so that workers and policy fit on a small machine
     gpus: Resources = 0.0
     threads: Annotated[int, Field(ge=1, le=MOST_CPUS)] = 1  # of OpenMP, MKL, llvmpipe and the like
-    # Ray's; its env_vars override the thread settings. A simulator with other packages names their
-    # Python, with Ray in
-    # it: {"py_executable": "/envs/rcs/bin/python"}.
+    # Ray's runtime environment; its env_vars override the thread settings. For a simulator with
+    # other packages, give their Python, in which Ray is installed:
+    # {"py_executable": "/envs/rcs/bin/python"}.
     runtime_env: dict[str, JsonValue] = {}
 
     @field_validator("runtime_env")
@@ -147,8 +154,8 @@ class ClockConfig(_PlanModel):
     `vlagents_ray.evaluate.episode.latency`).
     """
 
-    # s that each answer takes: "measured" as it comes, transport included, or injected, which
-    # repeats exactly.
+    # The seconds that each answer takes: "measured", transport included, or an injected number,
+    # with which an episode repeats exactly.
     latency: Literal["measured"] | Annotated[float, Field(ge=0, le=3600)] = "measured"
     # The action between observation and answer. "chunk": the rest of the last chunk, then a stop of
     # the robot: "zero" for relative actions, else "hold"; "hold": the last action again; "zero": no
@@ -167,7 +174,7 @@ class StopConfig(_PlanModel):
     whichever comes first.
     """
 
-    # Of each case's confidence sequence, over all looks together.
+    # The error rate of each case's confidence sequence, over all looks together.
     error_rate: float = Field(default=0.05, gt=0, lt=1)
     # Stop when this success rate is excluded.
     target: float | None = Field(default=None, ge=0, le=1)
@@ -193,7 +200,8 @@ class SuiteConfig(_PlanModel):
     reset_options: dict[str, JsonValue] = {}  # passed to every `reset` of the env
     episodes: Count = 10  # of each env and seed
     seeds: list[Seed] = Field(default=[0], min_length=1)  # episode i uses seed + i
-    # That one worker steps together, in one simulator if it can (ManiSkill on a GPU)
+    # The environments that one worker steps together, in one simulator where that is possible
+    # (ManiSkill on a GPU).
     num_envs: Rows = 1
     worker: WorkerConfig | None = None  # None: `EvalConfig.worker`
     clock: ClockConfig | None = None  # real-time mode; None: the env waits for the policy
@@ -201,7 +209,8 @@ class SuiteConfig(_PlanModel):
     @field_validator("envs")
     @classmethod
     def _distinct(cls, envs: list[str]) -> list[str]:
-        if repeated := sorted({name for name in envs if envs.count(name) > 1}):
+        repeated = sorted({name for name in envs if envs.count(name) > 1})
+        if repeated:
             raise ValueError(f"{repeated} named twice; name each env once and raise `episodes`")
         return envs
 
@@ -226,7 +235,7 @@ class TrackingConfig(_PlanModel):
 
     project: Name = "vlagents-ray"
     group: str | None = None  # of runs; default: the name of the folder of results
-    # Of each case that are uploaded, failures first.
+    # The number of videos of each case that are uploaded, failures first.
     videos: Annotated[int, Field(ge=0, le=MOST_EPISODES)] = 4
 
 
@@ -251,7 +260,7 @@ class RobotConfig(_PlanModel):
     # Draws the order of policies; None: a key is drawn, and kept in the folder of results.
     key: Annotated[str, Field(min_length=8)] | None = None
     hz: Hertz = 10.0  # control rate
-    # As in `ChunkPlayer` and `Guard`:
+    # These settings are those of `ChunkPlayer` and `Guard`.
     mode: Literal["open_loop", "ensemble", "async"] = "async"
     deadline_s: Annotated[float, Field(ge=0, le=3600)] | None = None  # None: 0 in "async", else 1
     max_age_s: Seconds | None = None
@@ -259,7 +268,7 @@ class RobotConfig(_PlanModel):
     max_step: Annotated[float, Field(gt=0, le=1e6)] | None = None
     measure: str | None = None  # the part of the state that is the measured pose
     limits: str | None = None  # a file of `MotionLimits.read`, without the soft start
-    # Play although the training's statistics do not fit the arm; the log shows it.
+    # Play even if the training's statistics do not fit the arm; the log shows it.
     accept_misfit: bool = False
     silent_s: Seconds = 2.0  # a server that is silent for longer ends the trial, which is repeated
 
@@ -271,14 +280,13 @@ class EvalConfig(_PlanModel):
     suites: list[SuiteConfig] = Field(min_length=1)
     out: Path
     # Environments rolled out in parallel, each in a Ray actor. 0: one after another in this
-    # process, without Ray.
-    # None: 0 for a short evaluation, else 1 (see `chosen_workers`).
+    # process, without Ray. None: 0 for a short evaluation, else 1 (see `chosen_workers`).
     workers: Workers | None = None
     video: EpisodeChoice = "failures"  # of which episodes there are videos
-    # Of which there are trajectories: numbers and the policy's images.
+    # The episodes of which there are trajectories: numbers and the policy's images.
     record: EpisodeChoice = "none"
     resume: bool = False
-    # Resume although files of policy or environment changed; the report shows it.
+    # Resume even if files of the policy or the environment changed; the report shows it.
     accept_changes: bool = False
     worker: WorkerConfig = WorkerConfig()
     stop: StopConfig | None = None  # early stopping; None: every episode is played
@@ -287,7 +295,7 @@ class EvalConfig(_PlanModel):
     tracking: TrackingConfig = TrackingConfig()
     robot: RobotConfig | None = None  # a real robot and its tasks
 
-    # What happens when something breaks.
+    # These settings apply when something breaks.
     retries: Retries = 3  # further attempts after an infrastructure failure
     # Stop after so many lost episodes, or errors of policies, in a row; 0 = never.
     abort_after: Annotated[int, Field(ge=0, le=MOST_EPISODES)] = 10
@@ -301,7 +309,8 @@ class EvalConfig(_PlanModel):
     @classmethod
     def _named_apart(cls, policies: list[PolicyConfig]) -> list[PolicyConfig]:
         names = [policy.name for policy in policies]
-        if repeated := sorted({name for name in names if names.count(name) > 1}):
+        repeated = sorted({name for name in names if names.count(name) > 1})
+        if repeated:
             raise ValueError(f"two policies are named {repeated}; give each another `name`")
         return policies
 

@@ -175,11 +175,10 @@ def episodes(results: Results, gallery: Gallery) -> Episodes | None:
     if not played:
         return None
 
-    solved = [
-        (case, episode)
-        for case, episode in played
-        if episode.counts and episode.result.success_once
-    ]
+    solved = []
+    for case, episode in played:
+        if episode.counts and episode.result.success_once:
+            solved.append((case, episode))
     cards = gallery.cards(solved, MOST_SOLVED)
     rows = [_row(case, episode, gallery) for case, episode in played[:MOST_LISTED]]
     all_count = all(episode.counts for _, episode in played)

@@ -120,6 +120,7 @@ def compare(
         if timing not in timings:
             raise ConfigError(f"compare: got the timing {timing!r}, want one of {list(timings)}")
         results = results.among(timings[timing])
+
     return comparisons(results, [(a, b)], accept_changes=accept_changes)[0]
 
 
@@ -330,9 +331,9 @@ def _mixed(results: Results, case: CaseResults, other: CaseResults) -> list[str]
     words.
     """
     accepted = results.accepted_changes
-    counted_by_case = [
-        [episode for episode in either.episodes if episode.counts] for either in (case, other)
-    ]
+    counted_by_case = []
+    for either in (case, other):
+        counted_by_case.append([episode for episode in either.episodes if episode.counts])
 
     mixed = []
     env_programs = {episode.env_program for episode in itertools.chain(*counted_by_case)} - {None}

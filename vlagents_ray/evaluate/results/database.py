@@ -227,6 +227,7 @@ def lock(out: Path) -> int:
             if time.monotonic() < deadline:
                 time.sleep(_RETRY_EVERY_S)
                 continue
+
             os.close(file)
             raise ConfigError(
                 f"{out}: another evaluation is writing there; wait, or choose another folder"

@@ -261,11 +261,10 @@ class Results:
         Raises:
             ConfigError: No case is left.
         """
-        selected = [
-            case
-            for case in self.cases
-            if contender in (None, case.contender) and env in (None, case.env)
-        ]
+        selected = []
+        for case in self.cases:
+            if contender in (None, case.contender) and env in (None, case.env):
+                selected.append(case)
         if not selected:
             known = sorted({f"{case.contender} in {case.env}" for case in self.cases})
             raise ConfigError(

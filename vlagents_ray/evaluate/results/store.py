@@ -345,13 +345,14 @@ class Store(AbstractContextManager["Store"]):
             self._db.execute("INSERT OR REPLACE INTO policies VALUES (?, ?)", (name, value))
 
     def _open(self, config: EvalConfig) -> sqlite3.Connection:
-        # By default each commit reaches the disk.
+        # By SQLite's default, each commit reaches the disk.
         db = sqlite3.connect(self._out / FILE, timeout=WAIT_S)
         try:
             if db.execute("PRAGMA user_version").fetchone()[0] == 0:
                 create(db)
             require_readable(self._out, db)
             self._require_resumable(db, config)
+
             stop = _rule(config)
             with db:
                 for case in self.cases:

@@ -34,7 +34,7 @@ from vlagents_ray.page_protocol import BACKLOG, PageListener, PageProtocol
 
 Outcome = Literal["success", "failure", "partial", "repeat"]
 SCENES = "scenes"
-_KEPT_QUALITY = 92  # JPEG, of the start pictures
+_START_QUALITY = 92  # JPEG, of the start pictures
 _OUTCOMES: dict[str, Outcome] = {"s": "success", "f": "failure", "p": "partial", "r": "repeat"}
 _Phase = Literal["scene", "playing", "verdict", "next", "end"]
 _CHOICES: dict[str, set[str]] = {
@@ -106,12 +106,16 @@ class Verdict:
             raise ConfigError("verdict: got a repetition without a reason, want one in words")
         if self.outcome != "partial":
             return float(self.outcome == "success")
-        if not rubric or (unknown := sorted(set(self.earned) - rubric.keys())):
-            got = f"the parts {unknown}" if rubric else "a partial success"
+
+        unknown_parts = sorted(set(self.earned) - rubric.keys())
+        if not rubric or unknown_parts:
+            actual = f"the parts {unknown_parts}" if rubric else "a partial success"
             raise ConfigError(
-                f"verdict: got {got}, want some of the rubric's {sorted(rubric)}; see `robot.tasks`"
+                f"verdict: got {actual}, want some of the rubric's {sorted(rubric)}; see "
+                "`robot.tasks`"
             )
-        return sum(rubric[part] for part in set(self.earned)) / sum(rubric.values())
+        points = sum(rubric[name] for name in set(self.earned))
+        return points / sum(rubric.values())
 
 
 class Operator(Protocol):
@@ -151,34 +155,34 @@ class Operator(Protocol):
         """
 
 
-def start_pictures(out: Path, place: str) -> dict[str, Path]:
+def start_pictures(out: Path, scene: str) -> dict[str, Path]:
     """Return the JPEG of each camera at the first start of a scene; {} before that."""
-    return {path.stem: path for path in sorted((out / SCENES / place).glob("*.jpg"))}
+    return {path.stem: path for path in sorted((out / SCENES / scene).glob("*.jpg"))}
 
 
-def save_start(out: Path, place: str, obs: Obs) -> None:
+def save_start(out: Path, scene: str, obs: Obs) -> None:
     """Save the pictures of a scene at its start, in place of earlier ones."""
     for camera, name in distinct(obs.cameras).items():
-        with whole(out / SCENES / place / f"{name}.jpg") as part:
-            part.write_bytes(encode_jpeg(obs.cameras[camera], _KEPT_QUALITY))
+        with whole(out / SCENES / scene / f"{name}.jpg") as unfinished_path:
+            unfinished_path.write_bytes(encode_jpeg(obs.cameras[camera], _START_QUALITY))
 
 
 def save_overlay(start: Path, now: np.ndarray) -> Path:
-    """Save the mean of a start picture and the camera's present picture, beside the former's
-    folder.
+    """Save the mean of a start picture and the camera's present picture, beside the folder of the
+    start picture.
 
     Returns:
         The new JPEG; it has the size of `now`, and only `now` if the sizes differ.
     """
-    before = decode(start.read_bytes())
-    mean = (
-        now
-        if before.shape != now.shape
-        else ((before.astype(np.uint16) + now) // 2).astype(np.uint8)
-    )
+    start_picture = decode(start.read_bytes())
+    if start_picture.shape == now.shape:
+        mean = ((start_picture.astype(np.uint16) + now) // 2).astype(np.uint8)
+    else:
+        mean = now
+
     path = start.parent.with_name(f"overlay-{start.name}")
-    with whole(path) as part:
-        part.write_bytes(encode_jpeg(mean, _KEPT_QUALITY))
+    with whole(path) as unfinished_path:
+        unfinished_path.write_bytes(encode_jpeg(mean, _START_QUALITY))
     return path
 
 
@@ -203,10 +207,14 @@ class TerminalOperator(Operator):
         self._stopping = _enter_pressed if stopping is None else stopping
 
     def prepare(self, trial: VisibleTrial, observe: Callable[[], Obs]) -> bool:
+        """Print the trial and the setup of its scene, and wait for Enter; "q" or the end of the
+        input ends the evaluation.
+        """
         self._say(f"\ntrial {trial.number} of {trial.total}: {trial.task}, scene {trial.scene}")
         pictures = (f"set it as in {picture}" for picture in trial.start.values())
         for line in filter(None, (trial.message, trial.instruction, trial.setup, *pictures)):
             self._say(f"  {line}")
+
         while True:
             try:
                 typed = self._ask(
@@ -227,39 +235,40 @@ class TerminalOperator(Operator):
         return self._stopping()
 
     def judge(self, trial: VisibleTrial, ending: str) -> Verdict:
+        """Ask for the outcome, for each part of the rubric in a partial success, and for a note.
+
+        The questions are repeated until the verdict is valid.
+        """
         self._say(f"trial {trial.number} has ended: {ending}")
-        choices = (
-            "s success, f failure, p partial, r repeat"
-            if trial.rubric
-            else "s success, f failure, r repeat"
-        )
+        partial = "p partial, " if trial.rubric else ""
+        choices = f"s success, f failure, {partial}r repeat"
         while True:
             try:
                 outcome = _OUTCOMES.get(self._ask(f"verdict ({choices}): ").strip().lower())
                 if outcome is None:
                     continue
-                earned = []
-                for part, points in trial.rubric.items() if outcome == "partial" else ():
-                    if (
-                        self._ask(f"  {part} ({points:g} points), reached? y/n: ")
-                        .strip()
-                        .lower()
-                        .startswith("y")
-                    ):
-                        earned.append(part)
-                verdict = Verdict(
-                    outcome,
-                    tuple(earned),
-                    self._ask("why: " if outcome == "repeat" else "note: ").strip(),
-                )
+
+                earned = self._earned_parts(trial.rubric) if outcome == "partial" else ()
+                note = self._ask("why: " if outcome == "repeat" else "note: ").strip()
+                verdict = Verdict(outcome, earned, note)
             except EOFError:
                 raise KeyboardInterrupt from None
+
             try:
                 verdict.score(trial.rubric)
             except ConfigError as error:
                 self._say(str(error))
             else:
                 return verdict
+
+    def _earned_parts(self, rubric: Mapping[str, float]) -> tuple[str, ...]:
+        """Ask for each part of the rubric whether it was reached."""
+        earned = []
+        for name, points in rubric.items():
+            answer = self._ask(f"  {name} ({points:g} points), reached? y/n: ")
+            if answer.strip().lower().startswith("y"):
+                earned.append(name)
+        return tuple(earned)
 
     def _look(self, trial: VisibleTrial, obs: Obs) -> None:
         if not trial.start:
@@ -309,6 +318,7 @@ class PageOperator(Operator):
         listening = PageListener.bound("127.0.0.1", self._port)
         token = secrets.token_urlsafe(24)
         self.url = f"http://127.0.0.1:{listening.getsockname()[1]}/{token}/"
+
         routes = [
             Route("/", self._file),
             Route("/{name:str}", self._file),
@@ -327,6 +337,7 @@ class PageOperator(Operator):
             ws="none",
             backlog=BACKLOG,
         )
+
         self._server = uvicorn.Server(settings)
         self._thread = threading.Thread(
             target=lambda: asyncio.run(self._server.serve([listening])),
@@ -348,16 +359,21 @@ class PageOperator(Operator):
                 )
             else:
                 self._ending = "The evaluation ended with an error: see the terminal"
+
         if self._is_watched():
             self._end_shown.wait(_AWAY_S)
         self._server.should_exit = self._server.force_exit = True
         self._thread.join()
 
     def prepare(self, trial: VisibleTrial, observe: Callable[[], Obs]) -> bool:
+        """Show the scene to set and live pictures, until the page sends an answer."""
         self._enter("scene", trial)
-        while (answer := self._wait(_LOOK_S)) is None:
+        answer = self._wait(_LOOK_S)
+        while answer is None:
             if self._is_watched():
                 self._obs = observe()
+            answer = self._wait(_LOOK_S)
+
         self._enter("playing" if answer["do"] == "ready" else "next", trial)
         return bool(answer["do"] == "ready")
 
@@ -368,15 +384,21 @@ class PageOperator(Operator):
         return self._answer is not None or not self._is_watched()
 
     def judge(self, trial: VisibleTrial, ending: str) -> Verdict:
+        """Show the form for the verdict, until the page sends it."""
         self._enter("verdict", trial, ending)
-        while (answer := self._wait(1.0)) is None:
-            pass
+        answer = self._wait(1.0)
+        while answer is None:
+            answer = self._wait(1.0)
+
         self._enter("next", trial)
         return _verdict(answer)
 
     def _enter(self, phase: _Phase, trial: VisibleTrial, ending: str = "") -> None:
         with self._changed:
-            self._phase, self._trial, self._ending, self._answer = phase, trial, ending, None
+            self._phase = phase
+            self._trial = trial
+            self._ending = ending
+            self._answer = None
 
     def _wait(self, seconds: float) -> dict[str, Any] | None:
         with self._changed:
@@ -390,9 +412,8 @@ class PageOperator(Operator):
         name = http.path_params.get("name", "operator.html")
         if name not in _FILES:
             return PlainTextResponse("not found", 404)
-        text = (package_files("vlagents_ray.evaluate.robot") / "page" / name).read_text(
-            encoding="utf-8"
-        )
+        file = package_files("vlagents_ray.evaluate.robot") / "page" / name
+        text = file.read_text(encoding="utf-8")
         return Response(text, media_type=_FILES[name], headers=_HEADERS)
 
     async def _state(self, _: Request) -> Response:
@@ -406,68 +427,73 @@ class PageOperator(Operator):
                 "ending": self._ending,
                 "answered": self._answer is not None,
             }
+
         cameras = [] if obs is None else sorted(distinct(obs.cameras).values())
         sent = BackgroundTask(self._end_shown.set) if state["phase"] == "end" else None
         return JSONResponse(state | {"cameras": cameras}, background=sent)
 
     async def _camera(self, http: Request) -> Response:
         obs = self._obs
-        names = (
-            {} if obs is None else {name: camera for camera, name in distinct(obs.cameras).items()}
-        )
-        camera = names.get(http.path_params["name"])
-        if obs is None or camera is None:
+        if obs is None:
             return PlainTextResponse("not found", 404)
+        cameras_by_name = {name: camera for camera, name in distinct(obs.cameras).items()}
+        camera = cameras_by_name.get(http.path_params["name"])
+        if camera is None:
+            return PlainTextResponse("not found", 404)
+
         picture = await run_in_threadpool(encode_jpeg, obs.cameras[camera], _PAGE_QUALITY)
         return Response(picture, media_type="image/jpeg", headers=_HEADERS)
 
     async def _start(self, http: Request) -> Response:
         trial = self._trial
         path = None if trial is None else trial.start.get(http.path_params["name"])
-        return (
-            PlainTextResponse("not found", 404)
-            if path is None
-            else FileResponse(path, headers=_HEADERS)
-        )
+        if path is None:
+            return PlainTextResponse("not found", 404)
+        return FileResponse(path, headers=_HEADERS)
 
     async def _take(self, http: Request) -> Response:
         """Accept an answer, unless it is for another trial or question than the present one."""
         if not http.headers.get("content-type", "").startswith("application/json"):
             return PlainTextResponse("want application/json", 415)
+
         body = b""
-        async for part in http.stream():
-            body += part
+        async for data in http.stream():
+            body += data
             if len(body) > _BODY:
                 return PlainTextResponse(f"want at most {_BODY} bytes", 413)
+
         try:
             answer = json.loads(body)
             if not isinstance(answer["do"], str):
                 raise TypeError
-            about = answer["phase"], answer["trial"], answer["attempt"]
+            question = answer["phase"], answer["trial"], answer["attempt"]
             verdict = _verdict(answer) if answer["phase"] == "verdict" else None
         except (ValueError, TypeError, KeyError, RecursionError):
             return PlainTextResponse("want phase, trial, attempt, do, earned, note", 400)
+
         with self._changed:
             trial = self._trial
             if (
                 trial is None
-                or about != (self._phase, trial.number, trial.attempt)
+                or question != (self._phase, trial.number, trial.attempt)
                 or self._answer is not None
             ):
                 return PlainTextResponse("the trial has gone on meanwhile", 409)
-            if answer["do"] not in (choices := _CHOICES.get(self._phase, set())):
+
+            choices = _CHOICES.get(self._phase, set())
+            if answer["do"] not in choices:
                 return PlainTextResponse(f"do: want one of {sorted(choices)}", 400)
             try:
                 if verdict is not None:
                     verdict.score(trial.rubric)
             except ConfigError as error:
                 return PlainTextResponse(str(error), 400)
+
             self._answer = answer
             self._changed.notify_all()
         return JSONResponse({})
 
 
 def _verdict(answer: dict[str, Any]) -> Verdict:
-    return Verdict(
-        answer["do"], tuple(map(str, answer.get("earned", ()))), str(answer.get("note", ""))
-    )
+    earned = tuple(map(str, answer.get("earned", ())))
+    return Verdict(answer["do"], earned, str(answer.get("note", "")))

@@ -59,7 +59,7 @@ from vlagents_ray.robot.loop import Robot, opened, robot_factory
 LOG = "trials.jsonl"
 HIDDEN = "trials.hidden.jsonl"
 KEY = "trials.key"
-# bytes: hidden lines have a multiple of this length, so that the size of the file reveals no
+# Hidden lines have a multiple of this length in bytes, so that the size of the file reveals no
 # policy.
 _BLOCK = 16384
 _KILLED = "the evaluation ended before the verdict"
@@ -72,9 +72,10 @@ class LoggedTrial:
     trial: int
     attempt: int
     at: float  # s since 1970, of its end
-    # In plain text: outcome, earned, score, note; or `again`, the reason of a repetition.
+    # The fields in plain text: outcome, earned, score, note; or `again`, the reason of a
+    # repetition.
     seen: dict[str, Any]
-    hidden: dict[str, Any]  # what reveals the policy
+    hidden: dict[str, Any]  # the fields that reveal the policy
 
     @property
     def finished(self) -> bool:
@@ -108,15 +109,17 @@ class TrialLog(contextlib.AbstractContextManager["TrialLog"]):
                     "folder"
                 )
             self.key = _key(config)
+
         with contextlib.ExitStack() as files:
             with storing(config.out):
                 self._log = files.enter_context(_JsonLines(self._path))
                 self._hidden = files.enter_context(_JsonLines(config.out / HIDDEN, mode=0o600))
             self._log.lock()
-            plan = canonical(
-                [[case.fingerprint, *case.name, case.planned, case.suite.seeds] for case in cases]
-            )
-            self._read(config, hmac.digest(self.key, plan.encode(), hashlib.sha256).hex())
+
+            plan = []
+            for case in cases:
+                plan.append([case.fingerprint, *case.name, case.planned, case.suite.seeds])
+            self._read(config, _hash(self.key, canonical(plan).encode()))
             self._files = files.pop_all()
 
     def __exit__(self, *exc: object) -> None:
@@ -125,25 +128,30 @@ class TrialLog(contextlib.AbstractContextManager["TrialLog"]):
     @property
     def finished(self) -> dict[int, LoggedTrial]:
         """The trials that have a result, by their number."""
-        return {one.trial: one for one in self.attempts if one.finished}
+        return {logged.trial: logged for logged in self.attempts if logged.finished}
 
     def of(self, trial: int) -> list[LoggedTrial]:
-        return [one for one in self.attempts if one.trial == trial]
+        """Return the attempts at the trial of this number, in their order."""
+        return [logged for logged in self.attempts if logged.trial == trial]
 
     def begin(self, trial: int, attempt: int) -> None:
         """Record that an attempt begins. If no end follows, the evaluation was killed."""
         self._write({"trial": trial, "attempt": attempt, "begun": time.time()})
 
-    def end(self, trial: int, attempt: int, seen: dict[str, Any], hidden: dict[str, Any]) -> None:
+    def end(
+        self, trial: int, attempt: int, visible: dict[str, Any], hidden: dict[str, Any]
+    ) -> None:
+        """Record the end of an attempt, with the fields `seen` and `hidden` of `LoggedTrial`."""
         at = time.time()
-        self._write({"trial": trial, "attempt": attempt, "at": at, **seen}, hidden)
-        self.attempts.append(LoggedTrial(trial, attempt, at, seen, hidden))
+        self._write({"trial": trial, "attempt": attempt, "at": at, **visible}, hidden)
+        self.attempts.append(LoggedTrial(trial, attempt, at, visible, hidden))
 
     def note_unblinded(self) -> None:
         """Record that the results were written before all trials were played."""
         self._write({"unblinded": time.time()})
 
     def _read(self, config: EvalConfig, identity: str) -> None:
+        """Read the attempts, or begin the log; `identity` is the hash of the plan."""
         lines = [json.loads(line) for line in self._log.read()]
         hidden_lines = _by_hash(self.key, self._hidden.read())
         if not lines:
@@ -151,20 +159,23 @@ class TrialLog(contextlib.AbstractContextManager["TrialLog"]):
             plan = {"config": json.loads(config.model_dump_json(exclude_unset=True))}
             self._write({"plan": identity, "at": self.started}, plan)
             return
+
         if not hmac.compare_digest(lines[0]["plan"], identity):
             raise ConfigError(
                 f"{self._path}: is of another plan, robot or key; take those, or another out folder"
             )
         self.started = float(lines[0]["at"])
-        begun: set[tuple[int, int]] = set()
+        unfinished_attempts: set[tuple[int, int]] = set()
         for line in lines[1:]:
             if "unblinded" in line:
                 continue
+
             attempt = line.pop("trial"), line.pop("attempt")
             if "begun" in line:
-                begun.add(attempt)
+                unfinished_attempts.add(attempt)
                 continue
-            begun.discard(attempt)
+
+            unfinished_attempts.discard(attempt)
             hidden = hidden_lines.get(line.pop("hidden"))
             if hidden is None:
                 raise ConfigError(
@@ -174,7 +185,8 @@ class TrialLog(contextlib.AbstractContextManager["TrialLog"]):
             self.attempts.append(
                 LoggedTrial(*attempt, line.pop("at"), seen=line, hidden=json.loads(hidden))
             )
-        for attempt in begun:
+
+        for attempt in unfinished_attempts:
             self.end(*attempt, {"again": _KILLED, "cause": "operator"}, {})
 
     def _write(self, line: dict[str, Any], hidden: dict[str, Any] | None = None) -> None:
@@ -182,7 +194,8 @@ class TrialLog(contextlib.AbstractContextManager["TrialLog"]):
             if hidden is not None:
                 text = json.dumps(hidden, default=str).encode()
                 text += b" " * (-len(text) % _BLOCK)
-                # Before the line that has its hash, since the process may be killed.
+                # The hidden line is written before the line that has its hash, since the process
+                # may be killed between the two.
                 self._hidden.append(text)
                 line = {**line, "hidden": _hash(self.key, text)}
             self._log.append(canonical(line).encode())
@@ -215,6 +228,7 @@ class _JsonLines(contextlib.AbstractContextManager["_JsonLines"]):
         return data[:complete].splitlines()
 
     def append(self, line: bytes) -> None:
+        """Write a line to the disk."""
         self._file.write(line + b"\n")
         self._file.flush()
         os.fsync(self._file.fileno())
@@ -224,7 +238,15 @@ class _JsonLines(contextlib.AbstractContextManager["_JsonLines"]):
 
 
 def logged_plan(out: Path, key: str | None) -> EvalConfig:
-    """Return the plan of the log in a folder, with the policies' URLs."""
+    """Return the plan of the log in a folder, with the policies' URLs.
+
+    Args:
+        out: The folder of an evaluation on a robot.
+        key: The plan's key; None: the folder's own.
+
+    Raises:
+        ConfigError: The folder has no log, or it is of another key.
+    """
     try:
         with (out / LOG).open("rb") as file:
             first = json.loads(file.readline())
@@ -253,9 +275,9 @@ def _by_hash(key: bytes, lines: Iterable[bytes]) -> dict[str, bytes]:
 
 def _key(config: EvalConfig) -> bytes:
     """Return the plan's key, or the one drawn for this folder."""
-    given = config.real_robot.key if config.real_robot is not None else None
-    if given is not None:
-        return given.encode()
+    if config.real_robot is not None and config.real_robot.key is not None:
+        return config.real_robot.key.encode()
+
     path = config.out / KEY
     if not path.exists() or not path.stat().st_size:
         descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600)
@@ -265,7 +287,7 @@ def _key(config: EvalConfig) -> bytes:
 
 
 RECORDINGS = "recordings"
-# Their messages may name a policy.
+# The messages of these loggers may name a policy.
 _LOGGERS = ("vlagents_ray", "ray", "ray.serve", "websockets", "asyncio")
 
 
@@ -313,12 +335,12 @@ def evaluate_on_robot(
     if config.record != "none":
         for module in ("av", "pyarrow"):
             require(module)
+
     factory = agent_factory or agents(config, None, "robot")
     with contextlib.ExitStack() as stack:
         if robot is None:
-            robot = stack.enter_context(
-                opened(robot_factory("--robot", str(planned[0].on_robot[0].arm)))
-            )
+            settings, _ = planned[0].on_robot
+            robot = stack.enter_context(opened(robot_factory("--robot", str(settings.arm))))
         log = stack.enter_context(TrialLog(config, planned))
         trials = schedule(planned, log.key)
         run = _RemainingTrials(config, operator, WatchedRobot(robot), factory, log, trials)
@@ -384,31 +406,33 @@ class _RemainingTrials:
     _log: TrialLog
     _trials: Sequence[Trial]
     _message: str = ""  # for the operator, about the last trial
-    # By task and case.
+    # The state of early stopping, by task and by the fingerprint of the case.
     _stopping: dict[tuple[str, str], dict[str, Stopping]] = dataclasses.field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        for trial in self._trials:
-            case = trial.job.case
-            if (stop := self._config.stop) is not None:
-                found = self._stopping.setdefault(trial.task, {})
-                found.setdefault(case.fingerprint, Stopping(stop, case.suite.seeds, case.planned))
+        stop = self._config.stop
+        if stop is not None:
+            for trial in self._trials:
+                case = trial.job.case
+                stopping = Stopping(stop, case.suite.seeds, case.planned)
+                stopping_by_case = self._stopping.setdefault(trial.task, {})
+                stopping_by_case.setdefault(case.fingerprint, stopping)
+
         for number, logged in self._log.finished.items():
             trial = self._trials[number - 1]
             self._count(trial, result_of(trial, logged))
 
     def play(self) -> None:
-        left = [
-            trial
-            for trial in self._trials
-            if trial.number not in self._log.finished and not self._is_over(trial)
-        ]
-        if not left:
+        """Rehearse the policies, then play each trial until it has a result."""
+        remaining = [trial for trial in self._trials if self._is_due(trial)]
+        if not remaining:
             return
+
         obs = self._robot.observe()
-        policies = {trial.job.case.contender: trial.job.case for trial in left}
-        # An order that reveals nothing.
-        for _, case in sorted(policies.items(), key=lambda one: one[0]):
+        case_of_policy = {trial.job.case.contender: trial.job.case for trial in remaining}
+        # The order of the names reveals nothing about the order of the trials.
+        for contender in sorted(case_of_policy):
+            case = case_of_policy[contender]
             try:
                 rehearse(case, self._robot, self._factory, self._operator, obs)
             except ContractMismatch as error:
@@ -420,56 +444,65 @@ class _RemainingTrials:
                 ) from None
             except VLAgentsError as error:
                 raise from_code(error.code, f"policy {case.contender!r}: {error}") from error
-        for trial in left:
-            while not self._is_over(trial) and trial.number not in self._log.finished:
+
+        for trial in remaining:
+            while self._is_due(trial):
                 self._play(trial)
 
+    def _is_due(self, trial: Trial) -> bool:
+        """Return whether the trial has no result and its task goes on."""
+        return trial.number not in self._log.finished and not self._is_over(trial)
+
     def _play(self, trial: Trial) -> None:
+        """Play one attempt at the trial, and record its verdict or the reason of its repetition."""
         view = self._visible(trial)
         attempt = view.attempt
         if not self._operator.prepare(view, self._robot.observe):
             raise KeyboardInterrupt
-        if all(self._trials[number - 1].place != trial.place for number in self._log.finished):
+
+        finished_scenes = {self._trials[number - 1].place for number in self._log.finished}
+        if trial.place not in finished_scenes:
             with storing(self._config.out):
                 save_start(self._config.out, trial.place, self._robot.observe())
+
         self._log.begin(trial.number, attempt)
         try:
-            name = f"trial{trial.number:04d}-{attempt}"
-            recording = (
-                None if self._config.record == "none" else self._config.out / RECORDINGS / name
-            )
+            recording = None
+            if self._config.record != "none":
+                name = f"trial{trial.number:04d}-{attempt}"
+                recording = self._config.out / RECORDINGS / name
             played = play(trial, self._robot, self._factory, self._operator, recording)
         except VLAgentsError as error:
             failure = explain(error)
-            why, cause = f"it could not be played ({failure.code})", "policy"
+            reason, cause = f"it could not be played ({failure.code})", "policy"
             if failure.code == "env_failed":
-                why, cause = failure.message, "worker"
-            self._log.end(
-                trial.number, attempt, {"again": why, "cause": cause}, dataclasses.asdict(failure)
-            )
+                reason, cause = failure.message, "worker"
+            repetition = {"again": reason, "cause": cause}
+            self._log.end(trial.number, attempt, repetition, dataclasses.asdict(failure))
             return
+
         self._require_same_policy(trial, played)
         if played.result.status == "policy_error":
-            self._record(
-                trial, attempt, played, Verdict("failure", note=played.ending), played.result
-            )
+            verdict = Verdict("failure", note=played.ending)
+            self._record(trial, attempt, played, verdict, played.result)
             self._message = f"trial {trial.number}: {played.ending}, so it counts as a failure"
             return
+
         self._message = ""
         verdict = self._operator.judge(view, played.ending)
         score = verdict.score(view.rubric)
         if verdict.outcome == "repeat":
             self._log.end(trial.number, attempt, {"again": verdict.note, "cause": "operator"}, {})
             return
+
         # A partial success counts as a failure in success rates; its score is stored as the return.
-        success, steps = verdict.outcome == "success", played.result.steps
-        judged: dict[str, Any] = {
-            "success_once": success,
-            "success_at_end": success,
-            "episode_return": score,
-        }
+        success = verdict.outcome == "success"
         result = dataclasses.replace(
-            played.result, first_success=steps if success else None, **judged
+            played.result,
+            first_success=played.result.steps if success else None,
+            success_once=success,
+            success_at_end=success,
+            episode_return=score,
         )
         self._record(trial, attempt, played, verdict, result)
 
@@ -481,7 +514,7 @@ class _RemainingTrials:
         verdict: Verdict,
         result: EpisodeResult,
     ) -> None:
-        seen = {
+        visible = {
             "outcome": verdict.outcome,
             "earned": sorted(set(verdict.earned)),
             "note": verdict.note,
@@ -489,7 +522,7 @@ class _RemainingTrials:
             "ending": played.ending,
         }
         hidden = {"result": dataclasses.asdict(result), "metadata": played.metadata}
-        self._log.end(trial.number, attempt, seen, hidden)
+        self._log.end(trial.number, attempt, visible, hidden)
         self._count(trial, result)
 
     def _count(self, trial: Trial, result: EpisodeResult) -> None:
@@ -497,23 +530,31 @@ class _RemainingTrials:
             self._stopping[trial.task][trial.job.case.fingerprint].add(result)
 
     def _is_over(self, trial: Trial) -> bool:
-        stopping = self._stopping.get(trial.task)
-        return stopping is not None and all(one.at is not None for one in stopping.values())
+        """Return whether all cases of the trial's task have stopped early."""
+        stopping_by_case = self._stopping.get(trial.task)
+        if stopping_by_case is None:
+            return False
+        return all(stopping.at is not None for stopping in stopping_by_case.values())
 
     def _visible(self, trial: Trial) -> VisibleTrial:
-        (robot, task), earlier = trial.job.case.on_robot, self._log.of(trial.number)
+        robot, task = trial.job.case.on_robot
+        earlier_attempts = self._log.of(trial.number)
+        message = self._message
+        if earlier_attempts:
+            message = f"played again: {earlier_attempts[-1].seen['again']}"
+
         return VisibleTrial(
             number=trial.number,
             total=len(self._trials),
             task=" ".join(filter(None, trial.task)),
             scene=trial.scene,
-            attempt=len(earlier) + 1,
+            attempt=len(earlier_attempts) + 1,
             instruction=task.instruction,
             setup=task.setup,
             seconds=task.max_steps / robot.hz,
             rubric=task.rubric,
             start=start_pictures(self._config.out, trial.place),
-            message=f"played again: {earlier[-1].seen['again']}" if earlier else self._message,
+            message=message,
         )
 
     def _require_same_policy(self, trial: Trial, played: PlayedTrial) -> None:
@@ -521,30 +562,44 @@ class _RemainingTrials:
         trials.
         """
         case = trial.job.case
-        now = {name: getattr(played.result, name) for name in ("checkpoint", "weights")}
         for number, logged in self._log.finished.items():
-            other = self._trials[number - 1].job.case
-            if other.policy.name != case.policy.name:
+            earlier_case = self._trials[number - 1].job.case
+            if earlier_case.policy.name != case.policy.name:
                 continue
-            what = changed(logged.hidden["metadata"], played.metadata, swept=case.step is not None)
-            if what is None and other.contender == case.contender:
-                before = logged.hidden["result"]
-                what = next(
-                    (
-                        name
-                        for name in now
-                        if now[name] and before[name] and now[name] != before[name]
-                    ),
-                    None,
-                )
-            if what is not None:
+
+            difference = changed(
+                logged.hidden["metadata"], played.metadata, swept=case.step is not None
+            )
+            if difference is None and earlier_case.contender == case.contender:
+                difference = _changed_weights(logged.hidden["result"], played.result)
+            if difference is not None:
                 raise ConfigError(
-                    f"the {what} of a policy has changed since its earlier trials; serve all "
+                    f"the {difference} of a policy has changed since its earlier trials; serve all "
                     "policies as before and go on with --resume, or choose another out folder"
                 )
 
 
+def _changed_weights(earlier: dict[str, Any], result: EpisodeResult) -> str | None:
+    """Return the first of "checkpoint" and "weights" that two results state differently; None if
+    there is none.
+
+    Args:
+        earlier: The fields of the earlier result.
+        result: The present result.
+    """
+    for name in ("checkpoint", "weights"):
+        value = getattr(result, name)
+        if value and earlier[name] and value != earlier[name]:
+            return name
+    return None
+
+
 def result_of(trial: Trial, logged: LoggedTrial) -> EpisodeResult:
+    """Return the result of a finished trial from the log.
+
+    Raises:
+        ConfigError: The logged result is of another plan.
+    """
     fields = dict(logged.hidden["result"])
     fields["key"] = EpisodeKey(**fields["key"])
     if fields["key"] != trial.job.key:
@@ -577,22 +632,29 @@ def _write_results(
     trials = schedule(planned, log.key)
     with storing(config.out):
         (config.out / RESULTS).unlink(missing_ok=True)
+
     with Store(config.model_copy(update={"resume": True})) as store, storing(config.out):
         store.begin_run(config, versions(), log.started)
         save_diffs(config.out, driver_code().values())
-        for place in {case.place: case for case in planned}.values():
-            store.note_env(place.place, EnvInfo({"robot": place.on_robot[0].arm}, {}))
+
+        case_of_place = {case.place: case for case in planned}
+        for case in case_of_place.values():
+            settings, _ = case.on_robot
+            store.note_env(case.place, EnvInfo({"robot": settings.arm}, {}))
+
         for logged in log.attempts:
             trial = trials[logged.trial - 1]
             job = dataclasses.replace(trial.job, attempt=logged.attempt)
             if not logged.finished:
-                by_operator = logged.seen["cause"] == "operator"
-                again = Failure("operator", "trial_repeated", logged.seen["again"])
-                store.record_attempt(
-                    job, again if by_operator else Failure(**logged.hidden), retried=True
-                )
+                if logged.seen["cause"] == "operator":
+                    failure = Failure("operator", "trial_repeated", logged.seen["again"])
+                else:
+                    failure = Failure(**logged.hidden)
+                store.record_attempt(job, failure, retried=True)
                 continue
+
             if logged.hidden["metadata"]:
                 store.note_policy(trial.job.case.policy.name, logged.hidden["metadata"])
             store.record(result_of(trial, logged), logged.attempt, finished=logged.at)
+
         return conclude(config, store, state)

@@ -87,19 +87,20 @@ def schedule(cases: Iterable[EvalCase], key: bytes) -> list[Trial]:
     tasks: dict[tuple[str, str], dict[str, EvalCase]] = {}
     for case in cases:
         tasks.setdefault((case.suite.name, case.env), {})[case.contender] = case
+
     trials: list[Trial] = []
     rows_used: Counter[int] = Counter()
     for task, contenders in tasks.items():
         suite = next(iter(contenders.values())).suite
         scenes = list(itertools.product(suite.seeds, range(suite.episodes)))
         orders = _orders(key, task, contenders, len(scenes), rows_used)
-        for number, ((seed, episode), order) in enumerate(
-            zip(scenes, orders, strict=True), start=1
-        ):
+        for i, (scene, order) in enumerate(zip(scenes, orders, strict=True)):
+            seed, episode = scene
             for name in order:
                 case = contenders[name]
-                job = Job(EpisodeKey(case.env, episode, seed + episode, case.fingerprint), case)
-                trials.append(Trial(len(trials) + 1, number, job))
+                key_of_episode = EpisodeKey(case.env, episode, seed + episode, case.fingerprint)
+                job = Job(key_of_episode, case)
+                trials.append(Trial(number=len(trials) + 1, scene=i + 1, job=job))
     return trials
 
 
@@ -116,22 +117,26 @@ def _orders(
     for first in range(0, scenes, size):
         remaining = scenes - first
         square: list[str | int] = [*task, first // size]
-        columns = _drawn(key, [*square, "policy"] if remaining >= size else ["policy"], names)
+        is_whole = remaining >= size
+        columns = _drawn(key, [*square, "policy"] if is_whole else ["policy"], names)
         rows = [int(row) for row in _drawn(key, [*square, "row"], map(str, range(size)))]
-        if remaining < size:
+        if not is_whole:
             rows = sorted(rows, key=rows_used.__getitem__)[:remaining]
             rows_used.update(rows)
+
         for row in rows:
             yield columns[row:] + columns[:row]
 
 
-def _drawn(key: bytes, what: list[str | int], names: Iterable[str]) -> list[str]:
+def _drawn(key: bytes, purpose: list[str | int], names: Iterable[str]) -> list[str]:
     """Return the names in the order of their authentication codes, independent of the plan's
-    order.
+    order; `purpose` makes each draw another.
     """
-    return sorted(
-        names, key=lambda name: hmac.digest(key, canonical([*what, name]).encode(), hashlib.sha256)
-    )
+
+    def code(name: str) -> bytes:
+        return hmac.digest(key, canonical([*purpose, name]).encode(), hashlib.sha256)
+
+    return sorted(names, key=code)
 
 
 @dataclass(frozen=True, slots=True)
@@ -155,6 +160,7 @@ class WatchedRobot(RobotWrapper):
             return super().observe()
 
     def apply(self, action: np.ndarray) -> None:
+        """Command an action, and count it as a step of the running trial if it is one."""
         with env_side("robot, apply"):
             super().apply(action)
         if self.stats is not None and self.step_due:
@@ -177,6 +183,7 @@ class _OperatorStop(CommandInbox):
         self._operator = operator
 
     def apply(self, control: RobotControl) -> list[Command]:
+        """Stop the robot if the operator stops the trial."""
         if self._operator.stops() and not control.stopped:
             control.stop(_STOPPED)
         return super().apply(control)
@@ -201,20 +208,24 @@ class _CountingPlayer(ChunkPlayer):
         self._chunk = -1
 
     def reset(self, obs: Obs, instruction: str | None = None, **kwargs: Any) -> dict[str, Any]:
+        """Reset the policy, and record the metadata of its answer."""
         with policy_side("reset"):
             info = super().reset(obs, instruction, **kwargs)
         self._stats.began(info)
         return info
 
     def act(self, obs: Obs) -> Act:
+        """Show the observation to the operator, and return the next action."""
         self._operator.watch(obs)
         with policy_side("act"):
             act = super().act(obs)
         self._robot.step_due = True
-        number = act.info.get("chunk", self._chunk)
-        if number != self._chunk:
-            self._chunk = number
-            self._stats.acted(act, act.info.get("timing", {}).get("round_trip_ms", 0.0) / 1e3, None)
+
+        chunk = act.info.get("chunk", self._chunk)
+        if chunk != self._chunk:
+            self._chunk = chunk
+            round_trip_ms = act.info.get("timing", {}).get("round_trip_ms", 0.0)
+            self._stats.acted(act, round_trip_ms / 1e3, None)
         return act
 
 
@@ -248,10 +259,12 @@ def play(
     with contextlib.ExitStack() as stack:
         stack.callback(setattr, robot, "stats", None)
         agent, player = stack.enter_context(_player(case, factory, stats, robot, operator))
-        recorder = (
-            None if recording is None else stack.enter_context(Recorder(recording, settings.hz))
-        )
-        failed, report = None, LoopReport(settings.hz)
+        recorder = None
+        if recording is not None:
+            recorder = stack.enter_context(Recorder(recording, settings.hz))
+
+        failed = None
+        report = LoopReport(settings.hz)
         try:
             report = run_loop(
                 robot,
@@ -265,14 +278,15 @@ def play(
                 recorder=recorder,
                 until=until,
                 commands=_OperatorStop(operator),
-                # The rehearsal has compared the numbers; what the policy does in a trial is its
-                # result.
+                # The rehearsal has compared the numbers with the training; in a trial, the policy's
+                # behaviour is its result.
                 fit=fit_of(player, robot, trained=Trained()),
             )
         except CheckpointFailed:
             raise
         except PolicyFailed as error:
             failed = error
+
         for bark in report.barks:  # failures of infrastructure are not the policy's
             if bark == _STOPPED:
                 continue
@@ -283,15 +297,21 @@ def play(
             raise PolicyUnavailable(
                 f"the policy's server could not be reached: {report.reasons['lost']}"
             )
-        stats.ending = "policy_done" if report.done else "terminated" if stopped else "truncated"
+
+        if report.done:
+            stats.ending = "policy_done"
+        else:
+            stats.ending = "terminated" if stopped else "truncated"
         stats.ticks_held = report.safe_ticks
-        result = stats.result(transport_of(agent), failed)
-        # Without whether the policy considered the task finished, as only some policies ever do.
-        over = _STOPPED if stopped else "the trial is over"
-        ending = over if failed is None else "the policy failed"
-        return PlayedTrial(
-            replace(result, env_seconds=None), dict(getattr(agent, "metadata", {})), ending
-        )
+        result = replace(stats.result(transport_of(agent), failed), env_seconds=None)
+
+        # The text does not contain whether the policy considered the task finished, as only some
+        # policies ever do.
+        if failed is not None:
+            ending = "the policy failed"
+        else:
+            ending = _STOPPED if stopped else "the trial is over"
+        return PlayedTrial(result, dict(getattr(agent, "metadata", {})), ending)
 
 
 def rehearse(
@@ -310,10 +330,12 @@ def rehearse(
         limits = None if settings.limits is None else MotionLimits.read(settings.limits)
         fit = fit_of(agent, robot, limits, accept=settings.accept_misfit)
         fit.require(obs, None)
+
         if fit.trained.action is not None:
             with contextlib.suppress(InvalidAction):
                 agent.reset(obs, task.instruction, **case.policy_options)
                 fit.require(None, agent.act(obs).rows())
+
         with contextlib.suppress(InvalidAction):  # in a trial it is a failure of the policy
             player.reset(obs, task.instruction, **case.policy_options)
             player.act(obs)
@@ -335,28 +357,25 @@ def _player(
     with contextlib.ExitStack() as unplayed:
         unplayed.callback(agent.close)
         agent.initialize()
-        player = _CountingPlayer(
-            agent,
-            stats,
-            robot,
-            operator,
-            PlayerSettings(
-                mode=settings.mode,
-                execute=case.policy.execute,
-                deadline_s=_deadline_s(settings),
-                max_age_s=settings.max_age_s,
-                safe=settings.safe,
-            ),
-            check=Guard(
-                agent.contract,
-                max_step=settings.max_step,
-                measure=measured_state(settings.measure),
-                limits=settings.limits,
-                hz=settings.hz,
-                soft_start_s=0.0,  # the same limits in each trial of each policy
-            ),
+
+        player_settings = PlayerSettings(
+            mode=settings.mode,
+            execute=case.policy.execute,
+            deadline_s=_deadline_s(settings),
+            max_age_s=settings.max_age_s,
+            safe=settings.safe,
         )
-        unplayed.pop_all()  # the player closes it
+        guard = Guard(
+            agent.contract,
+            max_step=settings.max_step,
+            measure=measured_state(settings.measure),
+            limits=settings.limits,
+            hz=settings.hz,
+            soft_start_s=0.0,  # the same limits in each trial of each policy
+        )
+        player = _CountingPlayer(agent, stats, robot, operator, player_settings, check=guard)
+        unplayed.pop_all()  # the player closes the agent
+
     with player:
         yield agent, player
 

@@ -195,15 +195,15 @@ def tail_at(host: str, paths: Sequence[str]) -> str:
     """Return `tail` of files on any host of the cluster; "" if the host is lost."""
     if host == socket.gethostname():
         return tail(paths)
-    nodes = [
-        node["NodeID"]
-        for node in ray.nodes()
-        if node["Alive"] and node["NodeManagerHostname"] == host
-    ]
-    if not nodes:
+
+    node_ids = []
+    for node in ray.nodes():
+        if node["Alive"] and node["NodeManagerHostname"] == host:
+            node_ids.append(node["NodeID"])
+    if not node_ids:
         return ""
 
-    on_that_host = NodeAffinitySchedulingStrategy(nodes[0], soft=False)
+    on_that_host = NodeAffinitySchedulingStrategy(node_ids[0], soft=False)
     read = ray.remote(tail).options(num_cpus=0, scheduling_strategy=on_that_host)
     try:
         return str(ray.get(read.remote(list(paths)), timeout=TIMEOUT_S))

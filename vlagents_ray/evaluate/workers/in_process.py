@@ -53,11 +53,13 @@ class InProcessWorkers(Workers):
         self._variables.close()
 
     def free_slot(self) -> bool:
+        """Remove the worker if it is idle; return whether there is none."""
         for worker in self.idle():
             self._workers.remove(worker)
         return not self._workers
 
     def start(self, case: EvalCase) -> None:
+        """Begin the worker of a case, and set its environment variables in this process."""
         self._variables.enter_context(variables(case.worker.runtime_env.get(VARIABLES) or {}))  # type: ignore[arg-type]
         self._workers.append(
             WorkerHandle(case.worker, case.kind, actor=None, starting=self, started_at=0.0)
@@ -67,11 +69,13 @@ class InProcessWorkers(Workers):
         worker.jobs = jobs
 
     def wait(self, timeout_s: float) -> Iterator[tuple[Job, Report]]:
+        """Play the dispatched jobs, and yield their reports; the time is not limited."""
         for worker in self._workers:
             worker.starting = None
             jobs, worker.jobs = worker.jobs, ()
             if not jobs:
                 continue
+
             with raised_at_once(), _exits_raised(), _hangs_reported(self._rollout, self._config):
                 reports = self._rollout.run(jobs)
             if reports[0].env is not None:
@@ -83,10 +87,12 @@ class InProcessWorkers(Workers):
             yield from zip(jobs, reports, strict=True)
 
     def close(self) -> None:
-        broken, self._rollout = self._rollout, self._make()
+        """Close the agent and the environment; the next jobs begin with new ones."""
+        rollout = self._rollout
+        self._rollout = self._make()
         try:
             with raised_at_once():
-                broken.close()
+                rollout.close()
         except VLAgentsError as error:
             log.warning("closing the env: %s", error)
 
@@ -95,12 +101,13 @@ class InProcessWorkers(Workers):
 def _exits_raised() -> Iterator[None]:
     """Let `os._exit`, called by a policy or a simulator in this thread, raise `PolicyFailed`.
 
-    Else it would end the command without a message, and possibly with status 0.
+    The call would otherwise end the command without a message, and possibly with status 0.
     """
     end_process = os._exit
     player = (os.getpid(), threading.get_ident())
 
     def end(status: int) -> NoReturn:
+        """Raise an error in this thread; end the process in any other."""
         # A child of this process, or Ray's watcher in another thread, may end its process.
         if (os.getpid(), threading.get_ident()) != player:
             end_process(status)
@@ -124,6 +131,7 @@ def _hangs_reported(rollout: Rollout, config: EvalConfig) -> Iterator[None]:
     limits_s = phase_limits_s(config)
 
     def watch() -> None:
+        """Query the phase until the episode has ended."""
         reported = ("", -1)
         while not ended.wait(_LOOK_S):
             heartbeat = rollout.progress()

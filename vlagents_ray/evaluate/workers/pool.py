@@ -91,6 +91,7 @@ class WorkerPool(Workers):
         self._leaving.clear()
 
     def free_slot(self) -> bool:
+        """Return whether a worker can be started, after ending an idle one if that is needed."""
         if not self._head.answers():
             return False
         if len(self._workers) < (self._config.workers or 1):
@@ -107,6 +108,7 @@ class WorkerPool(Workers):
         return True
 
     def start(self, case: EvalCase) -> None:
+        """Start an actor with the resources of the case, if possible near its policy."""
         workers_by_node = Counter(worker.node for worker in self._workers)
         node = self._placement.node(case.policy.url, workers_by_node)
         options = {
@@ -130,6 +132,7 @@ class WorkerPool(Workers):
         self._workers.append(worker)
 
     def dispatch(self, worker: WorkerHandle, jobs: tuple[Job, ...]) -> None:
+        """Send jobs to a worker, which answers in `wait`."""
         phase: Phase = "env reset" if worker.env_place == jobs[0].case.place else "make"
         worker.jobs = jobs
         worker.heartbeat, worker.heartbeat_at = Heartbeat(phase, 0.0, 0), monotonic()
@@ -162,6 +165,7 @@ class WorkerPool(Workers):
         yield from self._check_workers()
 
     def close(self) -> None:
+        """Close the agents and the environments of the idle workers."""
         closing = [worker.actor.close.remote() for worker in self.idle()]
         if not closing:
             return

@@ -84,7 +84,7 @@ class Report:
     env: EnvInfo | None = None  # if an environment was made for the job
     # Metadata of the policy ({} for a local one), if the connection is new.
     policy: dict[str, Any] | None = None
-    worker: WorkerInfo | None = None  # if `env` or `policy` is new
+    worker: WorkerInfo | None = None  # if the environment or the policy is new
 
 
 @dataclass(frozen=True, slots=True)
@@ -106,15 +106,17 @@ class Rollout:
         agent_factory: AgentFactory,
         recorders: RecorderFactory = Recording,
     ) -> None:
-        self._config, self._agent_factory, self._recorders = config, agent_factory, recorders
+        self._config = config
+        self._agent_factory = agent_factory
+        self._recorders = recorders
         self._agent: Agent | None = None
         self._policy: str | None = None  # the policy of the agent
-        self._described: dict[str, Any] = {}  # of an agent without a server: its weights
+        self._local_metadata: dict[str, Any] = {}  # of an agent without a server: its weights
         self._broken_agents = 0  # in a row
         self._sessions: list[Agent] = []  # further sessions of the agent, for parallel episodes
         self._env: BatchEnv | None = None
-        self._place: str | None = None  # the place of the environment
-        self._repeatable = True  # as far as is known of the environment
+        self._env_place: str | None = None  # `EvalCase.place` of the environment
+        self._repeatable = True  # whether every second pass so far repeated its episode
         self._surplus = 0  # successes over failures in this environment
         self._thread = 0  # id of the thread that plays
         self._current_phase: tuple[episode.Phase, float, int] = ("idle", monotonic(), 0)
@@ -139,66 +141,80 @@ class Rollout:
         phase, since, steps = self._current_phase
         age_s = monotonic() - since
         frame = sys._current_frames().get(self._thread) if age_s > LONG_S else None
-        return Heartbeat(
-            phase, age_s, steps, "".join(traceback.format_stack(frame)) if frame else ""
-        )
+        stack = "".join(traceback.format_stack(frame)) if frame else ""
+        return Heartbeat(phase, age_s, steps, stack)
 
     def run(self, jobs: tuple[Job, ...]) -> list[Report]:
         """Play the episodes of one case, in parallel if there are several; return a report for
         each.
         """
         self._thread = threading.get_ident()
-        found: dict[str, Any] = {}  # fields of the first report, whatever the outcome
+        new_fields: dict[str, Any] = {}  # fields of the first report, whatever the outcome
         try:
-            reports = self._played(jobs, found)
+            reports = self._play(jobs, new_fields)
         except VLAgentsError as error:
             reports = [Report(failure=explain_batch(error, len(jobs)))] * len(jobs)
         finally:
             self._set_phase("idle", 0)
-        if any(
-            report.failure is not None and report.failure.cause == "policy" for report in reports
-        ):
+
+        failures = [report.failure for report in reports if report.failure is not None]
+        if any(failure.cause == "policy" for failure in failures):
             self._broken_agents += 1
             self._drop_agent()
         elif any(report.result is not None for report in reports):
             self._broken_agents = 0
-        return [replace(reports[0], **found), *reports[1:]]
+        return [replace(reports[0], **new_fields), *reports[1:]]
 
     def close(self) -> None:
+        """Close the agent and the environment."""
         self._drop_agent()
         self._drop_env()
 
-    def _played(self, jobs: tuple[Job, ...], found: dict[str, Any]) -> list[Report]:
+    def _play(self, jobs: tuple[Job, ...], new_fields: dict[str, Any]) -> list[Report]:
+        """Play the episodes. Fields of the first report that describe a new agent or environment
+        are added to `new_fields`, also if an error is raised later.
+        """
         case = jobs[0].case
         if self._agent is None or self._policy != case.policy.name:
             self._agent = self._connect(case.policy)
-            found["policy"] = self._described or _metadata(self._agent)
-        if self._env is None or self._place != case.place:
+            new_fields["policy"] = self._local_metadata or _metadata(self._agent)
+        if self._env is None or self._env_place != case.place:
             self._env = self._make_env(case)
-            # The driver may have another numpy, which cannot read this one's pickles.
-            found["env"] = EnvInfo(
+            # The description is of plain values, since the driver may have another numpy, which
+            # cannot read this one's pickles.
+            new_fields["env"] = EnvInfo(
                 plain_values(self._env.describe()),
                 self._env.contract.to_json(),
                 code_of(env_class(case.env).__module__),
                 env_program(case, loaded_code),
                 socket.gethostname(),
             )
+
         agent, env = self._agent, self._env
-        if found:
+        if new_fields:
             require_match(agent.contract, env.contract, f"{case.policy.name!r} in {case.env!r}: ")
-            if (renderer := env.renderer()) is not None:
+            renderer = env.renderer()
+            if renderer is not None:
                 require_own(renderer)
-            name, where = (
+            new_fields["worker"] = WorkerInfo(
+                socket.gethostname(),
+                this_node(),
+                os.getpid(),
+                case.policy.name,
+                episode.transport_of(agent),
                 None if renderer is None else renderer.name,
-                (socket.gethostname(), this_node(), os.getpid()),
             )
-            found["worker"] = WorkerInfo(
-                *where, case.policy.name, episode.transport_of(agent), name
-            )
+
         with contextlib.ExitStack() as stack:
-            made = (self._recorders(self._config, env.contract.control_hz) for _ in jobs)
-            recordings = [stack.enter_context(contextlib.closing(one)) for one in made]
-            wanted = recordings[0].wants_images
+            recordings = []
+            for _ in jobs:
+                recorder = self._recorders(self._config, env.contract.control_hz)
+                recordings.append(stack.enter_context(contextlib.closing(recorder)))
+
+            choice = recordings[0].wants_images
+            renders = choice == "all" or (
+                choice == "failures" and self._renders_at_once(agent, env, case.policy)
+            )
             outcomes = episode.run_episodes(
                 env,
                 agent,
@@ -210,45 +226,43 @@ class Rollout:
                 policy_options=case.policy_options,
                 observers=recordings,
                 watch=self._set_phase,
-                images=wanted == "all"
-                or (wanted == "failures" and self._renders_at_once(agent, env, case.policy)),
+                images=renders,
             )
+
             reports = []
             for job, outcome, recording in zip(jobs, outcomes, recordings, strict=True):
                 if isinstance(outcome, EpisodeResult):
-                    report = Report(
-                        result=outcome, artifacts=self._finished(env, job, outcome, recording)
-                    )
+                    artifacts = self._finish_recording(env, job, outcome, recording)
+                    report = Report(result=outcome, artifacts=artifacts)
                 elif isinstance(outcome, episode.Diverged):
-                    report = Report(
-                        failure=replace(explain(outcome.error), diverged=outcome.result)
-                    )
+                    failure = replace(explain(outcome.error), diverged=outcome.result)
+                    report = Report(failure=failure)
                 else:
                     report = Report(failure=explain(outcome))
                 reports.append(report)
             return reports
 
-    def _finished(
+    def _finish_recording(
         self, env: BatchEnv, job: Job, result: EpisodeResult, recording: EpisodeRecorder
     ) -> Artifacts:
         """Return the artifacts of an episode; if images are missing, play it again."""
         options = episode.options_of_reset(env, job.key.episode, job.case.suite.reset_options)
-        kept = recording.finish(
+        artifacts = recording.finish(
             result,
             lambda played, record: played.play_again(
                 env, job.key.seed, options, self._set_phase, record
             ),
         )
-        self._repeatable = self._repeatable and kept.not_repeatable is None
+        self._repeatable = self._repeatable and artifacts.not_repeatable is None
         self._surplus += 1 if result.success_once else -1
-        return kept
+        return artifacts
 
     def _renders_at_once(self, agent: Agent, env: BatchEnv, policy: PolicyConfig) -> bool:
         """Return whether each step is rendered as it is played, if only failures need images.
 
-        The alternative is to play the failed ones again. That saves nothing if the policy gets each
-        image, and costs more than it saves if most fail; environments that one simulator runs
-        together cannot be played again alone.
+        The alternative is to play the failed episodes again. That saves nothing if the policy gets
+        each image, and costs more than it saves if most episodes fail. It is impossible if one
+        simulator runs several environments together.
         """
         rows = policy.execute or (agent.contract.chunk if agent.contract is not None else None)
         return (
@@ -259,9 +273,12 @@ class Rollout:
         )
 
     def _sessions_of(self, agent: Agent, env: BatchEnv, number: int) -> list[Agent]:
+        """Return an agent for each of `number` parallel episodes."""
         if env.num_envs == 1:
             return [agent]
-        if (sessions := getattr(agent, "sessions", None)) is None:
+
+        sessions = getattr(agent, "sessions", None)
+        if sessions is None:
             raise ConfigError(
                 "num_envs: got more than 1 for a policy in the worker's own process; give it a "
                 "`url`"
@@ -274,54 +291,69 @@ class Rollout:
         self._current_phase = (phase, monotonic(), steps)
 
     def _connect(self, policy: PolicyConfig) -> Agent:
+        """Return a new agent of the policy, and close the present one."""
         self._set_phase("connect", 0)
         self._drop_agent()
         if self._broken_agents:  # the server may be restarting, or full
             sleep(min(FIRST_WAIT_S * 2 ** (self._broken_agents - 1), LONGEST_WAIT_S))
+
         with policy_side("start"):
             agent = self._agent_factory(policy)
         try:
-            with policy_side("initialize"), used_checkpoints() as found:
+            with policy_side("initialize"), used_checkpoints() as checkpoints:
                 agent.initialize()
                 # Fetches the metadata, which checks that the server runs and has the policy.
                 _metadata(agent)
         except VLAgentsError:
             agent.close()
             raise
-        weights = agent.weights_id or weights_of(found)
-        self._described = {"weights": weights} if weights and not hasattr(agent, "metadata") else {}
+
+        weights = agent.weights_id or weights_of(checkpoints)
+        is_local = not hasattr(agent, "metadata")
+        self._local_metadata = {"weights": weights} if weights and is_local else {}
         self._policy = policy.name
         return agent
 
     def _make_env(self, case: EvalCase) -> BatchEnv:
+        """Return the environment of the case, and close the present one."""
         self._set_phase("make", 0)
         self._drop_env()  # first, so that a worker never holds two simulators
         try:
             with env_side(f"{case.env!r}: make"):
-                options, number = case.suite.env_options, case.suite.num_envs
+                options = case.suite.env_options
+                number = case.suite.num_envs
                 if number == 1:  # even if the suite has a simulator for many
                     env: BatchEnv = SequentialBatch([make_env(case.env, **options)])
                 else:
                     env = make_batch(case.env, number, **options)
         except EnvFailed as error:
-            if (reason := env_class(case.env).missing()) is None:
+            reason = env_class(case.env).missing()
+            if reason is None:
                 raise
             raise MissingDependency(f"env {case.env!r} cannot run here: {reason}") from error
-        self._place = case.place
-        self._repeatable, self._surplus = True, 0
+
+        self._env_place = case.place
+        self._repeatable = True
+        self._surplus = 0
         return env
 
     def _drop_agent(self) -> None:
-        agents = [*self._sessions, *([] if self._agent is None else [self._agent])]
-        self._agent, self._sessions = None, []
-        for agent in agents:
+        agents_to_close = list(self._sessions)
+        if self._agent is not None:
+            agents_to_close.append(self._agent)
+        self._agent = None
+        self._sessions = []
+
+        for agent in agents_to_close:
             try:
                 agent.close()
             except VLAgentsError as error:  # the connection is broken: nothing is left to close
                 log.warning("closing the agent: %s", error)
 
     def _drop_env(self) -> None:
-        env, self._env, self._place = self._env, None, None
+        env = self._env
+        self._env = None
+        self._env_place = None
         if env is not None:
             with env_side("close"):
                 env.close()
@@ -335,39 +367,48 @@ def own_logs() -> list[str]:
     """Return the files of this process's standard output and error; in a Ray worker, Ray's log
     files.
     """
-    found = []
-    for number in (1, 2):
+    paths = []
+    for descriptor in (1, 2):
         with contextlib.suppress(OSError):  # no /proc
-            found.append(os.readlink(f"/proc/self/fd/{number}"))
-    return [path for path in dict.fromkeys(found) if Path(path).is_file()]
+            paths.append(os.readlink(f"/proc/self/fd/{descriptor}"))
+    return [path for path in dict.fromkeys(paths) if Path(path).is_file()]
 
 
 def agents(
     config: EvalConfig, own: OwnAgents = None, priority: PriorityName = "simulation"
 ) -> AgentFactory:
-    """Return the factory that a worker calls: `own`, that of a policy's name in it, or one of
-    `RemoteAgent`s.
+    """Return the factory with which a worker makes an agent of a policy.
+
+    Args:
+        config: The policies, and the timeouts of a connection.
+        own: Makes the agent of every policy, or, by the name of a policy, the agent of that one.
+            The agents of other policies are `RemoteAgent`s.
+        priority: The priority of the `RemoteAgent`s.
+
+    Raises:
+        ConfigError: A policy has neither a URL nor a factory in `own`.
     """
     if callable(own):
         return lambda _policy: own()
-    made = own or {}
+
+    factories = own or {}
     for policy in config.policies:
-        if policy.url is None and policy.name not in made:
+        if policy.url is None and policy.name not in factories:
             raise ConfigError(
                 f"policy {policy.name!r}: got no url, want that of its server, as "
                 "http://localhost:8000"
             )
-    return functools.partial(_agent, config, made, priority)
+    return functools.partial(_agent, config, factories, priority)
 
 
 def _agent(
     config: EvalConfig,
-    own: Mapping[str, Callable[[], Agent]],
+    factories: Mapping[str, Callable[[], Agent]],
     priority: PriorityName,
     policy: PolicyConfig,
 ) -> Agent:
-    if policy.name in own:
-        return own[policy.name]()
+    if policy.name in factories:
+        return factories[policy.name]()
     return RemoteAgent(
         str(policy.url),  # `agents` has checked that there is one
         transport=policy.transport,
@@ -381,8 +422,8 @@ def _agent(
 
 
 def factory_programs(config: EvalConfig, own: OwnAgents) -> dict[str, Program]:
-    """Return the files of the agents that are made in the workers, by policy; served policies
-    state theirs.
+    """Return the files of the agents that are made in the workers, by policy; the metadata of
+    served policies contains theirs.
     """
     if callable(own):
         program = factory_program(own)
@@ -396,7 +437,8 @@ def factory_program(make: Callable[[], Agent]) -> Program:
     """
     settings: dict[str, Any] = {}
     if isinstance(make, functools.partial):
-        settings = {**{str(i): value for i, value in enumerate(make.args)}, **make.keywords}
+        arguments = {str(i): value for i, value in enumerate(make.args)}
+        settings = {**arguments, **make.keywords}
         make = make.func
     module = getattr(make, "__module__", None) or type(make).__module__
     return code_of_class(module) | files_named(settings)
