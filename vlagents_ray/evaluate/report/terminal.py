@@ -256,11 +256,11 @@ def results_table(summary: Summary) -> Table:
     for name, total in zip(names, summary.totals, strict=True):
         rows = [(group, "") for group in summary.cases if group.contender == name]
         if len(rows) > 1:
-            parts = summary.parts(name)
-            if len(parts) == 1:
+            groups_by_timing = summary.parts(name)
+            if len(groups_by_timing) == 1:
                 rows.append((total, ""))
             else:
-                rows += [(part, timing) for timing, part in parts.items()]
+                rows += [(group, timing) for timing, group in groups_by_timing.items()]
         for group, timing in rows:
             cells = _cells(group, timing, some_lost=some_lost)
             table.add_row(*([name, *cells] if len(names) > 1 else cells))

@@ -120,8 +120,8 @@ class Summary:
     def has_one_rate_each(self) -> bool:
         """Whether each policy id has one rate for all its cases with one clock."""
         for contender in self.results.contenders:
-            parts = self.parts(contender).values()
-            if not all(part.success_once.pooled for part in parts):
+            groups = self.parts(contender).values()
+            if not all(group.success_once.pooled for group in groups):
                 return False
         return True
 
