@@ -212,6 +212,7 @@ def _check(settings: RosSettings, where: str) -> None:
                 f"{where}: {name}: got {reading.topic} as {reading.type}, and elsewhere as "
                 f"{types_of[reading.topic]}"
             )
+
     if not settings.sensors:
         raise ConfigError(
             f"{where}: got no camera, state or gripper, want one, by whose age the robot is stopped"
@@ -227,6 +228,7 @@ def _check(settings: RosSettings, where: str) -> None:
         )
     for i, command in enumerate(settings.actions):
         _check_command(command, settings, f"{where}: actions[{i}]")
+
     limits = [
         ("ready_s", settings.ready_s),
         *([("heartbeat: hz", beat.hz)] if (beat := settings.heartbeat) else []),
@@ -281,20 +283,23 @@ def _reading(stated: Any, where: str, kind: str, usual: Mapping[str, Any]) -> In
 
 
 def _made(kind: type[Any], stated: Any, where: str) -> Any:
-    given = dict(_mapping(stated, where))
-    for name in given.keys() & {"names", "fields"}:
-        value = given[name]
-        if not isinstance(value, list) or not all(isinstance(one, str) for one in value):
+    arguments = dict(_mapping(stated, where))
+    for name in arguments.keys() & {"names", "fields"}:
+        value = arguments[name]
+        if not isinstance(value, list) or not all(isinstance(item, str) for item in value):
             raise ConfigError(f"{where}: {name}: got {value!r}, want a list of names")
-        given[name] = tuple(value)
-    if (grippers := given.get("grippers")) is not None:
+        arguments[name] = tuple(value)
+
+    grippers = arguments.get("grippers")
+    if grippers is not None:
         if not isinstance(grippers, list) or not all(type(number) is int for number in grippers):
             raise ConfigError(
                 f"{where}: grippers: got {grippers!r}, want a list of numbers from 0, such as [2]"
             )
-        given["grippers"] = tuple(grippers)
-    require_arguments(where, kind, given)
-    return kind(**given)
+        arguments["grippers"] = tuple(grippers)
+
+    require_arguments(where, kind, arguments)
+    return kind(**arguments)
 
 
 def _mapping(stated: Any, where: str) -> Mapping[str, Any]:
@@ -493,8 +498,8 @@ class RosRobot:
                 f"action: got {action.shape}, want ({self.settings.dim},), as the topics take"
             )
         first = 0
-        for place, command in enumerate(self.settings.actions):
-            row = self._commanded[place] = action[first : first + command.dim].copy()
+        for index, command in enumerate(self.settings.actions):
+            row = self._commanded[index] = action[first : first + command.dim].copy()
             self._publish(command, row)
             first += command.dim
 
@@ -504,9 +509,10 @@ class RosRobot:
         Grippers keep their last command, as the measured opening would loosen their grasp.
         """
         self._stop_unsent = not self._link.up  # if so, it is sent on reconnection
-        for place, command in enumerate(self.settings.actions):
+        for index, command in enumerate(self.settings.actions):
             if command.stop == NOTHING:
                 continue
+
             grippers = self.settings.gripper_columns(command)
             if command.stop in ("", ZEROS):
                 row = np.zeros(command.dim, np.float32)
@@ -524,8 +530,9 @@ class RosRobot:
                     )
                     continue
                 row = reader.value.copy()
-            if place in self._commanded:
-                row[grippers] = self._commanded[place][grippers]
+
+            if index in self._commanded:
+                row[grippers] = self._commanded[index][grippers]
             self._publish(command, row)
 
     def _measured_opening(self) -> float:
@@ -600,6 +607,7 @@ class RosRobot:
                     "`ros2 topic list --show-types`"
                 )
             time.sleep(0.01)
+
         for reading in self.settings.sensors:
             ago_s = time.time() - self._readers[id(reading)].captured_at
             if not -SKEW_S <= ago_s <= reading.silent_s:
@@ -609,6 +617,7 @@ class RosRobot:
                     "now; synchronize the clocks of both machines, or count from the arrival: "
                     "`clock: arrival`"
                 )
+
         for command in self.settings.actions:
             pose = self.settings.state.get(command.stop)
             if pose is not None and self._value(pose).shape != (command.dim,):
