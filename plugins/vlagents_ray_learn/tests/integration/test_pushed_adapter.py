@@ -8,24 +8,15 @@ from typing import Any
 
 import numpy as np
 import pytest
-from adapted_network import DIM, LAYERS, Small, base, pairs, save
+from adapted_network import LAYERS, Small, base, pairs, save
+from adapted_server import RANKS, observation, policy, save_adapters, serving_adapters
 
-from tests.integration.conftest import serving
-from vlagents_ray import Obs, RemoteAgent
+from vlagents_ray import RemoteAgent
 from vlagents_ray.errors import InvalidWeights
 from vlagents_ray.serve.launch.server import Server
 from vlagents_ray_learn import Publisher
 
 pytestmark = pytest.mark.torch
-
-RANKS = {"stack": 4, "pour": 2}
-
-
-def policy(folder: Path) -> Small:
-    """The base alone."""
-    made = Small.from_config({"checkpoint": str(folder)})
-    made.initialize()
-    return made
 
 
 @pytest.fixture(scope="module")
@@ -35,35 +26,22 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def values(folder: Path) -> dict[str, dict[str, np.ndarray]]:
-    """The adapters by name, which lie in folders of that name beside the base."""
-    network = policy(folder).model
-    made = {name: pairs(network, LAYERS, rank, seed=rank) for name, rank in RANKS.items()}
-    for name, one in made.items():
-        save(folder.parent / name, one)
-    return made
+    return save_adapters(folder)
 
 
 @pytest.fixture(scope="module")
 def server(
     shared_ray: None, folder: Path, values: dict[str, dict[str, np.ndarray]]
 ) -> Iterator[Server]:
-    choices = {name: {"adapter": str(folder.parent / name)} for name in values}
-    config = {"checkpoint": str(folder)}
-    with serving(
-        "adapted_network:Small", config=config, checkpoints={"choices": choices}
-    ) as server:
+    with serving_adapters(folder) as server:
         yield server
-
-
-def at(seed: int) -> Obs:
-    return Obs(state={"joints": np.random.default_rng(seed).normal(size=DIM).astype(np.float32)})
 
 
 def played(server: Server, **options: Any) -> tuple[bytes, dict[str, Any]]:
     """The first action of an episode, and the weights that it states."""
     with RemoteAgent(server.url, transport="http", priority="simulation") as agent:
-        agent.reset(at(0), None, seed=0, **options)
-        act = agent.act(at(1))
+        agent.reset(observation(0), None, seed=0, **options)
+        act = agent.act(observation(1))
         return act.action.tobytes(), act.info["policy"]
 
 
@@ -81,9 +59,9 @@ def test_an_adapter_that_is_pushed_over_the_network_acts_as_the_saved_one(
             {"checkpoint": str(folder), "adapters": {"stack": str(folder.parent / "trained")}}
         )
         alone.initialize()
-        alone.reset(at(0), None, seed=0, adapter="stack")
+        alone.reset(observation(0), None, seed=0, adapter="stack")
         action, stated = played(server, checkpoint="stack")
-        assert action == alone.act(at(1)).action.tobytes() != before["stack"][0]
+        assert action == alone.act(observation(1)).action.tobytes() != before["stack"][0]
         assert stated["version"] == version
         assert played(server, checkpoint="pour") == (before["pour"][0], stated)
         assert played(server) == plain
