@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import json
-import queue
 import sys
 import threading
 import time
@@ -28,7 +27,7 @@ from vlagents_ray.protocol.messages import PRIORITIES, Reply, Request
 from vlagents_ray.registry import require
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.models.checkpoints import Checkpoints
-from vlagents_ray.serve.requests import PendingRequest
+from vlagents_ray.serve.requests import AwaitedReplies, IncomingMessage, PendingRequest
 from vlagents_ray.testing import random_observation
 
 CAMERAS = {"base_0_rgb": "front", "left_wrist_0_rgb": "wrist", "right_wrist_0_rgb": "right_wrist"}
@@ -182,10 +181,11 @@ class Session:
 
     def ask(self, op: Any = "act", **given: Any) -> Reply:
         """Make a request and wait for its reply; raises its error."""
-        replies: queue.SimpleQueue[Reply] = queue.SimpleQueue()
+        message, awaited = IncomingMessage("lab"), AwaitedReplies()
+        message.expect(1, awaited)
         request = Request(op, self._view, priority="robot", **given)
-        self._engine.submit([PendingRequest(self._name, request, replies.put, PRIORITIES["robot"])])
-        reply = replies.get(timeout=LATE_S)
+        self._engine.submit([PendingRequest(self._name, request, message, PRIORITIES["robot"])])
+        [reply] = awaited.replies.result(timeout=LATE_S)
         if reply.error is not None:
             raise reply.error
         return reply

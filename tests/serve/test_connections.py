@@ -15,6 +15,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
+from types import ModuleType
 from urllib.parse import urlsplit
 
 import numpy as np
@@ -41,8 +42,8 @@ from vlagents_ray.protocol.websocket_frames import ReceiveBuffer, frame_head
 from vlagents_ray.serve import periodic
 from vlagents_ray.serve.access import api_keys
 from vlagents_ray.serve.access.api_keys import NoKey
+from vlagents_ray.serve.endpoints import answers, websocket
 from vlagents_ray.serve.endpoints import shm as local
-from vlagents_ray.serve.endpoints import websocket
 from vlagents_ray.serve.endpoints.access_middleware import AccessMiddleware
 from vlagents_ray.serve.endpoints.http import build_http_app
 from vlagents_ray.serve.endpoints.shm import ShmServer
@@ -502,8 +503,8 @@ FAULTS = [
     (Sender, "throttled_s"),
     (Sender, "release"),
     (IncomingMessage, "decoded"),
-    (IncomingMessage, "frame"),
-    (IncomingMessage, "packed"),
+    (answers, "as_frame"),
+    (answers, "as_compact"),
     (MessageAdmission, "begin_message"),
     (MessageAdmission, "begin"),
     (MessageAdmission, "hold"),
@@ -550,7 +551,11 @@ def frame_of(data: bytes) -> bytes:
     ("owner", "name"), FAULTS, ids=lambda value: getattr(value, "__name__", value)
 )
 def test_an_unexpected_error_anywhere_ends_that_connection_and_nothing_else(
-    keyed: Replica, owner: type, name: str, monkeypatch: pytest.MonkeyPatch, no_records: None
+    keyed: Replica,
+    owner: type | ModuleType,
+    name: str,
+    monkeypatch: pytest.MonkeyPatch,
+    no_records: None,
 ) -> None:
     """It is raised in callbacks of sockets, of timers, and of the threads that decode and
     answer.

@@ -12,8 +12,8 @@ from collections import Counter
 from collections.abc import Callable, Iterator
 from typing import Any
 
+import in_flight
 import pytest
-from in_flight import submit
 
 from tests.simulation.clients import Robot, Violation, play
 from tests.simulation.world import Replica, World
@@ -124,9 +124,12 @@ def deadlines_begin_anew(replica: Replica) -> None:
     def seek(pending: PendingRequest, error: VLAgentsError) -> bool:
         def retry() -> None:
             try:
-                submit(engine, pending.session_id, pending.request, pending.done)
-            except VLAgentsError as again:
-                pending.fail(again)
+                again = in_flight.pending(pending.session_id, pending.request)
+                again.message, again.index = pending.message, pending.index
+                engine.check(again)
+                engine.queue.put(again)
+            except VLAgentsError as later:
+                pending.fail(later)
 
         if (
             pending.request.op != "act"

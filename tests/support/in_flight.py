@@ -4,20 +4,58 @@ from __future__ import annotations
 
 import queue
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 from vlagents_ray.protocol.frames import Decoded, decode_requests
 from vlagents_ray.protocol.messages import PRIORITIES, Reply, Request
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.engine.sender import Sender
-from vlagents_ray.serve.requests import PendingRequest
+from vlagents_ray.serve.requests import IncomingMessage, PendingRequest
 
 Done = Callable[[Reply], Any]
 
 
-def pending(session_id: str, request: Request, done: Done, **fields: Any) -> PendingRequest:
+@dataclass(frozen=True)
+class Calls:
+    """The receiver of a message that calls a function with its replies."""
+
+    function: Callable[[list[Reply]], Any]
+
+    def deliver(self, message: IncomingMessage) -> None:
+        """Call the function."""
+        self.function(message.replies)
+
+
+@dataclass(frozen=True)
+class CallsWithOne:
+    """The receiver of a message of one request that calls a function with its reply."""
+
+    function: Done
+
+    def deliver(self, message: IncomingMessage) -> None:
+        """Call the function."""
+        [reply] = message.replies
+        self.function(reply)
+
+
+def ignore(_: object) -> None:
+    """Drop a reply."""
+
+
+def message_of_one(done: Done = ignore) -> IncomingMessage:
+    """A message of one request, whose reply `done` gets."""
+    message = IncomingMessage("test")
+    message.expect(1, CallsWithOne(done))
+    return message
+
+
+def pending(
+    session_id: str, request: Request, done: Done = ignore, **fields: Any
+) -> PendingRequest:
     """A request in flight with the priority and the deadline that it states."""
-    one = PendingRequest(session_id, request, done, PRIORITIES[request.priority], **fields)
+    priority = PRIORITIES[request.priority]
+    one = PendingRequest(session_id, request, message_of_one(done), priority, **fields)
     if request.deadline_ms is not None:
         one.deadline = one.arrived + request.deadline_ms / 1e3
     return one
@@ -57,7 +95,7 @@ def send(
     """Send the requests of a message; `done` gets all replies."""
     message, decoded = sender.message(), Decoded(list(requests), {})
     message.decoded(decoded)
-    return sender.send(message, decoded, lambda message: done(message.replies))
+    return sender.send(message, decoded, Calls(done))
 
 
 async def ask(sender: Sender, requests: Sequence[Request]) -> list[Reply]:

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from functools import partial
 from typing import Any
 
-from in_flight import answered
+from in_flight import Calls, answered
 
 from vlagents_ray.client.agent import RemoteAgent
 from vlagents_ray.client.connection import Connection
@@ -140,7 +140,7 @@ class InProcess:
         self._sender.send(
             self._sender.message(),
             decoded,
-            lambda message: answers.put(encode_replies(message.replies)),
+            Calls(lambda replies: answers.put(encode_replies(replies))),
         )
         try:
             answer = answers.get(timeout=timeout_s)

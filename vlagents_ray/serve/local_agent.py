@@ -5,7 +5,6 @@ from __future__ import annotations
 import importlib.metadata
 import uuid
 from collections.abc import Mapping, Sequence
-from concurrent.futures import Future
 from functools import partial
 from typing import Any
 
@@ -19,7 +18,7 @@ from vlagents_ray.serve.config.deployment import ServerArgs
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.models.checkpoints import resolved
 from vlagents_ray.serve.python_env.child_agent import make_agent, version_of
-from vlagents_ray.serve.requests import PendingRequest
+from vlagents_ray.serve.requests import AwaitedReplies, IncomingMessage, PendingRequest
 from vlagents_ray.serve.sessions import SessionFinder
 
 _LOOK_S = 0.1  # wait for a checkpoint that another thread loads
@@ -123,21 +122,24 @@ class LocalAgent(Agent):
 
     def _replies(self, sessions: Sequence[Any], requests: Sequence[Request]) -> list[Reply]:
         """Return the reply to one request of each session."""
-        answers: list[Future[Reply]] = [Future() for _ in requests]
-        pending = [
-            PendingRequest(session._session, request, answer.set_result, Priority.SIMULATION)
-            for session, request, answer in zip(sessions, requests, answers, strict=True)
-        ]
-        self.engine.submit(pending)
+        message, awaited = IncomingMessage("local"), AwaitedReplies()
+        message.expect(len(requests), awaited)
+        pairs = zip(sessions, requests, strict=True)
+        self.engine.submit(
+            [
+                PendingRequest(session._session, request, message, Priority.SIMULATION, index=index)
+                for index, (session, request) in enumerate(pairs)
+            ]
+        )
 
-        while not self.engine.threaded and not all(answer.done() for answer in answers):
+        while not self.engine.threaded and not awaited.replies.done():
             taken = self.engine.queue.take()
             if taken is None:
                 break
             self.engine.run(taken)
             if not taken.batch:
                 self.engine.queue.poller.poll(_LOOK_S)
-        return [answer.result() for answer in answers]
+        return awaited.replies.result()
 
 
 class LocalPolicy(LocalAgent):

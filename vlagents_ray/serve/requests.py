@@ -2,10 +2,14 @@
 answer.
 
 An endpoint creates an `IncomingMessage` when the last byte has arrived, decodes it, and passes its
-requests to a `Sender`, which creates a `PendingRequest` for each. The engine finishes each of these
-once; when the last one is finished, the endpoint writes all answers of the message. The decoded
-`Request` is not modified on the way: the server's decisions are in the `PendingRequest`. Only the
-observations are removed after use, since their memory may belong to the sender.
+requests to a `Sender`, which creates a `PendingRequest` for each. The decoded `Request` is not
+modified on the way: the server's decisions are in the `PendingRequest`. Only the observations are
+removed after use, since their memory may belong to the sender.
+
+An answer is a value, a request with its reply. A request has a reference to its message, and the
+message to its receiver: the connection that it arrived on, or the caller that waits for it.
+`PendingRequest.finish` stores a reply in the message, once; the message with its last reply is
+delivered to the receiver, which encodes all replies together (`vlagents_ray.serve.endpoints`).
 
 Requests arrive on the thread that reads the connections (the policy's own, or a reader while a
 batch runs) or on an event loop. The policy's thread runs batches and finishes their requests;
@@ -16,34 +20,25 @@ or the one that closes the engine.
 
 from __future__ import annotations
 
-import json
 import logging
 import math
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Iterable, Sequence
+from concurrent.futures import Future
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any, Protocol, TypeAlias
 
 from vlagents_ray.errors import VLAgentsError
-from vlagents_ray.protocol.frames import Decoded, encode_replies
-from vlagents_ray.protocol.json_messages import reply_to_json
+from vlagents_ray.protocol.frames import Decoded
 from vlagents_ray.protocol.messages import DecodedFiles, Priority, Reply, Request
-from vlagents_ray.protocol.shm_layout import write_answers
 from vlagents_ray.serve.queue.preparation import Preparation
 
 if TYPE_CHECKING:
     from vlagents_ray.serve.access.api_keys import Caller
-    from vlagents_ray.serve.engine.metrics_buffer import MetricsBuffer
-
-T = TypeVar("T")
-Answered = Callable[["IncomingMessage"], None]
+    from vlagents_ray.serve.engine.admission import MessageAdmission
 
 logger = logging.getLogger(__name__)
-
-# Times of a reply's `timing`: the total, then the stages in the order of `STAGES`.
-_TIMES = ("total_ms", "decode_ms", "queue_ms", "inference_ms", "encode_ms")
-_NOT_MEASURED = (0.0,) * 4  # stages of a request that failed
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,16 +98,11 @@ class Opening:
 
 @dataclass(slots=True, eq=False)
 class PendingRequest:
-    """One request in flight, from its message to its answer.
-
-    `done` is called with the answer, on any thread: the policy's, one that detects a hanging
-    policy, the one that reads the connection, or an event loop. If two threads answer at once,
-    `done` ignores the second answer.
-    """
+    """One request in flight, from its message to its answer."""
 
     session_id: str  # the id in the engine
     request: Request
-    done: Callable[[Reply], None]
+    message: IncomingMessage  # the message that contained it, which gets its reply
     priority: Priority = Priority.ROBOT
     # Time of arrival, s, of the engine's clock, which is this one by default.
     arrived: float = field(default_factory=time.perf_counter)
@@ -139,14 +129,18 @@ class PendingRequest:
     observer_data: dict[Any, Any] = None  # type: ignore[assignment]
 
     def finish(self, reply: Reply) -> None:
-        """Deliver the answer, unless the request is over."""
+        """Store the reply in the message, unless the request is over; called on any thread.
+
+        If it is the last reply of its message, the message is delivered. An error of its receiver
+        is logged, and affects no other request.
+        """
         if self.over:
             return
         self.over = True
         if self.preparation is not None:
             self.drop_preparation()
         try:
-            self.done(reply)
+            self.message.answer(self.index, reply)
         except Exception:
             logger.exception(
                 "request %s: its caller could not take the reply", self.request.request_id
@@ -189,72 +183,98 @@ class PendingRequest:
         return self.over or self.origin.ended
 
 
-class IncomingMessage:
-    """The requests of one message, from the arrival of its last byte until their answers are
-    written.
+Answer: TypeAlias = tuple[PendingRequest, Reply]
+"""The answer to a request: what a call of the policy returns, before it is delivered."""
 
-    A message collects the answers, encodes them with their times, and records them for the metrics.
+
+def deliver(answers: Iterable[Answer]) -> None:
+    """Deliver answers to the messages of their requests, in this order."""
+    for pending, reply in answers:
+        pending.finish(reply)
+
+
+class Receiver(Protocol):
+    """Receives messages with all their replies: a connection, or a caller that waits."""
+
+    def deliver(self, message: IncomingMessage) -> None:
+        """Take the replies of a message, on the thread of the last one."""
+
+
+class IncomingMessage:
+    """The requests of one message, from the arrival of its last byte until their replies are
+    delivered.
 
     Args:
+        transport: Transport, for the metrics.
         op: Operation of its only request, if that is known before decoding.
         priority: Priority of that request.
     """
 
     __slots__ = (
         "__weakref__",
-        "_asked",
-        "_decoded",
         "_lock",
         "_missing",
-        "_stats",
-        "_then",
+        "admission",
         "arrived",
+        "decoded_at",
+        "kinds",
+        "observed",
+        "receiver",
         "replies",
+        "sender",
+        "size",
         "transport",
     )
 
-    def __init__(
-        self, stats: MetricsBuffer, transport: str, op: str = "unknown", priority: str = "robot"
-    ) -> None:
-        self._stats = stats
-        self._asked: list[tuple[str, str]] = [(op, priority)]
+    def __init__(self, transport: str = "", op: str = "unknown", priority: str = "robot") -> None:
         self.transport = transport
-        self.arrived = self._decoded = time.perf_counter()  # s
-        self.replies: list[Reply] = []  # complete when `then` of `expect` is called
+        self.kinds: list[tuple[str, str]] = [(op, priority)]  # operation and priority by request
+        self.arrived = self.decoded_at = time.perf_counter()  # s
+        self.replies: list[Reply] = []  # complete when the message is delivered
+        self.receiver: Receiver  # set by `expect`
+        self.sender: Receiver | None = None  # see `expect`
+        self.admission: MessageAdmission | None = None  # is released before the delivery
+        self.observed: Sequence[PendingRequest] = ()  # the requests that observers have seen
+        self.size = 0  # bytes that count as unanswered at its connection
         self._missing = 0
-        self._then: Answered | None = None
         self._lock = threading.Lock()
 
     def arrive(self) -> None:
         """Record that the last byte has arrived."""
-        self.arrived = self._decoded = time.perf_counter()
+        self.arrived = self.decoded_at = time.perf_counter()
 
     def decoded(self, decoded: Decoded) -> None:
         """Record that the requests are decoded, with their operations and priorities."""
-        self._decoded = time.perf_counter()
-        self._asked = [(request.op, request.priority) for request in decoded.requests]
+        self.decoded_at = time.perf_counter()
+        self.kinds = [(request.op, request.priority) for request in decoded.requests]
         for index in sorted(decoded.refused):
-            self._asked.insert(index, ("unknown", "robot"))
+            self.kinds.insert(index, ("unknown", "robot"))
 
     def decoded_alike(self, requests: int = 1) -> None:
         """Record that `requests` requests, all of the message's own `op` and `priority`, are
         decoded.
         """
-        self._decoded = time.perf_counter()
-        self._asked = [self._asked[0]] * requests
+        self.decoded_at = time.perf_counter()
+        self.kinds = [self.kinds[0]] * requests
 
-    def expect(self, requests: int, then: Answered) -> None:
-        """Expect this number of answers from `put`, and call `then` when the last one has
-        arrived.
+    def expect(self, requests: int, receiver: Receiver, sender: Receiver | None = None) -> None:
+        """Expect this number of replies, and deliver the message to `receiver` with the last one.
+
+        Args:
+            requests: Number of requests, including those that could not be decoded.
+            receiver: Takes the replies.
+            sender: The `Sender` of the message, if it has one: it gets the message first, and
+                passes it on.
         """
-        self.replies = [None] * requests  # type: ignore[list-item]  # replaced by `put`
+        self.replies = [None] * requests  # type: ignore[list-item]  # replaced by `answer`
+        self.receiver = receiver
+        self.sender = sender
         self._missing = requests
-        self._then = then
 
-    def put(self, index: int, reply: Reply) -> None:
-        """Store the answer to the request at that index; a second answer is ignored."""
+    def answer(self, index: int, reply: Reply) -> None:
+        """Store the reply to the request at that index; a second reply is ignored."""
         if reply.error is None:
-            reply.timing["decode_ms"] = (self._decoded - self.arrived) * 1e3
+            reply.timing["decode_ms"] = (self.decoded_at - self.arrived) * 1e3
         else:
             reply.error.__traceback__ = None  # its frames would retain this message and its bytes
         with self._lock:
@@ -265,87 +285,23 @@ class IncomingMessage:
             if self._missing:
                 return
 
-        # `then` may refer to the requests, which refer to this message.
-        then, self._then = self._then, None
-        if then is not None:
-            then(self)
+        if self.sender is None:
+            self.receiver.deliver(self)
+        else:
+            self.sender.deliver(self)
 
     def refuse(self, error: VLAgentsError, request_id: str = "") -> None:
         """Answer an unreadable message with one error."""
-        error.__traceback__ = None  # as in `put`
+        error.__traceback__ = None  # as in `answer`
         self.replies = [Reply(request_id, error=error)]
 
-    def frame(self) -> bytes:
-        """Encode and record the replies as a frame with complete `timing`."""
-        data = encode_replies(self.replies, arrived=self.arrived)
-        self.record()
-        return data
 
-    def packed(self) -> tuple[bytes, bool]:
-        """Encode the replies with complete `timing`; call `record` after they are sent.
+@dataclass(frozen=True, slots=True, eq=False)
+class AwaitedReplies:
+    """The receiver of a message whose caller waits on another thread."""
 
-        Returns:
-            The replies in compact form if they fit into that, otherwise as a frame; and whether
-            they are compact.
-        """
-        compact = write_answers(self.replies, arrived=self.arrived)
-        data = encode_replies(self.replies, arrived=self.arrived) if compact is None else compact
-        return data, compact is not None
+    replies: Future[list[Reply]] = field(default_factory=Future)
 
-    def document(self) -> bytes:
-        """Encode and record the only reply, which must not be an error, as JSON with complete
-        `timing`.
-        """
-        begun = time.perf_counter()
-        document = reply_to_json(self.replies[0])
-        document.pop("timing")
-        text = _json(document)
-        self._written(begun)
-        return f'{text[:-1]},"timing":{_json(self.replies[0].timing)}}}'.encode()
-
-    def written(self, write: Callable[[], T]) -> T:
-        """Encode the replies with `write` for a client of another system, and record them.
-
-        The `timing` of a reply is complete only after this call.
-        """
-        begun = time.perf_counter()
-        data = write()
-        self._written(begun)
-        return data
-
-    def record_failure(self, code: str) -> None:
-        """Record all requests as failed with this error code, even if the caller no longer
-        waits.
-        """
-        total_ms = (time.perf_counter() - self.arrived) * 1e3
-        for op, priority in self._asked:
-            self._stats.handled((op, self.transport, priority, code), (total_ms, *_NOT_MEASURED))
-
-    def _written(self, begun: float) -> None:
-        ended = time.perf_counter()
-        for reply in self.replies:
-            reply.timing["encode_ms"] = (ended - begun) * 1e3
-            reply.timing["total_ms"] = (ended - self.arrived) * 1e3
-        self.record()
-
-    def record(self) -> None:
-        """Record the requests for the metrics. Call this after sending if possible, so that no
-        client waits.
-        """
-        if len(self.replies) != len(self._asked):  # the message was unreadable as a whole
-            self._asked = self._asked[:1]
-
-        for (op, priority), reply in zip(self._asked, self.replies, strict=True):
-            if reply.error is None:
-                # Replies too large together are sent as errors, without times.
-                times = tuple([reply.timing.get(name, 0.0) for name in _TIMES])
-                self._stats.handled((op, self.transport, priority, "ok"), times)
-            else:
-                total_ms = (time.perf_counter() - self.arrived) * 1e3
-                self._stats.handled(
-                    (op, self.transport, priority, reply.error.code), (total_ms, *_NOT_MEASURED)
-                )
-
-
-def _json(value: dict[str, Any]) -> str:
-    return json.dumps(value, allow_nan=False, separators=(",", ":"))
+    def deliver(self, message: IncomingMessage) -> None:
+        """Set the result of the future."""
+        self.replies.set_result(message.replies)

@@ -16,7 +16,7 @@ from typing import Any, Generic, Protocol, TypeVar
 
 from vlagents_ray.errors import PolicyUnavailable, TooManyRequests, UnknownSession
 from vlagents_ray.interface import Agent
-from vlagents_ray.serve.requests import NOWHERE, Origin, PendingRequest
+from vlagents_ray.serve.requests import NOWHERE, Answer, Origin, PendingRequest
 from vlagents_ray.serve.weights import WeightsVersion
 
 M = TypeVar("M")  # type of a loaded model
@@ -106,11 +106,12 @@ class SessionFinder(Protocol):
         `caller` has too many.
         """
 
-    def announce(self, session_id: str, step: int, then: Callable[[], None]) -> None:
+    def announce(self, session_id: str, step: int, answer: Answer | None = None) -> None:
         """Announce to the other replicas that the session began an episode here at `step`; their
         states are older.
 
-        `then` is called once the others have dropped those states, or a short time has passed.
+        The `answer` to the reset is delivered once the others have dropped those states, or a short
+        time has passed.
         """
 
 

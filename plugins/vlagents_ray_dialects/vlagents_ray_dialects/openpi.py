@@ -280,8 +280,8 @@ class MapConnection:
         replies = await base.act_together(incoming, session_inputs, request_id)
 
         before_ms, batched = self._before_ms, batch is not None
-        data = incoming.written(
-            lambda: openpi.encode(dialect.answer(replies, before_ms, batched=batched))
+        data: bytes = dialect.encoded(
+            incoming, lambda: openpi.encode(dialect.answer(replies, before_ms, batched=batched))
         )
         self._before_ms = (time.perf_counter() - incoming.arrived) * 1e3
         return data
@@ -349,7 +349,7 @@ async def _answer(
         answer = await connection.answer(message, incoming, request_id, gate)
     except Exception as error:  # noqa: BLE001 - the error is the reply to the client
         problem = public_problem(error, incoming.transport, request_id)
-        incoming.record_failure(problem.code)
+        dialects[0].record_failure(incoming, problem)
         await socket.send_text(f"{problem} (request {request_id})")
 
         # The connection stays open, as nothing was acted on.

@@ -169,14 +169,14 @@ class VlaEvalDialect(base.RouteDialect):
 
                 incoming.decoded_alike()
                 reply = await session.act(incoming, obs, instruction, request_id)
-                rows = incoming.written(lambda: self.rows(reply))
+                rows = self.encoded(incoming, lambda: self.rows(reply))
                 chunk.replace(rows[: self.config.execute])
 
             actions = {"actions": chunk.take().action}
             return vla_eval.VlaEvalMessage("action", actions, message.seq)
         except Exception as error:  # noqa: BLE001 - the error is the reply to the client
             problem = public_problem(error, self.name, request_id)
-            incoming.record_failure(problem.code)
+            self.record_failure(incoming, problem)
             return _error(problem, message.seq, request_id)
         finally:
             admission.release()

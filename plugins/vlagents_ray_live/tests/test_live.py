@@ -27,7 +27,7 @@ from vlagents_ray.policies.noop import Noop
 from vlagents_ray.protocol.messages import PRIORITIES, DecodedFiles, Reply, Request
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.engine.observer import Observer, Observers
-from vlagents_ray.serve.requests import PendingRequest
+from vlagents_ray.serve.requests import IncomingMessage, PendingRequest
 from vlagents_ray_live import live, live_view, ring, spans
 from vlagents_ray_live.live import LEASE_S, RATE, LiveObserver
 from vlagents_ray_live.live_view import ReplicaView
@@ -45,7 +45,7 @@ def observe(
     files: DecodedFiles | None = None,
 ) -> None:
     pending = PendingRequest(
-        session, request, lambda _: None, PRIORITIES[request.priority], observer_data={}
+        session, request, IncomingMessage("test"), PRIORITIES[request.priority], observer_data={}
     )
     pending.files = files or {}
     observer.on_request(pending)

@@ -18,7 +18,7 @@ from typing import Any
 
 import pytest
 from eval_fakes import wait_for
-from in_flight import send
+from in_flight import Calls, ignore, send
 
 from vlagents_ray import Obs
 from vlagents_ray.errors import (
@@ -331,7 +331,7 @@ def test_each_request_of_a_message_is_charged_to_the_key_once(
         admission = sender.admission(DEFAULT_LIMITS)
         decoded = decode_requests(encode_requests(requests), admission)
     message = sender.message()
-    sender.send(message, decoded, lambda _: None, admission=admission)
+    sender.send(message, decoded, Calls(ignore), admission=admission)
     engine.close()
     # The engine is not started.
     assert [type(reply.error) for reply in message.replies] == [PolicyUnavailable] * 3

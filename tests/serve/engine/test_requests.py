@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 from eval_fakes import wait_for
-from in_flight import ask, send
+from in_flight import Calls, ask, send
 
 from vlagents_ray.errors import (
     DeadlineExceeded,
@@ -28,6 +28,7 @@ from vlagents_ray.protocol import frames
 from vlagents_ray.protocol.frames import Decoded, decode_replies
 from vlagents_ray.protocol.messages import MessageLimits, Reply, Request
 from vlagents_ray.serve.access.api_keys import NoKey
+from vlagents_ray.serve.endpoints import answers
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.engine.metrics_buffer import MetricsBuffer
 from vlagents_ray.serve.engine.observer import Observer
@@ -245,14 +246,14 @@ def test_too_many_replies_for_one_frame_are_errors_and_recorded(
     monkeypatch.setattr(frames, "DEFAULT_LIMITS", MessageLimits(body_bytes=2000))
     stats = MetricsBuffer()
     stats.enable()
-    message = IncomingMessage(stats, "test")
+    message = IncomingMessage("test")
     message.decoded_alike(2)
     message.replies = [
         Reply(act=Act(np.zeros(300, np.float32)), timing={"queue_ms": 1.0}) for _ in range(2)
     ]
-    assert all(
-        isinstance(reply.error, MessageTooLarge) for reply in decode_replies(message.frame())
-    )
+    frame = answers.as_frame(message)
+    stats.record(message)
+    assert all(isinstance(reply.error, MessageTooLarge) for reply in decode_replies(frame))
     assert sum(sample.count for sample in stats.collect().requests.values()) == 2
 
 
@@ -300,12 +301,10 @@ def test_the_requests_of_a_message_are_seen_around_its_answer_without_those_that
     served.engine.observers.add(Noting(seen))
     sender = served.sender("a")
 
-    def sent(_: IncomingMessage) -> None:
-        seen.append("sent")
-
     message = sender.message()
     requests = [Request("reset", Obs(), session=name) for name in "ab"]
-    sender.send(message, Decoded(requests, {1: Reply(error=InvalidInput("no"))}), sent)
+    decoded = Decoded(requests, {1: Reply(error=InvalidInput("no"))})
+    sender.send(message, decoded, Calls(lambda _: seen.append("sent")))
     wait_for(lambda: seen[-1:] == ["answer 2 to b"])
     assert message.replies[1].error is not None
     assert seen == [

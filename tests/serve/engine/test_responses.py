@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from in_flight import pending
 
 from vlagents_ray.errors import PolicyFailed
 from vlagents_ray.interface import Act, Obs
@@ -22,7 +23,6 @@ from vlagents_ray.serve.engine.responses import (
     require_serializable,
 )
 from vlagents_ray.serve.queue.call_limits import CallLimits
-from vlagents_ray.serve.requests import PendingRequest
 from vlagents_ray.serve.sessions import Session
 
 LIMIT = 1000
@@ -35,9 +35,7 @@ def large(nbytes: int) -> np.ndarray:
 
 def replied(act: Act) -> tuple[Reply, Session]:
     session = Session("s")
-    return build_reply(
-        PendingRequest("s", Request("act", Obs()), lambda _: None), session, act, None, LIMIT
-    ), session
+    return build_reply(pending("s", Request("act", Obs())), session, act, None, LIMIT), session
 
 
 @pytest.mark.parametrize(
@@ -60,7 +58,7 @@ def test_an_act_over_the_limit_fails_and_is_not_counted(act: Act) -> None:
 
 def test_no_info_may_be_said_with_none() -> None:
     session = Session("s")
-    ticket = PendingRequest("s", Request("act", Obs()), lambda _: None)
+    ticket = pending("s", Request("act", Obs()))
     act = Act(np.zeros(1), info=None)  # type: ignore[arg-type]
     reply = build_reply(ticket, session, act, None, LIMIT, {"policy": {"version": 1}})
     assert reply.act.info == {"policy": {"version": 1}}
@@ -109,8 +107,8 @@ def test_a_deployment_sets_the_limits_as_far_as_clients_read() -> None:
 
 
 def test_an_error_in_this_process_names_no_server() -> None:
-    pending = PendingRequest("s", Request("act", Obs()), lambda _: None)
-    assert str(public_error(RuntimeError("x"), pending)).endswith(
+    ticket = pending("s", Request("act", Obs()))
+    assert str(public_error(RuntimeError("x"), ticket)).endswith(
         "the policy raised RuntimeError; its process wrote the traceback to stderr"
     )
 

@@ -17,7 +17,7 @@ import numpy as np
 import psutil
 import pytest
 from eval_fakes import Clock, wait_for
-from in_flight import answered, asked
+from in_flight import answered, asked, pending
 from shm_client import call, client, request
 from starlette.testclient import TestClient
 
@@ -35,7 +35,7 @@ from vlagents_ray.serve.queue.call_limits import (
     PolicyCall,
     PolicyCalls,
 )
-from vlagents_ray.serve.requests import DEFAULT, PendingRequest
+from vlagents_ray.serve.requests import DEFAULT
 
 LIMITS = CallLimits(act_s=10.0, warm_up_s=100.0, load_s=1000.0)
 
@@ -145,7 +145,7 @@ def test_a_call_over_its_limit_is_unhealthy_those_who_wait_for_it_are_answered_a
     assert isinstance(begun.get(timeout=10).error, OutcomeUnknown)
     assert isinstance(behind.get(timeout=10).error, PolicyUnavailable)
     late: queue.SimpleQueue[Reply] = queue.SimpleQueue()  # it was checked just before
-    engine.queue.put(PendingRequest("good", Request("act", Obs()), late.put))
+    engine.queue.put(pending("good", Request("act", Obs()), late.put))
     engine.notice_hung()
     assert isinstance(late.get(timeout=10).error, PolicyUnavailable)
     with pytest.raises(PolicyUnavailable, match="another replica"):

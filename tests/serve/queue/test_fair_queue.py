@@ -11,7 +11,7 @@ import pytest
 from gain_policies import Gain
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from in_flight import pending, send
+from in_flight import ignore, message_of_one, pending, send
 from in_memory_keys import ChangingKeys
 
 from vlagents_ray.errors import PolicyUnavailable
@@ -26,8 +26,9 @@ from vlagents_ray.serve.requests import Origin, PendingRequest
 def ticket(
     session: str, *, owner: str = "", priority: Priority = Priority.SIMULATION, arrived: float = 0.0
 ) -> PendingRequest:
+    origin = Origin(connection=owner)
     return PendingRequest(
-        session, Request("act"), lambda _: None, priority, arrived, origin=Origin(connection=owner)
+        session, Request("act"), message_of_one(), priority, arrived, origin=origin
     )
 
 
@@ -84,7 +85,7 @@ def test_keys_with_equal_names_of_sessions_have_turns_of_their_own(
     def act(key: str, session: str) -> None:
         caller = keys.keys.check(tokens[key], "app")
         sender = Sender(engine, "http", "robot-1", caller=caller, connected=connected)
-        send(sender, [Request("act", session=session)], lambda _: None)
+        send(sender, [Request("act", session=session)], ignore)
 
     for number in range(64):
         act("other", f"env-{number}")

@@ -8,18 +8,17 @@ import socket
 import threading
 import time
 from collections.abc import Callable, Iterator
-from concurrent.futures import Future
 
 import numpy as np
 import pytest
 from eval_fakes import wait_for
+from in_flight import answered, pending
 from process_resources import descriptors, running_threads
 
 from vlagents_ray.interface import Act, Agent, Obs
-from vlagents_ray.protocol.messages import Priority, Reply, Request
+from vlagents_ray.protocol.messages import PriorityName, Reply, Request
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.queue.poller import Poller
-from vlagents_ray.serve.requests import PendingRequest
 
 SLOW_S = 0.02  # a batch at least, so that the queue takes the policy for a slow one
 
@@ -60,29 +59,22 @@ class Slow:
     def start(self) -> None:
         self.engine.start()
         for name in NAMES:
-            done: Future[Reply] = Future()
-            self.engine.submit(
-                [
-                    PendingRequest(
-                        name, Request("reset", Obs()), done.set_result, Priority.SIMULATION
-                    )
-                ]
-            )
-            assert done.result(10).error is None
+            reset = Request("reset", Obs(), priority="simulation")
+            assert answered(self.engine, name, reset).error is None
 
-    def put(self, *sessions: str, priority: Priority = Priority.SIMULATION) -> None:
+    def put(self, *sessions: str, priority: PriorityName = "simulation") -> None:
         """A request of each session, together."""
 
         def done(session: str) -> Callable[[Reply], None]:
-            def answered(reply: Reply) -> None:
+            def note(reply: Reply) -> None:
                 self.answered_by[session] = threading.current_thread().name.partition("_")[0]
                 self.events.append(f"{'answer' if reply.error is None else 'error'} {session}")
 
-            return answered
+            return note
 
         self.engine.submit(
             [
-                PendingRequest(s, Request("act", Obs(info={"name": s})), done(s), priority)
+                pending(s, Request("act", Obs(info={"name": s}), priority=priority), done(s))
                 for s in sessions
             ]
         )
@@ -242,7 +234,7 @@ def test_a_robot_is_answered_before_the_next_batch(slow: Callable[..., Slow]) ->
     one.learn("a", "b")
     one.open.clear()
     one.busy.clear()
-    one.put("r", priority=Priority.ROBOT)
+    one.put("r", priority="robot")
     assert one.busy.wait(5)
     one.put("c", "d")
     one.open.set()

@@ -86,6 +86,7 @@ from vlagents_ray.serve.config.dialects import (
     PortConfig,
     read_mapping,
 )
+from vlagents_ray.serve.endpoints import answers
 from vlagents_ray.serve.endpoints.http_messages import (
     LONG_BYTES,
     problem_response,
@@ -284,7 +285,19 @@ class RouteDialect(Dialect):
 
     def arrived(self) -> IncomingMessage:
         """Create the `IncomingMessage` of an observation that has just arrived."""
-        return IncomingMessage(self.context.engine.stats, self.name, "act", self.config.priority)
+        return IncomingMessage(self.name, "act", self.config.priority)
+
+    def encoded(self, message: IncomingMessage, encode: Callable[[], T]) -> T:
+        """Encode the replies of a message with `encode`, which completes their `timing`, and record
+        them for the metrics.
+        """
+        data = answers.timed(message, encode)
+        self.context.engine.stats.record(message)
+        return data
+
+    def record_failure(self, message: IncomingMessage, error: VLAgentsError) -> None:
+        """Record a message that gets an error for the metrics."""
+        self.context.engine.stats.record_failure(message, error.code)
 
 
 class PortDialect(Dialect):
@@ -526,7 +539,8 @@ async def _reset(observations: Sequence[SessionObs], request_id: str) -> None:
     resets = first._sender.message("reset", first._priority)
     resets.decoded_alike(len(observations))
     replies = await _ask(resets, "reset", observations, openings, request_id)
-    resets.written(lambda: None)
+    answers.timed(resets, lambda: None)
+    first._engine.stats.record(resets)
 
     for (session, _, _), opening, reply in zip(observations, openings, replies, strict=True):
         if reply.error is None:
@@ -617,14 +631,14 @@ class HttpDialect(RouteDialect):
                 finally:
                     sender.release(for_good=True)
 
-            body = message.written(lambda: write(self.rows(reply)))
+            body = self.encoded(message, lambda: write(self.rows(reply)))
             return Response(body, media_type=media_type)
         except ClientDisconnect:
-            message.record_failure("disconnected")
+            self.context.engine.stats.record_failure(message, "disconnected")
             return Response(status_code=499)
         except Exception as error:  # noqa: BLE001 - the error is the reply to the client
             problem = public_problem(error, self.name, name)
-            message.record_failure(problem.code)
+            self.record_failure(message, problem)
             return problem_response(problem, name)
         finally:
             admission.release()

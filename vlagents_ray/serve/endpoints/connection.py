@@ -109,11 +109,20 @@ class PolledConnection(ABC):
         """Read from the connection, which is readable."""
 
     @abstractmethod
-    def _write(self, message: IncomingMessage) -> None:
+    def _send_answers(self, message: IncomingMessage) -> None:
+        """Encode and send the answers of a message."""
+
+    def deliver(self, message: IncomingMessage) -> None:
         """Send and record the answers of a message, on the thread of the last one.
 
         An unexpected error ends this connection, and nothing else.
         """
+        try:
+            self._send_answers(message)
+            self._engine.stats.record(message)
+        except Exception:
+            logger.exception("%s: a client's answers cannot be sent", self._name)
+            self.end("its answers cannot be sent", INTERNAL_ERROR)
 
     @abstractmethod
     def _discard(self) -> None:
@@ -235,7 +244,7 @@ class PolledConnection(ABC):
                 submit(result())
         except VLAgentsError as error:
             message.refuse(error)
-            self._write(message)
+            self.deliver(message)
         self._resume(DECODING)
 
     def overdue(

@@ -31,7 +31,7 @@ from vlagents_ray.protocol import messages
 from vlagents_ray.protocol.frames import CONTENT_TYPE, decode_requests, encode_replies
 from vlagents_ray.protocol.json_messages import plain_values
 from vlagents_ray.serve.access.api_keys import current_caller
-from vlagents_ray.serve.endpoints import http_messages
+from vlagents_ray.serve.endpoints import answers, http_messages
 from vlagents_ray.serve.endpoints.docs_page import STYLE, docs_page
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.engine.sender import REFUSED, Sender
@@ -128,9 +128,11 @@ class _HttpEndpoint:
     def endpoint(self, op: messages.Op) -> Callable[[HttpRequest], Awaitable[Response]]:
         """Return the handler of `POST /v1/<op>`."""
 
+        stats = self.engine.stats
+
         async def handle(http: HttpRequest) -> Response:
             """Decode the requests of the body, submit them, and reply with the answers."""
-            incoming = IncomingMessage(self.engine.stats, "http", op)
+            incoming = IncomingMessage("http", op)
             request_id = http_messages.request_id(http)
             headers = http_messages.headers_of(http.scope)
             try:
@@ -153,20 +155,23 @@ class _HttpEndpoint:
                 error = replies[0].error if len(replies) == 1 else None
                 if error is not None:
                     raise error
+                step_header = {}
                 if CONTENT_TYPE in headers.get("accept", "") or len(replies) > 1:
-                    return Response(incoming.frame(), media_type=CONTENT_TYPE)
+                    content, media_type = answers.as_frame(incoming), CONTENT_TYPE
+                else:
+                    content, media_type = answers.as_document(incoming), "application/json"
+                    step = replies[0].step
+                    if step is not None:
+                        step_header[messages.STEP_HEADER] = str(step)
 
-                step = replies[0].step
-                step_header = {} if step is None else {messages.STEP_HEADER: str(step)}
-                return Response(
-                    incoming.document(), headers=step_header, media_type="application/json"
-                )
+                stats.record(incoming)
+                return Response(content, headers=step_header, media_type=media_type)
             except ClientDisconnect:
-                incoming.record_failure("disconnected")
+                stats.record_failure(incoming, "disconnected")
                 return Response(status_code=499)
             except Exception as failure:  # noqa: BLE001 - the error is the reply to the client
                 problem = http_messages.public_problem(failure, op, request_id)
-                incoming.record_failure(problem.code)
+                stats.record_failure(incoming, problem.code)
                 return http_messages.problem_response(problem, request_id)
 
         return handle
@@ -220,7 +225,9 @@ class _HttpEndpoint:
             request_id = "" if isinstance(error, VLAgentsError) else uuid.uuid4().hex
             problem = http_messages.public_problem(error, "stream", request_id)
             incoming.refuse(problem, request_id)
-        return incoming.frame()
+        data = answers.as_frame(incoming)
+        self.engine.stats.record(incoming)
+        return data
 
 
 def _timed(http: HttpRequest, incoming: IncomingMessage) -> HttpRequest:

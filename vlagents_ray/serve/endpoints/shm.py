@@ -40,11 +40,11 @@ from vlagents_ray.protocol.messages import (
     peer_process,
 )
 from vlagents_ray.serve.access.api_keys import Caller, NoKey
+from vlagents_ray.serve.endpoints import answers
 from vlagents_ray.serve.endpoints.connection import (
     BACKLOG,
     BACKLOGGED,
     DECODING,
-    INTERNAL_ERROR,
     MOST_UNANSWERED,
     POLICY_VIOLATION,
     STAMP_SPACE,
@@ -172,7 +172,7 @@ class UnixConnection(PolledConnection):
         if self._sender is not None and self._sender.rated and self._throttle():
             return
 
-        message = IncomingMessage(self._engine.stats, self._name)
+        message = IncomingMessage(self._name)
         try:
             data, control = _read_buffer.receive(self._connection, _MESSAGE_BYTES, _CONTROL)
         except BlockingIOError:
@@ -196,7 +196,7 @@ class UnixConnection(PolledConnection):
                 self._receive(sender, message, time_in_socket_s(control), data, descriptors)
         except VLAgentsError as error:
             message.refuse(error)
-            self._write(message)
+            self.deliver(message)
             if self._sender is None:
                 self._refused_keys += 1
                 if self._refused_keys >= REFUSALS:
@@ -242,7 +242,7 @@ class UnixConnection(PolledConnection):
             sender.count_message()
         decoded = Decoded(self._reader.read(text, memory), {})
         message.decoded(decoded)
-        sender.send(message, decoded, self._write, waited_s=waited_s)
+        sender.send(message, decoded, self, waited_s=waited_s)
 
     def _submit(
         self,
@@ -255,7 +255,7 @@ class UnixConnection(PolledConnection):
         message.decoded(decoded)
         if DECODING in self._unpolled_for:
             waited_s += time.perf_counter() - message.arrived
-        sender.send(message, decoded, self._write, admission=admission, waited_s=waited_s)
+        sender.send(message, decoded, self, admission=admission, waited_s=waited_s)
 
     def _authenticate(self, message: bytes) -> Sender | None:
         """Identify the client by the key in its first message.
@@ -302,16 +302,13 @@ class UnixConnection(PolledConnection):
             while self._connection.recv(1):
                 pass
 
-    def _write(self, message: IncomingMessage) -> None:
-        try:
-            self._send(*message.packed())
-            message.record()
-        except Exception:
-            logger.exception("local client: its answers cannot be sent")
-            self.end("its answers cannot be sent", INTERNAL_ERROR)
+    def _send_answers(self, message: IncomingMessage) -> None:
+        frame = answers.as_compact(message)
+        flags = LocalAddress.COMPACT
+        if frame is None:
+            frame = answers.as_frame(message)
+            flags = 0
 
-    def _send(self, frame: bytes, compact_form: bool) -> None:
-        flags = LocalAddress.COMPACT if compact_form else 0
         with self._sending:
             self._unanswered -= 1
             if self._paused and self._unanswered < MOST_UNANSWERED:

@@ -49,11 +49,11 @@ from vlagents_ray.protocol.websocket_frames import (
 )
 from vlagents_ray.serve.access.api_keys import Caller, Identity, NoKey, token_of
 from vlagents_ray.serve.access.origin_check import require_own_page
+from vlagents_ray.serve.endpoints import answers
 from vlagents_ray.serve.endpoints.connection import (
     BACKLOG,
     BACKLOGGED,
     DECODING,
-    INTERNAL_ERROR,
     LEAST_WAIT_S,
     MOST_UNANSWERED,
     POLICY_VIOLATION,
@@ -553,7 +553,7 @@ class WebSocketConnection(PolledConnection):
                 self._decode(message, partial(decode_requests, data), admission, submit)
         except VLAgentsError as error:
             message.refuse(error)
-            self._write(message)
+            self.deliver(message)
             if sender.refused_too_often:
                 self.end(REFUSED)
 
@@ -575,33 +575,32 @@ class WebSocketConnection(PolledConnection):
         message.decoded(decoded)
         waited_s = time.perf_counter() - arrived
         size += sum(map(image_bytes, decoded.requests))
+        message.size = size
         with self._sending:
             self._unanswered += 1
             self._unanswered_bytes += size
         sender.send(
             message,
             decoded,
-            partial(self._answered, size),
+            self,
             admission=admission,
             waited_s=waited_s if waited_s > LEAST_WAIT_S else 0.0,
         )
 
-    def _answered(self, size: int, message: IncomingMessage) -> None:
-        with self._sending:
-            self._unanswered -= 1
-            self._unanswered_bytes -= size
-            may_resume = self._paused and not self._is_backlogged()
-            self._paused = self._paused and not may_resume
-        if may_resume:
-            self._call_soon(partial(self._resume, BACKLOGGED))
-        self._write(message)
+    def deliver(self, message: IncomingMessage) -> None:
+        """Send the answers of a message, and read on if the client had too many unanswered."""
+        if message.size:  # a message that was refused before its requests were sent has none
+            with self._sending:
+                self._unanswered -= 1
+                self._unanswered_bytes -= message.size
+                may_resume = self._paused and not self._is_backlogged()
+                self._paused = self._paused and not may_resume
+            if may_resume:
+                self._call_soon(partial(self._resume, BACKLOGGED))
+        super().deliver(message)
 
-    def _write(self, message: IncomingMessage) -> None:
-        try:
-            self._send(message.frame())
-        except Exception:
-            logger.exception("stream client: its answers cannot be sent")
-            self.end("its answers cannot be sent", INTERNAL_ERROR)
+    def _send_answers(self, message: IncomingMessage) -> None:
+        self._send(answers.as_frame(message))
 
     def _send(self, data: bytes) -> None:
         with self._sending:

@@ -47,7 +47,15 @@ from vlagents_ray.serve.queue.batch_queue import BatchQueue, Taken
 from vlagents_ray.serve.queue.call_limits import CallLimits, PolicyCall, PolicyCalls
 from vlagents_ray.serve.queue.poller import Poller
 from vlagents_ray.serve.queue.preparation import Preparations
-from vlagents_ray.serve.requests import NOWHERE, CheckpointChoice, Opening, Origin, PendingRequest
+from vlagents_ray.serve.requests import (
+    NOWHERE,
+    Answer,
+    CheckpointChoice,
+    Opening,
+    Origin,
+    PendingRequest,
+    deliver,
+)
 from vlagents_ray.serve.sessions import DrainList, Session, SessionFinder, SessionTable
 from vlagents_ray.serve.weights import Rest, WeightsVersion, WeightUpdates, follows
 
@@ -147,7 +155,7 @@ class Engine:
         self.alive = False  # whether a thread takes batches from the queue
 
         # Answers that another thread sends while the next batch runs.
-        self._unsent: list[tuple[PendingRequest, Reply]] = []
+        self._unsent: list[Answer] = []
         self._answers = ThreadPoolExecutor(1, "policy-answers")
         # Held while the policy's thread runs a batch, and while the policy sleeps.
         self._acting = threading.Lock()
@@ -204,7 +212,7 @@ class Engine:
             while (taken := self.queue.next()) is not None:
                 if self._unsent:
                     unsent, self._unsent = self._unsent, []
-                    self._answers.submit(_send, unsent)
+                    self._answers.submit(deliver, unsent)
 
                 if not self._acting.acquire(blocking=False):
                     self._acting.acquire()  # the policy has slept
@@ -215,7 +223,7 @@ class Engine:
                     self._acting.release()
                 del taken  # their observations may be in the sender's memory
 
-            _send(self._unsent)
+            deliver(self._unsent)
             self._answers.shutdown()
             self.queue.poller.close()
         finally:
@@ -563,9 +571,9 @@ class Engine:
                     session, model, weights = self._ready(pending)
                     acting.setdefault((model, weights), []).append((pending, session))
                 elif pending.opening is not None:
-                    self._reset(pending, pending.opening)
+                    deliver(self._reset(pending, pending.opening))
                 else:
-                    pending.finish(Reply(pending.request.request_id, info=self._other(pending)))
+                    deliver([self._other(pending)])
             except Exception as error:  # noqa: BLE001 - becomes the reply
                 public = public_error(error, pending)
                 if pending.request.op == "act":
@@ -579,10 +587,10 @@ class Engine:
             if self.queue.window.slow:
                 group, prepared_s = self._prepared(model, group)  # noqa: PLW2901 - without those that failed
             if group:
-                self._act(model, weights, group, prepared_s)
+                deliver(self._act(model, weights, group, prepared_s))
 
-    def _reset(self, pending: PendingRequest, opening: Opening) -> None:
-        """Begin the episode of a reset, and answer the reset.
+    def _reset(self, pending: PendingRequest, opening: Opening) -> Sequence[Answer]:
+        """Begin the episode of a reset, and return the answer to the reset, if it is due.
 
         A reset whose checkpoint is not loaded leaves the queue. It is queued again when the
         checkpoint is loaded, or answered with an error if loading fails. Meanwhile the session may
@@ -608,7 +616,7 @@ class Engine:
             if self.models.hold(session, opening.choice, requeue, is_abandoned) is None:
                 # The policy does no work on it while its checkpoint is loaded.
                 pending.begun = False
-                return  # `_requeue` queues it again
+                return ()  # `_requeue` queues it again
         else:
             session = self.sessions.get(session_id)
             if session.resetting is not pending:
@@ -621,7 +629,7 @@ class Engine:
 
         session.resetting = None
         try:
-            self._begin_episode(pending, opening, session)
+            return self._begin_episode(pending, opening, session)
         except BaseException:
             # The session must not hold the model without an episode.
             self.models.release_model(session)
@@ -629,8 +637,10 @@ class Engine:
 
     def _begin_episode(
         self, pending: PendingRequest, opening: Opening, session: Session[LoadedModel]
-    ) -> None:
-        """Begin an episode on the model that the session holds, and answer the request."""
+    ) -> Sequence[Answer]:
+        """Begin an episode on the model that the session holds, and return the answer, if it is
+        due now.
+        """
         request, model = pending.request, session.model
         if model is None or request.obs is None:  # the decoder ensures the second condition
             raise UnknownSession(
@@ -657,15 +667,15 @@ class Engine:
 
         reply = Reply(request.request_id, info=info, step=session.steps, timing=spent)
         if session.announced or self.finder is None:
-            pending.finish(reply)
-            return
+            return [(pending, reply)]
         session.announced = True
         # The session's acts come over the same connection, to this replica.
         if pending.origin.owner:
-            pending.finish(reply)
-            self.finder.announce(session.id, session.steps, lambda: None)
-        else:  # the next act may come to a replica that still has an older episode
-            self.finder.announce(session.id, session.steps, partial(pending.finish, reply))
+            self.finder.announce(session.id, session.steps)
+            return [(pending, reply)]
+        # The next act may come to a replica that still has an older episode.
+        self.finder.announce(session.id, session.steps, (pending, reply))
+        return ()
 
     def _requeue(self, pending: PendingRequest, error: VLAgentsError | None) -> None:
         """Queue a reset again whose checkpoint is loaded, or answer it with the error."""
@@ -688,14 +698,15 @@ class Engine:
             or session.resetting is not pending
         )
 
-    def _other(self, pending: PendingRequest) -> dict[str, Any]:
-        """Run a request that is neither an act nor a reset, and return the info of its answer."""
+    def _other(self, pending: PendingRequest) -> Answer:
+        """Run a request that is neither an act nor a reset, and return the answer."""
         session_id, request = pending.session_id, pending.request
+        info: dict[str, Any] = {}
         if request.op == "export":
-            return self.export(session_id)
-        if request.op == "release":
-            return {"released": self.sessions.release(session_id, request.kwargs["version"])}
-        if request.op == "adopt":
+            info = self.export(session_id)
+        elif request.op == "release":
+            info = {"released": self.sessions.release(session_id, request.kwargs["version"])}
+        elif request.op == "adopt":
             # The replica of this process reuses names, for sessions that it compares.
             self.sessions.free(session_id)
             # That replica decides which version of the weights acts: the session's may be older, or
@@ -708,7 +719,7 @@ class Engine:
         else:
             self.sessions.close(session_id)
             pending.origin.sessions.pop(session_id, None)
-        return {}
+        return pending, Reply(request.request_id, info=info)
 
     def _ready(
         self, pending: PendingRequest
@@ -770,8 +781,10 @@ class Engine:
         weights: WeightsVersion,
         acting: Sequence[Acting],
         prepared_s: float,
-    ) -> None:
-        """Answer the act requests of sessions with one version of one model's weights."""
+    ) -> list[Answer]:
+        """Act in sessions with one version of one model's weights, and return the answers that are
+        due now.
+        """
         observations = [pending.request.obs for pending, _ in acting]
         agents = [session.agent for _, session in acting]
         padding = 0
@@ -818,7 +831,7 @@ class Engine:
             call.ended - call.began
         )
 
-        unsent = []
+        answers: list[Answer] = []
         for (pending, session), result in zip(acting, results, strict=True):
             reply = build_reply(
                 pending, session, result, model.contract, self._reply_bytes, weights.info
@@ -827,13 +840,11 @@ class Engine:
                 reply.timing = timing(pending, call.began - prepared_s, call.ended)
                 reply.timing["batch_size"] = len(acting)
             if defer and (robots or pending.priority is not Priority.ROBOT):
-                unsent.append((pending, reply))
+                self._unsent.append((pending, reply))
             else:
-                pending.finish(reply)
-
-        if unsent:
-            self._unsent.extend(unsent)
+                answers.append((pending, reply))
         self.stats.batch(len(acting), rows)
+        return answers
 
     # Sessions that move between replicas: their state is bytes and settings.
 
@@ -954,8 +965,3 @@ def _not_taken(pending: PendingRequest) -> VLAgentsError:
     return DeadlineExceeded(
         f"no action within {pending.request.deadline_ms:g} ms: dropped before inference"
     )
-
-
-def _send(answers: Sequence[tuple[PendingRequest, Reply]]) -> None:
-    for pending, reply in answers:
-        pending.finish(reply)

@@ -9,13 +9,19 @@ from __future__ import annotations
 
 import random
 import threading
+import time
 from collections import Counter
 from dataclasses import dataclass, field
 from typing import Generic, TypeVar
 
+from vlagents_ray.serve.requests import IncomingMessage
+
 T = TypeVar("T")
 
 STAGES = ("decode", "queue", "inference", "encode")
+# Times of a reply's `timing`: the total, then the stages.
+_TIMES = ("total_ms", *(f"{stage}_ms" for stage in STAGES))
+_NOT_MEASURED = (0.0,) * len(STAGES)  # stages of a request that failed
 SAMPLE = 100  # largest number of values in a sample
 
 Kind = tuple[str, str, str, str]
@@ -72,6 +78,35 @@ class MetricsBuffer:
     def enable(self) -> None:
         """Start recording requests and batches, since an exporter will collect them."""
         self._enabled = True
+
+    def record(self, message: IncomingMessage) -> None:
+        """Record the requests of a message, whose replies are encoded with complete `timing`.
+
+        Call this after sending if possible, so that no client waits.
+        """
+        if not self._enabled:
+            return
+
+        kinds = message.kinds
+        if len(message.replies) != len(kinds):  # the message was unreadable as a whole
+            kinds = kinds[:1]
+        for (op, priority), reply in zip(kinds, message.replies, strict=True):
+            if reply.error is None:
+                # Replies too large together are sent as errors, without times.
+                times = tuple([reply.timing.get(name, 0.0) for name in _TIMES])
+                self.handled((op, message.transport, priority, "ok"), times)
+            else:
+                total_ms = (time.perf_counter() - message.arrived) * 1e3
+                kind = (op, message.transport, priority, reply.error.code)
+                self.handled(kind, (total_ms, *_NOT_MEASURED))
+
+    def record_failure(self, message: IncomingMessage, code: str) -> None:
+        """Record all requests of a message as failed with this error code, even if its caller no
+        longer waits.
+        """
+        total_ms = (time.perf_counter() - message.arrived) * 1e3
+        for op, priority in message.kinds:
+            self.handled((op, message.transport, priority, code), (total_ms, *_NOT_MEASURED))
 
     def handled(self, kind: Kind, times: Times) -> None:
         """Record a request that was answered."""

@@ -6,7 +6,6 @@ import asyncio
 import uuid
 import weakref
 from collections.abc import Sequence
-from functools import partial
 from typing import TYPE_CHECKING, TypeVar
 
 from vlagents_ray.errors import DeadlineExceeded, OutcomeUnknown, TooManyRequests, VLAgentsError
@@ -14,12 +13,7 @@ from vlagents_ray.protocol.frames import Decoded
 from vlagents_ray.protocol.messages import PRIORITIES, MessageLimits, Priority, Reply
 from vlagents_ray.serve.access.api_keys import Caller, Identity, NoKey
 from vlagents_ray.serve.engine.admission import REQUEST_BYTES, MessageAdmission
-from vlagents_ray.serve.requests import (
-    Answered,
-    IncomingMessage,
-    Origin,
-    PendingRequest,
-)
+from vlagents_ray.serve.requests import IncomingMessage, Origin, PendingRequest, Receiver
 
 if TYPE_CHECKING:
     from vlagents_ray.serve.engine.engine import Engine
@@ -96,7 +90,7 @@ class Sender:
 
     def message(self, op: str = "unknown", priority: str = "robot") -> IncomingMessage:
         """Return a message that has just arrived from the sender, see `IncomingMessage`."""
-        return IncomingMessage(self._engine.stats, self._origin.transport, op, priority)
+        return IncomingMessage(self._origin.transport, op, priority)
 
     def admission(
         self, limits: MessageLimits, size: int = 0, priority: str = "robot"
@@ -172,7 +166,7 @@ class Sender:
         self,
         message: IncomingMessage,
         decoded: Decoded,
-        then: Answered,
+        receiver: Receiver,
         *,
         admission: MessageAdmission | None = None,
         waited_s: float = 0.0,
@@ -180,8 +174,7 @@ class Sender:
         """Submit the requests of a message.
 
         Args:
-            then: Called with the message when all its answers have arrived, on the thread of the
-                last one.
+            receiver: Takes the message with all its replies, on the thread of the last one.
             admission: Admission of the message, which has already charged the requests to the key.
             waited_s: Time that the message waited before it was read, s, which counts towards the
                 deadlines.
@@ -208,8 +201,10 @@ class Sender:
         except VLAgentsError as error:
             overloaded = error
 
-        answered = partial(self._answered, then, admission, sent if is_observed else ())
-        message.expect(len(requests) + len(refused), answered)
+        message.admission = admission
+        if is_observed:
+            message.observed = sent
+        message.expect(len(requests) + len(refused), receiver, self)
 
         index = 0
         for request in requests:
@@ -218,7 +213,7 @@ class Sender:
             pending = PendingRequest(
                 self._prefix + (request.session or self._session_id),
                 request,
-                partial(message.put, index),
+                message,
                 PRIORITIES[request.priority],
                 now,
                 origin=self._origin,
@@ -245,7 +240,7 @@ class Sender:
             )
 
         for index, reply in refused.items():
-            message.put(index, reply)
+            message.answer(index, reply)
         return sent
 
     def _admitted(
@@ -271,28 +266,30 @@ class Sender:
             allowed.append(pending)
         return allowed
 
-    def _answered(
-        self,
-        then: Answered,
-        admission: MessageAdmission | None,
-        observed: Sequence[PendingRequest],
-        message: IncomingMessage,
-    ) -> None:
-        if self._engine.drain_list.ask(self.session_id):
+    def deliver(self, message: IncomingMessage) -> None:
+        """Pass a message with all its replies on to its receiver, between the calls of the
+        observers.
+
+        The memory of the message is released, and its client is requested to reconnect if the
+        replica drains.
+        """
+        engine = self._engine
+        if engine.drain_list.ask(self.session_id):
             self._asked_to_reconnect = True
-        if self._asked_to_reconnect or self._engine.draining:
+        if self._asked_to_reconnect or engine.draining:
             for reply in message.replies:
                 # The client reconnects, and its sessions move to another replica.
                 reply.draining = True
-        if admission is not None:
-            admission.release()
+        if message.admission is not None:
+            message.admission.release()
 
-        observers = self._engine.observers
+        # The requests refer to the message.
+        observed, message.observed = message.observed, ()
         for pending in observed:
-            observers.before_answer(pending, message.replies[pending.index])
-        then(message)
+            engine.observers.before_answer(pending, message.replies[pending.index])
+        message.receiver.deliver(message)
         for pending in observed:
-            observers.on_answer(pending, message.replies[pending.index])
+            engine.observers.on_answer(pending, message.replies[pending.index])
 
     async def ask(
         self, message: IncomingMessage, decoded: Decoded, admission: MessageAdmission | None = None
@@ -304,15 +301,9 @@ class Sender:
         withdrawn.
         """
         loop = asyncio.get_running_loop()
-        future: asyncio.Future[list[Reply]] = loop.create_future()
+        waiting = WaitingTask()
         waited_s = self._engine.pauses.waited_s()
-        sent = self.send(
-            message,
-            decoded,
-            lambda done: settle(future, done.replies),
-            admission=admission,
-            waited_s=waited_s,
-        )
+        sent = self.send(message, decoded, waiting, admission=admission, waited_s=waited_s)
 
         timer = None
         if sent and all(request.deadline_ms is not None for request in decoded.requests):
@@ -320,7 +311,7 @@ class Sender:
             timer = loop.call_later(last_s, self._expire, message, sent)
 
         try:
-            return await future
+            return await waiting.replies
         finally:
             unanswered = [pending for pending in sent if not pending.over]
             if unanswered:
@@ -342,7 +333,7 @@ class Sender:
                     "time) or hang in a call (the server's log then names the line)"
                 )
             # Ignored if the request has been answered.
-            pending.done(Reply(pending.request.request_id, error=late))
+            message.answer(pending.index, Reply(pending.request.request_id, error=late))
 
     def release(self, *, for_good: bool = False) -> None:
         """End the sessions of a closed connection, unless its client has to reconnect elsewhere.
@@ -376,11 +367,22 @@ class Sender:
         return caller.priority != "simulation"
 
 
+class WaitingTask:
+    """The receiver of a message for whose replies a task waits; created on the task's loop."""
+
+    def __init__(self) -> None:
+        self.replies: asyncio.Future[list[Reply]] = asyncio.get_running_loop().create_future()
+
+    def deliver(self, message: IncomingMessage) -> None:
+        """Set the replies, from any thread."""
+        settle(self.replies, message.replies)
+
+
 def settle(future: asyncio.Future[T], result: T) -> None:
     """Set the result of a future, from any thread, unless its caller no longer waits."""
+    future.get_loop().call_soon_threadsafe(_set_result, future, result)
 
-    def set_result() -> None:
-        if not future.done():
-            future.set_result(result)
 
-    future.get_loop().call_soon_threadsafe(set_result)
+def _set_result(future: asyncio.Future[T], result: T) -> None:
+    if not future.done():
+        future.set_result(result)

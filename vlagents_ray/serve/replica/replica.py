@@ -27,6 +27,7 @@ from vlagents_ray.serve.access.api_keys import NoKey, require_access, warn_of_pl
 from vlagents_ray.serve.access.audit import write_audit
 from vlagents_ray.serve.config.deployment import ServerArgs
 from vlagents_ray.serve.dialects.base import ReplicaContext, dialect_routes
+from vlagents_ray.serve.endpoints import answers
 from vlagents_ray.serve.endpoints.access_middleware import AccessMiddleware, Shutdown
 from vlagents_ray.serve.endpoints.connection import Admit
 from vlagents_ray.serve.endpoints.http import build_http_app
@@ -416,7 +417,9 @@ async def answer_frame(engine: Engine, limits: MessageLimits, session_id: str, f
         await sender.ask(message, decoded, admission)
     except VLAgentsError as error:
         message.refuse(error)
-    return message.frame()
+    data = answers.as_frame(message)
+    engine.stats.record(message)
+    return data
 
 
 def _plain_host() -> str:

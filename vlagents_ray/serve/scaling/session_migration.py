@@ -33,11 +33,18 @@ from functools import partial
 from typing import Any, Concatenate, ParamSpec, TypeVar
 
 from vlagents_ray.errors import VLAgentsError
-from vlagents_ray.protocol.messages import Op, Reply, Request
+from vlagents_ray.protocol.messages import Op, Request
 from vlagents_ray.serve.engine.engine import Engine
-from vlagents_ray.serve.engine.sender import settle
+from vlagents_ray.serve.engine.sender import WaitingTask
 from vlagents_ray.serve.models.loaded_model import LoadedModel
-from vlagents_ray.serve.requests import NOWHERE, Origin, PendingRequest
+from vlagents_ray.serve.requests import (
+    NOWHERE,
+    Answer,
+    IncomingMessage,
+    Origin,
+    PendingRequest,
+    deliver,
+)
 from vlagents_ray.serve.sessions import Outdated, Session, Version
 from vlagents_ray.serve.weights import VersionNotHeld
 
@@ -230,15 +237,16 @@ class HeldSessions:
 
         If the request has not begun after `timeout_s`, it is cancelled, and has no effect.
         """
-        answered: asyncio.Future[Reply] = self._loop.create_future()
-        pending = PendingRequest(session_id, Request(op, kwargs=kwargs), partial(settle, answered))
+        message, waiting = IncomingMessage("migration"), WaitingTask()
+        message.expect(1, waiting)
+        pending = PendingRequest(session_id, Request(op, kwargs=kwargs), message)
         self._engine.submit([pending])
-        await asyncio.wait([answered], timeout=timeout_s)
-        if not answered.done():
+        await asyncio.wait([waiting.replies], timeout=timeout_s)
+        if not waiting.replies.done():
             if self._engine.queue.cancel(pending):
                 return None
-            await answered
-        reply = answered.result()
+            await waiting.replies
+        [reply] = waiting.replies.result()
         if reply.error is not None:
             logger.info("session %s: %s: %s", session_id, op, reply.error)
             return None
@@ -299,7 +307,7 @@ class SessionMigrator:
         self._callers: Counter[str] = Counter()  # number of running searches by caller
         # Steps of begun episodes that are not announced yet, by session.
         self._unannounced: dict[str, int] = {}
-        self._announced: list[Callable[[], None]] = []  # called once those are announced
+        self._announced: list[Answer] = []  # delivered once those are announced
         # Number of sessions that are being fetched since other replicas offered them.
         self._offered = 0
         # Time until which a silent replica gets no request, by its name.
@@ -353,17 +361,20 @@ class SessionMigrator:
         self._loop.call_soon_threadsafe(lambda: self._spawn(self._search(session_id)))
         return True
 
-    def announce(self, session_id: str, step: int, then: Callable[[], None]) -> None:
+    def announce(self, session_id: str, step: int, answer: Answer | None = None) -> None:
         """Announce to the other replicas that the session began an episode here at `step`; their
         states are older.
 
-        `then` is called once they have dropped those states, or `_OTHERS_S` have passed.
+        The `answer` to the reset is delivered once they have dropped those states, or `_OTHERS_S`
+        have passed.
         """
         with self._lock:
-            self._announced.append(then)
+            is_first = not self._unannounced
             self._unannounced[session_id] = step
-            if len(self._announced) > 1:
-                return
+            if answer is not None:
+                self._announced.append(answer)
+        if not is_first:
+            return
         self._loop.call_soon_threadsafe(lambda: self._spawn(self._announce_all()))
 
     async def hand_over(self) -> None:
@@ -615,7 +626,7 @@ class SessionMigrator:
             return None
 
     async def _announce_all(self) -> None:
-        announced: list[Callable[[], None]] = []
+        announced: list[Answer] | None = None
         try:
             peers = [] if self._closed else await self._peers()
             if peers:
@@ -628,12 +639,11 @@ class SessionMigrator:
                 ]
                 await asyncio.wait(answers, timeout=_OTHERS_S)
         finally:  # also if the task is cancelled, as the replica stops
-            for then in announced or self._take_unannounced()[1]:
-                then()
+            deliver(self._take_unannounced()[1] if announced is None else announced)
 
-    def _take_unannounced(self) -> tuple[dict[str, int], list[Callable[[], None]]]:
-        """Return the steps of the begun episodes, by session, and what to call once those are
-        announced.
+    def _take_unannounced(self) -> tuple[dict[str, int], list[Answer]]:
+        """Return the steps of the begun episodes, by session, and the answers that are due once
+        those are announced.
         """
         with self._lock:
             begun, self._unannounced = self._unannounced, {}

@@ -38,7 +38,7 @@ from vlagents_ray.protocol.messages import (
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.models.agent_copies import AgentCopies
 from vlagents_ray.serve.python_env.child_start import die_with_parent, own_stdout
-from vlagents_ray.serve.requests import PendingRequest
+from vlagents_ray.serve.requests import IncomingMessage, PendingRequest
 from vlagents_ray.testing import random_observation
 from vlagents_ray.validation import check_observation
 
@@ -56,6 +56,19 @@ class QueuedTurn:
     actions_per_s: float
     mean_batch: float
     trips_ms: Sequence[float]  # of each call
+
+
+@dataclass(frozen=True, slots=True)
+class _QueuedReplies:
+    """The receiver of one session's replies, which are put into a queue with its index."""
+
+    answers: queue.SimpleQueue[tuple[int, Reply]]
+    index: int
+
+    def deliver(self, message: IncomingMessage) -> None:
+        """Put the only reply of a message into the queue."""
+        [reply] = message.replies
+        self.answers.put((self.index, reply))
 
 
 class MeasuredPolicy:
@@ -136,13 +149,16 @@ class MeasuredPolicy:
         """
         views = [self._view(self.engine.contract, i) for i in range(size)]
         answers: queue.SimpleQueue[tuple[int, Reply]] = queue.SimpleQueue()
+        receivers = [_QueuedReplies(answers, i) for i in range(size)]
         sent_at = [0.0] * size
 
         def send(i: int, op: Any, **fields: Any) -> None:
             sent_at[i] = time.perf_counter()
             request = Request(op, views[i], priority=priority, **fields)
-            done = lambda reply: answers.put((i, reply))  # noqa: E731 - of this request
-            self.engine.submit([PendingRequest(f"bench-{i}", request, done, PRIORITIES[priority])])
+            message = IncomingMessage("bench", op, priority)
+            message.expect(1, receivers[i])
+            pending = PendingRequest(f"bench-{i}", request, message, PRIORITIES[priority])
+            self.engine.submit([pending])
 
         def receive() -> tuple[int, Reply, float]:
             i, reply = answers.get(timeout=_LATE_S)
