@@ -26,6 +26,7 @@ from vlagents_ray.policies.wrapper import build_agent
 from vlagents_ray.protocol.messages import PRIORITIES, Reply, Request
 from vlagents_ray.registry import require
 from vlagents_ray.serve.engine.engine import Engine
+from vlagents_ray.serve.engine.settings import EngineSettings
 from vlagents_ray.serve.models.checkpoints import Checkpoints
 from vlagents_ray.serve.requests import AwaitedReplies, IncomingMessage, PendingRequest
 from vlagents_ray.testing import random_observation
@@ -157,7 +158,7 @@ class Lab:
         rows = self.size(8, 2)
         config = self.settings(**{"compile": self.graphs, "batch_sizes": [1, rows], **changed})
         offered = Checkpoints(partial(build_agent, "pi0"), config, {"other": {"seed": 1}}, loaded=2)
-        engine = Engine(offered, max_batch_size=rows, patience=0.1)
+        engine = Engine(offered, EngineSettings(max_batch_size=rows, patience=0.1))
         try:
             with self.lines_of("policy", "start"):
                 engine.start()
@@ -184,7 +185,9 @@ class Session:
         message, awaited = IncomingMessage("lab"), AwaitedReplies()
         message.expect(1, awaited)
         request = Request(op, self._view, priority="robot", **given)
-        self._engine.submit([PendingRequest(self._name, request, message, PRIORITIES["robot"])])
+        self._engine.intake.submit(
+            [PendingRequest(self._name, request, message, PRIORITIES["robot"])]
+        )
         [reply] = awaited.replies.result(timeout=LATE_S)
         if reply.error is not None:
             raise reply.error

@@ -638,7 +638,7 @@ def destruction(lab: Lab) -> None:
         del agent.predict
         robots[0].ask()
         lab.check("one row acts after memory was exhausted", True, equal=True)
-        engine.check_health()
+        engine.health.check()
 
         def broken(rows: Sequence[Any]) -> Any:
             if lab.dry:
@@ -651,7 +651,7 @@ def destruction(lab: Lab) -> None:
             robots[0].ask()
         said = ""
         try:
-            engine.check_health()
+            engine.health.check()
         except Exception as error:  # noqa: BLE001 - the health check may raise any error
             said = f"{type(error).__name__}: {error}"
         lab.show(health=said[:300])

@@ -44,6 +44,7 @@ from vlagents_ray.serve.endpoints.http import build_http_app
 from vlagents_ray.serve.endpoints.shm import ShmServer
 from vlagents_ray.serve.endpoints.websocket import WebSocketServer
 from vlagents_ray.serve.engine.engine import Engine
+from vlagents_ray.serve.engine.settings import EngineSettings
 from vlagents_ray.serve.models.checkpoints import Checkpoints
 from vlagents_ray.serve.ports import free_port, reserve
 
@@ -132,6 +133,11 @@ def _pixel(obs: Obs) -> float:
     return float(next(iter(obs.cameras.values()), np.zeros((1, 1, 1)))[-1, -1, -1])
 
 
+def _wall_clock() -> int:
+    """The time at which each step is drawn, ns."""
+    return _DRAWN_AT
+
+
 class Server:
     """What a scenario talks to; its settings are `sessions`, `ready`, `replicas`, and `dialects`
     by name.
@@ -146,7 +152,7 @@ class Server:
         self._gate = Gate()
         self._own: Any = None
         stack.callback(lambda: self._own and self._own.close())  # after the engine
-        options = {"session_limit": settings.get("sessions", 100), "wall_clock": lambda: _DRAWN_AT}
+        session_limit = settings.get("sessions", 100)
         self._offered = partial(
             Checkpoints, self._agent, {"checkpoint": "first"}, {"other": {"checkpoint": "second"}}
         )
@@ -154,12 +160,15 @@ class Server:
         gateway = self._dialects.keys() & _GATEWAYS.keys()
         if gateway or settings.get("replicas"):
             self._replicas = Replicas(
-                [self._offered() for _ in range(settings.get("replicas", 1))], **options
+                [self._offered() for _ in range(settings.get("replicas", 1))],
+                wall_clock=_wall_clock,
+                session_limit=session_limit,
             )
             stack.callback(self._replicas.close)
             self.engines = self._replicas.engines
         else:
-            self.engines = [Engine(self._offered(), **options)]
+            engine_settings = EngineSettings(session_limit=session_limit)
+            self.engines = [Engine(self._offered(), engine_settings, wall_clock=_wall_clock)]
             stack.callback(self.engines[0].close)
         self._ports: dict[int, int] = {}  # of HTTP, by replica
         for name in gateway:

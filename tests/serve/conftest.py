@@ -9,6 +9,7 @@ import pytest
 
 from vlagents_ray.interface import Agent
 from vlagents_ray.serve.engine.engine import Engine
+from vlagents_ray.serve.engine.settings import EngineSettings
 
 
 @pytest.fixture
@@ -17,7 +18,7 @@ def serving() -> Iterator[Callable[..., Engine]]:
     engines: list[Engine] = []
 
     def serve(agent: Agent, **options: Any) -> Engine:
-        engines.append(Engine(agent, **options))
+        engines.append(Engine(agent, EngineSettings(**options)))
         engines[-1].start()
         return engines[-1]
 

@@ -50,7 +50,9 @@ from vlagents_ray.serve.endpoints.shm import ShmServer
 from vlagents_ray.serve.endpoints.websocket import WebSocketServer
 from vlagents_ray.serve.engine.admission import MessageAdmission
 from vlagents_ray.serve.engine.engine import Engine
+from vlagents_ray.serve.engine.intake import Intake
 from vlagents_ray.serve.engine.sender import Sender
+from vlagents_ray.serve.engine.settings import EngineSettings
 from vlagents_ray.serve.requests import IncomingMessage
 
 BASE = urlsplit("http://127.0.0.1")
@@ -110,7 +112,7 @@ def shown(token: str | None) -> dict[str, str]:
 @contextlib.contextmanager
 def replica(*, keyed: bool = True, slow_s: float = 60.0, idle_s: float = 60.0) -> Iterator[Replica]:
     known, policy = ChangingKeys(), Witness()
-    engine = Engine(policy, session_limit=8)
+    engine = Engine(policy, EngineSettings(session_limit=8))
     admit = (lambda token: known.keys.check(token, "app")) if keyed else NoKey.OPEN
     own = WebSocketServer(
         engine, MessageLimits(), "127.0.0.1", None, admit, slow_s=slow_s, idle_s=idle_s
@@ -497,7 +499,7 @@ def test_a_probe_is_answered_without_a_session_and_a_broken_one_leaves_the_strea
 
 
 FAULTS = [
-    (Engine, "check"),
+    (Intake, "admit"),
     (Sender, "admission"),
     (Sender, "send"),
     (Sender, "throttled_s"),

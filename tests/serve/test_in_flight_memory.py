@@ -33,6 +33,7 @@ from vlagents_ray.serve.endpoints.shm import ShmServer
 from vlagents_ray.serve.endpoints.websocket import WebSocketServer
 from vlagents_ray.serve.engine.admission import REQUEST_BYTES
 from vlagents_ray.serve.engine.engine import Engine
+from vlagents_ray.serve.engine.settings import EngineSettings
 
 pytestmark = pytest.mark.own_process
 
@@ -74,7 +75,7 @@ class Replica:
 def replica() -> Iterator[Replica]:
     limits = MessageLimits(in_flight_bytes=IN_FLIGHT)
     policy = Gate()
-    engine = Engine(policy, in_flight_bytes=IN_FLIGHT)
+    engine = Engine(policy, EngineSettings(in_flight_bytes=IN_FLIGHT))
     own, near = (
         WebSocketServer(engine, limits, "127.0.0.1", None, NoKey.OPEN),
         ShmServer(engine, limits, NoKey.OPEN),

@@ -18,7 +18,7 @@ import pytest
 from tests.simulation.clients import Robot, Violation, play
 from tests.simulation.world import Replica, World
 from vlagents_ray.errors import PolicyUnavailable, UnknownSession, VLAgentsError
-from vlagents_ray.serve.requests import PendingRequest
+from vlagents_ray.serve.requests import Answer, Opening, PendingRequest, ReservedAct, deliver
 from vlagents_ray.serve.scaling import session_migration
 from vlagents_ray.serve.sessions import Session
 
@@ -88,11 +88,16 @@ def overwrite(replica: Replica) -> None:
 
     def enter(arriving: Session) -> None:
         if (here := table._sessions.get(arriving.id)) is not None:
-            table.ended(here)
+            table._end(here)
         table._sessions[arriving.id] = arriving
 
     table.enter = enter  # type: ignore[method-assign]
-    replica.migrator.announce = lambda _session, _step, then: then()  # type: ignore[method-assign]
+
+    def announce(session_id: str, step: int, answer: Answer | None = None) -> None:
+        if answer is not None:
+            deliver([answer])
+
+    replica.migrator.announce = announce  # type: ignore[method-assign]
 
 
 def export_at_once(replica: Replica) -> None:
@@ -126,7 +131,7 @@ def deadlines_begin_anew(replica: Replica) -> None:
             try:
                 again = in_flight.pending(pending.session_id, pending.request)
                 again.message, again.index = pending.message, pending.index
-                engine.check(again)
+                again.reserved = engine.intake.admit(again)
                 engine.queue.put(again)
             except VLAgentsError as later:
                 pending.fail(later)
@@ -141,20 +146,25 @@ def deadlines_begin_anew(replica: Replica) -> None:
             pending.fail(PolicyUnavailable("the replica is stopping"))
         return True
 
-    engine._seek = seek  # type: ignore[method-assign]
+    engine.intake.search = seek  # type: ignore[method-assign]
 
 
 def forget_episodes(replica: Replica) -> None:
     """An act without a step is for whatever episode its session is in when the policy is free."""
-    check = replica.engine.check
+    admit, fetch = replica.engine.intake.admit, replica.migrator.fetch
 
-    def check_and_forget(pending: PendingRequest) -> None:
-        check(pending)
-        if pending.request.op == "act":
-            pending.episode = None
+    def admit_and_forget(pending: PendingRequest) -> ReservedAct | Opening | None:
+        reserved = admit(pending)
+        if isinstance(reserved, ReservedAct):
+            reserved.episode = None
+        return reserved
 
-    replica.engine.check = check_and_forget  # type: ignore[method-assign]
-    replica.engine._user_of = lambda pending, *_: pending.origin  # type: ignore[method-assign]
+    def fetch_any(session_id: str, then: Callable[[], None], caller: str, origin_for: Any) -> bool:
+        origin = origin_for.__self__._pending.origin
+        return fetch(session_id, then, caller, lambda *_: origin)
+
+    replica.engine.intake.admit = admit_and_forget  # type: ignore[method-assign]
+    replica.migrator.fetch = fetch_any  # type: ignore[method-assign]
 
 
 def outlive_connections(replica: Replica) -> None:

@@ -25,6 +25,7 @@ from vlagents_ray.protocol.messages import Op, Reply, Request
 from vlagents_ray.serve.access.api_keys import NoKey
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.engine.sender import Sender
+from vlagents_ray.serve.engine.settings import EngineSettings
 from vlagents_ray.serve.queue.batch_queue import Taken
 from vlagents_ray.serve.scaling.session_migration import Peer, PeerEnded, SessionMigrator
 
@@ -91,14 +92,14 @@ class Replica:
         self.migrator = SessionMigrator(self.name, self._others, self.loop, _at_once)
         self.engine = Engine(
             Remembering(world.log),
-            max_batch_size=4,
+            EngineSettings(max_batch_size=4, threaded=False),
             clock=lambda: world.clock.now,
             wall_clock=lambda: _EPOCH_NS + int((world.clock.now + self.clock_error_s) * 1e9),
             poller=_NoFiles(self._wake),  # type: ignore[arg-type]
             finder=self.migrator,
         )
         self.migrator.start(self.engine)
-        self.engine.start(threaded=False)
+        self.engine.start()
 
     @property
     def alive(self) -> bool:
@@ -118,7 +119,7 @@ class Replica:
         if self._busy:
             return
         batch, expired = self.engine.queue.take() or Taken([], [])
-        self.engine.run(Taken([], expired))
+        self.engine.runner.run(Taken([], expired))
         if batch:
             self._busy = True
             draw = self.world.draw
@@ -129,7 +130,7 @@ class Replica:
             self._wake()
 
     def _finish(self, taken: Taken) -> None:
-        self.engine.run(taken)
+        self.engine.runner.run(taken)
         self._busy = False
         self._turn()
 
@@ -319,7 +320,7 @@ class World:
         replica = self.draw.choice(ready)
         if name == "drain" and len(ready) > 1:
             replica.draining = True
-            replica.engine.drain()
+            replica.engine.drain_list.drain()
             replica.loop.call_later(self.draw.uniform(0.1, 0.5), self._stop, replica)
         elif name == "clock":
             replica.clock_error_s += self.draw.choice([-3600.0, -1.0, 1.0, 3600.0])

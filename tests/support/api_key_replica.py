@@ -64,6 +64,7 @@ from vlagents_ray.serve.endpoints.http import build_http_app
 from vlagents_ray.serve.endpoints.shm import ShmServer
 from vlagents_ray.serve.endpoints.websocket import WebSocketServer
 from vlagents_ray.serve.engine.engine import Engine
+from vlagents_ray.serve.engine.settings import EngineSettings
 from vlagents_ray.serve.ports import free_port, reserve
 from vlagents_ray.serve.replica.part import PartContext, open_parts
 from vlagents_ray.weights.safetensors import ValueSpec, header_of, read_header
@@ -164,7 +165,7 @@ class KeyedReplica:
         self.known = ChangingKeys()
         self.at_gateway = self.known.another()  # of another process
         self.policy = Recorder()
-        self.engine = Engine(self.policy, session_limit=5000)
+        self.engine = Engine(self.policy, EngineSettings(session_limit=5000))
         self.priorities: dict[str, str] = {}
         self._watch_priorities()
         admit = partial(self.known.keys.check, app="app")

@@ -19,6 +19,7 @@ from vlagents_ray.serve.dialects.base import ReplicaContext, RouteDialect, diale
 from vlagents_ray.serve.endpoints.access_middleware import AccessMiddleware
 from vlagents_ray.serve.endpoints.http import build_http_app
 from vlagents_ray.serve.engine.engine import Engine
+from vlagents_ray.serve.engine.settings import EngineSettings
 from vlagents_ray_dialects.messages import openpi as openpi_codec
 from vlagents_ray_dialects.messages import openvla as openvla_codec
 from vlagents_ray_dialects.messages import vla_eval as vla_eval_codec
@@ -37,7 +38,7 @@ ALL: dict[str, Any] = {  # those on the server's own port, with settings where t
 def serving(
     agent: Agent, dialects: dict[str, Any], keys: Keys | None = None, **options: Any
 ) -> Iterator[tuple[TestClient, Engine]]:
-    engine = Engine(agent, **options)
+    engine = Engine(agent, EngineSettings(**options))
     engine.start()
     with client_of(engine, dialects, keys) as client:
         yield client, engine

@@ -6,7 +6,7 @@ import asyncio
 import queue
 import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any
 
@@ -33,6 +33,7 @@ from vlagents_ray.protocol.messages import (
 from vlagents_ray.serve.access.api_keys import NoKey
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.engine.sender import Sender
+from vlagents_ray.serve.engine.settings import EngineSettings
 from vlagents_ray.serve.models.checkpoints import Checkpoints
 from vlagents_ray.serve.scaling.session_migration import Peer, PeerEnded, SessionMigrator
 
@@ -42,7 +43,13 @@ class Replicas:
     not stop.
     """
 
-    def __init__(self, agents: Sequence[Agent | Checkpoints], **options: Any) -> None:
+    def __init__(
+        self,
+        agents: Sequence[Agent | Checkpoints],
+        *,
+        wall_clock: Callable[[], int] = time.time_ns,
+        **options: Any,
+    ) -> None:
         self.dead: set[int] = set()
         self.frozen: set[int] = set()
         self.prefer = 0  # where new connections go, if that one lives and does not stop
@@ -57,7 +64,7 @@ class Replicas:
             for number in range(len(agents))
         ]
         self.engines = [
-            Engine(agent, finder=finder, **options)
+            Engine(agent, EngineSettings(**options), finder=finder, wall_clock=wall_clock)
             for agent, finder in zip(agents, self.migrators, strict=True)
         ]
         for migrator, engine in zip(self.migrators, self.engines, strict=True):

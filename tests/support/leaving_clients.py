@@ -60,6 +60,7 @@ from vlagents_ray.serve.endpoints.http import build_http_app
 from vlagents_ray.serve.endpoints.shm import ShmServer
 from vlagents_ray.serve.endpoints.websocket import WebSocketServer
 from vlagents_ray.serve.engine.engine import Engine
+from vlagents_ray.serve.engine.settings import EngineSettings
 from vlagents_ray.serve.ports import free_port, reserve
 from vlagents_ray_dialects.messages import vla_eval as vla_eval_codec
 
@@ -145,7 +146,7 @@ class StoppableServer:
     def __init__(self, stack: contextlib.ExitStack) -> None:
         self.stack = stack
         self.policy = GatedPolicy()
-        self.engine = Engine(self.policy, max_batch_size=1)
+        self.engine = Engine(self.policy, EngineSettings(max_batch_size=1))
         self.queued: list[Any] = []  # each request that was queued
         put = self.engine.queue.put
 
@@ -191,7 +192,7 @@ class StoppableServer:
     def _send(self, session: str, op: Any, brightness: int) -> queue.SimpleQueue[Reply]:
         replies: queue.SimpleQueue[Reply] = queue.SimpleQueue()
         request = Request(op, Obs({"front": image(brightness)}))
-        self.engine.submit([pending(session, request, replies.put)])
+        self.engine.intake.submit([pending(session, request, replies.put)])
         return replies
 
     def is_stopping(self) -> bool:

@@ -18,6 +18,7 @@ from vlagents_ray import Act, Agent, Obs
 from vlagents_ray.contract import Contract, StateSpec
 from vlagents_ray.protocol.messages import Reply, Request
 from vlagents_ray.serve.engine.engine import Engine
+from vlagents_ray.serve.engine.settings import EngineSettings
 from vlagents_ray.serve.models.checkpoints import Checkpoints
 
 
@@ -99,9 +100,8 @@ class Library:
         """
         config = {"checkpoint": "a/{step}", "checkpoint_step": 1}
         named = {choice[0]: {"checkpoint": choice} for choice in choices}
-        engine = Engine(
-            Checkpoints(self.make, config, named, steps=steps, loaded=loaded), **options
-        )
+        checkpoints = Checkpoints(self.make, config, named, steps=steps, loaded=loaded)
+        engine = Engine(checkpoints, EngineSettings(**options))
         engine.start()
         return engine
 

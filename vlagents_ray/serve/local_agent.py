@@ -16,6 +16,7 @@ from vlagents_ray.protocol.messages import Priority, Reply, Request
 from vlagents_ray.ray_tools.git_state import GitState
 from vlagents_ray.serve.config.deployment import ServerArgs
 from vlagents_ray.serve.engine.engine import Engine
+from vlagents_ray.serve.engine.settings import EngineSettings
 from vlagents_ray.serve.models.checkpoints import resolved
 from vlagents_ray.serve.python_env.child_agent import make_agent, version_of
 from vlagents_ray.serve.requests import AwaitedReplies, IncomingMessage, PendingRequest
@@ -25,7 +26,11 @@ _LOOK_S = 0.1  # wait for a checkpoint that another thread loads
 
 
 def build_engine(
-    args: ServerArgs, config: Mapping[str, Any], finder: SessionFinder | None = None
+    args: ServerArgs,
+    config: Mapping[str, Any],
+    finder: SessionFinder | None = None,
+    *,
+    threaded: bool = True,
 ) -> Engine:
     """Create the engine of a deployment, without loading its policy.
 
@@ -33,9 +38,9 @@ def build_engine(
         args: The settings, with `environment.process` decided.
         config: The settings of the policy, with those of the deployment's `user_config`.
         finder: Fetches sessions from other replicas.
+        threaded: Whether a thread of the engine runs the policy.
     """
-    return Engine(
-        args.checkpoints.of(partial(make_agent, args), config),
+    settings = EngineSettings(
         max_batch_size=args.batch.max_size,
         patience=args.batch.patience,
         batch_sizes=args.batch.sizes or (),
@@ -46,8 +51,10 @@ def build_engine(
         limits=args.limits.call_limits(),
         reply_bytes=args.limits.reply_bytes,
         in_flight_bytes=args.limits.in_flight_bytes,
-        finder=finder,
+        threaded=threaded,
     )
+    checkpoints = args.checkpoints.of(partial(make_agent, args), config)
+    return Engine(checkpoints, settings, finder=finder)
 
 
 def policy_metadata(
@@ -125,18 +132,18 @@ class LocalAgent(Agent):
         message, awaited = IncomingMessage("local"), AwaitedReplies()
         message.expect(len(requests), awaited)
         pairs = zip(sessions, requests, strict=True)
-        self.engine.submit(
+        self.engine.intake.submit(
             [
                 PendingRequest(session._session, request, message, Priority.SIMULATION, index=index)
                 for index, (session, request) in enumerate(pairs)
             ]
         )
 
-        while not self.engine.threaded and not awaited.replies.done():
+        while not self.engine.settings.threaded and not awaited.replies.done():
             taken = self.engine.queue.take()
             if taken is None:
                 break
-            self.engine.run(taken)
+            self.engine.runner.run(taken)
             if not taken.batch:
                 self.engine.queue.poller.poll(_LOOK_S)
         return awaited.replies.result()
@@ -157,8 +164,9 @@ class LocalPolicy(LocalAgent):
                 default the caller's does, so that a debugger stops in it.
         """
         environment = args.environment.model_copy(update={"process": "child"})
-        super().__init__(build_engine(args.model_copy(update={"environment": environment}), config))
-        self._args, self._code, self._threaded = args, args.code(), threaded
+        local_args = args.model_copy(update={"environment": environment})
+        super().__init__(build_engine(local_args, config, threaded=threaded))
+        self._args, self._code = args, args.code()
 
     @property
     def metadata(self) -> dict[str, Any]:
@@ -166,7 +174,7 @@ class LocalPolicy(LocalAgent):
         return policy_metadata(self._args, self.engine, *self._code)
 
     def initialize(self) -> None:
-        self.engine.start(threaded=self._threaded)
+        self.engine.start()
 
     def sessions(self, n: int) -> list[LocalAgent]:
         """Open `n` more sessions, for `act_batch` of this agent; close each of them."""

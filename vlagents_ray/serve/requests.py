@@ -86,14 +86,28 @@ class Origin:
 NOWHERE = Origin()
 
 
-@dataclass(slots=True)
+@dataclass(frozen=True, slots=True)
 class Opening:
-    """The server's settings for the episode that a reset begins."""
+    """The reservation of a reset: an episode of its session, with the server's settings."""
 
     choice: CheckpointChoice
     kwargs: dict[str, Any]  # the options of the request that are for the policy
     follows: bool  # whether the episode takes the newest version of the weights
-    first: int = 0  # step at which the episode begins
+    first: int  # step at which the episode begins
+    # First step of the connection's previous episode, which continues if the reset is undone; None
+    # if there is none.
+    previous: int | None
+
+
+@dataclass(slots=True, eq=False)
+class ReservedAct:
+    """The reservation of an act: its session and episode, and what was done in advance."""
+
+    session: Any  # the `Session` at its arrival
+    model: Any  # the `LoadedModel` whose contract it was checked against, or None
+    # Step at which the episode began that it was sent in; None for the session's latest one.
+    episode: int | None
+    preparation: Preparation | None  # preparation of its observation, on another thread
 
 
 @dataclass(slots=True, eq=False)
@@ -111,16 +125,11 @@ class PendingRequest:
     over: bool = False  # whether it was answered, or its caller no longer waits
     begun: bool = False  # whether a batch has taken it for the policy; set under the queue's lock
     sought: bool = False  # whether other replicas were searched for its session
-    session: Any = None  # the `Session` of an act at its arrival
-    # For an act: the step at which the episode began that it was sent in, once that is known. For a
-    # reset: the same of the connection's previous episode, which continues if the reset is undone.
-    episode: int | None = None
-    model: Any = None  # for an act: the `LoadedModel` whose contract it was checked against
-    opening: Opening | None = None  # for a reset: the server's settings
+    # What was reserved for an act or a reset when it was admitted; see `Intake.admit`.
+    reserved: ReservedAct | Opening | None = None
     # If a reset had to wait for its checkpoint: the time at which that was loaded, s. Such a reset
     # runs even if it is over, to release the checkpoint.
     loaded: float | None = None
-    preparation: Preparation | None = None  # preparation of its observation, on another thread
     # Recent time from an answer to the session's next request, s, if known.
     return_s: float | None = None
     index: int = 0  # index among the requests of its message
@@ -137,7 +146,8 @@ class PendingRequest:
         if self.over:
             return
         self.over = True
-        if self.preparation is not None:
+        reserved = self.reserved
+        if isinstance(reserved, ReservedAct) and reserved.preparation is not None:
             self.drop_preparation()
         try:
             self.message.answer(self.index, reply)
@@ -148,9 +158,10 @@ class PendingRequest:
 
     def drop_preparation(self) -> None:
         """Cancel the preparation of the observation, unless it has begun."""
-        preparation, self.preparation = self.preparation, None
-        if preparation is not None:
-            preparation.future.cancel()
+        reserved = self.reserved
+        if isinstance(reserved, ReservedAct) and reserved.preparation is not None:
+            reserved.preparation.future.cancel()
+            reserved.preparation = None
 
     def fail(self, error: VLAgentsError) -> None:
         """Deliver an error, unless the request is over."""

@@ -115,6 +115,13 @@ class SessionFinder(Protocol):
         """
 
 
+class SessionModels(Protocol[M]):
+    """The models that sessions hold: `vlagents_ray.serve.models.model_manager.ModelCache`."""
+
+    def release_model(self, session: Session[M]) -> bool:
+        """Release the model that the session holds; return whether it held one."""
+
+
 class SessionTable(Generic[M]):
     """The sessions of a replica, by id. Thread-safe.
 
@@ -124,16 +131,22 @@ class SessionTable(Generic[M]):
     replica have seen, even if the clocks are wrong.
     """
 
-    def __init__(self, limit: int, idle_s: float, clock: Callable[[], int] = time.time_ns) -> None:
+    def __init__(
+        self,
+        limit: int,
+        idle_s: float,
+        clock: Callable[[], int] = time.time_ns,
+        models: SessionModels[M] | None = None,
+    ) -> None:
         """Create an empty table.
 
         Args:
             limit: Largest number of sessions.
             idle_s: Time without a request after which a session may be dropped, s.
             clock: Wall clock, ns.
+            models: The models that the sessions hold; None if they hold none.
         """
-        # Called with each session that is removed, under the table's lock.
-        self.ended: Callable[[Session[M]], None] = lambda _: None
+        self._models = models
         self._sessions: dict[str, Session[M]] = {}
         self._expected: list[Session[M]] = []  # sessions that are arriving from other replicas
         self.limit = limit
@@ -181,9 +194,9 @@ class SessionTable(Generic[M]):
         session.origin = origin
         return session
 
-    def begin(self, session: Session[M], known: int | None) -> int:
+    def begin(self, session: Session[M], known: int | None, arrived: float) -> int:
         """Draw the step at which the session's next episode begins, above `known`, the step that
-        its client reports.
+        its client reports; the reset `arrived` at that time, s.
         """
         with self._lock:
             before = max(session.version, self._left.get(session.id, (0, 0)))[0]
@@ -191,7 +204,21 @@ class SessionTable(Generic[M]):
                 before = max(before, known)
             self._drawn = max(self._clock(), self._drawn + 1)
             session.expected = max(self._drawn, before + _UNSEEN)
+            session.last_reset = arrived
             return session.expected
+
+    def end_episode(self, session: Session[M], reset: PendingRequest, first: int) -> None:
+        """End the session's episode, since the policy's thread runs a reset, whose episode begins
+        at the step `first`.
+        """
+        with self._lock:
+            session.agent = None
+            session.steps = session.first = first
+            session.moves = 0
+            session.expected = max(session.expected, first)
+            session.began = reset.arrived
+            session.last_reset = max(session.last_reset, reset.arrived)
+            session.resetting = reset
 
     def undo(self, session_id: str, first: int) -> None:
         """Undo `begin` for a reset that was cancelled: the current episode continues, here or at
@@ -204,7 +231,7 @@ class SessionTable(Generic[M]):
             session.expected, session.last_reset = session.first, session.began
             if session.steps == 0:  # the reset was the session's first one here
                 del self._sessions[session_id]
-                self.ended(session)
+                self._end(session)
 
     def is_past(self, session_id: str, first: int) -> bool:
         """Return whether the session has passed an episode that was to begin at that step, here
@@ -244,7 +271,7 @@ class SessionTable(Generic[M]):
             if replaced is None:
                 self.opened += 1
             else:
-                self.ended(replaced)
+                self._end(replaced)
             self._sessions[arriving.id] = arriving
 
     def _require_newer(self, arriving: Session[M]) -> None:
@@ -269,6 +296,12 @@ class SessionTable(Generic[M]):
             if arriving.id not in self._sessions:
                 self.require_allowed(arriving.origin)
             self._expected.append(arriving)
+
+    def abandon(self, arriving: Session[M]) -> None:
+        """End a session that was to arrive from another replica, and will not."""
+        with self._lock:
+            self.forget_expected(arriving)
+            self._end(arriving)
 
     def forget_expected(self, arriving: Session[M]) -> None:
         """Stop counting a session that has arrived, or will not arrive."""
@@ -401,7 +434,13 @@ class SessionTable(Generic[M]):
         session = self._sessions.pop(session_id, None)
         if session is not None:
             self._remember(session_id, left or (session.steps, _ANY))
-            self.ended(session)
+            self._end(session)
+
+    def _end(self, session: Session[M]) -> None:
+        """Mark a session as ended that is removed; the caller holds the lock."""
+        session.over = True
+        if self._models is not None:
+            self._models.release_model(session)
 
     def _remember(self, session_id: str, version: Version) -> None:
         self._left[session_id] = max(version, self._left.pop(session_id, version))
@@ -410,35 +449,52 @@ class SessionTable(Generic[M]):
 
 
 class DrainList:
-    """The connections to move to another replica; each gets the request in its next reply, once.
+    """The connections to move to another replica: all of them if this replica drains, otherwise
+    those that others have room for, each of which gets the request in its next reply, once.
     Thread-safe.
 
-    `vlagents_ray.serve.scaling.rebalancer` selects them.
+    `vlagents_ray.serve.scaling.rebalancer` selects the latter.
     """
 
     def __init__(self) -> None:
+        # Whether the replica will stop. Only `drain` sets it, and nothing resets it.
+        self.draining = False
+        self._lock = threading.Lock()  # held while one of the following is read or changed
         self._marked: set[str] = set()
-        self._asked: dict[str, float] = {}
+        self._asked: dict[str, float] = {}  # time of the request to reconnect, s
+
+    def drain(self) -> None:
+        """Request all clients, in their next replies, to reconnect to other replicas."""
+        self.draining = True
 
     def mark(self, connections: set[str]) -> None:
         """Replace the set of connections requested to reconnect."""
-        self._marked = connections
+        with self._lock:
+            self._marked = connections
 
     def ask(self, connection: str) -> bool:
-        """Return whether the current reply must request a reconnection; if so, record that."""
-        if not self._marked or connection not in self._marked:
+        """Return whether the current reply must request the reconnection of that connection alone;
+        if so, record that.
+        """
+        if not self._marked:  # nearly always, so that an answer takes no lock
             return False
-        self._marked.discard(connection)
-        self._asked[connection] = time.monotonic()
-        return True
+        with self._lock:
+            if connection not in self._marked:
+                return False
+            self._marked.discard(connection)
+            self._asked[connection] = time.monotonic()
+            return True
 
     def asked_within(self, seconds: float) -> set[str]:
         """Return the connections that were requested to reconnect within the last `seconds`."""
         since = time.monotonic() - seconds
-        return {connection for connection, when in list(self._asked.items()) if when >= since}
+        with self._lock:
+            return {connection for connection, when in self._asked.items() if when >= since}
 
     def forget_older(self, seconds: float) -> None:
         """Forget the connections that were requested to reconnect more than `seconds` ago."""
-        lately = self.asked_within(seconds)
-        for connection in list(self._asked.keys() - lately):
-            self._asked.pop(connection, None)
+        since = time.monotonic() - seconds
+        with self._lock:
+            self._asked = {
+                connection: when for connection, when in self._asked.items() if when >= since
+            }

@@ -203,6 +203,11 @@ class ModelWeights:
             session.weights = self.newest if follows else self.pinned
             return session.weights
 
+    def end(self, session: FollowingSession) -> None:
+        """Hold no version for the session any more, since its episode has ended."""
+        with self._lock:
+            session.weights = None
+
     def find(self, number: int, digest: str, *, follows: bool = False) -> WeightsVersion:
         """Return the version for a session from another replica, which acts with that number there.
 
@@ -619,24 +624,38 @@ class HeldVersion:
     values: dict[str, np.ndarray]  # by name, as returned by `portable`
 
 
+class OwnWeights(Protocol):
+    """The models of a replica, as far as their weights are concerned."""
+
+    @property
+    def own_weights(self) -> ModelWeights:
+        """The weights of the deployment's own model; raises `PolicyUnavailable` while it loads."""
+
+
+class AllSessions(Protocol):
+    """The sessions of a replica, as far as their weights are concerned."""
+
+    def all(self) -> Sequence[FollowingSession]:
+        """Return all sessions, without a lock."""
+
+
 class WeightUpdates:
     """Stages and commits new weights in one replica. Thread-safe."""
 
     def __init__(
         self,
-        own: Callable[[], ModelWeights],
-        sessions: Callable[[], Sequence[FollowingSession]],
-        acting: threading.Lock | None = None,
+        models: OwnWeights,
+        sessions: AllSessions,
     ) -> None:
         """Update the weights of a replica.
 
         Args:
-            own: Returns the weights, or raises `PolicyUnavailable` while the policy loads.
-            sessions: Returns the sessions, which act with them.
-            acting: The lock that the policy's thread holds while it runs a batch.
+            models: Has the weights of the deployment's own model.
+            sessions: The sessions, which act with them.
         """
-        self.own, self._sessions = own, sessions
-        self._acting = acting or threading.Lock()
+        self._models, self._sessions = models, sessions
+        # Held while the policy's thread runs a batch, and while the policy sleeps.
+        self.acting_lock = threading.Lock()
         self._resting = threading.RLock()  # held during each step of a rest
         # Those of the policy that sleeps, for which `acting` is held.
         self._asleep: ModelWeights | None = None
@@ -644,17 +663,21 @@ class WeightUpdates:
         # In a child process: those that its replica refers to.
         self._given: dict[int, WeightsVersion] = {}
 
+    def own(self) -> ModelWeights:
+        """Return the weights; raise `PolicyUnavailable` while the policy loads."""
+        return self._models.own_weights
+
     def stage(
         self, number: int, pushed: Mapping[str, Any] | SharedValues, options: PushOptions
     ) -> str:
         """Check and hold a new version, and return its fingerprint, as `ModelWeights.stage`
         does.
         """
-        return self.own().stage(number, pushed, options, self._sessions)
+        return self.own().stage(number, pushed, options, self._sessions.all)
 
     def commit(self, number: int, options: PushOptions) -> None:
         """Use the staged version, as `ModelWeights.commit` does."""
-        self.own().commit(number, options, self._sessions)
+        self.own().commit(number, options, self._sessions.all)
 
     def held(self) -> list[HeldVersion]:
         """Return the pinned and the newest version, the older one first, except for the
@@ -691,21 +714,21 @@ class WeightUpdates:
                 self._asleep.wake()
                 if rest.step == "wake":
                     self._asleep = None
-                    self._acting.release()
+                    self.acting_lock.release()
                     if self._alarm is not None:
                         self._alarm.cancel()
 
     def _sleep(self, own: ModelWeights, rest: Rest) -> None:
         if self._asleep is not None:
             raise Overloaded("sleep: the policy sleeps already; call wake first")
-        self._acting.acquire()
+        self.acting_lock.acquire()
         try:
             own.sleep(offload=rest.offload)
         except BaseException:
             try:
                 own.wake()
             finally:
-                self._acting.release()
+                self.acting_lock.release()
             raise
         self._asleep = own
         self._set_alarm(rest.at_most_s)
@@ -756,7 +779,7 @@ class WeightUpdates:
         two batches.
         """
         if use is not None:
-            self.own().act_with(self.given(use), self._sessions())
+            self.own().act_with(self.given(use), self._sessions.all())
         if forget is not None:
             self._given.pop(forget, None)
 

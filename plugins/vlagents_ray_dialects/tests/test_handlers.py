@@ -45,6 +45,7 @@ from vlagents_ray.serve.endpoints.access_middleware import AccessMiddleware
 from vlagents_ray.serve.endpoints.docs_page import docs_page
 from vlagents_ray.serve.endpoints.http import build_http_app
 from vlagents_ray.serve.engine.engine import Engine
+from vlagents_ray.serve.engine.settings import EngineSettings
 from vlagents_ray.serve.launch.deployment_file import deployment
 from vlagents_ray_dialects.messages import openvla as openvla_codec
 from vlagents_ray_dialects.openvla import OpenVLADialect
@@ -60,7 +61,7 @@ def test_a_replica_that_stops_keeps_no_session_that_nobody_will_ask_for() -> Non
             call(pi, libero(1))
             send(benchmark, "observation", seen(1), 1)
             assert receive(benchmark).kind == "action"
-            engine.drain()
+            engine.drain_list.drain()
             assert client.post("/act", json=body(5)).status_code == 200
             assert len(engine.sessions) == 2
         assert len(engine.sessions) == 0
@@ -198,7 +199,7 @@ def test_a_mapping_that_lacks_what_the_policy_needs_is_refused_at_the_start() ->
 
     with pytest.raises(ConfigError, match=r"dialects.openvla: camera 'wrist'"):
         args.require_fit(Two.contract)
-    engine = Engine(Two(), check=args.require_fit)
+    engine = Engine(Two(), EngineSettings(check=args.require_fit))
     with pytest.raises(PolicyFailed, match="wrist"):
         engine.start()
 

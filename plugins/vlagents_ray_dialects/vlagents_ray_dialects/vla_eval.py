@@ -79,7 +79,7 @@ class VlaEvalDialect(base.RouteDialect):
     async def health(self, _http: HttpRequest) -> Response:
         """Reply whether the policy is ready, like vla-eval's own servers."""
         try:
-            self.context.engine.require_ready()
+            self.context.engine.health.require_ready()
         except VLAgentsError as error:
             return problem_response(error, "", PolicyUnavailable.status)
         return JSONResponse({"status": "ok"})

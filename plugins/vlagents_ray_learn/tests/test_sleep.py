@@ -25,6 +25,7 @@ from vlagents_ray.errors import (
 from vlagents_ray.interface import Act, Agent, Obs
 from vlagents_ray.protocol.messages import Reply, Request
 from vlagents_ray.serve.engine.engine import Engine
+from vlagents_ray.serve.engine.settings import EngineSettings
 from vlagents_ray.weights import trainable
 from vlagents_ray.weights.trainable import portable
 from vlagents_ray_learn import Publisher
@@ -35,7 +36,7 @@ def serving() -> Iterator[Callable[..., Engine]]:
     engines: list[Engine] = []
 
     def serve(agent: Agent, **options: Any) -> Engine:
-        engines.append(Engine(agent, **options))
+        engines.append(Engine(agent, EngineSettings(**options)))
         engines[-1].start()
         assert (
             answered(
@@ -151,7 +152,7 @@ def test_a_replica_that_ends_does_not_wait_for_the_learner(serving: Callable[...
     Publisher(engine).sleep()
     waiting = asked(engine)
     engine.close()
-    assert not engine.alive
+    assert not engine.health.alive
     reply = waiting.get(timeout=30)
     assert reply.act is not None or isinstance(reply.error, PolicyUnavailable)
 

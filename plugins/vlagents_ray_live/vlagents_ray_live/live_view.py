@@ -191,7 +191,7 @@ class ReplicaView:
                 "gpu_memory": engine.models.gpu_memory(),
                 "gpu_ms": engine.stats.gpu_ms,
                 "replays": CudaGraph.replays,
-                "ready": engine.ready,
+                "ready": engine.health.ready,
                 "step": engine.models.step,
                 "session_limit": engine.sessions.limit,
                 "utilisation": round(self._meter.read().utilisation, 3),

@@ -33,6 +33,7 @@ from vlagents_ray.policies.base.accelerator import (
 from vlagents_ray.policies.base.model_inputs import state_vector
 from vlagents_ray.policies.loading import loading_report, report_device
 from vlagents_ray.serve.engine.engine import Engine
+from vlagents_ray.serve.engine.settings import EngineSettings
 
 pytestmark = pytest.mark.torch
 
@@ -471,7 +472,7 @@ def test_one_row_that_does_not_fit_is_an_error_and_counted(monkeypatch: pytest.M
         with pytest.raises(torch.OutOfMemoryError):
             acted(policy, 3)
         assert engine.stats.collect().out_of_memory == 2
-        engine.check_health()
+        engine.health.check()
     finally:
         engine.close()
 
@@ -489,8 +490,8 @@ def test_the_time_of_a_batch_on_the_gpu_is_reported_at_the_next_one(
 
     monkeypatch.setattr(Crowded, "predict", predicted)
     policy = Crowded.from_config({"checkpoint": "none", "max_rows": 3})
-    engine = Engine(policy)
-    engine.start(threaded=False)
+    engine = Engine(policy, EngineSettings(threaded=False))
+    engine.start()
     assert engine.stats.gpu_ms is None, "of the start"
     for rows in (1, 3):
         acted(policy, rows)

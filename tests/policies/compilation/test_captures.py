@@ -592,11 +592,11 @@ def test_a_model_on_a_gpu_acts_from_graphs_in_less_memory_and_until_the_gpu_fail
         cuda.most_rows = 2
         assert actions(act(4)) == alone
         assert policy.most_rows == 2
-        engine.check_health()
+        engine.health.check()
         cuda.fail()
         assert all(isinstance(reply.error, PolicyFailed) for reply in act(4))
         with pytest.raises(PolicyUnavailable, match="device-side assert"):
-            engine.check_health()
+            engine.health.check()
     finally:
         engine.close()
 

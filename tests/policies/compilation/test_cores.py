@@ -31,6 +31,7 @@ from vlagents_ray.policies.base.model_inputs import state_vector
 from vlagents_ray.policies.compilation import Compilation, keep_jax_programs, keep_torch_programs
 from vlagents_ray.policies.loading import LoadingReport, loading_report
 from vlagents_ray.serve.engine.engine import Engine
+from vlagents_ray.serve.engine.settings import EngineSettings
 
 pytestmark = pytest.mark.torch
 
@@ -206,7 +207,7 @@ def test_the_sizes_are_those_of_the_deployments_batches_unless_the_settings_name
     compiler: CountingCompiler, batch: dict[str, Any], own: list[int] | None, sizes: list[int]
 ) -> None:
     policy = Linear.from_config({"checkpoint": "none", "compile": "require", "batch_sizes": own})
-    with contextlib.closing(Engine(policy, **batch)) as engine:
+    with contextlib.closing(Engine(policy, EngineSettings(**batch))) as engine:
         engine.start()
         assert (policy.compilation.sizes, policy.config.batch_sizes) == (sizes, sizes)
         assert sorted(compiler.rows) == sizes
@@ -214,7 +215,7 @@ def test_the_sizes_are_those_of_the_deployments_batches_unless_the_settings_name
 
 def test_a_policy_that_is_not_compiled_keeps_any_size_in_a_server() -> None:
     policy = Linear.from_config({"checkpoint": "none"})
-    with contextlib.closing(Engine(policy, max_batch_size=6)) as engine:
+    with contextlib.closing(Engine(policy, EngineSettings(max_batch_size=6))) as engine:
         engine.start()
         assert policy.config.batch_sizes is None
 

@@ -43,11 +43,12 @@ from vlagents_ray.serve.access.api_keys import Caller, NoKey
 from vlagents_ray.serve.endpoints.shm import ShmServer
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.engine.sender import REFUSALS
+from vlagents_ray.serve.engine.settings import EngineSettings
 
 
 @pytest.fixture
 def served() -> Iterator[tuple[Engine, ShmServer]]:
-    engine = Engine(Keeper(), session_limit=50)
+    engine = Engine(Keeper(), EngineSettings(session_limit=50))
     endpoint = ShmServer(engine, LIMITS, NoKey.OPEN)
     endpoint.open()
     engine.start()

@@ -28,6 +28,7 @@ from vlagents_ray.serve.access.api_keys import NoKey
 from vlagents_ray.serve.endpoints import websocket
 from vlagents_ray.serve.endpoints.websocket import WebSocketServer
 from vlagents_ray.serve.engine.engine import Engine
+from vlagents_ray.serve.engine.settings import EngineSettings
 
 BASE = urlsplit("http://127.0.0.1")
 
@@ -44,7 +45,7 @@ class Echo(Agent):
 
 @pytest.fixture
 def endpoint() -> Iterator[WebSocketServer]:
-    engine = Engine(Echo(), session_limit=3)
+    engine = Engine(Echo(), EngineSettings(session_limit=3))
     endpoint = WebSocketServer(engine, MessageLimits(), "127.0.0.1", None, NoKey.OPEN)
     endpoint.open()
     engine.start()

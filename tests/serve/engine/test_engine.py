@@ -238,7 +238,7 @@ def test_a_loading_policy_is_unavailable_and_a_broken_one_says_why() -> None:
 
     engine = Engine(Broken())
     with pytest.raises(PolicyUnavailable):
-        engine.require_ready()
+        engine.health.require_ready()
     with pytest.raises(PolicyFailed, match=r"no such checkpoint \(test_engine.py:\d+\)$"):
         engine.start()
     # No path leaves it.

@@ -149,7 +149,7 @@ def test_a_connection_acts_without_a_step_in_an_episode_that_had_begun_when_it_w
     [withdrawn] = send(
         served.sender("other", connected=False), [Request("reset", Obs())], lambda _: None
     )
-    served.engine.withdraw(withdrawn)
+    served.engine.intake.withdraw(withdrawn)
     act = served.put(new, "act", session="other")
     served.go_on()
     assert act.get(timeout=10)[0].error is None
@@ -198,7 +198,7 @@ def test_closing_answers_everyone_and_so_does_a_deadline_that_passes_in_the_queu
     Gated.gate.set()
     closer.join(10)
     assert running.get(timeout=10)[0].error is None
-    assert not served.engine.alive
+    assert not served.engine.health.alive
     assert isinstance(
         served.put(other, "act").get(timeout=10)[0].error, PolicyUnavailable | PolicyFailed
     )
@@ -210,7 +210,7 @@ def test_a_connection_to_a_draining_replica_leaves_its_sessions_to_another_one(
 ) -> None:
     other = served.sender("other")
     served.ask(other, "reset")
-    served.engine.drain()
+    served.engine.drain_list.drain()
     other.release(for_good=for_good)
     assert ("other" in served.engine.sessions) is not for_good
 
@@ -360,11 +360,11 @@ def test_no_request_is_executed_of_which_a_deadline_said_that_it_never_will_be(
     policy.executed.clear()
     owner, method = {
         "take": (engine.queue, "take"),
-        "run": (engine, "_run"),
+        "run": (engine.runner, "_run"),
         "hold": (engine.models, "hold"),
-        "begin_episode": (engine, "_begin_episode"),
-        "ready": (engine, "_ready"),
-        "act": (engine, "_act"),
+        "begin_episode": (engine.runner, "_begin_episode"),
+        "ready": (engine.runner, "_ready"),
+        "act": (engine.runner, "_act"),
     }[step]
     original = getattr(owner, method)
     sent: list[PendingRequest] = []
@@ -373,7 +373,7 @@ def test_no_request_is_executed_of_which_a_deadline_said_that_it_never_will_be(
 
     def late(*arguments: object) -> object:
         if queued.wait(10) and not said_never:  # as `Sender._expire` does, on another thread
-            engine.withdraw(*sent)
+            engine.intake.withdraw(*sent)
             said_never.append(not sent[0].begun)
         return original(*arguments)
 

@@ -35,6 +35,7 @@ from vlagents_ray.errors import (
 from vlagents_ray.policies.loading import loading_report
 from vlagents_ray.protocol.messages import Reply, Request
 from vlagents_ray.serve.engine.engine import Engine
+from vlagents_ray.serve.engine.settings import EngineSettings
 from vlagents_ray.serve.python_env.child_agent import Child, ChildAgent
 from vlagents_ray.serve.python_env.child_main import Settings
 from vlagents_ray.serve.queue.call_limits import CallLimits
@@ -55,7 +56,7 @@ def agent(policy: str = "Telling", **config: Any) -> ChildAgent:
 
 @pytest.fixture(scope="module")
 def engine() -> Iterator[Engine]:
-    engine = Engine(agent(), session_limit=100)
+    engine = Engine(agent(), EngineSettings(session_limit=100))
     engine.start()
     yield engine
     engine.close()
@@ -139,7 +140,7 @@ def test_the_policy_runs_in_another_process_with_its_variables_and_this_ones_dev
 
 
 def test_one_that_hangs_is_noticed_and_keeps_nobody_waiting() -> None:
-    one = Engine(agent(), limits=CallLimits(act_s=0.2, warm_up_s=0.2))
+    one = Engine(agent(), EngineSettings(limits=CallLimits(act_s=0.2, warm_up_s=0.2)))
     one.start()
     pid = info(ask(one, "a", "reset"))["pid"]
     assert one.ready

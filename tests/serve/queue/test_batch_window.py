@@ -11,7 +11,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import pytest
-from in_flight import pending
+from in_flight import AnySession, pending
 
 from vlagents_ray.protocol.messages import Op, Priority, Request
 from vlagents_ray.serve.queue.batch_window import BatchCost, BatchWindow
@@ -39,6 +39,13 @@ def ticket(
     return one
 
 
+class AllButClosed(AnySession):
+    """A table in which every session exists, except "closed"."""
+
+    def __contains__(self, session_id: object) -> bool:
+        return session_id != "closed"
+
+
 @dataclass
 class World:
     """Clients that come back so long after each answer, a policy, and the queue between them."""
@@ -54,7 +61,7 @@ class World:
 
     def run(self, batches: int) -> World:
         returning, waiting, now, took = (
-            BatchWindow(self.patience, SIZE, lambda _: True),
+            BatchWindow(self.patience, SIZE, AnySession()),
             FairQueue(),
             0.0,
             0.0,
@@ -185,7 +192,7 @@ def answered_together(
     *names: str, patience: float = 0.1, robots: str = "", back_s: float = 0.002
 ) -> tuple[BatchWindow, FairQueue]:
     """Three batches of 100 ms, the last over at 2.0; in between all were back after `back_s`."""
-    returning = BatchWindow(patience, SIZE, lambda name: name != "closed")
+    returning = BatchWindow(patience, SIZE, AllButClosed())
     priorities = {name: Priority.ROBOT if name in robots else Priority.SIMULATION for name in names}
     tickets = [ticket(name, 0.0, priorities[name]) for name in names]
     for end in (0.0, 1.0, 2.0):  # the first shows that the policy is slow

@@ -28,6 +28,7 @@ from vlagents_ray.serve.access.api_keys import NoKey
 from vlagents_ray.serve.endpoints.http import build_http_app
 from vlagents_ray.serve.endpoints.shm import ShmServer
 from vlagents_ray.serve.engine.engine import Engine
+from vlagents_ray.serve.engine.settings import EngineSettings
 from vlagents_ray.serve.queue.call_limits import (
     FAILED_BATCHES,
     LOAD,
@@ -84,7 +85,7 @@ def clock() -> Clock:
 
 @pytest.fixture
 def engine(agent: Hanging, clock: Clock) -> Iterator[Engine]:
-    engine = Engine(agent, limits=LIMITS)
+    engine = Engine(agent, EngineSettings(limits=LIMITS))
     engine.calls.clock = clock
     engine.start()
     yield engine
@@ -130,15 +131,15 @@ def test_a_call_over_its_limit_is_unhealthy_those_who_wait_for_it_are_answered_a
     begun, behind = hang(engine, op), put(engine, "good", "act")
     clock.now += 9.9
     engine.notice_hung()
-    assert engine.ready
+    assert engine.health.ready
     assert begun.empty()
     assert behind.empty()
     clock.now += 0.2
-    assert not engine.ready
+    assert not engine.health.ready
     with pytest.raises(
         PolicyUnavailable, match=rf"not returned from '{op}' for 10.1 s; its limit is 10 s"
     ):
-        engine.check_health()
+        engine.health.check()
     engine.notice_hung()
     engine.notice_hung()
     # Not to be repeated elsewhere, where it would hang as well; unlike what had not begun.
@@ -156,7 +157,7 @@ def test_a_call_over_its_limit_is_unhealthy_those_who_wait_for_it_are_answered_a
     agent.over.set()
     wait_for(lambda: not engine.calls.under_way)
     engine.notice_hung()
-    assert engine.ready
+    assert engine.health.ready
     assert "has returned" in caplog.text
     ask(engine, "good", "act")
     assert begun.empty()
@@ -165,7 +166,7 @@ def test_a_call_over_its_limit_is_unhealthy_those_who_wait_for_it_are_answered_a
 def test_every_batch_size_may_compile_where_batches_have_fixed_sizes(
     agent: Hanging, clock: Clock
 ) -> None:
-    engine = Engine(agent, limits=LIMITS, batch_sizes=[1, 2], max_batch_size=2)
+    engine = Engine(agent, EngineSettings(limits=LIMITS, batch_sizes=[1, 2], max_batch_size=2))
     engine.calls.clock = clock
     engine.start()
     hang(engine, "act")
@@ -194,11 +195,11 @@ def test_a_policy_that_never_loads_has_failed() -> None:
             self.over.wait(60)
 
     agent = Loading()
-    engine = Engine(agent, limits=CallLimits(load_s=0.05))
+    engine = Engine(agent, EngineSettings(limits=CallLimits(load_s=0.05)))
     with pytest.raises(PolicyFailed, match=r"not loaded within 0.05 s"):
         engine.start()
     with pytest.raises(PolicyFailed, match="did not load"):
-        engine.check_health()
+        engine.health.check()
     agent.over.set()
 
 
@@ -355,13 +356,13 @@ def test_a_replica_whose_accelerator_failed_is_not_healthy_and_sends_its_clients
 ) -> None:
     engine, policy, ask = failing
     assert ask("reset") is None
-    engine.check_health()
+    engine.health.check()
     policy.errors[op] = RuntimeError(f"{ASSERT}\nmore")
     assert isinstance(ask(op.removesuffix("_batch")), PolicyFailed)
     policy.errors.clear()
     with pytest.raises(PolicyUnavailable, match=ASSERT):
-        engine.check_health()
-    assert not engine.ready
+        engine.health.check()
+    assert not engine.health.ready
     for later in ("reset", "act"):
         with pytest.raises(PolicyUnavailable, match="begins again at another one"):
             ask(later)
@@ -375,13 +376,13 @@ def test_a_replica_all_of_whose_batches_fail_is_not_healthy_until_one_does_not(
     assert ask("reset") is None
     policy.errors[op] = ZeroDivisionError("of the policy")
     for _ in range(FAILED_BATCHES):
-        engine.check_health()
+        engine.health.check()
         assert isinstance(ask("act"), PolicyFailed)
     with pytest.raises(PolicyFailed, match=f"the last {FAILED_BATCHES} batches failed as a whole"):
-        engine.check_health()
+        engine.health.check()
     policy.errors.clear()
     assert ask("act") is None
-    engine.check_health()
+    engine.health.check()
 
 
 @pytest.mark.parametrize(
@@ -400,4 +401,4 @@ def test_what_another_replica_could_not_do_better_leaves_a_replica_healthy(
     policy.errors["act"] = error
     rounds = 1 if isinstance(error, RuntimeError) else FAILED_BATCHES + 1
     assert all(ask("act") is not None for _ in range(rounds))
-    engine.check_health()
+    engine.health.check()

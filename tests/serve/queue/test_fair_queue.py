@@ -11,7 +11,7 @@ import pytest
 from gain_policies import Gain
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from in_flight import ignore, message_of_one, pending, send
+from in_flight import AnySession, ignore, message_of_one, pending, send
 from in_memory_keys import ChangingKeys
 
 from vlagents_ray.errors import PolicyUnavailable
@@ -79,7 +79,7 @@ def test_keys_with_equal_names_of_sessions_have_turns_of_their_own(
         for request in requests:
             waiting.add(request)
 
-    engine.submit = submit  # type: ignore[method-assign]
+    engine.intake.submit = submit  # type: ignore[method-assign]
     tokens = {key: keys.add(key) for key in ("other", "own")}
 
     def act(key: str, session: str) -> None:
@@ -181,7 +181,7 @@ def queue() -> Iterator[Callable[[int], BatchQueue]]:
     made: list[BatchQueue] = []
 
     def make(max_batch_size: int) -> BatchQueue:
-        made.append(BatchQueue(max_batch_size))
+        made.append(BatchQueue(max_batch_size, sessions=AnySession()))
         made[-1].bind()
         return made[-1]
 
@@ -226,7 +226,7 @@ def test_who_waits_when_it_closes_is_given_back(queue: Callable[[int], BatchQueu
 
 
 def test_the_time_spent_waiting_for_requests_counts_as_idle() -> None:
-    quiet = BatchQueue(1, idle_s=0.05)
+    quiet = BatchQueue(1, sessions=AnySession(), idle_s=0.05)
     quiet.bind()
     before_s, began = quiet.load_s()[0], time.perf_counter()
     assert quiet.next() == ([], []), "its thread is told that nothing came for long"

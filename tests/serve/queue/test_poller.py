@@ -18,6 +18,7 @@ from process_resources import descriptors, running_threads
 from vlagents_ray.interface import Act, Agent, Obs
 from vlagents_ray.protocol.messages import PriorityName, Reply, Request
 from vlagents_ray.serve.engine.engine import Engine
+from vlagents_ray.serve.engine.settings import EngineSettings
 from vlagents_ray.serve.queue.poller import Poller
 
 SLOW_S = 0.02  # a batch at least, so that the queue takes the policy for a slow one
@@ -53,7 +54,7 @@ class Slow:
         self.open.set()
         self.busy = threading.Event()
         self.answered_by: dict[str, str] = {}  # the thread, by session
-        self.engine = Engine(_Policy(self), max_batch_size=size, patience=patience)
+        self.engine = Engine(_Policy(self), EngineSettings(max_batch_size=size, patience=patience))
         self.queue = self.engine.queue
 
     def start(self) -> None:
@@ -72,7 +73,7 @@ class Slow:
 
             return note
 
-        self.engine.submit(
+        self.engine.intake.submit(
             [
                 pending(s, Request("act", Obs(info={"name": s}), priority=priority), done(s))
                 for s in sessions
@@ -111,7 +112,7 @@ def slow() -> Iterator[Callable[..., Slow]]:
     for one in made:
         one.open.set()
         one.engine.close()
-        assert not one.engine.alive
+        assert not one.engine.health.alive
 
 
 def test_messages_are_heard_beside_a_batch_and_never_on_two_threads_at_once(

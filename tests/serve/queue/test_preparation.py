@@ -19,6 +19,7 @@ from vlagents_ray.errors import PolicyFailed, PolicyUnavailable
 from vlagents_ray.interface import Act, Agent, Obs
 from vlagents_ray.protocol.messages import Reply, Request
 from vlagents_ray.serve.engine.engine import Engine
+from vlagents_ray.serve.engine.settings import EngineSettings
 
 Answer = queue.SimpleQueue[Reply]
 
@@ -58,7 +59,7 @@ class Serving:
 
     def __init__(self, sessions: int) -> None:
         self.agent = Preparing()
-        self.engine = Engine(self.agent, max_batch_size=32)
+        self.engine = Engine(self.agent, EngineSettings(max_batch_size=32))
         self.engine.start()
         self.names = [f"s{number}" for number in range(sessions)]
         for name in self.names:

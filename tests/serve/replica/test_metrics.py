@@ -10,6 +10,7 @@ import pytest
 from vlagents_ray.policies.compilation import CudaGraph
 from vlagents_ray.policies.noop import Noop
 from vlagents_ray.serve.engine.engine import Engine
+from vlagents_ray.serve.engine.settings import EngineSettings
 from vlagents_ray.serve.replica import metrics
 from vlagents_ray.serve.replica.metrics import Exporter
 
@@ -24,8 +25,8 @@ def test_the_series_of_a_gpu_have_values_only_with_one(monkeypatch: pytest.Monke
         return SimpleNamespace(set=write, inc=write, observe=write)
 
     monkeypatch.setattr(metrics, "series", series)
-    engine = Engine(Noop.from_config({}))
-    engine.start(threaded=False)
+    engine = Engine(Noop.from_config({}), EngineSettings(threaded=False))
+    engine.start()
     exporter = Exporter(engine, {})
     engine.stats.enable()
     monkeypatch.setattr(CudaGraph, "replays", 0)

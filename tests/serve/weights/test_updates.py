@@ -263,16 +263,16 @@ def test_a_moved_session_goes_on_with_its_version_and_not_where_that_is_missing(
     state = here.ask("a", Request("export")).info
     assert state is not None
     with pytest.raises(UnknownSession, match="version 1 of the weights"):
-        there.engine.adopt("a", state)  # nobody acts with it there
+        there.engine.moves.adopt("a", state)  # nobody acts with it there
     for one in (here, there):
         one.push(3)
     here.reset("a")
     state = here.ask("a", Request("export")).info
     assert state is not None
-    there.engine.adopt("a", state)
+    there.engine.moves.adopt("a", state)
     assert there.act("a") == (3, 3.0)
     with pytest.raises(UnknownSession, match="version 3 of the weights"):
-        without.engine.adopt("a", state)
+        without.engine.moves.adopt("a", state)
 
 
 def test_versions_that_nobody_acts_with_are_freed(serving: Callable[..., Engine]) -> None:

@@ -390,7 +390,7 @@ async def accept_or_refuse(websocket: WebSocket, context: ReplicaContext) -> boo
     replica is full.
     """
     try:
-        context.engine.require_ready()
+        context.engine.health.require_ready()
         sessions = context.engine.sessions
         if len(sessions) >= sessions.limit:
             raise sessions.full()
@@ -610,7 +610,7 @@ class HttpDialect(RouteDialect):
             self.context.limits, priority=self.config.priority
         )
         try:
-            self.context.engine.require_ready()
+            self.context.engine.health.require_ready()
             body = await read_body(http, admission)
             message.arrive()
             theirs = await decoded(read, body, admission)

@@ -93,7 +93,9 @@ class _HttpEndpoint:
         needs no key.
         """
         try:
-            ready = await asyncio.wait_for(asyncio.to_thread(lambda: self.engine.ready), _HEALTH_S)
+            ready = await asyncio.wait_for(
+                asyncio.to_thread(lambda: self.engine.health.ready), _HEALTH_S
+            )
         except asyncio.TimeoutError:  # the policy's own check hangs
             ready = False
         if ready:
@@ -108,7 +110,7 @@ class _HttpEndpoint:
     async def show_metadata(self, http: HttpRequest) -> Response:
         """Reply with the metadata, or with those for a caller on the machine that it names."""
         machine = http.headers.get(messages.MACHINE_HEADER)
-        if machine and self.machine_metadata is not None and self.engine.ready:
+        if machine and self.machine_metadata is not None and self.engine.health.ready:
             return JSONResponse(plain_values(await self.machine_metadata(machine)))
         return self._when_ready(http, lambda: JSONResponse(plain_values(self.metadata())))
 
@@ -120,7 +122,7 @@ class _HttpEndpoint:
 
     def _when_ready(self, http: HttpRequest, answer: Callable[[], Response]) -> Response:
         try:
-            self.engine.require_ready()
+            self.engine.health.require_ready()
         except VLAgentsError as error:
             return http_messages.problem_response(error, http_messages.request_id(http), 503)
         return answer()

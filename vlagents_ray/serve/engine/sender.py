@@ -233,9 +233,9 @@ class Sender:
             for pending in sent:
                 pending.fail(overloaded)
         elif self._caller is None:
-            engine.submit(sent)
+            engine.intake.submit(sent)
         else:
-            engine.submit(
+            engine.intake.submit(
                 self._admitted(self._caller, sent, admission is not None or self._counted)
             )
 
@@ -276,7 +276,7 @@ class Sender:
         engine = self._engine
         if engine.drain_list.ask(self.session_id):
             self._asked_to_reconnect = True
-        if self._asked_to_reconnect or engine.draining:
+        if self._asked_to_reconnect or engine.drain_list.draining:
             for reply in message.replies:
                 # The client reconnects, and its sessions move to another replica.
                 reply.draining = True
@@ -315,7 +315,7 @@ class Sender:
         finally:
             unanswered = [pending for pending in sent if not pending.over]
             if unanswered:
-                self._engine.withdraw(*unanswered)
+                self._engine.intake.withdraw(*unanswered)
             if timer is not None:
                 timer.cancel()
 
@@ -323,7 +323,7 @@ class Sender:
         """Answer the unanswered requests, whose deadlines have passed; withdraw those that have
         not begun.
         """
-        self._engine.withdraw(*sent)
+        self._engine.intake.withdraw(*sent)
         for pending in sent:
             after = f"no action within {pending.request.deadline_ms:g} ms"
             late: VLAgentsError = DeadlineExceeded(f"{after}: not acted on, and never will be")
@@ -346,7 +346,9 @@ class Sender:
         """
         self._origin.ended = True
         owner = self._origin.owner
-        if owner and (for_good or not (self._asked_to_reconnect or self._engine.draining)):
+        if owner and (
+            for_good or not (self._asked_to_reconnect or self._engine.drain_list.draining)
+        ):
             # The sessions are copied, since a migrator's thread may add one.
             self._engine.sessions.close_owned(owner, tuple(self._origin.sessions))
 

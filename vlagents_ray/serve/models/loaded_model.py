@@ -12,7 +12,7 @@ from collections.abc import Callable, Hashable, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 from functools import partial
-from typing import Any
+from typing import Any, Protocol
 
 from vlagents_ray.contract import Contract, require_match
 from vlagents_ray.errors import UnknownSession
@@ -218,6 +218,16 @@ class LoadedModel:
             self.busy.release()
 
 
+class ModelStats(Protocol):
+    """Records what models report while they act: the `MetricsBuffer` of an engine."""
+
+    def out_of_memory(self) -> None:
+        """Record a forward pass that did not fit into the accelerator's memory."""
+
+    def gpu(self, took_ms: float) -> None:
+        """Record the time of a forward pass on the GPU."""
+
+
 class Loader:
     """Loads models from settings."""
 
@@ -229,25 +239,29 @@ class Loader:
         max_batch_size: int,
         check: Callable[[Contract | None], None],
         calls: PolicyCalls,
+        stats: ModelStats,
     ) -> None:
-        """Create the loader; its arguments are described at `Engine`."""
+        """Create the loader; `stats` records what the models report, and the other arguments are
+        described at `EngineSettings`.
+        """
         self._source, self._version, self._batch_sizes = source, version, batch_sizes
         self._compiled_sizes = batch_sizes or powers_up_to(max_batch_size)
-        self._check, self._calls = check, calls
-        # Called with each step of a long load.
-        self.on_progress: Callable[[str], None] = lambda _: None
-        # Called each time that a model runs out of memory.
-        self.on_out_of_memory: Callable[[], None] = lambda: None
-        # Called with the time of forward passes on a GPU.
-        self.on_gpu_ms: Callable[[float], None] = lambda _: None
+        self._check, self._calls, self._stats = check, calls, stats
 
     def load(
-        self, choice: CheckpointChoice, settings: dict[str, Any], agent: Agent | None = None
+        self,
+        choice: CheckpointChoice,
+        settings: dict[str, Any],
+        on_progress: Callable[[str], None],
+        agent: Agent | None = None,
     ) -> LoadedModel:
         """Load a model into `agent`, by default a new one; the agent is closed if it cannot be
         served.
 
         Args:
+            choice: The choice to load it for.
+            settings: The settings of the agent.
+            on_progress: Called with each step of a long load.
             agent: An agent created from the `settings`, but not initialized yet.
 
         Raises:
@@ -255,17 +269,21 @@ class Loader:
                 its contract.
         """
         with PolicyCall(self._calls, LOAD):
-            return self._load(choice, settings, agent)
+            return self._load(choice, settings, on_progress, agent)
 
     def _load(
-        self, choice: CheckpointChoice, settings: dict[str, Any], agent: Agent | None
+        self,
+        choice: CheckpointChoice,
+        settings: dict[str, Any],
+        on_progress: Callable[[str], None],
+        agent: Agent | None,
     ) -> LoadedModel:
         agent = agent or self._source.make(settings)
         try:
             with (
                 used_checkpoints() as checkpoints,
                 loading_report(
-                    self.on_progress, self._compiled_sizes, self.on_out_of_memory, self.on_gpu_ms
+                    on_progress, self._compiled_sizes, self._stats.out_of_memory, self._stats.gpu
                 ) as report,
             ):
                 agent.initialize()

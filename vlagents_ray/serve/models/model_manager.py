@@ -84,7 +84,7 @@ class EvictTask:
 class ModelCache:
     """The eviction policy: the loaded models, the sessions that wait for others, and the next task.
 
-    It uses no threads; the lock of `ModelManager` guards all calls. If all slots are in use:
+    It uses no threads; its lock `changed` guards all calls. If all slots are in use:
 
     - The least recently used checkpoint without a session is evicted.
     - If all have sessions, the waiting sessions wait for episodes to end. After `PATIENCE_S`, the
@@ -93,7 +93,9 @@ class ModelCache:
       worth loading.
     """
 
-    def __init__(self, source: Checkpoints, fits: Callable[[int], bool] = lambda _: True) -> None:
+    def __init__(self, source: Checkpoints) -> None:
+        # Held during all calls, and notified after changes.
+        self.changed = threading.Condition()
         self.config = source.config  # the deployment's own settings in effect
         self.next: dict[str, Any] | None = None  # settings to swap to
         self.failure: str | None = None  # error of the last swap
@@ -101,7 +103,7 @@ class ModelCache:
         self.loaded: dict[str, LoadedModel] = {}
         self.waiting: list[Waiter] = []  # waiting sessions in order of arrival
         self.draining = ""  # key of the model that accepts no more episodes before its eviction
-        self._source, self._fits = source, fits  # whether one more fits beside so many
+        self._source = source
 
     def describe(self) -> dict[str, Any]:
         """Return the available choices, the loaded checkpoints and the state of the last swap,
@@ -136,7 +138,7 @@ class ModelCache:
 
     def assign(self, session: Session[LoadedModel], model: LoadedModel) -> LoadedModel:
         """Assign the model to the session, in place of any other, and return the model."""
-        self.release_model(session)
+        self._take_model(session)
         # The most recently used model is the last one.
         self.loaded[model.key] = self.loaded.pop(model.key)
         session.model = model
@@ -144,7 +146,16 @@ class ModelCache:
         return model
 
     def release_model(self, session: Session[LoadedModel]) -> bool:
-        """Release the model that the session holds; return whether it held one."""
+        """Release the model that the session holds, and return whether it held one; may be called
+        without the lock.
+        """
+        with self.changed:
+            held = self._take_model(session)
+            if held:
+                self.changed.notify_all()
+            return held
+
+    def _take_model(self, session: Session[LoadedModel]) -> bool:
         model, session.model = session.model, None
         if model is not None:
             model.sessions -= 1
@@ -180,8 +191,11 @@ class ModelCache:
             due.append((waiter.on_loaded, error))
         return due
 
-    def plan(self) -> LoadTask | EvictTask | None:
-        """Return the next task, or None; also decides which model is `draining`."""
+    def plan(self, fits: Callable[[int], bool]) -> LoadTask | EvictTask | None:
+        """Return the next task, or None; also decides which model is `draining`.
+
+        `fits` returns whether one more model fits into memory beside so many.
+        """
         self.draining = ""
         idle = [model for model in self.loaded.values() if not model.sessions]
         for model in idle:
@@ -195,7 +209,7 @@ class ModelCache:
 
         limit = self._source.limit
         if len(self.loaded) < limit:
-            if self._fits(len(self.loaded)):
+            if fits(len(self.loaded)):
                 return task
             limit = len(self.loaded)
 
@@ -249,10 +263,21 @@ class ModelManager:
     """
 
     def __init__(
-        self, source: Checkpoints, loader: Loader, sessions: SessionTable[LoadedModel]
+        self,
+        source: Checkpoints,
+        loader: Loader,
+        cache: ModelCache,
+        sessions: SessionTable[LoadedModel],
+        on_step: Callable[[str], None] | None = None,
     ) -> None:
-        """Manage the models of a replica; the `sessions` of a model that is evicted at once are
-        closed.
+        """Manage the models of a replica.
+
+        Args:
+            source: The checkpoints that may be loaded.
+            loader: Loads them.
+            cache: The loaded models, which the sessions release when they end.
+            sessions: The sessions; those of a model that is evicted at once are closed.
+            on_step: Called with each step of a long first load, on the loading thread.
         """
         # Whether chunks of the deployment's own model continue the executed plan.
         self.continues_plans = False
@@ -263,16 +288,13 @@ class ModelManager:
         self.devices: list[dict[str, Any]] = []  # devices of that model
         self.files: Program = {}  # digests of the files named in the settings of that model
         self.step = ""  # the step of a long first load, such as "compiling 4 rows (3 of 5)"
-        # Called with `step`, on the loading thread.
-        self.on_step: Callable[[str], None] = lambda _: None
+        self._on_step = on_step
         self._source, self._loader = source, loader
-        loader.on_progress = self._set_step
         self._sessions = sessions
         self._first: Agent | None = None
         self._fingerprint = ""
-        self._cache = ModelCache(source, self._fits)
+        self._cache, self._changed = cache, cache.changed
         self._begun = self._loaded = self._closed = self._full = False
-        self._changed = threading.Condition()
         self._thread = threading.Thread(target=self._loop, name="checkpoints", daemon=True)
 
     @property
@@ -300,7 +322,7 @@ class ModelManager:
         """
         self._begun = True
         first, self._first = self._first, None
-        model = self._loader.load(DEFAULT, self.config, first)
+        model = self._loader.load(DEFAULT, self.config, self._set_step, first)
         with self._changed:
             self._cache.loaded[model.key] = model
             self._set_own_model(model)
@@ -423,7 +445,7 @@ class ModelManager:
         """
         with self._changed:
             self._require_open()
-            self.release_model(session)
+            self._cache.release_model(session)
 
             model = self._cache.free(choice)
             if model is not None and not session.over:
@@ -474,15 +496,7 @@ class ModelManager:
 
     def release_model(self, session: Session[LoadedModel]) -> None:
         """Release the model of a session that has no episode."""
-        with self._changed:
-            if self._cache.release_model(session):
-                self._changed.notify_all()
-
-    def release(self, session: Session[LoadedModel]) -> None:
-        """Release the model of a session that has ended."""
-        with self._changed:
-            session.over = True
-            self.release_model(session)
+        self._cache.release_model(session)
 
     def _require_open(self) -> None:
         if self._closed:
@@ -499,7 +513,8 @@ class ModelManager:
     def _set_step(self, step: str) -> None:
         if not self._loaded:
             self.step = step
-            self.on_step(step)
+            if self._on_step is not None:
+                self._on_step(step)
 
     def _set_own_model(self, model: LoadedModel) -> None:
         self.contract, self._fingerprint = model.contract, model.version[1]
@@ -535,7 +550,7 @@ class ModelManager:
                     return due
 
                 draining = self._cache.draining
-                task = self._cache.plan()
+                task = self._cache.plan(self._fits)
                 if task is not None:
                     return task
                 if self._cache.draining == draining:
@@ -546,7 +561,7 @@ class ModelManager:
         begun = time.monotonic()
         try:
             with beside_acts(None):
-                model = self._loader.load(task.choice, task.settings)
+                model = self._loader.load(task.choice, task.settings, self._set_step)
         except BaseException as error:
             logger.exception("%s did not load", task.choice)
             failure = (

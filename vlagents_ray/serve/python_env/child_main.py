@@ -38,6 +38,7 @@ from vlagents_ray.protocol.messages import INNER_OPS, MessageLimits
 from vlagents_ray.serve.access.api_keys import NoKey
 from vlagents_ray.serve.endpoints.shm import ShmServer
 from vlagents_ray.serve.engine.engine import Engine
+from vlagents_ray.serve.engine.settings import EngineSettings
 from vlagents_ray.serve.python_env.child_start import die_with_parent, own_stdout
 from vlagents_ray.serve.queue.call_limits import CallLimits
 from vlagents_ray.serve.weights import PushOptions, WeightUpdates
@@ -108,8 +109,7 @@ def run() -> None:
 
     try:
         agent = build_agent(settings.policy, settings.config, settings.wrappers)
-        engine = Engine(
-            agent,
+        engine_settings = EngineSettings(
             max_batch_size=settings.batch,
             session_limit=sys.maxsize,
             session_idle_s=_NEVER_S,
@@ -118,9 +118,9 @@ def run() -> None:
             reply_bytes=MessageLimits().body_bytes,  # the replica applies its own limit
             in_flight_bytes=_NO_LIMITS.in_flight_bytes,
         )
+        engine = Engine(agent, engine_settings, on_step=report_step)
         server = ShmServer(engine, _NO_LIMITS, NoKey.INSIDE, INNER_OPS)
         server.open()
-        engine.models.on_step = report_step
         engine.start()
     except Exception as error:
         logging.getLogger(__name__).exception("the policy did not load")

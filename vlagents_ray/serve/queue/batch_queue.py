@@ -17,7 +17,7 @@ from __future__ import annotations
 import os
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Container, Iterable, Sequence
 from typing import NamedTuple
 
 from vlagents_ray.errors import PolicyUnavailable
@@ -55,7 +55,7 @@ class BatchQueue:
         idle_s: Time without a request after which `next` returns nothing, s.
         patience: After a batch that took D s, the thread waits at most `patience` * D s for the
             sessions of that batch that are about to send their next requests.
-        is_open: Returns whether a session still exists.
+        sessions: Contains the ids of the sessions that exist.
         poller: Poller for the watched files; by default the queue creates one.
     """
 
@@ -63,9 +63,9 @@ class BatchQueue:
         self,
         max_batch_size: int,
         *,
+        sessions: Container[str],
         idle_s: float = 30.0,
         patience: float = 0.0,
-        is_open: Callable[[str], bool] = lambda _: True,
         clock: Callable[[], float] = time.perf_counter,
         poller: Poller | None = None,
     ) -> None:
@@ -83,7 +83,7 @@ class BatchQueue:
         self._dense = False  # whether requests arrive in quick succession
 
         self.poller = poller or Poller()
-        self.window = BatchWindow(patience, max_batch_size, is_open)
+        self.window = BatchWindow(patience, max_batch_size, sessions)
         self._gathering = False
         self._wait_over = threading.Event()
         self._running: Sequence[PendingRequest] = ()
@@ -120,6 +120,14 @@ class BatchQueue:
         with self._lock:
             for pending in requests:
                 pending.over = True
+
+    def give_back(self, requests: Iterable[PendingRequest]) -> None:
+        """Record that the policy has not received these requests, although a batch has taken
+        them.
+        """
+        with self._lock:
+            for pending in requests:
+                pending.begun = False
 
     def cancel(self, pending: PendingRequest) -> bool:
         """End a request without an answer, unless a batch has taken it; return whether it was

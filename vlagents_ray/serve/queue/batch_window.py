@@ -24,7 +24,7 @@ that have a rate of their own: they neither wait nor are waited for. A lone sess
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Container, Sequence
 
 from vlagents_ray.protocol.messages import Priority
 from vlagents_ray.serve.queue.fair_queue import FairQueue
@@ -92,11 +92,11 @@ class BatchWindow:
     Args:
         patience: Longest wait, as a multiple of the duration of the last batch.
         size: Largest number of requests in a batch.
-        is_open: Returns whether a session still exists.
+        sessions: Contains the ids of the sessions that exist.
     """
 
-    def __init__(self, patience: float, size: int, is_open: Callable[[str], bool]) -> None:
-        self._patience, self._size, self._is_open = patience, size, is_open
+    def __init__(self, patience: float, size: int, sessions: Container[str]) -> None:
+        self._patience, self._size, self._sessions = patience, size, sessions
         self._no_batch = _AnsweredBatch(())
         self._last = self._previous = self._no_batch
         self._duration = 0.0  # duration of the last batch, s
@@ -163,7 +163,7 @@ class BatchWindow:
             and abs(self._last.ended + return_s - now) <= bound
             and not (robots and return_s > bound)
             and session_id not in waiting
-            and self._is_open(session_id)
+            and session_id in self._sessions
         }
 
         self._until = now + bound

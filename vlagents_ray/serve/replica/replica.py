@@ -205,14 +205,14 @@ class PolicyReplica(ClientApi, SiblingApi):
         """Raise an error if the policy died or hangs; Serve calls this after loading, and then
         replaces the replica.
         """
-        await asyncio.to_thread(self._engine.check_health)
+        await asyncio.to_thread(self._engine.health.check)
 
     async def refusal(self) -> str | None:
         """Return the full reason why the policy cannot act, for the process that starts the
         server; None if it can.
         """
         try:
-            self._engine.check_health()
+            self._engine.health.check()
         except Exception as error:  # noqa: BLE001 - a policy's own check may raise any error
             return str(error)
         return None
@@ -319,7 +319,7 @@ class PolicyReplica(ClientApi, SiblingApi):
     # Other replicas: `SiblingApi`.
 
     def _load_of(self, sessions: int) -> ReplicaLoad:
-        accepts = self._engine.ready and not (self._engine.draining or replica_is_ending())
+        accepts = self._engine.health.ready and not (self._engine.draining or replica_is_ending())
         node = ray.get_runtime_context().get_node_id()
         return ReplicaLoad(
             self._peers.own_name, sessions, accepts, node, boot_id(), self._engine.models.version
@@ -362,7 +362,7 @@ class PolicyReplica(ClientApi, SiblingApi):
             self._engine.notice_hung()
         faulthandler.cancel_dump_traceback_later()
         if await asyncio.to_thread(_others_run):
-            self._engine.drain()
+            self._engine.drain_list.drain()
         self._shutdown.begin(_LEAVE_S if self._engine.draining else 0.0)
 
     async def _poll_gateways(self) -> None:

@@ -240,7 +240,7 @@ class HeldSessions:
         message, waiting = IncomingMessage("migration"), WaitingTask()
         message.expect(1, waiting)
         pending = PendingRequest(session_id, Request(op, kwargs=kwargs), message)
-        self._engine.submit([pending])
+        self._engine.intake.submit([pending])
         await asyncio.wait([waiting.replies], timeout=timeout_s)
         if not waiting.replies.done():
             if self._engine.queue.cancel(pending):
@@ -514,10 +514,10 @@ class SessionMigrator:
             if await self._query_peer(peer, []) is None:
                 self._finish(session_id)
         if not release.result():
-            self._engine.abandon(arriving)
+            self._engine.moves.abandon(arriving)
             return False
 
-        self._engine.enter(arriving)
+        self._engine.moves.enter(arriving)
         logger.info(
             "session %s: fetched from another replica, after %d acts",
             session_id,
@@ -534,7 +534,7 @@ class SessionMigrator:
 
         async def prepare(weights: dict[str, Any] | None = None) -> Session[LoadedModel]:
             """Create the copy on another thread, with the values of its weights if given."""
-            create = self._engine.prepare_adoption
+            create = self._engine.moves.prepare
             arriving: Session[LoadedModel] = await self._in_thread(
                 create, session_id, state, _LOAD_S, began, origin, weights
             )

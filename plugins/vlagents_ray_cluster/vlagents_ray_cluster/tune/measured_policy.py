@@ -36,6 +36,7 @@ from vlagents_ray.protocol.messages import (
     Request,
 )
 from vlagents_ray.serve.engine.engine import Engine
+from vlagents_ray.serve.engine.settings import EngineSettings
 from vlagents_ray.serve.models.agent_copies import AgentCopies
 from vlagents_ray.serve.python_env.child_start import die_with_parent, own_stdout
 from vlagents_ray.serve.requests import IncomingMessage, PendingRequest
@@ -82,13 +83,13 @@ class MeasuredPolicy:
         max_size: int,
         patience: float = 0.0,
         batch_sizes: Sequence[int] = (),
-        on_step: Callable[[str], None] = lambda _: None,
+        on_step: Callable[[str], None] | None = None,
     ) -> None:
         self.agent = agent
-        self.engine = Engine(
-            agent, max_batch_size=max_size, patience=patience, batch_sizes=batch_sizes
+        settings = EngineSettings(
+            max_batch_size=max_size, patience=patience, batch_sizes=batch_sizes
         )
-        self.engine.models.on_step = on_step
+        self.engine = Engine(agent, settings, on_step=on_step)
         self.load_s = 0.0
         self._view = view
         self._copies: AgentCopies
@@ -158,7 +159,7 @@ class MeasuredPolicy:
             message = IncomingMessage("bench", op, priority)
             message.expect(1, receivers[i])
             pending = PendingRequest(f"bench-{i}", request, message, PRIORITIES[priority])
-            self.engine.submit([pending])
+            self.engine.intake.submit([pending])
 
         def receive() -> tuple[int, Reply, float]:
             i, reply = answers.get(timeout=_LATE_S)

@@ -13,7 +13,7 @@ from shared_cpu_memory import SharedCpuMemory, files_of_torch
 
 from vlagents_ray.errors import VLAgentsError
 from vlagents_ray.interface import Act, Agent, Obs
-from vlagents_ray.serve.weights import ModelWeights, WeightUpdates
+from vlagents_ray.serve.weights import FollowingSession, ModelWeights, WeightUpdates
 from vlagents_ray.weights.trainable import portable
 
 
@@ -65,7 +65,16 @@ class _Replica:
         self.agent.initialize()
         self.left_open: set[str] = set()
         self.weights = ModelWeights(self.agent, threading.Lock())
-        self.updates = WeightUpdates(lambda: self.weights, list)
+        self.updates = WeightUpdates(self, self)
+
+    @property
+    def own_weights(self) -> ModelWeights:
+        """The versions of its weights."""
+        return self.weights
+
+    def all(self) -> list[FollowingSession]:
+        """Its sessions, of which it has none."""
+        return []
 
     def values(self) -> dict[str, np.ndarray]:
         """Act with the newest version, and return its values."""

@@ -1,0 +1,246 @@
+"""Admission of requests to the queue: each is checked, and gets what it reserves.
+
+A reset reserves an episode of its session, and an act its session and the episode that it belongs
+to. A reservation is a value in its request, so that it can be undone if the policy never receives
+the request. An act whose session is not here is admitted again after a search at other replicas.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+from vlagents_ray.errors import NotReset, PolicyUnavailable, UnknownSession, VLAgentsError
+from vlagents_ray.protocol.messages import Priority
+from vlagents_ray.serve.engine.parts import EngineParts
+from vlagents_ray.serve.engine.responses import public_error
+from vlagents_ray.serve.models.loaded_model import LoadedModel
+from vlagents_ray.serve.queue.preparation import Preparations
+from vlagents_ray.serve.requests import Opening, Origin, PendingRequest, ReservedAct
+from vlagents_ray.serve.sessions import Session
+from vlagents_ray.serve.weights import follows
+
+
+class Intake:
+    """Admits requests to the queue. Thread-safe."""
+
+    def __init__(self, parts: EngineParts) -> None:
+        self._health = parts.health
+        self._sessions = parts.sessions
+        self._models = parts.models
+        self._source = parts.source
+        self._queue = parts.queue
+        self._finder = parts.finder
+        self._drain_list = parts.drain_list
+        # None if the engine has no threads.
+        self._preparations = Preparations() if parts.settings.threaded else None
+
+    def submit(self, requests: Sequence[PendingRequest]) -> None:
+        """Admit requests, and queue them together; those that cannot be queued are finished with
+        their errors.
+        """
+        ready: list[PendingRequest] = []
+        for pending in requests:
+            try:
+                pending.reserved = self.admit(pending)
+                ready.append(pending)
+            except Exception as error:  # noqa: BLE001 - becomes the reply, and affects no other request
+                public = public_error(error, pending)
+                if not self.search(pending, public):
+                    self.fail(pending, public)
+
+        try:
+            if ready:
+                self._queue.put(*ready)
+        except VLAgentsError as error:
+            for pending in ready:
+                self.fail(pending, error)
+
+    def admit(self, pending: PendingRequest) -> ReservedAct | Opening | None:
+        """Check a request before it is queued, and return what it reserves; raise if it is refused.
+
+        The session of a request becomes one of its connection's.
+        """
+        request, origin, session_id = pending.request, pending.origin, pending.session_id
+        is_act = request.op == "act"
+        if is_act and origin.owner and not request.session and session_id not in origin.sessions:
+            raise NotReset("act before reset: this connection has no session yet; reset first")
+        self._health.require_ready()
+
+        if is_act:
+            session = self._sessions.get(session_id)
+            if session.agent is None:
+                raise NotReset(
+                    f"session {session_id!r}: act before a successful reset; reset first"
+                )
+            step = request.step
+            if step is not None and step > session.steps and step > session.expected:
+                raise session.wrong_step(step)
+
+            # An act that was queued before, and has waited for a search, keeps its episode.
+            before = pending.reserved
+            episode = before.episode if isinstance(before, ReservedAct) else None
+            if episode is None:
+                episode = origin.sessions.get(session_id)
+            if episode is None:
+                episode = _latest_episode(pending, session)
+            if (episode if step is None else step) >= session.expected:
+                # An act of an older episode, which will be refused, does not use the session.
+                session.origin = origin
+
+            model = session.model  # another thread may set it to None
+            if model is not None:
+                model.check(request)
+            preparation = None
+            if self._preparations is not None and self._queue.window.overlaps:
+                preparation = self._preparations.begin(session.agent, request.obs)
+            if origin.owner:
+                origin.sessions[session_id] = episode
+            return ReservedAct(session, model, episode, preparation)
+
+        if request.op == "reset":
+            return self._open(pending)
+        if origin.owner and request.op == "adopt":
+            origin.sessions[session_id] = None
+        elif origin.owner and request.op != "close":
+            origin.sessions.setdefault(session_id, None)
+        return None
+
+    def _open(self, pending: PendingRequest) -> Opening:
+        """Check a reset, and reserve an episode of its session."""
+        request, origin, session_id = pending.request, pending.origin, pending.session_id
+        choice, kwargs = self._source.split_options(request.kwargs)
+        follows_newest = follows(kwargs, by_default=pending.priority is not Priority.ROBOT)
+        # If the checkpoint is not loaded, the request is checked after loading.
+        model = self._models.loaded(choice)
+        if model is not None:
+            model.check(request)
+
+        session = self._sessions.open(session_id, origin)
+        first = self._sessions.begin(session, request.step, pending.arrived)
+        previous = origin.sessions.get(session_id)
+        if origin.owner:
+            origin.sessions[session_id] = first
+        return Opening(choice, kwargs, follows_newest, first, previous)
+
+    def withdraw(self, *requests: PendingRequest) -> None:
+        """End requests without an answer, as `BatchQueue.withdraw` does, and undo resets that
+        have not begun.
+        """
+        self._queue.withdraw(*requests)
+        for pending in requests:
+            pending.drop_preparation()
+            self.undo(pending)
+
+    def undo(self, pending: PendingRequest) -> None:
+        """Undo the reservation of a reset that has not begun."""
+        opening = pending.reserved
+        if pending.begun or not isinstance(opening, Opening):
+            return
+        self._sessions.undo(pending.session_id, opening.first)
+        sessions = pending.origin.sessions
+        if sessions.get(pending.session_id) == opening.first:
+            sessions[pending.session_id] = opening.previous
+
+    def fail(self, pending: PendingRequest, error: VLAgentsError) -> None:
+        """Finish a request with an error, and undo a reset that has not begun."""
+        self.undo(pending)
+        pending.fail(error)
+
+    def search(self, pending: PendingRequest, error: VLAgentsError) -> bool:
+        """Search for an act's session at other replicas, and queue the act again; return False if
+        there is no search.
+
+        If its session is not found, the act fails with the `error`.
+        """
+        if (
+            self._finder is None
+            or pending.sought
+            or pending.request.op != "act"
+            or pending.is_abandoned
+            or not isinstance(error, UnknownSession)
+        ):
+            return False
+
+        pending.sought = True
+        origin = pending.origin
+        searcher = origin.owner if origin.caller is None else origin.caller.name
+        search = SessionSearch(self, pending, error)
+        if self._finder.fetch(pending.session_id, search.end, searcher, search.origin_for):
+            return True
+        if self._drain_list.draining:  # the replica has given its sessions to others
+            pending.fail(
+                PolicyUnavailable(
+                    "the replica is stopping; connect again, or send the same request again"
+                )
+            )
+            return True
+        return False
+
+    def retry(self, pending: PendingRequest) -> None:
+        """Queue an act again after a search of its session; raise if it is refused."""
+        # The session stays elsewhere if its key has no room for it here.
+        if pending.session_id not in self._sessions:
+            self._sessions.require_allowed(pending.origin)
+        pending.reserved = self.admit(pending)
+        self._queue.put(pending)
+
+    def close(self) -> None:
+        """End the threads that prepare observations."""
+        if self._preparations is not None:
+            self._preparations.close()
+
+
+class SessionSearch:
+    """A search of other replicas for the session of an act."""
+
+    def __init__(self, intake: Intake, pending: PendingRequest, error: VLAgentsError) -> None:
+        self._intake = intake
+        self._pending = pending
+        self._error = error  # error of the act if its session is not found
+
+    def end(self) -> None:
+        """Queue the act again, or finish it with its error, once the search has ended."""
+        pending = self._pending
+        if pending.is_abandoned:
+            pending.fail(self._error)
+            return
+        try:
+            self._intake.retry(pending)
+        except Exception as error:  # noqa: BLE001 - becomes the reply
+            is_same = type(error) is type(self._error)
+            pending.fail(self._error if is_same else public_error(error, pending))
+
+    def origin_for(self, state: dict[str, Any], began: float) -> Origin | None:
+        """Return the origin of the act if it can be executed on a session in that state, at another
+        replica, else None.
+
+        If it cannot be, the session stays where it is. The session's episode `began` at that time,
+        s.
+        """
+        pending = self._pending
+        if pending.is_abandoned:
+            return None
+        reserved = pending.reserved
+        episode = reserved.episode if isinstance(reserved, ReservedAct) else None
+        if not episode:
+            episode = pending.origin.sessions.get(pending.session_id)
+        if pending.request.step is not None:
+            fits = pending.request.step == state["steps"]
+        elif episode is not None:
+            fits = episode == state["first"]
+        else:
+            fits = began <= pending.latest_begin
+        return pending.origin if fits else None
+
+
+def _latest_episode(pending: PendingRequest, session: Session[LoadedModel]) -> int:
+    """Return the step at which the episode began that an act belongs to whose connection has none.
+
+    That is the session's latest one; but an act without a step does not belong to an episode that
+    has begun since the connection was opened, or over HTTP, since the act arrived, while it waited
+    for a search of its session.
+    """
+    if pending.request.step is None and session.last_reset > pending.latest_begin:
+        raise session.wrong_episode()
+    return session.expected

@@ -1,0 +1,130 @@
+"""Moves of sessions between replicas: their state is bytes and settings."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Mapping
+from typing import Any
+
+from vlagents_ray.errors import UnknownSession
+from vlagents_ray.serve.engine.parts import EngineParts
+from vlagents_ray.serve.models.loaded_model import LoadedModel
+from vlagents_ray.serve.requests import NOWHERE, CheckpointChoice, Origin
+from vlagents_ray.serve.sessions import Session
+
+
+class SessionMoves:
+    """Exports the sessions of an engine, and continues those of other replicas. Thread-safe."""
+
+    def __init__(self, parts: EngineParts) -> None:
+        self._sessions = parts.sessions
+        self._models = parts.models
+        self._health = parts.health
+
+    def export(self, session_id: str) -> dict[str, Any]:
+        """Return the state that another replica needs to continue the session after its release
+        here; called on the policy's thread.
+        """
+        session = self._sessions.get(session_id)
+        model, weights = session.model, session.weights
+        if session.agent is None or model is None or weights is None:
+            raise UnknownSession(f"session {session_id!r}: not reset yet")
+        with model.busy, model.uncaptured, model.call("export"):
+            agent = model.copies.dump(session.agent)
+        return {
+            "agent": agent,
+            "steps": session.steps,
+            "first": session.first,
+            "moves": session.moves,
+            "began": session.began,
+            "version": list(model.version),
+            "choice": [model.choice.name, model.choice.step],
+            "settings": model.settings,
+            "parameters": [weights.number, weights.fingerprint],
+            "follows": session.follows,
+            "instruction": session.instruction,
+        }
+
+    def adopt(self, session_id: str, state: dict[str, Any], timeout_s: float = 0.0) -> None:
+        """Continue a session that another replica has released.
+
+        Args:
+            session_id: Id of the session.
+            state: The `info` of the other replica's reply to "export".
+            timeout_s: Maximum time for loading the session's checkpoint, s; 0 if it must be loaded
+                already.
+
+        Raises:
+            UnknownSession: The session has, or had, a newer state here, has begun a reset, or needs
+                a checkpoint or a version of the policy that is not available here.
+        """
+        self.enter(self.prepare(session_id, state, timeout_s))
+
+    def prepare(
+        self,
+        session_id: str,
+        state: dict[str, Any],
+        timeout_s: float = 0.0,
+        began: float = 0.0,
+        origin: Origin = NOWHERE,
+        weights: Mapping[str, Any] | None = None,
+    ) -> Session[LoadedModel]:
+        """Create a copy of the session that cannot act before `enter`; if it is not needed, call
+        `abandon`.
+
+        Its episode `began` at that time, s, of this engine's clock, or later. From now on it counts
+        for the key of the `origin`. `weights` are the values of its version of the weights, if that
+        is not held here.
+        """
+        self._health.require_ready()
+        self._sessions.require_room(session_id)
+
+        first, moves = state["first"], state["moves"] + 1
+        arriving: Session[LoadedModel] = Session(
+            session_id,
+            steps=state["steps"],
+            first=first,
+            expected=first,
+            began=began,
+            last_reset=began,
+            moves=moves,
+            announced=True,
+            origin=origin,
+        )
+        self._sessions.expect(arriving)
+        try:
+            model = self._models.adopt(
+                arriving, CheckpointChoice(*state["choice"]), state["settings"], timeout_s
+            )
+            if tuple(state["version"]) != model.version:
+                raise UnknownSession(
+                    f"session {session_id!r}: of another version of the policy; reset it"
+                )
+
+            number, fingerprint = state["parameters"]
+            # The session holds the version until `find` returns it, or a newer one.
+            if weights is not None:
+                arriving.weights = model.parameters.restore(number, fingerprint, weights)
+            arriving.weights = model.parameters.find(number, fingerprint, follows=state["follows"])
+            with model.busy, model.uncaptured, model.call("adopt", threading.get_ident()):
+                arriving.agent = model.copies.load(state["agent"])
+            arriving.follows, arriving.instruction = state["follows"], state["instruction"]
+        except BaseException:
+            self.abandon(arriving)
+            raise
+        return arriving
+
+    def enter(self, arriving: Session[LoadedModel]) -> None:
+        """Add a prepared session to the table, so that it acts here from now on."""
+        model = arriving.model
+        try:
+            self._sessions.enter(arriving)
+        except BaseException:
+            self.abandon(arriving)
+            raise
+        if model is not None:
+            model.parameters.catch_up(arriving)
+
+    def abandon(self, arriving: Session[LoadedModel]) -> None:
+        """Drop a prepared session that is not needed."""
+        self._sessions.abandon(arriving)

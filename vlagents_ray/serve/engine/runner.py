@@ -1,0 +1,494 @@
+"""The policy's thread, which takes batches from the queue and runs them.
+
+Each call of the policy returns its answers as values, which are delivered after the call. Answers
+to simulations may be delivered on another thread, while the next batch runs.
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from collections.abc import Sequence
+from concurrent.futures import Future, ThreadPoolExecutor, wait
+from typing import Any
+
+from vlagents_ray.errors import (
+    ConnectionLost,
+    DeadlineExceeded,
+    NotReset,
+    PolicyFailed,
+    UnknownSession,
+    VLAgentsError,
+)
+from vlagents_ray.interface import Act
+from vlagents_ray.protocol.messages import Priority, Reply
+from vlagents_ray.serve.engine.intake import Intake
+from vlagents_ray.serve.engine.moves import SessionMoves
+from vlagents_ray.serve.engine.parts import EngineParts
+from vlagents_ray.serve.engine.responses import (
+    build_reply,
+    public_error,
+    require_serializable,
+    timing,
+)
+from vlagents_ray.serve.models.loaded_model import LoadedModel
+from vlagents_ray.serve.models.model_manager import too_late
+from vlagents_ray.serve.queue.batch_queue import Taken
+from vlagents_ray.serve.queue.preparation import Preparations
+from vlagents_ray.serve.requests import Answer, Opening, PendingRequest, ReservedAct, deliver
+from vlagents_ray.serve.sessions import Session
+from vlagents_ray.serve.weights import WeightsVersion
+
+logger = logging.getLogger(__name__)
+
+Acting = tuple[PendingRequest, Session[LoadedModel]]
+
+# Share of a batch's time that the policy's thread computes, over which it is busy rather than
+# waits.
+_WORKING = 0.5
+
+
+class WaitingReset:
+    """A reset that waits for its checkpoint."""
+
+    def __init__(
+        self, runner: Runner, pending: PendingRequest, session: Session[LoadedModel]
+    ) -> None:
+        self._runner = runner
+        self._pending = pending
+        self._session = session
+
+    def end(self, error: VLAgentsError | None) -> None:
+        """Queue the reset again, since its session holds the model, or answer it with the error."""
+        self._runner.requeue(self._pending, error)
+
+    def is_abandoned(self) -> bool:
+        """Return whether the reset need not wait any more."""
+        return self._runner.is_abandoned(self._pending, self._session)
+
+
+class Runner:
+    """Loads the policy, and runs its batches, on one thread: the policy's.
+
+    Only `start` and `join` may be called on another thread.
+    """
+
+    def __init__(self, parts: EngineParts, intake: Intake, moves: SessionMoves) -> None:
+        self._intake = intake
+        self._moves = moves
+        self._health = parts.health
+        self._sessions = parts.sessions
+        self._models = parts.models
+        self._weights = parts.weights
+        self._queue = parts.queue
+        self._stats = parts.stats
+        self._finder = parts.finder
+        self._clock = parts.clock
+        self._batch_sizes = parts.settings.batch_sizes
+        self._reply_bytes = parts.settings.reply_bytes
+        self._load_s = parts.settings.limits.load_s
+
+        # Whether the policy's thread is the engine's own, and not the one that calls `start`.
+        self.threaded = parts.settings.threaded
+        self._thread = threading.Thread(target=self._serve, name="policy", daemon=True)
+        # Done when loading the policy has succeeded or failed.
+        self._started: Future[None] = Future()
+        # Answers that another thread delivers while the next batch runs.
+        self._unsent: list[Answer] = []
+        self._answers = ThreadPoolExecutor(1, "policy-answers")
+
+    def start(self) -> None:
+        """Load the policy on its thread, and return when it can act.
+
+        Raises:
+            BaseException: Any error of the policy's initialization.
+            TimeoutError: The policy does not load within the time limit.
+        """
+        self._health.begin_thread()
+        if not self.threaded:
+            self._models.start()
+            self._queue.bind(driven=True)
+            return
+
+        self._thread.start()
+        if not wait([self._started], self._load_s).done:
+            raise TimeoutError(f"not loaded within {self._load_s:g} s, its limit")
+        self._started.result()
+
+    def join(self, timeout_s: float) -> None:
+        """Wait for the end of the thread, whose queue is closed, but at most `timeout_s`."""
+        if self._thread.ident is None:
+            self._queue.poller.close()
+        elif self._thread is not threading.current_thread():
+            self._thread.join(timeout_s)
+
+    def _serve(self) -> None:
+        """Load the policy, and run its batches until the queue is closed."""
+        try:
+            self._models.start()
+        except BaseException as error:  # noqa: BLE001 - raised again by start(), on the caller's thread
+            self._health.end_thread()
+            self._queue.poller.close()
+            self._started.set_exception(error)
+            return
+
+        self._queue.bind()
+        self._started.set_result(None)
+        acting = self._weights.acting_lock
+        try:
+            while (taken := self._queue.next()) is not None:
+                if self._unsent:
+                    unsent, self._unsent = self._unsent, []
+                    self._answers.submit(deliver, unsent)
+
+                if not acting.acquire(blocking=False):
+                    acting.acquire()  # the policy has slept
+                    taken = self._without_late(taken)
+                try:
+                    self.run(taken)
+                finally:
+                    acting.release()
+                del taken  # their observations may be in the sender's memory
+
+            deliver(self._unsent)
+            self._answers.shutdown()
+            self._queue.poller.close()
+        finally:
+            self._health.end_thread()
+
+    def _without_late(self, taken: Taken) -> Taken:
+        """Return the work without the requests that have become useless since they were taken."""
+        now = self._clock()
+        late = [
+            pending for pending in taken.batch if pending.loaded is None and pending.is_useless(now)
+        ]
+        self._queue.give_back(late)
+        in_time = [pending for pending in taken.batch if pending not in late]
+        return Taken(in_time, [*taken.expired, *late])
+
+    def run(self, taken: Taken) -> None:
+        """Answer the expired requests, and run the batch. Called on the policy's thread."""
+        for pending in taken.expired:
+            self._intake.fail(pending, _not_taken(pending))
+        if not taken.batch:
+            self._sessions.drop_idle()
+            return
+        self._queue.begin(taken.batch)
+        try:
+            self._run(taken.batch)
+        except BaseException as error:
+            # A policy that calls sys.exit() must not end the replica's only thread. Where the
+            # caller's thread runs the policy, Ctrl-C ends it.
+            if not self.threaded and not isinstance(error, SystemExit):
+                raise
+            logger.exception("the batch failed")
+            for pending in taken.batch:
+                pending.fail(PolicyFailed(f"the policy raised {type(error).__name__}"))
+        self._queue.end()
+
+    def _run(self, batch: Sequence[PendingRequest]) -> None:
+        acting: dict[tuple[LoadedModel, WeightsVersion], list[Acting]] = {}
+        for pending in batch:
+            try:
+                if pending.request.op == "act":
+                    session, model, weights = self._ready(pending)
+                    acting.setdefault((model, weights), []).append((pending, session))
+                elif isinstance(pending.reserved, Opening):
+                    deliver(self._reset(pending, pending.reserved))
+                else:
+                    deliver([self._other(pending)])
+            except Exception as error:  # noqa: BLE001 - becomes the reply
+                public = public_error(error, pending)
+                if pending.request.op == "act":
+                    self._queue.give_back([pending])
+                    is_elsewhere = pending.session_id not in self._sessions
+                    if is_elsewhere and self._intake.search(pending, public):
+                        continue
+                self._intake.fail(pending, public)
+
+        for (model, weights), group in acting.items():
+            prepared_s = 0.0
+            if self._queue.window.slow:
+                group, prepared_s = self._prepared(model, group)  # noqa: PLW2901 - without those that failed
+            if group:
+                deliver(self._act(model, weights, group, prepared_s))
+
+    def _reset(self, pending: PendingRequest, opening: Opening) -> Sequence[Answer]:
+        """Begin the episode of a reset, and return the answer to the reset, if it is due.
+
+        A reset whose checkpoint is not loaded leaves the queue. It is queued again when the
+        checkpoint is loaded, or answered with an error if loading fails. Meanwhile the session may
+        be reset again or closed, or its client may stop waiting.
+        """
+        session_id = pending.session_id
+        if pending.loaded is None:
+            if self._sessions.is_past(session_id, opening.first):
+                raise UnknownSession(
+                    f"session {session_id!r}: reset elsewhere, or ended, while this reset waited"
+                )
+
+            session = self._sessions.open(session_id, pending.origin)
+            self._sessions.end_episode(session, pending, opening.first)
+            model = session.model
+            if model is None:
+                session.weights = None  # no commit of a model changes it
+            else:
+                model.parameters.end(session)
+
+            waiting = WaitingReset(self, pending, session)
+            held = self._models.hold(session, opening.choice, waiting.end, waiting.is_abandoned)
+            if held is None:
+                # The policy does no work on it while its checkpoint is loaded.
+                self._queue.give_back([pending])
+                return ()  # `requeue` queues it again
+        else:
+            session = self._sessions.get(session_id)
+            if session.resetting is not pending:
+                raise UnknownSession(
+                    f"session {session_id!r}: reset anew, or closed, while this reset waited"
+                )
+            if self.is_abandoned(pending, session):
+                self._models.release_model(session)
+                raise too_late(opening.choice)
+
+        session.resetting = None
+        try:
+            return self._begin_episode(pending, opening, session)
+        except BaseException:
+            # The session must not hold the model without an episode.
+            self._models.release_model(session)
+            raise
+
+    def _begin_episode(
+        self, pending: PendingRequest, opening: Opening, session: Session[LoadedModel]
+    ) -> Sequence[Answer]:
+        """Begin an episode on the model that the session holds, and return the answer, if it is
+        due now.
+        """
+        request, model = pending.request, session.model
+        if model is None or request.obs is None:  # the decoder ensures the second condition
+            raise UnknownSession(
+                f"session {pending.session_id!r}: closed before its reset was over"
+            )
+        model.check(request)
+
+        with model.busy, model.uncaptured, model.call("reset") as call:
+            model.require_open()
+            model.parameters.use(model.parameters.begin(session, follows=opening.follows))
+            agent = model.copies.make()
+            info = agent.reset(request.obs, request.instruction, **opening.kwargs)
+            if not isinstance(info, dict):
+                raise PolicyFailed(f"reset: the policy returned {type(info).__name__}, want a dict")
+            for obs in request.history:
+                agent.observe(obs)
+
+        info = {**model.identity, **info}  # a session with an adapter returns both by itself
+        spent = timing(pending, call.began, call.ended)
+        require_serializable(info, self._reply_bytes)
+        session.agent, session.instruction = agent, request.instruction or ""
+        model.padding.record_reset(request, opening.kwargs)
+        request.drop_observations()
+
+        reply = Reply(request.request_id, info=info, step=session.steps, timing=spent)
+        if session.announced or self._finder is None:
+            return [(pending, reply)]
+        session.announced = True
+        # The session's acts come over the same connection, to this replica.
+        if pending.origin.owner:
+            self._finder.announce(session.id, session.steps)
+            return [(pending, reply)]
+        # The next act may come to a replica that still has an older episode.
+        self._finder.announce(session.id, session.steps, (pending, reply))
+        return ()
+
+    def requeue(self, pending: PendingRequest, error: VLAgentsError | None) -> None:
+        """Queue a reset again whose checkpoint is loaded, or answer it with the error; called on
+        any thread.
+        """
+        pending.loaded = self._clock()
+        try:
+            if error is not None:
+                raise error
+            self._queue.put(pending)
+        except VLAgentsError as reason:
+            pending.request.drop_observations()  # the session may still refer to the request
+            pending.fail(reason)
+
+    def is_abandoned(self, pending: PendingRequest, session: Session[LoadedModel]) -> bool:
+        """Return whether the caller of that reset no longer waits, or the session was reset
+        again; called on any thread.
+        """
+        return (
+            pending.is_abandoned
+            or pending.expired(self._clock())
+            or session.resetting is not pending
+        )
+
+    def _other(self, pending: PendingRequest) -> Answer:
+        """Run a request that is neither an act nor a reset, and return the answer."""
+        session_id, request = pending.session_id, pending.request
+        info: dict[str, Any] = {}
+        if request.op == "export":
+            info = self._moves.export(session_id)
+        elif request.op == "release":
+            info = {"released": self._sessions.release(session_id, request.kwargs["version"])}
+        elif request.op == "adopt":
+            # The replica of this process reuses names, for sessions that it compares.
+            self._sessions.free(session_id)
+            # That replica decides which version of the weights acts: the session's may be older, or
+            # not held here.
+            state = {**request.kwargs, "parameters": self._weights.acting()}
+            self._moves.adopt(session_id, state)
+        elif request.op == "observe":
+            self._observe(pending)
+        elif request.op == "weights":
+            self._weights.obey(**request.kwargs)
+        else:
+            self._sessions.close(session_id)
+            pending.origin.sessions.pop(session_id, None)
+        return pending, Reply(request.request_id, info=info)
+
+    def _ready(
+        self, pending: PendingRequest
+    ) -> tuple[Session[LoadedModel], LoadedModel, WeightsVersion]:
+        """Return the session of an act or an observation, with its model and its version of the
+        weights; raise if it is not the one that the request was sent for.
+        """
+        reserved = pending.reserved if isinstance(pending.reserved, ReservedAct) else None
+        # Since the lookup the session has ended, or arrived here from another replica.
+        if reserved is None or reserved.session.over:
+            session = self._sessions.get(pending.session_id)
+        else:
+            session = reserved.session
+        model, weights = session.model, session.weights
+        # An earlier reset in the queue failed, or still waits for its checkpoint.
+        if session.agent is None:
+            raise NotReset(f"session {pending.session_id!r}: its last reset failed; reset again")
+        step = pending.request.step
+        if step is not None and step != session.steps:
+            raise session.wrong_step(step)
+        episode = None if reserved is None else reserved.episode
+        if step is None and episode is not None and episode != session.first:
+            raise session.wrong_episode()
+        if model is None or weights is None:
+            raise UnknownSession(f"session {pending.session_id!r}: has just been closed; reset it")
+        # A reset before it in the queue chose another model, or the session has arrived since.
+        if reserved is None or model is not reserved.model:
+            model.check(pending.request)
+        return session, model, weights
+
+    def _observe(self, pending: PendingRequest) -> None:
+        session, model, weights = self._ready(pending)
+        # `_ready` and the decoder ensure both conditions.
+        if session.agent is not None and pending.request.obs is not None:
+            with model.busy, model.uncaptured, model.call("observe"):
+                model.require_open()
+                model.parameters.use(weights)
+                session.agent.observe(pending.request.obs)
+        pending.request.drop_observations()
+
+    def _prepared(self, model: LoadedModel, acting: list[Acting]) -> tuple[list[Acting], float]:
+        """Finish the preparations of observations, and answer the requests whose preparation
+        failed.
+
+        Returns:
+            The remaining requests, and the duration, s, which counts as inference.
+        """
+        preparations = []
+        for pending, session in acting:
+            reserved = pending.reserved
+            preparation = reserved.preparation if isinstance(reserved, ReservedAct) else None
+            preparations.append((preparation, session.agent))
+        if all(preparation is None for preparation, _ in preparations):
+            return acting, 0.0
+        with model.busy, model.uncaptured, model.call("act", "prepare") as call:
+            errors = {} if model.closed else Preparations.finish(preparations)
+
+        for index, error in errors.items():
+            pending = acting[index][0]
+            pending.request.drop_observations()
+            pending.fail(public_error(error, pending))
+
+        prepared = [pair for index, pair in enumerate(acting) if index not in errors]
+        return prepared, call.ended - call.began
+
+    def _act(
+        self,
+        model: LoadedModel,
+        weights: WeightsVersion,
+        acting: Sequence[Acting],
+        prepared_s: float,
+    ) -> list[Answer]:
+        """Act in sessions with one version of one model's weights, and return the answers that are
+        due now.
+        """
+        observations = [pending.request.obs for pending, _ in acting]
+        agents = [session.agent for _, session in acting]
+        padding = 0
+        if self._batch_sizes:
+            with model.busy, model.uncaptured:
+                padding = model.pad(observations, agents)
+
+        rows = len(observations)
+        call = model.call("act", rows if self._batch_sizes else None)
+        slow = self._queue.window.slow
+        # The time is not measured for fast acts: two calls take a fiftieth of the fastest ones.
+        worked_s = time.thread_time() if slow else 0.0
+        try:
+            with model.busy, model.uncaptured, call:
+                model.require_open()
+                model.parameters.use(weights)
+                results: Sequence[Act | Exception] = model.agent.act_batch(observations, agents)  # type: ignore[arg-type]
+            if len(results) != rows:
+                raise PolicyFailed(
+                    f"act_batch: got {rows} observations, returned {len(results)} actions"
+                )
+        except Exception as error:  # noqa: BLE001 - becomes the replies
+            results = [error] * rows
+
+        worked_s = time.thread_time() - worked_s if slow else 0.0
+        # This is skipped for a lone act that succeeded like the one before: it would take a
+        # hundredth of the act's time.
+        if len(acting) > 1 or isinstance(results[0], Exception) or model.calls.failed_batches:
+            model.calls.record_batch(results[: len(acting)])
+
+        del observations  # they may be in the sender's memory
+        for pending, _ in acting:
+            pending.request.drop_observations()
+        if padding:
+            model.padding.check_results(results[len(acting) :])
+            results = results[: len(acting)]
+
+        # Replies to simulations are sent while the next full batch runs. After a full batch this
+        # also applies to robots, if the policy leaves the interpreter to other threads while it
+        # waits for a GPU or another process. If it computes in Python, the slowest robots would
+        # wait longer.
+        defer = self._queue.full_batch_waits()
+        robots = len(acting) == self._queue.largest and worked_s < _WORKING * (
+            call.ended - call.began
+        )
+
+        answers: list[Answer] = []
+        for (pending, session), result in zip(acting, results, strict=True):
+            reply = build_reply(
+                pending, session, result, model.contract, self._reply_bytes, weights.info
+            )
+            if reply.error is None:
+                reply.timing = timing(pending, call.began - prepared_s, call.ended)
+                reply.timing["batch_size"] = len(acting)
+            if defer and (robots or pending.priority is not Priority.ROBOT):
+                self._unsent.append((pending, reply))
+            else:
+                answers.append((pending, reply))
+        self._stats.batch(len(acting), rows)
+        return answers
+
+
+def _not_taken(pending: PendingRequest) -> VLAgentsError:
+    """Return the error for a request that the policy has not received, and never will."""
+    if pending.origin.ended:
+        return ConnectionLost("its connection has ended: not acted on, and never will be")
+    return DeadlineExceeded(
+        f"no action within {pending.request.deadline_ms:g} ms: dropped before inference"
+    )

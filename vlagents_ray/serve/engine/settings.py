@@ -1,0 +1,39 @@
+"""The settings of an engine."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+
+from vlagents_ray.contract import Contract
+from vlagents_ray.protocol.messages import DEFAULT_LIMITS
+from vlagents_ray.serve.queue.call_limits import CallLimits
+
+
+def accept_any(_: Contract | None) -> None:
+    """Accept a policy with any contract."""
+
+
+@dataclass(frozen=True, slots=True)
+class EngineSettings:
+    """The settings of an engine, with those of a deployment that concern it."""
+
+    max_batch_size: int = 16  # maximum number of observations in a batch
+    patience: float = 0.0  # see `BatchQueue`
+    # Sizes to which batches are padded; the largest one is `max_batch_size`. Without them, a
+    # compiled policy that names no sizes is compiled for 1, 2, 4, … `max_batch_size`.
+    batch_sizes: Sequence[int] = ()
+    session_limit: int = 1000  # maximum number of sessions
+    session_idle_s: float = 600.0  # time without a request after which a session may be dropped, s
+    # Version of the policy; sessions only move between replicas of equal version and settings.
+    version: str = ""
+    # Raises an error if a policy with that contract cannot be served.
+    check: Callable[[Contract | None], None] = accept_any
+    # Time limits of the policy's calls, over which the engine is unhealthy.
+    limits: CallLimits = field(default_factory=CallLimits)
+    reply_bytes: int = DEFAULT_LIMITS.reply_bytes  # maximum size of a reply
+    # Maximum size of all messages in flight together, bytes.
+    in_flight_bytes: int = DEFAULT_LIMITS.in_flight_bytes
+    # Whether a thread of the engine runs the policy. Otherwise the thread that calls `start` does,
+    # and then calls `queue.take` and `runner.run` in turns.
+    threaded: bool = True
