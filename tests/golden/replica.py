@@ -206,7 +206,7 @@ class Server:
         return Policy(OPEN if self._dialects else STRICT, self._gate, settings["checkpoint"])
 
     def _start(self) -> None:
-        if self._ready and self._replicas is None and not self.engines[0].alive:
+        if self._ready and self._replicas is None and not self.engines[0].health.alive:
             self.engines[0].start()
 
     def _http(self, number: int) -> int:

@@ -72,7 +72,7 @@ def test_the_hidden_state_moves_with_a_session(policy: Raptor, replicas: Replica
         agent.reset(START, None)
         for i in range(60):
             if i == 30:
-                replicas.engines[0].drain()
+                replicas.engines[0].drain_list.drain()
             act = agent.act(observation(inputs[i, 0]))
             assert "resumed" not in act.info
             assert np.abs(act.action - wanted[i, 0]).max() < TOLERANCE

@@ -332,7 +332,7 @@ def test_a_session_that_closes_while_it_arrives_keeps_no_checkpoint(
         there.sessions.close(session.id)
 
     monkeypatch.setattr(there.sessions, "enter", closed_at_once)
-    there.adopt("s", state)
+    there.moves.adopt("s", state)
     assert holders(there) == {"a/1": 0}
 
 
@@ -386,11 +386,11 @@ def test_a_session_that_moves_takes_its_checkpoint_along(
     state = export(here, "s")
     assert state is not None
     with pytest.raises(UnknownSession):
-        elsewhere.adopt("s", state, timeout_s=10)
+        elsewhere.moves.adopt("s", state, timeout_s=10)
     assert elsewhere.models.describe()["loaded"] == ["a/1"], "it is not offered there"
     with pytest.raises(UnknownSession, match="'b' is not loaded here"):
-        there.adopt("s", state)
-    there.adopt("s", state, timeout_s=10)
+        there.moves.adopt("s", state)
+    there.moves.adopt("s", state, timeout_s=10)
     assert act(there, "s") == [2, 2]
     assert library.loads["b/2"] == 2
     wait_for(lambda: not any(model.sessions for model in here.models._cache.loaded.values()))

@@ -143,13 +143,13 @@ def test_one_that_hangs_is_noticed_and_keeps_nobody_waiting() -> None:
     one = Engine(agent(), EngineSettings(limits=CallLimits(act_s=0.2, warm_up_s=0.2)))
     one.start()
     pid = info(ask(one, "a", "reset"))["pid"]
-    assert one.ready
+    assert one.health.ready
     os.kill(pid, signal.SIGSTOP)
     # Else it may answer once more.
     wait_for(lambda: psutil.Process(pid).status() == psutil.STATUS_STOPPED, 30)
     replies: list[Reply] = []
     submit(one, "a", Request("act", observation()), replies.append)
-    wait_for(lambda: not one.ready, 30)
+    wait_for(lambda: not one.health.ready, 30)
     one.notice_hung()
     assert isinstance(replies[0].error, DeadlineExceeded)
     os.kill(pid, signal.SIGKILL)
@@ -216,7 +216,7 @@ def test_a_session_moves_between_replicas_with_all_its_state(engine: Engine, oth
     state = export(engine, "moving")
     assert state is not None
     assert "moving" not in engine.sessions
-    other.adopt("moving", state)
+    other.moves.adopt("moving", state)
     told = info(ask(other, "moving", "act", 3))
     assert (told["seen"], told["acts"], told["pid"] != first["pid"]) == ([1, 2, 3], 2, True)
 
@@ -237,7 +237,7 @@ def test_a_child_that_dies_loses_the_connection_and_makes_the_replica_unhealthy(
     one = Engine(agent())
     one.start()
     told = info(ask(one, "a", "reset", instruction="a task"))
-    one.check_health()
+    one.health.check()
     if ends == "is killed":
         os.kill(told["pid"], signal.SIGKILL)
     [reply] = ask_all(one, [("a", Request("act", observation(exit=ends != "is killed")))])
@@ -247,8 +247,8 @@ def test_a_child_that_dies_loses_the_connection_and_makes_the_replica_unhealthy(
         == f"the policy's process ended with exit status {status}; the replica is being replaced"
     )
     with pytest.raises(PolicyUnavailable, match=f"exit status {status}"):
-        one.check_health()
-    assert not one.ready
+        one.health.check()
+    assert not one.health.ready
     one.close()
 
 
@@ -258,9 +258,9 @@ def test_a_child_whose_accelerator_failed_ends_so_that_the_replica_is_replaced()
     ask(one, "a", "reset", instruction="a task")
     [reply] = ask_all(one, [("a", Request("act", observation(broken=True)))])
     assert isinstance(reply.error, PolicyFailed)
-    wait_for(lambda: not one.ready)
+    wait_for(lambda: not one.health.ready)
     with pytest.raises(PolicyUnavailable, match="exit status 1"):
-        one.check_health()
+        one.health.check()
     one.close()
 
 
@@ -282,10 +282,10 @@ def test_why_a_policy_does_not_load_is_said(policy: str, config: dict[str, Any],
         one.start()
     assert said in str(error.value)
     with pytest.raises(PolicyFailed) as seen:  # by the operator
-        one.check_health()
+        one.health.check()
     assert said in str(seen.value)
     with pytest.raises(PolicyFailed) as told:  # what its clients are told
-        one.require_ready()
+        one.health.require_ready()
     assert said not in str(told.value)
     assert sys.executable not in str(told.value)
     one.close()
@@ -334,7 +334,7 @@ def test_a_push_to_a_child_that_dies_is_refused_and_leaves_nothing() -> None:
         push(served, gains(1))
     assert len(list(files.iterdir())) <= before
     assert served.weights.number == 0
-    assert not served.ready
+    assert not served.health.ready
     with pytest.raises(PolicyUnavailable):
         child.call_for_weights(name=0, values="")
     served.close()

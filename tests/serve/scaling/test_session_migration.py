@@ -103,7 +103,7 @@ def slow(engine: Engine, step: str) -> Iterator[tuple[queue.SimpleQueue[str], th
     """Have a step of taking over a session wait for the event, and put something into the queue
     when it begins.
     """
-    begun, release, work = queue.SimpleQueue[str](), threading.Event(), getattr(engine, step)
+    begun, release, work = queue.SimpleQueue[str](), threading.Event(), getattr(engine.moves, step)
 
     def waits(*args: Any) -> Any:
         begun.put("")
@@ -111,7 +111,7 @@ def slow(engine: Engine, step: str) -> Iterator[tuple[queue.SimpleQueue[str], th
         return work(*args)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(engine, step, waits)
+        patch.setattr(engine.moves, step, waits)
         yield begun, release
         release.set()
 
@@ -138,11 +138,11 @@ def test_an_older_episode_never_takes_the_place_of_a_newer_one_which_takes_its(
     state = export(a, "robot-1")
     assert state is not None
     with pytest.raises(UnknownSession, match="newer"):
-        b.adopt("robot-1", state)
+        b.moves.adopt("robot-1", state)
     assert obeys(b) == ("episode 2", 1)
     newer = export(b, "robot-1")
     assert newer is not None
-    c.adopt("robot-1", newer)
+    c.moves.adopt("robot-1", newer)
     assert obeys(c) == ("episode 2", 2)
 
 
@@ -158,7 +158,7 @@ def test_a_reset_under_way_is_not_overtaken_by_what_it_ends(
     state = export(a, "robot-1")
     assert state is not None
     with pytest.raises(UnknownSession):
-        b.adopt("robot-1", state)
+        b.moves.adopt("robot-1", state)
     Counting.gate.set()
     assert answers.get(timeout=20).error is None
     assert obeys(b) == ("episode 2", 1)
@@ -180,7 +180,7 @@ def test_a_reset_that_comes_late_ends_no_newer_episode(
     state = export(a, "robot-1")
     assert state is not None
     if first == "the newer episode":
-        b.adopt("robot-1", state)
+        b.moves.adopt("robot-1", state)
         b.weights.rest(Rest("wake"))
         assert isinstance(late.get(timeout=20).error, UnknownSession)
     else:
@@ -204,11 +204,11 @@ def test_a_session_that_was_closed_does_not_come_back(replicas: Callable[[int], 
     ask(a, "reset", instruction="episode 1")
     state = export(a, "robot-1")
     assert state is not None
-    b.adopt("robot-1", state)
+    b.moves.adopt("robot-1", state)
     ask(b, "act")
     ask(b, "close")
     with pytest.raises(UnknownSession, match="newer"):
-        b.adopt("robot-1", state)
+        b.moves.adopt("robot-1", state)
     assert len(b.sessions) == 0
 
 
@@ -399,13 +399,13 @@ def test_what_comes_twice_or_late_changes_nothing(replicas: Callable[[int], Repl
     assert [len(engine.sessions) for engine in (a, b, c)] == [0, 1, 0]
     assert obeys(c) == ("episode 1", 1)  # fetched from there
     with pytest.raises(UnknownSession, match="newer"):
-        b.adopt("robot-1", state)
+        b.moves.adopt("robot-1", state)
     assert [len(engine.sessions) for engine in (a, b, c)] == [0, 0, 1]
     returned = serve(served, 2, "copy", "robot-1")
     assert serve(served, 2, "release", "robot-1", version_of(returned), "one") is True
     assert serve(served, 2, "release", "robot-1", version_of(returned), "another") is False
     assert serve(served, 2, "release", "robot-1", version_of(returned), "one") is True
-    a.adopt("robot-1", returned)
+    a.moves.adopt("robot-1", returned)
     serve(served, 0, "release", "robot-1", version_of(state), "one")
     assert obeys(a) == ("episode 1", 2)
 
@@ -417,7 +417,7 @@ def test_a_slow_replica_that_was_given_a_session_is_waited_for(
     a, b, c = served.engines
     for number in range(20):
         ask(a, "reset", f"robot-{number}", instruction=f"{number}")
-    with slow(b, "prepare_adoption") as (begun, release):
+    with slow(b, "prepare") as (begun, release):
         given = threading.Thread(target=served.hand_over, args=[0])
         given.start()
         wait_for(lambda: len(c.sessions) == 10 and begun.qsize() > 3)  # of several at a time
@@ -471,7 +471,7 @@ def test_a_session_on_its_way_to_another_replica_is_waited_for(
     served = replicas(3)
     a, b, c = served.engines
     ask(a, "reset", instruction="episode 1")
-    with slow(b, "prepare_adoption") as (begun, release):
+    with slow(b, "prepare") as (begun, release):
         given = threading.Thread(target=served.hand_over, args=[0])
         given.start()
         begun.get(timeout=20)
@@ -488,7 +488,7 @@ def test_an_act_whose_deadline_passed_while_its_session_was_fetched_is_not_execu
     served = replicas(2)
     a, b = served.engines
     ask(a, "reset", instruction="episode 1")
-    with slow(b, "prepare_adoption") as (_, release):
+    with slow(b, "prepare") as (_, release):
 
         async def late(timed: bool) -> list[Reply]:
             request = Request("act", Obs(), deadline_ms=50)
@@ -515,7 +515,7 @@ def test_an_act_whose_client_has_gone_while_its_session_was_fetched_is_not_execu
 ) -> None:
     a, b = replicas(2).engines
     ask(a, "reset", instruction="episode 1")
-    with slow(b, "prepare_adoption") as (begun, release):
+    with slow(b, "prepare") as (begun, release):
 
         async def go() -> None:
             sender = Sender(b, "http", "robot-1", connected=False, caller=NoKey.OPEN)
