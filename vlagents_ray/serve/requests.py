@@ -159,9 +159,10 @@ class PendingRequest:
     def drop_preparation(self) -> None:
         """Cancel the preparation of the observation, unless it has begun."""
         reserved = self.reserved
-        if isinstance(reserved, ReservedAct) and reserved.preparation is not None:
-            reserved.preparation.future.cancel()
-            reserved.preparation = None
+        if isinstance(reserved, ReservedAct):
+            preparation, reserved.preparation = reserved.preparation, None
+            if preparation is not None:
+                preparation.future.cancel()
 
     def fail(self, error: VLAgentsError) -> None:
         """Deliver an error, unless the request is over."""
