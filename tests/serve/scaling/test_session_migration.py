@@ -185,7 +185,7 @@ def test_a_reset_that_comes_late_ends_no_newer_episode(
         assert isinstance(late.get(timeout=20).error, UnknownSession)
     else:
         with slow(b, "enter") as (begun, release):
-            arrival = threading.Thread(target=b.adopt, args=("robot-1", state))
+            arrival = threading.Thread(target=b.moves.adopt, args=("robot-1", state))
             arrival.start()
             begun.get(timeout=20)
             b.weights.rest(Rest("wake"))
