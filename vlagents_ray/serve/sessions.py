@@ -160,7 +160,7 @@ class SessionTable(Generic[M]):
     def __len__(self) -> int:
         return len(self._sessions)
 
-    def __contains__(self, session_id: str) -> bool:
+    def __contains__(self, session_id: object) -> bool:
         return session_id in self._sessions
 
     def get(self, session_id: str) -> Session[M]:
