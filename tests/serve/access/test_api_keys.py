@@ -284,10 +284,10 @@ def test_a_file_that_cannot_be_given_to_its_owner_is_left_as_it_is(
 
     real = os.fstat
 
-    def other_caller(file: int) -> os.stat_result:
+    def stat_of_another_user(file: int) -> os.stat_result:
         return os.stat_result((*real(file)[:4], 4321, 4321, *real(file)[6:]))
 
-    monkeypatch.setattr(key_store.os, "fstat", other_caller)
+    monkeypatch.setattr(key_store.os, "fstat", stat_of_another_user)
     monkeypatch.setattr(key_store.os, "fchown", refuse)
     with pytest.raises(ConfigError, match="nothing was changed"):
         revoke(file, "arm")
