@@ -1,4 +1,4 @@
-"""Strict loading of LeRobot checkpoints: missing, unknown or random parts are errors before
+"""Strict loading of LeRobot checkpoints: missing, unknown or random parameters are errors before
 serving.
 """
 
@@ -19,7 +19,12 @@ from vlagents_ray.errors import ConfigError
 from vlagents_ray.policies.base.accelerator import ensure_torchvision
 from vlagents_ray.policies.base.checkpoint import SavedTensors, find_checkpoint, require_loaded
 from vlagents_ray.registry import require
-from vlagents_ray_models.lerobot.config import LeRobotConfig, is_new, other_version, refusal
+from vlagents_ray_models.lerobot.config import (
+    LeRobotConfig,
+    cure_with_other_version,
+    is_new,
+    reason_not_served,
+)
 from vlagents_ray_models.lerobot.kinds import KINDS, LONGEST_PREFIX, Diffusion, Flow
 from vlagents_ray_models.lerobot.processors import PIPELINES, require_known_steps
 
@@ -33,20 +38,32 @@ _CHECK = "transformers.models.siglip.check"  # a module added by these changes
 
 
 def find(config: LeRobotConfig) -> Path:
-    """Find the folder with config, weights and processors; raises `ConfigError` if there is
-    none.
+    """Find the folder of a checkpoint, and check that it is complete.
+
+    Args:
+        config: The settings of the policy, with the folder or the hub id of the checkpoint.
+
+    Returns:
+        The folder with the policy's config, weights and both processor pipelines.
+
+    Raises:
+        ConfigError: There is no such folder, a file is missing, GR00T's own code wrote the
+            checkpoint, or a pipeline names code that is not trusted.
     """
     folder = find_checkpoint(config.checkpoint, config.checkpoint_step)
     if (folder / TRAINED).is_dir():
         folder /= TRAINED
     _require_no_nvidia(folder / "config.json")
+
     folder = find_checkpoint(str(folder.resolve()), needs=["config.json", WEIGHTS])
-    if missing := [name for name in PIPELINES if not (folder / name).is_file()]:
+    missing = [name for name in PIPELINES if not (folder / name).is_file()]
+    if missing:
         raise ConfigError(
             f"checkpoint {folder}: misses {missing}, with the normalisation; convert a checkpoint "
             "from before LeRobot had processors by: python -m "
             f"lerobot.processor.migrate_policy_normalization --pretrained-path {folder}"
         )
+
     if not config.trust_remote_code:
         for name in PIPELINES:
             require_known_steps(folder / name)
@@ -54,125 +71,176 @@ def find(config: LeRobotConfig) -> Path:
 
 
 def load(folder: Path, config: LeRobotConfig, device: Any) -> Any:
-    """Load LeRobot's policy to the device, in evaluation mode, with every parameter from the
-    checkpoint.
+    """Load LeRobot's policy, with every parameter from the checkpoint.
+
+    Args:
+        folder: The folder of the checkpoint, as returned by `find`.
+        config: The settings of the policy.
+        device: The torch device of the policy.
+
+    Returns:
+        LeRobot's policy object on the device, in evaluation mode.
+
+    Raises:
+        ConfigError: LeRobot cannot load the checkpoint, or its weights do not fill the network.
     """
     ensure_torchvision()
     factory = require("lerobot.policies.factory")
-    require_served(str(_config(folder / "config.json").get("type", "")), folder)
-    settings = _settings(folder, config)
+    policy_type = str(_read_config(folder / "config.json").get("type", ""))
+    require_served(policy_type, folder)
+
+    settings = _read_settings(folder, config)
     # As in LeRobot's factory; without it EO-1 loads its backbone from the hub.
     settings.pretrained_path = folder
-    as_saved = _prepare(settings, config, device)
+    keeps_saved_types = _prepare(settings, config, device)
+
     try:
         saved = SavedTensors.open(folder / WEIGHTS)
-        policy = factory.get_policy_class(settings.type).from_pretrained(
-            str(folder), config=settings
-        )
+        policy_class = factory.get_policy_class(settings.type)
+        policy = policy_class.from_pretrained(str(folder), config=settings)
     except ConfigError:
         raise
     except Exception as error:
         raise ConfigError(
-            f"checkpoint {folder}: LeRobot cannot load it as {settings.type!r} ({_said(error)}); "
-            f"is it complete? {other_version()}. Without a network, what it names on the hub has "
-            "to be in the cache, or to be replaced by `overrides`"
+            f"checkpoint {folder}: LeRobot cannot load it as {settings.type!r} "
+            f"({_with_causes(error)}); is it complete? {cure_with_other_version()}. Without a "
+            "network, what it names on the hub has to be in the cache, or to be replaced by "
+            "`overrides`"
         ) from error
-    require_loaded(policy, _as_loaded(policy, saved))
+    require_loaded(policy, _with_current_names(policy, saved))
+
     _warn_of_float32(settings, config, device)
     if config.dtype == "float32":
         policy.float()
-    elif as_saved:
+    elif keeps_saved_types:
         for name, parameter in policy.named_parameters():
-            parameter.data = parameter.data.to(
-                saved[name].dtype if name in saved else parameter.dtype
-            )
+            dtype = saved[name].dtype if name in saved else parameter.dtype
+            parameter.data = parameter.data.to(dtype)
     return policy.to(device).eval()
 
 
-def _settings(folder: Path, config: LeRobotConfig) -> Any:
+def _read_settings(folder: Path, config: LeRobotConfig) -> Any:
     """Read the checkpoint's config.json, with `overrides`, as LeRobot's config object."""
     base = require("lerobot.configs.policies").PreTrainedConfig
     require("lerobot.utils.import_utils").register_third_party_plugins()
     try:
         settings = base.from_pretrained(folder)
-        known = {one.name for one in dataclasses.fields(settings)}
-        if unknown := sorted(set(config.overrides) - known):
+        known = {setting.name for setting in dataclasses.fields(settings)}
+        unknown = sorted(set(config.overrides) - known)
+        if unknown:
             raise ConfigError(f"overrides: got {unknown}, want some of {sorted(known)}")
-        words = [f"--{name}={json.dumps(value)}" for name, value in config.overrides.items()]
-        return base.from_pretrained(folder, cli_overrides=words) if words else settings
+        if not config.overrides:
+            return settings
+
+        arguments = [f"--{name}={json.dumps(value)}" for name, value in config.overrides.items()]
+        return base.from_pretrained(folder, cli_overrides=arguments)
     except ConfigError:
         raise
     except Exception as error:
         raise ConfigError(
             f"checkpoint {folder}: config.json with overrides {config.overrides} is not LeRobot's "
-            f"({_said(error)}); {other_version()}. The types it knows here: "
+            f"({_with_causes(error)}); {cure_with_other_version()}. The types it knows here: "
             f"{sorted(base.get_known_choices())}"
         ) from error
 
 
-def require_served(name: str, folder: Path) -> None:
-    """Raise `ConfigError` unless this environment can load LeRobot's policies of type `name`,
-    saved in `folder`.
+def require_served(policy_type: str, folder: Path) -> None:
+    """Check that this environment can serve a type of LeRobot's policies.
+
+    Args:
+        policy_type: The `type` in the checkpoint's config.json.
+        folder: The folder of the checkpoint, for the error message.
+
+    Raises:
+        ConfigError: The type is not served, or needs another environment.
     """
-    if reason := refusal(name):
-        raise ConfigError(f"checkpoint {folder}: is a {name!r}, which is not served here: {reason}")
-    if name in _PATCHED and not is_new():
-        found = None
+    reason = reason_not_served(policy_type)
+    if reason is not None:
+        raise ConfigError(
+            f"checkpoint {folder}: is a {policy_type!r}, which is not served here: {reason}"
+        )
+
+    if policy_type in _PATCHED and not is_new():
+        spec = None
         with contextlib.suppress(ModuleNotFoundError):
-            found = importlib.util.find_spec(_CHECK)
-        if found is None:
+            spec = importlib.util.find_spec(_CHECK)
+        if spec is None:
             raise ConfigError(
-                f"checkpoint {folder}: LeRobot's {name!r} needs transformers with openpi's "
-                f"changes, which no release has; install the branch that LeRobot's page on {name} "
-                "names into this environment, serve it with LeRobot 0.6.1, which does without "
-                "(`vlagents-ray env make lerobot06`), by 'openpi' or, for π0, by 'pi0'"
+                f"checkpoint {folder}: LeRobot's {policy_type!r} needs transformers with openpi's "
+                "changes, which no release has; install the branch that LeRobot's page on "
+                f"{policy_type} names into this environment, serve it with LeRobot 0.6.1, which "
+                "does without (`vlagents-ray env make lerobot06`), by 'openpi' or, for π0, by 'pi0'"
             )
 
 
 def _prepare(settings: Any, config: LeRobotConfig, device: Any) -> bool:
-    """Set the device and types of the policy; return whether its parameters keep their saved
-    types.
+    """Set the device, the types and the compilation of the policy in LeRobot's config object.
+
+    Returns:
+        Whether the parameters keep the types in which they were saved.
+
+    Raises:
+        ConfigError: The checkpoint is a PEFT adapter, or a setting does not apply to its type.
     """
     if settings.use_peft:
         raise ConfigError(
             "checkpoint: is a PEFT adapter, want whole weights; merge it (merge_and_unload) and "
             "save that, or serve its base with the adapter as one of the deployment's `checkpoints`"
         )
+
     settings.device = str(device)
     if hasattr(settings, "pretrained_backbone_weights"):
         settings.pretrained_backbone_weights = None  # would be downloaded, only to be replaced
-    # Types that `compile` supports.
-    if issubclass(KINDS.get(settings.type, object), (Diffusion, Flow)):
+
+    kind = KINDS.get(settings.type, object)
+    if issubclass(kind, (Diffusion, Flow)):  # the types that `compile` supports
         if config.overrides.get("compile_model"):
             raise ConfigError(
                 "overrides: got compile_model, want `compile: true` in its place, which is checked"
             )
         settings.compile_model = False
-    if issubclass(KINDS.get(settings.type, object), Flow):
-        rtc = settings.rtc_config or require("lerobot.policies.rtc.configuration_rtc").RTCConfig()
-        mode: dict[str, str] = {}
-        # In LeRobot's own rollouts a trained checkpoint is guided by default.
-        if getattr(settings, LONGEST_PREFIX, 0):
-            mode["mode"] = (config.overrides.get("rtc_config") or {}).get("mode", "trained")
-        settings.rtc_config = dataclasses.replace(rtc, enabled=True, debug=False, **mode)
-    choices = ["auto", "float32", *(["bfloat16"] if hasattr(settings, "dtype") else [])]
+    if issubclass(kind, Flow):
+        settings.rtc_config = _real_time_chunking(settings, config)
+
+    _set_dtype(settings, config)
+    keeps_saved_types = bool(getattr(settings, "load_vlm_weights", False))
+    if keeps_saved_types:
+        settings.load_vlm_weights = False  # would be downloaded in bfloat16, only to be replaced
+    return keeps_saved_types
+
+
+def _real_time_chunking(settings: Any, config: LeRobotConfig) -> Any:
+    """Return LeRobot's settings of real-time chunking, enabled."""
+    rtc = settings.rtc_config or require("lerobot.policies.rtc.configuration_rtc").RTCConfig()
+    mode: dict[str, str] = {}
+    # LeRobot's own rollouts use guidance by default, also for a checkpoint trained with prefixes.
+    if getattr(settings, LONGEST_PREFIX, 0):
+        overrides = config.overrides.get("rtc_config") or {}
+        mode["mode"] = overrides.get("mode", "trained")
+    return dataclasses.replace(rtc, enabled=True, debug=False, **mode)
+
+
+def _set_dtype(settings: Any, config: LeRobotConfig) -> None:
+    """Set the type of the weights; raise `ConfigError` if the policy does not support it."""
+    has_dtype = hasattr(settings, "dtype")
+    choices = ["auto", "float32"]
+    if has_dtype:
+        choices.append("bfloat16")
     if config.dtype not in choices:
         raise ConfigError(
             f"dtype: got {config.dtype!r}, LeRobot's {settings.type!r} takes one of {choices}"
         )
-    if hasattr(settings, "dtype") and config.dtype != "auto":
+
+    if has_dtype and config.dtype != "auto":
         settings.dtype = config.dtype
     if config.dtype == "float32" and hasattr(settings, "use_bf16"):
         settings.use_bf16 = False  # GR00T would otherwise still compute in bfloat16
-    as_saved = bool(getattr(settings, "load_vlm_weights", False))
-    if as_saved:
-        settings.load_vlm_weights = False  # would be downloaded in bfloat16, only to be replaced
-    return as_saved
 
 
 def _warn_of_float32(settings: Any, config: LeRobotConfig, device: Any) -> None:
-    """Warn if `auto` is float32 on a GPU, which is the default of LeRobot's configs, not of its
-    published models.
+    """Warn if `auto` selects float32 on a GPU.
+
+    LeRobot's configs have float32 by default, but its published models do not.
     """
     if (
         device.type != "cpu"
@@ -186,20 +254,23 @@ def _warn_of_float32(settings: Any, config: LeRobotConfig, device: Any) -> None:
         )
 
 
-def _said(error: BaseException | None) -> str:
-    """Return the text of an error and of its causes, such as that of a config's own check."""
-    said = []
+def _with_causes(error: BaseException | None) -> str:
+    """Return the text of an error and of its causes, for example the check of a config that
+    failed.
+    """
+    texts = []
     while error is not None:
-        said.append(f"{type(error).__name__}: {error}")
+        texts.append(f"{type(error).__name__}: {error}")
         error = error.__cause__ or error.__context__
-    return ", from ".join(dict.fromkeys(said))
+    return ", from ".join(dict.fromkeys(texts))
 
 
 def _require_no_nvidia(file: Path) -> None:
-    """Raise `ConfigError` for a checkpoint of NVIDIA's own GR00T code, which LeRobot accepts
-    only as a base.
+    """Raise `ConfigError` for a checkpoint of NVIDIA's own GR00T code.
+
+    LeRobot accepts such a checkpoint only as a base for training.
     """
-    if file.is_file() and "gr00t" in str(_config(file).get("model_type", "")).lower():
+    if file.is_file() and "gr00t" in str(_read_config(file).get("model_type", "")).lower():
         raise ConfigError(
             f"checkpoint {file.parent}: is one of NVIDIA's own GR00T code, want one that LeRobot "
             "saved; serve it by the policy gr00t (docs/policies/gr00t.md), or train it on with "
@@ -208,41 +279,44 @@ def _require_no_nvidia(file: Path) -> None:
         )
 
 
-def _config(file: Path) -> Mapping[str, Any]:
-    """Read a config.json, which may be of another library."""
+def _read_config(file: Path) -> Mapping[str, Any]:
+    """Read a config.json, which may be of another library; empty if it is not a JSON object."""
     try:
-        found = json.loads(file.read_text(encoding="utf-8"))
+        content = json.loads(file.read_text(encoding="utf-8"))
     except ValueError as error:
         raise ConfigError(
             f"checkpoint {file.parent}: {file.name} is no JSON ({error}); copy it again"
         ) from error
-    return found if isinstance(found, dict) else {}
+    return content if isinstance(content, dict) else {}
 
 
-def _as_loaded(policy: Any, saved: SavedTensors) -> SavedTensors | Mapping[str, Any]:
-    """Return the saved tensors by LeRobot's current names; checkpoints of openpi and LeRobot 0.4
-    have older names.
+def _with_current_names(policy: Any, saved: SavedTensors) -> SavedTensors | Mapping[str, Any]:
+    """Return the saved tensors by LeRobot's current names.
+
+    Checkpoints of openpi and of LeRobot 0.4 have older names.
     """
     module = sys.modules[type(policy).__module__]
-    names = list(saved)
-    older = getattr(module, "_is_vendored_florence_state_dict", None)  # of X-VLA in LeRobot 0.6
-    if older is not None and older(dict.fromkeys(names)):
-        renamed: Mapping[str, Any] = module._remap_vendored_florence_state_dict(
-            {name: saved[name] for name in names}
-        )
+    saved_names = list(saved)
+
+    # X-VLA's modules, in LeRobot 0.6.
+    has_older_names = getattr(module, "_is_vendored_florence_state_dict", None)
+    if has_older_names is not None and has_older_names(dict.fromkeys(saved_names)):
+        tensors = {name: saved[name] for name in saved_names}
+        renamed: Mapping[str, Any] = module._remap_vendored_florence_state_dict(tensors)
         return renamed
-    return SavedTensors(
-        {
-            new: functools.partial(saved.__getitem__, name)
-            for name in names
-            for new in _renamed(policy, name)
-        }
-    )
+
+    readers = {}
+    for saved_name in saved_names:
+        for name in _current_names(policy, saved_name):
+            readers[name] = functools.partial(saved.__getitem__, saved_name)
+    return SavedTensors(readers)
 
 
-def _renamed(policy: Any, name: str) -> list[str]:
+def _current_names(policy: Any, saved_name: str) -> list[str]:
     """Return LeRobot's names of a saved tensor; empty if it drops the tensor."""
-    if (fix := getattr(policy, "_fix_pytorch_state_dict_keys", None)) is None:
-        return [name]
-    found = fix({name: require("torch").empty(0)}, policy.config)
-    return [new if new.startswith("model.") else f"model.{new}" for new in found]
+    rename = getattr(policy, "_fix_pytorch_state_dict_keys", None)
+    if rename is None:
+        return [saved_name]
+
+    renamed = rename({saved_name: require("torch").empty(0)}, policy.config)
+    return [name if name.startswith("model.") else f"model.{name}" for name in renamed]
