@@ -23,7 +23,7 @@ from vlagents_ray.registry import require
 from vlagents_ray_models.lerobot import checkpoint, kinds
 from vlagents_ray_models.lerobot.config import LeRobotConfig
 from vlagents_ray_models.lerobot.kinds import ACTION, STATE
-from vlagents_ray_models.lerobot.processors import Processors, own_processors
+from vlagents_ray_models.lerobot.processors import Processors, adapter_processors
 from vlagents_ray_models.model_code import remote_code
 
 log = logging.getLogger(__name__)
@@ -173,7 +173,7 @@ class LeRobot(ModelPolicy):
         the adapter's dataset.
         """
         model: LoadedLeRobot = self.model
-        own = own_processors(folder, model.kind.config, self.config, model.processors)
+        own = adapter_processors(folder, model.kind.config, self.config, model.processors)
         if own is None:
             return
         stated, renames = own.dataset(), model.renames or own.rename_map

@@ -22,37 +22,45 @@ from vlagents_ray_models.lerobot.kinds import ACTION, STATE, groot_dataset, requ
 from vlagents_ray_models.model_code import CURE
 
 PIPELINES = ("policy_preprocessor.json", "policy_postprocessor.json")
-_NAME = "tokenizer_name"  # a hub id, or a folder of the trainer's
-_DEVICE, _RENAME, _TOKENIZER = (
-    "device_processor",
-    "rename_observations_processor",
-    "tokenizer_processor",
-)
+_CONFIG = "config.json"
+
+# Registered names of processor steps.
+_DEVICE = "device_processor"
+_RENAME = "rename_observations_processor"
+_TOKENIZER = "tokenizer_processor"
 _GROOT_TOKENIZER = "groot_n1_7_vlm_encode_v1"
 _NORMALIZERS = ("normalizer_processor", "unnormalizer_processor")
-_ABSOLUTE = "AbsoluteActionsProcessorStep"  # of LeRobot 0.6: adds the state to relative actions
-_STATE_IN_PROMPT = ("pi05", "pi0_fast")  # their prompts differ at each act
-# Types that tokenize elsewhere.
+_ABSOLUTE = (
+    "AbsoluteActionsProcessorStep"  # class in LeRobot 0.6: adds the state to relative actions
+)
+
+_NAME = "tokenizer_name"  # a hub id, or a folder on the machine where the policy was trained
+
+# Types whose prompts contain the state, so that they differ at each call.
+_STATE_IN_PROMPT = ("pi05", "pi0_fast")
+# Types that tokenize outside the pre-processor.
 _TOKENIZING = ("eo1", "evo1", "fastwam", "molmoact2", "vla_jepa", "wall_x")
-_CONFIG = "config.json"
+
 # Settings of a policy, apart from its cameras, that change the network for the same weights.
 _NETWORK = (
-    *(
-        "type",
-        "n_obs_steps",
-        "chunk_size",
-        "empty_cameras",
-        "tokenizer_max_length",
-        "image_resolution",
-    ),
-    *(
-        "resize_imgs_with_padding",
-        "adapt_to_pi_aloha",
-        "use_delta_joint_actions_aloha",
-        "add_image_special_tokens",
-    ),
-    *("attention_mode", "prefix_length", "self_attn_every_n_layers", "min_period", "max_period"),
+    "type",
+    "n_obs_steps",
+    "chunk_size",
+    "empty_cameras",
+    "tokenizer_max_length",
+    "image_resolution",
+    "resize_imgs_with_padding",
+    "adapt_to_pi_aloha",
+    "use_delta_joint_actions_aloha",
+    "add_image_special_tokens",
+    "attention_mode",
+    "prefix_length",
+    "self_attn_every_n_layers",
+    "min_period",
+    "max_period",
 )
+
+# Mode of normalisation -> the statistics that it needs.
 _STATISTICS = {
     "MEAN_STD": ("mean", "std"),
     "MIN_MAX": ("min", "max"),
@@ -62,56 +70,55 @@ _STATISTICS = {
 
 
 class Processors:
-    """The pre- and post-processor, on the policy's device; raises `ConfigError` if they are
-    incomplete.
+    """The pre- and the post-processor of a policy, on the policy's device.
+
+    Args:
+        folder: The folder with both pipelines.
+        settings: LeRobot's config object of the policy.
+        config: The settings of the deployment, with overrides of the steps' settings.
+        staging: Copies inputs to the policy's device.
+
+    Raises:
+        ConfigError: A pipeline does not load, or `config` overrides a step that does not exist.
     """
 
     def __init__(
         self, folder: Path, settings: Any, config: LeRobotConfig, staging: Staging
     ) -> None:
         self.staging = staging
-        saved = [_saved_steps(folder / name) for name in PIPELINES]
-        if unknown := sorted(set(config.processors) - set().union(*saved)):
+        before, after = (_saved_steps(folder / name) for name in PIPELINES)
+        unknown = sorted(set(config.processors) - before.keys() - after.keys())
+        if unknown:
             raise ConfigError(
-                f"processors: got {unknown}, the checkpoint has "
-                f"{[sorted(steps) for steps in saved]}"
+                f"processors: got {unknown}, the checkpoint has {[sorted(before), sorted(after)]}"
             )
-        self.steps = [list(steps) for steps in saved]  # the registered names, for both pipelines
-        self.step_settings = {  # without steps that depend on the dataset or the machine
-            name: {
-                key: value
-                for key, value in step.items()
-                if key not in (_NAME, *config.processors.get(name, ()))
-            }
-            for steps in saved
-            for name, step in steps.items()
-            if name not in (_DEVICE, _RENAME, *_NORMALIZERS)
-        }
-        # `perceive` uses the policy's names.
-        own = {_DEVICE: {"device": settings.device}, _RENAME: {"rename_map": {}}}
-        overrides = {**own, **config.processors}
-        trained = saved[0].get(_RENAME, {}).get("rename_map") or {}
+
+        self.steps = [list(before), list(after)]  # the registered names, for both pipelines
+        self.step_settings = _comparable_settings(before, config)
+        self.step_settings.update(_comparable_settings(after, config))
+
+        saved_rename_map = before.get(_RENAME, {}).get("rename_map") or {}
         self.rename_map: dict[str, str] = dict(
-            trained if config.rename_map is None else config.rename_map
+            saved_rename_map if config.rename_map is None else config.rename_map
         )
-        self.instructed = settings.type in _TOKENIZING or bool(
-            {_TOKENIZER, _GROOT_TOKENIZER} & set(saved[0])
-        )
+        has_tokenizer = _TOKENIZER in before or _GROOT_TOKENIZER in before
+        self.instructed = has_tokenizer or settings.type in _TOKENIZING
+
+        before_overrides = {
+            _DEVICE: {"device": settings.device},
+            _RENAME: {"rename_map": {}},  # `perceive` uses the policy's names
+            **config.processors,
+        }
         try:
-            self._before, self._after = require(
-                "lerobot.policies.factory"
-            ).make_pre_post_processors(
+            factory = require("lerobot.policies.factory")
+            self._before, self._after = factory.make_pre_post_processors(
                 settings,
                 pretrained_path=str(folder),
-                preprocessor_overrides={
-                    name: value for name, value in overrides.items() if name in saved[0]
-                },
-                postprocessor_overrides={
-                    name: value for name, value in config.processors.items() if name in saved[1]
-                },
+                preprocessor_overrides=_of_steps(before_overrides, before),
+                postprocessor_overrides=_of_steps(config.processors, after),
             )
-            for step in self._before.steps:  # GR00T's loads its tokenizer on first use
-                getattr(step, "proc", None)
+            for step in self._before.steps:
+                getattr(step, "proc", None)  # GR00T's loads its tokenizer on first use
         except Exception as error:
             raise ConfigError(
                 f"checkpoint {folder}: its processors do not load ({type(error).__name__}: "
@@ -120,89 +127,94 @@ class Processors:
                 "{model_name: …}}, π0-FAST's second one by {action_tokenizer_processor: "
                 "{paligemma_tokenizer_name: …}}"
             ) from error
+
         if settings.type not in _STATE_IN_PROMPT:
             self._keep_tokens()
-        self._groot = settings.type == "groot"
+
+        self._is_groot = settings.type == "groot"
         absolute = [
             step for step in self._after.steps if type(step).__name__ == _ABSOLUTE and step.enabled
         ]
-        # Holds the states of the last batch.
+        # Stores the states of the last batch.
         self._relative = absolute[0].relative_step if absolute else None
         # Whether actions are converted by whole chunks instead of rows.
-        self.whole = self._groot or bool(absolute)
-        self.inverse = self._inverse()
+        self.whole = self._is_groot or bool(absolute)
+        self.inverse = self._make_inverse()
 
     def statistics(self, key: str) -> dict[str, list[float]]:
-        """Return the statistics of a feature of the dataset; empty if there are none."""
+        """Return the statistics of a feature of the dataset, such as "mean"; empty if there are
+        none.
+        """
         for step in self._before.steps:
-            of_step = getattr(step, "_tensor_stats", None) or getattr(step, "stats", None) or {}
-            if found := of_step.get(key):
+            by_feature = getattr(step, "_tensor_stats", None) or getattr(step, "stats", None) or {}
+            statistics = by_feature.get(key)
+            if statistics:
+                as_tensor = require("torch").as_tensor
                 return {
-                    name: require("torch").as_tensor(value).flatten().tolist()
-                    for name, value in found.items()
+                    name: as_tensor(value).flatten().tolist() for name, value in statistics.items()
                 }
         return {}
 
     def normalises(self, feature: Any) -> bool:
-        """Return whether the pre-processor normalises that feature by its statistics."""
-        maps = [step.norm_map for step in self._before.steps if hasattr(step, "norm_map")]
-        return any(getattr(one.get(feature.type), "name", "IDENTITY") != "IDENTITY" for one in maps)
+        """Return whether the pre-processor normalises a feature with its statistics."""
+        for step in _normalisers(self._before):
+            mode = step.norm_map.get(feature.type)
+            if getattr(mode, "name", "IDENTITY") != "IDENTITY":
+                return True
+        return False
 
     def dataset(self) -> DatasetContract | None:
-        """Return the contract of the dataset of the training; None if it has none."""
-        numbers = self.statistics(STATISTICS).get(BYTES)
-        return (
-            groot_dataset(self._before.steps)
-            if numbers is None
-            else DatasetContract.from_statistics(numbers)
-        )
+        """Return the contract of the training dataset; None if the dataset has none."""
+        contract_bytes = self.statistics(STATISTICS).get(BYTES)
+        if contract_bytes is None:
+            return groot_dataset(self._before.steps)
+        return DatasetContract.from_statistics(contract_bytes)
 
     def require_statistics(self, settings: Any, inputs: Sequence[str]) -> None:
-        """Raise `ConfigError` unless there are statistics for all `inputs` and the actions."""
-        if self._groot:
+        """Check that the processors have finite statistics for the features that they normalise.
+
+        Args:
+            settings: LeRobot's config object of the policy.
+            inputs: The keys of the policy's observations.
+
+        Raises:
+            ConfigError: Statistics of an input or of the actions are missing or not finite.
+        """
+        if self._is_groot:
             require_groot_statistics(self._before.steps, self._after.steps, settings)
             return
-        features = {**settings.input_features, **settings.output_features}
-        for pipeline, keys, file in (
-            (self._before, inputs, PIPELINES[0]),
-            (self._after, [ACTION], PIPELINES[1]),
-        ):
-            steps = [step for step in pipeline.steps if hasattr(step, "norm_map")]
-            for key in keys:
-                modes = steps[0].norm_map if steps else settings.normalization_mapping
-                wanted = _STATISTICS.get(getattr(modes.get(features[key].type), "name", ""), ())
-                have = {
-                    name: value
-                    for step in steps
-                    for name, value in step._tensor_stats.get(key, {}).items()
-                }
-                missing = [
-                    name for name in wanted if name not in have or not have[name].isfinite().all()
-                ]
-                if missing:
-                    raise ConfigError(
-                        f"checkpoint: {file} has no usable {missing} of {key!r}, has "
-                        f"{sorted(have)}; without them its inputs and actions are wrong: save its "
-                        "processors with the statistics of its dataset"
-                    )
+
+        for key in inputs:
+            _require_feature_statistics(self._before, key, settings, PIPELINES[0])
+        _require_feature_statistics(self._after, ACTION, settings, PIPELINES[1])
 
     def observe(self, rows: Sequence[Row], steps: int) -> dict[str, Any]:
-        """Return the policy's inputs, (rows * steps, …) on its device: the last `steps` frames
-        of each row.
+        """Return the policy's inputs for the last observations of some rows.
+
+        Args:
+            rows: B rows with their observations.
+            steps: The number of observations of each row, from the newest backwards.
+
+        Returns:
+            Tensors (B * steps, …) on the policy's device, by the policy's observation key.
         """
-        batch = self.staging.stack(
-            [frame for row in rows for frame in row.history(steps)], keep=steps > 1
-        )
+        frames: list[Any] = []
+        instructions: list[str] = []
+        for row in rows:
+            frames.extend(row.history(steps))
+            instructions.extend([row.instruction] * steps)
+
+        batch = self.staging.stack(frames, keep=steps > 1)
         for key, values in batch.items():
-            if values.ndim == 4:
+            if values.ndim == 4:  # images: (…, H, W, 3) uint8 to (…, 3, H, W) in [0, 1]
                 batch[key] = values.permute(0, 3, 1, 2).float() / 255
-        batch["task"] = [row.instruction for row in rows for _ in range(steps)]
+        batch["task"] = instructions
         return {key: value for key, value in self._before(batch).items() if value is not None}
 
     def normalised_state(self, rows: Sequence[Row]) -> Any:
         """Return the last states of rows, (B, D) on the policy's device, in the policy's units."""
         states = self.staging.upload(np.stack([row.frames[-1][STATE] for row in rows]))
-        [step] = [step for step in self._before.steps if hasattr(step, "norm_map")]
+        [step] = _normalisers(self._before)
         return step._normalize_observation({STATE: states}, inverse=False)[STATE]
 
     def actions(self, chunks: Any) -> np.ndarray:
@@ -213,31 +225,34 @@ class Processors:
         return fetch(flat.unflatten(0, chunks.shape[:2]).float())
 
     def leftover(self, row: Row) -> Any:
-        """Convert the leftover actions of a row, (H, D'), to the policy's units; None if that is
-        not possible.
+        """Convert the leftover actions of a row, (H, D'), to the policy's units.
+
+        Returns:
+            A tensor (H, D); None if the row has no leftover, or the conversion is not possible.
         """
         if self.inverse is None or row.leftover is None:
             return None
-        rows = require("torch").from_numpy(row.leftover)
+
+        actions = require("torch").from_numpy(row.leftover)
         if self._relative is not None:  # relative to the state in which the sampled chunk begins
             state = require("torch").from_numpy(row.frames[-1][STATE])
-            mask = self._relative._build_mask(rows.shape[-1])
-            rows = require("lerobot.processor").to_relative_actions(rows, state[None], mask)
-        return self.inverse(rows)
+            mask = self._relative._build_mask(actions.shape[-1])
+            actions = require("lerobot.processor").to_relative_actions(actions, state[None], mask)
+        return self.inverse(actions)
 
     def width(self, dim: int) -> int:
         """Return D', the number of values of the robot's actions, for a policy with `dim`
         values.
         """
-        return dim if self.whole else int(self._after(require("torch").zeros(1, dim)).shape[-1])
+        if self.whole:
+            return dim
+        return int(self._after(require("torch").zeros(1, dim)).shape[-1])
 
     def _keep_tokens(self) -> None:
         """Cache the tokens of instructions, if they do not depend on the other rows of a batch."""
+        tokenizer_class = require("lerobot.processor").TokenizerProcessorStep
         for step in self._before.steps:
-            if (
-                type(step) is require("lerobot.processor").TokenizerProcessorStep
-                and step.padding == "max_length"
-            ):
+            if type(step) is tokenizer_class and step.padding == "max_length":
                 step._tokenize_text = cached_tokenizer(
                     step.input_tokenizer,
                     self.staging.device,
@@ -246,27 +261,26 @@ class Processors:
                     padding_side=step.padding_side,
                 )
 
-    def _inverse(self) -> Any:
-        """Make the inverse of the post-processor, if it only unnormalises."""
-        processor, converters = (
-            require("lerobot.processor"),
-            require("lerobot.processor.converters"),
-        )
+    def _make_inverse(self) -> Any:
+        """Return the inverse of the post-processor; None if it does more than unnormalise."""
+        processor = require("lerobot.processor")
+        converters = require("lerobot.processor.converters")
+
         steps: list[Any] = []
         for step in self._after.steps:
             if isinstance(step, processor.UnnormalizerProcessorStep):
-                steps.append(
-                    processor.NormalizerProcessorStep(
-                        features=step.features,
-                        norm_map=step.norm_map,
-                        stats=step.stats,
-                        eps=step.eps,
-                    )
+                normalizer = processor.NormalizerProcessorStep(
+                    features=step.features,
+                    norm_map=step.norm_map,
+                    stats=step.stats,
+                    eps=step.eps,
                 )
+                steps.append(normalizer)
             elif not (
                 isinstance(step, processor.DeviceProcessorStep) or type(step).__name__ == _ABSOLUTE
             ):
                 return None
+
         return processor.PolicyProcessorPipeline(
             steps=steps,
             to_transition=converters.policy_action_to_transition,
@@ -274,16 +288,73 @@ class Processors:
         )
 
 
-def own_processors(
+def _of_steps(overrides: Mapping[str, Any], steps: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the overrides of those steps that a pipeline has."""
+    return {name: settings for name, settings in overrides.items() if name in steps}
+
+
+def _comparable_settings(
+    steps: Mapping[str, Mapping[str, Any]], config: LeRobotConfig
+) -> dict[str, dict[str, Any]]:
+    """Return the settings of the steps that depend neither on the dataset nor on the machine.
+
+    Settings that the deployment overrides are left out, as are those of the steps that move, rename
+    or normalise.
+    """
+    comparable: dict[str, dict[str, Any]] = {}
+    for name, settings in steps.items():
+        if name in (_DEVICE, _RENAME, *_NORMALIZERS):
+            continue
+        ignored = {_NAME, *config.processors.get(name, ())}
+        comparable[name] = {key: value for key, value in settings.items() if key not in ignored}
+    return comparable
+
+
+def _normalisers(pipeline: Any) -> list[Any]:
+    """Return the steps of a pipeline that normalise or unnormalise."""
+    return [step for step in pipeline.steps if hasattr(step, "norm_map")]
+
+
+def _require_feature_statistics(pipeline: Any, key: str, settings: Any, file: str) -> None:
+    """Raise `ConfigError` if a pipeline lacks finite statistics to normalise a feature.
+
+    Args:
+        pipeline: LeRobot's pipeline, which was read from `file`.
+        key: The key of the feature.
+        settings: LeRobot's config object of the policy.
+        file: The name of the pipeline's file, for the error message.
+    """
+    steps = _normalisers(pipeline)
+    modes = steps[0].norm_map if steps else settings.normalization_mapping
+    feature = {**settings.input_features, **settings.output_features}[key]
+    mode = getattr(modes.get(feature.type), "name", "")
+    needed = _STATISTICS.get(mode, ())
+
+    statistics: dict[str, Any] = {}
+    for step in steps:
+        statistics.update(step._tensor_stats.get(key, {}))
+
+    missing = [
+        name for name in needed if name not in statistics or not statistics[name].isfinite().all()
+    ]
+    if missing:
+        raise ConfigError(
+            f"checkpoint: {file} has no usable {missing} of {key!r}, has {sorted(statistics)}; "
+            "without them its inputs and actions are wrong: save its processors with the "
+            "statistics of its dataset"
+        )
+
+
+def adapter_processors(
     folder: Path, settings: Any, config: LeRobotConfig, base: Processors
 ) -> Processors | None:
     """Return the processors saved with an adapter, whose dataset may have other statistics than the
-    base's.
+    dataset of the base.
 
     Args:
         folder: The adapter's folder.
-        settings: The policy's own config.
-        config: The settings of the policy.
+        settings: LeRobot's config object of the policy.
+        config: The settings of the deployment.
         base: The processors of the base.
 
     Returns:
@@ -291,119 +362,152 @@ def own_processors(
 
     Raises:
         ConfigError: They differ from the base's in more than the statistics of state and actions,
-            or the policy's config beside them is of another network.
+            or the policy's config in the same folder describes another network.
     """
     _require_same_network(folder / _CONFIG, settings, config)
-    if not any((folder / name).is_file() for name in PIPELINES):
+    missing = [name for name in PIPELINES if not (folder / name).is_file()]
+    if len(missing) == len(PIPELINES):
         return None
-    if missing := [name for name in PIPELINES if not (folder / name).is_file()]:
+    if missing:
         raise ConfigError(
             f"{folder}: misses {missing}, want both pipelines as LeRobot saves them, or none of "
             "them"
         )
+
     if not config.trust_remote_code:
         for name in PIPELINES:
             require_known_steps(folder / name)
-    own = Processors(folder, settings, config, base.staging)
+    processors = Processors(folder, settings, config, base.staging)
     features = {**settings.input_features, **settings.output_features}
-    own.require_statistics(settings, [key for key in features if key != ACTION])
-    changed = {
-        key
-        for key in features
-        if own.normalises(features[key]) and own.statistics(key) != base.statistics(key)
-    }
-    sizes = [
-        [len(one.statistics(key).get("mean", ())) for key in (STATE, ACTION)] for one in (own, base)
-    ]
-    odd = [
-        name for name, one in own.step_settings.items() if base.step_settings.get(name, one) != one
-    ]
+    processors.require_statistics(settings, [key for key in features if key != ACTION])
+
     allowed = {ACTION} if settings.type in _STATE_IN_PROMPT else {STATE, ACTION}
-    other = {
-        "steps": own.steps != base.steps,
-        f"settings of {odd}": bool(odd),
-        "actions relative to the state": own.whole,
-        f"numbers {sizes[0]} of state and actions, not {sizes[1]}": sizes[0] != sizes[1],
-        f"statistics of {sorted(changed - allowed)}": bool(changed - allowed),
-    }
-    if any(other.values()):
-        said = ", ".join(what for what, differs in other.items() if differs)
+    differences = _differences(processors, base, settings, allowed)
+    if differences:
         raise ConfigError(
-            f"{folder}: its processors have other {said} than those of the base, want the same but "
-            f"for the statistics of {sorted(allowed)}; merge the adapter into its base, and serve "
-            "that as a checkpoint of its own"
+            f"{folder}: its processors have other {', '.join(differences)} than those of the base, "
+            f"want the same but for the statistics of {sorted(allowed)}; merge the adapter into "
+            "its base, and serve that as a checkpoint of its own"
         )
-    return own
+    return processors
+
+
+def _differences(
+    processors: Processors, base: Processors, settings: Any, allowed: set[str]
+) -> list[str]:
+    """Return what distinguishes an adapter's processors from the base's, for an error message.
+
+    Statistics of the features in `allowed` may differ.
+    """
+    differences = []
+    if processors.steps != base.steps:
+        differences.append("steps")
+
+    changed_settings = [
+        name
+        for name, step in processors.step_settings.items()
+        if base.step_settings.get(name, step) != step
+    ]
+    if changed_settings:
+        differences.append(f"settings of {changed_settings}")
+
+    if processors.whole:
+        differences.append("actions relative to the state")
+
+    sizes, base_sizes = _sizes(processors), _sizes(base)
+    if sizes != base_sizes:
+        differences.append(f"numbers {sizes} of state and actions, not {base_sizes}")
+
+    changed_features = set()
+    for key, feature in {**settings.input_features, **settings.output_features}.items():
+        if processors.normalises(feature) and processors.statistics(key) != base.statistics(key):
+            changed_features.add(key)
+    if changed_features - allowed:
+        differences.append(f"statistics of {sorted(changed_features - allowed)}")
+    return differences
+
+
+def _sizes(processors: Processors) -> list[int]:
+    """Return the numbers of values in a state and in an action, according to the statistics."""
+    return [len(processors.statistics(key).get("mean", ())) for key in (STATE, ACTION)]
 
 
 def _require_same_network(file: Path, settings: Any, config: LeRobotConfig) -> None:
-    """Raise `ConfigError` if the policy's config in the adapter's folder has cameras or passes
-    unlike the base's.
+    """Raise `ConfigError` if the policy's config in an adapter's folder differs from the base's in
+    its cameras or its network.
     """
     if not file.is_file():
         return
+
     try:
         saved = json.loads(file.read_text(encoding="utf-8"))
-        cameras = [
-            key
-            for key, one in (saved.get("input_features") or {}).items()
-            if one["type"] == "VISUAL"
-        ]
+        features = saved.get("input_features") or {}
+        saved_cameras = [key for key, feature in features.items() if feature["type"] == "VISUAL"]
     except (ValueError, AttributeError, KeyError, TypeError) as error:
         raise ConfigError(
             f"{file}: is no config of a LeRobot policy ({error!r}); copy it again"
         ) from error
+
+    of_adapter: dict[str, Any] = {}
+    of_base: dict[str, Any] = {}
     base = {name: getattr(settings, name) for name in _NETWORK if hasattr(settings, name)}
-    other = {
-        name: [saved[name], value]
-        for name, value in json.loads(json.dumps(base)).items()
-        if name not in config.overrides and name in saved and saved[name] != value
-    }
-    if cameras and cameras != list(settings.image_features):
-        other["cameras"] = [cameras, list(settings.image_features)]
-    if other:
+    for name, value in json.loads(json.dumps(base)).items():
+        if name not in config.overrides and name in saved and saved[name] != value:
+            of_adapter[name], of_base[name] = saved[name], value
+
+    base_cameras = list(settings.image_features)
+    if saved_cameras and saved_cameras != base_cameras:
+        of_adapter["cameras"], of_base["cameras"] = saved_cameras, base_cameras
+
+    if of_adapter:
         raise ConfigError(
-            f"{file}: was trained with "
-            f"{ ({name: theirs for name, (theirs, _) in other.items()}) }, the base with "
-            f"{ ({name: ours for name, (_, ours) in other.items()}) }, want the same; merge the "
-            "adapter into its base, and serve that as a checkpoint of its own"
+            f"{file}: was trained with {of_adapter}, the base with {of_base}, want the same; merge "
+            "the adapter into its base, and serve that as a checkpoint of its own"
         )
 
 
 def require_known_steps(file: Path) -> None:
-    """Raise `ConfigError` if a pipeline names a step that is neither LeRobot's nor an installed
-    plugin's.
+    """Check that a pipeline names only processor steps of LeRobot or of installed plug-ins.
 
-    LeRobot imports and calls the "class" of a step without a "registry_name", also
+    LeRobot imports and calls the "class" of a step without a "registry_name", even if that is
     `subprocess.Popen`.
+
+    Args:
+        file: The JSON file of the pipeline.
+
+    Raises:
+        ConfigError: A step is some other class.
     """
     steps = json.loads(file.read_text(encoding="utf-8")).get("steps", [])
-    for name in [step.get("class") for step in steps if "registry_name" not in step]:
-        if not _is_lerobots(name):
+    for step in steps:
+        if "registry_name" not in step and not _is_lerobots(step.get("class")):
             raise ConfigError(
-                f"{file}: got a step of the class {name!r}, want one with a registry_name, or a "
-                "processor step in lerobot.*: loading the checkpoint would run that, whatever it "
-                f"is; {CURE}"
+                f"{file}: got a step of the class {step.get('class')!r}, want one with a "
+                "registry_name, or a processor step in lerobot.*: loading the checkpoint would run "
+                f"that, whatever it is; {CURE}"
             )
 
 
-def _is_lerobots(name: object) -> bool:
-    module, _, cls = str(name).rpartition(".")
+def _is_lerobots(path: object) -> bool:
+    """Return whether a dotted path names a processor step in LeRobot."""
+    module, _, class_name = str(path).rpartition(".")
     if not module.startswith("lerobot."):
         return False
     try:
-        found = getattr(require(module), cls, None)
+        value = getattr(require(module), class_name, None)
     except (ImportError, MissingDependency):
         return False
-    return inspect.isclass(found) and issubclass(found, require("lerobot.processor").ProcessorStep)
+    return inspect.isclass(value) and issubclass(value, require("lerobot.processor").ProcessorStep)
 
 
 def _saved_steps(file: Path) -> dict[str, Mapping[str, Any]]:
-    """Map the registered name of each step of a pipeline to its settings."""
+    """Return the settings of each step of a pipeline, by the step's registered name."""
     steps = json.loads(file.read_text(encoding="utf-8")).get("steps", [])
-    return {
-        step.get("registry_name", step.get("class", "")): step.get("config", {}) for step in steps
-    }
+    settings = {}
+    for step in steps:
+        name = step.get("registry_name", step.get("class", ""))
+        settings[name] = step.get("config", {})
+    return settings
 
 
 def cached_tokenizer(
@@ -416,17 +520,20 @@ def cached_tokenizer(
 
     Args:
         tokenizer: A tokenizer of transformers.
-        device: The device of the tensors, where the cache has them already.
-        settings: Further arguments of its calls, such as `max_length`.
+        device: The device of the tensors; the cache stores them there.
+        settings: Further arguments of the tokenizer's calls, such as `max_length`.
     """
 
     @keeping_tokens
-    def tokenized(text: str) -> dict[str, Any]:
+    def tokenize(text: str) -> dict[str, Any]:
         tokens = tokenizer([text], padding="max_length", return_tensors="pt", **settings)
         return {name: row.to(device) for name, row in tokens.items()}
 
-    def call(texts: list[str]) -> dict[str, Any]:
-        rows = [tokenized(text) for text in texts]
-        return {name: require("torch").cat([row[name] for row in rows]) for name in rows[0]}
+    def tokenize_batch(texts: list[str]) -> dict[str, Any]:
+        rows = [tokenize(text) for text in texts]
+        batch = {}
+        for name in rows[0]:
+            batch[name] = require("torch").cat([row[name] for row in rows])
+        return batch
 
-    return call
+    return tokenize_batch
