@@ -25,8 +25,13 @@ from vlagents_ray_models.lerobot.config import (
     is_new,
     reason_not_served,
 )
-from vlagents_ray_models.lerobot.kinds import KINDS, LONGEST_PREFIX, Diffusion, Flow
 from vlagents_ray_models.lerobot.processors import PIPELINES, require_known_steps
+from vlagents_ray_models.lerobot.samplers import (
+    LONGEST_PREFIX,
+    SAMPLERS,
+    DiffusionSampler,
+    FlowSampler,
+)
 
 logger = logging.getLogger(__name__)
 
@@ -192,14 +197,14 @@ def _prepare(settings: Any, config: LeRobotConfig, device: Any) -> bool:
     if hasattr(settings, "pretrained_backbone_weights"):
         settings.pretrained_backbone_weights = None  # would be downloaded, only to be replaced
 
-    kind = KINDS.get(settings.type, object)
-    if issubclass(kind, (Diffusion, Flow)):  # the types that `compile` supports
+    sampler = SAMPLERS.get(settings.type, object)
+    if issubclass(sampler, (DiffusionSampler, FlowSampler)):  # the types that `compile` supports
         if config.overrides.get("compile_model"):
             raise ConfigError(
                 "overrides: got compile_model, want `compile: true` in its place, which is checked"
             )
         settings.compile_model = False
-    if issubclass(kind, Flow):
+    if issubclass(sampler, FlowSampler):
         settings.rtc_config = _real_time_chunking(settings, config)
 
     _set_dtype(settings, config)

@@ -10,8 +10,14 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from vlagents_ray.contract import ActionSpec, CameraSpec, Contract
-from vlagents_ray.dataset_contract import DatasetContract, angles_in, centre_between, usual_unit
+from vlagents_ray.contract import ActionSpec, CameraSpec, Contract, StateSpec
+from vlagents_ray.dataset_contract import (
+    Centre,
+    DatasetContract,
+    angles_in,
+    centre_between,
+    usual_unit,
+)
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.interface import GIVEN, Obs
 from vlagents_ray.policies.base import ModelPolicy, Prediction, Row, model_inputs
@@ -20,42 +26,46 @@ from vlagents_ray.policies.base.staging import StagedRow
 from vlagents_ray.policies.flow import OFFERED
 from vlagents_ray.policies.outcomes import attempt
 from vlagents_ray.registry import require
-from vlagents_ray_models.lerobot import checkpoint, kinds
+from vlagents_ray_models.lerobot import checkpoint, samplers
 from vlagents_ray_models.lerobot.config import LeRobotConfig
-from vlagents_ray_models.lerobot.kinds import ACTION, STATE
 from vlagents_ray_models.lerobot.processors import Processors, adapter_processors
+from vlagents_ray_models.lerobot.samplers import ACTION, STATE
 from vlagents_ray_models.model_code import remote_code
 
 log = logging.getLogger(__name__)
 
 ENVIRONMENT = "observation.environment_state"
 JOINTS, ENVIRONMENT_STATE = "joints", "environment_state"  # default parts of `Obs.state`
-_MATCHED = ("min", "max", "mean")  # statistics by which the parts of a state are located in it
-_FLOWS = sorted(name for name in kinds.KINDS if issubclass(kinds.KINDS[name], kinds.Flow))
+
+# Statistics that tell in which order the parts of a state were concatenated.
+_COMPARED_STATISTICS = ("min", "max", "mean")
 _EMPTY = "empty_camera_"  # prefix of cameras that were always masked in training
+_FLOWS = sorted(
+    name for name, sampler in samplers.SAMPLERS.items() if issubclass(sampler, samplers.FlowSampler)
+)
 
 
 @dataclass(frozen=True, slots=True)
 class LoadedLeRobot:
     """A loaded checkpoint, shared by all sessions."""
 
-    kind: kinds.Kind
+    sampler: samplers.Sampler
     processors: Processors
     cameras: dict[str, str]  # the policy's observation key -> our name
     state: list[str]  # parts of the proprioception; empty if the policy has no state
     environment: list[str]  # parts of the environment's state; empty if the policy has none
     contract: Contract
-    trained: DatasetContract  # of the dataset; empty if the dataset states none
+    trained: DatasetContract  # of the training dataset; empty if the dataset has no contract
     renames: dict[str, str]  # from the dataset's cameras to the policy's observation keys
-    # Of adapters that were trained with other statistics.
-    own: dict[str, Processors] = field(default_factory=dict)
+    # Fingerprint of an adapter -> its processors, if it was trained with other statistics.
+    adapter_processors: dict[str, Processors] = field(default_factory=dict)
 
 
 class LeRobot(ModelPolicy):
     """A policy that the environment's LeRobot loads, selected by the `type` in its checkpoint."""
 
     Config: ClassVar[type] = LeRobotConfig
-    trainable = network = "model.kind.policy"
+    trainable = network = "model.sampler.policy"
     adaptable = True
     config: LeRobotConfig
 
@@ -65,308 +75,439 @@ class LeRobot(ModelPolicy):
 
     @property
     def continues_plans(self) -> bool:
-        loaded: LoadedLeRobot | None = self.model
-        if loaded is None or not isinstance(loaded.kind, kinds.Flow):
+        model: LoadedLeRobot | None = self.model
+        if model is None or not isinstance(model.sampler, samplers.FlowSampler):
             return False
-        return loaded.processors.inverse is not None and self.config.actions == "chunk"
+        return model.processors.inverse is not None and self.config.actions == "chunk"
 
     @property
     def history(self) -> int:
-        return 1 if self.model is None else self.model.kind.steps
+        return 1 if self.model is None else self.model.sampler.steps
 
     @property
     def state_dim(self) -> int | None:
-        feature = None if self.model is None else self.model.kind.config.robot_state_feature
+        feature = None if self.model is None else self.model.sampler.config.robot_state_feature
         return None if feature is None else int(feature.shape[0])
 
     def load(self) -> LoadedLeRobot:
-        with remote_code(allowed=self.config.trust_remote_code):
-            return self._loaded(checkpoint.find(self.config))
+        """Read the checkpoint, and set the defaults that it provides in `config`.
 
-    def _loaded(self, folder: Path) -> LoadedLeRobot:
+        Raises:
+            ConfigError: The checkpoint is incomplete or of another version of LeRobot, or a setting
+                does not apply to its type.
+        """
+        with remote_code(allowed=self.config.trust_remote_code):
+            return self._load(checkpoint.find(self.config))
+
+    def _load(self, folder: Path) -> LoadedLeRobot:
         policy = checkpoint.load(folder, self.config, torch_device(self.config.device))
         settings = policy.config
-        kind = kinds.KINDS.get(settings.type, kinds.Kind)(policy, self.compilation)
+        sampler_class = samplers.SAMPLERS.get(settings.type, samplers.Sampler)
+        sampler = sampler_class(policy, self.compilation)
+        self._configure(sampler)
+        self.config = _with_defaults(self.config, sampler)
+
+        processors = Processors(folder, settings, self.config, sampler.staging)
+        trained = _training_dataset(settings, processors)
+        model = self._describe(sampler, processors, trained, processors.rename_map)
+        self.statistics = _ranges(model)
+        return model
+
+    def _configure(self, sampler: samplers.Sampler) -> None:
+        """Apply the settings that only some types support; raise `ConfigError` for other types."""
+        policy_type = sampler.config.type
         if self.config.compile not in (False, "auto") and not self.compilation.cores:
             raise ConfigError(
-                f"compile: not for LeRobot's {settings.type!r}; leave it out, or have LeRobot "
+                f"compile: not for LeRobot's {policy_type!r}; leave it out, or have LeRobot "
                 "compile it, where its config has that: overrides: {compile_model: true}"
             )
-        if isinstance(kind, kinds.Flow):
-            kind.noise_level, kind.passes.adapters = self.config.noise_level, self.adapters
+        if isinstance(sampler, samplers.FlowSampler):
+            sampler.noise_level = self.config.noise_level
+            sampler.passes.adapters = self.adapters
         elif self.config.adapters:
             raise ConfigError(
-                f"adapters: got them for LeRobot's {settings.type!r}, want one of {_FLOWS}; merge "
+                f"adapters: got them for LeRobot's {policy_type!r}, want one of {_FLOWS}; merge "
                 "each into its base"
             )
         elif self.config.noise_level:
             raise ConfigError(
-                f"noise_level: got {self.config.noise_level} for LeRobot's {settings.type!r}, want "
+                f"noise_level: got {self.config.noise_level} for LeRobot's {policy_type!r}, want "
                 f"0, as its actions come out of no flow; those of {_FLOWS} do"
             )
-        self.config = _with_defaults(self.config, kind)
-        processors = Processors(folder, settings, self.config, kind.staging)
-        loaded = self._described(
-            kind, processors, _trained(settings, processors), processors.rename_map
-        )
-        self.statistics = _ranges(loaded)
-        return loaded
 
-    def _described(
+    def _describe(
         self,
-        kind: kinds.Kind,
+        sampler: samplers.Sampler,
         processors: Processors,
         trained: DatasetContract,
         renames: dict[str, str],
     ) -> LoadedLeRobot:
-        """Return the loaded checkpoint with the contract that follows from its training."""
-        settings = kind.config
+        """Return the loaded checkpoint with the contract that follows from its training.
+
+        Args:
+            sampler: The sampler with the loaded policy.
+            processors: The processors of the dataset that `trained` describes.
+            trained: The contract of the training dataset.
+            renames: From the dataset's cameras to the policy's observation keys.
+
+        Raises:
+            ConfigError: The settings name cameras or parts that do not fit, or the processors lack
+                statistics.
+        """
+        settings = sampler.config
         cameras = _cameras(settings, self.config, renames, trained.cameras)
-        parts = (
-            list(self.config.state or trained.state or [JOINTS])
-            if settings.robot_state_feature
-            else []
-        )
-        inputs = [
-            *cameras,
-            *(key for key in (STATE, ENVIRONMENT) if key in settings.input_features),
-        ]
-        processors.require_statistics(settings, inputs)
-        environment = (
-            list(trained.environment or [ENVIRONMENT_STATE]) if settings.env_state_feature else []
-        )
-        width = processors.width(kind.dim)
-        action, known = trained.contract.action, trained.contract.state or {}
-        action = action if action.dim == width else ActionSpec(dim=width)
-        if len(names := getattr(settings, "action_feature_names", None) or ()) == width:
-            action = replace(action, names=tuple(names))
-        state = (
-            model_inputs.state_specs(parts, settings.robot_state_feature.shape[0]) if parts else {}
-        )
-        if tuple(parts) == trained.state:
-            state |= known
-        around = (
-            model_inputs.state_specs(environment, settings.env_state_feature.shape[0])
-            if environment
-            else {}
-        )
+        vectors = [key for key in (STATE, ENVIRONMENT) if key in settings.input_features]
+        processors.require_statistics(settings, [*cameras, *vectors])
+
+        state: list[str] = []
+        if settings.robot_state_feature:
+            state = list(self.config.state or trained.state or [JOINTS])
+        environment: list[str] = []
+        if settings.env_state_feature:
+            environment = list(trained.environment or [ENVIRONMENT_STATE])
+
         contract = Contract(
-            cameras={ours: _camera(settings, key) for key, ours in cameras.items()},
-            state=state | {part: known.get(part, spec) for part, spec in around.items()},
-            gripper=model_inputs.needs_gripper(parts),
+            cameras={name: _camera(settings, key) for key, name in cameras.items()},
+            state=_state_specs(settings, state, environment, trained),
+            gripper=model_inputs.needs_gripper(state),
             instruction=processors.instructed or None,
-            action=action,
+            action=_action_spec(settings, processors.width(sampler.dim), trained),
             control_hz=trained.contract.control_hz,
-            chunk=self.chunk(kind.horizon),
-            history=kind.steps,
+            chunk=self.chunk(sampler.horizon),
+            history=sampler.steps,
             behaviour=self.offered(OFFERED if self.config.noise_level else ()),
         )
         return LoadedLeRobot(
-            kind, processors, cameras, parts, environment, contract, trained, renames
+            sampler, processors, cameras, state, environment, contract, trained, renames
         )
 
     def adapt(self, adapter: str, folder: Path) -> None:
         """Keep the processors saved with an adapter, if any, for the state and the actions of its
         rows.
 
-        A base that does not describe its dataset, such as one of many robots, gets the contract of
-        the adapter's dataset.
+        If the base does not describe its dataset, as a base of many robots does not, the contract
+        becomes that of the adapter's dataset.
+
+        Raises:
+            ConfigError: The adapter's processors do not fit the base, or its dataset has another
+                contract.
         """
         model: LoadedLeRobot = self.model
-        own = adapter_processors(folder, model.kind.config, self.config, model.processors)
-        if own is None:
+        settings = model.sampler.config
+        processors = adapter_processors(folder, settings, self.config, model.processors)
+        if processors is None:
             return
-        stated, renames = own.dataset(), model.renames or own.rename_map
-        trained = model.trained if stated is None else _trained(model.kind.config, own)
-        unsaid = model.trained.contract == Contract() and model.trained.state in ((), trained.state)
-        if own.rename_map not in ({}, renames) or not (unsaid or stated in (None, model.trained)):
+
+        dataset = processors.dataset()
+        renames = model.renames or processors.rename_map
+        trained = model.trained if dataset is None else _training_dataset(settings, processors)
+
+        has_same_names = processors.rename_map in ({}, renames)
+        is_base_undescribed = model.trained.contract == Contract() and model.trained.state in (
+            (),
+            trained.state,
+        )
+        has_same_contract = dataset in (None, model.trained)
+        if not has_same_names or not (is_base_undescribed or has_same_contract):
             raise ConfigError(
                 f"{folder}: its dataset has another contract, or its cameras other names, than "
                 "that of the base or of an adapter before, want the same; serve it in a deployment "
                 "of its own"
             )
+
         if trained != model.trained:
-            self.model = model = replace(
-                self._described(model.kind, model.processors, trained, renames), own=model.own
-            )
-        model.own[adapter] = own
+            described = self._describe(model.sampler, model.processors, trained, renames)
+            model = replace(described, adapter_processors=model.adapter_processors)
+            self.model = model
+        model.adapter_processors[adapter] = processors
 
     def perceive(self, obs: Obs) -> StagedRow:
+        """Return the images (H, W, 3) uint8 and the state vectors (D,) of an observation, by the
+        policy's observation key.
+        """
         model: LoadedLeRobot = self.model
-        frame = {
-            key: image.copy()
-            for key, image in model_inputs.camera_images(obs, model.cameras).items()
-        }
+        images = model_inputs.camera_images(obs, model.cameras)
+        inputs = {key: image.copy() for key, image in images.items()}
         if model.state:
-            frame[STATE] = model.trained.wrapped(
-                model_inputs.state_vector(obs, model.state, self.state_dim)
-            )
+            state = model_inputs.state_vector(obs, model.state, self.state_dim)
+            inputs[STATE] = model.trained.wrapped(state)
         if model.environment:
-            width = int(model.kind.config.env_state_feature.shape[0])
-            frame[ENVIRONMENT] = model_inputs.state_vector(obs, model.environment, width)
-        return model.kind.staging.stage(frame)
+            width = int(model.sampler.config.env_state_feature.shape[0])
+            inputs[ENVIRONMENT] = model_inputs.state_vector(obs, model.environment, width)
+        return model.sampler.staging.stage(inputs)
 
     def predict(self, rows: Sequence[Row]) -> list[Prediction | Exception]:
-        if not self.model.kind.batched:  # an error fails only its session
+        """Compute the chunks of rows; rows whose inputs have the same shapes share a pass."""
+        if not self.model.sampler.batched:  # an error fails only its session
             return [attempt(lambda row: self._draw([row])[0], row) for row in rows]
-        groups: dict[Any, list[int]] = {}
+
+        by_shapes: dict[Any, list[int]] = {}
         for i, row in enumerate(rows):
-            groups.setdefault(tuple(array.shape for array in row.frames[-1].values()), []).append(i)
-        drawn: dict[int, Prediction | Exception] = {}
-        for members in groups.values():
-            drawn |= zip(members, self._draw([rows[i] for i in members]), strict=True)
-        return [drawn[i] for i in range(len(rows))]
+            shapes = tuple(array.shape for array in row.frames[-1].values())
+            by_shapes.setdefault(shapes, []).append(i)
+
+        predictions: dict[int, Prediction | Exception] = {}
+        for indices in by_shapes.values():
+            drawn = self._draw([rows[i] for i in indices])
+            predictions.update(zip(indices, drawn, strict=True))
+        return [predictions[i] for i in range(len(rows))]
 
     def _draw(self, rows: list[Row]) -> list[Prediction]:
-        torch, model = require("torch"), self.model
-        kind, settings = model.kind, model.kind.config
-        leftovers = [model.own.get(row.adapter, model.processors).leftover(row) for row in rows]
+        torch = require("torch")
+        model: LoadedLeRobot = self.model
+        sampler, settings = model.sampler, model.sampler.config
+
+        leftovers = []
+        for row in rows:
+            processors = model.adapter_processors.get(row.adapter, model.processors)
+            leftovers.append(processors.leftover(row))
+
         # As in LeRobot's own loop.
-        mixed = settings.use_amp and torch.device(settings.device).type == "cuda"
-        with torch.inference_mode(), torch.autocast("cuda", enabled=mixed):
-            seen = [rows[i] for i in kind.observations(rows)]
-            inputs = model.processors.observe(seen, kind.steps)
-            for adapter, own in model.own.items():
-                if STATE in inputs and (places := _of(adapter, seen)):
-                    inputs[STATE][places] = own.normalised_state([seen[i] for i in places])
-            drawn = kind.draw(inputs, rows, leftovers)
+        mixed_precision = settings.use_amp and torch.device(settings.device).type == "cuda"
+        with torch.inference_mode(), torch.autocast("cuda", enabled=mixed_precision):
+            observed = [rows[i] for i in sampler.observed_rows(rows)]
+            inputs = model.processors.observe(observed, sampler.steps)
+            for adapter, processors in model.adapter_processors.items():
+                indices = _rows_of(adapter, observed)
+                if indices and STATE in inputs:
+                    states = processors.normalised_state([observed[i] for i in indices])
+                    inputs[STATE][indices] = states
+
+            drawn = sampler.draw(inputs, rows, leftovers)
             chunks = np.array(model.processors.actions(drawn))
-            for adapter, own in model.own.items():
-                if places := _of(adapter, rows):
-                    chunks[places] = own.actions(drawn[places])
-            dim = settings.action_feature.shape[0]
-            outputs = {} if kind.random is None else kind.random.outputs(self.config.execute, dim)
-        given = [{GIVEN: kind.given[i]} if i in kind.given else {} for i in range(len(rows))]
-        return [
-            Prediction(chunk, behaviour=outputs.get(i, {}), info=given[i])
-            for i, chunk in enumerate(chunks)
-        ]
+            for adapter, processors in model.adapter_processors.items():
+                indices = _rows_of(adapter, rows)
+                if indices:
+                    chunks[indices] = processors.actions(drawn[indices])
+
+            behaviours: dict[int, dict[str, Any]] = {}
+            if sampler.random_steps is not None:
+                dim = settings.action_feature.shape[0]
+                behaviours = sampler.random_steps.outputs(self.config.execute, dim)
+
+        predictions = []
+        for i, chunk in enumerate(chunks):
+            info = {GIVEN: sampler.prefix_rows[i]} if i in sampler.prefix_rows else {}
+            predictions.append(Prediction(chunk, behaviour=behaviours.get(i, {}), info=info))
+        return predictions
 
 
-def _of(adapter: str, rows: Sequence[Row]) -> list[int]:
+def _rows_of(adapter: str, rows: Sequence[Row]) -> list[int]:
+    """Return the indices of the rows of an adapter, which its fingerprint identifies."""
     return [i for i, row in enumerate(rows) if row.adapter == adapter]
 
 
-def _with_defaults(config: LeRobotConfig, kind: kinds.Kind) -> LeRobotConfig:
+def _with_defaults(config: LeRobotConfig, sampler: samplers.Sampler) -> LeRobotConfig:
     """Return the settings, with the checkpoint's values as defaults."""
-    coefficient = getattr(kind.config, "temporal_ensemble_coeff", None)
-    defaults: dict[str, Any] = {} if config.actions == "ensemble" else {"execute": kind.usual}
-    if kind.steps > 1:  # trained on consecutive frames, so it also needs those within a chunk
+    coefficient = getattr(sampler.config, "temporal_ensemble_coeff", None)
+    defaults: dict[str, Any] = {}
+    if config.actions != "ensemble":
+        defaults["execute"] = sampler.default_execute
+    if sampler.steps > 1:  # trained on consecutive frames, so it also needs those within a chunk
         defaults["actions"] = "queue"
     if coefficient is not None:  # its n_action_steps is 1, since LeRobot then runs it at every tick
         defaults = {"actions": "ensemble", "ensemble_m": coefficient, "execute": None}
-    if (config.execute or 0) > kind.horizon:
+
+    if (config.execute or 0) > sampler.horizon:
         raise ConfigError(
-            f"execute: got {config.execute}, the checkpoint's chunks have {kind.horizon} rows from "
-            "the observation on; want at most these"
+            f"execute: got {config.execute}, the checkpoint's chunks have {sampler.horizon} rows "
+            "from the observation on; want at most these"
         )
-    return config.model_copy(
-        update={k: v for k, v in defaults.items() if k not in config.model_fields_set}
-    )
+    unset = {name: default for name, default in defaults.items() if not _is_set(config, name)}
+    return config.model_copy(update=unset)
 
 
-def _ranges(loaded: LoadedLeRobot) -> dict[str, Any] | None:
-    """Return `Agent.statistics`: without turned angles of the state, and relative actions."""
-    found: dict[str, Any] = {}
-    for key, comparable in (
-        (STATE, not loaded.trained.angles),
-        (ACTION, not loaded.processors.whole),
-    ):
-        known = loaded.processors.statistics(key) if comparable else {}
-        for names in (("min", "max"), ("q01", "q99")):
-            if all(known.get(name) and np.isfinite(known[name]).all() for name in names):
-                found.setdefault(key, {name: known[name] for name in names})
-    return {"parts": loaded.state, **found} if found else None
+def _is_set(config: LeRobotConfig, name: str) -> bool:
+    return name in config.model_fields_set
 
 
-def _trained(settings: Any, processors: Processors) -> DatasetContract:
-    """Return the contract of the checkpoint's dataset, or one inferred from the features of a
-    dataset without one.
+def _ranges(model: LoadedLeRobot) -> dict[str, Any] | None:
+    """Return `Agent.statistics`, the ranges of the state and the actions in training.
+
+    The state is left out if its angles are wrapped, and the actions if they are relative to it.
     """
-    state, dataset = settings.robot_state_feature, processors.dataset()
+    comparable = []
+    if not model.trained.angles:
+        comparable.append(STATE)
+    if not model.processors.whole:
+        comparable.append(ACTION)
+
+    ranges: dict[str, Any] = {}
+    for key in comparable:
+        statistics = model.processors.statistics(key)
+        for bounds in (("min", "max"), ("q01", "q99")):
+            if all(_is_finite(statistics.get(bound)) for bound in bounds):
+                ranges[key] = {bound: statistics[bound] for bound in bounds}
+                break
+    return {"parts": model.state, **ranges} if ranges else None
+
+
+def _is_finite(values: Sequence[float] | None) -> bool:
+    """Return whether there are values, all of them finite."""
+    return bool(values) and bool(np.isfinite(values).all())  # type: ignore[arg-type]
+
+
+def _training_dataset(settings: Any, processors: Processors) -> DatasetContract:
+    """Return the contract of the checkpoint's dataset.
+
+    If the dataset has none, it is inferred from its features; it is empty if that is not possible,
+    or if the contract does not fit the policy.
+    """
+    state_feature, dataset = settings.robot_state_feature, processors.dataset()
     if dataset is None:
-        return (
-            DatasetContract(Contract())
-            if state is None
-            else _of_features(settings.input_features, processors)
-        )
-    if state is None or dataset.width == state.shape[0]:
+        if state_feature is None:
+            return DatasetContract(Contract())
+        return _infer_from_features(settings.input_features, processors)
+
+    if state_feature is None or dataset.width == state_feature.shape[0]:
         return dataset
     log.warning(
         "the contract of the checkpoint's dataset has %d numbers of state, the policy takes %d: it "
         "is not used; set `state` to the parts that the policy was trained with",
         dataset.width,
-        state.shape[0],
+        state_feature.shape[0],
     )
     return DatasetContract(Contract())
 
 
-def _of_features(features: Iterable[str], processors: Processors) -> DatasetContract:
+def _infer_from_features(features: Iterable[str], processors: Processors) -> DatasetContract:
     """Infer the parts of the state, and its angles, from features and their statistics.
 
     Copies that LeRobot's tools make without some episodes have no contract. The parts are the
     features other than `observation.state`; their order follows from comparing their statistics
-    with those of `observation.state`.
+    with the statistics of `observation.state`.
+
+    Args:
+        features: The keys of the dataset's features, in their order.
+        processors: The processors with the features' statistics.
+
+    Returns:
+        A contract with the parts; an empty one if no order fits.
     """
-    keys = {key.removeprefix(f"{STATE}."): key for key in features if key.startswith(f"{STATE}.")}
-    if f"observation.{model_inputs.GRIPPER}" in features:
-        keys[model_inputs.GRIPPER] = f"observation.{model_inputs.GRIPPER}"
-    whole = processors.statistics(STATE)
-    parts = {part: processors.statistics(key) for part, key in keys.items()}
-    listed = [part for key in features for part, own in keys.items() if own == key]
+    features = list(features)
+    key_of = {key.removeprefix(f"{STATE}."): key for key in features if key.startswith(f"{STATE}.")}
+    gripper_key = f"observation.{model_inputs.GRIPPER}"
+    if gripper_key in features:
+        key_of[model_inputs.GRIPPER] = gripper_key
 
-    def alike(name: str) -> bool:
-        values, wanted = (
-            np.concatenate([parts[part].get(name, []) for part in order]),
-            whole.get(name, []),
-        )
-        return len(values) == len(wanted) and np.allclose(values, wanted, rtol=1e-5, atol=1e-6)
-
-    for order in (listed, sorted(keys, key=lambda part: (part == model_inputs.GRIPPER, part))):
-        if order and all(map(alike, _MATCHED)):
+    state_statistics = processors.statistics(STATE)
+    part_statistics = {name: processors.statistics(key) for name, key in key_of.items()}
+    as_listed = sorted(key_of, key=lambda name: features.index(key_of[name]))
+    gripper_last = sorted(key_of, key=lambda name: (name == model_inputs.GRIPPER, name))
+    for order in (as_listed, gripper_last):
+        if order and _fits(order, part_statistics, state_statistics):
             break
     else:
         return DatasetContract(Contract())
-    angles, place = {}, 0
-    for part in order:
-        width = len(parts[part]["mean"])
-        for i in angles_in(part, usual_unit(part), width):
-            centre = centre_between(whole["min"][place + i], whole["max"][place + i])
+
+    angles: dict[int, Centre] = {}
+    first = 0  # the index of a part's first value in the state
+    for name in order:
+        width = len(part_statistics[name]["mean"])
+        for i in angles_in(name, usual_unit(name), width):
+            index = first + i
+            centre = centre_between(state_statistics["min"][index], state_statistics["max"][index])
             if centre is not None:
-                angles[place + i] = centre
-        place += width
+                angles[index] = centre
+        first += width
     return DatasetContract(Contract(), tuple(order), angles=angles)
+
+
+def _fits(
+    order: Sequence[str],
+    part_statistics: Mapping[str, Mapping[str, list[float]]],
+    state_statistics: Mapping[str, list[float]],
+) -> bool:
+    """Return whether parts in this order have, one after another, the statistics of the state."""
+    for statistic in _COMPARED_STATISTICS:
+        joined = np.concatenate([part_statistics[name].get(statistic, []) for name in order])
+        expected = state_statistics.get(statistic, [])
+        if len(joined) != len(expected):
+            return False
+        if not np.allclose(joined, expected, rtol=1e-5, atol=1e-6):
+            return False
+    return True
 
 
 def _cameras(
     settings: Any, config: LeRobotConfig, renames: dict[str, str], trained: Mapping[str, str]
 ) -> dict[str, str]:
-    names = {key: _short(key) for key in settings.image_features if _EMPTY not in key}
-    if unknown := sorted(set(config.masked_cameras) - set(names.values())):
-        raise ConfigError(f"masked_cameras: got {unknown}, want some of {sorted(names.values())}")
-    if config.masked_cameras and settings.type not in kinds.MASKING:
+    """Return the policy's observation key of each camera that is not masked -> our name.
+
+    Args:
+        settings: LeRobot's config object of the policy.
+        config: The settings of the deployment.
+        renames: From the dataset's cameras to the policy's observation keys.
+        trained: The dataset's camera features -> our names, as far as its contract has them.
+
+    Raises:
+        ConfigError: `cameras` or `masked_cameras` names cameras that the policy does not have, or
+            the policy cannot mask any.
+    """
+    name_of = {key: _short(key) for key in settings.image_features if _EMPTY not in key}
+    known = sorted(name_of.values())
+    unknown = sorted(set(config.masked_cameras) - set(known))
+    if unknown:
+        raise ConfigError(f"masked_cameras: got {unknown}, want some of {known}")
+    if config.masked_cameras and settings.type not in samplers.MASKING:
         raise ConfigError(
-            f"masked_cameras: LeRobot's {settings.type!r} needs all its cameras, "
-            f"{sorted(names.values())}; {sorted(kinds.MASKING)} can do without"
+            f"masked_cameras: LeRobot's {settings.type!r} needs all its cameras, {known}; "
+            f"{sorted(samplers.MASKING)} can do without"
         )
-    seen = {key: name for key, name in names.items() if name not in config.masked_cameras}
+
+    used = {key: name for key, name in name_of.items() if name not in config.masked_cameras}
     sources = {renamed: source for source, renamed in renames.items()}
-    features = {name: sources.get(key, key) for key, name in seen.items()}  # the dataset's names
-    usual = {name: trained.get(feature, _short(feature)) for name, feature in features.items()}
-    chosen = model_inputs.choose_cameras(config.cameras, usual, list(seen.values()))
-    return {key: chosen[name] for key, name in seen.items()}
+    defaults = {}
+    for key, name in used.items():
+        feature = sources.get(key, key)  # the dataset's key
+        defaults[name] = trained.get(feature, _short(feature))
+    chosen = model_inputs.choose_cameras(config.cameras, defaults, list(used.values()))
+    return {key: chosen[name] for key, name in used.items()}
 
 
 def _short(key: str) -> str:
+    """Return the name of a camera in its observation key."""
     return key.removeprefix("observation.images.").removeprefix("observation.")
 
 
 def _camera(settings: Any, key: str) -> CameraSpec:
-    """Specify a camera: any size if the policy resizes, else that of its training."""
+    """Specify a camera: of any size if the policy resizes images, else of the size in training."""
     if (
-        settings.type in kinds.RESIZING
+        settings.type in samplers.RESIZING
         or getattr(settings, "resize_imgs_with_padding", None) is not None
     ):
         return CameraSpec()
     _, height, width = settings.input_features[key].shape
     return CameraSpec(height, width)
+
+
+def _state_specs(
+    settings: Any, state: Sequence[str], environment: Sequence[str], trained: DatasetContract
+) -> dict[str, StateSpec]:
+    """Specify the parts of the state and of the environment's state, as the training dataset does
+    if it has the same parts.
+    """
+    known = trained.contract.state or {}
+    specs: dict[str, StateSpec] = {}
+    if state:
+        specs |= model_inputs.state_specs(state, settings.robot_state_feature.shape[0])
+    if tuple(state) == trained.state:
+        specs |= known
+    if environment:
+        width = settings.env_state_feature.shape[0]
+        for name, spec in model_inputs.state_specs(environment, width).items():
+            specs[name] = known.get(name, spec)
+    return specs
+
+
+def _action_spec(settings: Any, width: int, trained: DatasetContract) -> ActionSpec:
+    """Specify an action of `width` numbers, as the training dataset does if its actions have that
+    many.
+    """
+    action = trained.contract.action
+    if action.dim != width:
+        action = ActionSpec(dim=width)
+    names = getattr(settings, "action_feature_names", None) or ()
+    if len(names) == width:
+        action = replace(action, names=tuple(names))
+    return action

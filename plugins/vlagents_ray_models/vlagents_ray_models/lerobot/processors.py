@@ -18,7 +18,12 @@ from vlagents_ray.policies.base.model_inputs import keeping_tokens
 from vlagents_ray.policies.base.staging import Staging
 from vlagents_ray.registry import require
 from vlagents_ray_models.lerobot.config import LeRobotConfig
-from vlagents_ray_models.lerobot.kinds import ACTION, STATE, groot_dataset, require_groot_statistics
+from vlagents_ray_models.lerobot.samplers import (
+    ACTION,
+    STATE,
+    groot_dataset,
+    require_groot_statistics,
+)
 from vlagents_ray_models.model_code import CURE
 
 PIPELINES = ("policy_preprocessor.json", "policy_postprocessor.json")

@@ -158,7 +158,7 @@ def test_rows_with_prompts_of_one_length_share_a_pass(
     loaded: Load, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     policy = loaded("groot", actions="chunk")
-    network, sizes = policy.model.kind.policy._groot_model, []
+    network, sizes = policy.model.sampler.policy._groot_model, []
     act = network.get_action
     monkeypatch.setattr(
         network, "get_action", lambda inputs: sizes.append(len(inputs["state"])) or act(inputs)

@@ -17,7 +17,7 @@ from plugins.vlagents_ray_models.tests.families.lerobot import tiny
 from vlagents_ray import Obs
 from vlagents_ray.serve.models.agent_copies import AgentCopies
 from vlagents_ray_models.lerobot import LeRobot
-from vlagents_ray_models.lerobot.kinds import LONGEST_PREFIX
+from vlagents_ray_models.lerobot.samplers import LONGEST_PREFIX
 
 torch.set_num_threads(1)  # the models are too small for more: threads would wait for one another
 # LeRobot 0.4 runs pi0 and pi0.5 only with a transformers that has openpi's changes, such as this

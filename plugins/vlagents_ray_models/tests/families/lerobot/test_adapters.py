@@ -60,7 +60,7 @@ def saved(made: Made, loaded: Load, tmp_path_factory: pytest.TempPathFactory) ->
     of its own.
     """
     root, folders = tmp_path_factory.mktemp("adapters"), {}
-    network = loaded("smolvla").model.kind.policy
+    network = loaded("smolvla").model.sampler.policy
     kinds = [("expert", TARGETS, 4), ("all", f"{TARGETS}|{SEEING}", 2), ("units", TARGETS, 8)]
     for seed, (name, pattern, rank) in enumerate(kinds):
         values = {
@@ -71,7 +71,7 @@ def saved(made: Made, loaded: Load, tmp_path_factory: pytest.TempPathFactory) ->
         whole = shutil.copytree(made("smolvla"), root / f"merged-{name}")
         merged = LeRobot.from_config({"checkpoint": str(whole)})
         merged.initialize()
-        policy = merged.model.kind.policy
+        policy = merged.model.sampler.policy
         merge(policy, values)
         policy.save_pretrained(whole)
         if name == "units":
@@ -213,7 +213,10 @@ def stated(
     """Folders of the adapter "units" with the contracts of two datasets, and "whole", the first
     one merged.
     """
-    root, settings = tmp_path_factory.mktemp("stated"), loaded("smolvla").model.kind.policy.config
+    root, settings = (
+        tmp_path_factory.mktemp("stated"),
+        loaded("smolvla").model.sampler.policy.config,
+    )
     folders = {
         name: shutil.copytree(saved["units"], root / name) for name in ("ten", "twenty", "again")
     }

@@ -20,9 +20,9 @@ SIZE = 4
 
 def on_meta(policy: LeRobot) -> LeRobot:
     """Move a loaded policy to the device meta."""
-    kind, processors = policy.model.kind, policy.model.processors
-    kind.policy.to(META)
-    kind.config.device, kind.staging.device = "meta", META
+    sampler, processors = policy.model.sampler, policy.model.processors
+    sampler.policy.to(META)
+    sampler.config.device, sampler.staging.device = "meta", META
     for step in [*processors._before.steps, *processors._after.steps]:
         if hasattr(step, "norm_map"):
             step.to(device=META)

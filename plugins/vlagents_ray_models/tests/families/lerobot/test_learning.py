@@ -21,7 +21,7 @@ from plugins.vlagents_ray_models.tests.families.lerobot.conftest import (
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.interface import BEHAVIOUR, DISTRIBUTION, SAMPLES, WANT, Act
 from vlagents_ray.policies.base import Row
-from vlagents_ray_models.lerobot import LeRobot, kinds
+from vlagents_ray_models.lerobot import LeRobot, samplers
 
 pytestmark = FILTERS
 
@@ -38,7 +38,7 @@ def learnt(loaded: Load) -> LeRobot:
 
 def velocity(policy: LeRobot, number: int, noisy: Any, time: float) -> Any:
     """The flow's velocity (1, H, D) by LeRobot's own training pass, which has no cache."""
-    session, seen, network = begun(policy, number), [], policy.model.kind.policy
+    session, seen, network = begun(policy, number), [], policy.model.sampler.policy
     row = Row((session.perceive(view(number)),), session.episode.instruction, session.episode.rng)
     batch = network._prepare_batch(policy.model.processors.observe([row], 1))
     images, masks = network.prepare_images(batch)
@@ -98,7 +98,7 @@ def test_the_samples_of_an_observation_are_of_one_reading_of_it(
     learnt: LeRobot, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     read: list[int] = []
-    model = learnt.model.kind.policy.model
+    model = learnt.model.sampler.policy.model
     embed = model.embed_prefix
 
     def counted(images: Any, *rest: Any, **more: Any) -> Any:
@@ -107,5 +107,5 @@ def test_the_samples_of_an_observation_are_of_one_reading_of_it(
 
     monkeypatch.setattr(model, "embed_prefix", counted)
     views = [view(0, **{SAMPLES: 8, WANT: ALL}), view(1), view(2, **{SAMPLES: 3})]
-    check_shared_readings(learnt, views, begun, kinds, ATOL)
+    check_shared_readings(learnt, views, begun, samplers, ATOL)
     assert read == [3, 14]

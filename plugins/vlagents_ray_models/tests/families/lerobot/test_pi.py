@@ -187,7 +187,7 @@ def test_random_steps_have_the_log_probability_of_the_networks_own_steps(
     kind: str, made: Callable[[str], Path], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     policy = _loaded(made(kind), noise_level=0.5)
-    network = policy.model.kind.policy.model
+    network = policy.model.sampler.policy.model
     read: list[int] = []
     alone: dict[str, Any] = {}
     embed, step = network.embed_prefix, network.denoise_step
@@ -277,7 +277,7 @@ def test_tokens_that_are_no_actions_fail_their_own_session(
 ) -> None:
     policy = _loaded(made(FAST), **settings_of_fast(made))
     alone = begun(policy, 2).act(view(2)).action
-    network, read = policy.model.kind.policy, list[int]()
+    network, read = policy.model.sampler.policy, list[int]()
     decode = network.detokenize_actions
 
     def checked(*tokens: Any, **shape: Any) -> Any:

@@ -25,7 +25,7 @@ from vlagents_ray.contract import CameraSpec, StateSpec
 from vlagents_ray.errors import InvalidObservation
 from vlagents_ray.interface import DISTRIBUTION, SAMPLES, Act
 from vlagents_ray.testing import check_agent
-from vlagents_ray_models.lerobot import LeRobot, kinds
+from vlagents_ray_models.lerobot import LeRobot, samplers
 
 pytestmark = FILTERS
 
@@ -69,7 +69,7 @@ def test_the_samples_of_an_observation_of_x_vla_are_of_one_reading_of_it(
     loaded: Load, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     policy, read = loaded("xvla"), list[int]()
-    vlm = policy.model.kind.policy.model.vlm
+    vlm = policy.model.sampler.policy.model.vlm
     name = "get_image_features" if tiny.NEW else "_encode_image"
     look = getattr(vlm, name)
 
@@ -79,7 +79,7 @@ def test_the_samples_of_an_observation_of_x_vla_are_of_one_reading_of_it(
 
     monkeypatch.setattr(vlm, name, counted)
     views = [view(0, **{SAMPLES: 8}), view(1), view(2, **{SAMPLES: 3})]
-    check_shared_readings(policy, views, begun, kinds, ATOL)
+    check_shared_readings(policy, views, begun, samplers, ATOL)
     assert read == [3, 14]
 
 
@@ -116,8 +116,8 @@ def test_the_names_of_the_joints_are_those_of_the_training(
     policy, names = loaded("act"), [f"joint{number}.pos" for number in range(tiny.ACTION)]
     model = policy.model
     # As LeRobot 0.6 saves it.
-    monkeypatch.setattr(model.kind.config, "action_feature_names", names, raising=False)
-    found = policy._described(model.kind, model.processors, model.trained, {})
+    monkeypatch.setattr(model.sampler.config, "action_feature_names", names, raising=False)
+    found = policy._describe(model.sampler, model.processors, model.trained, {})
     assert found.contract.action.names == tuple(names)
     assert policy.contract.action.names is None
 
@@ -178,5 +178,5 @@ def test_acts_with_pushed_weights(kind: str, made: Made) -> None:
     policy = LeRobot.from_config({"checkpoint": str(made(kind))})
     policy.initialize()
     # Those of LeRobot's trainer.
-    assert policy.parameters().keys() == policy.model.kind.policy.state_dict().keys()
+    assert policy.parameters().keys() == policy.model.sampler.policy.state_dict().keys()
     check_pushed_weights(policy, lambda: begun(policy, 1).act(view(1)).action)

@@ -19,7 +19,7 @@ from plugins.vlagents_ray_models.tests.families.lerobot.conftest import begun, v
 from plugins.vlagents_ray_models.tests.families.lerobot.test_pi import _loaded, _normalised, shrunk  # noqa: F401 - a fixture
 from plugins.vlagents_ray_models.tests.families.lerobot.test_upstream import Theirs, draws_of
 from vlagents_ray.interface import DELAY, GIVEN, LEFTOVER
-from vlagents_ray_models.lerobot.kinds import LONGEST_PREFIX
+from vlagents_ray_models.lerobot.samplers import LONGEST_PREFIX
 
 LONGEST = 4
 

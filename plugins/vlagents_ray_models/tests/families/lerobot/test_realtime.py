@@ -25,7 +25,7 @@ from vlagents_ray.errors import InvalidObservation
 from vlagents_ray.interface import DELAY, GIVEN, LEFTOVER
 from vlagents_ray_models.lerobot import LeRobot, checkpoint
 from vlagents_ray_models.lerobot.config import LeRobotConfig
-from vlagents_ray_models.lerobot.kinds import LONGEST_PREFIX, SmolVLAPasses
+from vlagents_ray_models.lerobot.samplers import LONGEST_PREFIX, SmolVLAPasses
 
 pytestmark = FILTERS
 
@@ -76,7 +76,7 @@ def test_the_settings_of_the_guidance_can_be_overridden(made: Made) -> None:
     )
     policy.initialize()
     assert policy.continues_plans
-    used = policy.model.kind.policy.rtc_processor.rtc_config
+    used = policy.model.sampler.policy.rtc_processor.rtc_config
     assert (used.execution_horizon, used.max_guidance_weight) == (4, 2.0)
     assert used.prefix_attention_schedule.name == "EXP"
 

@@ -27,10 +27,12 @@ pytestmark = FILTERS
 def test_smolvla_loads_and_acts(tmp_path: Path, dtype: str) -> None:
     written = write_checkpoint("smolvla", tmp_path / "made", "small", dtype)
     policy = acts(written.config)
-    network = policy.model.kind.policy.model.vlm_with_expert
+    network = policy.model.sampler.policy.model.vlm_with_expert
     assert {one.dtype for one in network.vlm.parameters()} == {getattr(torch, dtype)}
     assert {one.dtype for one in network.lm_expert.parameters()} == {torch.float32}
-    assert written.parameters == sum(one.numel() for one in policy.model.kind.policy.parameters())
+    assert written.parameters == sum(
+        one.numel() for one in policy.model.sampler.policy.parameters()
+    )
 
 
 @pytest.mark.parametrize("family", ["act", "diffusion"])

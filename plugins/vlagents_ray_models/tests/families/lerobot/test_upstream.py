@@ -163,7 +163,7 @@ def test_smolvla_with_its_language_model_in_bfloat16_is_theirs(tmp_path: Path) -
     for file in (folder / "vlm").glob("*.safetensors"):
         file.unlink()
     policy.initialize()
-    ours = {name: one.dtype for name, one in policy.model.kind.policy.named_parameters()}
+    ours = {name: one.dtype for name, one in policy.model.sampler.policy.named_parameters()}
     assert ours == {name: one.dtype for name, one in theirs.policy.named_parameters()}
     assert torch.bfloat16 in ours.values()
     shape = (1, tiny.CHUNK, theirs.policy.config.max_action_dim)
@@ -173,7 +173,7 @@ def test_smolvla_with_its_language_model_in_bfloat16_is_theirs(tmp_path: Path) -
     )
     exact = LeRobot.from_config({"checkpoint": str(folder), "dtype": "float32"})
     exact.initialize()
-    assert {one.dtype for one in exact.model.kind.policy.parameters()} == {torch.float32}
+    assert {one.dtype for one in exact.model.sampler.policy.parameters()} == {torch.float32}
 
 
 @pytest.mark.verifies("parity")

@@ -27,31 +27,40 @@ from vlagents_ray.registry import require
 from vlagents_ray_models.key_value_cache import cache_of, layers_of, stack_of
 from vlagents_ray_models.pi0_passes import Pi0Passes
 
-# The config's field, of LeRobot after 0.6.1, for π0.5; 0: without prefixes.
+# A field of the configs of LeRobot after 0.6.1, for π0.5; 0: trained without prefixes.
 LONGEST_PREFIX = "rtc_training_max_delay"
 # Fields of π0.5's config in the same versions.
 _MEMORIES = ("use_visual_memory", "use_proprioceptive_memory")
+
+# Keys of LeRobot's observations and actions.
 STATE, ACTION, IMAGES = "observation.state", "action", "observation.images"
 FRAMES = (STATE, "observation.environment_state", IMAGES)  # inputs of each step of a history
+_TOKENS = ("observation.language.tokens", "observation.language.attention_mask")
 
 
-class Kind:
-    """The default for any type: one row at a time with a seed from its session, which is slow
-    but exact.
+class Sampler:
+    """Computes the chunks of a policy; this base class serves any type.
+
+    It runs one row at a time with a seed from the row's session, which is slow but exact.
     """
 
-    batched = False
-    # The config's rows of a chunk, by preference.
+    batched = False  # whether `draw` accepts several rows
+    # Fields of the config with the number of rows of a chunk, by preference.
     lengths: ClassVar[tuple[str, ...]] = ("chunk_size", "n_action_steps")
-    random: RandomSteps | None = None  # of the last sampled chunks
-    # Number of rows that the last sampled chunks were given, by the row of the batch.
-    given: Mapping[int, int] = {}
+    random_steps: RandomSteps | None = None  # of the last call of `draw`
+    # In the last call of `draw`: index of a row -> the number of its chunk's first rows that were
+    # an input, because they are already planned.
+    prefix_rows: Mapping[int, int] = {}
 
     def __init__(self, policy: Any, compilation: Compilation) -> None:
-        """Use a loaded policy, and mark its core functions for compilation if its type has any."""
+        """Use a loaded policy, and compile its core functions if its type supports that.
+
+        Raises:
+            ConfigError: The policy object stores what belongs to a session.
+        """
         self.policy, self.config = policy, policy.config
         self.staging = Staging(policy.config.device)
-        if type(self) is Kind and self.steps > 1:
+        if type(self) is Sampler and self.steps > 1:
             raise ConfigError(
                 f"checkpoint: {policy.name!r} keeps {self.steps} observations by itself, so that "
                 "sessions would mix; want another type, or a policy with n_obs_steps 1"
@@ -65,9 +74,8 @@ class Kind:
     @property
     def horizon(self) -> int:
         """The number of rows of a chunk, counted from the current tick."""
-        return int(
-            getattr(self.config, self.lengths[0], 0) or getattr(self.config, self.lengths[-1])
-        )
+        preferred, alternative = self.lengths[0], self.lengths[-1]
+        return int(getattr(self.config, preferred, 0) or getattr(self.config, alternative))
 
     @property
     def dim(self) -> int:
@@ -75,15 +83,14 @@ class Kind:
         return int(self.config.action_feature.shape[0])
 
     @property
-    def usual(self) -> int:
-        """The number of rows that the policy executes before the next inference, from its
-        config.
-        """
+    def default_execute(self) -> int:
+        """The number of rows that LeRobot executes before the next inference, from the config."""
         return min(int(getattr(self.config, "n_action_steps", self.horizon)), self.horizon)
 
-    def observations(self, rows: Sequence[Row]) -> list[int]:
-        """Return the indices of the rows whose observations `draw` needs: all, unless samples
-        share one.
+    def observed_rows(self, rows: Sequence[Row]) -> list[int]:
+        """Return the indices of the rows whose observations `draw` reads.
+
+        These are all rows, unless several samples share an observation.
         """
         return list(range(len(rows)))
 
@@ -91,7 +98,7 @@ class Kind:
         """Compute chunks in the policy's own units.
 
         Args:
-            batch: The output of the policy's pre-processor, for the rows of `observations`.
+            batch: The output of the policy's pre-processor, for the rows of `observed_rows`.
             rows: The rows of the batch.
             leftovers: The leftover actions of each row, (H', D) in the same units, or None.
 
@@ -103,9 +110,10 @@ class Kind:
         [row] = rows
         with seeded(row.rng, require("torch").device(self.config.device)):
             self.policy.reset()
-            return self._alone(batch, row)
+            return self._draw_one(batch, row)
 
-    def _alone(self, batch: dict[str, Any], row: Row) -> Any:
+    def _draw_one(self, batch: dict[str, Any], row: Row) -> Any:
+        """Compute the chunk of a single row, (1, horizon, D), with the seed already set."""
         return self.policy.predict_action_chunk(batch)
 
 
@@ -123,8 +131,16 @@ def vectors(config: Any) -> list[str]:
 
 
 def stacked(batch: dict[str, Any], config: Any, rows: int) -> dict[str, Any]:
-    """Reshape (rows * steps, …) to (rows, steps, …), with the cameras in one tensor (rows,
-    steps, cameras, 3, H, W).
+    """Group the observations of each row, and stack its cameras.
+
+    Args:
+        batch: Tensors (rows * steps, …) by observation key.
+        config: LeRobot's config object of the policy.
+        rows: The number of rows.
+
+    Returns:
+        Tensors (rows, steps, …) by observation key; the images are one tensor, (rows, steps,
+        cameras, 3, H, W).
     """
     if config.image_features:
         images = [batch[key] for key in config.image_features]
@@ -132,10 +148,7 @@ def stacked(batch: dict[str, Any], config: Any, rows: int) -> dict[str, Any]:
     return {key: batch[key].unflatten(0, (rows, -1)) for key in FRAMES if key in batch}
 
 
-_TOKENS = ("observation.language.tokens", "observation.language.attention_mask")
-
-
-class Diffusion(Kind):
+class DiffusionSampler(Sampler):
     """Diffusion policies, with noise for the first sample and, with DDPM, for every denoising
     step.
     """
@@ -147,7 +160,12 @@ class Diffusion(Kind):
         unet = policy.diffusion.unet
         denoise = compilation.core("denoise", unet.forward)
         self._encode = compilation.core("vision encoder", self._condition)
-        unet.forward = lambda sample, times, global_cond: denoise(sample, times, global_cond)  # noqa: PLW0108 - named
+
+        # LeRobot passes `global_cond` by name, a compiled core takes its arguments by position.
+        def forward(sample: Any, times: Any, global_cond: Any) -> Any:
+            return denoise(sample, times, global_cond)
+
+        unet.forward = forward
 
     @property
     def horizon(self) -> int:
@@ -157,27 +175,28 @@ class Diffusion(Kind):
         from vlagents_ray_models.sampling_rng import generator_of
 
         model = self.policy.diffusion
-        noise = np.stack(
-            [row.noise(self.config.horizon, self.config.action_feature.shape[0]) for row in rows]
-        )
+        shape = (self.config.horizon, self.config.action_feature.shape[0])
+        noise = np.stack([row.noise(*shape) for row in rows])
+        observations = stacked(batch, self.config, len(rows))
         actions = model.conditional_sample(
             len(rows),
-            global_cond=self._encode(*stacked(batch, self.config, len(rows)).values()),
+            global_cond=self._encode(*observations.values()),
             generator=[generator_of(row.rng) for row in rows],
             noise=self.staging.upload(noise),
         )
         return actions[:, self.steps - 1 :]
 
     def _condition(self, *inputs: Any) -> Any:
-        names = [*vectors(self.config), *([IMAGES] if self.config.image_features else [])]
-        return self.policy.diffusion._prepare_global_conditioning(
-            dict(zip(names, inputs, strict=True))
-        )
+        names = vectors(self.config)
+        if self.config.image_features:
+            names.append(IMAGES)
+        observations = dict(zip(names, inputs, strict=True))
+        return self.policy.diffusion._prepare_global_conditioning(observations)
 
 
-class MultiTaskDit(Kind):
-    """The multi-task diffusion transformer of LeRobot 0.6, by diffusion or flow matching, with
-    an instruction.
+class MultiTaskDitSampler(Sampler):
+    """The multi-task diffusion transformer of LeRobot 0.6, which reads an instruction; it denoises
+    by diffusion or flow matching.
     """
 
     batched = True
@@ -187,25 +206,26 @@ class MultiTaskDit(Kind):
         return int(self.config.horizon - self.steps + 1)
 
     def draw(self, batch: dict[str, Any], rows: Sequence[Row], leftovers: Sequence[Any]) -> Any:
-        seen = stacked(batch, self.config, len(rows))
+        observations = stacked(batch, self.config, len(rows))
         for name in _TOKENS:
-            # The same in each step of a history.
-            seen[name] = batch[name].unflatten(0, (len(rows), -1))[:, -1]
-        condition = self.policy.observation_encoder.encode(seen)
-        # DDPM's steps draw in the latter.
-        own = self.policy.objective, require("diffusers.utils.torch_utils")
-        with row_draws(rows, *own):
-            actions = self.policy.objective.conditional_sample(
+            # They are the same in each step of a history.
+            observations[name] = batch[name].unflatten(0, (len(rows), -1))[:, -1]
+
+        condition = self.policy.observation_encoder.encode(observations)
+        objective = self.policy.objective
+        # The steps of DDPM draw in diffusers' module.
+        with row_draws(rows, objective, require("diffusers.utils.torch_utils")):
+            actions = objective.conditional_sample(
                 self.policy.noise_predictor, len(rows), condition
             )
         return actions[:, self.steps - 1 :]
 
 
-class Flow(Kind):
+class FlowSampler(Sampler):
     """SmolVLA, π0 and π0.5: flow matching from noise of the sessions, guided by their leftovers.
 
-    A checkpoint that was trained with prefixes is given the first rows of a leftover instead, and
-    no guidance.
+    A checkpoint that was trained with prefixes reads the first rows of a leftover as an input
+    instead, and is not guided.
     """
 
     batched = True
@@ -216,55 +236,62 @@ class Flow(Kind):
         model, config = policy.model, self.config
         if policy.name == "smolvla":
             self.passes: FlowPasses = SmolVLAPasses(model, compilation)
+            self.flow_steps = int(config.num_steps)
         else:
             self.passes = Pi0Passes(model, compilation, stated=policy.name == "pi0")
-        self.flow_steps = int(
-            config.num_steps if policy.name == "smolvla" else config.num_inference_steps
-        )
-        if memories := [name for name in _MEMORIES if getattr(config, name, False)]:
+            self.flow_steps = int(config.num_inference_steps)
+
+        memories = [name for name in _MEMORIES if getattr(config, name, False)]
+        if memories:
             raise ConfigError(
                 f"checkpoint: has {memories}, want none: the policy object keeps them, so that "
                 "sessions would mix"
             )
+
         # The policy calls it after preparing the inputs and before converting the actions.
         model.sample_actions = self.passes.sample
-        trained = getattr(policy.rtc_processor.rtc_config, "mode", "guided") == "trained"
-        self.longest = int(getattr(config, LONGEST_PREFIX)) if trained else 0  # rows of a prefix
-        self.passes.by_row = trained
+        has_prefixes = getattr(policy.rtc_processor.rtc_config, "mode", "guided") == "trained"
+        self.longest = int(getattr(config, LONGEST_PREFIX)) if has_prefixes else 0  # rows
+        self.passes.by_row = has_prefixes
 
-    def observations(self, rows: Sequence[Row]) -> list[int]:
+    def observed_rows(self, rows: Sequence[Row]) -> list[int]:
         return self._shared(rows)[0]
 
     def draw(self, batch: dict[str, Any], rows: Sequence[Row], leftovers: Sequence[Any]) -> Any:
         shape = (self.horizon, int(self.config.max_action_dim))
-        convert = self.staging.upload
-        # This noise is drawn before that of the steps, which only some rows draw.
-        noise = convert(np.stack([row.noise(*shape) for row in rows]))
-        self.random = RandomSteps.for_rows(
-            rows, (self.flow_steps, *shape), self.noise_level, convert
+        upload = self.staging.upload
+        # This noise is drawn before the noise of the steps, which only some rows draw.
+        noise = upload(np.stack([row.noise(*shape) for row in rows]))
+        self.random_steps = RandomSteps.for_rows(
+            rows, (self.flow_steps, *shape), self.noise_level, upload
         )
+
         changes: list[Change] = []
         frozen = None
-        given_rows: dict[int, int] = {}
-        if any(left is not None for left in leftovers):
-            plans = [None if left is None else self._encoded(left) for left in leftovers]
+        prefix_rows: dict[int, int] = {}
+        if any(leftover is not None for leftover in leftovers):
+            plans = [
+                None if leftover is None else self._encoded(leftover) for leftover in leftovers
+            ]
             prefixes = None
             if self.longest:
                 prefixes = Guide.for_rows(list(map(self._prefixed, rows, plans)), *shape)
+
             if prefixes is not None:
                 for i, plan in enumerate(plans):
                     if plan is not None:
-                        given_rows[i] = int(prefixes.frozen[i].sum())
-                prefixes = prefixes.to(convert)
+                        prefix_rows[i] = int(prefixes.frozen[i].sum())
+                prefixes = prefixes.to(upload)
                 noise = prefixes.insert_frozen(noise)
                 frozen = prefixes.frozen
                 changes.append(prefixes.keep)
             else:
                 delays = [row.delay for row in rows]
-                changes.append(guided(self.policy.rtc_processor, plans, delays, shape, convert))
-        if self.random is not None:
-            changes.append(self.random.change)
-        self.given = given_rows
+                changes.append(guided(self.policy.rtc_processor, plans, delays, shape, upload))
+        if self.random_steps is not None:
+            changes.append(self.random_steps.change)
+        self.prefix_rows = prefix_rows
+
         return self.policy.predict_action_chunk(
             batch,
             noise=noise,
@@ -285,18 +312,18 @@ class Flow(Kind):
         return shared_frames(rows)
 
     def _prefixed(self, row: Row, plan: Any) -> Row:
-        """Return the row with its plan in the policy's units, and the number of its rows that
-        are given.
+        """Return the row with its plan in the policy's units, and with a delay that is the number
+        of the plan's rows that the policy reads.
         """
         # Before the first answer its delay is unknown.
         delay = min(row.delay or self.longest, self.longest)
         return replace(row, leftover=None if plan is None else fetch(plan), delay=delay)
 
-    def _encoded(self, left: Any) -> Any:
+    def _encoded(self, leftover: Any) -> Any:
         """Convert a leftover to the units of π0's ALOHA, if SmolVLA was trained in these."""
         if not getattr(self.config, "adapt_to_pi_aloha", False):
-            return left
-        return self.policy._pi_aloha_encode_actions_inv(left[None].clone())[0]
+            return leftover
+        return self.policy._pi_aloha_encode_actions_inv(leftover[None].clone())[0]
 
 
 def guided(
@@ -317,20 +344,28 @@ def guided(
         convert: Makes a tensor of an array, on the policy's device.
     """
     torch, settings = require("torch"), processor.rtc_config
-    target, weights = torch.zeros(len(plans), *shape), torch.zeros(len(plans), shape[0], 1)
+    rows, dim = shape
+    target = torch.zeros(len(plans), rows, dim)
+    weights = torch.zeros(len(plans), rows, 1)
     for i, (plan, delay) in enumerate(zip(plans, delays, strict=True)):
-        if plan is not None:
-            part = plan[: shape[0]]
-            target[i, : len(part), : part.shape[1]] = part
-            horizon = min(settings.execution_horizon, len(part))
-            weights[i, :, 0] = processor.get_prefix_weights(max(delay, 0), horizon, shape[0])
+        if plan is None:
+            continue
+        leftover = plan[:rows]
+        target[i, : len(leftover), : leftover.shape[1]] = leftover
+        horizon = min(settings.execution_horizon, len(leftover))
+        weights[i, :, 0] = processor.get_prefix_weights(max(delay, 0), horizon, rows)
+
     target, weights = convert(target.numpy()), convert(weights.numpy())
-    most = float(settings.max_guidance_weight)
+    max_strength = float(settings.max_guidance_weight)
 
     def change(velocity: Any, actions: Any, time: float) -> Any:
-        end, done = actions - time * velocity, 1 - time
-        strength = most if done == 0 else min(most, time / done * (time**2 + done**2) / time**2)
-        return velocity - strength * weights * (target - end)
+        expected_end = actions - time * velocity
+        done = 1 - time
+        if done == 0:
+            strength = max_strength
+        else:
+            strength = min(max_strength, time / done * (time**2 + done**2) / time**2)
+        return velocity - strength * weights * (target - expected_end)
 
     return change
 
@@ -346,10 +381,9 @@ class SmolVLAPasses(FlowPasses):
         self._vlm = model.vlm_with_expert.get_vlm_model()
         # LeRobot 0.4 stores keys and values by name, (B, L, heads, D); later versions in a cache of
         # transformers.
-        self._by_name = (
-            "fill_kv_cache" in inspect.signature(model.vlm_with_expert.forward).parameters
-        )
-        # Of an image's patches, (L,), by its height and width.
+        parameters = inspect.signature(model.vlm_with_expert.forward).parameters
+        self._by_name = "fill_kv_cache" in parameters
+        # Height and width of an image -> the positions of its patches, (L,).
         self._positions: dict[tuple[int, int], Any] = {}
         self._embed_image = model.vlm_with_expert.embed_image
         model.vlm_with_expert.embed_image = self._embed
@@ -358,15 +392,14 @@ class SmolVLAPasses(FlowPasses):
         """Return the patches of images (P, 3, H, W) in the format of the vision model, (P, L,
         E).
         """
-        vision = self._vlm.vision_model
-        places = vision.embeddings.position_embedding
-        found = []
+        embeddings = self._vlm.vision_model.embeddings
+        dtype = self._vlm.vision_model.dtype
+        encoded = []
         for image in images:
-            patches = (
-                vision.embeddings.patch_embedding(image.to(vision.dtype)).flatten(2).transpose(1, 2)
-            )
-            found.append(patches + places(self._positions_of(image)))
-        return found
+            patches = embeddings.patch_embedding(image.to(dtype)).flatten(2).transpose(1, 2)
+            positions = embeddings.position_embedding(self._positions_of(image))
+            encoded.append(patches + positions)
+        return encoded
 
     def encode(
         self, tokens: Any, mask: Any, cameras: Any, state: Any, *patches: Any
@@ -390,10 +423,9 @@ class SmolVLAPasses(FlowPasses):
     def velocity(self, encoded: Any, present: Any, state: Any, actions: Any, times: Any) -> Any:
         layers = encoded.unbind(1)
         if self._by_name:
-            cache = {
-                i: {"key_states": layer[:, 0], "value_states": layer[:, 1]}
-                for i, layer in enumerate(layers)
-            }
+            cache = {}
+            for i, layer in enumerate(layers):
+                cache[i] = {"key_states": layer[:, 0], "value_states": layer[:, 1]}
         else:
             cache = cache_of(layers)
         return self.model.denoise_step(
@@ -408,30 +440,28 @@ class SmolVLAPasses(FlowPasses):
         return self._vlm.connector(vision.post_layernorm(hidden))
 
     def _positions_of(self, image: Any) -> Any:
-        """Return the positions that the vision model gives to the patches of an image of this
-        size.
+        """Return the positions, (L,), that the vision model assigns to the patches of images of
+        this size.
         """
         size = (image.shape[-2], image.shape[-1])
         if size not in self._positions:
             torch, vision = require("torch"), self._vlm.vision_model
-            found: list[Any] = []
+            captured: list[Any] = []
             hook = vision.embeddings.position_embedding.register_forward_pre_hook(
-                lambda _, given: found.extend(given)
+                lambda _, inputs: captured.extend(inputs)
             )
             with hook, self.adapters.rows(()):  # the image belongs to no row
                 patches = [length // vision.patch_size for length in size]
-                vision.embeddings(
-                    image[:1].to(vision.dtype),
-                    torch.ones(1, *patches, dtype=torch.bool, device=image.device),
-                )
-            self._positions[size] = found[0][0].clone()
+                mask = torch.ones(1, *patches, dtype=torch.bool, device=image.device)
+                vision.embeddings(image[:1].to(vision.dtype), mask)
+            self._positions[size] = captured[0][0].clone()
         return self._positions[size]
 
 
 _BOUNDS = ("min", "max")  # statistics that scale states and actions
 
 
-class Groot(Kind):
+class GrootSampler(Sampler):
     """GR00T N1.7: flow matching from noise drawn for each session.
 
     The layers above its language model do not mask padding, so only observations whose prompts have
@@ -446,50 +476,68 @@ class Groot(Kind):
         return int(self.policy._resolve_prediction_horizon(require("torch").empty(1, longest, 1)))
 
     @property
-    def usual(self) -> int:
+    def default_execute(self) -> int:
         return min(int(self.policy._action_queue_steps), self.horizon)
 
     def draw(self, batch: dict[str, Any], rows: Sequence[Row], leftovers: Sequence[Any]) -> Any:
-        groups: dict[int, list[int]] = {}
-        for place, length in enumerate(batch["attention_mask"].sum(1).tolist()):
-            groups.setdefault(int(length), []).append(place)
+        by_length: dict[int, list[int]] = {}  # number of tokens -> indices of rows
+        for i, length in enumerate(batch["attention_mask"].sum(1).tolist()):
+            by_length.setdefault(int(length), []).append(i)
+
         chunks: list[Any] = [None] * len(rows)
-        for length, places in groups.items():
-            with row_draws([rows[place] for place in places], self.policy._groot_model.action_head):
-                drawn = self.policy.predict_action_chunk(_part(batch, places, length, len(rows)))
-            for place, chunk in zip(places, drawn, strict=True):
-                chunks[place] = chunk
+        for length, indices in by_length.items():
+            inputs = _select_rows(batch, indices, length, len(rows))
+            with row_draws([rows[i] for i in indices], self.policy._groot_model.action_head):
+                drawn = self.policy.predict_action_chunk(inputs)
+            for i, chunk in zip(indices, drawn, strict=True):
+                chunks[i] = chunk
         return require("torch").stack(chunks).float()
 
 
-def _part(
-    batch: Mapping[str, Any], places: Sequence[int], length: int, rows: int
+def _select_rows(
+    batch: Mapping[str, Any], indices: Sequence[int], length: int, rows: int
 ) -> dict[str, Any]:
-    """Return the inputs of some rows, whose prompts have `length` tokens, without the padding
-    before them.
+    """Return GR00T's inputs of some rows, without the padding before their prompts.
+
+    Args:
+        batch: The inputs of all rows.
+        indices: The selected rows.
+        length: The number of tokens in the prompts of these rows.
+        rows: The number of all rows.
     """
-    grid = batch["image_grid_thw"]
-    patches = batch["pixel_values"].split(grid.prod(1).tolist())  # one for each image
+    grid = batch["image_grid_thw"]  # (rows * views, 3): patches of each image in time and space
+    patches = batch["pixel_values"].split(grid.prod(1).tolist())  # one tensor for each image
     views = len(grid) // rows
-    images = [place * views + view for place in places for view in range(views)]
-    padded = batch["input_ids"].shape
-    found = {
+    images: list[int] = []
+    for i in indices:
+        images.extend(range(i * views, (i + 1) * views))
+
+    selected = {
         "pixel_values": require("torch").cat([patches[i] for i in images]),
         "image_grid_thw": grid[images],
     }
+    padded_shape = batch["input_ids"].shape
     for name, value in batch.items():
-        if name not in found and hasattr(value, "shape") and value.shape[:1] == (rows,):
-            of_tokens = value.shape[:2] == padded
-            found[name] = value[places][:, -length:] if of_tokens else value[places]
-    return found
+        if name in selected or not hasattr(value, "shape") or value.shape[:1] != (rows,):
+            continue
+        is_padded = value.shape[:2] == padded_shape
+        selected[name] = value[indices][:, -length:] if is_padded else value[indices]
+    return selected
 
 
 def require_groot_statistics(before: Sequence[Any], after: Sequence[Any], settings: Any) -> None:
-    """Raise `ConfigError` unless GR00T's processors have usable bounds; LeRobot replaces missing
-    ones by 0 and 1.
+    """Check that GR00T's processors have usable bounds; LeRobot replaces missing ones with 0 and 1.
+
+    Args:
+        before: The steps of the pre-processor.
+        after: The steps of the post-processor.
+        settings: LeRobot's config object of the policy.
+
+    Raises:
+        ConfigError: Bounds of the state or the actions are missing, too few or not finite, or the
+            embodiment is unknown.
     """
-    torch = require("torch")
-    pack, decode = _step(before, "embodiment_tag"), _step(after, "env_action_dim")
+    pack, decode = _find_step(before, "embodiment_tag"), _find_step(after, "env_action_dim")
     if pack is None or decode is None:
         raise ConfigError(
             "checkpoint: misses the steps of GR00T N1.7's processors; save it with LeRobot 0.6 "
@@ -500,50 +548,60 @@ def require_groot_statistics(before: Sequence[Any], after: Sequence[Any], settin
             f"checkpoint: got the embodiment {pack.embodiment_tag!r}, want one of "
             f"{sorted(pack.embodiment_mapping)}: LeRobot would act as the first of them"
         )
+
     sources = [
         ("policy_preprocessor.json", STATE, pack.stats),
         ("policy_preprocessor.json", ACTION, pack.stats),
     ]
     if hasattr(decode, "stats"):
         sources.append(("policy_postprocessor.json", ACTION, decode.stats))
+
+    as_tensor = require("torch").as_tensor
     features = {**settings.input_features, **settings.output_features}
-    for file, key, stats in sources:
-        have = {
-            name: torch.as_tensor(value).float()
-            for name, value in ((stats or {}).get(key) or {}).items()
-        }
+    for file, key, by_feature in sources:
+        statistics = (by_feature or {}).get(key) or {}
+        bounds = {name: as_tensor(value).float() for name, value in statistics.items()}
         width = features[key].shape[0]
-        missing = [name for name in _BOUNDS if name not in have or not have[name].isfinite().all()]
-        short = [name for name in _BOUNDS if name in have and have[name].numel() < width]
+        missing = [
+            name for name in _BOUNDS if name not in bounds or not bounds[name].isfinite().all()
+        ]
+        short = [name for name in _BOUNDS if name in bounds and bounds[name].numel() < width]
         if missing or short:
             raise ConfigError(
                 f"checkpoint: {file} has no usable {missing or short} of {key!r}, has "
-                f"{sorted(have)}, want {width} numbers each; without them its inputs and actions "
+                f"{sorted(bounds)}, want {width} numbers each; without them its inputs and actions "
                 "are wrong: save it with its dataset's statistics"
             )
 
 
 def groot_dataset(before: Sequence[Any]) -> DatasetContract | None:
-    """Return the parts of the state that NVIDIA's checkpoint names; None if no name has a
-    meaning.
+    """Return the parts of the state that NVIDIA's checkpoint names.
+
+    Args:
+        before: The steps of the pre-processor.
+
+    Returns:
+        A contract with these parts; None if a part's width is unknown, or its "gripper" is not a
+        single number.
     """
-    pack = _step(before, "embodiment_tag")
-    names = ((getattr(pack, "modality_config", None) or {}).get("state") or {}).get(
-        "modality_keys"
-    ) or ()
-    stats = (getattr(pack, "raw_stats", None) or {}).get("state") or {}
-    widths = {name: len(stats.get(name, {}).get("min", ())) for name in names}
+    pack = _find_step(before, "embodiment_tag")
+    state_config = (getattr(pack, "modality_config", None) or {}).get("state") or {}
+    names = state_config.get("modality_keys") or ()
+    statistics = (getattr(pack, "raw_stats", None) or {}).get("state") or {}
+    widths = {name: len(statistics.get(name, {}).get("min", ())) for name in names}
     if not widths or not all(widths.values()) or widths.get(GRIPPER, 1) != 1:
         return None
+
     specs = {name: StateSpec(width) for name, width in widths.items() if name != GRIPPER}
     return DatasetContract(Contract(state=specs), tuple(names))
 
 
-def _step(steps: Sequence[Any], attribute: str) -> Any:
+def _find_step(steps: Sequence[Any], attribute: str) -> Any:
+    """Return the first step that has an attribute; None if there is none."""
     return next((step for step in steps if hasattr(step, attribute)), None)
 
 
-class ActPolicy(Kind):
+class ActSampler(Sampler):
     """ACT, whose latent is zero at inference, so that nothing is random."""
 
     batched = True
@@ -553,25 +611,25 @@ class ActPolicy(Kind):
         self._act = compilation.core("act", self._actions)
 
     def draw(self, batch: dict[str, Any], rows: Sequence[Row], leftovers: Sequence[Any]) -> Any:
-        return self._act(
-            *(batch[key] for key in (*vectors(self.config), *self.config.image_features))
-        )
+        names = [*vectors(self.config), *self.config.image_features]
+        return self._act(*(batch[name] for name in names))
 
     def _actions(self, *inputs: Any) -> Any:
         names = vectors(self.config)
         batch = dict(zip(names, inputs, strict=False))
-        if images := inputs[len(names) :]:
+        images = inputs[len(names) :]
+        if images:
             batch[IMAGES] = list(images)
         return self.policy.model(batch)[0]
 
 
-class Fast(Kind):
+class FastSampler(Sampler):
     """π0-FAST, which decodes only the tokens of rows that are executed."""
 
     lengths = ("n_action_steps",)
 
 
-class Evo1(Kind):
+class Evo1Sampler(Sampler):
     """EVO-1, whose post-processor removes the padding of actions."""
 
     @property
@@ -579,7 +637,7 @@ class Evo1(Kind):
         return int(self.config.max_action_dim)
 
 
-class XVla(Kind):
+class XVlaSampler(Sampler):
     """X-VLA, which draws its noise itself and does not mask padding, so a batch needs
     instructions of one length.
     """
@@ -590,29 +648,28 @@ class XVla(Kind):
 
     def __init__(self, policy: Any, compilation: Compilation) -> None:
         super().__init__(policy, compilation)
-        self._look = policy.model.forward_vlm
+        self._forward_vlm = policy.model.forward_vlm
 
     def draw(self, batch: dict[str, Any], rows: Sequence[Row], leftovers: Sequence[Any]) -> Any:
         firsts, owners = shared_frames(rows)
 
-        def look(*inputs: Any) -> dict[str, Any]:
+        def forward_vlm(*inputs: Any) -> dict[str, Any]:
             """Run the vision-language encoder once for each observation."""
-            return {
-                name: one[owners]
-                for name, one in self._look(*(each[firsts] for each in inputs)).items()
-            }
+            outputs = self._forward_vlm(*(values[firsts] for values in inputs))
+            return {name: values[owners] for name, values in outputs.items()}
 
-        self.policy.model.forward_vlm = look
+        self.policy.model.forward_vlm = forward_vlm
         with row_draws(rows, self.policy.model):
             return self.policy.predict_action_chunk(batch)
 
 
-class VqBet(Kind):
+class VqBetSampler(Sampler):
     """VQ-BeT, which samples the codes of its residual VQ; checkpoints of its first training
     phase have no codes.
     """
 
-    batched, lengths = True, ("action_chunk_size",)
+    batched = True
+    lengths = ("action_chunk_size",)
 
     def __init__(self, policy: Any, compilation: Compilation) -> None:
         super().__init__(policy, compilation)
@@ -627,7 +684,7 @@ class VqBet(Kind):
             return self.policy.vqbet(stacked(batch, self.config, len(rows)), rollout=True)
 
 
-class Tdmpc(Kind):
+class TdmpcSampler(Sampler):
     """TD-MPC, which runs one row at a time, since the rows of a batch would share random
     trajectories and Q functions.
 
@@ -641,24 +698,29 @@ class Tdmpc(Kind):
         return int(self.config.horizon) if self.config.use_mpc else 1
 
     @property
-    def usual(self) -> int:
+    def default_execute(self) -> int:
         return self.horizon if self.config.n_action_repeats > 1 else int(self.config.n_action_steps)
 
-    def _alone(self, batch: dict[str, Any], row: Row) -> Any:
+    def _draw_one(self, batch: dict[str, Any], row: Row) -> Any:
         torch, policy = require("torch"), self.policy
-        if (mean := row.memory.get("mean")) is not None:
-            policy._prev_mean = torch.from_numpy(mean).to(self.config.device)
+        previous_mean = row.memory.get("mean")
+        if previous_mean is not None:
+            policy._prev_mean = torch.from_numpy(previous_mean).to(self.config.device)
+
         latent = policy.model.encode(batch)
         # (horizon, 1, D)
         actions = policy.plan(latent) if self.config.use_mpc else policy.model.pi(latent)[None]
         actions = actions.clamp(-1, 1)
         if policy._prev_mean is not None:
             row.memory["mean"] = fetch(policy._prev_mean)
+
         repeats = self.config.n_action_repeats
-        return (actions[:1].expand(repeats, -1, -1) if repeats > 1 else actions).transpose(0, 1)
+        if repeats > 1:
+            actions = actions[:1].expand(repeats, -1, -1)
+        return actions.transpose(0, 1)
 
 
-class Single(Kind):
+class SacSampler(Sampler):
     """SAC, which LeRobot 0.6 calls `gaussian_actor`, with single actions and no state between
     them.
     """
@@ -672,29 +734,31 @@ class Single(Kind):
         # The gripper's choice, which comes last.
         return super().dim + (self.config.num_discrete_actions is not None)
 
-    def _alone(self, batch: dict[str, Any], row: Row) -> Any:
-        # The gripper's network takes no others.
+    def _draw_one(self, batch: dict[str, Any], row: Row) -> Any:
+        # The gripper's network accepts no other inputs.
         inputs = {key: batch[key] for key in self.config.input_features}
         return self.policy.select_action(inputs)[:, None]
 
 
 # Types that resize images themselves.
 RESIZING = {"groot", "smolvla", "pi0", "pi05", "pi0_fast", "wall_x"}
+# Types that mask missing cameras.
 MASKING = {"smolvla", "pi0", "pi05", "pi0_fast", "xvla"}
 
-KINDS: Mapping[str, type[Kind]] = {
-    "act": ActPolicy,
-    "diffusion": Diffusion,
-    "evo1": Evo1,
-    "gaussian_actor": Single,
-    "groot": Groot,
-    "multi_task_dit": MultiTaskDit,
-    "pi0": Flow,
-    "pi05": Flow,
-    "pi0_fast": Fast,
-    "sac": Single,
-    "smolvla": Flow,
-    "tdmpc": Tdmpc,
-    "vqbet": VqBet,
-    "xvla": XVla,
+# Policy type -> its sampler; `Sampler` itself serves all other types.
+SAMPLERS: Mapping[str, type[Sampler]] = {
+    "act": ActSampler,
+    "diffusion": DiffusionSampler,
+    "evo1": Evo1Sampler,
+    "gaussian_actor": SacSampler,
+    "groot": GrootSampler,
+    "multi_task_dit": MultiTaskDitSampler,
+    "pi0": FlowSampler,
+    "pi05": FlowSampler,
+    "pi0_fast": FastSampler,
+    "sac": SacSampler,
+    "smolvla": FlowSampler,
+    "tdmpc": TdmpcSampler,
+    "vqbet": VqBetSampler,
+    "xvla": XVlaSampler,
 }
